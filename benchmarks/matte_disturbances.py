@@ -1,13 +1,15 @@
-"""Lay what goes wrong on a set on recorded frames, for ``benchmarks.matte_views``."""
+"""Lay what goes wrong on a set, or other walls, on frames for ``benchmarks.matte_views``."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
 
+from benchmarks.matte_scenes import READ, SHOT, cluttered
 from express50.files.images import linear_to_srgb, srgb_to_linear
 from express50.geometry.cameras import Camera, pinhole, rays
 
@@ -15,6 +17,9 @@ SHADE = 0.5  # share of linear light that the shadow takes; the key forgives a q
 STAND = (0.06, 0.07, 0.05)  # linear light of the object
 PATCH_M = 0.04  # radius of the patch
 BUMP = (0.09, 0.04, 3.0)  # shares of the image's side, degrees
+
+Wall = Callable[[np.random.Generator, int], np.ndarray]
+"""Linear light (size, size, 3) of a wall, at random."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +91,59 @@ DISTURBANCES: dict[str, Callable[[list[Shot]], list[Shot]]] = {
     "patch": patch,
     "bumped": bumped,
 }
+
+
+def walls(shots: list[Shot]) -> dict[str, list[Shot]]:
+    """Return the shots before other walls, with plates of them.
+
+    `bland` is a grey wall with light falling off, `skin` and `shirt` have the subject's colours,
+    `cluttered` is as in ``benchmarks.matte_scenes``; every camera sees another part of the room.
+    """
+    front = shots[len(shots) // 2]
+    height, width = front.true.shape
+    skin, shirt = (
+        np.median(
+            srgb_to_linear(front.frame[rows, columns] / 255)[front.true[rows, columns] > 0.99], 0
+        )
+        for rows, columns in (
+            (
+                slice(int(0.42 * height), int(0.5 * height)),
+                slice(int(0.45 * width), int(0.55 * width)),
+            ),
+            (slice(int(0.93 * height), height), slice(int(0.4 * width), int(0.6 * width))),
+        )
+    )
+    makers: dict[str, Wall] = {
+        "bland": partial(_falling_off, colour=np.full(3, 0.42)),
+        "skin": partial(_falling_off, colour=skin),
+        "shirt": partial(_falling_off, colour=shirt),
+        "cluttered": cluttered,
+    }
+    return {
+        name: [_before(shot, make, np.random.default_rng([7, k])) for k, shot in enumerate(shots)]
+        for name, make in makers.items()
+    }
+
+
+def _falling_off(rng: np.random.Generator, size: int, colour: np.ndarray) -> np.ndarray:
+    """Return a wall (size, size, 3) of one colour, linear light, brighter to one side."""
+    y, x = np.mgrid[0:size, 0:size] / size - 0.5
+    slope = rng.uniform(-0.3, 0.3, 2)
+    return (1 + slope[0] * x + slope[1] * y)[..., None] * colour * rng.uniform(0.97, 1.03, 3)
+
+
+def _before(shot: Shot, make: Wall, rng: np.random.Generator) -> Shot:
+    """Return a shot before another wall; frame and plate have noise of their own."""
+    height, width = shot.true.shape
+    light = np.clip(make(rng, max(height, width))[:height, :width], 0.01, 0.95)
+    shown = srgb_to_linear(shot.frame / 255)
+    share = ((1 - shot.true) * shot.valid)[..., None]
+    shown = shown + share * (_noisy(light, rng) - srgb_to_linear(shot.plate / 255))
+    return replace(shot, frame=_srgb8(shown), plate=_srgb8(_noisy(light, rng)))
+
+
+def _noisy(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    return light + rng.normal(size=light.shape) * np.hypot(READ, SHOT * np.sqrt(light))
 
 
 def _behind(shot: Shot, light: np.ndarray, cover: np.ndarray) -> Shot:

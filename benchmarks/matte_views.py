@@ -1,4 +1,4 @@
-"""Measure several views against the key, in scenes in which no camera alone can be right.
+"""Measure how several views help each other: against the key, and without plates.
 
 ``python -m benchmarks.matte_views`` records a rig of 24 cameras with the digital twin (a minute),
 or takes ``--dataset`` and ``--truth``, disturbs the peaks and measures the mattes before and after
@@ -9,6 +9,12 @@ the cameras have agreed, with all cameras and with every third:
 - ``object``: a quarter see a stand with a cable behind the subject;
 - ``patch``: a patch of the skin has one colour in all views, and two have the same behind it;
 - ``bumped``: one camera was turned after calibration, its matte is right where it now looks.
+
+``no_plate`` withholds the plates: mattes of all cameras together (`cut_out`), before the set as
+recorded, bland and cluttered walls, and walls of the skin's and the shirt's colour. Beside its
+``sad`` are that of the key, which has the plates (``sad_plate``), and that of each camera cut alone
+(``sad_alone``). ``sad_ratio_to_plate`` and ``worst_ratio``, that of the worst camera, are printed
+per scene and of all scenes together.
 
 Disturbances are laid on the recorded frames in linear light with the true alpha, and keyed anew.
 ``sad`` is the summed absolute error in thousands, ``mae`` its mean, both means over cameras and
@@ -32,11 +38,12 @@ import numpy as np
 
 from benchmarks.calibrate import recorded, rounded
 from benchmarks.matte import errors
-from benchmarks.matte_disturbances import DISTURBANCES, Shot
+from benchmarks.matte_disturbances import DISTURBANCES, Shot, walls
 from express50.capture.frames import read_frame, read_recorded_plate
 from express50.capture.index import read_index
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
+from express50.errors import NoFaceError
 from express50.files.images import contact_sheet, write_image
 from express50.geometry.cameras import pinhole
 from express50.geometry.sampling import undistort_image, undistorted_mask
@@ -45,6 +52,7 @@ from express50.twin.truth import Truth
 from pipelines.matte import STAGE
 from pipelines.matte.config import MatteConfig
 from pipelines.matte.consensus import agree
+from pipelines.matte.cutout import CutView, cut_out, make_cut_view, soft_alpha
 from pipelines.matte.key import key_alpha
 from pipelines.matte.stage import corrected, make_view
 from pipelines.matte.visual_hull import ball_of
@@ -84,6 +92,7 @@ def main() -> int:
     parser.add_argument("--peaks", type=int, default=2, help="moments, at most")
     parser.add_argument("--set", dest="assignments", action="append", default=[])
     parser.add_argument("--pictures", type=Path, help="folder for pictures of the standard preset")
+    parser.add_argument("--plates-only", action="store_true", help="leave out no_plate")
     args = parser.parse_args()
     cv2.setNumThreads(1)
     if (args.dataset is None) != (args.truth is None):
@@ -94,6 +103,7 @@ def main() -> int:
         dataset, truth = Dataset(args.dataset), Truth(args.truth)
     configs = {name: resolve_config(STAGE, name, None, args.assignments) for name in PRESETS}
     rows: dict[tuple[int, str, str], list[Figures]] = {}
+    bare: dict[tuple[int, str], list[Figures]] = {}
     for subject, frame in moments(dataset, truth, args.peaks):
         clean = shots_of(dataset, truth, subject, frame)
         undone: dict[int, Keyed] = {}  # most shots of a scene are untouched, and keyed once
@@ -106,7 +116,15 @@ def main() -> int:
                     rows.setdefault((len(keyed[::step]), preset, scene), []).append(row)
                     print(subject, frame, scene, preset, len(keyed[::step]), rounded(row),
                           file=sys.stderr)  # fmt: skip
-    print(json.dumps({"benchmark": "matte_views", **summary(rows)}))
+        if not args.plates_only:
+            for scene, shots in {"recorded": clean, **walls(clean)}.items():
+                for step in (1, 3):
+                    sheet = sheet_of(args, "standard", f"no-plate-{scene}", step, frame)
+                    bare.setdefault((len(shots[::step]), scene), []).append(
+                        without_plates(shots[::step], sheet)
+                    )
+    result = {"benchmark": "matte_views", **summary(rows), "no_plate": bare_summary(bare)}
+    print(json.dumps(result))
     return 0
 
 
@@ -169,6 +187,60 @@ def measure(keyed: list[Keyed], config: MatteConfig, sheet: Path | None) -> Figu
     row = {name: float(np.mean([e[name] for e in later])) for name in ("sad", "mae")}
     row |= {f"{name}_key": float(np.mean([e[name] for e in before])) for name in ("sad", "mae")}
     return row | {"named": float(len(found.warnings)), "seconds_per_moment": seconds}
+
+
+def without_plates(shots: list[Shot], sheet: Path | None) -> Figures:
+    """Return errors of a moment whose plates are withheld, beside those with plates."""
+    started = time.process_time()
+    ball = ball_of({shot.camera.id: shot.camera for shot in shots})
+    views = [make_cut_view(pinhole(shot.camera), shot.frame, shot.valid) for shot in shots]
+    cuts = cut_out(views, ball)
+    alphas = [soft_alpha(shot.frame, shot.valid, cuts[shot.camera.id]) for shot in shots]
+    seconds = time.process_time() - started
+    alone = [_alone(shot, view) for shot, view in zip(shots, views, strict=True)]
+    keyed = [key(shot).alpha / 255 for shot in shots]
+    if sheet is not None:
+        rows = [[s.frame, (255 * a).astype(np.uint8)] for s, a in zip(shots, alphas, strict=True)]
+        sheet.parent.mkdir(parents=True, exist_ok=True)
+        write_image(sheet, contact_sheet(rows[:8], [shot.camera.id for shot in shots[:8]]))
+    sad, sad_plate, sad_alone = (
+        np.array([errors(a, shot.true)["sad"] for a, shot in zip(found, shots, strict=True)])
+        for found in (alphas, keyed, alone)
+    )
+    return {
+        "sad": float(sad.mean()), "sad_plate": float(sad_plate.mean()),
+        "sad_alone": float(sad_alone.mean()), "worst_ratio": float((sad / sad_plate).max()),
+        "seconds_per_view": seconds / len(shots),
+    }  # fmt: skip
+
+
+def _alone(shot: Shot, view: CutView) -> np.ndarray:
+    try:
+        return soft_alpha(shot.frame, shot.valid, cut_out([view], None)[view.name])
+    except NoFaceError:
+        return np.zeros(shot.true.shape, np.float32)
+
+
+def bare_summary(rows: dict[tuple[int, str], list[Figures]]) -> dict[str, Any]:
+    """Return means over the peaks by number of cameras and scene, and of all scenes together."""
+    table: dict[str, Any] = {}
+    for (count, scene), mine in rows.items():
+        means = {name: float(np.mean([row[name] for row in mine])) for name in mine[0]}
+        table.setdefault(f"cameras_{count}", {})[scene] = means
+    every = [means for scenes in table.values() for means in scenes.values()]
+    for means in every:
+        means["sad_ratio_to_plate"] = means["sad"] / means["sad_plate"]
+    result: dict[str, Any] = {
+        cameras: {scene: rounded(means) for scene, means in scenes.items()}
+        for cameras, scenes in table.items()
+    }
+    if every:
+        total, plates = (sum(means[name] for means in every) for name in ("sad", "sad_plate"))
+        result |= rounded({
+            "sad_ratio_to_plate": total / plates,
+            "worst_ratio": max(means["worst_ratio"] for means in every),
+        })  # fmt: skip
+    return result
 
 
 def sheet_of(

@@ -19,7 +19,8 @@ class MatteConfig:
     """
 
     method: Literal["key", "grabcut", "bgmv2", "salient"] = "key"
-    """Key against the plate, cut by colours around the face, or run a network."""
+    """Key against the plate, and without one cut by colours and by what the other cameras see
+    (grabcut does so everywhere), or run a network."""
     weights: str = ""
     """File of the network's weights, TorchScript or ONNX; such a file is a program, so trust its
     origin."""

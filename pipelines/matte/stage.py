@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,9 +37,17 @@ EMPTY = 0.003  # share of the image below which a matte counts as empty
 # Share of the image's top or of a side that the subject may cover before it counts as cut off.
 MOST_CONTACT = 0.02
 
-Matter = Callable[[np.ndarray, Any, np.ndarray, Camera], np.ndarray]
-"""Frame (H, W, 3) uint8, plate or None, valid pixels (H, W) and pinhole camera to opacity (H, W)
-float32."""
+Matter = Callable[[np.ndarray, Any, np.ndarray], np.ndarray]
+"""Frame (H, W, 3) uint8, plate or None and valid pixels (H, W) to opacity (H, W) float32."""
+
+
+@dataclass(frozen=True)
+class CameraMatte:
+    """What one camera alone shows: alpha (H, W) uint8, and its frame reduced to `matte.side`."""
+
+    alpha: np.ndarray
+    rgb: np.ndarray
+    plated: bool = True
 
 
 def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
@@ -47,30 +57,19 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
         StageError: no camera could be matted.
     """
     cv2.setNumThreads(1)  # the runner counts one core per item
-    subject, expression = item.split("/")
-    matter, plated = _matter(config), config.method not in WITHOUT_PLATE
-    cameras = read_cameras_of(dataset, subject, undistorted=False)
+    cameras = read_cameras_of(dataset, item.split("/")[0], undistorted=False)
     ball = ball_of(cameras)
     compares = config.agree and ball is not None
-    alphas: dict[str, np.ndarray] = {}
-    views: list[MatteView] = []
-    dropped: list[Note] = []
-    for name, camera in cameras.items():  # one camera's full images at a time
-        try:
-            frame = read_peak_frame(dataset, subject, expression, name)
-            plate = _plate(dataset, subject, name) if plated else None
-            # Resampling mixes the outermost pixels with what lies beyond the image.
-            valid = cv2.erode(undistorted_mask(camera).astype(np.uint8), np.ones((3, 3))) > 0
-            alpha = np.where(valid, matter(frame, plate, valid, pinhole(camera)), np.float32(0))
-        except (CaptureError, NoFaceError, StageError) as error:
-            dropped.append(Note(name, str(error)))
-            continue
-        alphas[name] = np.rint(alpha * 255).astype(np.uint8)
-        # Without a common place to look at, a view is only for the picture.
-        place = ball or Ball(np.zeros(3), 1.0)
-        views.append(make_view(camera, place, frame, alphas[name], config.side))
-    if not alphas:
+    mattes, dropped = camera_mattes(dataset, item, config, cameras, ball)
+    if not mattes:
         raise StageError(f"{item}: {dropped[0].why if dropped else 'no camera is calibrated'}")
+    alphas = {name: matte.alpha for name, matte in mattes.items()}
+    # Without a common place to look at, a view is only for the picture.
+    place = ball or Ball(np.zeros(3), 1.0)
+    views = [
+        make_view(cameras[name], place, matte.rgb, matte.alpha, config.side)
+        for name, matte in mattes.items()
+    ]
     if compares:
         found = agree(views, config.cells, config.strand)
     elif config.agree:
@@ -87,6 +86,7 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
     figures = {
         "method": config.method,
         "views": len(views) if compares else 0,
+        "without_plate": [name for name, matte in mattes.items() if not matte.plated],
         "coverage": {name: round(float(a.mean()) / 255, 6) for name, a in final.items()},
         "border_contact": {name: border_contact(alpha) for name, alpha in final.items()},
         "removed": {name: _share(alphas[name], final[name]) for name in found.removed},
@@ -98,34 +98,86 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
     return Result(figures, dropped, [*found.warnings, *odd])
 
 
+def camera_mattes(
+    dataset: Dataset, item: str, config: MatteConfig, cameras: Mapping[str, Camera],
+    ball: Ball | None,
+) -> tuple[dict[str, CameraMatte], list[Note]]:  # fmt: skip
+    """Matte each camera of a peak, those without a plate together.
+
+    One camera's full images are held at a time. `ball` is what the cameras look at; None where
+    they do not share a place. Also returns the cameras without a matte.
+    """
+    subject, expression = item.split("/")
+    read = partial(read_peak_frame, dataset, subject, expression)
+    lacking = [
+        name
+        for name in cameras
+        if config.method == "grabcut"
+        or (config.method == "key" and not dataset.plate_file(subject, name).is_file())
+    ]
+    if lacking:
+        from pipelines.matte import cutout  # loads torch
+    matter = _matter(config)
+    found: dict[str, CameraMatte] = {}
+    seen = []
+    dropped: list[Note] = []
+    for name, camera in cameras.items():
+        try:
+            frame, valid, alpha = read(name), valid_pixels(camera), None
+            if name not in lacking:
+                plate = None if config.method in WITHOUT_PLATE else _plate(dataset, subject, name)
+                alpha = eight_bit(matter(frame, plate, valid), valid)
+                found[name] = CameraMatte(alpha, shrink(frame, config.side))
+        except (CaptureError, StageError) as error:
+            dropped.append(Note(name, str(error)))
+            continue
+        if lacking:
+            seen.append(cutout.make_cut_view(pinhole(camera), frame, valid, alpha))
+    unplated = [view.name for view in seen if view.known is None]
+    try:
+        cuts = cutout.cut_out(seen, ball) if unplated else {}
+    except NoFaceError as error:
+        dropped += [Note(name, str(error)) for name in unplated]
+        return found, sorted(dropped, key=lambda note: note.what)
+    for name in unplated:
+        frame, valid = read(name), valid_pixels(cameras[name])
+        alpha = eight_bit(cutout.soft_alpha(frame, valid, cuts[name]), valid)
+        found[name] = CameraMatte(alpha, shrink(frame, config.side), plated=False)
+    return {name: found[name] for name in cameras if name in found}, dropped
+
+
 def _plate(dataset: Dataset, subject: str, camera: str) -> np.ndarray:
     plate = read_plate_image(dataset, subject, camera)
     if plate is None:
         raise StageError(
             f"no clean plate of {camera}; photograph the empty set as plates/{camera}.png and run"
-            " 'express50 ingest' and 'express50 frames' again, or set matte.method to grabcut or"
-            " salient"
+            " 'express50 ingest' and 'express50 frames' again, or set matte.method to key, grabcut"
+            " or salient"
         )
     return plate
 
 
+def valid_pixels(camera: Camera) -> np.ndarray:
+    """Return pixels (H, W) bool with footage, without the outermost, which resampling mixes."""
+    return cv2.erode(undistorted_mask(camera).astype(np.uint8), np.ones((3, 3))) > 0
+
+
+def eight_bit(alpha: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Return opacity (H, W) as uint8, 0 where no pixel is valid."""
+    return np.rint(np.where(valid, alpha, np.float32(0)) * 255).astype(np.uint8)
+
+
 def _matter(config: MatteConfig) -> Matter:
     """Make the function that mattes one frame. Networks are imported here: torch is slow to."""
-    if config.method == "key":
-        return lambda frame, plate, valid, camera: key_alpha(frame, plate, valid, config)
-    if config.method == "grabcut":
-        from express50.landmarks.network import load_network as load_landmarks
-        from pipelines.matte.grabcut import person_alpha
-
-        net = load_landmarks()
-        return lambda frame, plate, valid, camera: person_alpha(net, camera, frame)
+    if config.method in ("key", "grabcut"):
+        return lambda frame, plate, valid: key_alpha(frame, plate, valid, config)
     from pipelines.matte.learned import BGMV2, SALIENT, background_alpha, salient_alpha
-    from pipelines.networks import load_network
+    from pipelines.networks import load_network as load_weights
 
-    network = load_network(config.weights, SALIENT if config.method == "salient" else BGMV2)
+    network = load_weights(config.weights, SALIENT if config.method == "salient" else BGMV2)
     if config.method == "salient":
-        return lambda frame, plate, valid, camera: salient_alpha(network, frame)
-    return lambda frame, plate, valid, camera: background_alpha(
+        return lambda frame, plate, valid: salient_alpha(network, frame)
+    return lambda frame, plate, valid: background_alpha(
         network, frame, exposed(plate, exposure_gain(frame, plate)), config.tile
     )
 

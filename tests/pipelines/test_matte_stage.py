@@ -159,11 +159,12 @@ def test_a_camera_without_a_plate_or_a_frame_is_dropped(aligned) -> None:
     assert not aligned.matte_file("S001", "smile", "cam02").exists()
 
 
-def test_keying_without_a_plate_is_refused(tmp_path) -> None:
+def test_keying_without_a_plate_or_a_face_is_refused(tmp_path) -> None:
     dataset = make_dataset(tmp_path, [unplated(tmp_path / "raw")])
     summary = run(dataset)
     assert [o.status for o in summary.outcomes] == ["failed"] * 2
-    assert "plates/cam00.png" in summary.outcomes[0].reason
+    assert "no face found" in summary.outcomes[0].reason
+    assert "give plates" in summary.outcomes[0].reason
 
 
 def test_keyed_mattes_are_8_bit_and_the_same_twice(aligned) -> None:

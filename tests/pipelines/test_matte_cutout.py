@@ -1,4 +1,4 @@
-"""Alpha about a face, without plate or weights: a photograph, its edges, and what has no face."""
+"""Alpha without plates or weights: a photograph, a rig, their edges, and what has no face."""
 
 from __future__ import annotations
 
@@ -9,18 +9,24 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.calibrate import recorded
+from express50.capture.frames import read_cameras_of
 from express50.capture.index import read_index
 from express50.cli.main import main
 from express50.contract.layout import Dataset
 from express50.errors import ConfigError, StageError
 from express50.files.images import read_alpha, write_image
-from express50.landmarks.network import load_network
+from express50.geometry.cameras import pinhole
 from express50.runner.runner import run_stage
 from express50.shards.reader import ShardReader
-from pipelines import calibrate, ingest
+from express50.twin.config import TwinConfig
+from express50.twin.truth import Truth
+from pipelines import calibrate, frames, ingest
+from pipelines.calibrate.config import CalibrateConfig
 from pipelines.matte import STAGE as MATTE
 from pipelines.matte.config import MatteConfig
-from pipelines.matte.grabcut import person_alpha
+from pipelines.matte.cutout import cut_out, make_cut_view, soft_alpha
+from pipelines.matte.stage import valid_pixels
 from pipelines.photo.capture import make_photo_capture, open_picture, single_camera
 from pipelines.track.config import TrackConfig
 from tests.synth import write_peak_frames, write_video
@@ -33,7 +39,9 @@ BEHIND = [(350, 40), (100, 60), (480, 60), (310, 130), (130, 120), (225, 5)]
 def alpha_of(image: np.ndarray) -> np.ndarray:
     height, width = image.shape[:2]
     camera = single_camera("photo", width, height, 1.6 * max(width, height))
-    alpha = person_alpha(load_network(), camera, image)
+    valid = np.ones((height, width), bool)
+    cuts = cut_out([make_cut_view(camera, image, valid)], None)
+    alpha = soft_alpha(image, valid, cuts["photo"])
     assert alpha.shape == image.shape[:2] and alpha.dtype == np.float32
     assert np.isfinite(alpha).all() and alpha.min() >= 0 and alpha.max() <= 1
     return alpha
@@ -139,3 +147,57 @@ def test_a_frame_without_a_face_costs_itself_alone(tmp_path: Path) -> None:
         "eva/clip_00": "done", "eva/clip_01": "failed",
     }  # fmt: skip
     assert dataset.matte_file("eva", "clip_00", "photo").is_file()
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory) -> tuple[Dataset, Truth]:
+    """A made-up person before eight cameras, two of them behind; peaks are written."""
+    twin = TwinConfig(
+        subjects=1, first_subject=61, cameras=8, width=256, height=256, expressions=("neutral",),
+        frames_per_expression=4, footage="jpg", board_frames=0, give_calibration=True,
+    )  # fmt: skip
+    dataset, truth = recorded(twin, tmp_path_factory.mktemp("twin"))
+    subject = dataset.subjects()[0]
+    assert run_stage(calibrate.STAGE, dataset, CalibrateConfig(), workers=0, progress=False).ok
+    name, seen = next(iter(read_index(dataset, subject).cameras.items()))
+    peak = {"frame": 0, "camera": name, "pts": seen.pts[0], "dhash": seen.dhash[0],
+            "confidence": 1.0, "annotator": "test"}  # fmt: skip
+    dataset.item_dir("align", subject).mkdir(parents=True)
+    dataset.peaks_file(subject).write_text(json.dumps({"neutral": peak}))
+    assert run_stage(frames.STAGE, dataset, frames.STAGE.config(), workers=0, progress=False).ok
+    return dataset, truth
+
+
+def mean_errors(dataset: Dataset, truth: Truth) -> dict[str, float]:
+    """Mean absolute errors of the mattes of the only peak, by camera."""
+    subject = dataset.subjects()[0]
+    cameras = read_cameras_of(dataset, subject)
+    used = {name: truth.cameras(subject)[name] for name in cameras}
+    return {
+        name: float(np.abs(
+            read_alpha(dataset.matte_file(subject, "neutral", name)) / 255
+            - truth.render_alpha(subject, 0, pinhole(camera)) * valid_pixels(camera)
+        ).mean())
+        for name, camera in used.items()
+    }  # fmt: skip
+
+
+def test_a_rig_without_plates_is_matted_from_all_sides(rig) -> None:
+    dataset, truth = rig
+    subject = dataset.subjects()[0]
+    metrics = dataset.item_dir("matte", f"{subject}/neutral") / "metrics.json"
+
+    names = list(read_cameras_of(dataset, subject))
+    dataset.plate_file(subject, names[3]).unlink()
+    assert run_stage(MATTE, dataset, MatteConfig(), workers=0, progress=False).ok
+    assert json.loads(metrics.read_text())["without_plate"] == [names[3]]
+    beside_plates = mean_errors(dataset, truth)
+    assert beside_plates[names[3]] < 0.015
+
+    for name in names:
+        dataset.plate_file(subject, name).unlink(missing_ok=True)
+    assert run_stage(MATTE, dataset, MatteConfig(), workers=0, progress=False).ok
+    figures = json.loads(metrics.read_text())
+    assert figures["without_plate"] == names and not figures["dropped"]
+    without = mean_errors(dataset, truth)
+    assert max(without.values()) < 0.026 and np.mean(list(without.values())) < 0.018

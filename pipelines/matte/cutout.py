@@ -1,0 +1,390 @@
+"""Cut a person out of all cameras of a moment at once, without plates or weights.
+
+The faces that the cameras see place one head in the world, and with it roughly where skull, hair
+and shoulders are in every picture, those from behind included. GrabCut (Rother, Kolmogorov and
+Blake 2004) finds by colours where they end. Then the cameras overrule each other: nothing lies
+where the others see past the person, and nothing lacks where they all see the person; colours
+decide again. One camera alone has colours only.
+
+Around an outline, alpha is the posterior mean of a mixture (Bayesian matting, Chuang et al. 2001)
+of two colours: the person's nearby, and the wall's. The wall behind is filled in from what is seen
+beside the person, and how wrong that is, is measured where it is seen. Before a bland wall that is
+as good as a plate; before a cluttered one colours prove little and the outline decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import cv2
+import numpy as np
+from scipy.ndimage import binary_fill_holes
+
+from express50.errors import NoFaceError
+from express50.files.images import edge_distance, shrink
+from express50.geometry.cameras import Camera, resized
+from express50.geometry.conventions import corner_to_cell
+from express50.geometry.transforms import similarity_fit
+from express50.landmarks.detector import Detection, detect_many
+from express50.landmarks.network import load_network
+from pipelines.calibrate.footage_rig import INNER, mean_landmarks, pose_of_face
+from pipelines.matte.plates import blurred, local_colours, to_light
+from pipelines.matte.visual_hull import (
+    Ball,
+    Evidence,
+    MatteView,
+    evidence_of,
+    make_space,
+    projection_of,
+    subject_place,
+)
+from pipelines.track.observe import LandmarkView, robust_triangulate
+
+FACE_SCORE = 0.3  # heads from behind score up to 0.2, profiles from 0.33 on
+SEARCH = 0.08  # smallest windows searched for the face, of the longer side
+SIDE = 512  # pixels of the pictures in which faces are looked for
+PIXEL_M = 0.0015  # on the head, to which pictures are reduced to be cut; edges are solved later
+SURE, LIKELY, HAIR = 0.7, 1.3, 1.6  # skulls: no background in the first, no hair past the last
+LEAST_POINTS = 12  # landmarks on which cameras agree, to place a head by
+LEAST_DEPTH = 0.05  # metres before the camera
+HOLE_M2 = 1.5e-3  # larger gaps show the background
+CUTS = 6  # of GrabCut, each time
+FEWEST = 4  # cameras that can overrule each other
+SLACK_PX = (3.0, 1.5)  # distance from an outline that proves nothing, per round
+CELLS = 96  # along each side of the cube in which cameras are compared
+
+# Lengths on the head, metres.
+OUTER_M, INNER_M = 0.014, 0.010  # alpha is soft so far outside and inside the outline
+RIM_M = (0.004, 0.015)  # the person's colours are those so deep inside the outline
+REACH_M, WALL_M, RING_M = 0.006, 0.004, 0.014  # nearest colours: of person, wall, and its error
+DOUBT_M = 0.0035  # an outline is wrong by about this
+SPREAD = 0.15  # share by which hair may be brighter or darker than what is seen of it nearby
+NOISE = 1.5  # standard deviation of a pixel, 8-bit steps
+OPACITIES = np.linspace(0.0, 1.0, 9)
+MIXED, ODD = 0.2, 0.02  # chance of a soft pixel on the outline, of a wrong one far from it
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A person's outline in one camera: mask (h, w) bool, and pixels of it per metre of head."""
+
+    mask: np.ndarray
+    density: float
+
+
+@dataclass(frozen=True)
+class CutView:
+    """One camera's reduced picture.
+
+    Attributes:
+        camera: pinhole, of the reduced picture.
+        rgb: (h, w, 3) uint8.
+        valid: (h, w) bool, pixels with footage.
+        known: (h, w) bool, the person's outline where it is known, as from a plate.
+    """
+
+    camera: Camera
+    rgb: np.ndarray
+    valid: np.ndarray
+    known: np.ndarray | None = None
+
+    @property
+    def name(self) -> str:
+        """Return the camera's id."""
+        return self.camera.id
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a mean head stands: world = scale * rotation @ head + shift."""
+
+    scale: float
+    rotation: np.ndarray
+    shift: np.ndarray
+
+    def density(self, camera: Camera) -> float:
+        """Return pixels per metre of the head in a camera, negative behind it."""
+        depth = camera.cam_from_world[2, :3] @ self.shift + camera.cam_from_world[2, 3]
+        return float(camera.K[0, 0] * self.scale / depth)
+
+    def pixels(self, points: np.ndarray, camera: Camera) -> np.ndarray:
+        """Project points (N, 3) of head space, those before the camera, to pixels (M, 2)."""
+        world = self.scale * points @ self.rotation.T + self.shift
+        seen = world @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+        seen = seen[seen[:, 2] > LEAST_DEPTH * self.scale] @ camera.K.T
+        return seen[:, :2] / seen[:, 2:]
+
+
+def make_cut_view(
+    camera: Camera, frame: np.ndarray, valid: np.ndarray, alpha: np.ndarray | None = None
+) -> CutView:
+    """Reduce a frame (H, W, 3) of a pinhole camera; `alpha` (H, W) uint8 is its matte if known."""
+    rgb = shrink(frame, SIDE)
+    known = None if alpha is None else shrink(alpha, SIDE) > 127
+    small = shrink(valid.astype(np.uint8) * 255, SIDE) == 255
+    return CutView(resized(camera, rgb.shape[1], rgb.shape[0]), rgb, small, known)
+
+
+def cut_out(views: Sequence[CutView], ball: Ball | None) -> dict[str, Cut]:
+    """Find the person's outline in all cameras of a moment.
+
+    `ball` is what the cameras look at; None where they do not share a place.
+
+    Raises:
+        NoFaceError: no camera shows a face.
+    """
+    faces = detect_many(load_network(), [view.rgb for view in views], smallest=SEARCH)
+    place = _place_head(views, faces)
+    small = [_at_scale(view, PIXEL_M * place.density(view.camera)) for view in views]
+    guesses = [_guess(view, place) for view in small]
+    masks = [
+        _cut(view, guess, guess) if view.known is None else view.known
+        for view, guess in zip(small, guesses, strict=True)
+    ]
+    if ball is not None and len(views) >= FEWEST:
+        for slack in SLACK_PX:
+            masks = _overruled(small, guesses, masks, ball, slack)
+    return {
+        view.name: Cut(mask, place.density(view.camera))
+        for view, mask in zip(small, masks, strict=True)
+    }
+
+
+def _place_head(views: Sequence[CutView], faces: Sequence[Detection]) -> _Place:
+    """Place the mean head by all faces found, or by the best of them."""
+    head = mean_landmarks()
+    found = [
+        (LandmarkView(view.name, view.camera, face.points, face.sigma, face.score), face)
+        for view, face in zip(views, faces, strict=True)
+        if face.score >= FACE_SCORE
+    ]
+    points, _ = robust_triangulate([view for view, _ in found])
+    known = np.isfinite(points[INNER]).all(1)
+    if known.sum() >= LEAST_POINTS:
+        return _Place(*similarity_fit(head[INNER][known], points[INNER][known]))
+    for view, face in sorted(found, key=lambda one: -one[1].score):
+        pose, error = pose_of_face(face.points, face.sigma, view.camera, head)
+        if np.isfinite(error):
+            world = np.linalg.inv(view.camera.cam_from_world) @ pose
+            return _Place(1.0, world[:3, :3], world[:3, 3])
+    best = max((face.score for face in faces), default=0.0)
+    raise NoFaceError(
+        f"no face found (score {best:.2f}, expected {FACE_SCORE} or more), and without a plate a"
+        " person is found by the face; set matte.method to salient and matte.weights, or give"
+        " plates"
+    )
+
+
+def _at_scale(view: CutView, factor: float) -> CutView:
+    """Reduce a view's picture by a factor of at most 1; the known outline with it."""
+    width, height = (max(8, round(n * min(factor, 1.0))) for n in view.rgb.shape[1::-1])
+
+    def mask(values: np.ndarray) -> np.ndarray:
+        size = (width, height)
+        return cv2.resize(values.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+
+    return CutView(
+        resized(view.camera, width, height),
+        cv2.resize(view.rgb, (width, height), interpolation=cv2.INTER_AREA),
+        mask(view.valid),
+        None if view.known is None else mask(view.known),
+    )
+
+
+@cache
+def _parts() -> dict[int, tuple[np.ndarray, ...]]:
+    """Make convex parts (N, 3) of a person in head space, metres, by GrabCut's label."""
+    from express50.head.load import load_head
+
+    vertices = load_head("procedural").template.double().numpy()
+    face = mean_landmarks()
+    chin, bottom = float(face[8, 1]), float(vertices[:, 1].min())
+    skull = vertices[vertices[:, 1] > chin]
+    middle = (skull.min(0) + skull.max(0)) / 2
+    back = float(np.median(vertices[vertices[:, 1] < bottom + 0.02, 2]))  # the neck's axis
+    neck = _slab((0.03, 0.04), (chin, bottom - 0.05), back, 0.03)
+    torso = _slab((0.07, 0.2, 0.24), (bottom, bottom - 0.08, bottom - 0.7), back, 0.1)
+    hair = _slab((0.16, 0.18), (middle[1], bottom - 0.1), back, 0.12)
+    wide = _slab((0.2, 0.4, 0.45), (chin, bottom - 0.05, bottom - 0.9), back, 0.25)
+    sure, likely, reach = (middle + k * (skull - middle) for k in (SURE, LIKELY, HAIR))
+    for part in (likely, reach):  # no hair grows before a face
+        part[:, 2] = np.minimum(part[:, 2], skull[:, 2].max())
+    return {
+        cv2.GC_PR_BGD: (reach, hair, wide),
+        cv2.GC_PR_FGD: (likely, vertices, torso),
+        cv2.GC_FGD: (sure, neck, face.mean(0) + 0.95 * (face - face.mean(0))),
+    }
+
+
+def _slab(
+    half_widths: tuple[float, ...], heights: tuple[float, ...], back: float, thick: float
+) -> np.ndarray:
+    """Return corners (N, 3) of a body with these half widths at these heights, about a depth."""
+    return np.array([
+        (side * width, height, back + face * thick)
+        for width, height in zip(half_widths, heights, strict=True)
+        for side in (-1, 1)
+        for face in (-1, 1)
+    ])  # fmt: skip
+
+
+def _guess(view: CutView, place: _Place) -> np.ndarray:
+    """Return GrabCut's labels (h, w) uint8 by where a person may be."""
+    labels = np.full(view.valid.shape, cv2.GC_BGD, np.uint8)
+    for value, parts in _parts().items():
+        for points in parts:
+            pixels = place.pixels(points, view.camera)
+            if len(pixels) > 2:
+                far = 4 * max(labels.shape)  # OpenCV's polygons are of 16-bit integers
+                cells = corner_to_cell(np.clip(pixels, -far, far))
+                hull = cv2.convexHull(cells.astype(np.float32))
+                cv2.fillConvexPoly(labels, hull.round().astype(np.int32), value)
+    return labels
+
+
+def _cut(view: CutView, labels: np.ndarray, guess: np.ndarray) -> np.ndarray:
+    """Run GrabCut from labels (h, w); returns the person's mask (h, w), small holes filled.
+
+    Parts that do not touch where the person surely is, by the `guess` (h, w), are left out.
+    """
+    sure = guess == cv2.GC_FGD
+    if not sure.any():  # the person is out of view
+        return np.zeros(labels.shape, bool)
+    if not np.isin(labels, (cv2.GC_BGD, cv2.GC_PR_BGD)).any():
+        return view.valid.copy()  # the face fills the picture
+    cv2.setRNGSeed(0)  # its clusters start at random
+    found, _, _ = cv2.grabCut(
+        np.ascontiguousarray(view.rgb[..., ::-1]), labels.copy(), None, np.zeros((1, 65)),
+        np.zeros((1, 65)), CUTS, cv2.GC_INIT_WITH_MASK,
+    )  # fmt: skip
+    inside = ((found == cv2.GC_FGD) | (found == cv2.GC_PR_FGD)) & view.valid
+    _, parts = cv2.connectedComponents(inside.astype(np.uint8), connectivity=4)
+    person = np.isin(parts, np.unique(parts[sure & inside])) & inside
+    holes = binary_fill_holes(person) & ~person
+    _, parts, stats, _ = cv2.connectedComponentsWithStats(holes.astype(np.uint8), connectivity=4)
+    return person | (holes & (stats[:, cv2.CC_STAT_AREA] < HOLE_M2 / PIXEL_M**2)[parts])
+
+
+def _overruled(
+    views: Sequence[CutView],
+    guesses: Sequence[np.ndarray],
+    masks: Sequence[np.ndarray],
+    ball: Ball,
+    slack: float,
+) -> list[np.ndarray]:
+    """Cut all views again, within what the others leave possible; `slack` is in pixels."""
+    mattes = [
+        MatteView(
+            view.name, projection_of(view.camera, ball),
+            (view.camera.center - ball.center) / ball.radius, view.rgb, mask.astype(np.float32),
+            view.valid,
+        )
+        for view, mask in zip(views, masks, strict=True)
+    ]  # fmt: skip
+    space = make_space(mattes, CELLS, slack)
+    place = subject_place(space)
+    return [
+        _cut(view, _labels(matte, evidence_of(matte, space, place)), guess)
+        if view.known is None
+        else view.known
+        for view, matte, guess in zip(views, mattes, guesses, strict=True)
+    ]
+
+
+def _labels(view: MatteView, evidence: Evidence) -> np.ndarray:
+    """Return GrabCut's labels (h, w) by a view's mask and what the others say."""
+    inside = (view.alpha > 0) | evidence.solid
+    labels = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    labels[(evidence.known & ~evidence.possible) | ~view.valid] = cv2.GC_BGD
+    labels[cv2.erode(evidence.solid.astype(np.uint8), np.ones((5, 5))) > 0] = cv2.GC_FGD
+    return labels
+
+
+def soft_alpha(frame: np.ndarray, valid: np.ndarray, cut: Cut) -> np.ndarray:
+    """Solve opacity (H, W) float32 about an outline.
+
+    Args:
+        frame: (H, W, 3) uint8, without lens distortion.
+        valid: (H, W) bool, pixels with footage; others get 0.
+        cut: of a reduced picture of it.
+    """
+    height, width = valid.shape
+    mask = cv2.resize(cut.mask.astype(np.float32), (width, height)) > 0.5
+    density = cut.density * max(height, width) / max(cut.mask.shape)
+    if not mask.any():
+        return np.zeros(valid.shape, np.float32)
+    depth = edge_distance(mask) - edge_distance(~mask) if not mask.all() else mask * np.inf
+    depth = (depth / density).astype(np.float32)  # metres inside the outline
+    band = valid & (depth > -OUTER_M) & (depth < INNER_M)
+    alpha = (valid & (depth >= INNER_M)).astype(np.float32)
+    if band.any():
+        alpha[band] = _posterior(frame.astype(np.float32), valid, depth, band, density)
+    return alpha
+
+
+def _posterior(
+    image: np.ndarray, valid: np.ndarray, depth: np.ndarray, band: np.ndarray, density: float
+) -> np.ndarray:
+    """Return the mean opacity (N,) of the pixels of a band (H, W), given person and wall."""
+    wall, wall_error = _wall(image, valid & (depth <= -OUTER_M), depth, density)
+    light, behind = to_light(image, linear=True), to_light(wall, linear=True)[band]
+    rim = (valid & (depth > RIM_M[0]) & (depth < RIM_M[1])).astype(np.float32)
+    mean, covariance = local_colours(light, rim, band, REACH_M * density, SPREAD)
+    level = np.clip(wall[band], 1, 254)
+    slope = (to_light(level + 1, linear=True) - to_light(level - 1, linear=True)) / 2
+    own, error = (NOISE * slope) ** 2, (wall_error[band] * slope) ** 2
+    inside = np.clip(1 / (1 + np.exp(-depth[band] / DOUBT_M)), ODD, 1 - ODD)
+    soft = MIXED * np.exp(-np.abs(depth[band]) / (4 * DOUBT_M)) + ODD
+    chances = np.log([
+        (1 - inside) * (1 - soft), *([soft / (len(OPACITIES) - 2)] * (len(OPACITIES) - 2)),
+        inside * (1 - soft),
+    ])  # fmt: skip
+    for row, opacity in enumerate(OPACITIES):
+        off = light[band] - opacity * mean - (1 - opacity) * behind
+        variance = own + (1 - opacity) ** 2 * error
+        chances[row] += _log_density(off, opacity**2 * covariance, variance)
+    weight = np.exp(chances - chances.max(0))
+    return (OPACITIES @ weight / weight.sum(0)).astype(np.float32)
+
+
+def _log_density(off: np.ndarray, covariance: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Return log densities (N,) of normal errors (N, 3), up to a constant.
+
+    Their covariance is `covariance` (N, 3, 3) and on its diagonal `variance` (N, 3) more. By
+    cofactors: NumPy's solver takes ten times as long for so many small matrices.
+    """
+    a, b, c = (covariance[:, k, k] + variance[:, k] + 1e-8 for k in range(3))
+    d, e, f = covariance[:, 1, 2], covariance[:, 0, 2], covariance[:, 0, 1]
+    x, y, z = off.T.astype(np.float64)
+    A, B, C = b * c - d * d, a * c - e * e, a * b - f * f
+    D, E, F = e * f - a * d, d * f - b * e, d * e - c * f
+    determinant = np.maximum(a * A + f * F + e * E, 1e-30)
+    square = A * x * x + B * y * y + C * z * z + 2 * (D * y * z + E * x * z + F * x * y)
+    return -0.5 * (square / determinant + np.log(determinant))
+
+
+def _wall(
+    image: np.ndarray, seen: np.ndarray, depth: np.ndarray, density: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fill in the wall (H, W, 3) behind the person, and how wrong that is (H, W, 3).
+
+    The error is measured in a ring where the wall is `seen` (H, W), filled in from further out.
+    """
+    ring = seen & (depth > -OUTER_M - RING_M)
+    further, ring_weight = (mask.astype(np.float32) for mask in (seen & ~ring, ring))
+    reach = WALL_M * density
+    off = np.where(ring[..., None], image - _filled(image, further, reach), 0) ** 2
+    error = np.sqrt(np.maximum(_filled(off, ring_weight, 4 * reach), NOISE**2))
+    return _filled(image, seen.astype(np.float32), reach), error
+
+
+def _filled(image: np.ndarray, weight: np.ndarray, reach: float) -> np.ndarray:
+    """Average an image (H, W, 3) by weights (H, W) over the nearest reach, pixels, that has any."""
+    total, mass = np.zeros_like(image), np.full(weight.shape, 1e-12, np.float32)
+    for octave in range(6):
+        share = np.float32(1e-2**octave)
+        total += share * blurred(image * weight[..., None], reach * 2**octave)
+        mass += share * blurred(weight, reach * 2**octave)
+    return total / mass[..., None]
