@@ -300,16 +300,17 @@ def stated_figures(
 ) -> dict[str, float]:
     """Return stated uncertainty over true error, rms over cameras, for rigs of 4, 8 and all.
 
-    The smaller rigs are every sixth and every third camera of the same recording: six rigs of four
-    and three of eight, of 24.
+    The smaller rigs are parts of the recorded one: neighbours, and cameras evenly apart.
     """
-    found = {}
-    for count in (4, 8, len(sizes)):
+    found, names = {}, sorted(sizes)
+    for count in (4, 8, len(names)):
         stated, off = list[float](), list[float]()
-        apart = len(sizes) // count
-        for first in range(apart):
-            names = sorted(sizes)[first::apart]
-            mine = np.isin(observations.camera, [observations.cameras.index(n) for n in names])
+        apart = len(names) // count
+        parts = [names[first::apart] for first in range(apart)]
+        if apart > 1:
+            parts += [names[count * i :][:count] for i in range(apart)]
+        for part in parts:
+            mine = np.isin(observations.camera, [observations.cameras.index(n) for n in part])
             solved = solve_rig(observations.select(mine), points, sizes)
             middle = meeting_point({name: true[name] for name in solved.cameras})
             stated += [error.px for error in state_uncertainty(solved, points).values()]

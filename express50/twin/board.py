@@ -36,7 +36,7 @@ dictionary = "{DICTIONARY}"
 """
 _TEXELS = 24  # a square's side in the pattern; a marker takes 18: six cells of three
 _MARGIN = 12  # white border, texels
-_RAYS = 16
+_RAYS = 17  # odd, or else pictures are shifted by half the distance of rays
 
 
 def charuco_board() -> cv2.aruco.CharucoBoard:

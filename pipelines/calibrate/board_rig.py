@@ -35,6 +35,7 @@ from pipelines.calibrate.timing import CameraTiming, estimate_timing, in_step
 
 LADDER = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")  # from few to many parameters
 WEAK_CORNERS, WEAK_FRAMES = 200, 8  # cameras with less are reported
+FITTING = 0.75  # share of a camera's corners; cameras that moved meanwhile keep less
 LEAST_CORNERS = 24  # that must fit the other cameras, or a camera is dropped
 REJECT_SIGMA = 4.0
 """Corners further off than this many robust standard deviations are rejected; 3 to 6 gave the same
@@ -282,7 +283,7 @@ def _weak(rig: BoardRig, found: BoardCorners, kept: BoardCorners) -> dict[str, s
         shared = {f for other, frames in seen.items() if other != name for f in frames}
         tied = len(seen[name] & shared)
         of = int((found.camera == found.cameras.index(name)).sum())
-        if 2 * mine.sum() < of:
+        if mine.sum() < FITTING * of:
             weak[name] = (
                 f"only {int(mine.sum())} of its {of} corners fit the other cameras and are used:"
                 " not synchronised, moved during the recording, or wrong corners"

@@ -3,7 +3,8 @@
 The covariance of all cameras follows from the derivatives of the corners' errors, boards' poses
 eliminated. It is carried over to points in the head's place, after worlds are laid on each other by
 these points, as nothing else matters further on. It takes corners' errors for independent and the
-lens model for true, so it is joined with what two halves of the board images say of each other.
+lens model for true. So it grows where corners of one image are off together, and where rigs of two
+halves of the board images differ by more than it lets expect.
 After mrcal's projection uncertainty (Kogan, https://mrcal.secretsauce.net/uncertainty.html).
 """
 
@@ -21,6 +22,7 @@ from pipelines.calibrate.board import BoardCorners
 from pipelines.calibrate.board_adjust import (
     BoardRig,
     adjust_board_rig,
+    corner_errors,
     derive,
     derive_corners,
     rig_covariance,
@@ -29,6 +31,7 @@ from pipelines.calibrate.board_adjust import (
 from pipelines.calibrate.board_rig import LEAST_CORNERS, BoardSolution
 
 HEAD_RADIUS_M = 0.13
+DRAWS = 3  # of independent errors, to compare those of whole images with
 
 
 @dataclass(frozen=True)
@@ -42,8 +45,9 @@ class HeadError:
 def state_uncertainty(solution: BoardSolution, points: np.ndarray) -> dict[str, HeadError]:
     """Estimate each camera's error in the head's place; empty for a lone camera.
 
-    `points` (P, 3) are corners on the board. The covariance's variance is multiplied by the mean of
-    1 and of what halves of the board images differ by, squared, over what it lets expect of them.
+    `points` (P, 3) are corners on the board. Where halves of the board images differ by more than
+    the covariance lets expect, its variance is multiplied by the mean of 1 and the square of by how
+    much more.
     """
     names = sorted(solution.cameras)
     if len(names) < 2:
@@ -53,10 +57,10 @@ def state_uncertainty(solution: BoardSolution, points: np.ndarray) -> dict[str, 
     sigma = _noise(solution, scale)
 
     def expected(corners: BoardCorners) -> dict[str, float]:
-        names, covariance = _covariance(rig, corners, points, sigma)
+        names, covariance, excess = _covariance(rig, corners, points, sigma)
         moved = _move_head([rig.cameras[name] for name in names], head)
         squared = np.einsum("ckip,pq,ckiq->ck", moved, covariance, moved, optimize=True).mean(1)
-        return dict(zip(names, squared.tolist(), strict=True))
+        return dict(zip(names, (excess * squared).tolist(), strict=True))
 
     squared = expected(solution.corners)
     halves = _halves(solution.corners)
@@ -64,7 +68,7 @@ def state_uncertainty(solution: BoardSolution, points: np.ndarray) -> dict[str, 
         one, other = (adjust_board_rig(rig, half, points, scale).cameras for half in halves)
         variance = [expected(half) for half in halves]
         for name, off in camera_errors(one, other, head).items():
-            squared[name] *= (1 + off**2 / sum(half[name] for half in variance)) / 2
+            squared[name] *= max(1.0, (1 + off**2 / sum(half[name] for half in variance)) / 2)
     return {name: _head_error(solution.cameras[name], squared[name]) for name in names}
 
 
@@ -109,19 +113,39 @@ def _noise(solution: BoardSolution, scale: float) -> np.ndarray:
 
 def _covariance(
     rig: BoardRig, corners: BoardCorners, points: np.ndarray, sigma: np.ndarray
-) -> tuple[list[str], np.ndarray]:
+) -> tuple[list[str], np.ndarray, float]:
     """Return the names of the cameras and the covariance (14 C, 14 C) of their unknowns.
 
-    `sigma` is the noise of corners by the number that their camera has in `corners`.
+    `sigma` is the noise of corners by the number that their camera has in `corners`. The third
+    value is how many times larger variances are as corners of one image are off together.
     """
     present, camera = np.unique(corners.camera, return_inverse=True)
     names = [corners.cameras[i] for i in present]
+    frames, group = np.unique(corners.frame, return_inverse=True)
     by_camera, by_board = derive_corners(rig, corners, points)
-    noise, none = sigma[corners.camera][:, None, None], np.zeros((len(camera), 2))
-    normal = eliminate(by_camera / noise, by_board / noise, none, camera, corners.frame, len(names))
-    unknowns = np.count_nonzero(normal.diagonal) + 6 * (len(np.unique(corners.frame)) - 1)
-    left = max(1 - unknowns / (2 * len(camera)), 0.1)  # noise that the unknowns did not take up
-    return names, rig_covariance(normal) / left
+    noise = sigma[corners.camera][:, None]
+    by_camera, by_board = by_camera / noise[..., None], by_board / noise[..., None]
+    errors = corner_errors(rig, corners, points) / noise
+    together, alone = _together(errors, corners), 0.0
+    rng = np.random.default_rng(0)
+    for _ in range(DRAWS):  # what the unknowns leave of independent errors
+        drawn = rng.normal(size=errors.shape)
+        normal = eliminate(by_camera, by_board, drawn, camera, group, len(names))
+        covariance = rig_covariance(normal)
+        step = covariance @ normal.right
+        drawn += np.einsum("nij,nj->ni", by_camera, step.reshape(len(names), -1)[camera])
+        drawn += np.einsum("nij,nj->ni", by_board, normal.follow(step)[group])
+        alone += _together(drawn, corners) / DRAWS
+    unknowns = np.count_nonzero(normal.diagonal) + 6 * (len(frames) - 1)
+    left = max(1 - unknowns / errors.size, 0.1)  # noise that the unknowns did not take up
+    return names, covariance / left, max(1.0, together / max(alone, 1e-9))
+
+
+def _together(errors: np.ndarray, corners: BoardCorners) -> float:
+    """Return the squared sums of errors (N, 2) over images, over the sum of their squares."""
+    image = corners.camera * len(corners.frames) + corners.frame
+    sums = [np.bincount(image, errors[:, i]) for i in (0, 1)]
+    return float(np.sum(np.square(sums)) / np.sum(errors**2))
 
 
 def _move_head(cameras: list[Camera], head: np.ndarray) -> np.ndarray:

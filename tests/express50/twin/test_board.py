@@ -4,7 +4,8 @@ import pytest
 
 from express50.geometry.cameras import project
 from express50.geometry.conventions import opencv_pixels_to_corner
-from express50.twin.board import board_poses, charuco_board, render_board
+from express50.twin.board import _RAYS, board_poses, charuco_board, render_board
+from express50.twin.render import ray_pattern
 from express50.twin.rig import expose, make_rig, make_sensor
 
 
@@ -32,6 +33,10 @@ def test_detected_corners_are_where_the_truth_has_them():
     assert np.quantile(np.linalg.norm(errors, axis=1), 0.95) < 0.3
     # A half-pixel slip would show as a common shift.
     assert np.abs(np.median(errors, axis=0)).max() < 0.06
+
+
+def test_rays_are_spread_about_the_middle_of_a_pixel():
+    assert np.abs(np.mean(ray_pattern(_RAYS), axis=1)).max() < 1e-6  # or pictures are shifted
 
 
 @pytest.mark.parametrize("count", [4, 8, 24])
