@@ -8,6 +8,7 @@ import json
 import os
 import signal
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -15,6 +16,7 @@ from typing import IO, Any
 from express50.errors import ConfigError, Express50Error
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
+DEBUG = "EXPRESS50_DEBUG"  # variable of the environment
 
 
 def run_handler(
@@ -22,8 +24,7 @@ def run_handler(
 ) -> int:
     """Call a command's handler and turn its ending into an exit code.
 
-    An Express50Error or an error of the operating system becomes one line on standard error; any
-    other error is a defect and keeps its traceback.
+    Any error becomes one line on standard error; with EXPRESS50_DEBUG=1 the traceback follows.
     """
     try:
         with _stop_on_sigterm():
@@ -31,23 +32,31 @@ def run_handler(
         with readers_may_leave(sys.stdout):
             sys.stdout.flush()
         return code
-    except Express50Error as error:
-        line = " ".join(str(error).split())
-        sys.stderr.write(f"{program}: {type(error).__name__}: {line}\n")
+    except Exception as error:  # noqa: BLE001 (nobody is helped by a page of a library's files)
+        sys.stderr.write(f"{program}: {_line_of(error)}\n")
+        if os.environ.get(DEBUG):
+            traceback.print_exception(error)
         return USAGE if isinstance(error, ConfigError) else FAILED
-    except OSError as error:  # the machine's, not a defect: permissions, a full disk, a folder
-        place = f" {error.filename}:" if error.filename is not None else ""
-        words = error.strerror or str(error) or "no reason given"
-        words = f"{type(error).__name__}:{place} {words}"
-        sys.stderr.write(
-            f"{program}: {words}; check the path, its permissions and the free disk space\n"
-        )
-        return FAILED
     except KeyboardInterrupt:
         sys.stderr.write(
             f"{program}: interrupted; finished work is kept, run the same command to continue\n"
         )
         return INTERRUPTED
+
+
+def _line_of(error: Exception) -> str:
+    name, words = type(error).__name__, " ".join(str(error).split())
+    if isinstance(error, Express50Error):
+        return f"{name}: {words}"
+    if isinstance(error, OSError):  # the machine's, not a defect: permissions, a folder
+        place = f" {error.filename}:" if error.filename is not None else ""
+        words = error.strerror or words or "no reason given"
+        return f"{name}:{place} {words}; check the path, its permissions and the free disk space"
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return (
+        f"{name}: {Express50Error(words)} (unexpected, in {Path(last.filename).name} line "
+        f"{last.lineno}); set {DEBUG}=1, run the same again and report what it prints"
+    )
 
 
 def add_command(

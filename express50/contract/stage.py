@@ -147,7 +147,7 @@ def _load(point: EntryPoint) -> Any:
     except (ImportError, AttributeError) as error:
         raise ConfigError(
             f"entry point {point.name} = {point.value} of {point.group} does not load ({error}); "
-            "fix or uninstall its package"
+            f"{INSTALL}, or fix or uninstall its package"
         ) from error
 
 
@@ -182,8 +182,21 @@ def with_required(names: Iterable[str]) -> list[Stage]:
 
 
 def commands() -> dict[str, Command]:
-    """Return the commands that other packages bring, by name."""
-    return {p.name: _load(p) for p in sorted(entry_points(group="express50.commands"))}
+    """Return the commands that other packages bring, by name.
+
+    One that does not load raises its ConfigError only when it is asked for.
+    """
+    found = {}
+    for point in sorted(entry_points(group="express50.commands")):
+        try:
+            found[point.name] = _load(point)
+        except ConfigError as error:
+            found[point.name] = Command("does not load", functools.partial(_refuse, error))
+    return found
+
+
+def _refuse(error: ConfigError, subparsers: Any) -> None:
+    raise error
 
 
 def hook(name: str) -> Callable[..., Any]:

@@ -1,5 +1,6 @@
 """The command line: output, exit codes, one line for an error, only one area imported."""
 
+import argparse
 import json
 import os
 import subprocess
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from express50.cli.main import main
+from express50.console import run_handler
 from tests.synth import make_capture
 
 COMMANDS = [
@@ -72,6 +74,19 @@ def test_a_mistyped_file_is_refused_before_anything_is_done(run, data, capture, 
     code, _, err = run("run", data, capture, *sets, "--workers", "0")
     assert code == 2 and str(bad) in err and err.count("\n") == 1
     assert not data.exists()
+
+
+@pytest.mark.parametrize("debug", ["", "1"])
+def test_a_defect_is_one_line_unless_its_traceback_is_asked_for(capsys, monkeypatch, debug):
+    def handler(args):
+        return {}["absent\nkey"]
+
+    monkeypatch.setenv("EXPRESS50_DEBUG", debug)
+    assert run_handler("express50", handler, argparse.Namespace()) == 1
+    line, *more = capsys.readouterr().err.splitlines()
+    assert line.startswith("express50: KeyError: 'absent") and "in test_cli.py line " in line
+    assert "set EXPRESS50_DEBUG=1" in line
+    assert more[:1] == (["Traceback (most recent call last):"] if debug else [])
 
 
 def test_json_is_alone_on_standard_output(data, capture):

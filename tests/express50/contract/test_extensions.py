@@ -5,6 +5,7 @@ from importlib.metadata import EntryPoint
 
 import pytest
 
+from express50.cli.main import main
 from express50.contract import stage
 from express50.errors import ConfigError, StageError
 from tests.faults import toy
@@ -53,3 +54,10 @@ def test_what_cannot_work_is_one_error(install, points):
     install(*points)
     with pytest.raises(ConfigError):
         stage.stages()
+
+
+def test_a_broken_command_takes_no_other_with_it(install, capsys):
+    install(OWN, EntryPoint("broken", "no.such:COMMAND", "express50.commands"))
+    assert main(["config", "pack"]) == 0
+    assert main(["broken"]) == 2
+    assert "entry point broken = no.such:COMMAND" in capsys.readouterr().err
