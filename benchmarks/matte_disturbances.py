@@ -125,6 +125,31 @@ def walls(shots: list[Shot]) -> dict[str, list[Shot]]:
     }
 
 
+def other_plates(shots: list[Shot]) -> dict[str, list[Shot]]:
+    """Return the shots with plates that are not as they should be.
+
+    `shifted` were taken from a little further on, `relit` in other light, `room` elsewhere.
+    """
+    elsewhere = zip(shots, [*shots[1:], *shots[:1]], strict=True)
+    return {
+        "shifted": [replace(shot, plate=_shifted(shot.plate)) for shot in shots],
+        "relit": [replace(shot, plate=_relit(shot.plate)) for shot in shots],
+        "room": [replace(shot, plate=other.plate) for shot, other in elsewhere],
+    }
+
+
+def _shifted(image: np.ndarray) -> np.ndarray:
+    motion, size = np.array([[1, 0.004, 2.3], [-0.004, 1, -1.6]]), image.shape[1::-1]
+    border = cv2.BORDER_REPLICATE
+    return cv2.warpAffine(image, motion, size, flags=cv2.INTER_CUBIC, borderMode=border)
+
+
+def _relit(image: np.ndarray) -> np.ndarray:
+    height, width = image.shape[:2]
+    y, x = np.mgrid[0:height, 0:width] / max(height, width) - 0.5
+    return _srgb8(srgb_to_linear(image / 255) * (1.15 + 0.35 * x - 0.2 * y)[..., None])
+
+
 def _falling_off(rng: np.random.Generator, size: int, colour: np.ndarray) -> np.ndarray:
     """Return a wall (size, size, 3) of one colour, linear light, brighter to one side."""
     y, x = np.mgrid[0:size, 0:size] / size - 0.5

@@ -16,6 +16,10 @@ recorded, bland and cluttered walls, and walls of the skin's and the shirt's col
 (``sad_alone``). ``sad_ratio_to_plate`` and ``worst_ratio``, that of the worst camera, are printed
 per scene and of all scenes together.
 
+``plates`` says the same of plates that were shifted, taken in other light or elsewhere, before the
+recorded and the cluttered set: ``sad`` as `match_plate` brings them to the frame, ``sad_untouched``
+as they are, ``sad_right`` with the right plate, and the share that is ``refused``.
+
 Disturbances are laid on the recorded frames in linear light with the true alpha, and keyed anew.
 ``sad`` is the summed absolute error in thousands, ``mae`` its mean, both means over cameras and
 peaks; ``*_key`` is each camera alone. ``named`` counts the cameras that were found wrong, of which
@@ -29,7 +33,7 @@ import argparse
 import json
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +42,7 @@ import numpy as np
 
 from benchmarks.calibrate import recorded, rounded
 from benchmarks.matte import errors
-from benchmarks.matte_disturbances import DISTURBANCES, Shot, walls
+from benchmarks.matte_disturbances import DISTURBANCES, Shot, other_plates, walls
 from express50.capture.frames import read_frame, read_recorded_plate
 from express50.capture.index import read_index
 from express50.contract.config import resolve_config
@@ -54,6 +58,7 @@ from pipelines.matte.config import MatteConfig
 from pipelines.matte.consensus import agree
 from pipelines.matte.cutout import CutView, cut_out, make_cut_view, soft_alpha
 from pipelines.matte.key import key_alpha
+from pipelines.matte.plates import LEAST_SHARE, match_plate
 from pipelines.matte.stage import corrected, make_view
 from pipelines.matte.visual_hull import ball_of
 
@@ -104,6 +109,7 @@ def main() -> int:
     configs = {name: resolve_config(STAGE, name, None, args.assignments) for name in PRESETS}
     rows: dict[tuple[int, str, str], list[Figures]] = {}
     bare: dict[tuple[int, str], list[Figures]] = {}
+    plates: dict[str, list[Figures]] = {}
     for subject, frame in moments(dataset, truth, args.peaks):
         clean = shots_of(dataset, truth, subject, frame)
         undone: dict[int, Keyed] = {}  # most shots of a scene are untouched, and keyed once
@@ -123,7 +129,20 @@ def main() -> int:
                     bare.setdefault((len(shots[::step]), scene), []).append(
                         without_plates(shots[::step], sheet)
                     )
-    result = {"benchmark": "matte_views", **summary(rows), "no_plate": bare_summary(bare)}
+            for scene, shots in {"recorded": clean, "cluttered": walls(clean)["cluttered"]}.items():
+                for wrong, plated in other_plates(shots[::4]).items():
+                    plates.setdefault(f"{scene}_{wrong}", []).append(
+                        with_plates(plated, shots[::4])
+                    )
+    result = {
+        "benchmark": "matte_views",
+        **summary(rows),
+        "no_plate": bare_summary(bare),
+        "plates": {
+            name: rounded({key: float(np.mean([row[key] for row in mine])) for key in mine[0]})
+            for name, mine in plates.items()
+        },
+    }
     print(json.dumps(result))
     return 0
 
@@ -219,6 +238,23 @@ def _alone(shot: Shot, view: CutView) -> np.ndarray:
         return soft_alpha(shot.frame, shot.valid, cut_out([view], None)[view.name])
     except NoFaceError:
         return np.zeros(shot.true.shape, np.float32)
+
+
+def with_plates(wrong: list[Shot], right: list[Shot]) -> Figures:
+    """Return errors of shots with wrong plates; those that are refused count for nothing else."""
+    kept: dict[str, list[float]] = {name: [] for name in ("sad", "sad_untouched", "sad_right")}
+    refused = 0
+    for shot, good in zip(wrong, right, strict=True):
+        matched = match_plate(shot.plate, shot.frame, shot.valid)
+        if matched.share < LEAST_SHARE:
+            refused += 1
+            continue
+        for name, plate in (
+            ("sad", matched.plate), ("sad_untouched", shot.plate), ("sad_right", good.plate)
+        ):  # fmt: skip
+            kept[name].append(errors(key(replace(shot, plate=plate)).alpha / 255, shot.true)["sad"])
+    means = {name: float(np.mean(values)) if values else 0.0 for name, values in kept.items()}
+    return means | {"refused": refused / len(wrong)}
 
 
 def bare_summary(rows: dict[tuple[int, str], list[Figures]]) -> dict[str, Any]:

@@ -49,6 +49,13 @@ def affine_to_opencv(matrix: np.ndarray) -> np.ndarray:
     return shifted
 
 
+def affine_from_opencv(matrix: np.ndarray) -> np.ndarray:
+    """Return the affine (2, 3) between corner-origin pixels; undoes `affine_to_opencv`."""
+    shifted = np.array(matrix, dtype=np.float64)
+    shifted[:, 2] -= shifted[:, :2] @ [0.5, 0.5] - 0.5
+    return shifted
+
+
 def corner_to_cell(places: Places) -> Places:
     """Return fractional indices, for interpolation, of corner-origin places; cell 0 spans 0 to 1.
 

@@ -27,9 +27,6 @@ from express50.files.images import edge_distance, shrink
 from express50.geometry.cameras import Camera, resized
 from express50.geometry.conventions import corner_to_cell
 from express50.geometry.transforms import similarity_fit
-from express50.landmarks.detector import Detection, detect_many
-from express50.landmarks.network import load_network
-from pipelines.calibrate.footage_rig import INNER, mean_landmarks, pose_of_face
 from pipelines.matte.plates import blurred, local_colours, to_light
 from pipelines.matte.visual_hull import (
     Ball,
@@ -40,7 +37,6 @@ from pipelines.matte.visual_hull import (
     projection_of,
     subject_place,
 )
-from pipelines.track.observe import LandmarkView, robust_triangulate
 
 FACE_SCORE = 0.3  # heads from behind score up to 0.2, profiles from 0.33 on
 SEARCH = 0.08  # smallest windows searched for the face, of the longer side
@@ -135,8 +131,7 @@ def cut_out(views: Sequence[CutView], ball: Ball | None) -> dict[str, Cut]:
     Raises:
         NoFaceError: no camera shows a face.
     """
-    faces = detect_many(load_network(), [view.rgb for view in views], smallest=SEARCH)
-    place = _place_head(views, faces)
+    place = _place_head(views)
     small = [_at_scale(view, PIXEL_M * place.density(view.camera)) for view in views]
     guesses = [_guess(view, place) for view in small]
     masks = [
@@ -152,8 +147,15 @@ def cut_out(views: Sequence[CutView], ball: Ball | None) -> dict[str, Cut]:
     }
 
 
-def _place_head(views: Sequence[CutView], faces: Sequence[Detection]) -> _Place:
+def _place_head(views: Sequence[CutView]) -> _Place:
     """Place the mean head by all faces found, or by the best of them."""
+    # Imported here: cameras with plates need no network, and torch takes seconds to import.
+    from express50.landmarks.detector import detect_many
+    from express50.landmarks.network import load_network
+    from pipelines.calibrate.footage_rig import INNER, mean_landmarks, pose_of_face
+    from pipelines.track.observe import LandmarkView, robust_triangulate
+
+    faces = detect_many(load_network(), [view.rgb for view in views], smallest=SEARCH)
     head = mean_landmarks()
     found = [
         (LandmarkView(view.name, view.camera, face.points, face.sigma, face.score), face)
@@ -197,6 +199,7 @@ def _at_scale(view: CutView, factor: float) -> CutView:
 def _parts() -> dict[int, tuple[np.ndarray, ...]]:
     """Make convex parts (N, 3) of a person in head space, metres, by GrabCut's label."""
     from express50.head.load import load_head
+    from pipelines.calibrate.footage_rig import mean_landmarks
 
     vertices = load_head("procedural").template.double().numpy()
     face = mean_landmarks()

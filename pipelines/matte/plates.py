@@ -18,7 +18,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.files.images import LIGHT_OF_LEVEL, scaled_levels, srgb_to_linear
+from express50.files.images import (
+    LIGHT_OF_LEVEL,
+    linear_to_srgb,
+    scaled_levels,
+    srgb_to_linear,
+)
+from express50.geometry.conventions import affine_from_opencv, affine_to_opencv
 
 LEVELS = np.linspace(16.0, 240.0, 8)  # 8-bit intensities at which noise is tabulated
 MOST_NOISE = 14.0  # 8-bit steps; larger differences are not noise, whatever the camera
@@ -27,6 +33,12 @@ NOISE_FLOOR = 1.0  # least noise assumed, in 8-bit steps
 LEAST_PLATE = 0.05
 # Largest changes of exposure, natural logarithms: a few tenths of a stop as a rule, else two stops.
 GAINS = (0.51, 1.41)
+# A plate that explains less than GOOD_SHARE of a frame's rim is moved and evened.
+RIM, ODD_STEPS, GOOD_SHARE, LEAST_GAIN = 0.06, 12.0, 0.97, 0.01
+WIDE_RIM = 0.15  # by which it is aligned
+MOST_MOVED = 0.03  # of the longer side; a plate that moved more is not believed to be aligned
+LEAST_SHARE = 0.9  # a plate that explains less is of another set
+ALIGN_SIDE = 1024  # pixels of the pictures that are aligned
 ROUNDS = 3  # the covariance a pixel sees depends on its alpha; settled to 0.01 after two
 OCTAVES = 4  # of reach, in which colours are looked for
 TINT = 0.1  # share of the spread in brightness by which colour spreads too
@@ -80,6 +92,124 @@ def exposed(plate: np.ndarray, gain: np.ndarray) -> np.ndarray:
         return plate.astype(np.float32)
     table = scaled_levels(gain).astype(np.float32)
     return np.stack([table[plate[..., c], c] for c in range(3)], axis=-1)
+
+
+@dataclass(frozen=True)
+class MatchedPlate:
+    """A plate (H, W, 3) uint8 brought to a frame.
+
+    Attributes:
+        plate: moved and evened, if that helps; else as it was.
+        moved_px: how far its corners moved at most.
+        evened: largest change of light, a share; 0 where none was needed.
+        share: of the frame's top and sides that it explains.
+    """
+
+    plate: np.ndarray
+    moved_px: float
+    evened: float
+    share: float
+
+
+def match_plate(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> MatchedPlate:
+    """Bring a plate to a frame that a camera took from a little further on, or in other light.
+
+    The person fills the middle of a frame as a rule: what counts are its top and its sides.
+
+    Args:
+        plate: (H, W, 3) uint8.
+        frame: (H, W, 3) uint8.
+        valid: (H, W) bool, pixels with footage.
+    """
+    rim = valid & _rim(valid.shape, RIM)
+    as_it_is = MatchedPlate(plate, 0.0, 0.0, _explained(plate, frame, rim))
+    if as_it_is.share > GOOD_SHARE:
+        return as_it_is
+    evened, change = _evened(plate, frame, rim)
+    best = as_it_is
+    for light, even in ((plate, 0.0), (evened, change)):
+        moved, corners = _moved(light, frame, valid)
+        for image, far in ((light, 0.0), (moved, corners)):
+            found = MatchedPlate(image, far, even, _explained(image, frame, rim))
+            best = found if found.share > best.share + LEAST_GAIN else best
+    return best
+
+
+def _rim(shape: tuple[int, ...], share: float) -> np.ndarray:
+    """Mark the top and the upper sides (H, W) of an image, a share of its longer side wide."""
+    height, width = shape
+    edge = max(2, round(share * max(shape)))
+    rim = np.zeros(shape, bool)
+    rim[:edge] = True
+    rim[: round(0.6 * height), :edge] = rim[: round(0.6 * height), width - edge :] = True
+    return rim
+
+
+def _explained(plate: np.ndarray, frame: np.ndarray, rim: np.ndarray) -> float:
+    """Return the share of a rim (H, W) where plate and frame differ by less than noise does."""
+    if not rim.any():  # nothing speaks against the plate
+        return 1.0
+    off = frame.astype(np.float32) - exposed(plate, exposure_gain(frame, plate))
+    return float((np.abs(cv2.blur(off, (3, 3))).max(2)[rim] < ODD_STEPS).mean())
+
+
+def _moved(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, float]:
+    """Move a plate onto a frame by an affine motion; also returns how far its corners move."""
+    scale = min(1.0, ALIGN_SIDE / max(valid.shape))
+    grey = [
+        cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None, fx=scale, fy=scale,
+                   interpolation=cv2.INTER_AREA)
+        for image in (frame, plate)
+    ]  # fmt: skip
+    height, width = grey[0].shape
+    mask = (valid & _rim(valid.shape, WIDE_RIM)).astype(np.uint8)
+    mask = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST)
+    motion = np.eye(2, 3, dtype=np.float32)
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
+    try:
+        for blur in (15, 5):  # the motion of broad things first
+            _, motion = cv2.findTransformECC(
+                *grey, motion, cv2.MOTION_AFFINE, stop, inputMask=mask, gaussFiltSize=blur
+            )
+    except cv2.error:  # nothing to see, or no motion explains it
+        return plate, 0.0
+    motion = affine_from_opencv(motion)
+    motion[:, 2] /= scale
+    height, width = valid.shape
+    corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]])
+    far = float(np.linalg.norm(corners @ motion.T - corners[:, :2], axis=1).max())
+    if far > MOST_MOVED * max(width, height):
+        return plate, 0.0
+    moved = cv2.warpAffine(
+        plate, affine_to_opencv(motion), (width, height),
+        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
+    )  # fmt: skip
+    return moved, far
+
+
+def _evened(plate: np.ndarray, frame: np.ndarray, rim: np.ndarray) -> tuple[np.ndarray, float]:
+    """Even a plate's light to a frame's; also returns the largest change, a share.
+
+    The change is a gain per channel that grows evenly across the image, so that it is known where
+    the person hides the plate too.
+    """
+    height, width = rim.shape
+    weight = rim.astype(np.float32)
+    reach = 0.02 * max(rim.shape)
+    seen, held = (
+        blurred((LIGHT_OF_LEVEL[image].astype(np.float32) + 1e-3) * weight[..., None], reach)
+        for image in (frame, plate)
+    )
+    step = max(1, max(rim.shape) // 256)
+    rows, columns = (index[rim[::step, ::step]] for index in np.mgrid[0:height:step, 0:width:step])
+    seen, held = (np.maximum(light[rows, columns], 1e-6) for light in (seen, held))
+    ratio = np.log(seen / held)
+    sides = [np.ones(len(rows)), rows / height, columns / width]
+    slope = np.linalg.lstsq(np.stack(sides, axis=1), ratio, rcond=None)[0]
+    y, x = np.arange(height)[:, None, None] / height, np.arange(width)[:, None] / width
+    gain = np.exp(np.clip(slope[0] + slope[1] * y + slope[2] * x, -1.5, 1.5)).astype(np.float32)
+    even = linear_to_srgb(np.clip(LIGHT_OF_LEVEL[plate] * gain, 0, 1))
+    return np.rint(255 * even).astype(np.uint8), float(np.abs(gain - 1).max())
 
 
 def fit_plate(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> PlateModel:

@@ -18,10 +18,11 @@ from express50.errors import CaptureError, NoFaceError, StageError
 from express50.files.images import shrink, tile_sheet, write_image
 from express50.geometry.cameras import Camera, pinhole, resized
 from express50.geometry.sampling import undistorted_mask
-from pipelines.matte.config import WITHOUT_PLATE, MatteConfig
+from pipelines.matte.config import NETWORKS, WITHOUT_PLATE, MatteConfig
 from pipelines.matte.consensus import Agreement, agree
+from pipelines.matte.cutout import CutView, cut_out, make_cut_view, soft_alpha
 from pipelines.matte.key import key_alpha
-from pipelines.matte.plates import exposed, exposure_gain
+from pipelines.matte.plates import LEAST_SHARE, exposed, exposure_gain, match_plate
 from pipelines.matte.visual_hull import (
     INSIDE,
     Ball,
@@ -60,7 +61,7 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
     cameras = read_cameras_of(dataset, item.split("/")[0], undistorted=False)
     ball = ball_of(cameras)
     compares = config.agree and ball is not None
-    mattes, dropped = camera_mattes(dataset, item, config, cameras, ball)
+    mattes, dropped, odd_plates = camera_mattes(dataset, item, config, cameras, ball)
     if not mattes:
         raise StageError(f"{item}: {dropped[0].why if dropped else 'no camera is calibrated'}")
     alphas = {name: matte.alpha for name, matte in mattes.items()}
@@ -95,66 +96,74 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
     }
     named = {note.what for note in found.warnings}
     odd = [note for note in matte_warnings(final) if note.what not in named]
-    return Result(figures, dropped, [*found.warnings, *odd])
+    return Result(figures, dropped, [*odd_plates, *found.warnings, *odd])
 
 
 def camera_mattes(
     dataset: Dataset, item: str, config: MatteConfig, cameras: Mapping[str, Camera],
     ball: Ball | None,
-) -> tuple[dict[str, CameraMatte], list[Note]]:  # fmt: skip
+) -> tuple[dict[str, CameraMatte], list[Note], list[Note]]:  # fmt: skip
     """Matte each camera of a peak, those without a plate together.
 
     One camera's full images are held at a time. `ball` is what the cameras look at; None where
-    they do not share a place. Also returns the cameras without a matte.
+    they do not share a place. Also returns the cameras without a matte, and warnings.
     """
     subject, expression = item.split("/")
     read = partial(read_peak_frame, dataset, subject, expression)
-    lacking = [
-        name
-        for name in cameras
-        if config.method == "grabcut"
-        or (config.method == "key" and not dataset.plate_file(subject, name).is_file())
-    ]
-    if lacking:
-        from pipelines.matte import cutout  # loads torch
     matter = _matter(config)
     found: dict[str, CameraMatte] = {}
-    seen = []
+    seen: list[CutView] = []
     dropped: list[Note] = []
+    warnings: list[Note] = []
     for name, camera in cameras.items():
         try:
             frame, valid, alpha = read(name), valid_pixels(camera), None
-            if name not in lacking:
-                plate = None if config.method in WITHOUT_PLATE else _plate(dataset, subject, name)
+            plate, why = _plate(dataset, subject, name, frame, valid, config)
+            if plate is not None or config.method in NETWORKS:
                 alpha = eight_bit(matter(frame, plate, valid), valid)
                 found[name] = CameraMatte(alpha, shrink(frame, config.side))
         except (CaptureError, StageError) as error:
             dropped.append(Note(name, str(error)))
             continue
-        if lacking:
-            seen.append(cutout.make_cut_view(pinhole(camera), frame, valid, alpha))
+        warnings += [Note(name, why)] if why else []
+        seen.append(make_cut_view(pinhole(camera), frame, valid, alpha))
     unplated = [view.name for view in seen if view.known is None]
     try:
-        cuts = cutout.cut_out(seen, ball) if unplated else {}
+        cuts = cut_out(seen, ball) if unplated else {}
     except NoFaceError as error:
         dropped += [Note(name, str(error)) for name in unplated]
-        return found, sorted(dropped, key=lambda note: note.what)
+        return found, sorted(dropped, key=lambda note: note.what), warnings
     for name in unplated:
         frame, valid = read(name), valid_pixels(cameras[name])
-        alpha = eight_bit(cutout.soft_alpha(frame, valid, cuts[name]), valid)
+        alpha = eight_bit(soft_alpha(frame, valid, cuts[name]), valid)
         found[name] = CameraMatte(alpha, shrink(frame, config.side), plated=False)
-    return {name: found[name] for name in cameras if name in found}, dropped
+    return {name: found[name] for name in cameras if name in found}, dropped, warnings
 
 
-def _plate(dataset: Dataset, subject: str, camera: str) -> np.ndarray:
+def _plate(
+    dataset: Dataset, subject: str, camera: str, frame: np.ndarray, valid: np.ndarray,
+    config: MatteConfig,
+) -> tuple[np.ndarray | None, str]:  # fmt: skip
+    """Read a plate and bring it to the frame; also returns a warning, empty if all is well."""
+    if config.method in WITHOUT_PLATE:
+        return None, ""
     plate = read_plate_image(dataset, subject, camera)
-    if plate is None:
+    if plate is None and config.method == "bgmv2":
         raise StageError(
             f"no clean plate of {camera}; photograph the empty set as plates/{camera}.png and run"
             " 'express50 ingest' and 'express50 frames' again, or set matte.method to key, grabcut"
             " or salient"
         )
-    return plate
+    if plate is None:
+        return None, ""
+    matched = match_plate(plate, frame, valid)
+    if matched.share >= LEAST_SHARE or config.method == "bgmv2":
+        return matched.plate, ""
+    return None, (
+        f"its plate explains {matched.share:.0%} of the frame's top and sides, expected"
+        f" {LEAST_SHARE:.0%}: it is of another set or place, and the camera was cut out without it;"
+        " photograph the plate again"
+    )
 
 
 def valid_pixels(camera: Camera) -> np.ndarray:

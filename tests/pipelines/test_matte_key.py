@@ -8,15 +8,19 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.matte_scenes import make_scene as hair_before
 from express50.errors import ConfigError
+from express50.files.images import linear_to_srgb, srgb_to_linear
 from pipelines.matte.config import MatteConfig
 from pipelines.matte.key import dilated, eroded, key_alpha, plate_difference
 from pipelines.matte.learned import MattingLaplacian
 from pipelines.matte.plates import (
+    LEAST_SHARE,
     exposed,
     exposure_gain,
     fit_plate,
     local_colours,
+    match_plate,
     shrunk,
     solve_opacity,
 )
@@ -204,3 +208,52 @@ def test_pixels_without_footage_are_transparent() -> None:
 def test_wrong_settings_are_refused(change) -> None:
     with pytest.raises(ConfigError, match="matte"):
         MatteConfig(**change)
+
+
+def moved(plate: np.ndarray, pixels: float) -> np.ndarray:
+    motion = np.array([[1, 0, pixels], [0, 1, -pixels]])
+    return cv2.warpAffine(
+        plate, motion, plate.shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+    )
+
+
+def test_a_plate_that_fits_stays_as_it_is() -> None:
+    scene = hair_before("dark", "cluttered", 256, np.random.default_rng(0))
+    matched = match_plate(scene.plate, scene.frame, np.ones((256, 256), bool))
+    assert matched.plate is scene.plate and matched.moved_px == matched.evened == 0.0
+
+
+@pytest.mark.parametrize(("pixels", "slope"), [(3.0, 0.0), (0.0, 0.4), (-2.5, 0.3)])
+def test_a_shifted_plate_and_one_in_other_light_are_brought_to_the_frame(
+    pixels: float, slope: float
+) -> None:
+    scene = hair_before("dark", "cluttered", 256, np.random.default_rng(0))
+    light = 1.1 + slope * (np.arange(256) / 256 - 0.5)
+    relit = linear_to_srgb(srgb_to_linear(scene.plate / 255) * light[:, None])
+    wrong = moved(np.rint(255 * np.clip(relit, 0, 1)).astype(np.uint8), pixels)
+    valid = np.ones((256, 256), bool)
+    matched = match_plate(wrong, scene.frame, valid)
+    before, after, right = (
+        np.abs(key_alpha(scene.frame, plate, valid, MatteConfig()) - scene.alpha).mean()
+        for plate in (wrong, matched.plate, scene.plate)
+    )
+    assert matched.share > LEAST_SHARE
+    assert after < 0.6 * before and after < 3 * right
+
+
+def test_a_plate_of_another_room_explains_nothing() -> None:
+    scene, other = (
+        hair_before("dark", "cluttered", 256, np.random.default_rng(seed)) for seed in (0, 1)
+    )
+    valid = np.ones((256, 256), bool)
+    assert match_plate(other.plate, scene.frame, valid).share < 0.5 < LEAST_SHARE
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (8, 300), (64, 64)])
+@pytest.mark.parametrize("level", [0, 255])
+def test_blank_and_tiny_plates_give_numbers(shape: tuple[int, int], level: int) -> None:
+    frame = np.random.default_rng(0).integers(0, 256, (*shape, 3), dtype=np.uint8)
+    plate = np.full_like(frame, level)
+    for valid in (np.ones(shape, bool), np.zeros(shape, bool)):
+        matched = match_plate(plate, frame, valid)
+        assert 0 <= matched.share <= 1 and matched.plate.shape == frame.shape
