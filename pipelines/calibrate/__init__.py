@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from express50.capture.index import calibration_file, read_index
 from express50.contract.layout import Dataset
-from express50.contract.stage import Command, Growth, Result, Stage
+from express50.contract.stage import Growth, Result, Stage
 from pipelines.calibrate.config import PRESETS, CalibrateConfig
 
-__all__ = ["COMMAND", "STAGE", "CalibrateConfig"]
+__all__ = ["STAGE", "CalibrateConfig"]
 
 
 def inputs(dataset: Dataset, item: str, config: CalibrateConfig) -> dict[str, Path | str]:
@@ -48,13 +47,3 @@ STAGE = Stage(
     purpose="Cameras: given, or solved from the board or the footage.",
     growth=Growth(items=("subjects",), time=("views", "pixels"), disk=("views",)),
 )
-
-
-def add_commands(subparsers: Any) -> None:
-    """Add ``express50 cameras``, see `pipelines.calibrate.cli`."""
-    from pipelines.calibrate.cli import add_commands as add
-
-    add(subparsers)
-
-
-COMMAND = Command("import and check calibrations", add_commands)
