@@ -9,7 +9,6 @@ says to load only files that one trusts.
 from __future__ import annotations
 
 import contextlib
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -124,10 +123,7 @@ def _torchscript(path: Path, role: Role) -> Network:
     """Return TorchScript module: on CUDA in half precision where there is one, else on the CPU."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
-        with warnings.catch_warnings():
-            # Of its deprecation; the weights are published in this format.
-            warnings.simplefilter("ignore", DeprecationWarning)
-            module = torch.jit.load(str(path), map_location=device).eval()
+        module = torch.jit.load(str(path), map_location=device).eval()
         arguments = module.forward.schema.arguments[1:]
     except TORCH_ERRORS as error:
         raise StageError(

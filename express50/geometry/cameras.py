@@ -162,7 +162,8 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
         points: (N, 3) world points, metres.
 
     Returns:
-        pixels (N, 2) as (x, y), NaN where depth <= 0; depth (N,), camera z, metres.
+        pixels (N, 2) as (x, y), NaN where depth <= 0; depth (N,), camera z, metres. Both are NaN
+        where a point is not finite.
 
     Raises:
         ValueError: points are not (N, 3).
@@ -171,6 +172,7 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     """
     points = np.asarray(points, dtype=np.float64)
     check_shape("points", points, (None, 3))
+    points = np.where(np.isfinite(points), points, np.nan)  # 0 * inf would be an invalid value
     p = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     depth = p[:, 2]
     ahead = depth > 0

@@ -157,6 +157,8 @@ def _procrustes(
     w = np.ones(len(source)) if weights is None else np.asarray(weights, dtype=np.float64)
     if len(source) < 3 or w.sum() <= 0:
         raise ValueError(f"a rigid fit needs 3 weighted points, got {int((w > 0).sum())}")
+    if not (np.isfinite(source).all() and np.isfinite(target).all()):
+        raise ValueError("a rigid fit needs finite points, got NaN or infinity")
     w = w / w.sum()
     mean_s, mean_t = w @ source, w @ target
     centred_s, centred_t = source - mean_s, target - mean_t

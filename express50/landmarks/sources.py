@@ -32,6 +32,7 @@ NAMES = ("schema", "cameras", "frames", "points")
 POINTS, IRISES = 68, 2
 # Points may lie this share of the image outside of it: a chin below the frame is still a chin.
 OUTSIDE = 0.5
+UNSURE = 1e-9  # a confidence below it says nothing
 
 
 @dataclass(frozen=True)
@@ -131,8 +132,7 @@ def given_detection(rows: np.ndarray) -> Detection:
     points = np.where(known[:, None], rows[:, :2], rows[known, :2].mean(0))
     confidence = np.where(known, rows[:, 2], 0.0)
     size = max(float(np.ptp(rows[known, :2], axis=0).max()), 1.0)
-    with np.errstate(divide="ignore"):
-        sigma = np.where(known, 0.006 * size / confidence, np.inf)
+    sigma = np.where(known, 0.006 * size / np.maximum(confidence, UNSURE), np.inf)
     return Detection(points, sigma, confidence, float(confidence[known].mean()))
 
 
@@ -142,8 +142,7 @@ def given_irises(rows: np.ndarray, face: Detection) -> Irises:
     known = np.isfinite(found[:, :2]).all(1) & (found[:, 2] > 0)
     width = [np.linalg.norm(face.points[a] - face.points[b]) for a, b in ((45, 42), (39, 36))]
     confidence = np.where(known, found[:, 2], 0.0)
-    with np.errstate(divide="ignore"):
-        sigma = np.where(known, 0.03 * np.array(width) / confidence, np.inf)
+    sigma = np.where(known, 0.03 * np.array(width) / np.maximum(confidence, UNSURE), np.inf)
     centres = np.where(known[:, None], found[:, :2], face.points[[42, 36]])
     return Irises(centres, np.where(sigma > 0, sigma, np.inf), confidence)
 

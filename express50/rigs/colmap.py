@@ -6,6 +6,7 @@ that of COLMAP's documentation of its output format.
 
 from __future__ import annotations
 
+import math
 import struct
 from pathlib import Path
 from typing import NamedTuple
@@ -73,7 +74,7 @@ def read_colmap_images(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
     cameras = {}
     for name, shot in zip(names, shots, strict=True):
         lens, turn = lenses.get(shot.camera), np.array(shot.pose[:4])
-        length = float(np.linalg.norm(turn))
+        length = math.hypot(*turn)  # a damaged file's may be huge
         if lens is None or not (np.isfinite(shot.pose).all() and 0 < length < 1e6):
             raise CalibrationError(
                 f"{path}: image {shot.name} has no pose or no camera; export again"

@@ -85,6 +85,11 @@ class ShardWriter:
         self._hash = hashlib.sha256()
         self.digests: dict[str, str] = {}  # SHA-256 of every finished shard, for the manifest
 
+    def __del__(self) -> None:
+        """Close the shard that an error left unfinished."""
+        if file := getattr(self, "_file", None):
+            file.close()
+
     def add_group(self, split: str, samples: Sequence[PackedSample]) -> None:
         """Append all samples of one (subject, expression), sorted by camera.
 

@@ -111,7 +111,7 @@ def test_laplacian_without_edges_or_displacement_is_zero():
     field = torch.rand(3, 3, requires_grad=True)
     loss = losses.laplacian_mm2(field, torch.zeros(0, 2, dtype=torch.int64))
     loss.backward()
-    assert float(loss) == 0 and torch.equal(field.grad, torch.zeros(3, 3))
+    assert loss.item() == 0 and torch.equal(field.grad, torch.zeros(3, 3))
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])

@@ -185,7 +185,7 @@ def test_unseen_people_are_measured_where_it_is_asked(checkpoint, shards, tmp_pa
     arguments = ["evaluate", str(checkpoint), str(shards), str(tmp_path), "--subjects=S002"]
     arguments += ["--fit-cameras=cam00", "--fit-expression=e0", "--cameras=cam02"]
     assert main([*arguments, "--expressions=e1"]) == 0
-    rows = list(csv.DictReader((tmp_path / "evaluation.csv").open()))
+    rows = list(csv.DictReader((tmp_path / "evaluation.csv").read_text().splitlines()))
     assert {(row["subject"], row["expression"], row["camera"]) for row in rows} == {
         ("S002", "e1", "cam02")
     }

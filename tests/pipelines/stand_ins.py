@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
 import torch
@@ -57,9 +56,7 @@ def traced_thirds(path: Path) -> Path:
     nn.init.zeros_(module.bias)
     module.weight.data[3] = 1.0  # bright is hair, dark is clothes
     module.weight.data[22] = -1.0
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        torch.jit.trace(module.eval(), torch.zeros(1, 3, 1024, 768)).save(str(path))
+    torch.jit.trace(module.eval(), torch.zeros(1, 3, 1024, 768)).save(str(path))
     return path
 
 
@@ -91,9 +88,7 @@ class BadPair(Bad):
 
 def torchscript(module: nn.Module, path: Path) -> Path:
     """Save a scripted module."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        torch.jit.script(module.eval()).save(str(path))
+    torch.jit.script(module.eval()).save(str(path))
     return path
 
 

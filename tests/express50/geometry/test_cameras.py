@@ -50,6 +50,13 @@ def test_a_point_behind_the_camera_has_no_pixel():
     assert depth[0] == pytest.approx(-1.0)
 
 
+def test_infinite_points_have_no_pixel_and_warn_nobody():
+    camera = Camera("a", 320, 240, "PINHOLE", (300.0, 300.0, 160.0, 120.0), np.eye(4))
+    points = [[np.inf, 0, 1], [0, 0, np.inf], [np.nan, 0, 1], [0, 0, 1]]
+    pixels, depth = cameras.project(camera, points)
+    assert np.isfinite(pixels).all(1).tolist() == [False, False, False, True] and depth[3] == 1
+
+
 def test_convention_first_pixel_centre_is_half():
     camera = cameras.pinhole_camera(
         "p", np.array([[10.0, 0, 2], [0, 10, 2], [0, 0, 1]]), 4, 4, np.eye(4)

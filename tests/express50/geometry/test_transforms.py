@@ -89,6 +89,13 @@ def test_fits_refuse_what_has_no_answer():
         transforms.quat_to_matrix(np.zeros(4))
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_fits_refuse_points_that_are_not_finite(bad):
+    points = np.eye(4, 3)
+    with pytest.raises(ValueError, match="finite points"):
+        transforms.rigid_fit(points, np.where(points == 1, bad, points))
+
+
 def test_look_at_puts_the_target_ahead_with_up_upwards():
     T = transforms.look_at(np.array([0.0, 1, 2]), np.array([0.0, 1, 0]), np.array([0.0, 1, 0]))
     np.testing.assert_allclose(T @ [0, 1, 0, 1], [0, 0, 2, 1], atol=1e-12)

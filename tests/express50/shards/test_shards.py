@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import pickle
@@ -125,6 +126,7 @@ def test_groups_stay_in_one_shard_with_members_adjacent(shards):
         assert "/" not in "".join(info.name for info in members)
 
 
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_webdataset_reads_every_sample_unchanged(shards):
     webdataset = pytest.importorskip("webdataset")
     reader = ShardReader(shards)
@@ -136,6 +138,8 @@ def test_webdataset_reads_every_sample_unchanged(shards):
     for number, entry in enumerate(reader.entries):
         for name in entry.members:
             assert read[entry.key][name] == reader.members(number)[name]
+    del row
+    gc.collect()  # webdataset leaves the shards open, of which only this test shall hear
 
 
 def test_select_by_ids_and_split(shards):
