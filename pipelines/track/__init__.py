@@ -16,13 +16,12 @@ def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path |
     """Name index, cameras, peaks, mattes, network weights and the head model's file."""
     from express50.capture.frames import frame_inputs
     from express50.capture.index import read_peaks
-    from express50.landmarks.sources import source_files
 
     found: dict[str, Path | str] = {
         "index": dataset.index_file(item),
         "cameras": dataset.cameras_file(item),
         "peaks": dataset.peaks_file(item),
-        **source_files(config.landmarks),
+        **_setting_files(config),
     }
     for expression in read_peaks(dataset, item):
         found |= frame_inputs(dataset, item, expression)
@@ -31,10 +30,17 @@ def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path |
         found["mattes"] = mattes
     if config.uv_rounds:
         found["face_uv"] = UV_WEIGHTS
+    return found
+
+
+def _setting_files(config: TrackConfig) -> dict[str, Path]:
+    from express50.landmarks.sources import source_files
+
+    found = source_files(config.landmarks)
     if config.head != "procedural":
         found["head"] = Path(config.head).expanduser()
     for name, setting in (("head", "head"), ("landmarks", "landmarks"), ("fan", "landmarks")):
-        if name in found and not Path(found[name]).exists():
+        if name in found and not found[name].exists():
             raise ConfigError(
                 f"track.{setting} is {getattr(config, setting)}: no such file; give its path, or"
                 " leave the setting out"
@@ -47,6 +53,7 @@ def try_files(config: TrackConfig) -> None:
     from express50.head.load import load_head
     from express50.landmarks.sources import EMBEDDED, try_source
 
+    _setting_files(config)
     if config.head != "procedural":
         load_head(config.head)
     if config.landmarks != EMBEDDED:
