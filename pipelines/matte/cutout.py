@@ -210,7 +210,7 @@ def _parts() -> dict[int, tuple[np.ndarray, ...]]:
     neck = _slab((0.03, 0.04), (chin, bottom - 0.05), back, 0.03)
     torso = _slab((0.07, 0.2, 0.24), (bottom, bottom - 0.08, bottom - 0.7), back, 0.1)
     hair = _slab((0.16, 0.18), (middle[1], bottom - 0.1), back, 0.12)
-    wide = _slab((0.2, 0.4, 0.45), (chin, bottom - 0.05, bottom - 0.9), back, 0.25)
+    wide = _slab((0.18, 0.3, 0.34), (chin, bottom - 0.05, bottom - 0.9), back, 0.25)
     sure, likely, reach = (middle + k * (skull - middle) for k in (SURE, LIKELY, HAIR))
     for part in (likely, reach):  # no hair grows before a face
         part[:, 2] = np.minimum(part[:, 2], skull[:, 2].max())
@@ -289,18 +289,19 @@ def _overruled(
     space = make_space(mattes, CELLS, slack)
     place = subject_place(space)
     return [
-        _cut(view, _labels(matte, evidence_of(matte, space, place)), guess)
+        _cut(view, _labels(matte, evidence_of(matte, space, place), guess), guess)
         if view.known is None
         else view.known
         for view, matte, guess in zip(views, mattes, guesses, strict=True)
     ]
 
 
-def _labels(view: MatteView, evidence: Evidence) -> np.ndarray:
-    """Return GrabCut's labels (h, w) by a view's mask and what the others say."""
+def _labels(view: MatteView, evidence: Evidence, guess: np.ndarray) -> np.ndarray:
+    """Return GrabCut's labels (h, w) by a view's mask, what the others say, and the guess."""
     inside = (view.alpha > 0) | evidence.solid
     labels = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-    labels[(evidence.known & ~evidence.possible) | ~view.valid] = cv2.GC_BGD
+    beyond = (evidence.known & ~evidence.possible) | (guess == cv2.GC_BGD)
+    labels[beyond | ~view.valid] = cv2.GC_BGD
     labels[cv2.erode(evidence.solid.astype(np.uint8), np.ones((5, 5))) > 0] = cv2.GC_FGD
     return labels
 
