@@ -26,8 +26,7 @@ from benchmarks.calibrate import rounded
 from express50.files.images import write_image
 from express50.files.video import iterate_video
 from express50.geometry.cameras import Camera, project, triangulate
-from express50.geometry.conventions import K_from_opencv
-from express50.geometry.transforms import make_transform
+from express50.rigs.read import read_rig
 from pipelines.calibrate.board import Board, BoardCorners, board_points, read_corners
 from pipelines.calibrate.board_rig import solve_rig
 from pipelines.calibrate.uncertainty import state_uncertainty
@@ -48,7 +47,7 @@ def main() -> int:
 
 def rig4_figures(folder: Path) -> dict[str, object]:
     """Return errors of our rig and of the peer's on the even frame sets."""
-    peer = peer_rig(folder / "camera_array.toml")
+    peer = dict(read_rig(folder / "camera_array.toml"))
     board, odd, even = seen_board(folder, peer)
     sizes = {name: (camera.width, camera.height) for name, camera in peer.items()}
     points = board_points(board)
@@ -64,18 +63,6 @@ def rig4_figures(folder: Path) -> dict[str, object]:
     }
 
 
-def peer_rig(path: Path) -> dict[str, Camera]:
-    """Read the cameras that caliscope solved."""
-    found = {}
-    for name, row in tomllib.loads(path.read_text())["cameras"].items():
-        K = K_from_opencv(np.array(row["matrix"]))
-        k1, k2, p1, p2, k3 = row["distortions"]
-        params = (K[0, 0], K[1, 1], K[0, 2], K[1, 2], k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
-        pose = make_transform(np.array(row["rotation"]), np.array(row["translation"]))
-        found[name] = Camera(name, row["size"][0], row["size"][1], "FULL_OPENCV", params, pose)
-    return found
-
-
 def seen_board(
     folder: Path, cameras: Mapping[str, Camera]
 ) -> tuple[Board, BoardCorners, BoardCorners]:
@@ -89,11 +76,11 @@ def seen_board(
     sets: dict[str, list[int]] = {name: [] for name in cameras}
     with (folder / "timestamps.csv").open() as rows:
         for row in csv.DictReader(rows):
-            sets[row["cam_id"]].append(int(row["sync_index"]))
+            sets[f"cam_{row['cam_id']}"].append(int(row["sync_index"]))
     with tempfile.TemporaryDirectory() as made:
         files: dict[str, list[Path]] = {name: [] for name in cameras}
         for name, numbers in sets.items():
-            footage = iterate_video(folder / f"cam_{name}.mp4")
+            footage = iterate_video(folder / f"{name}.mp4")
             for number, (_, image) in zip(sorted(numbers), footage, strict=True):
                 files[name].append(Path(made) / name / f"{number:06d}.png")
                 files[name][-1].parent.mkdir(exist_ok=True)

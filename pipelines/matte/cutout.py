@@ -93,7 +93,7 @@ class CutView:
 
 
 @dataclass(frozen=True)
-class _Place:
+class HeadPlace:
     """Where a mean head stands: world = scale * rotation @ head + shift."""
 
     scale: float
@@ -147,7 +147,7 @@ def cut_out(views: Sequence[CutView], ball: Ball | None) -> dict[str, Cut]:
     }
 
 
-def _place_head(views: Sequence[CutView]) -> _Place:
+def _place_head(views: Sequence[CutView]) -> HeadPlace:
     """Place the mean head by all faces found, or by the best of them."""
     # Imported here: cameras with plates need no network, and torch takes seconds to import.
     from express50.landmarks.detector import detect_many
@@ -165,12 +165,12 @@ def _place_head(views: Sequence[CutView]) -> _Place:
     points, _ = robust_triangulate([view for view, _ in found])
     known = np.isfinite(points[INNER]).all(1)
     if known.sum() >= LEAST_POINTS:
-        return _Place(*similarity_fit(head[INNER][known], points[INNER][known]))
+        return HeadPlace(*similarity_fit(head[INNER][known], points[INNER][known]))
     for view, face in sorted(found, key=lambda one: -one[1].score):
         pose, error = pose_of_face(face.points, face.sigma, view.camera, head)
         if np.isfinite(error):
             world = np.linalg.inv(view.camera.cam_from_world) @ pose
-            return _Place(1.0, world[:3, :3], world[:3, 3])
+            return HeadPlace(1.0, world[:3, :3], world[:3, 3])
     best = max((face.score for face in faces), default=0.0)
     raise NoFaceError(
         f"no face found (score {best:.2f}, expected {FACE_SCORE} or more), and without a plate a"
@@ -233,7 +233,7 @@ def _slab(
     ])  # fmt: skip
 
 
-def _guess(view: CutView, place: _Place) -> np.ndarray:
+def _guess(view: CutView, place: HeadPlace) -> np.ndarray:
     """Return GrabCut's labels (h, w) uint8 by where a person may be."""
     labels = np.full(view.valid.shape, cv2.GC_BGD, np.uint8)
     for value, parts in _parts().items():
