@@ -71,7 +71,7 @@ def test_depth_without_a_common_pixel_is_zero_with_zero_gradient():
         depth, torch.zeros(6, 6), torch.ones(6, 6), torch.ones(6, 6, dtype=torch.bool)
     )
     loss.backward()
-    assert float(loss) == 0 and torch.equal(depth.grad, torch.zeros(6, 6))
+    assert loss.item() == 0 and torch.equal(depth.grad, torch.zeros(6, 6))
 
 
 def test_depth_gradient():

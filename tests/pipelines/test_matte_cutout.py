@@ -66,8 +66,8 @@ def test_the_same_picture_gives_the_same_alpha(alpha: np.ndarray) -> None:
 @pytest.mark.parametrize("turns", [1, 3])
 def test_a_picture_on_its_side_is_cut_alike(alpha: np.ndarray, turns: int) -> None:
     turned = np.rot90(alpha_of(np.ascontiguousarray(np.rot90(data.astronaut(), turns))), -turns)
-    head = np.s_[:200, 120:330]
-    assert np.abs(turned - alpha)[head].mean() < 0.04
+    head = np.s_[:150, 120:330]  # whether the suit below is found depends on GrabCut's start
+    assert np.abs(turned - alpha)[head].mean() < 0.003
 
 
 @pytest.mark.parametrize(
