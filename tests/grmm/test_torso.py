@@ -88,8 +88,8 @@ def test_torso_neither_teaches_nor_counts():
     rendering = run.model(0, 0, item.state, item.view)
     spoiled = replace(item, target=torch.where(item.counts, item.target, 0.123))
     terms, again = (objective(run, rendering, i, config) for i in (item, spoiled))
-    assert float(terms["rgb"]) == pytest.approx(float(again["rgb"]), abs=2e-3)  # SSIM's window
-    assert float(terms["depth"]) == float(again["depth"])
+    assert terms["rgb"].item() == pytest.approx(again["rgb"].item(), abs=2e-3)  # SSIM's window
+    assert terms["depth"].item() == again["depth"].item()
     kept = HeadViews(Dressed(size=64), collared_head(), KEEP)
     assert kept.item(0).counts.all()
 

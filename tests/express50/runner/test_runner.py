@@ -214,7 +214,9 @@ def test_a_full_disk_stops_the_stage(tmp_path, workers):
     assert not dataset.item_dir("toy", "z5").exists()
     (dataset.root / "in" / "full1.txt").write_text("repaired")
     again = statuses(run_toy(dataset, workers=workers, seconds=0.1))
-    assert again["a"] == "skipped" and set(again.values()) == {"done", "skipped"}
+    # With two workers the item before is still being computed when the disk turns out to be full.
+    assert again["full1"] == "done" and (workers or again["a"] == "skipped")
+    assert set(again.values()) <= {"done", "skipped"}
 
 
 def test_a_nearly_full_disk_stops_before_an_item_is_computed(tmp_path, monkeypatch):
