@@ -93,6 +93,7 @@ def main() -> int:
     )
     parser.add_argument("--dataset", type=Path, help="a twin dataset (default: one is recorded)")
     parser.add_argument("--truth", type=Path, help="its truth")
+    parser.add_argument("--subject", type=int, default=RIG.first_subject, help="of the twin")
     parser.add_argument("--recording", type=Path, default=Path("build/bench-views"))
     parser.add_argument("--peaks", type=int, default=2, help="moments, at most")
     parser.add_argument("--set", dest="assignments", action="append", default=[])
@@ -103,7 +104,7 @@ def main() -> int:
     if (args.dataset is None) != (args.truth is None):
         sys.exit("name both --dataset and --truth, or neither")
     if args.dataset is None:
-        dataset, truth = recorded(RIG, args.recording)
+        dataset, truth = recorded(replace(RIG, first_subject=args.subject), args.recording)
     else:
         dataset, truth = Dataset(args.dataset), Truth(args.truth)
     configs = {name: resolve_config(STAGE, name, None, args.assignments) for name in PRESETS}
@@ -139,7 +140,12 @@ def main() -> int:
         **summary(rows),
         "no_plate": bare_summary(bare),
         "plates": {
-            name: rounded({key: float(np.mean([row[key] for row in mine])) for key in mine[0]})
+            name: rounded(
+                {
+                    key: float(np.mean([row[key] for row in mine if key in row]))
+                    for key in {key: None for row in mine for key in row}
+                }
+            )
             for name, mine in plates.items()
         },
     }
@@ -253,7 +259,7 @@ def with_plates(wrong: list[Shot], right: list[Shot]) -> Figures:
             ("sad", matched.plate), ("sad_untouched", shot.plate), ("sad_right", good.plate)
         ):  # fmt: skip
             kept[name].append(errors(key(replace(shot, plate=plate)).alpha / 255, shot.true)["sad"])
-    means = {name: float(np.mean(values)) if values else 0.0 for name, values in kept.items()}
+    means = {name: float(np.mean(values)) for name, values in kept.items() if values}
     return means | {"refused": refused / len(wrong)}
 
 

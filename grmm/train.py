@@ -9,6 +9,7 @@ steers the rate.
 from __future__ import annotations
 
 import os
+import shutil
 import time
 from datetime import timedelta
 from pathlib import Path
@@ -112,8 +113,10 @@ def train(
             if rank == 0 and (due or last):
                 spare.unlink(missing_ok=True)
                 save(state, checkpoint, config, source.head)
+                if not last:
+                    shutil.copyfile(checkpoint, spare)
                 saved = state.seconds
-            elif rank == 0 and not spare.exists():
+            elif rank == 0 and not spare.exists():  # how large the first one will be
                 save(state, spare, config, source.head)
             if interrupt.is_set():  # only now, after the save
                 raise KeyboardInterrupt

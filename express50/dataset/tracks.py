@@ -182,18 +182,15 @@ def read_registration(path: Path) -> Registration:
         raise FormatError(f"{path}: not a registration ({words}); {again}") from None
 
 
-def registration_of(
-    dataset: Dataset, subject: str, track: Track, expression: str
-) -> Registration | None:
-    """Return an expression's registration; None where there is none.
+def registration_of(path: Path, track: Track, digest: str) -> Registration | None:
+    """Return the registration in a file, of a track whose file has a digest; None without a file.
 
     Raises:
         FormatError: it is damaged, or of another track.
     """
-    path = dataset.registration_file(subject, expression)
     if not path.is_file():
         return None
-    found, digest = read_registration(path), file_sha256(dataset.track_file(subject))
+    found = read_registration(path)
     if found.track != digest or found.vertices.shape != track.vertices.shape[1:]:
         raise FormatError(f"{path}: is of another track; run 'express50 register' again")
     return found
@@ -205,9 +202,10 @@ def best_vertices(dataset: Dataset, subject: str, track: Track) -> np.ndarray:
     Raises:
         FormatError: a registration is damaged, or of another track.
     """
-    vertices = track.vertices.copy()
+    vertices, digest = track.vertices.copy(), file_sha256(dataset.track_file(subject))
     for row, expression in enumerate(track.expressions):
-        found = registration_of(dataset, subject, track, expression)
+        path = dataset.registration_file(subject, expression)
+        found = registration_of(path, track, digest)
         if found is not None:
             vertices[row] = found.vertices
     return vertices

@@ -58,7 +58,7 @@ def check_space(folder: Path) -> None:
         DiskFullError: less than `LEAST_FREE` is left.
     """
     usage = shutil.disk_usage(folder)
-    if usage.total and usage.free < LEAST_FREE:  # some network drives do not tell their size
+    if usage.total and usage.free < LEAST_FREE:  # some network drives do not report their size
         raise _full(folder, f"{usage.free / 1e6:.0f} MB are left, expected {LEAST_FREE / 1e6:.0f}")
 
 

@@ -25,6 +25,11 @@ def corner_to_opencv_pixels(pixels: np.ndarray) -> np.ndarray:
     return np.asarray(pixels, dtype=np.float64) - 0.5
 
 
+def mirror_opencv_pixels(pixels: np.ndarray, width: int) -> np.ndarray:
+    """Return OpenCV's pixels (N, 2) of an image flipped left to right, `width` pixels wide."""
+    return np.stack([width - 1 - pixels[:, 0], pixels[:, 1]], axis=1)
+
+
 def K_to_opencv(K: np.ndarray) -> np.ndarray:
     """Return K (3, 3) as OpenCV's functions expect it (principal point less half a pixel)."""
     shifted = np.array(K, dtype=np.float64)

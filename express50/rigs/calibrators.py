@@ -41,7 +41,7 @@ def read_calibration_toml(path: Path) -> dict[str, Camera]:
     table = read_toml(path, CalibrationError)
     rows = table.get("cameras", table)
     if not isinstance(rows, dict):
-        raise CalibrationError(f"{path}: cameras is no table; expected [cameras.0] and so on")
+        raise CalibrationError(f"{path}: cameras is not a table, expected [cameras.0] and so on")
     prefix = "cam_" if rows is not table else ""
     return as_rig(
         (

@@ -78,8 +78,8 @@ def _metashape_camera(
     lens = next((c for c in found if c.get("class") == "adjusted"), found[-1] if found else None)
     if lens is None or lens.get("type") != "frame":
         raise CalibrationError(
-            f"{where}: has no frame lens, expected an aligned camera that is no fisheye; undistort"
-            " first"
+            f"{where}: has no frame lens, expected an aligned camera that is not a fisheye;"
+            " undistort first"
         )
     value = {e.tag: _numbers(where, lens, e.tag, 1)[0] for e in lens if e.tag in TERMS}
     odd = [key for key in ("k4", "p3", "p4") if value.get(key)]

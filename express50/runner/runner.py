@@ -265,7 +265,7 @@ def _compare(
 
 
 def _is_there(task: Task, made: Made | None, ledger: Ledger) -> bool:
-    """Return whether an item's folder is the one that its receipt tells of.
+    """Return whether an item's folder is the one that its receipt describes.
 
     A run may have been killed after it had published another and before the new receipt.
     """

@@ -105,7 +105,7 @@ def run_task(task: Task) -> Receipt:
     Only a receipt travels back to the driver, never data.
 
     Raises:
-        DiskFullError: there is no room for the outputs, nor for any other item's.
+        DiskFullError: the disk has no room for the outputs; the other items' would fail alike.
     """
     cap_threads(task.threads)
     reset_peak_memory()

@@ -19,7 +19,7 @@ import numpy as np
 
 from express50.errors import CalibrationError
 from express50.files.containers import read_picture
-from express50.geometry.conventions import opencv_pixels_to_corner
+from express50.geometry.conventions import mirror_opencv_pixels, opencv_pixels_to_corner
 
 REQUIRED = ("squares_x", "squares_y", "square_length_m", "marker_length_m", "dictionary")
 ENOUGH = 4  # corners that show which way an image is to be read
@@ -148,7 +148,7 @@ def detect_corners(
         if found is not None and len(found) > len(ids):
             ids, corners = np.asarray(found, int).reshape(-1), np.asarray(at, float).reshape(-1, 2)
             if mirrored:
-                corners[:, 0] = grey.shape[1] - 1 - corners[:, 0]
+                corners = mirror_opencv_pixels(corners, grey.shape[1])
         if len(ids) >= ENOUGH:
             break
     if len(ids) == 0:

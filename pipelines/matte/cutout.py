@@ -93,6 +93,14 @@ class CutView:
 
 
 @dataclass(frozen=True)
+class PersonGuess:
+    """Where a person may be: GrabCut's labels (h, w) uint8, and pixels per metre of the head."""
+
+    labels: np.ndarray
+    density: float
+
+
+@dataclass(frozen=True)
 class HeadPlace:
     """Where a mean head stands: world = scale * rotation @ head + shift."""
 
@@ -101,9 +109,9 @@ class HeadPlace:
     shift: np.ndarray
 
     def density(self, camera: Camera) -> float:
-        """Return pixels per metre of the head in a camera, negative behind it."""
+        """Return pixels per metre of the head in a camera."""
         depth = camera.cam_from_world[2, :3] @ self.shift + camera.cam_from_world[2, 3]
-        return float(camera.K[0, 0] * self.scale / depth)
+        return float(camera.K[0, 0] * self.scale / max(depth, LEAST_DEPTH * self.scale))
 
     def pixels(self, points: np.ndarray, camera: Camera) -> np.ndarray:
         """Project points (N, 3) of head space, those before the camera, to pixels (M, 2)."""
@@ -135,15 +143,15 @@ def cut_out(views: Sequence[CutView], ball: Ball | None) -> dict[str, Cut]:
     small = [_at_scale(view, PIXEL_M * place.density(view.camera)) for view in views]
     guesses = [_guess(view, place) for view in small]
     masks = [
-        _cut(view, guess, guess) if view.known is None else view.known
+        _cut(view, guess.labels, guess) if view.known is None else view.known
         for view, guess in zip(small, guesses, strict=True)
     ]
     if ball is not None and len(views) >= FEWEST:
         for slack in SLACK_PX:
             masks = _overruled(small, guesses, masks, ball, slack)
     return {
-        view.name: Cut(mask, place.density(view.camera))
-        for view, mask in zip(small, masks, strict=True)
+        view.name: Cut(mask, guess.density)
+        for view, mask, guess in zip(small, masks, guesses, strict=True)
     }
 
 
@@ -233,8 +241,7 @@ def _slab(
     ])  # fmt: skip
 
 
-def _guess(view: CutView, place: HeadPlace) -> np.ndarray:
-    """Return GrabCut's labels (h, w) uint8 by where a person may be."""
+def _guess(view: CutView, place: HeadPlace) -> PersonGuess:
     labels = np.full(view.valid.shape, cv2.GC_BGD, np.uint8)
     for value, parts in _parts().items():
         for points in parts:
@@ -244,15 +251,15 @@ def _guess(view: CutView, place: HeadPlace) -> np.ndarray:
                 cells = corner_to_cell(np.clip(pixels, -far, far))
                 hull = cv2.convexHull(cells.astype(np.float32))
                 cv2.fillConvexPoly(labels, hull.round().astype(np.int32), value)
-    return labels
+    return PersonGuess(labels, place.density(view.camera))
 
 
-def _cut(view: CutView, labels: np.ndarray, guess: np.ndarray) -> np.ndarray:
+def _cut(view: CutView, labels: np.ndarray, guess: PersonGuess) -> np.ndarray:
     """Run GrabCut from labels (h, w); returns the person's mask (h, w), small holes filled.
 
-    Parts that do not touch where the person surely is, by the `guess` (h, w), are left out.
+    Parts that do not touch where the person surely is, by the `guess`, are left out.
     """
-    sure = guess == cv2.GC_FGD
+    sure = guess.labels == cv2.GC_FGD
     if not sure.any():  # the person is out of view
         return np.zeros(labels.shape, bool)
     if not np.isin(labels, (cv2.GC_BGD, cv2.GC_PR_BGD)).any():
@@ -267,12 +274,12 @@ def _cut(view: CutView, labels: np.ndarray, guess: np.ndarray) -> np.ndarray:
     person = np.isin(parts, np.unique(parts[sure & inside])) & inside
     holes = binary_fill_holes(person) & ~person
     _, parts, stats, _ = cv2.connectedComponentsWithStats(holes.astype(np.uint8), connectivity=4)
-    return person | (holes & (stats[:, cv2.CC_STAT_AREA] < HOLE_M2 / PIXEL_M**2)[parts])
+    return person | (holes & (stats[:, cv2.CC_STAT_AREA] < HOLE_M2 * guess.density**2)[parts])
 
 
 def _overruled(
     views: Sequence[CutView],
-    guesses: Sequence[np.ndarray],
+    guesses: Sequence[PersonGuess],
     masks: Sequence[np.ndarray],
     ball: Ball,
     slack: float,
@@ -289,7 +296,7 @@ def _overruled(
     space = make_space(mattes, CELLS, slack)
     place = subject_place(space)
     return [
-        _cut(view, _labels(matte, evidence_of(matte, space, place), guess), guess)
+        _cut(view, _labels(matte, evidence_of(matte, space, place), guess.labels), guess)
         if view.known is None
         else view.known
         for view, matte, guess in zip(views, mattes, guesses, strict=True)

@@ -22,6 +22,7 @@ from express50.files.images import (
     LIGHT_OF_LEVEL,
     linear_to_srgb,
     scaled_levels,
+    shrink,
     srgb_to_linear,
 )
 from express50.geometry.conventions import affine_from_opencv, affine_to_opencv
@@ -147,6 +148,8 @@ def _rim(shape: tuple[int, ...], share: float) -> np.ndarray:
 
 def _explained(plate: np.ndarray, frame: np.ndarray, rim: np.ndarray) -> float:
     """Return the share of a rim (H, W) where plate and frame differ by less than noise does."""
+    plate, frame = shrink(plate, ALIGN_SIDE), shrink(frame, ALIGN_SIDE)
+    rim = shrink(rim.astype(np.uint8) * 255, ALIGN_SIDE) == 255
     if not rim.any():  # nothing speaks against the plate
         return 1.0
     off = frame.astype(np.float32) - exposed(plate, exposure_gain(frame, plate))

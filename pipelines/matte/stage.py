@@ -154,10 +154,10 @@ def _plate(
             " 'express50 ingest' and 'express50 frames' again, or set matte.method to key, grabcut"
             " or salient"
         )
-    if plate is None:
-        return None, ""
+    if plate is None or config.method == "bgmv2":
+        return plate, ""
     matched = match_plate(plate, frame, valid)
-    if matched.share >= LEAST_SHARE or config.method == "bgmv2":
+    if matched.share >= LEAST_SHARE:
         return matched.plate, ""
     return None, (
         f"its plate explains {matched.share:.0%} of the frame's top and sides, expected"

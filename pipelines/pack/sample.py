@@ -20,6 +20,7 @@ from express50.dataset.tracks import (
     registration_of,
 )
 from express50.errors import FormatError, StageError
+from express50.files.digests import file_sha256
 from express50.files.images import (
     DEPTH_LIMIT_M,
     DEPTH_UNIT_M,
@@ -123,10 +124,11 @@ def _read_registered(
     dataset: Dataset, name: str, track: Track
 ) -> tuple[dict[str, Registration], list[Note]]:
     """Read a subject's registrations by expression, and why one cannot be packed."""
-    found, notes = {}, []
+    found, notes, digest = {}, [], file_sha256(dataset.track_file(name))
     for expression in track.expressions:
+        path = dataset.registration_file(name, expression)
         try:
-            registration = registration_of(dataset, name, track, expression)
+            registration = registration_of(path, track, digest)
         except FormatError as error:
             notes.append(Note(f"{name}/{expression}", f"packed without its registration: {error}"))
             continue

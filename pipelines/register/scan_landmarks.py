@@ -63,7 +63,9 @@ def read_landmarks(path: Path) -> np.ndarray:
                 raise ValueError(f"point {name} is there twice")
             points[place] = xyz
     except (ValueError, ArithmeticError, TypeError, LookupError, ElementTree.ParseError) as error:
-        raise FormatError(f"{path}: no landmarks of a scan ({reason(error)}); {_FIX}") from None
+        raise FormatError(
+            f"{path}: cannot be read as landmarks of a scan ({reason(error)}); {_FIX}"
+        ) from None
     return points
 
 

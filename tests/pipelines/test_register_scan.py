@@ -170,10 +170,14 @@ def test_landmarks_are_read_in_any_layout(tmp_path):
         ("a.csv", "68,0,0,0", "from 0 to 67"),
         ("a.csv", "nose_tip,0,0,0\npronasale,0,0,0", "twice"),
         ("a.json", "[[NaN, 0, 0]]", "NaN"),
-        ("a.json", '{"chin": 3}', "no landmarks"),
-        ("a.json", "7", "no landmarks"),
-        ("a.pp", "<PickedPoints><point/>", "no landmarks"),
-        ("a.pp", '<PickedPoints><point x="0" y="0" name="chin"/></PickedPoints>', "no landmarks"),
+        ("a.json", '{"chin": 3}', "cannot be read as landmarks"),
+        ("a.json", "7", "cannot be read as landmarks"),
+        ("a.pp", "<PickedPoints><point/>", "cannot be read as landmarks"),
+        (
+            "a.pp",
+            '<PickedPoints><point x="0" y="0" name="chin"/></PickedPoints>',
+            "cannot be read as landmarks",
+        ),
     ],
 )
 def test_wrong_landmarks_are_one_clear_line(tmp_path, name, text, words):

@@ -250,7 +250,7 @@ def test_a_metashape_chunk_without_a_world_is_its_own(tmp_path):
         ("qualisys", "</calibration>", "", "not XML"),
         ("qualisys", "<calibration>", "<!DOCTYPE a><calibration>", "document type"),
         ("metashape", "<k3>", "<k4>0.01</k4><k3>", "has k4, expected"),
-        ("metashape", 'type="frame" class="adj', 'type="fisheye" class="adj', "no fisheye"),
+        ("metashape", 'type="frame" class="adj', 'type="fisheye" class="adj', "not a fisheye"),
         ("metashape", 'jpg"><transform>', 'jpg"><transform>1 ', r"shape \(17,\)"),
         ("metashape", 'component_id="0"', 'component_id="1"', "2 components"),
         ("metashape", 'sensor_id="0"', 'sensor_id="5"', "has no frame lens"),
