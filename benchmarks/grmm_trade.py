@@ -28,7 +28,7 @@ from express50.files.atomic import write_json
 from express50.files.text import markdown_table
 from express50.head.load import load_head
 from grmm.config import Config, as_tables, from_tables, resolve
-from grmm.data import HeadViews, Sample, SampleKey, Source, spread
+from grmm.data import HeadViews, Place, Sample, SampleKey, Source, spread
 from grmm.evaluate import evaluate, mean, training_render
 from grmm.shard_source import open_shards
 from grmm.train import step
@@ -80,6 +80,12 @@ class Smaller:
             parts=None if sample.parts is None else sample.parts[:height:by, :width:by].copy(),
             K=np.diag([1 / by, 1 / by, 1.0]) @ sample.K,
         )
+
+    def place(self, index: int) -> Place:
+        """Return one sample's place in the reduced picture."""
+        place, by = self.source.place(index), self.factor
+        height, width = (side // by for side in place.size)
+        return replace(place, K=np.diag([1 / by, 1 / by, 1.0]) @ place.K, size=(height, width))
 
 
 def train_for(views: HeadViews, config: Config) -> tuple[torch.nn.Module, int]:

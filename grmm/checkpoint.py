@@ -5,7 +5,6 @@ Written whole or not at all, read with ``weights_only``: nothing in a checkpoint
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from torch import Tensor
 
 from express50.errors import ConfigError, FormatError, HeadModelError
 from express50.files.arrays import read_weights
-from express50.files.atomic import write_bytes
+from express50.files.atomic import write_with
 from express50.files.text import reason
 from express50.geometry.shapes import PIXEL_LIMIT, check_shape
 from express50.head.load import load_head
@@ -28,6 +27,7 @@ from grmm.model import GRMM, PinholeView
 from grmm.networks import Networks
 
 FORMAT = "grmm.checkpoint/1"
+PARAMETERS = ("shape", "expression", "neck", "jaw", "eyes", "R", "t")  # of a frame
 ANY = object()
 # Settings of older checkpoints and the value that this version computes with; no result depends
 # on those with ANY.
@@ -93,9 +93,9 @@ def collect_gallery(views: HeadViews, indices: Sequence[int]) -> Gallery:
     for index in indices:
         key = views.keys[index]
         if key.frame not in frames or key.camera not in cameras:
-            sample = views.sample(index)
-            frames.setdefault(key.frame, sample.tracked)
-            cameras.setdefault(key.camera, views.view_of(sample))
+            place = views.place(index)
+            frames.setdefault(key.frame, place.tracked)
+            cameras.setdefault(key.camera, views.view_of(place))
     return Gallery(frames=frames, cameras=cameras)
 
 
@@ -110,12 +110,14 @@ def save_checkpoint(
     loop: dict[str, Any] | None = None,
 ) -> None:
     """Write a checkpoint in one step; a former one stays until the new one is whole."""
-    arrays = {
-        frame: {n: torch.from_numpy(np.ascontiguousarray(a)) for n, a in vars(tracked).items()}
-        for frame, tracked in gallery.frames.items()
+    # One array per parameter: thousands of small ones take seconds to write. Offsets once per
+    # subject: they are larger than all other parameters together.
+    frames = gallery.frames
+    parameters = {
+        name: torch.from_numpy(_stacked([getattr(frame, name) for frame in frames.values()]))
+        for name in PARAMETERS
     }
-    # Once per subject: offsets are larger than all other parameters together.
-    offsets = {s: parameters.pop("offsets") for (s, _), parameters in arrays.items()}
+    offsets = {s: torch.from_numpy(np.ascontiguousarray(t.offsets)) for (s, _), t in frames.items()}
     content = {
         "format": FORMAT,
         "config": as_tables(config),
@@ -123,10 +125,8 @@ def save_checkpoint(
         "subjects": list(model.subjects),
         "expressions": list(model.expressions),
         "model": model.state_dict(),
-        "frames": [
-            {"subject": s, "expression_id": e, "parameters": parameters}
-            for (s, e), parameters in arrays.items()
-        ],
+        "frames": [{"subject": s, "expression_id": e} for s, e in frames],
+        "parameters": parameters,
         "offsets": offsets,
         "cameras": {
             name: vars(view) | {"K": view.K.cpu(), "cam_from_head": view.cam_from_head.cpu()}
@@ -138,6 +138,12 @@ def save_checkpoint(
     write_content(path, content)
 
 
+def _stacked(rows: Sequence[np.ndarray]) -> np.ndarray:
+    """Stack arrays (n, ...) of several lengths: missing trailing coefficients are zeros."""
+    length = max(map(len, rows))
+    return np.stack([np.pad(r, [(0, length - len(r))] + [(0, 0)] * (r.ndim - 1)) for r in rows])
+
+
 def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Loaded:
     """Read a checkpoint and build its model.
 
@@ -147,7 +153,7 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Loaded:
     """
     content = read_content(path)
     try:
-        for part in ("model", "frames", "offsets", "cameras"):
+        for part in ("model", "frames", "parameters", "offsets", "cameras"):
             _check_finite(path, part, content.get(part, {}))
         config = from_tables(_current_settings(path, content["config"]))
         head = load_head(content["head"]).to(device)
@@ -183,9 +189,7 @@ def read_content(path: Path) -> dict[str, Any]:
 
 def write_content(path: Path, content: dict[str, Any]) -> None:
     """Write the tables of a checkpoint in one step."""
-    buffer = io.BytesIO()
-    torch.save(content, buffer)
-    write_bytes(path, buffer.getvalue())
+    write_with(path, lambda file: torch.save(content, file))
 
 
 def _check_finite(path: Path, name: str, value: object) -> None:
@@ -249,9 +253,12 @@ def _gallery(
     """Return the frames and cameras of a file's content; an image may have the cameras' sizes."""
     offsets = {name: tensor.numpy() for name, tensor in content.get("offsets", {}).items()}
     frames = {}
-    for row in content["frames"]:
+    stacks = {name: tensor.numpy() for name, tensor in content.get("parameters", {}).items()}
+    for number, row in enumerate(content["frames"]):
         subject, expression = row["subject"], row["expression_id"]
-        arrays = {name: tensor.numpy() for name, tensor in row["parameters"].items()}
+        arrays = {name: stack[number] for name, stack in stacks.items()}
+        if "parameters" in row:  # as it was stored before
+            arrays = {name: tensor.numpy() for name, tensor in row["parameters"].items()}
         tracked = Tracked(**arrays, offsets=offsets.get(subject, NO_OFFSETS))
         check_tracked(f"{path}: {subject}/{expression}", tracked, head)
         frames[subject, expression] = tracked

@@ -161,7 +161,8 @@ class TrainConfig:
     seed: int = 0
     """Seed of weights, order and a fit's random cameras."""
     save_seconds: float = 120.0
-    """Training time between checkpoints, the most that a kill may cost. 0: only one, at the end."""
+    """Training time between checkpoints, the most that a kill may cost, unless saving would take
+    over a twentieth of the time. 0: only one, at the end."""
     evaluate_images: int = 32
     """Images evaluated for metrics.json, evenly chosen."""
 

@@ -7,9 +7,9 @@ parameters once per (subject, expression) and kept.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -25,6 +25,8 @@ from grmm.model import HeadState, PinholeView
 NO_OFFSETS = np.zeros((0, 3), np.float32)
 CACHE_BYTES = 512 << 20  # of decoded samples: some hundred of 512 px
 DEFAULTS = DataConfig()  # black behind the head, torso ignored
+Key = TypeVar("Key", bound=Hashable)
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +70,23 @@ class Tracked:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Place:
+    """Where one view's camera and head are: a sample without its pictures.
+
+    Attributes:
+        K: (3, 3) pixels, corner origin.
+        cam_from_world: (4, 4).
+        tracked: head-model parameters.
+        size: (H, W) of the view.
+    """
+
+    K: np.ndarray
+    cam_from_world: np.ndarray
+    tracked: Tracked
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Sample:
     """One decoded view as the shards hold it.
 
@@ -90,6 +109,17 @@ class Sample:
     parts: np.ndarray | None = None
 
     @property
+    def place(self) -> Place:
+        """Return what remains without the pictures."""
+        height, width = self.alpha.shape
+        return Place(
+            K=self.K,
+            cam_from_world=self.cam_from_world,
+            tracked=self.tracked,
+            size=(height, width),
+        )
+
+    @property
     def nbytes(self) -> int:
         """Return the memory that its images take."""
         images = (self.image, self.alpha, self.depth, self.parts)
@@ -106,6 +136,10 @@ class Source(Protocol):
 
     def read(self, index: int) -> Sample:
         """Decode one sample."""
+        ...
+
+    def place(self, index: int) -> Place:
+        """Return a sample's place without decoding a picture: training asks for thousands."""
         ...
 
 
@@ -138,16 +172,38 @@ class Item:
         return torch.where(self.counts, image, self.target)
 
 
+class Cache(Generic[Key, Value]):
+    """Keeps what was made last, up to so many bytes; the newest entry always stays."""
+
+    def __init__(self, limit: int, size: Callable[[Value], int]) -> None:
+        """Hold entries whose ``size``, bytes, adds up to at most ``limit``."""
+        self.limit, self.size, self.bytes = limit, size, 0
+        self.entries: OrderedDict[Key, Value] = OrderedDict()
+
+    def get(self, key: Key, make: Callable[[], Value]) -> Value:
+        """Return an entry, made if it is not there."""
+        if key in self.entries:
+            self.entries.move_to_end(key)
+            return self.entries[key]
+        value = self.entries[key] = make()
+        self.bytes += self.size(value)
+        while self.bytes > self.limit and len(self.entries) > 1:
+            self.bytes -= self.size(self.entries.popitem(last=False)[1])
+        return value
+
+
 class HeadViews:
-    """Samples of a source as items, with a bounded cache of decoded samples."""
+    """Samples of a source as items, with bounded caches of what took time to make."""
 
     def __init__(self, source: Source, head: HeadModel, data: DataConfig = DEFAULTS) -> None:
         """Wrap a source whose parameters belong to ``head``, on whose device items will be."""
         self.source, self.head = source, head
         self.background, self.ignore_torso = data.background, data.torso == "ignore"
-        self._torsos: dict[int, np.ndarray] = {}
-        self._cache: OrderedDict[int, Sample] = OrderedDict()
-        self._states: dict[tuple[str, str], HeadState] = {}
+        self._samples: Cache[int, Sample] = Cache(CACHE_BYTES, lambda sample: sample.nbytes)
+        self._torsos: Cache[int, np.ndarray] = Cache(CACHE_BYTES // 8, lambda bits: bits.nbytes)
+        self._states: Cache[tuple[str, str], HeadState] = Cache(
+            CACHE_BYTES // 2, lambda state: state.vertices.nbytes
+        )
 
     @property
     def keys(self) -> Sequence[SampleKey]:
@@ -162,7 +218,7 @@ class HeadViews:
         """
         sample, state = self.sample(index), self.state(index)
         height, width = sample.alpha.shape
-        view = self.view_of(sample)
+        view = self.view_of(sample.place)
         torso = self._torso(index, sample, state, view)
         rows, columns = slice(0, height), slice(0, width)
         if crop:
@@ -193,10 +249,12 @@ class HeadViews:
             return np.zeros(size, bool)
         if sample.parts is not None:
             return labelled_torso(sample.parts)
-        if index not in self._torsos:
+
+        def make() -> np.ndarray:
             mask = torso_mask(self.head, state.vertices, view, sample.alpha, sample.depth)
-            self._torsos[index] = np.packbits(mask)
-        bits = np.unpackbits(self._torsos[index], count=size[0] * size[1])
+            return np.packbits(mask)
+
+        bits = np.unpackbits(self._torsos.get(index, make), count=size[0] * size[1])
         return bits.reshape(size).astype(bool)
 
     def sample(self, index: int) -> Sample:
@@ -205,13 +263,11 @@ class HeadViews:
         Raises:
             FormatError: its images differ in size, or its parameters do not fit the head model.
         """
-        if index in self._cache:
-            self._cache.move_to_end(index)
-            return self._cache[index]
+        return self._samples.get(index, lambda: self._read(index))
+
+    def _read(self, index: int) -> Sample:
         sample = self.source.read(index)
-        key = self.keys[index]
-        where = f"{key.subject}/{key.expression}/{key.camera}"
-        size = sample.image.shape[:2]
+        where, size = self._where(index), sample.image.shape[:2]
         for name in ("alpha", "depth", "parts"):
             array = getattr(sample, name)
             if array is not None and array.shape != size:
@@ -219,28 +275,32 @@ class HeadViews:
                     f"{where}: {name} is {array.shape}, expected the image's size {size}; pack the "
                     "dataset again"
                 )
-        check_tracked(where, sample.tracked, self.head)
-        self._cache[index] = sample
-        while len(self._cache) > 1 and sum(s.nbytes for s in self._cache.values()) > CACHE_BYTES:
-            self._cache.popitem(last=False)
         return sample
+
+    def _where(self, index: int) -> str:
+        key = self.keys[index]
+        return f"{key.subject}/{key.expression}/{key.camera}"
+
+    def place(self, index: int) -> Place:
+        """Return a sample's place; a FormatError refuses parameters of another head model."""
+        place = self.source.place(index)
+        check_tracked(self._where(index), place.tracked, self.head)
+        return place
 
     def state(self, index: int) -> HeadState:
         """Return the tracked head of a sample, posed once per (subject, expression)."""
-        frame = self.keys[index].frame
-        if frame not in self._states:
-            self._states[frame] = pose_state(self.head, self.sample(index).tracked)
-        return self._states[frame]
+        return self._states.get(
+            self.keys[index].frame, lambda: pose_state(self.head, self.place(index).tracked)
+        )
 
-    def view_of(self, sample: Sample) -> PinholeView:
-        """Return a sample's camera in head space, float64: subjects may be far from the origin."""
-        height, width = sample.alpha.shape
-        camera = sample.cam_from_world @ make_transform(sample.tracked.R, sample.tracked.t)
+    def view_of(self, place: Place) -> PinholeView:
+        """Return a camera in head space, float64: subjects may be far from the origin."""
+        camera = place.cam_from_world @ make_transform(place.tracked.R, place.tracked.t)
         return PinholeView(
-            K=torch.as_tensor(sample.K, dtype=torch.float64, device=self.head.device),
+            K=torch.as_tensor(place.K, dtype=torch.float64, device=self.head.device),
             cam_from_head=torch.as_tensor(camera, dtype=torch.float64, device=self.head.device),
-            width=width,
-            height=height,
+            width=place.size[1],
+            height=place.size[0],
         )
 
     def _tensor(self, array: np.ndarray) -> Tensor:

@@ -290,7 +290,7 @@ def locality_loss(state: FitState, item: Item, rng: np.random.Generator) -> Tens
     mine = HeadCodes(
         z_id=state.z_id,
         z_exp=state.z_exp[item.key.expression],
-        tracked=state.views.sample(own).tracked,
+        tracked=state.views.place(own).tracked,
     )
     head = between(trained_head(state.loaded, *frame), mine, LOCALITY_T)
     scene = (head.z_id, head.z_exp, head.state(state.loaded), view, state.views.background)

@@ -13,7 +13,7 @@ import numpy as np
 from express50.errors import ConfigError, FormatError
 from express50.files.digests import text_digest
 from express50.shards.reader import ShardReader
-from grmm.data import Sample, SampleKey, Tracked
+from grmm.data import Place, Sample, SampleKey, Tracked
 
 INSET_PX = 2  # of the footage's border: undistortion has nothing to put there
 SIZES: dict[str, tuple[int, ...] | None] = {  # of what is tracked; None: any vector
@@ -55,7 +55,24 @@ class ShardSource:
             FormatError: it is damaged, or was tracked with another head model than the first.
         """
         sample = self.reader.sample(index)
-        meta, where = sample["meta"], f"{self.reader.root}: {sample['key']}"
+        place = self._place(index, sample["meta"])
+        rows, columns, _ = seen_window(sample["meta"], sample["key"])
+        return Sample(
+            image=sample["rgb"][rows, columns],
+            alpha=np.rint(sample["alpha"] * 255).astype(np.uint8)[rows, columns],
+            depth=sample["depth"][rows, columns] if sample["valid"].any() else None,
+            K=place.K,
+            cam_from_world=place.cam_from_world,
+            parts=None if sample["parts"] is None else sample["parts"][rows, columns],
+            tracked=place.tracked,
+        )
+
+    def place(self, index: int) -> Place:
+        """Read a sample's place from its meta alone; errors are those of `read`."""
+        return self._place(index, self.reader.meta(index))
+
+    def _place(self, index: int, meta: dict) -> Place:
+        where = f"{self.reader.root}: {self.reader.entries[index].key}"
         if meta.get("head") != self.head:
             raise FormatError(
                 f"{where}: tracked with head model {meta.get('head')!r}, the first sample with "
@@ -64,14 +81,11 @@ class ShardSource:
         rows, columns, _ = seen_window(meta, where)
         K = _matrix(meta, "K", (3, 3), where)
         K[:2, 2] -= columns.start, rows.start
-        return Sample(
-            image=sample["rgb"][rows, columns],
-            alpha=np.rint(sample["alpha"] * 255).astype(np.uint8)[rows, columns],
-            depth=sample["depth"][rows, columns] if sample["valid"].any() else None,
+        return Place(
             K=K,
             cam_from_world=_matrix(meta, "cam_from_world", (4, 4), where),
-            parts=None if sample["parts"] is None else sample["parts"][rows, columns],
             tracked=self._tracked(meta, self.keys[index].subject, where),
+            size=(rows.stop - rows.start, columns.stop - columns.start),
         )
 
     def window(self, index: int) -> tuple[slice, slice, tuple[int, int]]:
@@ -119,14 +133,19 @@ class MixedSource:
                         f"{owners[subject].reader.root}; expected other ids in every dataset: "
                         "rename the capture and pack it again"
                     )
-        self._places = [(source, i) for source in sources for i in range(len(source.keys))]
-        self.keys: Sequence[SampleKey] = [source.keys[i] for source, i in self._places]
+        self._sources = [(source, i) for source in sources for i in range(len(source.keys))]
+        self.keys: Sequence[SampleKey] = [source.keys[i] for source, i in self._sources]
         self.digest = text_digest("".join(f"{source.digest}\n" for source in sources))
 
     def read(self, index: int) -> Sample:
         """Decode one sample, as `ShardSource.read` does."""
-        source, place = self._places[index]
-        return source.read(place)
+        source, number = self._sources[index]
+        return source.read(number)
+
+    def place(self, index: int) -> Place:
+        """Read one sample's place, as `ShardSource.place` does."""
+        source, number = self._sources[index]
+        return source.place(number)
 
 
 def open_shards(roots: Sequence[Path], split: str) -> ShardSource | MixedSource:

@@ -9,7 +9,6 @@ steers the rate.
 from __future__ import annotations
 
 import os
-import shutil
 import time
 from datetime import timedelta
 from pathlib import Path
@@ -25,6 +24,7 @@ from express50.errors import TrainError
 from express50.files.atomic import check_space, write_json
 from express50.head.model import HeadModel
 from grmm import losses
+from grmm.checkpoint import collect_gallery
 from grmm.config import Config
 from grmm.data import HeadViews, Item, Source, spread
 from grmm.evaluate import evaluate, mean, training_render
@@ -40,6 +40,7 @@ from grmm.train_state import (
     deferred_interrupt,
     finished,
     prepare,
+    release,
     restore,
     save,
     set_rates,
@@ -50,6 +51,7 @@ from grmm.train_state import (
 from grmm.warm_start import warm_start
 
 LOG_EVERY = 20  # iterations between lines of progress
+SAVING_SHARE = 0.05  # of the training time at most
 PATIENT = 10_000  # iterations that a CPU does in a day at most
 GREY_DB = 10.0  # what a grey picture scores
 GLOO_SECONDS = 0.5  # for Gloo's threads to free tensors; 0.2 was enough in every run
@@ -85,6 +87,7 @@ def train(
         out.mkdir(parents=True, exist_ok=True)
         check_space(out)
         start_log(out / "log.jsonl", state.iteration)
+        gallery = collect_gallery(views, state.training)
         count, texels = len(state.model.texels), config.model.n_g**2
         log(
             f"{count} Gaussians of {texels} texels ({100 * count / texels:.0f} % covered); "
@@ -96,7 +99,7 @@ def train(
             log("this takes days on a CPU; '--preset measured --budget 1h' does best in an hour")
 
     # --- The loop ------------------------------------------------------------------------------
-    started, saved = time.perf_counter() - state.seconds, state.seconds
+    started, saved, cost = time.perf_counter() - state.seconds, state.seconds, 0.0
     with deferred_interrupt() as interrupt, spare_space(checkpoint) as spare:
         while not finished(state, config):
             set_rates(state, config)
@@ -106,18 +109,18 @@ def train(
             if world > 1:
                 agree(state, interrupt, device)
             last = finished(state, config) or interrupt.is_set()
-            due = 0 < config.train.save_seconds <= state.seconds - saved
+            pause = max(config.train.save_seconds, cost / SAVING_SHARE)
+            due = config.train.save_seconds > 0 and state.seconds - saved >= pause
             if rank == 0 and (state.iteration % LOG_EVERY == 0 or last):
                 log(progress_line(state, config))
                 append_log(out / "log.jsonl", state)
             if rank == 0 and (due or last):
-                spare.unlink(missing_ok=True)
-                save(state, checkpoint, config, source.head)
-                if not last:
-                    shutil.copyfile(checkpoint, spare)
-                saved = state.seconds
+                release(spare, checkpoint)
+                save(state, checkpoint, config, source.head, gallery)
+                saved = time.perf_counter() - started
+                cost = saved - state.seconds
             elif rank == 0 and not spare.exists():  # how large the first one will be
-                save(state, spare, config, source.head)
+                save(state, spare, config, source.head, gallery)
             if interrupt.is_set():  # only now, after the save
                 raise KeyboardInterrupt
     if world > 1:

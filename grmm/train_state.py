@@ -21,7 +21,7 @@ from express50.errors import ConfigError, TrainError
 from express50.files.atomic import write_bytes
 from express50.files.text import read_text
 from grmm import losses
-from grmm.checkpoint import collect_gallery, load_checkpoint, save_checkpoint
+from grmm.checkpoint import Gallery, load_checkpoint, save_checkpoint
 from grmm.config import Config, as_tables
 from grmm.data import HeadViews, SampleKey, Shuffle, spread
 from grmm.model import GRMM
@@ -178,14 +178,24 @@ def spare_space(path: Path) -> Iterator[Path]:
         spare.unlink(missing_ok=True)
 
 
-def save(state: TrainState, path: Path, config: Config, head_spec: str) -> None:
+def release(spare: Path, path: Path) -> None:
+    """Free the spare's space for the next checkpoint; the former one becomes the spare after it.
+
+    A second name keeps the former file when the next takes its place: no byte is copied.
+    """
+    spare.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # none yet, or a disk without second names
+        spare.hardlink_to(path)
+
+
+def save(state: TrainState, path: Path, config: Config, head_spec: str, gallery: Gallery) -> None:
     """Write a checkpoint with the loop's full state."""
     save_checkpoint(
         path,
         model=state.model,
         config=config,
         head_spec=head_spec,
-        gallery=collect_gallery(state.views, state.training),
+        gallery=gallery,
         optimizer=state.optimizer.state_dict(),
         loop={
             "iteration": state.iteration,

@@ -32,7 +32,8 @@ def redact(path: Path, subject: str) -> bool:
 
 def _without(content: dict[str, Any], subject: str) -> dict[str, Any]:
     rows = [row for row, name in enumerate(content["subjects"]) if name != subject]
-    frames = [frame for frame in content["frames"] if frame["subject"] != subject]
+    places = [n for n, frame in enumerate(content["frames"]) if frame["subject"] != subject]
+    frames = [content["frames"][n] for n in places]
     # No one else shows an expression that this person alone performed.
     lost = {f["expression_id"] for f in content["frames"]} - {f["expression_id"] for f in frames}
     kept = [row for row, name in enumerate(content["expressions"]) if name not in lost]
@@ -43,6 +44,7 @@ def _without(content: dict[str, Any], subject: str) -> dict[str, Any]:
         "expressions": [content["expressions"][row] for row in kept],
         "model": content["model"] | codes,
         "frames": frames,
+        "parameters": {k: v[places] for k, v in content.get("parameters", {}).items()},
         "offsets": {k: v for k, v in content.get("offsets", {}).items() if k != subject},
         "optimizer": {},
         "loop": {},

@@ -10,9 +10,10 @@ import json
 import os
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from express50.errors import DiskFullError
 
@@ -32,12 +33,17 @@ def dump_json(value: object) -> bytes:
 
 def write_bytes(path: Path, data: bytes) -> None:
     """Write a file so that a reader or a crash sees the old bytes or the new, nothing between."""
+    write_with(path, lambda file: file.write(data))
+
+
+def write_with(path: Path, write: Callable[[BinaryIO], object]) -> None:
+    """Write a file as `write_bytes` does, by a function that gets it open."""
     aside = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
     with naming_full_disk(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             with aside.open("wb") as file:
-                file.write(data)
+                write(file)
                 file.flush()
                 os.fsync(file.fileno())
             aside.replace(path)

@@ -10,7 +10,7 @@ import torch
 from express50.geometry.transforms import look_at
 from express50.head.model import REGIONS, HeadModel
 from grmm.config import Config, resolve
-from grmm.data import Sample, SampleKey, Tracked
+from grmm.data import Place, Sample, SampleKey, Tracked
 
 AXES = np.array([0.08, 0.11, 0.09])  # metres
 STRETCH = 0.015  # metres the first expression coefficient adds to the y axis
@@ -99,6 +99,9 @@ class EllipsoidSource:
         return Sample(
             image=image, alpha=alpha, depth=depth, K=K, cam_from_world=camera, tracked=tracked
         )
+
+    def place(self, index: int) -> Place:
+        return self.read(index).place
 
 
 def cast(axes, K, camera, turn, offset, size, subject):

@@ -1,12 +1,17 @@
 """Checkpoints that are damaged, or whose parts do not fit each other."""
 
+import zipfile
+
+import numpy as np
 import pytest
 import torch
 
 from express50.errors import FormatError
-from grmm.checkpoint import load_checkpoint
+from grmm.checkpoint import collect_gallery, load_checkpoint, save_checkpoint
+from grmm.data import HeadViews
+from grmm.model import GRMM
 from grmm.train import train
-from tests.grmm.synthetic import ellipsoid_head, tiny_config
+from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
 
 @pytest.fixture
@@ -58,10 +63,53 @@ def test_a_camera_whose_size_no_image_has_is_refused(path, size):
 @pytest.mark.parametrize(("name", "size"), [("shape", 4), ("expression", 5)])
 def test_a_frame_that_the_head_model_cannot_take_is_refused(path, name, size):
     content = torch.load(path, weights_only=True)
-    content["frames"][1]["parameters"][name] = torch.zeros(size)
+    content["parameters"][name] = torch.zeros(len(content["frames"]), size)
     torch.save(content, path)
-    with pytest.raises(FormatError, match=f"S000/e1: {size} {name}"):
+    with pytest.raises(FormatError, match=f"S000/e0: {size} {name}"):
         load_checkpoint(path)
+
+
+class Blind(EllipsoidSource):
+    """Gives places, no picture."""
+
+    def read(self, index):
+        raise AssertionError("a picture was decoded")
+
+    def place(self, index):
+        return EllipsoidSource.read(self, index).place
+
+
+def test_frames_are_collected_without_pictures_and_stored_as_few_arrays(tmp_path):
+    sizes = []
+    for people in (2, 9):
+        views = HeadViews(Blind(size=16, subjects=people, cameras=2), ellipsoid_head())
+        gallery = collect_gallery(views, range(len(views.keys)))
+        names = [f"S{n:03d}" for n in range(people)]
+        model = GRMM(tiny_config().model, views.head, names, ["e0", "e1"])
+        path = tmp_path / f"{people}.pt"
+        save_checkpoint(
+            path, model=model, config=tiny_config(), head_spec="ellipsoid", gallery=gallery
+        )
+        sizes.append(len(zipfile.ZipFile(path).namelist()))
+        again = load_checkpoint(path).gallery
+        assert again.frames.keys() == gallery.frames.keys() and len(again.frames) == 2 * people
+        for frame, tracked in again.frames.items():
+            for name, value in vars(gallery.frames[frame]).items():
+                np.testing.assert_array_equal(getattr(tracked, name), value)
+    assert sizes[1] - sizes[0] == 7  # the offsets of seven more people
+
+
+def test_frames_as_they_were_stored_before_are_read(path):
+    content = torch.load(path, weights_only=True)
+    stacks = content.pop("parameters")
+    for number, frame in enumerate(content["frames"]):
+        frame["parameters"] = {name: stack[number].clone() for name, stack in stacks.items()}
+    before = load_checkpoint(path).gallery.frames
+    torch.save(content, path)
+    again = load_checkpoint(path).gallery.frames
+    assert again.keys() == before.keys()
+    for frame, tracked in again.items():
+        np.testing.assert_array_equal(tracked.expression, before[frame].expression)
 
 
 def test_settings_that_are_gone_are_left_out_unless_they_changed_the_result(path):

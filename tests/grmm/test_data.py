@@ -35,15 +35,25 @@ def test_geometry_is_posed_once_per_frame(views):
 
 
 def test_cache_is_bounded_and_answers_from_memory(source, monkeypatch):
+    monkeypatch.setattr(data, "CACHE_BYTES", 2 * source.read(0).nbytes)
     views = HeadViews(source, ellipsoid_head())
     first = views.sample(0)
     second = views.sample(1)
     assert views.sample(0) is first
-    monkeypatch.setattr(data, "CACHE_BYTES", 2 * first.nbytes)
     views.sample(2)
     assert views.sample(0) is first and views.sample(1) is not second
     monkeypatch.setattr(data, "CACHE_BYTES", 0)
+    views = HeadViews(source, ellipsoid_head())
     assert views.sample(2) is views.sample(2)
+
+
+def test_every_cache_of_views_is_bounded(monkeypatch):
+    monkeypatch.setattr(data, "CACHE_BYTES", 0)
+    views = HeadViews(EllipsoidSource(size=32, expressions=4), ellipsoid_head())
+    for index in range(len(views.keys)):
+        views.item(index)
+    caches = (views._samples, views._states, views._torsos)
+    assert [len(cache.entries) for cache in caches] == [1, 1, 1]
 
 
 class Changed(EllipsoidSource):

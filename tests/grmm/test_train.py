@@ -1,12 +1,14 @@
+import io
 import json
 import os
 import signal
+import time
 
 import pytest
 import torch
 
 from express50.errors import ConfigError, DiskFullError, FormatError, TrainError
-from express50.files.atomic import write_bytes
+from express50.files.atomic import write_with
 from grmm import checkpoint
 from grmm import train as train_module
 from grmm.data import HeadViews
@@ -70,12 +72,15 @@ class Disk:
         self.folder, self.size = folder, free
 
     def used(self):
-        return sum(path.stat().st_size for path in self.folder.glob("*checkpoint*"))
+        files = [path.stat() for path in self.folder.glob("*checkpoint*")]
+        return sum({file.st_ino: file.st_size for file in files}.values())
 
-    def write(self, path, data):
-        if self.used() + len(data) > self.size:
+    def write(self, path, write):
+        buffer = io.BytesIO()
+        write(buffer)
+        if self.used() + buffer.tell() > self.size:
             raise DiskFullError(f"{path}: the disk is full")
-        write_bytes(path, data)
+        write_with(path, write)
 
 
 def test_a_disk_that_fills_up_takes_the_weights_still(tmp_path, source, monkeypatch):
@@ -86,15 +91,36 @@ def test_a_disk_that_fills_up_takes_the_weights_still(tmp_path, source, monkeypa
             disk.size = disk.used()
         rates(state, config)
 
-    monkeypatch.setattr(checkpoint, "write_bytes", disk.write)
+    monkeypatch.setattr(checkpoint, "write_with", disk.write)
     monkeypatch.setattr(train_module, "set_rates", fill_late)
     train(source, ellipsoid_head(), tmp_path, tiny_config(train={"iterations": 5}))
     assert state_of(tmp_path)["loop"]["iteration"] == 5
     assert [path.name for path in tmp_path.glob("*checkpoint*")] == ["checkpoint.pt"]
 
 
+def test_saving_takes_a_bounded_share_of_the_time(tmp_path, source, monkeypatch):
+    saves, galleries = [], []
+    real_save, real_gallery = train_module.save, train_module.collect_gallery
+
+    def slow(*arguments):
+        real_save(*arguments)
+        time.sleep(0.2)
+        saves.append(arguments[1].name)
+
+    def counted(*arguments):
+        galleries.append(real_gallery(*arguments))
+        return galleries[-1]
+
+    monkeypatch.setattr(train_module, "save", slow)
+    monkeypatch.setattr(train_module, "collect_gallery", counted)
+    settings = {"iterations": 25, "save_seconds": 1e-3}
+    train(source, ellipsoid_head(), tmp_path, tiny_config(train=settings))
+    assert saves[-1] == "checkpoint.pt" and len(saves) <= 4  # space kept, one in time, the last
+    assert len(galleries) == 1
+
+
 def test_training_on_a_full_disk_stops_at_once(tmp_path, source, monkeypatch, capsys):
-    monkeypatch.setattr(checkpoint, "write_bytes", Disk(tmp_path, 1e4).write)
+    monkeypatch.setattr(checkpoint, "write_with", Disk(tmp_path, 1e4).write)
     with pytest.raises(DiskFullError):
         train(source, ellipsoid_head(), tmp_path, tiny_config(train={"iterations": 25}))
     assert "iteration 20" not in capsys.readouterr().err

@@ -54,9 +54,13 @@ def test_an_expression_that_nobody_else_shows_goes_with_its_code(trained):
     path = trained[0]
     content = read_content(path)
     (first, *_), (own, *rest) = content["subjects"], content["expressions"]
-    content["frames"] = [
-        f for f in content["frames"] if f["expression_id"] != own or f["subject"] == first
+    places = [
+        n
+        for n, f in enumerate(content["frames"])
+        if f["expression_id"] != own or f["subject"] == first
     ]
+    content["frames"] = [content["frames"][n] for n in places]
+    content["parameters"] = {k: v[places] for k, v in content["parameters"].items()}
     code = content["model"]["z_exp"][0].numpy().tobytes()
     torch.save(content, path)
     assert redact(path, first)
