@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
+from numpy.polynomial import Polynomial
 
 from express50.geometry.conventions import cell_centres
 from express50.geometry.shapes import check_shape
@@ -24,6 +26,9 @@ MODELS: dict[str, tuple[str, ...]] = {
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
 NEAREST_M = 1e-9  # depth by which undistorted cameras divide at least
+WIDEST = 20.0  # radius on the plane z = 1: no perspective lens sees farther than 87 degrees
+TABLE_SIZE = 4096  # radii from which the inverse of a lens starts
+NEWTON_ROUNDS = 20
 _DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
@@ -124,34 +129,93 @@ def transform_camera(camera: Camera, new_from_old: np.ndarray) -> Camera:
 
 
 def distort(camera: Camera, xy: np.ndarray) -> np.ndarray:
-    """Return distorted normalised coordinates (N, 2) of ideal ones (N, 2).
+    """Return distorted normalised coordinates (N, 2) of ideal ones (N, 2), folded ones included.
 
     Source: OpenCV's rational model, of which COLMAP's OPENCV and RADIAL are special cases.
     """
-    k1, k2, p1, p2, k3, k4, k5, k6 = camera.dist
+    p1, p2 = camera.dist[2:4]
     x, y = xy[:, 0], xy[:, 1]
     r2 = x * x + y * y
-    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    radial, _ = _radial_part(camera.dist, r2)
     dx = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
     return np.stack([x * radial + dx, y * radial + dy], axis=1)
 
 
 def undistort(camera: Camera, xy: np.ndarray) -> np.ndarray:
-    """Return ideal normalised coordinates (N, 2) of distorted ones (N, 2), by damped fixed point.
+    """Return ideal normalised coordinates (N, 2) of distorted ones (N, 2).
 
-    Where the lens folds no solution exists: the result is then finite but does not distort back.
+    They are NaN where the lens forms no such image point, which is where it folds.
+
+    Source: Newton's method, from a table of the radial part, which grows steadily in its field.
     """
+    xy = np.asarray(xy, dtype=np.float64)
     if not camera.dist.any():
-        return np.asarray(xy, dtype=np.float64)
-    ideal = np.array(xy, dtype=np.float64)
-    for _ in range(30):
-        error = xy - distort(camera, ideal)
-        # Without the bound a diverging point overflows; 20 is 87 degrees off the axis.
-        ideal = np.clip(ideal + error, -20.0, 20.0)
-        if np.nanmax(np.abs(error), initial=0.0) < 1e-12:
-            break
+        return xy
+    radii = np.linspace(0.0, _field(camera.dist.tobytes()), TABLE_SIZE)
+    radial, _ = _radial_part(camera.dist, radii**2)
+    size = np.linalg.norm(xy, axis=1)
+    ideal = xy * (np.interp(size, radii * radial, radii) / np.maximum(size, NEAREST_M))[:, None]
+    todo = np.isfinite(xy).all(axis=1)
+    with np.errstate(all="ignore"):  # a point without an inverse may run away
+        for _ in range(NEWTON_ROUNDS):
+            error = distort(camera, ideal[todo]) - xy[todo]
+            a, b, c = _slopes(camera.dist, ideal[todo])
+            step = np.stack([c * error[:, 0] - b * error[:, 1], a * error[:, 1] - b * error[:, 0]])
+            ideal[todo] -= (step / (a * c - b * b)).T
+            # Newton doubles the digits: half of them before a step are all of them after it.
+            todo[todo] = np.abs(error).max(axis=1) > 1e-9
+            if not todo.any():
+                break
+        ideal[todo | ~in_field(camera, ideal)] = np.nan
     return ideal
+
+
+def in_field(camera: Camera, xy: np.ndarray) -> np.ndarray:
+    """Say which ideal normalised coordinates (N, 2) the lens pictures: not NaN, and not folded."""
+    if not camera.dist.any():
+        return np.isfinite(xy).all(axis=1)
+    a, b, c = _slopes(camera.dist, xy)
+    near = (xy**2).sum(axis=1) <= _field(camera.dist.tobytes()) ** 2
+    return near & (a > 0) & (a * c > b * b)
+
+
+def _slopes(dist: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the derivative of `distort`, symmetric, as (N,) dx/dx, dx/dy and dy/dy."""
+    p1, p2 = dist[2:4]
+    x, y = xy[:, 0], xy[:, 1]
+    radial, slope = _radial_part(dist, x * x + y * y)
+    a = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+    c = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+    return a, 2 * (x * y * slope + p1 * x + p2 * y), c
+
+
+def _radial_part(dist: np.ndarray, r2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the radial factor (N,) at squared radii (N,), and its derivative by them."""
+    k1, k2, _, _, k3, k4, k5, k6 = dist
+    below = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / below
+    slope = k1 + r2 * (2 * k2 + 3 * r2 * k3) - radial * (k4 + r2 * (2 * k5 + 3 * r2 * k6))
+    return radial, slope / below
+
+
+@lru_cache(maxsize=256)
+def _field(dist: bytes) -> float:
+    """Return the radius up to which the radial part grows: to its first fold or pole, or `WIDEST`.
+
+    The derivative of r N / D by r, with N and D polynomials of u = r^2, has the numerator
+    N D + 2 u (N' D - N D').
+    """
+    k1, k2, _, _, k3, k4, k5, k6 = np.frombuffer(dist)
+    above, below = Polynomial([1.0, k1, k2, k3]), Polynomial([1.0, k4, k5, k6])
+    slope = above * below + Polynomial([0, 2]) * (above.deriv() * below - above * below.deriv())
+    ends = [WIDEST**2]
+    for part in (slope, below):
+        # In units of WIDEST^2, so that roots far beyond it are dropped with their coefficient.
+        roots = part(Polynomial([0, WIDEST**2])).trim(1e-12).roots()
+        real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
+        ends += list(real * WIDEST**2)
+    return float(np.sqrt(min(ends))) * (1 - 1e-9)
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -162,8 +226,8 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
         points: (N, 3) world points, metres.
 
     Returns:
-        pixels (N, 2) as (x, y), NaN where depth <= 0; depth (N,), camera z, metres. Both are NaN
-        where a point is not finite.
+        pixels (N, 2) as (x, y), NaN where depth <= 0 and where the lens folds; depth (N,), camera
+        z, metres. Both are NaN where a point is not finite.
 
     Raises:
         ValueError: points are not (N, 3).
@@ -177,6 +241,8 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     depth = p[:, 2]
     ahead = depth > 0
     xy = p[:, :2] / np.where(ahead, depth, np.nan)[:, None]
+    with np.errstate(all="ignore"):  # outside the field of the lens anything may come out
+        xy = np.where(in_field(camera, xy)[:, None], xy, np.nan)
     K = camera.K
     return distort(camera, xy) * (K[0, 0], K[1, 1]) + K[:2, 2], depth
 
@@ -219,9 +285,9 @@ def triangulate(
     """
     pixels = np.asarray(pixels, dtype=np.float64)
     check_shape("pixels", pixels, (len(cameras), None, 2))
-    seen = np.isfinite(pixels).all(-1)
-    w = np.where(seen, 1.0 if weights is None else np.asarray(weights, dtype=np.float64), 0.0)
     xy = np.stack([normalised(c, p) for c, p in zip(cameras, pixels, strict=True)])
+    seen = np.isfinite(xy).all(-1)
+    w = np.where(seen, 1.0 if weights is None else np.asarray(weights, dtype=np.float64), 0.0)
     P = np.stack([c.cam_from_world[:3] for c in cameras])  # (C, 3, 4)
     focal = np.array([np.sqrt(c.K[0, 0] * c.K[1, 1]) for c in cameras])
     points = np.full((pixels.shape[1], 3), np.nan)

@@ -5,19 +5,42 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from express50.geometry.cameras import Camera
-from express50.geometry.conventions import K_to_opencv, corner_to_cell
+from express50.geometry.cameras import Camera, in_field
+from express50.geometry.conventions import K_to_opencv, cell_centres, corner_to_cell
 
 # cv2.remap takes at most 32767 rows and columns; this many points per call fit the cache.
 _COLUMNS, _ROWS = 4096, 2048
+COARSE = 64  # points across an image that say where a lens folds
+OUTSIDE = -10.0  # a place, in pixels, that no interpolation reaches the image from
 
 
 def undistort_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Map (H, W) x and y, float32, for ``cv2.remap`` from ``camera`` to its pinhole camera."""
-    K = K_to_opencv(camera.K)
-    return cv2.initUndistortRectifyMap(
-        K, camera.dist, None, K, (camera.width, camera.height), cv2.CV_32FC1
-    )
+    """Map (H, W) x and y, float32, for ``cv2.remap`` from ``camera`` to its pinhole camera.
+
+    Where the lens folds, the map points outside the image.
+    """
+    K, size = K_to_opencv(camera.K), (camera.width, camera.height)
+    x, y = cv2.initUndistortRectifyMap(K, camera.dist, None, K, size, cv2.CV_32FC1)
+    if pictured_share(camera) < 1:
+        across, down = cell_centres(camera.width), cell_centres(camera.height)
+        x[~_pictured(camera, across, down)] = OUTSIDE
+    return x, y
+
+
+def pictured_share(camera: Camera) -> float:
+    """Return the share of the pinhole camera's pixels, from a coarse grid, that the lens pictures.
+
+    It is under 1 where the distortion folds within the image: its coefficients then describe
+    another image size, or were fitted to points near the centre alone.
+    """
+    across = np.linspace(0, camera.width, COARSE)
+    return float(_pictured(camera, across, np.linspace(0, camera.height, COARSE)).mean())
+
+
+def _pictured(camera: Camera, across: np.ndarray, down: np.ndarray) -> np.ndarray:
+    x, y = np.meshgrid(across, down)
+    xy = np.stack([x.ravel(), y.ravel()], axis=1) - camera.K[:2, 2]
+    return in_field(camera, xy / camera.K[[0, 1], [0, 1]]).reshape(x.shape)
 
 
 def undistort_image(image: np.ndarray, camera: Camera) -> np.ndarray:

@@ -178,10 +178,9 @@ def read_points(path: Path, cameras: Mapping[str, Camera]) -> Table:
         if key[0] in cameras:
             camera = cameras[key[0]]
             rows = _checked(read, camera, path, key).copy()
-            known = np.isfinite(rows[:, :2]).all(1)
-            rows[~known] = (np.nan, np.nan, 0.0)
             focal, middle = camera.K[[0, 1], [0, 1]], camera.K[:2, 2]
-            rows[known, :2] = normalised(camera, rows[known, :2]) * focal + middle
+            rows[:, :2] = normalised(camera, rows[:, :2]) * focal + middle
+            rows[~np.isfinite(rows[:, :2]).all(1)] = (np.nan, np.nan, 0.0)
             table[key] = rows
     return table
 

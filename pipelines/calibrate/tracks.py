@@ -11,7 +11,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from express50.geometry.cameras import Camera, distort, normalised
+from express50.geometry.cameras import Camera, normalised
 
 Features: TypeAlias = tuple[np.ndarray, np.ndarray]
 """Recorded pixels (N, 2) and descriptors (N, 128) of length one."""
@@ -133,9 +133,8 @@ def _undistorted(camera: Camera, features: Features) -> Features:
     """
     K, (pixels, described) = camera.K, features
     xy = normalised(camera, pixels)
-    again = distort(camera, xy) * K[[0, 1], [0, 1]] + K[:2, 2]
-    valid = np.linalg.norm(again - pixels, axis=1) < 0.01
-    return xy * K[[0, 1], [0, 1]] + K[:2, 2], described * valid[:, None]
+    valid = np.isfinite(xy).all(axis=1, keepdims=True)
+    return np.where(valid, xy, 0) * K[[0, 1], [0, 1]] + K[:2, 2], described * valid
 
 
 def _neighbours(cameras: Mapping[str, Camera]) -> list[tuple[str, str]]:

@@ -16,10 +16,14 @@ from express50.contract.stage import Note, Result
 from express50.errors import CaptureError, StageError
 from express50.files.containers import to_srgb
 from express50.files.images import shrink, tile_sheet, write_image
-from express50.geometry.sampling import undistort_image
+from express50.geometry.sampling import pictured_share, undistort_image
 
 COLUMNS = 6  # of the contact sheet
 TILE = 240  # pixels
+FOLDS = (
+    "its lens folds within the image: {:.1%} of the frame stays black;"
+    " calibrate again, or check that the coefficients belong to this image size"
+)
 
 Read = Callable[[str], np.ndarray]
 """Camera id to its recorded image (H, W, 3); raises CaptureError."""
@@ -46,6 +50,7 @@ def run(dataset: Dataset, item: str, deep: bool, out: Path) -> Result:
         cameras = {name: camera for name, camera in cameras.items() if name in index.plates}
     read = _reader(dataset, subject, expression, deep)
     dropped: list[Note] = []
+    warnings: list[Note] = []
     tiles: dict[str, np.ndarray] = {}
     bits: dict[str, int] = {}
     for name, camera in cameras.items():
@@ -56,13 +61,15 @@ def run(dataset: Dataset, item: str, deep: bool, out: Path) -> Result:
             continue
         write_frame(out / f"{name}.jxl", image)
         bits[name] = 8 * image.itemsize
+        if (share := pictured_share(camera)) < 1:
+            warnings.append(Note(name, FOLDS.format(1 - share)))
         tiles[name] = shrink(to_srgb(image), TILE)
     if not tiles:
         why = "; ".join(f"{note.what}: {note.why}" for note in dropped[:3])
         raise StageError(f"{item}: no camera could be read ({why or 'none is calibrated'})")
     (out / "qc").mkdir()
     write_image(out / "qc" / "frames.jpg", tile_sheet(tiles, COLUMNS, TILE), quality=88)
-    return Result({"frames": len(tiles), "bits": bits}, dropped)
+    return Result({"frames": len(tiles), "bits": bits}, dropped, warnings)
 
 
 def _reader(dataset: Dataset, subject: str, expression: str, deep: bool) -> Read:

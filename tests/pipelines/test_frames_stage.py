@@ -49,6 +49,18 @@ def dataset(tmp_path, capture):
     return dataset
 
 
+def test_a_lens_that_folds_leaves_black_and_says_so(dataset):
+    rig = make_rig()
+    name = next(iter(rig))
+    rig[name] = replace(rig[name], params=(*rig[name].params[:4], -3.0, 0.0, 0.0, 0.0))
+    write_cameras(dataset.cameras_file("S001"), rig)
+    assert run(dataset).ok
+    [warning] = metrics_of(dataset, "S001/neutral")["warnings"]
+    assert warning["what"] == name and "folds within the image" in warning["why"]
+    written = read_peak_frame(dataset, "S001", "neutral", name)
+    assert not written[0, 0].any() and written[written.shape[0] // 2].any()
+
+
 def test_written_frames_are_the_undistorted_footage(dataset):
     peaks = read_peaks(dataset, "S001")
     rig = frames_module.read_cameras_of(dataset, "S001", undistorted=False)
