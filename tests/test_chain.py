@@ -66,9 +66,9 @@ def dataset(twin, reads, tmp_path_factory):
     original = FrameReader.read
     for name in STAGES:
 
-        def counted(self, frame, deep=False, rows=reads[name]):
+        def counted(self, frame, rows=reads[name]):
             rows.append((str(self.path), frame))
-            return original(self, frame, deep)
+            return original(self, frame)
 
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(FrameReader, "read", counted)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from express50.errors import CalibrationError
-from express50.files.images import linear_to_srgb, srgb_to_linear
+from express50.files.images import LIGHT_OF_LEVEL, linear_to_srgb
 
 _SQUARES = ("RR", "GG", "BB")
 _PRODUCTS = ("RG", "RB", "GB")
@@ -62,13 +62,11 @@ def expand(linear: np.ndarray, terms: int) -> np.ndarray:
 
 
 def correct_srgb(image: np.ndarray, matrix: tuple[tuple[float, ...], ...]) -> np.ndarray:
-    """Correct an sRGB image (H, W, 3) uint8 or uint16; what leaves the range is clipped."""
+    """Correct an sRGB image (H, W, 3) uint8; what leaves the range is clipped."""
     rows = np.asarray(matrix, dtype=np.float32)
-    white = np.iinfo(image.dtype).max
-    curve = srgb_to_linear(np.arange(white + 1, dtype=np.float32) / white).astype(np.float32)
     out = np.empty_like(image)
     for top in range(0, len(image), STRIPE):
-        linear = curve[image[top : top + STRIPE]]
+        linear = LIGHT_OF_LEVEL[image[top : top + STRIPE]]
         fixed = np.clip(expand(linear, rows.shape[1]) @ rows.T, 0.0, 1.0)
-        out[top : top + STRIPE] = np.rint(linear_to_srgb(fixed) * white).astype(image.dtype)
+        out[top : top + STRIPE] = np.rint(linear_to_srgb(fixed) * 255.0)
     return out

@@ -18,9 +18,9 @@ from express50.capture.raw import RawCamera
 from express50.contract.layout import Dataset
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.calibration import read_cameras
-from express50.files.containers import inside, read_samples, to_srgb
+from express50.files.containers import inside, read_picture, read_srgb
 from express50.files.digests import cached_by_file
-from express50.files.images import decode_image, read_image, upright
+from express50.files.images import decode_image, upright
 from express50.files.text import read_json, read_json_table
 from express50.files.video import VideoReader
 from express50.geometry.cameras import Camera, pinhole
@@ -54,10 +54,8 @@ class FrameReader:
         self._clip = 0
         self._video: VideoReader | None = None
 
-    def read(self, frame: int, deep: bool = False) -> np.ndarray:
-        """Read an image (H, W, 3) sRGB by decode index, colour-corrected but not undistorted.
-
-        It is uint8; where ``deep`` and the footage has more than 8 bits, uint16.
+    def read(self, frame: int) -> np.ndarray:
+        """Read an image (H, W, 3) uint8 sRGB by decode index, colours corrected, not undistorted.
 
         Raises:
             CaptureError: no such frame, or the footage is not what was ingested.
@@ -66,15 +64,14 @@ class FrameReader:
             raise CaptureError(
                 f"{self.path}: frame {frame} does not exist, expected 0 to {self.source.frames - 1}"
             )
-        return corrected(self._recorded(frame, deep), self.source)
+        return corrected(self._recorded(frame), self.source)
 
-    def _recorded(self, frame: int, deep: bool) -> np.ndarray:
+    def _recorded(self, frame: int) -> np.ndarray:
         """Read the frame as it was recorded and compare its hash with the index."""
         if self.source.kind == "frames":
             name = self.source.names[frame]
-            stored = read_samples(self.path, name, self.source.orientation)
-            image = self._checked(_srgb(stored, False, self._file(frame)), frame)
-            return _srgb(stored, True, self._file(frame)) if deep else image
+            image = read_picture(self.path, name, self.source.orientation)
+            return self._checked(image, frame)
         video, number = self._video_of(frame)
         image = upright(video.read(number), self.source.orientation)
         if dhash(image) != self.source.dhash[frame]:
@@ -118,14 +115,6 @@ class FrameReader:
         if self._video is not None:
             self._video.close()
             self._video = None
-
-
-def _srgb(stored: np.ndarray, deep: bool, where: str) -> np.ndarray:
-    """Convert samples as a file holds them to (H, W, 3) uint8, or uint16 if deep and not 8-bit."""
-    try:
-        return to_srgb(stored, np.uint16 if deep and stored.dtype != np.uint8 else np.uint8)
-    except ValueError as error:
-        raise CaptureError(f"{where}: {error}; export it again") from error
 
 
 def corrected(image: np.ndarray, source: CameraSource | RawCamera) -> np.ndarray:
@@ -181,20 +170,14 @@ def read_frame(
         return footage.read(camera_id, frame)
 
 
-def read_recorded_plate(index: Index, camera_id: str, deep: bool = False) -> np.ndarray:
-    """Read a clean plate (H, W, 3) sRGB that the index lists, colour-corrected, not undistorted.
-
-    It is uint8; where ``deep`` and the plate has more than 8 bits, uint16.
+def read_recorded_plate(index: Index, camera_id: str) -> np.ndarray:
+    """Read a clean plate (H, W, 3) uint8 sRGB of the index, colours corrected, not undistorted.
 
     Raises:
         CaptureError: it cannot be read, or its size is not that of the footage.
     """
     path = index.capture / index.plates[camera_id]
-    try:
-        stored = read_image(path)
-    except FormatError as error:
-        raise CaptureError(str(error)) from error
-    image = _srgb(stored, deep, str(path))
+    image = read_srgb(path)
     source = index.cameras[camera_id]
     if image.shape[:2] != (source.height, source.width):
         raise CaptureError(
@@ -205,7 +188,7 @@ def read_recorded_plate(index: Index, camera_id: str, deep: bool = False) -> np.
 
 
 def write_frame(path: Path, image: np.ndarray) -> None:
-    """Write an image (H, W, 3) uint8 or uint16 losslessly as JPEG XL; equal images, equal bytes.
+    """Write an image (H, W, 3) uint8 losslessly as JPEG XL; equal images, equal bytes.
 
     Effort 1 encodes a 3840x2160 frame in 0.03 s to half of a PNG's bytes (docs/LOG.md).
     """
@@ -213,12 +196,8 @@ def write_frame(path: Path, image: np.ndarray) -> None:
     path.write_bytes(imagecodecs.jpegxl_encode(pixels, lossless=True, effort=1, numthreads=1))
 
 
-def read_peak_frame(
-    dataset: Dataset, subject: str, expression: str, camera_id: str, deep: bool = False
-) -> np.ndarray:
-    """Read a peak frame (H, W, 3) sRGB as the pinhole camera of ``read_cameras_of`` sees it.
-
-    It is colour-corrected, and uint8; where ``deep`` and it has more than 8 bits, uint16.
+def read_peak_frame(dataset: Dataset, subject: str, expression: str, camera_id: str) -> np.ndarray:
+    """Read a peak frame (H, W, 3) uint8 sRGB, as the pinhole camera of ``read_cameras_of`` sees it.
 
     Raises:
         CaptureError: the frames stage did not write it, or it cannot be read.
@@ -229,27 +208,17 @@ def read_peak_frame(
             f"{path}: no frame of {camera_id}; run 'express50 frames {dataset.root}', or see "
             f"'express50 status {dataset.root}' for the reason"
         )
-    return _read_written(path, deep)
+    return read_srgb(path)
 
 
-def read_plate_image(
-    dataset: Dataset, subject: str, camera_id: str, deep: bool = False
-) -> np.ndarray | None:
-    """Read a clean plate (H, W, 3) sRGB, undistorted and corrected; None if there is none.
+def read_plate_image(dataset: Dataset, subject: str, camera_id: str) -> np.ndarray | None:
+    """Read a clean plate (H, W, 3) uint8 sRGB, undistorted and corrected; None if there is none.
 
     Raises:
         CaptureError: it cannot be read.
     """
     path = dataset.plate_file(subject, camera_id)
-    return _read_written(path, deep) if path.is_file() else None
-
-
-def _read_written(path: Path, deep: bool) -> np.ndarray:
-    try:
-        image = read_image(path)
-    except FormatError as error:
-        raise CaptureError(f"{error}; run 'express50 frames' again") from error
-    return image if deep else to_srgb(image)
+    return read_srgb(path) if path.is_file() else None
 
 
 def frame_inputs(dataset: Dataset, subject: str, expression: str) -> dict[str, Path]:

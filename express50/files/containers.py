@@ -34,10 +34,8 @@ OPEN_FILES = 4  # containers a process keeps open
 DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, AttributeError)
 
 
-def to_srgb(image: np.ndarray, kind: type = np.uint8) -> np.ndarray:
-    """Convert an image (H, W[, C]) to (H, W, 3) sRGB levels of uint8 or uint16.
-
-    Floats are linear, whole numbers are sRGB of eight bits, or of sixteen for both kinds.
+def to_srgb(image: np.ndarray) -> np.ndarray:
+    """Convert an image (H, W[, C]) of linear floats or sRGB of 8 or 16 bits to (H, W, 3) uint8.
 
     Raises:
         ValueError: the image holds NaN or infinity.
@@ -48,10 +46,10 @@ def to_srgb(image: np.ndarray, kind: type = np.uint8) -> np.ndarray:
     if image.dtype.kind == "f":
         if not np.isfinite(image).all():
             raise ValueError("image holds NaN or infinity")
-        image = np.rint(linear_to_srgb(np.clip(image, 0.0, 1.0)) * np.iinfo(kind).max)
-    elif image.dtype == np.uint16 and kind is np.uint8:
+        image = np.rint(linear_to_srgb(np.clip(image, 0.0, 1.0)) * 255.0)
+    elif image.dtype == np.uint16:
         image = np.rint(image / 257.0)
-    return np.ascontiguousarray(image.astype(kind))
+    return np.ascontiguousarray(image.astype(np.uint8))
 
 
 def inside(root: Path, name: str) -> Path:
@@ -76,18 +74,6 @@ def read_picture(root: Path, name: str, orientation: int = 1) -> np.ndarray:
     Raises:
         CaptureError: it is missing, damaged, too large, or its name leads out of the folder.
     """
-    try:
-        return to_srgb(read_samples(root, name, orientation))
-    except ValueError as error:
-        raise CaptureError(f"{root / name}: {error}; export it again") from error
-
-
-def read_samples(root: Path, name: str, orientation: int) -> np.ndarray:
-    """Read an image (H, W[, C]) by its name, turned upright, in the file's own sample type.
-
-    Raises:
-        CaptureError: it is missing, damaged, too large, or its name leads out of the folder.
-    """
     container, within, member = name.partition(WITHIN)
     path = inside(root, container)
     if within:
@@ -95,11 +81,22 @@ def read_samples(root: Path, name: str, orientation: int) -> np.ndarray:
     elif path.suffix.lower() == ".avif":
         stored = decode_picture(read_bytes(path, CaptureError, BYTES_LIMIT), str(path))
     else:
-        try:
-            stored = read_image(path)
-        except FormatError as error:
-            raise CaptureError(str(error)) from error
+        stored = read_srgb(path)
     return upright(stored, orientation)
+
+
+def read_srgb(path: Path) -> np.ndarray:
+    """Read an image file as (H, W, 3) uint8 sRGB.
+
+    Raises:
+        CaptureError: it is missing, damaged or too large.
+    """
+    try:
+        return to_srgb(read_image(path))
+    except FormatError as error:
+        raise CaptureError(str(error)) from error
+    except ValueError as error:
+        raise CaptureError(f"{path}: {error}; export it again") from error
 
 
 def decode_picture(data: bytes, where: str) -> np.ndarray:

@@ -127,6 +127,7 @@ def read_yaml(path: Path, kind: Kind) -> Any:
             could make a small file endless.
     """
     text, level = read_text(path, kind, YAML_LIMIT), 0
+    text = text.replace("%YAML:1.0", "%YAML 1.0", 1)  # as OpenCV writes it
     try:
         for event in yaml.parse(text, yaml.BaseLoader):
             level += isinstance(event, yaml.CollectionStartEvent)

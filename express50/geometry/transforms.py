@@ -7,26 +7,14 @@ rotation part is ``express50.geometry.transforms_torch``; a test holds the two a
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from express50.geometry.shapes import check_shape
 
 
 def axis_angle_to_matrix(axis_angle: np.ndarray) -> np.ndarray:
-    """Return rotation matrices (..., 3, 3) of axis-angle vectors (..., 3), radians.
-
-    Source: Rodrigues' formula, with the series of sin(x)/x and (1-cos x)/x^2 near zero.
-    """
-    a = np.asarray(axis_angle, dtype=np.float64)
-    theta2 = np.sum(a * a, axis=-1)[..., None, None]
-    theta = np.sqrt(theta2)
-    small = theta2 < 1e-8
-    safe = np.where(small, 1.0, theta)
-    s = np.where(small, 1.0 - theta2 / 6.0, np.sin(safe) / safe)
-    c = np.where(small, 0.5 - theta2 / 24.0, (1.0 - np.cos(safe)) / (safe * safe))
-    x, y, z = np.moveaxis(a, -1, 0)
-    zero = np.zeros_like(x)
-    k = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*a.shape[:-1], 3, 3)
-    return np.eye(3) + s * k + c * (k @ k)
+    """Return rotation matrices (..., 3, 3) of axis-angle vectors (..., 3), radians."""
+    return Rotation.from_rotvec(axis_angle).as_matrix()
 
 
 def quat_to_matrix(quats: np.ndarray) -> np.ndarray:
@@ -35,73 +23,24 @@ def quat_to_matrix(quats: np.ndarray) -> np.ndarray:
     Raises:
         ValueError: a quaternion has zero length.
     """
-    q = np.asarray(quats, dtype=np.float64)
-    norm = np.linalg.norm(q, axis=-1, keepdims=True)
-    if np.any(norm == 0.0):
-        raise ValueError("quats holds a quaternion of zero length, expected non-zero")
-    w, x, y, z = np.moveaxis(q / norm, -1, 0)
-    entries = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return np.stack(entries, -1).reshape(*q.shape[:-1], 3, 3)
+    return Rotation.from_quat(quats, scalar_first=True).as_matrix()
 
 
 def matrix_to_quat(R: np.ndarray) -> np.ndarray:
-    """Return unit quaternions (..., 4), wxyz with w >= 0, of rotation matrices (..., 3, 3).
-
-    Takes the best conditioned of the four branches (Shepperd 1978), so that half turns are exact.
-    """
-    m = np.asarray(R, dtype=np.float64)
-    d0, d1, d2 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
-    squares = [1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2]
-    x = m[..., 2, 1] - m[..., 1, 2]
-    y = m[..., 0, 2] - m[..., 2, 0]
-    z = m[..., 1, 0] - m[..., 0, 1]
-    xy = m[..., 1, 0] + m[..., 0, 1]
-    xz = m[..., 0, 2] + m[..., 2, 0]
-    yz = m[..., 2, 1] + m[..., 1, 2]
-    entries = [
-        squares[0], x, y, z,
-        x, squares[1], xy, xz,
-        y, xy, squares[2], yz,
-        z, xz, yz, squares[3],
-    ]  # fmt: skip
-    branches = np.stack(entries, -1).reshape(*m.shape[:-2], 4, 4)
-    best = np.argmax(squares, axis=0)[..., None, None]
-    q = np.take_along_axis(branches, best, axis=-2)[..., 0, :]
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    return np.where(q[..., :1] < 0, -q, q)
+    """Return unit quaternions (..., 4), wxyz with w >= 0, of rotation matrices (..., 3, 3)."""
+    return Rotation.from_matrix(R).as_quat(canonical=True, scalar_first=True)
 
 
 def matrix_to_axis_angle(R: np.ndarray) -> np.ndarray:
     """Return axis-angle vectors (..., 3), radians in [0, pi], of rotation matrices (..., 3, 3)."""
-    q = matrix_to_quat(R)
-    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
-    angle = 2.0 * np.arctan2(sine, q[..., :1])
-    scale = np.where(sine < 1e-12, 2.0, angle / np.where(sine < 1e-12, 1.0, sine))
-    return scale * q[..., 1:]
+    return Rotation.from_matrix(R).as_rotvec()
 
 
 def slerp(q0: np.ndarray, q1: np.ndarray, t: float | np.ndarray) -> np.ndarray:
-    """Interpolate spherically between unit quaternions (..., 4), along the shorter arc.
-
-    Source: Shoemake 1985; falls back to normalised linear interpolation for nearly equal ends.
-    """
-    q0 = np.asarray(q0, dtype=np.float64)
-    q1 = np.asarray(q1, dtype=np.float64)
-    t = np.asarray(t, dtype=np.float64)[..., None]
-    cosine = np.sum(q0 * q1, axis=-1, keepdims=True)
-    q1 = np.where(cosine < 0, -q1, q1)
-    angle = np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
-    sine = np.sin(angle)
-    near = sine < 1e-6
-    safe = np.where(near, 1.0, sine)
-    w0 = np.where(near, 1.0 - t, np.sin((1.0 - t) * angle) / safe)
-    w1 = np.where(near, t, np.sin(t * angle) / safe)
-    q = w0 * q0 + w1 * q1
-    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+    """Interpolate spherically between unit quaternions (..., 4), wxyz, along the shorter arc."""
+    start, end = (Rotation.from_quat(q, scalar_first=True) for q in (q0, q1))
+    way = Rotation.from_rotvec(np.asarray(t)[..., None] * (start.inv() * end).as_rotvec())
+    return (start * way).as_quat(scalar_first=True)
 
 
 def make_transform(R: np.ndarray, t: np.ndarray) -> np.ndarray:

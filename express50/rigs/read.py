@@ -6,22 +6,27 @@ the pixel origin at the first pixel's centre, so that K is shifted.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from express50.errors import CalibrationError
 from express50.files.calibration import read_cameras
-from express50.files.text import TOML_LIMIT, read_text, reason
+from express50.files.text import read_yaml, reason
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_from_opencv
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
 from express50.rigs.calibrators import read_calibration_toml, read_kalibr, read_qualisys
-from express50.rigs.camera_builder import at_size, camera_from_K, checked, holds, in_metres
+from express50.rigs.camera_builder import (
+    at_size,
+    camera_from_K,
+    checked,
+    finite_array,
+    holds,
+    in_metres,
+)
 from express50.rigs.colmap import is_colmap, read_colmap_images
 from express50.rigs.photogrammetry import read_metashape, read_reality_capture, read_vggt
 from express50.rigs.public_captures import read_nersemble, read_renderme
@@ -34,7 +39,6 @@ _ROTATION = ("R", "rotation", "rvec", "Rot")
 _TRANSLATION = ("T", "t", "tvec", "translation")
 _SIZES = (("image_width", "image_height"), ("width", "height"), ("W", "H"))
 YAML = (".yml", ".yaml")
-LEVELS, ENTRIES = 16, 64  # of nesting, and in a matrix
 
 
 class RigFormat(NamedTuple):
@@ -150,103 +154,45 @@ def read_opencv_yaml(path: Path, size: tuple[int, int] | None) -> dict[str, Came
     files = sorted(p for p in path.iterdir() if p.suffix in YAML) if path.is_dir() else [path]
     found = {}
     for file in files:
-        storage = _open(file)
-        with _damage(file):
-            K = _matrix(storage, _K, file)
-            dist = _matrix(storage, _DIST, file, optional=True)
-            pose = _pose(storage, file)
-            shape = _image_size(storage, size, file)
-            found[file.stem] = camera_from_K(file.stem, K_from_opencv(K), dist.ravel(), shape, pose)
+        table = read_yaml(file, CalibrationError)
+        K, dist = _matrix(table, _K, file), _matrix(table, _DIST, file)
+        R, t = _matrix(table, _ROTATION, file), _matrix(table, _TRANSLATION, file)
+        if K.shape != (3, 3):
+            raise CalibrationError(f"{file}: expected a 3 x 3 matrix called {' or '.join(_K)}")
+        if R.size == 3:
+            R = axis_angle_to_matrix(R.ravel())
+        if R.shape != (3, 3) or t.size != 3:
+            raise CalibrationError(
+                f"{file}: no pose; expected {' or '.join(_ROTATION)} (3 x 3 or a Rodrigues vector)"
+                f" and {' or '.join(_TRANSLATION)} (3), world to camera"
+            )
+        pair = next((pair for pair in _SIZES if table.keys() >= {*pair}), None)
+        shape = size
+        if pair is not None:
+            sides = [table[side] for side in pair]
+            width, height = finite_array(sides, (2,), f"{file} has {' and '.join(pair)}")
+            shape = int(width), int(height)
+        if shape is None:
+            raise CalibrationError(
+                f"{file}: does not say the images' size; give --size WIDTHxHEIGHT"
+            )
+        pose = make_transform(R, t.ravel())
+        found[file.stem] = camera_from_K(file.stem, K_from_opencv(K), dist, shape, pose)
     return checked(found, path)
 
 
-def _open(path: Path) -> cv2.FileStorage:
-    """Open a file after refusing nesting that would overflow OpenCV's recursive parser."""
-    text = read_text(path, CalibrationError, TOML_LIMIT)
-    if not text.startswith("%YAML"):
-        raise CalibrationError(f"{path}: does not begin with %YAML; expected OpenCV's YAML 1.0")
-    level = 0
-    for line in text.split("\n"):
-        lead = len(line) - len(line.lstrip(" -\t"))
-        level = max(0, level + line.count("[") + line.count("{"))
-        if level > LEVELS or lead > 4 * LEVELS:
-            raise CalibrationError(f"{path}: is nested over {LEVELS} deep, expected matrices")
-        level = max(0, level - line.count("]") - line.count("}"))
-    with _damage(path):
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    if not storage.isOpened():
-        raise CalibrationError(f"{path}: OpenCV cannot read it; expected its YAML 1.0 format")
-    return storage
-
-
-@contextmanager
-def _damage(path: Path) -> Iterator[None]:
-    """Name the file in errors of OpenCV, which checks a value only when it is asked for it."""
+def _matrix(table: object, keys: tuple[str, ...], path: Path) -> np.ndarray:
+    """Read the first of the named matrices, rows of numbers or OpenCV's own; empty without one."""
+    if not isinstance(table, dict):
+        raise CalibrationError(f"{path}: holds no named values, expected OpenCV's matrices")
+    name = next((key for key in keys if key in table), "")
+    value = table.get(name, [])
     try:
-        yield
-    except (cv2.error, SystemError, ValueError, OverflowError, TypeError) as error:
+        if isinstance(value, dict):
+            numbers = np.array(value["data"], np.float64)
+            return numbers.reshape(int(value["rows"]), int(value["cols"]))
+        return np.array(value, np.float64)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise CalibrationError(
-            f"{path}: OpenCV cannot read a value ({getattr(error, 'err', '') or reason(error)});"
-            " write the file again"
+            f"{path}: {name} cannot be read as a matrix ({reason(error)}); write the file again"
         ) from None
-
-
-def _matrix(
-    storage: cv2.FileStorage, keys: tuple[str, ...], path: Path, optional: bool = False
-) -> np.ndarray:
-    """Read the first of the named matrices that exists; a 3 x 3 one unless it is optional."""
-    for key in keys:
-        node = storage.getNode(key)
-        if node.empty():
-            continue
-        if node.isMap():  # OpenCV would allocate a matrix of any size before it reads the numbers
-            rows, columns = (int(node.getNode(side).real()) for side in ("rows", "cols"))
-            count = node.getNode("data").size()
-            if not 0 < rows * columns <= ENTRIES or rows * columns != count:
-                raise CalibrationError(f"{path}: {key} is {rows} x {columns} with {count} numbers")
-            value = node.mat()
-        else:
-            value = _list_of_numbers(path, key, node)
-        if optional or value.shape == (3, 3):
-            return np.asarray(value, dtype=np.float64)
-        raise CalibrationError(f"{path}: {key} has shape {value.shape}, expected (3, 3)")
-    if optional:
-        return np.zeros(0)
-    raise CalibrationError(f"{path}: has none of {', '.join(keys)}; expected a 3 x 3 matrix")
-
-
-def _list_of_numbers(path: Path, key: str, node: cv2.FileNode) -> np.ndarray:
-    """Read a list of numbers, or a list of rows of them."""
-    entries = [node.at(i) for i in range(min(node.size(), ENTRIES))]
-    if not any(entry.isSeq() for entry in entries):
-        return np.array([entry.real() for entry in entries])
-    if len({entry.size() if entry.isSeq() else -1 for entry in entries}) != 1:
-        raise CalibrationError(f"{path}: {key} has rows of several lengths, expected a matrix")
-    width = min(entries[0].size(), ENTRIES)
-    return np.array([[entry.at(i).real() for i in range(width)] for entry in entries])
-
-
-def _pose(storage: cv2.FileStorage, path: Path) -> np.ndarray:
-    """Read a pose world to camera (4, 4); a rotation is a matrix or Rodrigues' vector."""
-    R = _matrix(storage, _ROTATION, path, optional=True)
-    t = _matrix(storage, _TRANSLATION, path, optional=True)
-    if R.size == 3:
-        R = axis_angle_to_matrix(R.ravel())
-    if R.shape != (3, 3) or t.size != 3:
-        raise CalibrationError(
-            f"{path}: no pose; expected {' or '.join(_ROTATION)} (3 x 3 or a Rodrigues vector) and"
-            f" {' or '.join(_TRANSLATION)} (3), world to camera"
-        )
-    return make_transform(R, t.ravel())
-
-
-def _image_size(
-    storage: cv2.FileStorage, size: tuple[int, int] | None, path: Path
-) -> tuple[int, int]:
-    for pair in _SIZES:
-        nodes = [storage.getNode(key) for key in pair]
-        if not any(node.empty() for node in nodes):
-            return int(nodes[0].real()), int(nodes[1].real())
-    if size is None:
-        raise CalibrationError(f"{path}: does not say the images' size; give --size WIDTHxHEIGHT")
-    return size

@@ -17,11 +17,7 @@ from express50.contract.stage import Growth, Result, Stage
 
 @dataclass(frozen=True, kw_only=True)
 class FramesConfig:
-    """Sample depth of the written frames."""
-
-    deep: bool = True
-    """Keep 16 bits per channel where the footage has more than 8; the files are ten times as
-    large."""
+    """Nothing to set."""
 
 
 def items(dataset: Dataset) -> list[str]:
@@ -54,14 +50,14 @@ def run(dataset: Dataset, item: str, config: FramesConfig, out: Path) -> Result:
     """Write one file per camera, and a contact sheet."""
     from pipelines.frames.stage import run as work
 
-    return work(dataset, item, config.deep, out)
+    return work(dataset, item, out)
 
 
 STAGE = Stage(
     name="frames",
-    version=1,
+    version=2,
     config=FramesConfig,
-    presets={"draft": {"deep": False}, "standard": {}, "reference": {}},
+    presets={"draft": {}, "standard": {}, "reference": {}},
     items=items,
     inputs=inputs,
     run=run,

@@ -14,7 +14,6 @@ from express50.capture.index import check_peak, read_index, read_peak_rows
 from express50.contract.layout import PLATES, Dataset
 from express50.contract.stage import Note, Result
 from express50.errors import CaptureError, StageError
-from express50.files.containers import to_srgb
 from express50.files.images import shrink, tile_sheet, write_image
 from express50.geometry.sampling import pictured_share, undistort_image
 
@@ -29,14 +28,10 @@ Read = Callable[[str], np.ndarray]
 """Camera id to its recorded image (H, W, 3); raises CaptureError."""
 
 
-def run(dataset: Dataset, item: str, deep: bool, out: Path) -> Result:
+def run(dataset: Dataset, item: str, out: Path) -> Result:
     """Write `<camera>.jxl` per calibrated camera; a camera that cannot be read is dropped.
 
-    Args:
-        dataset: the dataset.
-        item: `subject/expression`, or `subject/_plates`.
-        deep: keep 16 bits per channel where the footage has them.
-        out: folder of the outputs.
+    The item is `subject/expression`, or `subject/_plates`.
 
     Raises:
         CaptureError: the labelled frame is not the one that was indexed.
@@ -48,11 +43,10 @@ def run(dataset: Dataset, item: str, deep: bool, out: Path) -> Result:
     if expression == PLATES:
         index = read_index(dataset, subject)
         cameras = {name: camera for name, camera in cameras.items() if name in index.plates}
-    read = _reader(dataset, subject, expression, deep)
+    read = _reader(dataset, subject, expression)
     dropped: list[Note] = []
     warnings: list[Note] = []
     tiles: dict[str, np.ndarray] = {}
-    bits: dict[str, int] = {}
     for name, camera in cameras.items():
         try:
             image = undistort_image(read(name), camera)
@@ -60,28 +54,27 @@ def run(dataset: Dataset, item: str, deep: bool, out: Path) -> Result:
             dropped.append(Note(name, str(error)))
             continue
         write_frame(out / f"{name}.jxl", image)
-        bits[name] = 8 * image.itemsize
         if (share := pictured_share(camera)) < 1:
             warnings.append(Note(name, FOLDS.format(1 - share)))
-        tiles[name] = shrink(to_srgb(image), TILE)
+        tiles[name] = shrink(image, TILE)
     if not tiles:
         why = "; ".join(f"{note.what}: {note.why}" for note in dropped[:3])
         raise StageError(f"{item}: no camera could be read ({why or 'none is calibrated'})")
     (out / "qc").mkdir()
     write_image(out / "qc" / "frames.jpg", tile_sheet(tiles, COLUMNS, TILE), quality=88)
-    return Result({"frames": len(tiles), "bits": bits}, dropped, warnings)
+    return Result({"frames": len(tiles)}, dropped, warnings)
 
 
-def _reader(dataset: Dataset, subject: str, expression: str, deep: bool) -> Read:
+def _reader(dataset: Dataset, subject: str, expression: str) -> Read:
     """Make the function that reads one camera's recorded frame or plate."""
     index = read_index(dataset, subject)
     if expression == PLATES:
-        return lambda camera: read_recorded_plate(index, camera, deep)
+        return lambda camera: read_recorded_plate(index, camera)
     peak = read_peak_rows(dataset, subject)[expression]
     check_peak(index, expression, peak)
 
     def read(camera: str) -> np.ndarray:
         with closing(FrameReader(index, camera)) as reader:
-            return reader.read(peak.frame, deep)
+            return reader.read(peak.frame)
 
     return read

@@ -34,8 +34,6 @@ class MatteConfig:
     """Difference that is as likely noise as subject; alpha is 0 below it."""
     high: float = 6.0
     """Difference that proves foreground; weaker pixels must touch such ones."""
-    light: Literal["linear", "display"] = "linear"
-    """Soft edges mix linear light, as in cameras, or sRGB values, as in composites."""
     shadow: float = 0.25
     """Broad darkening of the plate up to this share is a shadow; 0 turns this off."""
     agree: bool = True

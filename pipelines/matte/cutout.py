@@ -340,11 +340,11 @@ def _posterior(
 ) -> np.ndarray:
     """Return the mean opacity (N,) of the pixels of a band (H, W), given person and wall."""
     wall, wall_error = _wall(image, valid & (depth <= -OUTER_M), depth, density)
-    light, behind = to_light(image, linear=True), to_light(wall, linear=True)[band]
+    light, behind = to_light(image), to_light(wall)[band]
     rim = (valid & (depth > RIM_M[0]) & (depth < RIM_M[1])).astype(np.float32)
     mean, covariance = local_colours(light, rim, band, REACH_M * density, SPREAD)
     level = np.clip(wall[band], 1, 254)
-    slope = (to_light(level + 1, linear=True) - to_light(level - 1, linear=True)) / 2
+    slope = (to_light(level + 1) - to_light(level - 1)) / 2
     own, error = (NOISE * slope) ** 2, (wall_error[band] * slope) ** 2
     inside = np.clip(1 / (1 + np.exp(-depth[band] / DOUBT_M)), ODD, 1 - ODD)
     soft = MIXED * np.exp(-np.abs(depth[band]) / (4 * DOUBT_M)) + ODD

@@ -104,7 +104,7 @@ def _opacity(
     config: MatteConfig,
 ) -> np.ndarray:
     """Solve alpha (H, W) float32: 1 deep in the core and 0 off the support."""
-    core, linear = support.core, config.light == "linear"
+    core = support.core
     alpha = core.astype(np.float32)
     # Between strands the solid looks closed from a distance; near its edge it is measured.
     todo = support.near | (core & ~eroded(core, _pixels(FILL, length)))
@@ -114,15 +114,15 @@ def _opacity(
     if not core.any():
         strong = difference >= np.percentile(difference[difference > 0], 98)
         weight = (strong & support.near).astype(np.float32)
-    light = to_light(image, linear)
+    light = to_light(image)
     reach = REACH * length
     mean, covariance = local_colours(light, weight, todo, reach, SPREAD)
     plate = model.plate
     if config.shadow > 0:
         clear = ~(core | support.near)
         plate = plate * shade_of_plate(image, model, clear, config.shadow, length)[..., None]
-    noise = light_noise(plate[todo], model.sigma[todo], model.whiten, linear)
-    behind = to_light(plate[todo], linear)
+    noise = light_noise(plate[todo], model.sigma[todo], model.whiten)
+    behind = to_light(plate[todo])
     value, deviation, at_zero = solve_opacity(light[todo], behind, mean, covariance, noise)
     # In the core what is not surely open is solid, off it what is not surely subject is plate.
     solid = 1 - shrunk(1 - value, SURE * deviation)

@@ -294,18 +294,15 @@ def _contrast_share(error: np.ndarray, by_level: np.ndarray, contrast: np.ndarra
     return float(np.clip(np.sqrt(max(more, 0.0)) / np.median(contrast[steep]), 0.0, 0.3))
 
 
-def to_light(values: np.ndarray, linear: bool) -> np.ndarray:
-    """Return light in [0, 1] of sRGB values in 8-bit steps, or the scaled values if not linear."""
-    shares = np.clip(values, 0, 255) / 255.0
-    return srgb_to_linear(shares).astype(np.float32) if linear else shares.astype(np.float32)
+def to_light(values: np.ndarray) -> np.ndarray:
+    """Return linear light in [0, 1], float32, of sRGB values in 8-bit steps."""
+    return srgb_to_linear(np.clip(values, 0, 255) / 255.0).astype(np.float32)
 
 
-def light_noise(
-    plate: np.ndarray, sigma: np.ndarray, whiten: np.ndarray, linear: bool
-) -> np.ndarray:
+def light_noise(plate: np.ndarray, sigma: np.ndarray, whiten: np.ndarray) -> np.ndarray:
     """Return the covariance (N, 3, 3) of light from that of 8-bit steps at plate values (N, 3)."""
     level = np.clip(plate, 1, 254)
-    slope = (to_light(level + 1, linear) - to_light(level - 1, linear)) / 2
+    slope = (to_light(level + 1) - to_light(level - 1)) / 2
     deviation = (slope * sigma).astype(np.float64)
     mixing = np.linalg.inv(whiten.astype(np.float64))
     return deviation[:, :, None] * (mixing @ mixing.T) * deviation[:, None, :]

@@ -163,7 +163,7 @@ def own_colours(image: np.ndarray, alpha: np.ndarray, plate: np.ndarray | None) 
     solid = (opacity >= SOLID).astype(np.float32)
     if not soft.any() or not solid.any():
         return image
-    light = to_light(image, linear=True)
+    light = to_light(image)
     reach = max(1.0, REACH_SHARE * max(image.shape[:2]))
     mean, covariance = local_colours(light, solid, soft, reach, SPREAD)
     share = opacity[soft].astype(np.float64)[:, None]
@@ -171,7 +171,7 @@ def own_colours(image: np.ndarray, alpha: np.ndarray, plate: np.ndarray | None) 
         # Mostly subject: what is seen is as good a guess as what is nearby.
         colour = mean + share**4 * (light[soft] - mean)
     else:
-        behind = to_light(plate, linear=True)[soft]
+        behind = to_light(plate)[soft]
         rest = light[soft] - (1 - share) * behind - share * mean
         square = share[..., None] ** 2
         gain = np.linalg.solve(square * covariance + NOISE**2 * np.eye(3), rest[..., None])

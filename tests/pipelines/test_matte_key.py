@@ -150,14 +150,6 @@ def test_shrinking_drops_doubt_and_keeps_what_is_sure() -> None:
     assert (shrunk_to[:3] == 0).all() and shrunk_to[3:] == pytest.approx(values[3:], abs=1e-3)
 
 
-def test_composites_in_srgb_values_are_keyed_as_such() -> None:
-    scene = make_scene(16, "black")
-    front = np.array([14.0, 12.0, 12.0])
-    mixed = scene.alpha[..., None] * front + (1 - scene.alpha[..., None]) * scene.plate
-    scene = replace(scene, frame=np.rint(mixed).astype(np.uint8))
-    assert mae(key(scene, light="display"), scene) < 0.7 * mae(key(scene), scene)
-
-
 def test_strands_before_a_shadow_are_measured_against_the_darkened_plate() -> None:
     lit, shaded = make_scene(17, "black"), make_scene(17, "black", shadow=0.2)
     assert mae(key(shaded), shaded) < 1.2 * mae(key(lit), lit) + 1e-3

@@ -206,9 +206,9 @@ def test_a_clip_is_decoded_once_and_its_crops_are_of_its_frames(ingested, monkey
     decoded: Counter[tuple[str, int]] = Counter()
     original = FrameReader.read
 
-    def counted(self, frame, deep=False):
+    def counted(self, frame):
         decoded[self.camera_id, frame] += 1
-        return original(self, frame, deep)
+        return original(self, frame)
 
     def find(image, camera_id: str, frame: int) -> Marked:
         points = project(rig[camera_id], places)[0]

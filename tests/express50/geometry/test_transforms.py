@@ -85,7 +85,7 @@ def test_fits_refuse_what_has_no_answer():
         transforms.rigid_fit(np.zeros((2, 3)), np.zeros((2, 3)))
     with pytest.raises(ValueError, match="not all the same"):
         transforms.rigid_fit(np.ones((5, 3)), np.zeros((5, 3)))
-    with pytest.raises(ValueError, match="zero length"):
+    with pytest.raises(ValueError, match="zero norm"):
         transforms.quat_to_matrix(np.zeros(4))
 
 
