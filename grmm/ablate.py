@@ -46,6 +46,7 @@ class Variant:
         label: as in the table.
         changes: table -> key -> value over the common configuration.
         paper_db: the paper's PSNR minus that of its full model; None: no figure.
+        against: the row that it is compared with.
         trains_as: the row whose checkpoint it uses, where only the fit differs.
         without: the folder of shards left out.
     """
@@ -53,14 +54,20 @@ class Variant:
     label: str
     changes: Mapping[str, Mapping[str, object]]
     paper_db: float | None = None
+    against: str = "full"
     trains_as: str = ""
     without: Path | None = None
 
 
 VARIANTS = {
     "full": Variant(label="Full model", changes={}),
+    # Modes are not the paper's: they would be driven by shape coefficients in the row after.
+    "no_modes": Variant(label="W/o identity modes", changes={"model": {"identity_modes": 0}}),
     "no_residuals": Variant(
-        label="W/o residuals", changes={"model": {"residual_codes": False}}, paper_db=-1.63
+        label="W/o residuals, against w/o modes",
+        changes={"model": {"residual_codes": False, "identity_modes": 0}},
+        paper_db=-1.63,
+        against="no_modes",
     ),
     "no_mesh_decoder": Variant(
         label="W/o mesh decoder", changes={"model": {"mesh_decoder": False}}, paper_db=-2.18
@@ -117,6 +124,8 @@ def ablate(run: Ablation, names: Sequence[str] = ()) -> dict[str, Any]:
     """
     config = with_holdout(run.roots, run.config)
     variants = variants_of(run.roots, names)
+    if not config.model.identity_modes:
+        variants.pop("no_modes", None)
     source = open_shards(run.roots, "*")
     head = load_head(source.head)
     views = HeadViews(source, head)
@@ -188,6 +197,7 @@ def _row(run: Ablation, name: str, variant: Variant) -> dict:
     log(f"ablate: measuring {name}")
     row = measure(run, replace(loaded, config=settings), used)
     row |= {"digest": digest, "label": variant.label, "paper_db": variant.paper_db}
+    row["against"] = variant.against
     write_json(path, row)
     return row
 
@@ -252,18 +262,20 @@ def variants_of(roots: Sequence[Path], names: Sequence[str] = ()) -> dict[str, V
             raise ConfigError(
                 f"row {name!r} is unknown{nearest(name, rows)}; expected {', '.join(rows)}"
             )
-    # The full model comes first: others are compared with it, and no_locality uses its weights.
-    return {name: row for name, row in rows.items() if not names or name in (*names, "full")}
+    # Rows come after those that they are compared with; no_locality uses the full model's weights.
+    wanted = {*names, "full", *(rows[name].against for name in names)}
+    return {name: row for name, row in rows.items() if not names or name in wanted}
 
 
 def write_tables(out: Path, rows: Mapping[str, dict], config: Config) -> dict[str, Any]:
     """Write ablation.json and ablation.md of the rows measured so far; returns the former."""
-    full, table = rows["full"]["groups"], {}
+    table: dict[str, Any] = {}
     for name, row in rows.items():
+        other = rows.get(row["against"], rows["full"])["groups"]
         gains = {
-            group: round(numbers["psnr_db"] - full[group]["psnr_db"], 3)
+            group: round(numbers["psnr_db"] - other[group]["psnr_db"], 3)
             for group, numbers in row["groups"].items()
-            if group in full and None not in (numbers["psnr_db"], full[group]["psnr_db"])
+            if group in other and None not in (numbers["psnr_db"], other[group]["psnr_db"])
         }
         table[name] = row | {"difference_db": gains}
     budget = {"seconds": config.train.seconds or None, "iterations": config.train.iterations}

@@ -214,6 +214,8 @@ def _current_settings(path: Path, tables: dict[str, dict[str, Any]]) -> dict[str
                     f"{gone[key]!r}: the setting is gone. Train again, or use commit c44aa77"
                 )
         current[table] = {key: value for key, value in values.items() if key not in gone}
+    if current["data"].get("torso") == "keep":  # what the matte held was the head
+        current["data"]["torso"] = "background"
     return current
 
 

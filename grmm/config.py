@@ -17,7 +17,8 @@ from express50.contract.config import build_dataclass, known_assignments, read_t
 from express50.errors import ConfigError
 
 FRAMES = ("head", "tangent")
-SCALE_RANGE_MM = (0.1, 10.0)  # of Gaussians at n_g = 512, from the paper; its unit is G2's
+TORSO = ("background", "ignore")
+SCALE_RANGE_MM = (0.1, 10.0)  # of Gaussians, from the paper; its unit is G2's
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,12 +85,6 @@ class ModelConfig:
                 f"expected at most z_id = {self.z_id}"
             )
 
-    @property
-    def scale_bounds_mm(self) -> tuple[float, float]:
-        """Return the range of scales, mm: texels of a smaller map lie further apart."""
-        low, high = SCALE_RANGE_MM
-        return low * 512 / self.n_g, high * 512 / self.n_g
-
 
 @dataclass(frozen=True, kw_only=True)
 class LossConfig:
@@ -126,13 +121,13 @@ class DataConfig:
     Another subject must show the expression, or it has no code."""
     background: float = 0.0
     """Grey behind footage and renderings, sRGB in [0, 1]. G15."""
-    torso: str = "ignore"
-    """``ignore`` pixels of shoulders and clothes in losses and metrics, or ``keep`` them as if the
-    head model held them."""
+    torso: str = "background"
+    """Shoulders and clothes are ``background``, as in the paper, or ``ignore`` them: neither losses
+    nor metrics count their pixels, and Gaussians at the neck's end are free."""
 
     def __post_init__(self) -> None:
-        if self.torso not in ("ignore", "keep"):
-            raise ConfigError(f"data.torso is {self.torso!r}, expected one of ignore, keep")
+        if self.torso not in TORSO:
+            raise ConfigError(f"data.torso is {self.torso!r}, expected one of {', '.join(TORSO)}")
         _in_range("data.background", self.background, 0.0, 1.0)
 
 

@@ -15,16 +15,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from express50.contract.segmentation_labels import TORSO
 from express50.errors import FormatError
 from express50.geometry.transforms import make_transform
 from express50.head.model import HeadModel, pose
 from grmm.config import DataConfig
-from grmm.head_crop import crop_view, head_window, labelled_torso, torso_mask
+from grmm.head_crop import crop_view, grown, head_window, torso_mask
 from grmm.model import HeadState, PinholeView
 
 NO_OFFSETS = np.zeros((0, 3), np.float32)
 CACHE_BYTES = 512 << 20  # of decoded samples: some hundred of 512 px
-DEFAULTS = DataConfig()  # black behind the head, torso ignored
+DEFAULTS = DataConfig()  # black behind the head, torso too
 Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
 
@@ -98,6 +99,7 @@ class Sample:
         cam_from_world: (4, 4).
         tracked: head-model parameters.
         parts: (H, W) uint8 of segmentation_labels.LABELS. None: the shards have none.
+        bare: True where alpha and depth leave the torso out already.
     """
 
     image: np.ndarray
@@ -107,6 +109,7 @@ class Sample:
     cam_from_world: np.ndarray
     tracked: Tracked
     parts: np.ndarray | None = None
+    bare: bool = False
 
     @property
     def place(self) -> Place:
@@ -153,7 +156,7 @@ class Item:
         view: camera in head space.
         target: (3, H, W) footage composited on the background.
         mask: (H, W) bool, footage alpha over 0.5, and counts.
-        counts: (H, W) bool, False where footage shows what the head model does not hold: torso.
+        counts: (H, W) bool, False on a torso that is ignored (DataConfig.torso).
         depth: (H, W) metres.
         depth_valid: (H, W) bool.
     """
@@ -220,17 +223,18 @@ class HeadViews:
         height, width = sample.alpha.shape
         view = self.view_of(sample.place)
         torso = self._torso(index, sample, state, view)
+        matte = np.where(torso, 0, sample.alpha)
         rows, columns = slice(0, height), slice(0, width)
         if crop:
-            matte = np.where(torso, 0, sample.alpha)
             rows, columns = head_window(state.vertices, view, matte)
             view = crop_view(view, rows, columns)
-        image, alpha = sample.image[rows, columns], sample.alpha[rows, columns]
+        torso, image = torso[rows, columns], sample.image[rows, columns]
+        alpha = (sample.alpha if self.ignore_torso else matte)[rows, columns]
         depth = np.zeros_like(alpha) if sample.depth is None else sample.depth[rows, columns]
-        known = self._tensor(depth)
+        known = self._tensor(np.where(torso, 0, depth))
         weight = (self._tensor(alpha) / 255)[..., None]
         target = self._tensor(image) / 255 * weight + self.background * (1 - weight)
-        counts = torch.from_numpy(~torso[rows, columns]).to(self.head.device)
+        counts = torch.from_numpy(~(torso & self.ignore_torso)).to(self.head.device)
         return Item(
             key=self.keys[index],
             state=state,
@@ -239,16 +243,20 @@ class HeadViews:
             mask=(weight[..., 0] > 0.5) & counts,
             counts=counts,
             depth=known,
-            depth_valid=(known > 0) & counts,
+            depth_valid=known > 0,
         )
 
     def _torso(self, index: int, sample: Sample, state: HeadState, view: PinholeView) -> np.ndarray:
-        """Find the torso pixels (H, W) of a sample; masks that take long are kept as bits."""
+        """Find the torso pixels (H, W) of a sample; masks that take long are kept as bits.
+
+        Ignored ones are dilated, as footage and matte blend at the border.
+        """
         size = sample.alpha.shape
-        if not self.ignore_torso:
+        if sample.bare and not self.ignore_torso:
             return np.zeros(size, bool)
         if sample.parts is not None:
-            return labelled_torso(sample.parts)
+            labelled = sample.parts == TORSO
+            return grown(labelled) if self.ignore_torso else labelled
 
         def make() -> np.ndarray:
             mask = torso_mask(self.head, state.vertices, view, sample.alpha, sample.depth)

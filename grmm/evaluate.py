@@ -33,7 +33,7 @@ Window = Callable[[int], tuple[slice, slice, tuple[int, int]]]
 """Rows and columns of a sample's picture that its camera saw, and the picture's (H, W)."""
 IDS = ("subject", "expression", "camera", "kind")
 NUMBERS = (
-    "psnr_db", "psnr_head_db", "psnr_with_torso_db", "ssim", "ssim_head", "rmse", "rmse_head",
+    "psnr_db", "psnr_head_db", "ssim", "ssim_head", "rmse", "rmse_head",
     "lpips", "psnr_unrefined_db", "depth_mm",
 )  # fmt: skip
 SEEN, HELD_VIEW, HELD_EXPRESSION, HELD_IDENTITY = (
@@ -94,7 +94,7 @@ def evaluate(
 def compare(image: Tensor, item: Item, judge: PerceptualMetrics, kind: str = "") -> Row:
     """Compare one picture (3, H, W) in [0, 1] with its footage; the judge remembers it for FID.
 
-    ``psnr_db``, ``ssim``, ``rmse``, ``lpips`` count every pixel but torso (DataConfig.torso);
+    ``psnr_db``, ``ssim``, ``rmse``, ``lpips`` count every pixel, but a torso that is ignored;
     ``*_head`` pixels of the footage's matte only, so that an easy background cannot flatter.
 
     Raises:
@@ -112,7 +112,6 @@ def compare(image: Tensor, item: Item, judge: PerceptualMetrics, kind: str = "")
         "kind": kind,
         "psnr_db": psnr_db(image, item.target, item.counts),
         "psnr_head_db": psnr_db(image, item.target, item.mask),
-        "psnr_with_torso_db": psnr_db(image, item.target),
         "ssim": ssim_score(shown, item.target),
         "ssim_head": ssim_score(shown, item.target, item.mask),
         "rmse": rmse(image, item.target, item.counts),

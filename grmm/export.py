@@ -17,6 +17,7 @@ from express50.files.atomic import write_bytes
 from express50.geometry.shapes import check_finite
 from express50.head.model import HeadModel
 from grmm.checkpoint import Loaded
+from grmm.config import SCALE_RANGE_MM
 from grmm.edit import HeadCodes
 from grmm.model import PinholeView
 
@@ -85,11 +86,10 @@ def decoded(
     model, state = loaded.model, head.state(loaded)
     gaussians = model.geometry(head.z_id, head.z_exp, state)
     colours = model.appearance(head.z_id, state, view)[:, :3]
-    low, high = loaded.config.model.scale_bounds_mm
     cloud = GaussianCloud(
         means=gaussians.means.cpu().numpy(),
         quats=torch.nn.functional.normalize(gaussians.quats, dim=1).cpu().numpy(),
-        scales=1e-3 * gaussians.scales_mm.clamp(low, high).cpu().numpy(),
+        scales=1e-3 * gaussians.scales_mm.clamp(*SCALE_RANGE_MM).cpu().numpy(),
         opacities=gaussians.opacities.cpu().numpy(),
         colors=colours.cpu().numpy(),
     )

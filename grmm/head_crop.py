@@ -17,9 +17,9 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from express50.contract.segmentation_labels import TORSO
 from express50.geometry.conventions import cell_to_corner
 from express50.head.model import HeadModel
+from grmm.config import SCALE_RANGE_MM
 from grmm.model import GRMM, Gaussians, PinholeView, Rendering
 from grmm.rasterize.projection import ALPHA_MIN, NEAR_M
 
@@ -46,8 +46,7 @@ def draw_window(
     near the window's border as they do in training, whose crops have the same margin. ``colours``
     (N, 3 + features) are from `GRMM.appearance`; ``background`` is grey, sRGB in [0, 1].
     """
-    low, high = model.config.scale_bounds_mm
-    rows, columns = gaussian_window(gaussians, view, (1e-3 * low, 1e-3 * high))
+    rows, columns = gaussian_window(gaussians, view)
     out = model.draw(gaussians, colours, crop_view(view, rows, columns), background, refine)
     if (out.image.shape[1], out.image.shape[2]) == (view.height, view.width):
         return out
@@ -63,9 +62,7 @@ def draw_window(
     return replace(out, image=image, rgb=rgb, depth=depth, alpha=alpha)
 
 
-def gaussian_window(
-    gaussians: Gaussians, view: PinholeView, bounds_m: tuple[float, float]
-) -> tuple[slice, slice]:
+def gaussian_window(gaussians: Gaussians, view: PinholeView) -> tuple[slice, slice]:
     """Return the rows and columns that hold every pixel a Gaussian reaches, with a margin.
 
     A sphere bounds a Gaussian: its largest scale, out to where alpha falls under a level of 8 bits.
@@ -73,7 +70,7 @@ def gaussian_window(
     """
     with torch.no_grad():
         visible = gaussians.opacities > ALPHA_MIN
-        largest = gaussians.scales_mm.amax(1).mul(1e-3).clamp(*bounds_m)
+        largest = 1e-3 * gaussians.scales_mm.amax(1).clamp(*SCALE_RANGE_MM)
         sigmas = (gaussians.opacities / ALPHA_MIN).clamp_min(1.0).log().mul(2).sqrt()
         extra = CROP_MARGIN_PX + 2.0  # the rasteriser's blur reaches under two pixels
         reach = (largest * sigmas)[visible]
@@ -144,11 +141,6 @@ def crop_view(view: PinholeView, rows: slice, columns: slice) -> PinholeView:
     return replace(view, K=K, width=columns.stop - columns.start, height=rows.stop - rows.start)
 
 
-def labelled_torso(parts: np.ndarray) -> np.ndarray:
-    """Mark the pixels (H, W) bool that part labels (H, W) call torso, dilated."""
-    return _grown(parts == TORSO)
-
-
 def torso_mask(
     head: HeadModel,
     vertices: Tensor,
@@ -182,7 +174,7 @@ def torso_mask(
     on_neck, on_end = (region.cpu().numpy()[nearest] for region in (neck, end))
     torso = np.zeros_like(foreground)
     torso[rows, columns] = (on_neck & (distance > STAND_OFF_M)) | (on_end & (distance > END_M))
-    return _grown(torso)
+    return grown(torso)
 
 
 def _filled(
@@ -196,6 +188,7 @@ def _filled(
     return depth[tuple(index)]
 
 
-def _grown(mask: np.ndarray) -> np.ndarray:
+def grown(mask: np.ndarray) -> np.ndarray:
+    """Dilate a mask (H, W) bool by GROW_PX."""
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     return cv2.dilate(mask.astype(np.uint8), cross, iterations=GROW_PX, borderValue=0) > 0

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from express50.errors import ConfigError
 from express50.files.arrays import read_weights
-from grmm.config import LossConfig
+from grmm.config import SCALE_RANGE_MM, LossConfig
 
 L1, PERCEPTUAL = 0.8, 0.04  # weights of colours and of VGG16 features, the paper's (G14)
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
@@ -100,12 +100,13 @@ def depth_dm2(
     return (10.0 * (depth - target)[mask]).square().mean()
 
 
-def scale_mm(scales_mm: Tensor, low: float = 0.1, high: float = 10.0) -> Tensor:
-    """Keep scales (N, 3), millimetres, within [low, high]: 1 / s below, (s - high)^2 above.
+def scale_mm(scales_mm: Tensor) -> Tensor:
+    """Keep scales (N, 3), millimetres, within 0.1 to 10: 1 / s below, (s - 10)^2 above.
 
     Millimetres as in RGCA, whose constants these are: in metres 1 / s of a 1 mm Gaussian is 1000
     (G2). The reciprocal stops at 1e-7, as the paper has it.
     """
+    low, high = SCALE_RANGE_MM
     small = scales_mm < low
     below = 1.0 / torch.where(small, scales_mm.clamp_min(1e-7), torch.ones_like(scales_mm))
     above = (scales_mm - high).clamp_min(0).square()

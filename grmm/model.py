@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from express50.geometry.transforms_torch import matrix_to_quat
 from express50.head.model import HeadModel
 from grmm.anchors import interpolate, make_anchors, tangent_frames, uv_gradients
-from grmm.config import ModelConfig
+from grmm.config import SCALE_RANGE_MM, ModelConfig
 from grmm.networks import DISPLACEMENT_M, Networks, normalise_depth
 from grmm.rasterize import rasterize
 
@@ -239,11 +239,10 @@ class GRMM(Networks):
             colours = colours[:, :3]
         behind = colours.new_zeros(colours.shape[1])
         behind[:3] = background
-        low, high = self.config.scale_bounds_mm
         out = rasterize(
             gaussians.means,
             gaussians.quats,
-            1e-3 * gaussians.scales_mm.clamp(low, high),
+            1e-3 * gaussians.scales_mm.clamp(*SCALE_RANGE_MM),
             gaussians.opacities,
             colours,
             view.K,
@@ -294,7 +293,7 @@ def initial_scales(spacing_mm: Tensor, config: ModelConfig) -> Tensor:
 
     ``tangent``: along tangent, bitangent and, thinner, the normal; ``head``: the same on all axes.
     """
-    low, high = config.scale_bounds_mm
+    low, high = SCALE_RANGE_MM
     along = (config.scale_init * spacing_mm).clamp(1.05 * low, 0.95 * high)
     if config.frame == "tangent":
         thickness = THICKNESS * along.amin(1, keepdim=True)

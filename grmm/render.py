@@ -37,6 +37,7 @@ from grmm.networks import normalise_depth
 VIDEO_RATE = 24  # frames a second, as the rig's
 YAWS, PITCHES = (-60, -30, 0, 30, 60), (20, 0, -20)  # degrees of the sheet of novel views
 Sheet = tuple[list[list[np.ndarray]], list[str]]
+COLUMNS = "footage, refined, drawn, depth, error times four"  # of comparison sheets
 STEPS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 TURNS = {"neck, yaw": ("neck.1", 0.35), "eyes, yaw": ("eyes", 0.4)}  # radians of a step of 1
 JAW_OPEN = 0.35  # radians
@@ -56,7 +57,7 @@ def depth_picture(depth: Tensor, alpha: Tensor) -> np.ndarray:
 
 @torch.no_grad()
 def comparison_sheet(path: Path, views: HeadViews, indices: Many[int], render: Render) -> None:
-    """Write rows of footage | refined | rasterised | depth | error x 4."""
+    """Write rows of pictures in the order of COLUMNS."""
     rows, labels = [], []
     for index in indices:
         item = views.item(index)

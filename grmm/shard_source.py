@@ -65,6 +65,7 @@ class ShardSource:
             cam_from_world=place.cam_from_world,
             parts=None if sample["parts"] is None else sample["parts"][rows, columns],
             tracked=place.tracked,
+            bare=sample["meta"].get("torso") == "removed",
         )
 
     def place(self, index: int) -> Place:

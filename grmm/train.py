@@ -182,8 +182,7 @@ def objective(
         terms["depth"] = weights.depth * error
     codes, gaussians = model.codes(*model.rows(*item.key.frame)), rendering.gaussians
     return terms | {
-        "scale": weights.scale
-        * losses.scale_mm(gaussians.scales_mm, *config.model.scale_bounds_mm),
+        "scale": weights.scale * losses.scale_mm(gaussians.scales_mm),
         "laplacian": weights.laplacian * losses.laplacian_mm2(gaussians.displacement, state.edges),
         "codes": weights.codes * losses.codes(*codes),
     }

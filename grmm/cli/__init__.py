@@ -15,7 +15,7 @@ from typing import Any
 from express50 import __version__
 from express50.console import run_handler
 from grmm.cli import commands
-from grmm.config import PRESETS, TABLES
+from grmm.config import PRESETS, TABLES, TORSO
 
 DESCRIPTION = "Train the Gaussian Residual Morphable Model on packed shards, and use it."
 EPILOG = """example:
@@ -99,7 +99,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--fit-expression": {"default": "neutral", "help": "and this expression"},
     "--fit-budget": {"type": parse_seconds, "help": "time for a fit: 60s, 5m"},
     "--background": {"type": float, "default": 0.0, "help": "grey, 0 to 1"},
-    "--torso": {"default": "ignore", "choices": ("ignore", "keep"), "help": "its pixels"},
+    "--torso": {"default": TORSO[0], "choices": TORSO, "help": "its pixels (background)"},
     "--partial": FLAG | {"help": "score the pictures that exist"},
     "--rows": {"default": "", "help": "full,no_residuals,..; default: all"},
     "--json": FLAG | {"help": "print the result as JSON"},

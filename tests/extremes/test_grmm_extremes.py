@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from torch.autograd import gradcheck
 
 from grmm import losses
-from grmm.config import LossConfig
+from grmm.config import SCALE_RANGE_MM, LossConfig
 from grmm.edit import interpolate_tracked, slerp_axis_angle
 from grmm.metrics import psnr_db, ssim_score
 from grmm.model import initial_scales
@@ -73,7 +73,7 @@ def test_scale_term_of_huge_scales_is_finite():
 def test_initial_scales_stay_within_bounds(spacing):
     config = tiny_config().model
     raw = initial_scales(torch.full((2, 2), spacing), config)
-    low, high = config.scale_bounds_mm
+    low, high = SCALE_RANGE_MM
     scales = torch.nn.functional.softplus(raw)
     assert (scales >= 0.99 * low).all() and (scales <= high).all()
 

@@ -3,7 +3,7 @@ import torch
 
 from express50.errors import ConfigError
 from grmm import losses
-from grmm.config import PRESETS, as_tables, from_tables, resolve
+from grmm.config import PRESETS, SCALE_RANGE_MM, as_tables, from_tables, resolve
 from grmm.fit import LOCALITY_T
 from grmm.networks import Refinement
 
@@ -17,7 +17,7 @@ def test_paper_preset_has_the_papers_numbers():
     assert (loss.scale, loss.laplacian, loss.codes) == (0.1, 0.01, 0.001)
     assert (config.train.iterations, config.train.lr) == (250_000, 1e-4)
     assert (config.fit.locality, LOCALITY_T) == (0.1, 0.3)
-    assert model.scale_bounds_mm == (0.1, 10.0)
+    assert SCALE_RANGE_MM == (0.1, 10.0)
     assert (model.frame, model.identity_modes, model.refine_unshuffle) == ("head", 0, 1)
 
 

@@ -66,8 +66,7 @@ def test_window_draws_what_the_whole_image_shows(scene, yaw, dx, dy, zoom):
 
 def test_window_is_smaller_and_refines_alike_inside(scene):
     model, gaussians, colours, view = scene
-    low, high = model.config.scale_bounds_mm
-    rows, columns = gaussian_window(gaussians, view, (1e-3 * low, 1e-3 * high))
+    rows, columns = gaussian_window(gaussians, view)
     assert rows.stop - rows.start < 192 and columns.stop - columns.start < 192
     with torch.no_grad():
         out = draw_window(model, gaussians, colours, view, 0.25)

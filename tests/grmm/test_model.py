@@ -52,9 +52,9 @@ def test_head_frame_starts_unrotated_and_isotropic(views):
 @pytest.mark.parametrize("frame", ["head", "tangent"])
 def test_initial_scales_are_the_texel_spacing(frame):
     config = tiny_config(model={"frame": frame, "scale_init": 1.0}).model
-    raw = initial_scales(torch.tensor([[20.0, 30.0]]), config)
+    raw = initial_scales(torch.tensor([[2.0, 3.0]]), config)
     scales = torch.nn.functional.softplus(raw)[0].tolist()
-    expected = [600**0.5] * 3 if frame == "head" else [20, 30, 6]
+    expected = [6**0.5] * 3 if frame == "head" else [2, 3, 0.6]
     assert scales == pytest.approx(expected, rel=1e-4)
 
 

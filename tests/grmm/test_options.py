@@ -1,12 +1,18 @@
-"""The map's side, chosen from the images."""
+"""The map's side, chosen from the images; what captions say of the pictures."""
+
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
+import torch
 
+from grmm import render
 from grmm.checkpoint import load_checkpoint
 from grmm.data import HeadViews
 from grmm.model import GRMM
+from grmm.render import COLUMNS
 from grmm.train import train
-from grmm.train_state import with_map_size
+from grmm.train_state import prepare, with_map_size
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
 
@@ -30,3 +36,19 @@ def test_a_chosen_map_is_kept_in_the_checkpoint(tmp_path, source):
 def test_a_given_map_is_left_alone(views):
     config = tiny_config()
     assert with_map_size(config, views) is config
+
+
+def test_the_captions_name_the_columns_of_comparison_sheets(views, tmp_path, monkeypatch):
+    """Refined and drawn were once swapped in the README."""
+    run = prepare(views, tiny_config())
+    sheets = []
+    monkeypatch.setattr(render, "write_sheet", lambda path, rows, labels: sheets.append(rows))
+    item = views.item(0)
+    with torch.no_grad():
+        out = run.model(0, 0, item.state, item.view)
+    out = replace(out, image=torch.full_like(out.rgb, 0.25), rgb=torch.full_like(out.rgb, 0.75))
+    render.comparison_sheet(tmp_path / "x.jpg", views, [0], lambda item: out)
+    refined, drawn = (COLUMNS.split(", ").index(name) for name in ("refined", "drawn"))
+    assert sheets[0][0][refined].max() == 64 and sheets[0][0][drawn].min() == 191
+    page = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    assert page.count(COLUMNS) == 2

@@ -7,14 +7,13 @@ import torch
 from express50.contract.segmentation_labels import TORSO
 from grmm.config import DataConfig
 from grmm.data import HeadViews
-from grmm.evaluate import evaluate
 from grmm.head_crop import torso_mask
 from grmm.model import PinholeView
 from grmm.train import objective
 from grmm.train_state import prepare
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
-KEEP = DataConfig(torso="keep")
+IGNORE = DataConfig(torso="ignore")
 
 
 def collared_head():
@@ -81,7 +80,7 @@ class Dressed(EllipsoidSource):
 
 def test_torso_neither_teaches_nor_counts():
     config = tiny_config(model={"refine_widths": ()})
-    views = HeadViews(Dressed(size=64), collared_head())
+    views = HeadViews(Dressed(size=64), collared_head(), IGNORE)
     run = prepare(views, config)
     item = views.item(0)
     assert float(item.counts[54:, 10:54].float().mean()) < 0.5 and item.counts[:40].all()
@@ -90,16 +89,26 @@ def test_torso_neither_teaches_nor_counts():
     terms, again = (objective(run, rendering, i, config) for i in (item, spoiled))
     assert terms["rgb"].item() == pytest.approx(again["rgb"].item(), abs=2e-3)  # SSIM's window
     assert terms["depth"].item() == again["depth"].item()
-    kept = HeadViews(Dressed(size=64), collared_head(), KEEP)
-    assert kept.item(0).counts.all()
 
-    def render(item):
-        return run.model(0, 0, item.state, item.view)
 
-    row, row_kept = (evaluate(v, [0], render)[0] for v in (views, kept))
-    assert row["psnr_db"] > row["psnr_with_torso_db"] + 3
-    everything = pytest.approx(row["psnr_with_torso_db"], abs=1e-9)
-    assert row_kept["psnr_db"] == everything and row_kept["psnr_with_torso_db"] == everything
+def test_torso_is_background_by_default():
+    item = HeadViews(Dressed(size=64), collared_head()).item(0)
+    ignored = HeadViews(Dressed(size=64), collared_head(), IGNORE).item(0)
+    torso = ~ignored.counts
+    assert torso.any() and item.counts.all()
+    assert float(item.target[:, 58:, 20:44].max()) == 0 and not item.mask[58:, 20:44].any()
+    assert not (item.depth_valid & torso).any()
+    kept = ignored.mask & ~item.mask  # the dilated border alone
+    assert torch.equal(item.target[:, :40], ignored.target[:, :40]) and not kept.any()
+
+
+def test_a_matte_without_torso_is_taken_as_it_is():
+    class Bare(Dressed):
+        def read(self, index):
+            return replace(super().read(index), bare=True)
+
+    item = HeadViews(Bare(size=64), collared_head()).item(0)
+    assert float(item.target[:, 58:, 20:44].min()) == 1 and item.counts.all()
 
 
 class Labelled(Dressed):
@@ -113,7 +122,8 @@ class Labelled(Dressed):
 
 
 def test_labels_of_parts_go_before_distances():
-    item = HeadViews(Labelled(size=64), collared_head()).item(0)
+    item = HeadViews(Labelled(size=64), collared_head(), IGNORE).item(0)
     assert not item.counts[:34].any() and item.counts[36:].all()
     assert not item.depth_valid[:34].any() and not item.mask[:34].any()
-    assert HeadViews(Labelled(size=64), collared_head(), KEEP).item(0).counts.all()
+    background = HeadViews(Labelled(size=64), collared_head()).item(0)
+    assert background.counts.all() and float(background.target[:, :32].max()) == 0
