@@ -6,13 +6,14 @@ import numpy as np
 
 from express50.contract.segmentation_labels import LABELS
 from express50.geometry.cameras import Camera, resized
-from express50.twin.body import Material
+from express50.twin.surface import Material
 from express50.twin.truth import Truth
 from pipelines.regions.geometry import SCALP, head_labels
 
 _PLAIN = {
     Material.EYE: "eyes", Material.TEETH: "teeth", Material.MOUTH: "mouth",
     Material.TONGUE: "tongue", Material.HAIR: "hair", Material.CLOTH: "torso",
+    Material.HAND: "hand", Material.APPAREL: "apparel", Material.LENS: "apparel",
 }  # fmt: skip
 
 
@@ -41,7 +42,8 @@ def true_head_alpha(
     """
     fine = resized(camera, camera.width * rays, camera.height * rays)
     material, _ = truth.surface(subject, frame, fine)
-    head = ((material >= 0) & (material != Material.CLOTH)).astype(np.float32)
+    others = (Material.CLOTH, Material.HAND, Material.APPAREL)
+    head = ((material >= 0) & ~np.isin(material, others)).astype(np.float32)
     return head.reshape(camera.height, rays, camera.width, rays).mean((1, 3))
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from enum import IntEnum
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,33 +10,29 @@ import torch
 from express50.geometry.sampling import smoothstep
 from express50.geometry.transforms import rigid_fit
 from express50.head.model import HeadModel, landmarks, pose
-from express50.twin.hair import HairMesh, grow_hair
+from express50.twin.hair import HairMesh, grow_hair, join_hair
 from express50.twin.subjects import TwinPerformance, TwinSubject
-from express50.twin.surface import Caster, StarMap, smooth_over_mesh, vertex_normals
-
-
-class Material(IntEnum):
-    """Materials of triangles."""
-
-    SKIN = 0
-    EYE = 1
-    TEETH = 2
-    MOUTH = 3
-    TONGUE = 4
-    HAIR = 5
-    CLOTH = 6
-    HIDDEN = 7
+from express50.twin.surface import (
+    Caster,
+    Material,
+    StarMap,
+    smooth_over_mesh,
+    vertex_normals,
+)
+from express50.twin.worn import WITH_HAND, WornMesh, grow_worn, hold, wear
 
 
 @dataclass(frozen=True, kw_only=True)
 class Extras:
     """Geometry besides the head model, in rest head space."""
 
-    hair: HairMesh  # rigid with the skull; may be empty
+    hair: HairMesh  # of scalp and face; may be empty
     cloth_vertices: np.ndarray  # shoulders, rigid with the root
     cloth_faces: np.ndarray
     skull: np.ndarray  # (K,) head vertices that hair follows
     skull_rest: np.ndarray  # (K, 3) where they rest
+    worn: WornMesh  # may be empty
+    hand: np.ndarray  # (F, 4, 4) rest head space from that of the hand, none without one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,16 +41,27 @@ class Body:
 
     model: HeadModel
     subject: TwinSubject
-    faces: np.ndarray  # (F, 3) of the head, then hair, then shoulders, as one mesh
-    material: np.ndarray  # (F,) uint8
+    faces: np.ndarray  # (F, 3) of the head, hair, shoulders, then what is worn, as one mesh
+    material: np.ndarray  # (F,) uint8; lenses are last
+    solid: int  # number of faces before the lenses
+    rest: np.ndarray  # (V, 3) the subject's neutral head
     template: np.ndarray  # (V, 3) float32, the mean head, where textures live
     scalp: np.ndarray  # (V,) float32 hairiness, soft at the hairline
     centre: np.ndarray  # (3,) of the head, template space
     extras: Extras
 
 
-def build_body(model: HeadModel, subject: TwinSubject, seed: int, hair_detail: float = 1.0) -> Body:
-    """Build what no frame changes of a subject; a hair detail of 0 makes it bald."""
+def build_body(
+    model: HeadModel,
+    subject: TwinSubject,
+    seed: int,
+    hair_detail: float = 1.0,
+    kinds: tuple[str, ...] = (),
+) -> Body:
+    """Build what no frame changes of a subject, and what it wears of the `config.KINDS`.
+
+    A hair detail of 0 leaves the scalp bald.
+    """
     template = model.template.double().numpy()
     faces = model.faces.numpy().astype(np.int32)
     centre = head_centre(model)
@@ -64,7 +70,7 @@ def build_body(model: HeadModel, subject: TwinSubject, seed: int, hair_detail: f
     # Hair ends at the nape, wherever a model's scalp mask ends.
     chin = landmarks(model, model.template[None])[0, 8, 1].item()
     scalp = scalp * smoothstep(template[:, 1], chin - 0.005, chin + 0.025)
-    rest = template + model.shape_dirs.double().numpy() @ subject.shape + subject.offsets
+    rest = rest_vertices(model, subject)
     skin_faces = faces[model_materials(model)[faces].min(1) == Material.SKIN]
     cloth_vertices, cloth_faces = _shoulders(rest, skin_faces, model.regions["boundary"].numpy())
     # Hair lies on skin and shirt alike.
@@ -75,18 +81,43 @@ def build_body(model: HeadModel, subject: TwinSubject, seed: int, hair_detail: f
     )
     rng = np.random.default_rng([seed, subject.number, 7])
     hair = grow_hair(rng, rest, faces, scalp, star, subject.look, hair_detail)
+    # Worn hair has random numbers of its own, so that the rest of the person stays the same.
+    seeds = [seed, subject.number, 13]
+    hair = join_hair(
+        [hair, *grow_worn(kinds, model, rest, scalp, star, subject.look, hair_detail or 1.0, seeds)]
+    )
+    worn = wear(kinds, model, rest, skin_faces, subject.look, np.random.default_rng(seeds))
     skull = np.flatnonzero(scalp > 0.8)[::7]
     extras = Extras(
         hair=hair, cloth_vertices=cloth_vertices, cloth_faces=cloth_faces,
-        skull=skull, skull_rest=rest[skull],
+        skull=skull, skull_rest=rest[skull], worn=worn, hand=np.zeros((0, 4, 4)),
     )  # fmt: skip
     return assemble(model, subject, extras, scalp.astype(np.float32), centre)
+
+
+def rest_vertices(model: HeadModel, subject: TwinSubject) -> np.ndarray:
+    """Return the neutral vertices (V, 3) of a subject's head."""
+    template = model.template.double().numpy()
+    return template + model.shape_dirs.double().numpy() @ subject.shape + subject.offsets
+
+
+def with_hand(body: Body, play: TwinPerformance, seed: int) -> Body:
+    """Hold the hand, if there is one, before another part of the face in every cue window."""
+
+    def heads(frame: int) -> tuple[np.ndarray, np.ndarray]:
+        _, _, own = _skull_at_rest(body, play, frame)
+        return own, vertex_normals(own, body.model.faces.numpy())
+
+    seeds = [seed, body.subject.number, 14]
+    worn, cues = body.extras.worn, play.cues
+    hand = hold(worn, heads, body.model, cues, play.peaks, play.frames, seeds)
+    return replace(body, extras=replace(body.extras, hand=hand))
 
 
 def assemble(
     model: HeadModel, subject: TwinSubject, extras: Extras, scalp: np.ndarray, centre: np.ndarray
 ) -> Body:
-    """Join head, hair and shoulders into one mesh."""
+    """Join head, hair, shoulders and what is worn into one mesh."""
     faces = model.faces.numpy().astype(np.int32)
     heads, hairs = len(model.template), len(extras.hair.vertices)
     labels = model_materials(model)
@@ -95,14 +126,19 @@ def assemble(
     mixed = (labels[faces] == Material.SKIN).any(1) & (head_material == Material.MOUTH)
     head_material[mixed] = Material.SKIN
     shown = head_material != Material.HIDDEN
+    cloths, worn = len(extras.cloth_vertices), extras.worn
     joined = np.concatenate(
-        [faces[shown], extras.hair.faces + heads, extras.cloth_faces + heads + hairs]
-    ).astype(np.int32)
+        [
+            faces[shown], extras.hair.faces + heads, extras.cloth_faces + heads + hairs,
+            worn.faces + heads + hairs + cloths,
+        ]
+    ).astype(np.int32)  # fmt: skip
     counts = len(extras.hair.faces), len(extras.cloth_faces)
     others = np.repeat(np.array([Material.HAIR, Material.CLOTH], np.uint8), counts)
-    material = np.concatenate([head_material[shown], others])
+    material = np.concatenate([head_material[shown], others, worn.material])
     return Body(
         model=model, subject=subject, faces=joined, material=material,
+        solid=int((material != Material.LENS).sum()), rest=rest_vertices(model, subject),
         template=model.template.numpy(), scalp=scalp, centre=centre, extras=extras,
     )  # fmt: skip
 
@@ -163,20 +199,43 @@ class Posed:
 
 
 def pose_body(body: Body, play: TwinPerformance, frame: int) -> Posed:
-    """Pose head, hair and shoulders for a frame."""
-    extras, hair = body.extras, body.extras.hair
-    head = head_vertices(body.model, body.subject, play, frame)
-    turn, shift = rigid_fit(extras.skull_rest, head[extras.skull])
+    """Pose head, hair, shoulders and what is worn for a frame."""
+    extras, hair, worn = body.extras, body.extras.hair, body.extras.worn
+    turn, shift, own = _skull_at_rest(body, play, frame)
+    head = own @ turn.T + shift
+
+    def moved(vertices: np.ndarray, moves: np.ndarray) -> np.ndarray:
+        out = vertices.astype(np.float64)
+        skin, held = moves >= 0, moves == WITH_HAND
+        out[skin] += (own - body.rest)[moves[skin]]
+        if held.any():
+            hand = extras.hand[frame]
+            out[held] = out[held] @ hand[:3, :3].T + hand[:3, 3]
+        return out @ turn.T + shift
+
     cloth = extras.cloth_vertices @ play.R[frame].T + play.t[frame]
     solid = np.concatenate([head, cloth]).astype(np.float32)
     solid_faces = np.concatenate([body.model.faces.numpy(), extras.cloth_faces + len(head)])
     normals = vertex_normals(solid, solid_faces)
-    around_hair = [normals[: len(head)], hair.normals @ turn.T, normals[len(head) :]]
+    things = moved(worn.vertices, worn.moves)
+    bent = [normals[: len(head)], hair.normals @ turn.T, normals[len(head) :]]
+    bent.append(vertex_normals(things, worn.faces))
     return Posed(
-        vertices=np.concatenate([head, hair.vertices @ turn.T + shift, cloth]).astype(np.float32),
-        normals=np.concatenate(around_hair).astype(np.float32),
+        vertices=np.concatenate([head, moved(hair.vertices, hair.moves), cloth, things]).astype(
+            np.float32
+        ),
+        normals=np.concatenate(bent).astype(np.float32),
         tangents=(hair.tangents @ turn.T).astype(np.float32),
     )
+
+
+def _skull_at_rest(
+    body: Body, play: TwinPerformance, frame: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return how the skull moved, R (3, 3) and t (3,), and the head (V, 3) with that undone."""
+    head = head_vertices(body.model, body.subject, play, frame)
+    turn, shift = rigid_fit(body.extras.skull_rest, head[body.extras.skull])
+    return turn, shift, (head - shift) @ turn
 
 
 def _shoulders(

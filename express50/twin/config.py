@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 from express50.errors import ConfigError
 
+KINDS = ("glasses", "hand", "beard", "moustache", "fringe", "microphone", "mask")
+"""What a subject can wear or hold."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class TwinConfig:
@@ -43,6 +46,8 @@ class TwinConfig:
     "Write clean background plates."
     hair: bool = True
     "Give subjects hair strands."
+    wear: tuple[str, ...] = ()
+    "What every subject wears or holds: glasses, hand, beard, moustache, fringe, microphone, mask."
     noise: float = 1.0
     "Sensor noise relative to a good studio camera; 0 is none."
 
@@ -57,6 +62,10 @@ class TwinConfig:
             value = getattr(self, name)
             if not low <= value <= high:
                 raise ConfigError(f"twin.{name} is {value}, expected {low} to {high}")
+        if unknown := set(self.wear) - set(KINDS):
+            raise ConfigError(
+                f"twin.wear names {', '.join(sorted(unknown))}, expected some of {', '.join(KINDS)}"
+            )
         if self.footage not in ("video", "png", "jpg"):
             raise ConfigError(f"twin.footage is {self.footage!r}, expected video, png or jpg")
         if self.footage == "video" and (self.width % 2 or self.height % 2):

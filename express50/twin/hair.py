@@ -40,18 +40,34 @@ _STYLES = {
     "bob": HairStyle(5200, 14, 0.016, 0.002, 0.25, 1.0, 0.0, 0.5, 6e-4),
     "buzz": HairStyle(5800, 3, 0.006, 0.0, 0.0, 0.2, 0.0, 0.7, 5e-4),
     "swept": HairStyle(4800, 8, 0.022, 0.0015, 1.3, 0.3, 0.2, 0.3, 5.5e-4),
+    "beard": HairStyle(8000, 5, 0.011, 0.002, 0.0, 0.9, 0.0, 0.2, 6e-4),
+    "moustache": HairStyle(1600, 4, 0.006, 0.001, 0.0, 1.0, 0.0, 0.0, 5.5e-4),
+    "fringe": HairStyle(2200, 9, 0.010, 0.001, 0.0, 0.9, 0.0, 0.8, 6e-4),
 }
 
 
 @dataclass(frozen=True, kw_only=True)
 class HairMesh:
-    """Ribbons in rest head space: vertices, faces, unit tangents, outward normals, colours."""
+    """Ribbons in rest head space: vertices, faces, unit tangents, outward normals, colours.
+
+    ``moves`` (N,) is the vertex of the head that each moves with, or -1: with the skull.
+    """
 
     vertices: np.ndarray
     faces: np.ndarray
     tangents: np.ndarray
     normals: np.ndarray
     colours: np.ndarray
+    moves: np.ndarray
+
+
+def join_hair(meshes: list[HairMesh]) -> HairMesh:
+    """Join meshes of ribbons to one."""
+    names = ("vertices", "tangents", "normals", "colours", "moves")
+    counts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    faces = [mesh.faces + count for mesh, count in zip(meshes, counts, strict=True)]
+    parts = {name: np.concatenate([getattr(mesh, name) for mesh in meshes]) for name in names}
+    return HairMesh(faces=np.concatenate(faces).astype(np.int32), **parts)
 
 
 def grow_hair(
@@ -62,6 +78,7 @@ def grow_hair(
     star: StarMap,
     look: PersonLook,
     detail: float,
+    on_skull: bool = True,
 ) -> HairMesh:
     """Grow a subject's hair.
 
@@ -73,6 +90,7 @@ def grow_hair(
         star: outer surface of the head.
         look: colour, style and length.
         detail: more and thinner strands where above 1, fewer and thicker ones below, none at 0.
+        on_skull: strands move with the skull; otherwise with the skin at their roots.
     """
     style = _STYLES[look.hair_style]
     # Roots are even over the scalp's area.
@@ -85,7 +103,8 @@ def grow_hair(
     u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
     roots = a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen]
     points = _march(rng, roots, star, style, look.hair_length_m)
-    return _ribbons(rng, points, star.centre, style.width / max(detail, 0.1), look.hair)
+    moves = np.full(count, -1, np.int32) if on_skull else faces[chosen, 0].astype(np.int32)
+    return _ribbons(rng, points, star.centre, style.width / max(detail, 0.1), look.hair, moves)
 
 
 def _march(
@@ -147,6 +166,7 @@ def _ribbons(
     centre: np.ndarray,
     width: float,
     colour: np.ndarray,
+    moves: np.ndarray,
 ) -> HairMesh:
     """Make ribbons along strand points (N, P, 3), each rolled at random, thin at the tip."""
     count, length = points.shape[:2]
@@ -176,4 +196,5 @@ def _ribbons(
         tangents=spread(tangents),
         normals=spread(unit(0.75 * out + 0.25 * np.cross(side, tangents))),
         colours=spread(np.broadcast_to(colours, points.shape)),
+        moves=np.repeat(moves, 2 * length),
     )

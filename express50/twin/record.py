@@ -55,6 +55,7 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
         )  # fmt: skip
     parser.add_argument("--head", default=default.head, help=words["head"] + f" [{default.head}]")
     parser.add_argument("--expressions", metavar="ID,ID...", help=words["expressions"])
+    parser.add_argument("--wear", metavar="KIND,KIND...", default="", help=words["wear"])
     kind = parser.add_mutually_exclusive_group()
     kind.add_argument("--video", action="store_true", help="write H.264 videos [default]")
     kind.add_argument("--frames", choices=("png", "jpg"), nargs="?", const="png",
@@ -70,13 +71,15 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
 
 def record_command(args: argparse.Namespace) -> int:
     """Record and say what was recorded."""
-    ids = None
-    if args.expressions:
-        ids = tuple(part.strip() for part in args.expressions.split(",") if part.strip())
+    ids, worn = (
+        tuple(part.strip() for part in text.split(",") if part.strip())
+        for text in (args.expressions or "", args.wear)
+    )
     config = TwinConfig(
         **{name: getattr(args, name) for name in _NUMBERS},
         head=args.head,
-        expressions=ids,
+        expressions=ids or None,
+        wear=worn,
         footage=args.frames or "video",
         give_calibration=args.give_calibration,
         plates=not args.no_plates,

@@ -15,10 +15,9 @@ import numpy as np
 import scipy.spatial
 
 from express50.geometry.cameras import Camera, crop_camera, project, rays
-from express50.twin.body import Material
-from express50.twin.surface import MISS, Caster
+from express50.twin.surface import MISS, Caster, Material
 
-# Colours (N, 3) for directions (N, 3), faces (N,) and barycentrics (N, 2).
+# Premultiplied colours and alpha (N, 4) for directions (N, 3), faces (N,), barycentrics (N, 2).
 Shade = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 BAND_PIXELS = 1 << 18
 HALO = 4  # rows and columns beyond a band that the search for detail looks at
@@ -108,7 +107,7 @@ def render_band(
     seen = np.flatnonzero(keep.ravel() & (face != MISS))
     alpha[seen] = 1.0
     if shade is not None and seen.size:
-        colour[seen] = shade(grid[0, seen], face[seen], bary[seen])
+        colour[seen], alpha[seen] = _split(shade(grid[0, seen], face[seen], bary[seen]))
     for chosen, count in ((edge, sampling.edge), (inside & ~edge, sampling.inside)):
         index = np.flatnonzero((chosen & keep).ravel())
         for part in np.array_split(index, max(1, len(index) * count >> 18)):
@@ -184,9 +183,13 @@ def _cast_more(
     seen[hit] = 1.0
     colours = np.zeros((len(directions), 3), np.float32)
     if shade is not None and hit.size:
-        colours[hit] = shade(directions[hit], face[hit], bary[hit])
+        colours[hit], seen[hit] = _split(shade(directions[hit], face[hit], bary[hit]))
     count = len(places)
     return colours.reshape(count, -1, 3).sum(0), seen.reshape(count, -1).sum(0)
+
+
+def _split(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return seen[:, :3], seen[:, 3]
 
 
 def ray_pattern(count: int) -> tuple[np.ndarray, np.ndarray]:

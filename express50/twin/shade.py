@@ -12,13 +12,24 @@ import numpy as np
 
 from express50.geometry.sampling import smoothstep
 from express50.head.model import HeadModel
-from express50.twin.body import Body, Material, Posed, model_materials
+from express50.twin.body import Body, Posed, model_materials
 from express50.twin.skin import SkinTexture, sample_skin
-from express50.twin.surface import Caster, dot, make_lattice, noise, smooth_over_mesh, unit
+from express50.twin.surface import (
+    MISS,
+    Caster,
+    Material,
+    dot,
+    make_lattice,
+    noise,
+    smooth_over_mesh,
+    unit,
+)
+from express50.twin.worn import WITH_HAND
 
 # How far light bleeds round the terminator in skin, per channel: red most (d'Eon et al. 2007).
 _BLEED = np.array([0.32, 0.12, 0.06], np.float32)
 _AMBIENT_RAYS, _SOFT_RAYS, _SMOOTHING = 6, 2, 4
+_INDEX, _SURFACES = 1.5, 6  # of lenses; more of their surfaces than this in a row end a ray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +105,7 @@ class LitScene:
     eyes: TwinEyes
     lighting: Lighting
     attributes: np.ndarray
-    hair_tangents: np.ndarray
+    posed: Posed
     iris_lattice: np.ndarray
 
 
@@ -104,22 +115,27 @@ def build_scene(
     """Compile one frame: Embree scene, then light at every vertex."""
     caster = Caster(posed.vertices, body.faces)
     heads = len(body.template)
-    hairs = len(body.extras.hair.vertices)
+    hairs, cloths = len(body.extras.hair.vertices), len(body.extras.cloth_vertices)
+    worn = body.extras.worn
     attributes = np.ones((len(posed.vertices), 9 + len(lighting.colours)), np.float32)
     attributes[:, :3] = posed.normals
     attributes[:heads, 3:6] = body.template
     attributes[heads : heads + hairs, 3:6] = body.extras.hair.colours
     attributes[heads + hairs :, 3:6] = body.subject.look.cloth
+    attributes[heads + hairs + cloths :, 3:6] = worn.colours
     solid = np.r_[0:heads, heads + hairs : len(attributes)]
-    reach = _light_at(caster, posed.vertices[solid], posed.normals[solid], lighting)
+    opaque = Caster(posed.vertices, body.faces[: body.solid])
+    reach = _light_at(opaque, posed.vertices[solid], posed.normals[solid], lighting)
+    reach[heads + cloths :] = smooth_over_mesh(reach[heads + cloths :], worn.faces, _SMOOTHING)
     reach[:heads] = smooth_over_mesh(reach[:heads], body.model.faces.numpy(), _SMOOTHING)
     skin = np.zeros((len(solid), 1), np.float32)
     skin[:heads, 0] = model_materials(body.model) == Material.SKIN
+    skin[heads + cloths :, 0] = worn.moves == WITH_HAND
     attributes[solid, 6:9] = _diffuse(lighting, posed.normals[solid], reach, skin)
     attributes[solid, 9:] = reach[:, 1:]
     return LitScene(
         caster=caster, body=body, texture=texture, eyes=eyes, lighting=lighting,
-        attributes=attributes, hair_tangents=posed.tangents,
+        attributes=attributes, posed=posed,
         iris_lattice=make_lattice(np.random.default_rng([seed, body.subject.number, 10])),
     )  # fmt: skip
 
@@ -174,7 +190,61 @@ def _diffuse(
 def shade(
     scene: LitScene, directions: np.ndarray, face: np.ndarray, bary: np.ndarray
 ) -> np.ndarray:
-    """Return linear colour (N, 3) of rays' hits, as `Caster.cast` gives them, without misses."""
+    """Return premultiplied linear colour and alpha (N, 4) of rays' hits, of `Caster.cast`."""
+    out = np.ones((len(face), 4), np.float32)
+    glass = scene.body.material[face] == Material.LENS
+    plain = ~glass
+    out[plain, :3] = _opaque(scene, directions[plain], face[plain], bary[plain])
+    if glass.any():
+        out[glass] = _through(scene, unit(directions[glass]), face[glass], bary[glass])
+    return out
+
+
+def _through(scene: LitScene, way: np.ndarray, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
+    """Refract rays of unit directions (N, 3) that hit lenses; the first surfaces mirror a little.
+
+    Returns premultiplied colour and alpha (N, 4): what is behind the subject shines through.
+    """
+    out = np.zeros((len(face), 4), np.float32)
+    row, share = np.arange(len(face)), np.ones(len(face), np.float32)
+    lights, body = scene.lighting, scene.body
+    for _ in range(_SURFACES):
+        weights = np.column_stack([1 - bary.sum(1), bary])[..., None]
+        corners = body.faces[face]
+        places = (scene.posed.vertices[corners] * weights).sum(1)
+        normal = unit((scene.posed.normals[corners] * weights).sum(1))
+        cosine = -dot(normal, way)
+        entering = cosine > 0
+        normal, cosine = np.where(entering, normal, -normal), np.abs(cosine)
+        ratio = np.where(entering, 1 / _INDEX, _INDEX)
+        rest = 1 - ratio**2 * (1 - cosine**2)
+        fresnel = (0.04 + 0.96 * (1 - cosine[:, 0]) ** 5) * entering[:, 0]
+        mirror = way + 2 * cosine * normal
+        # Soft boxes are discs of even brightness before a dim room.
+        off = np.arccos(np.clip(mirror @ lights.directions.T, -1, 1))
+        boxes = smoothstep(off, 1.1 * lights.size, 0.9 * lights.size) / (np.pi * lights.size**2)
+        glare = boxes @ lights.colours + 0.3 * lights.ground
+        out[row, :3] += (share * fresnel)[:, None] * glare
+        share = share * (1 - fresnel) * (rest[:, 0] > 0)
+        out[row, 3] = 1 - share
+        way = unit(ratio * way + (ratio * cosine - np.sqrt(np.maximum(rest, 0))) * normal)
+        _, face, bary = scene.caster.cast(places + 2e-5 * way, way)
+        hit = face != MISS
+        row, share, way, face, bary = (part[hit] for part in (row, share, way, face, bary))
+        ended = body.material[face] != Material.LENS
+        seen = _opaque(scene, way[ended], face[ended], bary[ended])
+        out[row[ended], :3] += share[ended, None] * seen
+        out[row[ended], 3] = 1
+        row, share, way, face, bary = (part[~ended] for part in (row, share, way, face, bary))
+        if not len(row):
+            break
+    return out
+
+
+def _opaque(
+    scene: LitScene, directions: np.ndarray, face: np.ndarray, bary: np.ndarray
+) -> np.ndarray:
+    """Return the linear colour (N, 3) of hits on anything but lenses."""
     body = scene.body
     corners = body.faces[face]
     w1, w2 = bary[:, :1], bary[:, 1:]
@@ -193,7 +263,7 @@ def shade(
         n, v, m = normal[chosen], view[chosen], mixed[chosen]
         if kind == Material.HAIR:
             first = corners[chosen, 0] - len(body.template)
-            out[chosen] = _hair(scene.lighting, n, v, m[:, 3:6], scene.hair_tangents[first])
+            out[chosen] = _hair(scene.lighting, n, v, m[:, 3:6], scene.posed.tangents[first])
             continue
         albedo, gloss, power = _surface(scene, kind, m[:, 3:6])
         # The vertices' diffuse light, and Phong's highlight with Fresnel's rise.
@@ -217,6 +287,10 @@ def _surface(
         return _eye_albedo(scene, place), 0.16, 240.0
     if kind == Material.CLOTH:
         return place, 0.01, 5.0
+    if kind == Material.HAND:
+        return place, 0.045, 22.0
+    if kind == Material.APPAREL:
+        return place, 0.12, 60.0
     colour, gloss, power = {
         Material.TEETH: ((0.66, 0.57, 0.44), 0.2, 90.0),
         Material.MOUTH: ((0.30, 0.10, 0.09), 0.10, 40.0),

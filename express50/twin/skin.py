@@ -14,10 +14,11 @@ import numpy as np
 from express50.geometry.conventions import cell_centres, cell_to_corner
 from express50.geometry.sampling import smoothstep
 from express50.head.model import HeadModel, landmarks
-from express50.twin.body import Body, Material, model_materials
+from express50.twin.body import Body, model_materials
 from express50.twin.surface import (
     MISS,
     Caster,
+    Material,
     fractal,
     make_lattice,
     noise,

@@ -16,7 +16,7 @@ from express50.files.video import ImageFootage, VideoFootage
 from express50.geometry.cameras import Camera
 from express50.head.load import load_head
 from express50.twin.board import board_poses, render_board, studio_bands
-from express50.twin.body import Body, build_body, pose_body
+from express50.twin.body import Body, build_body, pose_body, with_hand
 from express50.twin.config import TwinConfig
 from express50.twin.render import RowBand, Sampling, hull_of, render_band, window_of
 from express50.twin.rig import Sensor, expose, make_rig, make_sensor
@@ -40,10 +40,10 @@ def cast_subject(config: TwinConfig, subject_id: str) -> tuple[Body, TwinPerform
     subject = make_subject(model, subject_id, number, config.seed)
     # Strands follow the pixels: thin enough to be finer than one, not finer than can be seen.
     detail = float(np.clip(min(config.width, config.height) / 512, 0.6, 3.0))
-    body = build_body(model, subject, config.seed, detail if config.hair else 0.0)
+    body = build_body(model, subject, config.seed, detail if config.hair else 0.0, config.wear)
     script = select(config.expressions)
     play = perform(model, script, config.frames_per_expression, config.fps, number, config.seed)
-    return body, play
+    return with_hand(body, play, config.seed), play
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,8 @@
-"""Serve the twin with ray casting (Embree), vectors, meshes and smooth random fields."""
+"""Serve the twin with materials, ray casting (Embree), vectors, meshes and smooth random fields."""
 
 from __future__ import annotations
+
+from enum import IntEnum
 
 import numpy as np
 import scipy.sparse
@@ -10,6 +12,22 @@ from express50.geometry.raycast import join_rays, mesh_scene
 
 MISS = np.uint32(0xFFFFFFFF)
 LATTICE = 32
+
+
+class Material(IntEnum):
+    """Materials of triangles."""
+
+    SKIN = 0
+    EYE = 1
+    TEETH = 2
+    MOUTH = 3
+    TONGUE = 4
+    HAIR = 5
+    CLOTH = 6
+    HIDDEN = 7
+    HAND = 8
+    APPAREL = 9
+    LENS = 10
 
 
 class Caster:

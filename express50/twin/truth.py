@@ -25,6 +25,7 @@ from express50.twin.body import Body, Extras, assemble, head_vertices, pose_body
 from express50.twin.hair import HairMesh
 from express50.twin.subjects import PersonLook, TwinPerformance, TwinSubject
 from express50.twin.surface import MISS, Caster
+from express50.twin.worn import WornMesh, bare
 
 SKIN_M = 0.5e-3  # hair roots stand on the skin; what lies this near to it is skin
 _PLAY = ("strength", "expression", "jaw", "neck", "eyes", "R", "t")
@@ -33,7 +34,10 @@ _PLAY = ("strength", "expression", "jaw", "neck", "eyes", "R", "t")
 def write_truth(
     folder: Path, head: str, body: Body, play: TwinPerformance, cameras: Mapping[str, Camera]
 ) -> None:
-    """Write a subject's truth: cameras.json, peaks.json, subject.json, frames.npz, body.npz."""
+    """Write a subject's truth: cameras.json, peaks.json, subject.json, frames.npz, body.npz.
+
+    What it wears and holds is in worn.npz.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     write_cameras(folder / "cameras.json", cameras)
     subject = body.subject
@@ -48,9 +52,12 @@ def write_truth(
         folder / "body.npz",
         shape=subject.shape, offsets=subject.offsets, scalp=body.scalp, centre=body.centre,
         hair_vertices=extras.hair.vertices, hair_faces=extras.hair.faces,
+        hair_moves=extras.hair.moves,
         cloth_vertices=extras.cloth_vertices, cloth_faces=extras.cloth_faces,
         skull=extras.skull, skull_rest=extras.skull_rest,
     )  # fmt: skip
+    if len(extras.worn.faces):
+        np.savez_compressed(folder / "worn.npz", hand=extras.hand, **vars(extras.worn))
 
 
 class Truth:
@@ -99,16 +106,18 @@ class Truth:
         return head_vertices(body.model, body.subject, play, frame)
 
     def mesh(self, subject: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return all geometry, hair and shoulders included: vertices (N, 3) and faces (F, 3)."""
-        _, vertices = self._scene(subject, frame)
-        return vertices, self._subject(subject)[0].faces
+        """Return all geometry but lenses: vertices (N, 3) and faces (F, 3)."""
+        body = self._subject(subject)[0]
+        return self._scene(subject, frame)[1], body.faces[: body.solid]
 
     def render_depth(
         self, subject: str, frame: int, camera: Camera
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Render depth (H, W) float32, camera z in metres, 0 where empty; validity (H, W) bool."""
-        caster, _ = self._scene(subject, frame)
-        return render.render_depth(caster, camera)
+        """Render depth (H, W) float32, camera z in metres, 0 where empty; validity (H, W) bool.
+
+        Lenses are looked through, here and where alpha and skin are asked for.
+        """
+        return render.render_depth(self._scene(subject, frame)[0], camera)
 
     def skin(self, subject: str, frame: int, camera: Camera) -> np.ndarray:
         """Return pixels (H, W) bool where the head's own surface is what the camera sees first."""
@@ -124,8 +133,10 @@ class Truth:
             material (H, W) int16, a `Material`, -1 where nothing is; vertex (H, W) int64, the
             corner nearest to the hit among ``mesh``'s vertices (the head model's come first).
         """
-        caster, _ = self._scene(subject, frame)
+        caster, vertices = self._scene(subject, frame)
         body = self._subject(subject)[0]
+        if body.solid < len(body.faces):
+            caster = Caster(vertices, body.faces)
         origin, directions = rays(camera)
         _, face, uv = caster.cast(origin, directions.reshape(-1, 3))
         hit = face != MISS
@@ -148,7 +159,7 @@ class Truth:
     def _compile(self, subject: str, frame: int) -> tuple[Caster, np.ndarray]:
         body, play = self._play(subject, frame)
         vertices = pose_body(body, play, frame).vertices
-        return Caster(vertices, body.faces), vertices
+        return Caster(vertices, body.faces[: body.solid]), vertices
 
     def _play(self, subject: str, frame: int) -> tuple[Body, TwinPerformance]:
         """Return a subject and its performance, which must have the frame."""
@@ -184,11 +195,17 @@ class Truth:
         blank = np.zeros_like(data["hair_vertices"])
         hair = HairMesh(
             vertices=data["hair_vertices"], faces=data["hair_faces"], tangents=blank, normals=blank,
-            colours=blank,
+            colours=blank, moves=data.get("hair_moves", np.full(len(blank), -1)),
         )  # fmt: skip
+        worn, hand = bare(), np.zeros((0, 4, 4))
+        if (folder / "worn.npz").is_file():
+            with np.load(folder / "worn.npz", allow_pickle=False) as stored:
+                parts = dict(stored)
+            hand = parts.pop("hand")
+            worn = WornMesh(**parts)
         extras = Extras(
             hair=hair, cloth_vertices=data["cloth_vertices"], cloth_faces=data["cloth_faces"],
-            skull=data["skull"], skull_rest=data["skull_rest"],
+            skull=data["skull"], skull_rest=data["skull_rest"], worn=worn, hand=hand,
         )  # fmt: skip
         body = assemble(load_head(about["head"]), person, extras, data["scalp"], data["centre"])
         return body, play

@@ -170,16 +170,9 @@ class HeadScene:
         self, rgba: np.ndarray, eye: np.ndarray, projection: np.ndarray, rng: Rng
     ) -> list[np.ndarray]:
         """Draw glasses, in place; returns outlines (RING, 2) of lenses that hide the eyes."""
-        marks = self.head.landmarks
-        across = unit(marks[45] - marks[36])
-        up = unit(marks[27] - marks[8] - across * (across @ (marks[27] - marks[8])))
-        forward = np.cross(across, up)
         size = rng.uniform([0.021, 0.015], [0.029, 0.025])
-        square, lift = rng.uniform(0.5, 1.0), forward * rng.uniform(0.012, 0.02)
-        angle = np.linspace(0, 2 * np.pi, RING, endpoint=False)
-        x, y = (np.sign(f) * np.abs(f) ** square for f in (np.cos(angle), np.sin(angle)))
-        oval = size[0] * x[:, None] * across + size[1] * (y[:, None] - 0.1) * up
-        rings = [marks[ids].mean(0) + lift + oval for ids in (range(36, 42), range(42, 48))]
+        square, lift = rng.uniform(0.5, 1.0), rng.uniform(0.012, 0.02)
+        rings, bridge, temples = glasses_lines(self.head.landmarks, size, square, lift)
         color = (*(float(c) for c in rng.uniform(0, 255 if rng.random() < 0.4 else 70, 3)), 255.0)
         dark, opaque = rng.random() < 0.25, []
         rings_2d = [_flat(projection, ring) for ring in rings]
@@ -192,9 +185,6 @@ class HeadScene:
                 opaque.append(ring)
         width = float(np.ptp(np.concatenate(rings_2d), axis=0).max())
         thick = max(1, int(round(width * rng.uniform(0.0, 0.045))))
-        bridge = np.stack([rings[0][0], marks[27] + lift, rings[1][RING // 2]])
-        sides = ((rings[0][RING // 2], marks[0]), (rings[1][0], marks[16]))
-        temples = [np.linspace(ring, ear + 0.02 * up - 0.01 * forward, 12) for ring, ear in sides]
         for line, closed in [(rings[0], 1), (rings[1], 1), (bridge, 0), *((t, 0) for t in temples)]:
             self._draw_line(rgba, eye, projection, line, closed, color, thick)
         return opaque
@@ -216,6 +206,29 @@ class HeadScene:
             if seen[k] and seen[j]:
                 ends = [tuple(int(v) for v in np.round(flat[i] * 8)) for i in (k, j)]
                 cv2.line(rgba, *ends, color, thick, cv2.LINE_AA, 3)
+
+
+def glasses_lines(
+    marks: np.ndarray, size: np.ndarray, square: float, lift: float
+) -> tuple[list[np.ndarray], np.ndarray, list[np.ndarray]]:
+    """Place glasses before landmarks (68, 3), ``lift`` metres off the eyes.
+
+    Returns:
+        rings (RING, 3) around the lenses, of half-axes ``size`` (2,) metres and corners the sharper
+        the smaller ``square`` is; the bridge (3, 3); the temples (12, 3).
+    """
+    across = unit(marks[45] - marks[36])
+    up = unit(marks[27] - marks[8] - across * (across @ (marks[27] - marks[8])))
+    forward = np.cross(across, up)
+    angle = np.linspace(0, 2 * np.pi, RING, endpoint=False)
+    x, y = (np.sign(f) * np.abs(f) ** square for f in (np.cos(angle), np.sin(angle)))
+    oval = size[0] * x[:, None] * across + size[1] * (y[:, None] - 0.1) * up
+    off = lift * forward
+    rings = [marks[ids].mean(0) + off + oval for ids in (range(36, 42), range(42, 48))]
+    bridge = np.stack([rings[0][0], marks[27] + off, rings[1][RING // 2]])
+    sides = ((rings[0][RING // 2], marks[0]), (rings[1][0], marks[16]))
+    temples = [np.linspace(ring, ear + 0.02 * up - 0.01 * forward, 12) for ring, ear in sides]
+    return rings, bridge, temples
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:

@@ -1,0 +1,184 @@
+"""Measure what glasses, hands and hair before the face do: ``python -m benchmarks.occluders``.
+
+The twin records one person bare and with each of the things, and the stages up to ``regions`` are
+run with their defaults; `off` runs ``track``, ``depth`` and ``regions`` without what they do about
+things before the face, on the same mattes.
+
+``iou`` is that of the labels of what hides the face (apparel, hand, hair) against the truth, over
+the pixels at which the face of the bare head mesh would be seen; a lens is apparel. The ratios say
+what a thing costs, with it over without: ``face_error_ratio`` of the rms vertex error of the face,
+hidden or not; ``depth_error_ratio`` and ``depth_coverage_ratio`` of the mean error and the known
+share of the face's skin that is truly seen. ``together`` pools the kinds. Seconds are processor
+seconds of the three stages per expression. The last line is one JSON object.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+
+from benchmarks.accuracy import true_world_cameras
+from benchmarks.regions_truth import true_labels
+from benchmarks.track import prepare
+from benchmarks.track_truth import rms
+from benchmarks.track_views import face_of
+from express50.capture.frames import read_cameras_of
+from express50.capture.index import read_peaks
+from express50.contract.config import build_config
+from express50.contract.layout import Dataset
+from express50.contract.segmentation_labels import label_mask
+from express50.dataset.depth_files import depth_file, read_depth
+from express50.dataset.tracks import read_track
+from express50.files.images import read_image
+from express50.geometry.raycast import visible_faces
+from express50.runner.runner import run_stage
+from express50.twin.config import TwinConfig
+from express50.twin.truth import Truth, align_worlds
+from pipelines import depth, regions, track
+
+KINDS = {"glasses": ("glasses",), "hand": ("hand",), "beard": ("beard", "moustache"),
+         "fringe": ("fringe",)}  # fmt: skip
+FURTHER = {"microphone": ("microphone",), "mask": ("mask",)}
+COVERS = ("hair", "apparel", "hand")
+STAGES = (track.STAGE, depth.STAGE, regions.STAGE)
+# What is replaced for `off`.
+OFF: dict[str, object] = {}
+Row = dict[str, float]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Record, run the stages, and print the figures."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.occluders", description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("--recording", type=Path, default=Path("build/bench-occluders"))
+    parser.add_argument("--subject", type=int, default=71, help="of the twin")
+    parser.add_argument("--cameras", type=int, default=14, help="of these 2 are left out")
+    parser.add_argument("--side", type=int, default=448, help="pixels of the recorded footage")
+    parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=[*KINDS, *FURTHER])
+    parser.add_argument("--ways", nargs="+", default=["on"], choices=["off", "on"])
+    options = parser.parse_args(arguments)
+    twin = TwinConfig(
+        subjects=1, first_subject=options.subject, cameras=options.cameras, width=options.side,
+        height=options.side, expressions=("neutral", "smile", "jaw_open"),
+        frames_per_expression=4, board_frames=0, give_calibration=True, footage="jpg", seed=5,
+    )  # fmt: skip
+    result: dict = {"benchmark": "occluders"}
+    kinds = {"none": ()} | {name: (KINDS | FURTHER)[name] for name in options.kinds}
+    for way in options.ways:
+        rows = {}
+        for name, worn in kinds.items():
+            source = recorded(replace(twin, wear=worn), options.recording / name)
+            rows[name] = measured(*source, way)
+            print(way, name, summary([rows[name]], [rows["none"]]), file=sys.stderr, flush=True)
+        bare = rows.pop("none")
+        figures = {name: summary([row], [bare]) for name, row in rows.items()}
+        figures["together"] = summary(list(rows.values()), [bare] * len(rows))
+        result[way] = figures
+    result |= result.get("on", result[options.ways[0]])["together"]
+    print(json.dumps(result))
+    return 0
+
+
+def recorded(config: TwinConfig, folder: Path) -> tuple[Dataset, Truth]:
+    """Return a recording with mattes, made where it is not there."""
+    if not (folder / "done").is_file():
+        prepare(config, folder)
+        (folder / "done").touch()
+    return Dataset(folder / "dataset"), Truth(folder / "truth")
+
+
+def measured(dataset: Dataset, truth: Truth, way: str) -> Row:
+    """Run the stages on a copy of a dataset and sum its figures over expressions and views."""
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        own = Dataset(Path(folder) / "data")
+        own.root.mkdir()
+        for path in dataset.root.iterdir():
+            (own.root / path.name).symlink_to(path.resolve())
+        for stage in STAGES:
+            (own.root / stage.name).unlink(missing_ok=True)
+        for target, other in OFF.items() if way == "off" else ():
+            stack.enter_context(patch(target, other))
+        began = time.process_time()
+        for stage in STAGES:
+            done = run_stage(stage, own, build_config(stage, {}), workers=0, progress=False)
+            if not done.ok:
+                sys.exit(f"{dataset.root}: {stage.name} failed")
+        seconds = time.process_time() - began
+        return figures_of(own, truth, seconds)
+
+
+def figures_of(dataset: Dataset, truth: Truth, seconds: float) -> Row:
+    """Compare labels, mesh and depth maps of the one subject with the truth."""
+    (subject,) = dataset.subjects()
+    tracked = read_track(dataset.track_file(subject))
+    cameras = true_world_cameras(dataset, truth, subject)
+    model = truth.head_model(subject)
+    motion = align_worlds(read_cameras_of(dataset, subject), truth.cameras(subject))
+    faces, on_face = model.faces.numpy(), face_of(model)
+    both = either = seen = known = 0
+    mesh_errors, depth_errors = [], []
+    for expression, frame in read_peaks(dataset, subject).items():
+        true = truth.vertices(subject, frame)
+        moved = tracked.vertices[tracked.row(expression)] @ motion[:3, :3].T + motion[:3, 3]
+        mesh_errors.append(np.linalg.norm(moved - true, axis=1)[on_face])
+        item = f"{subject}/{expression}"
+        for name, camera in cameras.items():
+            first, _ = visible_faces(true, faces, camera)
+            face = (first >= 0) & on_face[faces[first]].all(-1)
+            labels = read_image(dataset.item_dir("regions", item) / f"{name}.png")
+            found = label_mask(labels, *COVERS) & face
+            hidden = label_mask(true_labels(truth, subject, frame, camera), *COVERS) & face
+            both, either = both + (found & hidden).sum(), either + (found | hidden).sum()
+            path = depth_file(dataset.item_dir("depth", item), name)
+            if path is None:
+                sys.exit(f"{dataset.root}: {item}/{name} has no depth")
+            z, valid = read_depth(path)
+            skin = truth.skin(subject, frame, camera) & face
+            true_z, _ = truth.render_depth(subject, frame, camera)
+            depth_errors.append(1e3 * np.abs(z - true_z)[skin & valid])
+            seen, known = seen + skin.sum(), known + (skin & valid).sum()
+    return {
+        "mesh": 1e3 * rms(np.concatenate(mesh_errors)),
+        "both": both, "either": either, "seen": seen, "known": known,
+        "depth": float(np.concatenate(depth_errors).mean()),
+        "seconds": seconds / len(mesh_errors),
+    }  # fmt: skip
+
+
+def summary(rows: list[Row], bare: list[Row]) -> dict[str, float | None]:
+    """Compare rows with what the bare person gives."""
+
+    def ratio(value: float) -> float:
+        return round(float(value), 4)
+
+    def pooled(name: str, some: list[Row]) -> float:
+        return rms(np.array([row[name] for row in some]))
+
+    def coverage(some: list[Row]) -> float:
+        return float(sum(row["known"] for row in some) / sum(row["seen"] for row in some))
+
+    either = sum(row["either"] for row in rows)
+    return {
+        "iou": ratio(sum(row["both"] for row in rows) / either) if either else None,
+        "face_error_ratio": ratio(pooled("mesh", rows) / pooled("mesh", bare)),
+        "face_error_mm": ratio(pooled("mesh", rows)),
+        "depth_coverage_ratio": ratio(coverage(rows) / coverage(bare)),
+        "depth_error_ratio": ratio(pooled("depth", rows) / pooled("depth", bare)),
+        "depth_error_mm": ratio(pooled("depth", rows)),
+        "seconds_per_expression": round(float(np.mean([row["seconds"] for row in rows])), 1),
+    }
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
