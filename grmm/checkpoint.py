@@ -36,7 +36,7 @@ GONE: dict[str, dict[str, object]] = {
         "displacement_scale": 1e-2, "view_channels": 8, "code_spread": 1.0,
         "opacity_from_expression": False, "thickness_init": 0.3, "scale_min_mm": 0.1,
         "scale_max_mm": 10.0, "depth_normalisation": "minmax", "precision": "float32",
-        "refine_alpha": True, "backend": ANY,
+        "backend": ANY,
     },
     "loss": {
         "l1": 0.8, "perceptual": 0.04, "depth_erode_px": 2, "perceptual_crop_px": 0,
@@ -45,7 +45,7 @@ GONE: dict[str, dict[str, object]] = {
     "data": {"crop_margin_px": 16, "split": ANY, "cache_mb": ANY},
     "train": {
         "ema": 0.0, "clip_norm": 0.0, "overfit": 0, "shuffle_directions": 0.0, "betas": ANY,
-        "tensorboard": ANY, "warm_start": ANY, "warm_start_images": ANY, "save_every": ANY,
+        "tensorboard": ANY, "warm_start_images": ANY, "save_every": ANY,
         "log_every": ANY, "threads": ANY,
     },
     "fit": {
@@ -53,6 +53,12 @@ GONE: dict[str, dict[str, object]] = {
         "stage2_texel_lr_scale": ANY, "tune_refinement": ANY, "locality_t": ANY, "codes": ANY,
         "seed": ANY,
     },
+}  # fmt: skip
+
+
+# What checkpoints were trained with before these were settings.
+UNSAID: dict[str, dict[str, object]] = {
+    "model": {"refine_alpha": True}, "train": {"warm_start": True},
 }  # fmt: skip
 
 
@@ -213,7 +219,8 @@ def _current_settings(path: Path, tables: dict[str, dict[str, Any]]) -> dict[str
                     f"{path}: was trained with {table}.{key} = {values[key]!r}, expected "
                     f"{gone[key]!r}: the setting is gone. Train again, or use commit c44aa77"
                 )
-        current[table] = {key: value for key, value in values.items() if key not in gone}
+        kept = {key: value for key, value in values.items() if key not in gone}
+        current[table] = UNSAID.get(table, {}) | kept
     if current["data"].get("torso") == "keep":  # what the matte held was the head
         current["data"]["torso"] = "background"
     return current

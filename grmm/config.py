@@ -66,6 +66,8 @@ class ModelConfig:
     refine_widths: tuple[int, ...] = (32, 48, 64, 96)
     """Channels of the refinement U-Net per level; empty for the ablation "without refinement".
     G9."""
+    refine_alpha: bool = False
+    """Show the refinement alpha too: normalised depth is 0 at the nearest pixel and behind. G9."""
     refine_unshuffle: int = 1
     """Pixel-unshuffle factor before the refinement; 2 makes it four times cheaper. G9."""
 
@@ -102,12 +104,15 @@ class LossConfig:
     scale: float = 0.1
     """Weight of the penalty on scales outside their range, millimetres. G2."""
     laplacian: float = 0.01
-    """Weight of the Laplacian of the vertex displacements, mm^2. G12."""
+    """Weight of the squared Laplacian of the deformed mesh, mm^2. G12."""
+    displacement: float = 0.0
+    """Weight of the mean squared displacement of vertices, mm^2: the mesh stays as tracked where
+    the footage has no say. G12."""
     codes: float = 0.001
     """Weight of the sum of squares of both codes. G13."""
 
     def __post_init__(self) -> None:
-        _not_negative("loss", self, "ssim", "depth", "scale", "laplacian", "codes")
+        _not_negative("loss", self, "ssim", "depth", "scale", "laplacian", "displacement", "codes")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,6 +156,8 @@ class TrainConfig:
     would then learn to do nothing."""
     final_lr: float = 1.0
     """Last rate over the first, reached along a half cosine. G16."""
+    warm_start: bool = False
+    """Start from the footage's mean texture, not from grey. G17."""
     accumulate: int = 1
     """Views whose gradients are averaged per step; 4 stands for the paper's four GPUs."""
     seed: int = 0
@@ -187,6 +194,9 @@ class FitConfig:
     one or two views say little about how colours change with the direction."""
     texture_warm_start: bool = False
     """Start stage 2 from the colours that the given images show."""
+    random_background: bool = False
+    """Draw the grey behind footage and rendering anew in every step of stage 2: before black, dark
+    hair may be transparent. G15."""
     locality: float = 0.1
     """Weight of the locality loss."""
     locality_every: int = 1
@@ -233,10 +243,26 @@ def _in_range(name: str, value: float, low: float, high: float) -> None:
         raise ConfigError(f"{name} is {value}, expected {low} to {high}")
 
 
-# ``paper`` has the paper's sizes, ``small`` suits one GPU, ``demo`` two CPU cores and minutes.
-PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+Preset = dict[str, dict[str, Any]]
+# What we add to the paper's letter, at any size; docs/PAPER.md has what each was measured to do.
+PLUS: Preset = {
+    "model": {"refine_alpha": True},
+    "loss": {"laplacian": 0.0, "displacement": 0.01},
+    "train": {"warm_start": True},
+    "fit": {"texture_warm_start": True, "random_background": True},
+}
+
+
+def _plus(changes: Preset) -> Preset:
+    return {table: PLUS.get(table, {}) | changes.get(table, {}) for table in {**PLUS, **changes}}
+
+
+# ``paper`` is the paper's letter, ``paper-plus`` has its sizes with our additions, ``small`` suits
+# one GPU, ``demo`` two CPU cores and minutes.
+PRESETS: dict[str, Preset] = {
     "paper": {},
-    "small": {
+    "paper-plus": PLUS,
+    "small": _plus({
         "model": {
             "n_g": 256,
             "z_id": 128,
@@ -251,9 +277,9 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "frame": "tangent",
         },
         "train": {"iterations": 20_000, "lr": 5e-4, "code_lr_scale": 10.0, "final_lr": 0.1},
-        "fit": {"stage1_iterations": 200, "stage2_iterations": 200, "texture_warm_start": True},
-    },
-    "demo": {
+        "fit": {"stage1_iterations": 200, "stage2_iterations": 200},
+    }),
+    "demo": _plus({
         "model": {
             "n_g": 128,
             "z_id": 32,
@@ -282,13 +308,11 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "fit": {
             "stage1_iterations": 120,
             "stage2_iterations": 200,
-            "stage2_lr": 1e-3,
-            "texture_warm_start": True,
             "shuffle_directions": 0.5,
             "locality_every": 2,
         },
-    },
-}
+    }),
+}  # fmt: skip
 
 MEASURED = Path(__file__).with_name("measured.json")  # written by benchmarks.grmm_trade
 TABLES: dict[str, Any] = {table.name: table.default_factory for table in fields(Config)}

@@ -172,14 +172,11 @@ def invert_codes(state: FitState, until: float = math.inf) -> int:
         code.requires_grad_(True)
     done = 0
     optimizer = torch.optim.Adam(codes, lr=STAGE1_LR)
-    for number, item in _items(state, settings.stage1_iterations, until):
-        share = number / settings.stage1_iterations
+    for number, share, item in _items(state, settings.stage1_iterations, until):
         optimizer.param_groups[0]["lr"] = STAGE1_LR * STAGE1_FINAL_LR**share
         optimizer.zero_grad()
         z_exp = state.z_exp[item.key.expression]
-        rendering = state.model.render(
-            state.z_id, z_exp, item.state, item.view, state.views.background
-        )
+        rendering = state.model.render(state.z_id, z_exp, item.state, item.view, item.background)
         loss = state.config.loss.codes * losses.codes(state.z_id, z_exp)
         _finite(_footage_loss(state, rendering, item) + loss, number, 1).backward()
         optimizer.step()
@@ -194,13 +191,14 @@ def tune_decoders(state: FitState, until: float = math.inf) -> int:
     settings = state.config.fit
     optimizer = _decoder_optimizer(state)
     rng = np.random.default_rng(state.config.train.seed)
+    greys = rng if settings.random_background else None
     done = 0
-    for number, item in _items(state, settings.stage2_iterations, until):
+    for number, _, item in _items(state, settings.stage2_iterations, until, greys):
         optimizer.zero_grad()
         z_exp = state.z_exp[item.key.expression]
         shade = random_camera(state, rng) if rng.random() < settings.shuffle_directions else None
         rendering = state.model.render(
-            state.z_id, z_exp, item.state, item.view, state.views.background, shade
+            state.z_id, z_exp, item.state, item.view, item.background, shade
         )
         loss = _footage_loss(state, rendering, item)
         if settings.locality and number % settings.locality_every == 0:
@@ -213,13 +211,22 @@ def tune_decoders(state: FitState, until: float = math.inf) -> int:
     return done
 
 
-def _items(state: FitState, iterations: int, until: float) -> Iterator[tuple[int, Item]]:
-    """Yield given views in shuffled order until iterations or time run out; at least one."""
-    shuffle = Shuffle(state.given, state.config.train.seed)
+def _items(
+    state: FitState, iterations: int, until: float, greys: np.random.Generator | None = None
+) -> Iterator[tuple[int, float, Item]]:
+    """Yield given views in shuffled order until iterations or time run out; at least one.
+
+    Each comes with its number and the share of the iterations or of the time that is used up;
+    ``greys`` draws its background.
+    """
+    shuffle, began = Shuffle(state.given, state.config.train.seed), time.perf_counter()
     for number in range(iterations):
-        if number > 0 and time.perf_counter() >= until:
+        used = (time.perf_counter() - began) / max(until - began, 1e-9)
+        if number > 0 and used >= 1:
             return
-        yield number, state.views.item(shuffle.next(), crop=True)
+        grey = None if greys is None else float(greys.random())
+        item = state.views.item(shuffle.next(), crop=True, background=grey)
+        yield number, max(number / iterations, min(used, 1.0)), item
 
 
 def _decoder_optimizer(state: FitState) -> torch.optim.Optimizer:
@@ -293,7 +300,7 @@ def locality_loss(state: FitState, item: Item, rng: np.random.Generator) -> Tens
         tracked=state.views.place(own).tracked,
     )
     head = between(trained_head(state.loaded, *frame), mine, LOCALITY_T)
-    scene = (head.z_id, head.z_exp, head.state(state.loaded), view, state.views.background)
+    scene = (head.z_id, head.z_exp, head.state(state.loaded), view, item.background)
     tuned = state.model.render(*scene)
     with torch.no_grad():
         before = state.loaded.model.render(*scene)

@@ -254,8 +254,9 @@ class GRMM(Networks):
         maps = out.colors.permute(2, 0, 1)
         rgb = image = maps[:3]
         if refinement is not None:
-            depth = normalise_depth(out.depth, out.alpha)
-            image = refinement(torch.cat([maps, depth[None], out.alpha[None]]))
+            shown = [maps, normalise_depth(out.depth, out.alpha)[None]]
+            shown += [out.alpha[None]] * self.config.refine_alpha
+            image = refinement(torch.cat(shown))
         return Rendering(
             image=image, rgb=rgb, depth=out.depth, alpha=out.alpha, gaussians=gaussians
         )

@@ -49,7 +49,7 @@ class Networks(nn.Module):
             self.colour.bias[3:].normal_(0, FEATURE_STD)
         self.refinement = None
         if config.refine_widths:
-            inputs = 3 + config.features + 2  # colours, features, depth and alpha
+            inputs = 3 + config.features + 1 + config.refine_alpha  # colours, features, depth
             self.refinement = Refinement(inputs, config.refine_widths, config.refine_unshuffle)
 
 
@@ -182,7 +182,7 @@ def _zero_last_mlp(inputs: int, width: int, outputs: int) -> nn.Sequential:
 
 
 class Refinement(nn.Module):
-    """I = I_rgb + U-Net([I_rgb, features, normalised depth, alpha]).
+    """I = I_rgb + U-Net([I_rgb, features, normalised depth]), with alpha too if so configured.
 
     The paper names inputs and purpose only; G9 has the rest. ``unshuffle`` folds r x r pixels into
     channels first, which a CPU needs. Sides that are not a multiple of the stride are padded.

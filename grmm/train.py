@@ -80,7 +80,7 @@ def train(
     checkpoint = out / "checkpoint.pt"
     if resume:
         restore(state, checkpoint, config, device)
-    else:
+    elif config.train.warm_start:
         warm_start(state.model, views, state.training)
     parallel = DistributedDataParallel(state.model) if world > 1 else state.model
     if rank == 0:
@@ -147,7 +147,7 @@ def step(state: TrainState, parallel: torch.nn.Module, config: Config) -> None:
         item = state.views.item(state.shuffle.next(), crop=True)
         try:
             rows = state.model.rows(*item.key.frame)
-            rendering = parallel(*rows, item.state, item.view, state.views.background)
+            rendering = parallel(*rows, item.state, item.view, item.background)
         except NotFiniteTensorError as error:
             raise TrainError(
                 f"iteration {state.iteration}: training diverged ({error}); lower train.lr and "
@@ -183,7 +183,9 @@ def objective(
     codes, gaussians = model.codes(*model.rows(*item.key.frame)), rendering.gaussians
     return terms | {
         "scale": weights.scale * losses.scale_mm(gaussians.scales_mm),
-        "laplacian": weights.laplacian * losses.laplacian_mm2(gaussians.displacement, state.edges),
+        "laplacian": weights.laplacian
+        * losses.laplacian_mm2(item.state.vertices + gaussians.displacement, state.edges),
+        "displacement": weights.displacement * losses.displacement_mm2(gaussians.displacement),
         "codes": weights.codes * losses.codes(*codes),
     }
 

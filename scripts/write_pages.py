@@ -1,6 +1,6 @@
 """Write the parts of docs/ that are generated from the code: the main path and the settings.
 
-python scripts/write_pages.py           # rewrites CONFIG.md and the list in ARCHITECTURE.md
+python scripts/write_pages.py           # rewrites CONFIG.md, lists in ARCHITECTURE.md and PAPER.md
 python scripts/write_pages.py --check   # exits with 1 if they differ from the code
 """
 
@@ -16,6 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 PACKAGES = ("express50", "pipelines", "annotations", "grmm")
+DEVIATIONS = "<!-- deviations -->\n"
 BEGIN, END = "<!-- main path: begin -->\n", "<!-- main path: end -->\n"
 
 
@@ -77,6 +78,24 @@ def architecture() -> str:
     before, rest = text.split(BEGIN)
     _, after = rest.split(END)
     return f"{before}{BEGIN}{main_path()}{END}{after}"
+
+
+def paper() -> str:
+    """Return docs/PAPER.md with the deviations as the code has them."""
+    from grmm.config import PRESETS, resolve
+    from grmm.deviations import SMALLER, paper_diff
+
+    text = (ROOT / "docs" / "PAPER.md").read_text(encoding="utf-8")
+    before, _, after = text.split(DEVIATIONS)
+    lines = paper_diff(resolve("paper-plus"))
+    cut = lines.index("At every setting:")
+    for name in PRESETS:
+        if name not in ("paper", "paper-plus"):
+            known = set(lines[:cut])
+            own = [line for line in paper_diff(resolve(name)) if line.startswith("| `")]
+            own = [line for line in own if line not in known and SMALLER[0] not in line]
+            lines += ["", f"`{name}` also, besides sizes and rates:", "", *lines[:2], *own]
+    return DEVIATIONS.join([before, "\n".join([*lines, ""]), after])
 
 
 def field_notes(config: type) -> dict[str, str]:
@@ -148,7 +167,9 @@ def main() -> int:
     parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if stale")
     args = parser.parse_args()
     stale = []
-    for name, text in (("ARCHITECTURE.md", architecture()), ("CONFIG.md", settings())):
+    pages = {"ARCHITECTURE.md": architecture, "CONFIG.md": settings, "PAPER.md": paper}
+    for name, make in pages.items():
+        text = make()
         path = ROOT / "docs" / name
         if not path.is_file() or path.read_text(encoding="utf-8") != text:
             stale.append(name)

@@ -84,6 +84,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--holdout-expressions": {
         "default": "", "metavar": "SUBJECT/EXPRESSION,..", "help": "to test on",
     },
+    "--paper-diff": FLAG | {"help": "print deviations from the paper's letter instead"},
     "--anew": FLAG | {"help": "start over, though OUT has a checkpoint"},
     # Measuring
     "--alexnet": {"default": "", "help": "torchvision's alexnet state dict, for LPIPS"},
@@ -194,7 +195,7 @@ COMMANDS = {
     ),
     "config": GrmmCommand(
         handler=commands.config,
-        options=f"table {TRAINING}",
+        options=f"table {TRAINING} --paper-diff",
         help="print every setting with its meaning, as --config takes them",
         example="grmm config train fit --preset demo",
     ),

@@ -17,6 +17,7 @@ from express50.contract.config import config_toml, known_assignments
 from express50.errors import ConfigError
 from express50.files.atomic import write_bytes, write_json
 from grmm.config import TABLES, Config, as_tables, choose, from_tables, resolve
+from grmm.deviations import paper_diff
 
 if TYPE_CHECKING:
     from grmm.checkpoint import Loaded
@@ -69,6 +70,9 @@ def train_config(args: argparse.Namespace) -> Config:
 def config(args: argparse.Namespace) -> int:
     """Print the settings that `train` would take, as TOML."""
     resolved = train_config(args)
+    if args.paper_diff:
+        say(*paper_diff(resolved))
+        return OK
     for table in args.table or TABLES:
         if table not in TABLES:
             raise ConfigError(f"unknown table {table!r}; expected one of {', '.join(TABLES)}")

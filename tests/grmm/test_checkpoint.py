@@ -119,6 +119,10 @@ def test_settings_that_are_gone_are_left_out_unless_they_changed_the_result(path
         content["config"][table] |= values
     torch.save(content, path)
     assert load_checkpoint(path).config == tiny_config(train={"iterations": 1})
+    del content["config"]["model"]["refine_alpha"], content["config"]["train"]["warm_start"]
+    torch.save(content, path)
+    again = load_checkpoint(path).config  # both were so before they were settings
+    assert again.model.refine_alpha and again.train.warm_start
     content["config"]["model"]["precision"] = "bfloat16"
     torch.save(content, path)
     with pytest.raises(FormatError, match=r"model\.precision"):

@@ -134,7 +134,7 @@ def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (["train", "{shards}", "{out}", "--preset=dmeo"], 2, "expected one of paper, small, demo"),
+        (["train", "{shards}", "{out}", "--preset=dmeo"], 2, "paper, paper-plus, small, demo"),
         (["train", "{out}", "{out}"], 1, "the index is missing"),
         (["train", "{shards}", "{out}", *TINY, "--holdout-cameras=x"], 2, "names x"),
         (["fit", "{checkpoint}", "{shards}", "{out}", "--subject=S9"], 2, "no subject is"),

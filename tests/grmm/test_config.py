@@ -2,10 +2,11 @@ import pytest
 import torch
 
 from express50.errors import ConfigError
+from express50.head.load import load_head
 from grmm import losses
-from grmm.config import PRESETS, SCALE_RANGE_MM, as_tables, from_tables, resolve
+from grmm.config import PLUS, PRESETS, SCALE_RANGE_MM, as_tables, from_tables, resolve
 from grmm.fit import LOCALITY_T
-from grmm.networks import Refinement
+from grmm.networks import Networks, Refinement
 
 
 def test_paper_preset_has_the_papers_numbers():
@@ -19,6 +20,20 @@ def test_paper_preset_has_the_papers_numbers():
     assert (config.fit.locality, LOCALITY_T) == (0.1, 0.3)
     assert SCALE_RANGE_MM == (0.1, 10.0)
     assert (model.frame, model.identity_modes, model.refine_unshuffle) == ("head", 0, 1)
+    assert (model.refine_alpha, config.train.warm_start, loss.displacement) == (False, False, 0)
+    assert (config.data.torso, config.train.final_lr) == ("background", 1.0)
+    fit = config.fit
+    assert not (fit.texture_warm_start or fit.random_background or fit.shuffle_directions)
+    with torch.device("meta"):
+        networks = Networks(model, load_head("procedural"), 2, 3)
+    assert networks.refinement.enter[0].in_channels == 3 + 32 + 1  # colours, features, depth
+
+
+@pytest.mark.parametrize("name", ["paper-plus", "small", "demo"])
+def test_own_presets_have_what_we_add(name):
+    tables = as_tables(resolve(name))
+    for table, values in PLUS.items():
+        assert values.items() <= tables[table].items()
 
 
 def test_the_demos_refinement_sees_a_quarter_of_the_size():
@@ -63,7 +78,7 @@ def test_bad_values_are_named(assignment, message):
 
 
 def test_unknown_preset_and_missing_file_are_named(tmp_path):
-    with pytest.raises(ConfigError, match="paper, small, demo"):
+    with pytest.raises(ConfigError, match="paper, paper-plus, small, demo"):
         resolve("dmeo")
     with pytest.raises(ConfigError, match="no such file"):
         resolve("demo", tmp_path / "absent.toml")

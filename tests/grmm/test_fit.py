@@ -1,4 +1,6 @@
 import json
+import math
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -6,6 +8,7 @@ import pytest
 import torch
 
 from express50.errors import TrainError
+from grmm import fit as fit_module
 from grmm.checkpoint import load_checkpoint
 from grmm.data import HeadViews
 from grmm.edit import trained_head
@@ -122,6 +125,26 @@ def test_fit_stops_at_its_time_budget(loaded, views, tmp_path):
     assert 1 <= metrics["stage1_iterations"] < 10_000
     assert 1 <= metrics["stage2_iterations"] < 10_000
     assert metrics["psnr_is_of"].startswith("given views")
+
+
+def test_a_short_budget_decays_by_time(loaded, views):
+    state = start(loaded, views, unseen(views))
+    shares = [share for _, share, _ in fit_module._items(state, 10**6, time.perf_counter() + 0.3)]
+    assert shares[0] < 0.3 and 0.7 < shares[-1] <= 1 and shares == sorted(shares)
+    assert [share for _, share, _ in fit_module._items(state, 4, math.inf)] == [0, 0.25, 0.5, 0.75]
+
+
+def test_stage_two_draws_other_backgrounds_where_asked(loaded, views):
+    greys = {}
+    for random in (False, True):
+        state = start(loaded, views, unseen(views))
+        draw = np.random.default_rng(0) if random else None
+        items = [item for _, _, item in fit_module._items(state, 4, math.inf, draw)]
+        greys[random] = {item.background for item in items}
+        for item in items:
+            corner = item.target[:, 0, 0]
+            torch.testing.assert_close(corner, torch.full((3,), item.background))
+    assert greys[False] == {0.0} and len(greys[True]) == 4
 
 
 def test_views_of_two_subjects_are_refused(loaded, views, tmp_path):

@@ -101,6 +101,11 @@ def test_laplacian_is_zero_for_shifts_and_by_hand_for_a_spike():
     assert float(losses.laplacian_mm2(spike, edges)) == pytest.approx((1 + 3 / 9) / 4)
 
 
+def test_displacement_term_is_the_mean_square_in_millimetres():
+    field = torch.tensor([[0.003, 0.004, 0.0], [0.0, 0.0, 0.0]])
+    assert float(losses.displacement_mm2(field)) == pytest.approx(12.5)
+
+
 def test_laplacian_gradient():
     edges = losses.mesh_edges(torch.tensor([[0, 1, 2], [1, 2, 3]]))
     field = torch.rand(5, 3, dtype=torch.float64, requires_grad=True)
