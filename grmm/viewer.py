@@ -10,17 +10,23 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from http import HTTPStatus
 from typing import Any
 
 import numpy as np
 import torch
 import viser
+import websockets.asyncio.server
 from torch import Tensor
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
 
 from express50.console import stdout_to_stderr
 from express50.geometry.transforms import invert_transform, make_transform, quat_to_matrix
+from express50.local_server import Door
 from grmm.checkpoint import Loaded
 from grmm.edit import HeadCodes, between, controlled, principal_directions, trained_head
 from grmm.head_crop import draw_window
@@ -111,10 +117,38 @@ class Watcher:
 
 
 class _Server(viser.ViserServer):
-    """The library's server without its tunnel to a public one."""
+    """The library's server, behind a door and without its tunnel to a public one."""
+
+    def __init__(self, door: Door, **options: Any) -> None:
+        """Start to listen; the library has no setting for what a request must hold."""
+        listen = websockets.asyncio.server.serve
+        websockets.asyncio.server.serve = partial(_serve_behind, door, listen)
+        try:
+            super().__init__(host=door.host, **options)
+        finally:
+            websockets.asyncio.server.serve = listen
 
     def request_share_url(self, verbose: bool = True) -> None:
         """Share nothing: hiding the button instead leaves the whole page blank (viser 0.2.23)."""
+
+
+def _serve_behind(
+    door: Door, listen: Callable[..., Any], *args: Any, process_request: Any, **options: Any
+) -> Any:  # noqa: ANN401
+    """Listen as websockets' ``serve`` does, for pages and sockets that `Door` lets in."""
+
+    def check(connection: ServerConnection, request: Request) -> Response | None:
+        refusal = door.refusal(request.headers.get("Host"), request.headers.get("Origin"))
+        if refusal is not None:
+            return connection.respond(HTTPStatus.FORBIDDEN, refusal)
+        socket = request.headers.get("Upgrade") == "websocket"  # asked for without the last slash
+        path = door.inside(request.path + "/" * socket)
+        if path is None or path.startswith("/") or ".." in path.split("/"):
+            return connection.respond(HTTPStatus.NOT_FOUND, "no such page\n")
+        request.path = f"/{path}"
+        return process_request(connection, request)
+
+    return listen(*args, process_request=check, **options)
 
 
 class Viewer:
@@ -128,8 +162,9 @@ class Viewer:
         self._watchers: dict[int, Watcher] = {}
         self._head_changed = time.perf_counter()
         with stdout_to_stderr():
-            self.server = _Server(host=host, port=port, label="GRMM", verbose=False)
-        self.port = int(self.server.get_port())
+            door = Door(host)
+            self.server = _Server(door, port=port, label="GRMM", verbose=False)
+        self.address = door.address(int(self.server.get_port()))
         self.server.gui.configure_theme(dark_mode=True)
         self.server.scene.set_up_direction("+y")
         self._add_controls()

@@ -9,7 +9,7 @@ import argparse
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,8 @@ from rich.filesize import decimal
 from express50.console import FAILED, OK, add_command, answer, format_table, say
 from express50.contract.layout import Dataset, existing_dataset
 from express50.contract.stage import stages
-from express50.errors import ConfigError
 from express50.files.atomic import write_bytes
+from express50.local_server import NOT_FOUND, PageServer, Reply
 from express50.runner.ledger import COLUMNS, Ledger, Receipt, Run
 
 PAGE_SECONDS = 3.0  # between two pages while a run goes on
@@ -74,7 +74,7 @@ def add_commands(subparsers: Any) -> None:
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--json", action="store_true", help="print receipts as JSON")
     how.add_argument("--page", type=Path, metavar="FILE", help="HTML page, kept up while a run is")
-    how.add_argument("--serve", type=int, metavar="PORT", help="the page on http://127.0.0.1:PORT")
+    how.add_argument("--serve", type=int, metavar="PORT", help="the page on this machine, at PORT")
 
 
 def show_status(args: argparse.Namespace) -> int:
@@ -116,29 +116,14 @@ def _keep_page(dataset: Dataset, path: Path) -> list[StageStatus]:
 
 
 def _serve(dataset: Dataset, port: int) -> int:
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:  # noqa: N802
-            if self.path != "/":
-                self.send_error(404)
-                return
-            name = dataset.root.resolve().name
-            body = status_page(name, _read(dataset), PAGE_SECONDS).encode()
-            self.send_response(200)
-            self.send_header("Content-Type", "text/html; charset=utf-8")
-            self.send_header("Content-Length", str(len(body)))
-            self.send_header("Cache-Control", "no-store")
-            self.end_headers()
-            self.wfile.write(body)
+    def get(path: str) -> Reply:
+        if path:
+            return NOT_FOUND
+        page = status_page(dataset.root.resolve().name, _read(dataset), PAGE_SECONDS)
+        return Reply(HTTPStatus.OK, "text/html; charset=utf-8", page.encode())
 
-        def log_message(self, *unused: object) -> None:
-            """Stay silent: the page asks every few seconds."""
-
-    try:
-        server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
-    except (OSError, OverflowError) as error:
-        raise ConfigError(f"--serve {port}: {error}; choose another port") from error
-    with server:
-        say(f"http://127.0.0.1:{server.server_port} (Ctrl-C stops it)")
+    with PageServer(get, None, "127.0.0.1", port) as server:
+        say(f"{server.address} (Ctrl-C stops it)")
         server.serve_forever()
     return OK
 

@@ -168,9 +168,7 @@ def view(args: argparse.Namespace) -> int:
     from grmm.viewer import Viewer
 
     viewer = Viewer(_load(args.checkpoint), args.host, args.port, args.size, args.still)
-    if viewer.port != args.port:
-        say(f"port {args.port} is taken; this is another")
-    say(f"http://{args.host}:{viewer.port}  (Ctrl-C stops)")
+    say(f"{viewer.address}  (Ctrl-C stops)")
     viewer.run()
     return OK
 
@@ -303,7 +301,7 @@ def study_serve(args: argparse.Namespace) -> int:
     from grmm.study.server import make_server
 
     with make_server(args.out, args.host, args.port) as server:
-        say(f"http://{args.host}:{server.server_address[1]}  (Ctrl-C stops; answers are kept)")
+        say(f"{server.address}  (Ctrl-C stops; answers are kept)")
         server.serve_forever()
     return OK
 

@@ -12,9 +12,9 @@ from express50.files.images import decode_image
 class Browser:
     """Receives every message; keeps the controls by label and the newest picture."""
 
-    def __init__(self, port):
+    def __init__(self, page):
         self.open = ExitStack()
-        address = f"ws://127.0.0.1:{port}"
+        address = page.replace("http://", "ws://").removesuffix("/")  # as the page's script does
         self.socket = self.open.enter_context(connect(address, max_size=None, compression=None))
         self.controls, self.picture, self.pictures = {}, None, 0
 

@@ -1,11 +1,15 @@
 import shutil
 import subprocess
 import threading
+import urllib.error
+import urllib.request
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 import torch
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
 from grmm.checkpoint import load_checkpoint
 from grmm.edit import controlled, trained_head
@@ -90,7 +94,7 @@ def served(viewer):
 
 def test_a_slider_moved_in_a_browser_changes_the_picture(loaded):
     with served(Viewer(loaded, "127.0.0.1", 18200, moving=48, still=64)) as viewer:
-        browser = Browser(viewer.port)
+        browser = Browser(viewer.address)
         eye = np.array([0.0, 0.05, 0.7])
         browser.look(eye)
         assert browser.listen(1).shape == (48, 48, 3)
@@ -117,9 +121,28 @@ def test_a_browser_shows_the_controls(loaded, tmp_path):
         "--timeout=8000", "--virtual-time-budget=8000", "--dump-dom",
     ]  # fmt: skip
     with served(Viewer(loaded, "127.0.0.1", 8330, moving=32, still=32)) as viewer:
-        command.append(f"http://127.0.0.1:{viewer.port}")
+        command.append(viewer.address)
         for _ in range(3):  # a busy machine may not answer in the browser's time
             page = subprocess.run(command, capture_output=True, text=True, timeout=90, check=False)
             if "jaw open" in page.stdout:
                 break
     assert "jaw open" in page.stdout
+
+
+def test_other_sites_and_other_users_do_not_get_in(loaded):
+    with served(Viewer(loaded, "127.0.0.1", 8360, moving=32, still=32)) as viewer:
+        socket = viewer.address.replace("http://", "ws://").removesuffix("/")
+        root = socket.rsplit("/", 1)[0]
+        for address, origin, status in [
+            (socket, "http://evil.example", 403),
+            (root, None, 404),
+            (root + "/guess", None, 404),
+        ]:
+            with pytest.raises(InvalidStatus) as caught:
+                connect(address, origin=origin)
+            assert caught.value.response.status_code == status
+        for path in ("/etc/passwd", "../../../etc/passwd", "nothing.js"):
+            with pytest.raises(urllib.error.HTTPError, match="404"):
+                urllib.request.urlopen(viewer.address + path, timeout=5)
+        with urllib.request.urlopen(viewer.address, timeout=5) as page:
+            assert b"Viser" in page.read()

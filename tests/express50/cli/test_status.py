@@ -207,7 +207,7 @@ def test_serve_answers_on_this_machine_alone(tmp_path):
         with urllib.request.urlopen(address, timeout=10) as answer:
             assert "ingest" in parsed(answer.read().decode()).text
         with pytest.raises(urllib.error.HTTPError, match="404"):
-            urllib.request.urlopen(address + "/ledger.sqlite", timeout=10)
+            urllib.request.urlopen(address + "ledger.sqlite", timeout=10)
         process.terminate()
     assert process.returncode == 130
 

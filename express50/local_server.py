@@ -1,0 +1,159 @@
+"""Serve pages to the browser of this machine, and to nobody else.
+
+Every address begins with a random token, so that neither another user of the machine nor a web page
+can guess it. Requests that name another host (DNS rebinding) or come from another site's page are
+refused, slow ones are cut off, and only so many are answered at once.
+"""
+
+from __future__ import annotations
+
+import secrets
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from socket import SHUT_RDWR, socket
+from threading import BoundedSemaphore, Timer
+from typing import Any, NamedTuple
+from urllib.parse import urlsplit
+
+from express50.console import log
+from express50.errors import ConfigError
+
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+AT_ONCE = 32  # connections; more are closed unanswered
+LONGEST_S = 20.0  # one request and its answer
+
+
+class Reply(NamedTuple):
+    """The answer to one request: its status, media type and body."""
+
+    status: HTTPStatus
+    kind: str
+    body: bytes
+
+
+NOT_FOUND = Reply(HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
+Get = Callable[[str], Reply]
+"""The address after the token, without its slash, to its reply."""
+Post = Callable[[str, str, Callable[[int], bytes | None]], Reply]
+"""The address, the media type, and a function that reads a body of at most so many bytes."""
+
+
+@dataclass(frozen=True)
+class Door:
+    """Decides who may ask a server that listens on ``host``."""
+
+    host: str
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(16))
+
+    def address(self, port: int) -> str:
+        """Return the address to open in a browser."""
+        return f"http://{self.host}:{port}/{self.token}/"
+
+    def refusal(self, host: str | None, origin: str | None) -> str | None:
+        """Return why a request with these headers is refused, or None."""
+        name = urlsplit(f"//{host or ''}").hostname
+        if self.host in LOOPBACK and name not in LOOPBACK:
+            return "this server answers to its own address alone\n"
+        if origin is not None and origin != f"http://{host}":
+            return "this server does not answer to the pages of other sites\n"
+        return None
+
+    def inside(self, path: str) -> str | None:
+        """Return the path after the token and its slash; None without the token."""
+        before, slash, after = path.removeprefix("/").partition("/")
+        mine = secrets.compare_digest(before.encode(), self.token.encode())
+        return after if mine and slash else None
+
+
+class PageServer(ThreadingHTTPServer):
+    """A server of a few pages; ``serve_forever`` answers until Ctrl-C."""
+
+    daemon_threads = True
+
+    def __init__(self, get: Get, post: Post | None, host: str, port: int) -> None:
+        """Listen, without serving yet.
+
+        Raises:
+            ConfigError: the port is taken, or is not one.
+        """
+        self.door, self.get, self.post = Door(host), get, post
+        self._free = BoundedSemaphore(AT_ONCE)
+        try:
+            super().__init__((host, port), _Handler)
+        except (OSError, OverflowError) as error:
+            raise ConfigError(f"{host}:{port}: {error}; choose another port") from error
+
+    @property
+    def address(self) -> str:
+        """Return the address to open in a browser."""
+        return self.door.address(self.server_port)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer in a thread, if one is free."""
+        if self._free.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer one request, in at most `LONGEST_S`."""
+        limit = Timer(LONGEST_S, _cut_off, [request])
+        limit.daemon = True
+        limit.start()
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            limit.cancel()
+            self._free.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say in one line what went wrong, unless the browser just went away."""
+        error = sys.exc_info()[1]
+        if not isinstance(error, OSError):
+            log(f"a request failed: {type(error).__name__}: {error}")
+
+
+def _cut_off(connection: socket) -> None:
+    with suppress(OSError):  # closed already
+        connection.shutdown(SHUT_RDWR)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: PageServer
+    timeout = LONGEST_S / 2  # without a byte
+
+    def do_GET(self) -> None:  # noqa: N802
+        self._answer(self.server.get)
+
+    def do_POST(self) -> None:  # noqa: N802
+        post, kind = self.server.post, self.headers.get("Content-Type", "")
+        self._answer(lambda path: post(path, kind, self._body) if post else NOT_FOUND)
+
+    def _body(self, limit: int) -> bytes | None:
+        length = self.headers.get("Content-Length", "")
+        if not length.isdecimal() or len(length) > 9 or int(length) > limit:
+            return None
+        return self.rfile.read(int(length))
+
+    def _answer(self, get: Get) -> None:
+        refusal = self.server.door.refusal(self.headers["Host"], self.headers["Origin"])
+        path = self.server.door.inside(self.path)
+        if refusal is not None:
+            status, kind, body = HTTPStatus.FORBIDDEN, "text/plain", refusal.encode()
+        else:
+            status, kind, body = NOT_FOUND if path is None else get(path)
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("Referrer-Policy", "no-referrer")  # the address holds the token
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Say nothing: pages ask every few seconds."""
