@@ -14,6 +14,7 @@ import io
 import math
 import pickle
 import struct
+import warnings
 import zipfile
 import zlib
 from collections import OrderedDict
@@ -386,6 +387,11 @@ def read_weights(path: Path, kind: Kind, where: str, what: str, fix: str = AGAIN
     if not Path(path).is_file():
         raise kind(f"{where}: no such file; {fix}")
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings(action="ignore"):  # about pickles that are refused below
+            return torch.load(path, map_location="cpu", weights_only=True)
     except DAMAGE as error:
-        raise kind(f"{where}: not {what} ({reason(error)}); {fix}") from None
+        # Torch's own words tell the reader how to switch the protection off.
+        why = "it is damaged or of another kind"
+        if isinstance(error, pickle.UnpicklingError):
+            why = "it holds more than tensors and plain values; nothing in it was run"
+        raise kind(f"{where}: not {what} ({why}); {fix}") from None

@@ -1,5 +1,7 @@
 """Checkpoints that are damaged, or whose parts do not fit each other."""
 
+import os
+import pickle
 import zipfile
 
 import numpy as np
@@ -29,6 +31,26 @@ def test_checkpoint_is_read_with_weights_only_and_damage_is_named(tmp_path):
     torch.save({"format": "other/9"}, path)
     with pytest.raises(FormatError, match="other/9"):
         load_checkpoint(path)
+
+
+class Command:
+    """Pickles to a call of ``os.system``."""
+
+    def __init__(self, mark):
+        self.mark = mark
+
+    def __reduce__(self):
+        return os.system, (f"touch {self.mark}",)
+
+
+@pytest.mark.parametrize("save", [torch.save, lambda c, path: path.write_bytes(pickle.dumps(c, 4))])
+def test_a_checkpoint_that_runs_commands_is_refused_in_our_own_words(tmp_path, save):
+    path, mark = tmp_path / "checkpoint.pt", tmp_path / "mark"
+    save(Command(mark), path)
+    with pytest.raises(FormatError, match="more than tensors") as caught:
+        load_checkpoint(path)
+    assert not mark.exists()
+    assert "weights_only" not in str(caught.value)  # torch advises to switch it off
 
 
 @pytest.mark.parametrize(
