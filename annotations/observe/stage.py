@@ -6,7 +6,7 @@ jitter of single detections out of the curves in which expressions are searched 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -199,8 +199,8 @@ def find_points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find landmarks (T, 68, 2), corner-origin pixels, and scores (T,) of a clip.
 
-    The face is searched for in the middle frame only; all frames are then looked at through the
-    same window, except those where the face has left it.
+    The face is searched for in the middle frame only; all frames and their mirror images are then
+    looked at through the same window, except those where the face has left it.
 
     Args:
         net: from ``load_network``.
@@ -209,8 +209,18 @@ def find_points(
     """
     middle = detect(net, images[len(images) // 2], smallest=smallest)
     centre, side = face_box(middle.points)
-    found = list(_look(net, images, window_about(middle.points)))
-    points, scores = (np.concatenate(part) for part in zip(*found, strict=True))
+    window = window_about(middle.points)
+    points, scores = np.zeros((len(images), 68, 2)), np.zeros(len(images))
+    for start in range(0, len(images), BATCH):
+        crops = np.stack([_cut(image, window, CROP) for image in images[start : start + BATCH]])
+        both = np.concatenate([crops, crops[:, :, ::-1]])
+        with torch.inference_mode():
+            output = net(torch.from_numpy(both).permute(0, 3, 1, 2).float() / 255.0)
+        direct, mirrored = output.points.double().numpy().reshape(2, len(crops), -1, 2)
+        mirrored = np.stack([CROP - mirrored[:, MIRROR, 0], mirrored[:, MIRROR, 1]], axis=-1)
+        batch = slice(start, start + len(crops))
+        points[batch] = 0.5 * (direct + mirrored) @ window[:, :2].T + window[:, 2]
+        scores[batch] = torch.sigmoid(output.logit).double().numpy().reshape(2, -1).mean(0)
     for row, image in enumerate(images):
         away = np.linalg.norm(face_box(points[row])[0] - centre)
         if away > STRAY_SHARE * side or scores[row] < STRAY_SCORE * middle.score:
@@ -256,22 +266,6 @@ def steady(values: np.ndarray) -> np.ndarray:
     numbers = np.arange(len(values))
     weights = np.exp(-0.5 * ((numbers[:, None] - numbers) / STEADY_FRAMES) ** 2)
     return np.tensordot(weights / weights.sum(1, keepdims=True), values, axes=1)
-
-
-def _look(
-    net: LandmarkNet, images: Sequence[np.ndarray], window: np.ndarray
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Detect points and scores in batches through one window, averaged with its mirror."""
-    for start in range(0, len(images), BATCH):
-        crops = np.stack([_cut(image, window, CROP) for image in images[start : start + BATCH]])
-        both = np.concatenate([crops, crops[:, :, ::-1]])
-        with torch.inference_mode():
-            output = net(torch.from_numpy(both).permute(0, 3, 1, 2).float() / 255.0)
-        found = output.points.double().numpy()
-        direct, mirrored = found[: len(crops)], found[len(crops) :][:, MIRROR]
-        mirrored = np.stack([CROP - mirrored[..., 0], mirrored[..., 1]], axis=-1)
-        score = torch.sigmoid(output.logit).double().numpy().reshape(2, -1).mean(0)
-        yield 0.5 * (direct + mirrored) @ window[:, :2].T + window[:, 2], score
 
 
 def _cut(image: np.ndarray, window: np.ndarray, size: int) -> np.ndarray:

@@ -64,21 +64,22 @@ class FrameReader:
             raise CaptureError(
                 f"{self.path}: frame {frame} does not exist, expected 0 to {self.source.frames - 1}"
             )
-        return corrected(self._recorded(frame), self.source)
-
-    def _recorded(self, frame: int) -> np.ndarray:
-        """Read the frame as it was recorded and compare its hash with the index."""
+        orientation, expected = self.source.orientation, self.source.dhash[frame]
         if self.source.kind == "frames":
-            name = self.source.names[frame]
-            image = read_picture(self.path, name, self.source.orientation)
-            return self._checked(image, frame)
-        video, number = self._video_of(frame)
-        image = upright(video.read(number), self.source.orientation)
-        if dhash(image) != self.source.dhash[frame]:
-            # A decoder may conceal a missing reference after a seek; from the start it cannot.
-            video.restart()
-            image = upright(video.read(number), self.source.orientation)
-        return self._checked(image, frame)
+            image = read_picture(self.path, self.source.names[frame], orientation)
+        else:
+            video, number = self._video_of(frame)
+            image = upright(video.read(number), orientation)
+            if dhash(image) != expected:
+                # A decoder may conceal a missing reference after a seek; from the start it cannot.
+                video.restart()
+                image = upright(video.read(number), orientation)
+        if (found := dhash(image)) != expected:
+            raise CaptureError(
+                f"{self._file(frame)}: frame {frame} has hash {found}, the index says {expected}; "
+                "the footage changed since it was ingested, run 'express50 ingest' again"
+            )
+        return corrected(image, self.source)
 
     def _video_of(self, frame: int) -> tuple[VideoReader, int]:
         """Find the video that holds a frame, and the frame's number in it; one stays open."""
@@ -92,15 +93,6 @@ class FrameReader:
             self._video = VideoReader(path, self.source.pts[first:last])
             self._clip = clip
         return self._video, frame - first
-
-    def _checked(self, image: np.ndarray, frame: int) -> np.ndarray:
-        found, expected = dhash(image), self.source.dhash[frame]
-        if found != expected:
-            raise CaptureError(
-                f"{self._file(frame)}: frame {frame} has hash {found}, the index says {expected}; "
-                "the footage changed since it was ingested, run 'express50 ingest' again"
-            )
-        return image
 
     def _file(self, frame: int) -> str:
         """Name the file that holds a frame, for messages."""

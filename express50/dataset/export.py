@@ -219,7 +219,17 @@ def export_meshes(head: Head, kind: str, out: Path) -> dict:
             columns = {} if head.albedo is None else _vertex_colours(model, head.albedo)
             write_ply(path, vertices, faces, columns)
         else:
-            _write_head_glb(path, vertices, model, head.albedo)
+            pairs = np.stack([model.faces.numpy(), model.uv_faces.numpy()], -1).reshape(-1, 2)
+            unique, corners = np.unique(pairs, axis=0, return_inverse=True)
+            write_glb(
+                path,
+                "head",
+                vertices[unique[:, 0]],
+                corners.reshape(-1, 3),
+                uv=model.uv.numpy()[unique[:, 1]],
+                baseColorTexture=None if head.albedo is None else Image.fromarray(head.albedo),
+                baseColorFactor=[190 if head.albedo is None else 255] * 3 + [255],
+            )
     meta = head.meta(kind) | {
         "expressions": list(head.track.expressions),
         "frames": head.track.frames.tolist(),
@@ -236,23 +246,6 @@ def write_head_obj(
     """Write vertices (V, 3) with the head model's faces and texture coordinates as OBJ."""
     faces, uv_faces = model.faces.numpy(), model.uv_faces.numpy()
     write_obj(path, vertices, faces, model.uv.double().numpy(), uv_faces, texture)
-
-
-def _write_head_glb(
-    path: Path, vertices: np.ndarray, model: HeadModel, albedo: np.ndarray | None
-) -> None:
-    """Write a binary glTF file, with the albedo (H, W, 3) uint8 sRGB as its texture."""
-    pairs = np.stack([model.faces.numpy(), model.uv_faces.numpy()], -1).reshape(-1, 2)
-    unique, corners = np.unique(pairs, axis=0, return_inverse=True)
-    write_glb(
-        path,
-        "head",
-        vertices[unique[:, 0]],
-        corners.reshape(-1, 3),
-        uv=model.uv.numpy()[unique[:, 1]],
-        baseColorTexture=None if albedo is None else Image.fromarray(albedo),
-        baseColorFactor=[255, 255, 255, 255] if albedo is not None else [190, 190, 190, 255],
-    )
 
 
 def _vertex_colours(model: HeadModel, albedo: np.ndarray) -> dict[str, np.ndarray]:

@@ -6,6 +6,8 @@ Nothing in a file is executed: pickled objects are refused.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +20,7 @@ from express50.files.digests import file_sha256
 from express50.files.text import ID
 from express50.geometry.shapes import check_finite, check_shape
 
-SCHEMAS = ("express50.track/1", "express50.track/2")
+SCHEMA = "express50.track/2"
 SEQUENCE_SCHEMA = "express50.sequence/1"
 REGISTRATION_SCHEMA = "express50.registration/1"
 _WIDTHS = {"neck": (3,), "jaw": (3,), "eyes": (6,), "R": (3, 3), "t": (3,)}
@@ -30,7 +32,6 @@ class Track:
     """Holds what was tracked of a subject: E expressions, V vertices; world = R @ head + t.
 
     Attributes:
-        schema: of the file, one of SCHEMAS.
         head: head model, as ``load_head`` takes it.
         expressions: E ids.
         frames: (E,) int64 decode indices.
@@ -44,7 +45,6 @@ class Track:
         offsets: (V, 3) float32 metres, added to the rest shape; zeros where there are none.
     """
 
-    schema: str
     head: str
     expressions: tuple[str, ...]
     frames: np.ndarray
@@ -131,28 +131,31 @@ def read_track(path: Path) -> Track:
 
     Raises:
         StageError: the file is missing.
-        FormatError: it is not a track of a known schema, its arrays do not fit each other, or one
-            holds NaN or Inf.
+        FormatError: it is not a track, its arrays do not fit each other, or one holds NaN or Inf.
     """
     if not path.is_file():
         raise StageError(f"{path}: the track is missing; run 'express50 track'")
-    arrays = read_arrays(path, FormatError, "a track", fix=_AGAIN)
-    try:
-        schema, head = str(arrays.pop("schema")), str(arrays.pop("head"))
-        if schema not in SCHEMAS:
-            raise ValueError(f"schema {schema!r}, expected one of {', '.join(SCHEMAS)}")
-        if schema == SCHEMAS[0]:
-            arrays["offsets"] = np.zeros(arrays["vertices"].shape[1:], np.float32)
-        names = arrays.pop("expressions")
-        count = arrays["vertices"].shape[1] if arrays["vertices"].ndim == 3 else None
+    with _arrays_of(path, "a track", SCHEMA, _AGAIN) as arrays:
+        names, vertices = arrays["expressions"], arrays["vertices"]
+        count = vertices.shape[1] if vertices.ndim == 3 else None
         further = {"vertices": (names.size, count, 3), "offsets": (count, 3)}
         numbers = _checked(arrays, names, further)
         if len(set(names.tolist())) != len(names):
             raise ValueError("an expression appears twice")
+        return Track(head=str(arrays["head"]), expressions=tuple(names.tolist()), **numbers)
+
+
+@contextmanager
+def _arrays_of(path: Path, what: str, schema: str, again: str) -> Iterator[dict[str, np.ndarray]]:
+    """Read the arrays of a file; what is missing or wrong with them becomes one FormatError."""
+    arrays = read_arrays(path, FormatError, what, fix=again)
+    try:
+        if str(arrays["schema"]) != schema:
+            raise ValueError(f"schema {str(arrays['schema'])!r}, expected {schema}")
+        yield arrays
     except (KeyError, ValueError) as error:
         words = f"has no {error}" if isinstance(error, KeyError) else str(error)
-        raise FormatError(f"{path}: not a track ({words}); {_AGAIN}") from None
-    return Track(schema=schema, head=head, expressions=tuple(names.tolist()), **numbers)
+        raise FormatError(f"{path}: not {what} ({words}); {again}") from None
 
 
 def read_registration(path: Path) -> Registration:
@@ -162,24 +165,17 @@ def read_registration(path: Path) -> Registration:
         StageError: the file is missing.
         FormatError: it is not a registration, or its arrays do not fit or hold NaN or Inf.
     """
-    again = "run 'express50 register' again"
     if not path.is_file():
         raise StageError(f"{path}: the registration is missing; run 'express50 register'")
-    arrays = read_arrays(path, FormatError, "a registration", fix=again)
-    try:
-        schema, track = str(arrays.pop("schema")), str(arrays.pop("track"))
-        if schema != REGISTRATION_SCHEMA:
-            raise ValueError(f"schema {schema!r}, expected {REGISTRATION_SCHEMA}")
+    again = "run 'express50 register' again"
+    with _arrays_of(path, "a registration", REGISTRATION_SCHEMA, again) as arrays:
         count = len(arrays["vertices"])
         for name, width in {"vertices": (3,), "offsets": (3,), "residual": (), "sigma": ()}.items():
             check_shape(name, arrays[name], (count, *width))
             check_finite(name, arrays[name])
         check_shape("seen", arrays["seen"], (count,))
         names = ("vertices", "offsets", "seen", "residual", "sigma")
-        return Registration(track=track, **{name: arrays[name] for name in names})
-    except (KeyError, ValueError) as error:
-        words = f"has no {error}" if isinstance(error, KeyError) else str(error)
-        raise FormatError(f"{path}: not a registration ({words}); {again}") from None
+        return Registration(track=str(arrays["track"]), **{name: arrays[name] for name in names})
 
 
 def registration_of(path: Path, track: Track, digest: str) -> Registration | None:
@@ -226,16 +222,10 @@ def read_sequence(path: Path) -> Sequence:
             f"{path}: the sequence is missing; run 'express50 track --set track.frames=clips', or"
             " 'express50 photo' on a video"
         )
-    arrays = read_arrays(path, FormatError, "a sequence", fix=_AGAIN)
-    try:
-        schema, head, cues = str(arrays["schema"]), str(arrays["head"]), arrays["cues"]
-        if schema != SEQUENCE_SCHEMA:
-            raise ValueError(f"schema {schema!r}, expected {SEQUENCE_SCHEMA}")
+    with _arrays_of(path, "a sequence", SEQUENCE_SCHEMA, _AGAIN) as arrays:
+        cues = arrays["cues"]
         numbers = _checked(arrays, cues, {})
-    except (KeyError, ValueError) as error:
-        words = f"has no {error}" if isinstance(error, KeyError) else str(error)
-        raise FormatError(f"{path}: not a sequence ({words}); {_AGAIN}") from None
-    return Sequence(head=head, cues=tuple(cues.tolist()), **numbers)
+        return Sequence(head=str(arrays["head"]), cues=tuple(cues.tolist()), **numbers)
 
 
 def _checked(

@@ -13,7 +13,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -80,11 +79,7 @@ def read_kalibr(path: Path) -> dict[str, Camera]:
     names = [f"cam{n}" for n in range(len(table))] if isinstance(table, dict) else []
     if not names or not all(isinstance(table.get(name), dict) for name in names):
         raise CalibrationError(f"{path}: expected tables cam0, cam1 and so on without a gap")
-    return as_rig(_kalibr_cameras(path, names, table), path)
-
-
-def _kalibr_cameras(path: Path, names: list[str], table: dict[str, Any]) -> Iterator[Camera]:
-    pose = np.eye(4)
+    cameras, pose = [], np.eye(4)
     for name in names:
         row, where = table[name], f"{path}: {name}"
         model = f"{row.get('camera_model')}-{row.get('distortion_model')}"
@@ -103,7 +98,8 @@ def _kalibr_cameras(path: Path, names: list[str], table: dict[str, Any]) -> Iter
         if model.endswith("radtan"):
             terms = row.get("distortion_coeffs")
             dist = finite_array(terms, (4,), f"{where} has distortion_coeffs")
-        yield camera_from_K(name, K, dist, (int(width), int(height)), pose)
+        cameras.append(camera_from_K(name, K, dist, (int(width), int(height)), pose))
+    return as_rig(cameras, path)
 
 
 def read_qualisys(path: Path) -> dict[str, Camera]:

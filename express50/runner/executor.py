@@ -89,8 +89,16 @@ class Pool:
         for attempt in range(2, last + 1):
             groups = [left] if job and left else [[task] for task in left]
             left = [t for g in groups for t in self._run_window(workers, g, settle, begin, attempt)]
+        why, fix = "out of memory or a crash in native code", "give it more memory"
+        if job is not None:
+            why += f", or its job reached {job.time}"
+            fix += f" than {job.memory}, or more time"
+        words = (
+            f"its worker process died {last} times ({why}); run "
+            f"this item with --workers 0 to see, or {fix}"
+        )
         for killer in left:
-            settle(_killed(killer, last, job))
+            settle(failed_receipt(killer, words, last))
 
     def _run_window(
         self,
@@ -203,14 +211,3 @@ def _ended(
         if isinstance(failure, CancelledError):
             raise failure
     return [(future, [] if failure else future.result(), failure) for future, failure in failures]
-
-
-def _killed(task: Task, attempts: int, job: SlurmJob | None) -> Receipt:
-    why, fix = "out of memory or a crash in native code", "give it more memory"
-    if job is not None:
-        why, fix = f"{why}, or its job reached {job.time}", f"{fix} than {job.memory}, or more time"
-    reason = (
-        f"its worker process died {attempts} times ({why}); run "
-        f"this item with --workers 0 to see, or {fix}"
-    )
-    return failed_receipt(task, reason, attempts)

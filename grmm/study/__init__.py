@@ -245,7 +245,11 @@ def _row(study: dict, answers: Sequence[dict]) -> dict:
     people = sorted({answer["participant"] for answer in answers})
     counts = np.zeros((len(people), len(COLUMNS)))
     for answer in answers:
-        counts[people.index(answer["participant"]), COLUMNS.index(_column(study, answer))] += 1
+        side, participant, column = answer["answer"], answer["participant"], "tie"
+        if side != "=":  # the side back into a method
+            method = method_of(study, participant, answer["example"], side[0])
+            column = ("first" if method == study["methods"][0] else "second") + side[1:]
+        counts[people.index(participant), COLUMNS.index(column)] += 1
     draws = np.random.default_rng(0).integers(max(1, len(people)), size=(DRAWS, len(people)))
     row: dict[str, object] = {"judgments": len(answers)}
     for name, places in SUMS.items():
@@ -257,15 +261,6 @@ def _row(study: dict, answers: Sequence[dict]) -> dict:
             ends = np.percentile(_percent_of(counts[draws].sum(1), places), [tail, 100 - tail])
             row[f"{name}_interval"] = [round(float(end), 2) for end in ends]
     return row
-
-
-def _column(study: dict, answer: dict) -> str:
-    """Turn the side that an answer names back into a method."""
-    text = answer["answer"]
-    if text == "=":
-        return "tie"
-    method = method_of(study, answer["participant"], answer["example"], text[0])
-    return ("first" if method == study["methods"][0] else "second") + text[1:]
 
 
 def _percent_of(counts: np.ndarray, places: list[int]) -> np.ndarray:

@@ -275,7 +275,8 @@ def shows_surface(
     the `subject` ({name: (h, w) bool}): then this camera cannot separate it from its background.
     """
     rows, columns = np.nonzero(todo)
-    near = _neighbours(view, others)
+    near = sorted((o for o in others if o.name != view.name), key=lambda o: -_cosine(view, o))
+    near = [other for other in near[:NEIGHBOURS] if _cosine(view, other) > WIDEST]
     if not len(rows) or len(near) < 2:
         return np.zeros(todo.shape, bool)
     offsets = np.linspace(*SEARCH)
@@ -309,14 +310,6 @@ def subject_of(view: MatteView, evidence: Evidence) -> np.ndarray:
 
 def _smooth(rgb: np.ndarray) -> np.ndarray:
     return cv2.blur(rgb, (3, 3)).astype(np.float32)
-
-
-def _neighbours(view: MatteView, others: Sequence[MatteView]) -> list[MatteView]:
-    """Return the cameras that look from nearest by, as seen from the ball's centre."""
-    ranked = sorted(
-        (o for o in others if o.name != view.name), key=lambda o: _cosine(view, o), reverse=True
-    )
-    return [other for other in ranked[:NEIGHBOURS] if _cosine(view, other) > WIDEST]
 
 
 def _cosine(a: MatteView, b: MatteView) -> float:

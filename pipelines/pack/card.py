@@ -36,7 +36,10 @@ def split_subjects(
         )
     test = set(test_subjects)
     if not test and fraction > 0 and len(subjects) > 1:
-        draw = {name: _draw(name) for name in subjects}
+        draw = {}
+        for name in subjects:  # uniform in [0, 1)
+            digest = hashlib.sha256(f"0:{name}".encode()).digest()
+            draw[name] = int.from_bytes(digest[:8]) / 2**64
         test = {name for name in subjects if draw[name] < fraction}
         test = test or {min(subjects, key=lambda name: draw[name])}
     train = sorted(set(subjects) - test)
@@ -46,12 +49,6 @@ def split_subjects(
             " fewer pack.test_subjects"
         )
     return {"train": train, "test": sorted(test)}
-
-
-def _draw(subject: str) -> float:
-    """Give a subject a number that is uniform in [0, 1)."""
-    digest = hashlib.sha256(f"0:{subject}".encode()).digest()  # earlier datasets had a seed, 0
-    return int.from_bytes(digest[:8]) / 2**64
 
 
 def write_card(

@@ -29,8 +29,6 @@ NAMES = {
     "upper_lip": 51, "labiale_superius": 51, "lower_lip": 57, "labiale_inferius": 57,
 }  # fmt: skip
 _FIX = "docs/FORMAT.md, section Scans, has the layouts"
-Rows = list[tuple[str, tuple[float, ...]]]
-"""Names, empty where there are none, and coordinates."""
 
 
 def landmarks_beside(scan: Path) -> Path | None:
@@ -53,7 +51,7 @@ def read_landmarks(path: Path) -> np.ndarray:
         FormatError: the layout, the number of points, a name or a coordinate is wrong.
     """
     try:
-        rows = {".pp": _read_pp, ".json": _read_json}.get(path.suffix, _read_rows)(path)
+        rows = _read_rows(path)
         points = np.full((68, 3), np.nan)
         for place, (name, xyz) in zip(_places([name for name, _ in rows]), rows, strict=True):
             if len(xyz) != 3 or not np.isfinite(xyz).all():
@@ -86,23 +84,19 @@ def _places(names: list[str]) -> list[int]:
     return places
 
 
-def _read_pp(path: Path) -> Rows:
-    root = ElementTree.fromstring(read_text(path, FormatError, LIMIT))
-    return [
-        (point.get("name", ""), tuple(float(point.attrib[axis]) for axis in "xyz"))
-        for point in root.iter("point")
-        if point.get("active", "1") != "0"
-    ]
+def _read_rows(path: Path) -> list[tuple[str, tuple[float, ...]]]:
+    """Read names, empty where there are none, and coordinates from MeshLab's XML, JSON or text.
 
-
-def _read_json(path: Path) -> Rows:
-    content = read_json(path, FormatError)
-    rows = content.items() if isinstance(content, dict) else (("", row) for row in content)
-    return [(name, tuple(float(value) for value in row)) for name, row in rows]
-
-
-def _read_rows(path: Path) -> Rows:
-    """Read lines of x, y, z, perhaps after a name or a number; a head that ends in z is skipped."""
+    A line of text is x, y, z, perhaps after a name or a number; a head that ends in z is skipped.
+    """
+    if path.suffix == ".pp":
+        points = ElementTree.fromstring(read_text(path, FormatError, LIMIT)).iter("point")
+        kept = [point for point in points if point.get("active", "1") != "0"]
+        return [(p.get("name", ""), tuple(float(p.attrib[axis]) for axis in "xyz")) for p in kept]
+    if path.suffix == ".json":
+        content = read_json(path, FormatError)
+        pairs = content.items() if isinstance(content, dict) else (("", row) for row in content)
+        return [(name, tuple(float(value) for value in row)) for name, row in pairs]
     lines = read_text(path, FormatError, LIMIT).splitlines()
     plain = [line.split("#")[0].strip(" \t,;") for line in lines]
     rows = [re.split(r"[;,\s]+", line) for line in plain if line]

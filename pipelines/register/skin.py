@@ -50,7 +50,12 @@ def skin_trust(
     odd[np.r_[in_regions(model, ("lips",)), False][owner]] = 0.0
     sure = confidence / max(float(np.median(confidence[reference])), 1e-6)
     trust = np.clip((sure - SURE[0]) / (SURE[1] - SURE[0]), 0.0, 1.0) / (1.0 + (odd / ODD) ** 4)
-    return trust * _around(vertices, trust) ** 2
+    # What lies among untrusted vertices is not trusted either; some of those nearby will do.
+    some = np.arange(0, len(vertices), EVERY)
+    distance, nearest = cKDTree(vertices[some]).query(vertices, min(NEIGHBOURS, len(some)))
+    near = distance < AROUND_M
+    around = (trust[some][nearest] * near).sum(1) / np.maximum(near.sum(1), 1)
+    return trust * around**2
 
 
 def _oddness(colors: np.ndarray, reference: np.ndarray) -> np.ndarray:
@@ -60,11 +65,3 @@ def _oddness(colors: np.ndarray, reference: np.ndarray) -> np.ndarray:
     middle = np.median(axes[reference], axis=0)
     spread = 1.4826 * np.median(np.abs(axes[reference] - middle), axis=0)
     return np.linalg.norm((axes - middle) / np.maximum(spread, SPREADS), axis=1)
-
-
-def _around(vertices: np.ndarray, trust: np.ndarray) -> np.ndarray:
-    """Average trust (N,) over some of the vertices nearby."""
-    some = np.arange(0, len(vertices), EVERY)
-    distance, nearest = cKDTree(vertices[some]).query(vertices, min(NEIGHBOURS, len(some)))
-    near = distance < AROUND_M
-    return (trust[some][nearest] * near).sum(1) / np.maximum(near.sum(1), 1)

@@ -88,7 +88,7 @@ def write_track(dataset: Dataset, subject: str) -> None:
     t = -(low + high) / 2
     scale = np.array([0.14, 0.2, 0.17]) / (high - low)
     arrays = {
-        "schema": "express50.track/1",
+        "schema": "express50.track/2",
         "head": "procedural",
         "expressions": np.array(EXPRESSIONS),
         "frames": np.arange(count),
@@ -100,6 +100,7 @@ def write_track(dataset: Dataset, subject: str) -> None:
         "R": np.stack([np.eye(3)] * count),
         "t": np.stack([t] * count),
         "vertices": np.stack([((template + t) * scale).astype(np.float32)] * count),
+        "offsets": np.zeros((len(template), 3), np.float32),
     }
     np.savez(dataset.track_file(subject), **arrays)
 

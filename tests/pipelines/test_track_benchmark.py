@@ -15,7 +15,7 @@ from benchmarks.track_truth import clip_errors, compare, r_squared, summary
 from benchmarks.track_views import held_out_views
 from express50.capture.frames import read_cameras_of
 from express50.capture.index import read_index, read_peaks
-from express50.dataset.tracks import SCHEMAS
+from express50.dataset.tracks import SCHEMA
 
 CAMERAS, SUBJECT = 7, "S041"
 SHIFT = np.array([0.0, 0.008, 0.0])
@@ -35,7 +35,7 @@ def write_truth_as_track(truth, frames: list[int], path: Path, shift: np.ndarray
     vertices = np.stack([truth.vertices(SUBJECT, frame) for frame in frames]) + shift
     np.savez(
         path,
-        schema=np.array(SCHEMAS[1]),
+        schema=np.array(SCHEMA),
         head=np.array("procedural"),
         expressions=np.array([f"e{frame}" for frame in frames]),
         frames=np.array(frames),

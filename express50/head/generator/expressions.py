@@ -181,7 +181,14 @@ def _both_sides(mesh: WholeMesh, name: str, left: Array) -> dict[str, Array]:
 def _jaw_directions(mesh: WholeMesh, mean: WholeMesh, jaw: Array, hinge: Array) -> dict[str, Array]:
     """Return slides of the jaw, and how lips stay shut while the jaw opens by 0.3 rad."""
     share = jaw[:, None]
-    slide = _level_corners(mesh, jaw)[:, None] * np.array([[7.0, 0.0, 0.0]])
+    sideways = jaw.copy()  # the lips move as one towards their corners
+    for tag in ("lip0", "lip1", "lip2", "lip3", "cavity0", "cavity1"):
+        for side in ("left", "right"):
+            ring = mesh.tag(tag, side)
+            own = smoothstep(np.abs(np.arange(len(ring)) - len(ring) // 2), 0.0, 16.0)
+            both = 0.5 * (jaw[ring] + jaw[ring[::-1]])
+            sideways[ring] = both + own * (jaw[ring] - both)
+    slide = sideways[:, None] * np.array([[7.0, 0.0, 0.0]])
     back = turned(mean.vertices - hinge, np.array(0.3))
     lips = window(mesh.vertices, (0.0, -52.0, 95.0), (36.0, 15.0, 30.0))
     for k in range(4):
@@ -194,18 +201,6 @@ def _jaw_directions(mesh: WholeMesh, mean: WholeMesh, jaw: Array, hinge: Array) 
         "jawRight": -slide,
         "mouthClose": 0.9 * (share * lips[:, None]) * back,
     }
-
-
-def _level_corners(mesh: WholeMesh, jaw: Array) -> Array:
-    """Return the jaw's share (V,) with lips that move as one towards their corners."""
-    result = jaw.copy()
-    for tag in ("lip0", "lip1", "lip2", "lip3", "cavity0", "cavity1"):
-        for side in ("left", "right"):
-            ring = mesh.tag(tag, side)
-            own = smoothstep(np.abs(np.arange(len(ring)) - len(ring) // 2), 0.0, 16.0)
-            both = 0.5 * (jaw[ring] + jaw[ring[::-1]])
-            result[ring] = both + own * (jaw[ring] - both)
-    return result
 
 
 def _tongue_directions(mesh: WholeMesh) -> dict[str, Array]:

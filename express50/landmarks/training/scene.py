@@ -96,8 +96,9 @@ class HeadScene:
         facing = np.float32(forward @ unit(eye - marks[30]))
         pixels = project(K, cam_from_world, self.points)
         if rng.random() < GLASSES_SHARE and facing > -0.1:
-            worn = self._wear_glasses(rgba, eye, K @ cam_from_world[:3], rng)
-            visible &= ~_inside(worn, pixels)
+            for outline in self._wear_glasses(rgba, eye, K @ cam_from_world[:3], rng):
+                ring = np.round(outline).astype(np.float32)
+                visible &= [cv2.pointPolygonTest(ring, tuple(xy), False) <= 0 for xy in pixels]
         return TrainingView(rgba, pixels.astype(np.float32), visible, facing)
 
     def _seen(self, eye: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -180,7 +181,10 @@ class HeadScene:
             strength = rng.uniform(0.5, 1.0) if dark else rng.uniform(0.0, 0.2)
             _blend(rgba, ring, rng.uniform(0, 90 if dark else 255, 3), strength)
             if rng.random() < 0.3:
-                _blend(rgba, _glare(ring, rng), rng.uniform(180, 255, 3), rng.uniform(0.2, 0.9))
+                middle = ring.mean(0)
+                shift = (ring[rng.integers(RING)] - middle) * rng.uniform(0, 0.6)
+                glare = middle + shift + (ring - middle) * rng.uniform(0.1, 0.5, 2)
+                _blend(rgba, glare, rng.uniform(180, 255, 3), rng.uniform(0.2, 0.9))
             if strength > 0.6:
                 opaque.append(ring)
         width = float(np.ptp(np.concatenate(rings_2d), axis=0).max())
@@ -274,22 +278,6 @@ def _blend(rgba: np.ndarray, outline: np.ndarray, color: np.ndarray, strength: f
     share = (strength / 255) * mask[..., None].astype(np.float32)
     over = np.array([*color, 255.0], np.float32)
     rgba[:] = (rgba * (1 - share) + over * share).astype(np.uint8)
-
-
-def _glare(ring: np.ndarray, rng: Rng) -> np.ndarray:
-    """Return the outline (RING, 2) of a reflection in a lens."""
-    middle = ring.mean(0)
-    shift = (ring[rng.integers(RING)] - middle) * rng.uniform(0, 0.6)
-    return middle + shift + (ring - middle) * rng.uniform(0.1, 0.5, 2)
-
-
-def _inside(outlines: list[np.ndarray], points: np.ndarray) -> np.ndarray:
-    """Return which points (N, 2) lie within any of some outlines."""
-    inside = np.zeros(len(points), bool)
-    for outline in outlines:
-        ring = np.round(outline).astype(np.float32)
-        inside |= [cv2.pointPolygonTest(ring, (float(x), float(y)), False) > 0 for x, y in points]
-    return inside
 
 
 def _random_camera(

@@ -31,13 +31,6 @@ def test_reads_back_what_was_written(arrays, tmp_path) -> None:
         track.row("wink")
 
 
-def test_first_schema_has_no_offsets(arrays, tmp_path) -> None:
-    old = {k: v for k, v in arrays.items() if k != "offsets"}
-    old["schema"] = np.array("express50.track/1")
-    track = read_track(write_track(tmp_path / "track.npz", old))
-    assert track.offsets.shape == track.vertices.shape[1:] and not track.offsets.any()
-
-
 def bad(arrays: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
     """A message each, and the arrays that must cause it."""
 
