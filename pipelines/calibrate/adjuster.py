@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from express50.geometry.cameras import MODELS, Camera, distort, normalised
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
@@ -297,12 +298,13 @@ def eliminate(
     V = _sum_by(by_group.transpose(0, 2, 1) @ by_group, group, total)
     V += damping * V * np.eye(size)
     V += 1e-9 * (1 + np.trace(V, axis1=1, axis2=2))[:, None, None] * np.eye(size)
-    inverse = np.linalg.inv(V)
-    mixed = by_camera.transpose(0, 2, 1) @ by_group
-    blocks = _sum_by(mixed, group * cameras + camera, total * cameras)
-    coupling = blocks.reshape(total, cameras * each, size)
-    scaled = coupling @ inverse
+    root = np.linalg.cholesky(np.linalg.inv(V))
+    mixed = by_camera.transpose(0, 2, 1) @ (by_group @ root[group])
+    blocks = _sum_by(mixed, camera * total + group, total * cameras)
+    blocks = blocks.reshape(cameras, total, each, size).transpose(0, 2, 1, 3)
+    coupling = blocks.reshape(cameras * each, total * size)
     pull = _sum_by(np.einsum("nki,nk->ni", by_group, errors), group, total)
+    pull = (pull[:, None] @ root).reshape(-1)
     push = _sum_by(np.einsum("nki,nk->ni", by_camera, errors), camera, cameras).reshape(-1)
     own = np.arange(cameras)
     squares = np.zeros((cameras, each, cameras, each))
@@ -310,12 +312,12 @@ def eliminate(
     full = squares.reshape(cameras * each, cameras * each)
 
     def follow(step: np.ndarray) -> np.ndarray:
-        moved = pull + np.tensordot(step, coupling, (0, 1))
-        return -(inverse @ moved[..., None])[..., 0]
+        moved = (pull + step @ coupling).reshape(total, size, 1)
+        return -(root @ moved)[..., 0]
 
     return Normal(
-        cameras=full - np.tensordot(scaled, coupling, ((0, 2), (0, 2))),
-        right=np.tensordot(scaled, pull, ((0, 2), (0, 1))) - push,
+        cameras=full - coupling @ coupling.T,
+        right=coupling @ pull - push,
         diagonal=np.diag(full).copy(),
         follow=follow,
     )
@@ -323,6 +325,5 @@ def eliminate(
 
 def _sum_by(rows: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
     """Sum (count, ...) of rows (N, ...) by their group (N,)."""
-    out = np.zeros((count, *rows.shape[1:]))
-    np.add.at(out, group, rows)
-    return out
+    table = csr_array((np.ones(len(rows)), (group, np.arange(len(rows)))), (count, len(rows)))
+    return (table @ rows.reshape(len(rows), -1)).reshape(count, *rows.shape[1:])

@@ -30,8 +30,8 @@ from pipelines.calibrate.board import even
 from pipelines.calibrate.tracks import FEATURE_SIGMA_PX, Features, FrameSetPoints
 
 LONG_SIDE = 1280  # pixels of reduced images
-FEATURES = 1500  # kept per image, strongest first
-FACE_SCORE = 0.9  # below are profiles and backs of heads, whose landmarks are guessed
+FEATURES = 4000  # kept per image, strongest first
+FACE_SCORE = 0.4
 LANDMARK_INFLATION = 3.0  # of sigma, as errors within a view are correlated
 
 Images = Iterable[tuple[int, str, np.ndarray]]
@@ -130,7 +130,7 @@ def find_points(images: Images) -> dict[int, FrameSetPoints]:
 
 def find_features(image: np.ndarray) -> Features:
     """Find SIFT features in an image (H, W, 3) uint8; descriptors are roots (RootSIFT, 2012)."""
-    sift = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.01)
+    sift = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.004)
     keys, described = sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
     if not keys:
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32)

@@ -8,7 +8,7 @@ metre comes from the distance between the eyes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -24,11 +24,13 @@ from pipelines.calibrate.adjuster import AdjustedRig, RigPriors, adjust_rig, tri
 from pipelines.calibrate.board_guess import as_model, join_rig, mean_transform
 from pipelines.calibrate.config import AUTO
 from pipelines.calibrate.tracks import (
+    LEAST_INLIERS,
     LEAST_POINTS,
     FrameSetPoints,
+    PairMatches,
     PointTracks,
     join_tracks,
-    match_descriptors,
+    match_looks,
 )
 
 FACE_SCALES, FEATURE_SCALES = (6.0, 2.0), (3.0, 1.5)  # of Cauchy's loss, in sigmas
@@ -46,10 +48,8 @@ OUTLIER = 4.0  # sigmas; features with larger errors are mismatches and not repo
 EYES = (slice(36, 42), slice(42, 48))
 NOMINAL = 2.5  # focal length, in longer sides, at which distances are first estimated
 INNER = slice(17, 68)  # the jaw's outline is not the same skin from every side
+BY_CHANCE = 0.025  # share of wrong points that fit a wrong pose, at most
 NEAR_DEG = 25.0  # frame sets whose relative pose is further from the mean are wrong
-LEAST_INLIERS, LEAST_SHARE = 12, 0.4
-"""A camera without a face is placed if so many known points, and such a share of those it seems
-to see, agree on a pose within 4 pixels. Twelve alone were wrong by up to 16 degrees."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,13 @@ def solve_footage(
             the solution and nothing gives the metre.
     """
     head = mean_landmarks()
+    # A landmark is off by much the same in every frame set: more of them make it no surer.
+    seen = {
+        frame: replace(
+            points, landmarks=[(n, p, s * len(seen) ** 0.5) for n, p, s in points.landmarks]
+        )
+        for frame, points in seen.items()
+    }
     share = focal_at(distance_m, seen, sizes, head)
     lens = "SIMPLE_RADIAL" if model == AUTO else model
     start = {
@@ -150,10 +157,14 @@ def _adjust(
     """Adjust a rig first to landmarks, then to features, and place cameras without a face."""
     priors = RigPriors(focal=focal, focal_spread=FOCAL_SPREAD, centre=CENTRE, bend=BEND)
 
-    def with_features(rig: dict[str, Camera]) -> tuple[PointTracks, AdjustedRig]:
-        for band in BANDS:
+    looks = match_looks({frame: points.features for frame, points in seen.items()})
+
+    def with_features(
+        rig: dict[str, Camera], bands: Sequence[float]
+    ) -> tuple[PointTracks, AdjustedRig]:
+        for band in bands:
             for scale in FEATURE_SCALES:
-                tracks = join_tracks(rig, seen, band)  # anew, as the rig gets better
+                tracks = join_tracks(rig, seen, band, looks)  # anew, as the rig gets better
                 points = triangulate_tracks(rig, tracks)
                 fit = adjust_rig(rig, tracks, points, priors, (scale,), expected=start)
                 rig = fit.cameras
@@ -162,14 +173,18 @@ def _adjust(
     bare = {frame: FrameSetPoints(points.landmarks, {}) for frame, points in seen.items()}
     tracks = join_tracks(rig, bare, BANDS[0])
     fit = adjust_rig(rig, tracks, triangulate_tracks(rig, tracks), RigPriors(), FACE_SCALES)
-    tracks, fit = with_features(fit.cameras)
-    others = {name: camera for name, camera in start.items() if name not in rig}
-    more = place_by_features(fit.cameras, others, seen) if others else {}
-    if more:
-        tracks, fit = with_features(fit.cameras | more)
-        loose = set(_weak(tracks)) & set(more)  # held by neither a face nor features
-        if loose:
-            tracks, fit = with_features({n: c for n, c in fit.cameras.items() if n not in loose})
+    tracks, fit = with_features(fit.cameras, BANDS)
+    refused = set[str]()
+    while others := {n: c for n, c in start.items() if n not in fit.cameras and n not in refused}:
+        more = place_by_features(fit, tracks, others, seen, looks)
+        if not more:
+            break
+        wider, wide = with_features(fit.cameras | more, BANDS[:1])
+        loose = set(_weak(wider)) & set(more)  # held by neither a face nor features
+        refused |= loose
+        if set(more) - loose:
+            held = {n: c for n, c in wide.cameras.items() if n not in loose}
+            tracks, fit = with_features(held, BANDS)
     return tracks, fit
 
 
@@ -281,38 +296,45 @@ def face_rig(
 
 
 def place_by_features(
-    rig: Mapping[str, Camera],
+    fit: AdjustedRig,
+    tracks: PointTracks,
     others: Mapping[str, Camera],
     seen: Mapping[int, FrameSetPoints],
+    looks: PairMatches,
 ) -> dict[str, Camera]:
-    """Place `others`, which see no face, by features that look like points the rig knows.
+    """Place `others`, which see no face, by features that look like points of an adjusted rig.
 
-    Their focal length becomes the rig's median.
+    Their focal length becomes the rig's median. `looks` are the matches of all features.
     """
-    tracks = join_tracks(rig, seen, 0.015)
-    points = triangulate_tracks(rig, tracks)
-    known: list[tuple[int, np.ndarray, np.ndarray]] = []  # frame, points (M, 3), descriptors
-    for index, name in enumerate(tracks.names):
-        mine = np.flatnonzero((tracks.camera == index) & tracks.features())
-        place = {tracks.pixels[row].tobytes(): points[tracks.point[row]] for row in mine}
-        for frame, found in seen.items():
-            if name in found.features:
-                pixels, described = found.features[name]
-                rows = [i for i, p in enumerate(pixels) if p.tobytes() in place]
-                at = np.array([place[pixels[i].tobytes()] for i in rows]).reshape(-1, 3)
-                known.append((frame, at, described[rows]))
-    shares = [c.K[0, 0] / max(c.width, c.height) for c in rig.values()]
+    sure = tracks.features() & (np.linalg.norm(fit.errors, axis=1) < OUTLIER * tracks.sigma)
+    place = {
+        (tracks.names[tracks.camera[row]], tracks.pixels[row].tobytes()): fit.points[
+            tracks.point[row]
+        ]
+        for row in np.flatnonzero(sure)
+    }
+    known = {
+        (frame, name): np.array(
+            [place.get((name, pixel.tobytes()), np.full(3, np.nan)) for pixel in found[0]]
+        ).reshape(-1, 3)
+        for frame, points in seen.items()
+        for name, found in points.features.items()
+        if name in fit.cameras
+    }
+    shares = [c.K[0, 0] / max(c.width, c.height) for c in fit.cameras.values()]
     placed = {}
     for name, camera in sorted(others.items()):
         pairs = [np.zeros((0, 5))]
-        for frame, at, described in known:
-            if name in seen[frame].features:
-                pixels, mine = seen[frame].features[name]
-                matches = match_descriptors(mine, described)
-                pairs.append(np.column_stack([pixels[matches[:, 0]], at[matches[:, 1]]]))
+        for (frame, other), at in known.items():
+            first, second = sorted((name, other))
+            matches = looks[first, second].get(frame)
+            if matches is not None:
+                mine, theirs = matches.T if first == name else matches.T[::-1]
+                pairs.append(np.column_stack([seen[frame].features[name][0][mine], at[theirs]]))
+        rows = np.concatenate(pairs)
         focal = float(np.median(shares)) * max(camera.width, camera.height)
         lens = as_model(start_camera(name, (camera.width, camera.height), focal), camera.model)
-        pose = resect(np.concatenate(pairs), lens.K)
+        pose = resect(rows[np.isfinite(rows).all(1)], lens.K)
         if pose is not None:
             placed[name] = replace(lens, cam_from_world=pose)
     return placed
@@ -327,13 +349,13 @@ def resect(pairs: np.ndarray, K: np.ndarray) -> np.ndarray | None:
     pixels, points = np.ascontiguousarray(rows[:, :2]), np.ascontiguousarray(rows[:, 2:])
     try:
         ok, turn, shift, inliers = cv2.solvePnPRansac(
-            points, pixels, K, None, iterationsCount=2000, reprojectionError=4.0,
-            confidence=0.999, flags=cv2.SOLVEPNP_EPNP,
+            points, pixels, K, None, iterationsCount=10_000, reprojectionError=4.0,
+            confidence=0.9999, flags=cv2.SOLVEPNP_AP3P,
         )  # fmt: skip
     except cv2.error:  # points on a line or on one spot
         return None
     good = inliers[:, 0] if ok and inliers is not None else np.zeros(0, int)
     distinct = min(len(np.unique(column[good], axis=0)) for column in (pixels, points))
-    if distinct < LEAST_INLIERS or len(good) < LEAST_SHARE * len(rows):
+    if distinct < LEAST_INLIERS + BY_CHANCE * len(rows):
         return None
     return make_transform(cv2.Rodrigues(turn)[0], shift.ravel())

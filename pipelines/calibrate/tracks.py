@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import TypeAlias
 
 import cv2
@@ -15,6 +16,10 @@ from express50.geometry.cameras import Camera, normalised
 
 Features: TypeAlias = tuple[np.ndarray, np.ndarray]
 """Recorded pixels (N, 2) and descriptors (N, 128) of length one."""
+PairMatches: TypeAlias = dict[tuple[str, str], dict[int, np.ndarray]]
+"""Matches (M, 2), rows of `Features`, by two cameras in order of name and by frame."""
+LEAST_INLIERS, CHANCE = 12, 0.125
+"""What must agree on one geometry: so many matches, plus such a share of all of them."""
 RATIO = 0.8
 """A match counts if its distance is below this share of the second-best one's (Lowe 2004)."""
 FEATURE_SIGMA_PX = 0.7
@@ -79,11 +84,13 @@ def join_tracks(
     cameras: Mapping[str, Camera],
     seen: Mapping[int, FrameSetPoints],
     band: float,
+    looks: PairMatches | None = None,
     verified: bool = True,
 ) -> PointTracks:
     """Join landmarks and matched features of frames into tracks.
 
-    A match is at most `band` off its epipolar line, as a share of the image's diagonal. `verified`
+    A match is at most `band` off its epipolar line, as a share of the image's diagonal. `looks` are
+    matches by descriptors where these are known already, of `match_looks`. `verified`
     matches by descriptors and the pair's own fundamental matrix over all frames; `cameras` only
     give the band. Such matches can show that a whole rig is a little off, which matches searched
     along wrong lines would confirm. False searches along the lines: more matches if most cameras
@@ -94,17 +101,18 @@ def join_tracks(
              for f, p in seen.items()}  # fmt: skip
     matches: dict[int, list[tuple[str, str, np.ndarray]]] = {frame: [] for frame in seen}
     for a, b in _neighbours(cameras):
-        both = {f: (found[a], found[b]) for f, found in ideal.items() if a in found and b in found}
+        both = {f: (views[a], views[b]) for f, views in ideal.items() if a in views and b in views}
         reach = band * np.hypot(cameras[b].width, cameras[b].height)
-        if verified:
-            for frame, pairs in verified_pairs(both).items():
-                p, q = (both[frame][i][0][pairs[:, i]] for i in range(2))
-                near = epipolar_distance(cameras[a], cameras[b], p, q).diagonal() < reach
-                matches[frame].append((a, b, pairs[near]))
-        else:
-            for frame, ((p, looks_p), (q, looks_q)) in both.items():
-                near = epipolar_distance(cameras[a], cameras[b], p, q) < reach
-                matches[frame].append((a, b, match_descriptors(looks_p, looks_q, near)))
+        near = {
+            frame: epipolar_distance(cameras[a], cameras[b], p[0], q[0]) < reach
+            for frame, (p, q) in both.items()
+        }
+        found = verified_pairs(both, None if looks is None else looks[a, b]) if verified else {}
+        if not found:  # less can be mistaken where only what is near the lines is compared
+            found = {f: match_descriptors(p[1], q[1], near[f]) for f, (p, q) in both.items()}
+            found = verified_pairs(both, found) if verified else found
+        for frame, pairs in found.items():
+            matches[frame].append((a, b, pairs[near[frame][pairs[:, 0], pairs[:, 1]]]))
     rows: list[tuple[int, int, np.ndarray, float]] = []
     count = 0
     for frame, points in seen.items():
@@ -207,14 +215,32 @@ def epipolar_distance(
     return np.abs(lines @ np.column_stack([pixels_b, np.ones(len(pixels_b))]).T)
 
 
-def verified_pairs(features: Mapping[int, tuple[Features, Features]]) -> dict[int, np.ndarray]:
+def match_looks(features: Mapping[int, Mapping[str, Features]]) -> PairMatches:
+    """Match the features of all pairs of cameras, by name, in each frame by descriptors alone."""
+    names = sorted({name for found in features.values() for name in found})
+    return {
+        (a, b): {
+            frame: match_descriptors(found[a][1], found[b][1])
+            for frame, found in features.items()
+            if a in found and b in found
+        }
+        for a, b in combinations(names, 2)
+    }
+
+
+def verified_pairs(
+    features: Mapping[int, tuple[Features, Features]], looks: dict[int, np.ndarray] | None = None
+) -> dict[int, np.ndarray]:
     """Return the matches (M, 2) by frame that one fundamental matrix of two cameras explains.
 
-    Empty where it explains fewer than 12 matches, or fewer than two fifths of them.
+    `looks` are matches by descriptors. Empty where it explains fewer than 12 and an eighth of the
+    matches: of false ones, a matrix fitted to them explains about eight and a twentieth.
     """
-    looks = {frame: match_descriptors(a[1], b[1]) for frame, (a, b) in features.items()}
+    if looks is None:
+        looks = {frame: match_descriptors(a[1], b[1]) for frame, (a, b) in features.items()}
+    looks = {frame: looks[frame] for frame in features}
     counts = [len(pairs) for pairs in looks.values()]
-    if sum(counts) < 12:
+    if sum(counts) < LEAST_INLIERS:
         return {}
     p, q = (
         np.concatenate([features[f][i][0][pairs[:, i]] for f, pairs in looks.items()])
@@ -222,7 +248,7 @@ def verified_pairs(features: Mapping[int, tuple[Features, Features]]) -> dict[in
     )
     F, mask = cv2.findFundamentalMat(p, q, cv2.USAC_MAGSAC, 1.5, 0.999, 10_000)
     good = np.zeros(len(p), bool) if F is None else mask.ravel() > 0
-    if good.sum() < 12 or good.mean() < 0.4:
+    if good.sum() < LEAST_INLIERS + CHANCE * len(good):
         return {}
     parts = np.split(good, np.cumsum(counts)[:-1])
     return {f: pairs[ok] for (f, pairs), ok in zip(looks.items(), parts, strict=True)}
