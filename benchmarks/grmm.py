@@ -5,8 +5,8 @@ three frames of training people held out. Footage goes through every stage, so t
 the faults of tracked, matted and fused data. The full model, each ablation of the paper with the
 same number of steps, and the baseline (texel colours averaged on the tracked mesh, drawn as
 Gaussians, nothing trained) are measured in one run, which goes on where a stopped one ended. The
-unseen person is fitted from one picture of the frontal camera. Frame rates are by the clock, of one
-process with ``--threads`` threads. The last line is one JSON object.
+unseen person is fitted from one picture of the frontal camera, with a track of all cameras. Frame
+rates are by the clock, of one process with ``--threads`` threads. The last line is one JSON object.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from grmm.checkpoint import Loaded, load_checkpoint
 from grmm.config import Config, resolve
 from grmm.data import HeadViews, spread
 from grmm.edit import trained_head
-from grmm.evaluate import evaluate, mean, training_render
+from grmm.evaluate import REGIONS, evaluate, mean, training_render
 from grmm.identity_evaluation import FitProtocol
 from grmm.render import around, frontal, orbit, picture, resized
 from grmm.shard_source import open_shards
@@ -132,23 +132,28 @@ def speeds(loaded: Loaded) -> dict[str, float]:
     }
 
 
-def measure(shards: Path, out: Path, iterations: int, images: int, rows: list[str]) -> dict:
+def measure(
+    shards: Path, out: Path, iterations: int, images: int, rows: list[str], seeds: int
+) -> dict:
     """Return the baseline, full model and ablations on one folder of shards."""
     config = resolve("demo", None, [f"train.iterations={iterations}"])
     config, given = held_out(shards, config)
     protocol = FitProtocol(cameras=(given,), expression="neutral", images=images)
-    run = Ablation(roots=[shards], out=out / "ablation", config=config, protocol=protocol)
+    run = Ablation(
+        roots=[shards], out=out / "ablation", config=config, protocol=protocol, seeds=seeds
+    )
     table = ablate(run, rows)["rows"]
     full, groups = table["full"], table["full"]["groups"]
     loaded = load_checkpoint(out / "ablation" / "full" / "checkpoint.pt")
     others = {
-        name: {"difference_db": row["difference_db"], "paper_db": row["paper_db"]}
+        name: {key: row[key] for key in ("difference_db", "interval_db", "regions_db", "paper_db")}
         for name, row in table.items()
         if name != "full"
     }
     return {
         "psnr_heldout_view_db": groups["view"]["psnr_db"],
         "psnr_head_heldout_view_db": groups["view"]["psnr_head_db"],
+        **{f"psnr_{r}_heldout_view_db": groups["view"][f"psnr_{r}_db"] for r in REGIONS},
         "ssim_heldout_view": groups["view"]["ssim"],
         "psnr_heldout_expression_db": groups["expression"]["psnr_db"],
         "psnr_fit_one_view_db": groups["unseen"]["psnr_db"],
@@ -172,11 +177,12 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=2000, help="steps of every row")
     parser.add_argument("--images", type=int, default=48, help="pictures measured a row and group")
     parser.add_argument("--rows", nargs="*", default=[], help="ablations; all by default")
+    parser.add_argument("--seeds", type=int, default=1, help="trainings of every row")
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     args = parser.parse_args()
     shards = args.shards or make_shards(args.out, args.threads)
     torch.set_num_threads(args.threads)
-    result = measure(shards, args.out, args.iterations, args.images, args.rows)
+    result = measure(shards, args.out, args.iterations, args.images, args.rows, args.seeds)
     result |= {"threads": args.threads, "peak_memory_gib": round(peak_memory() / 2**30, 2)}
     write_json(args.out / "grmm.json", result)
     print(json.dumps(result))

@@ -14,6 +14,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from scipy.stats import t as student_t
+
 from express50.console import log
 from express50.contract.config import nearest
 from express50.errors import ConfigError, FormatError
@@ -23,8 +26,16 @@ from express50.files.text import markdown_table, read_json_table
 from express50.head.load import load_head
 from grmm.checkpoint import Loaded, load_checkpoint
 from grmm.config import Config, as_tables, from_tables
-from grmm.data import HeadViews, spread
-from grmm.evaluate import HELD_EXPRESSION, HELD_VIEW, evaluate, kind_of, mean, training_render
+from grmm.data import HeadViews, Source, spread
+from grmm.evaluate import (
+    HELD_EXPRESSION,
+    HELD_VIEW,
+    PSNRS,
+    evaluate,
+    kind_of,
+    mean,
+    training_render,
+)
 from grmm.identity_evaluation import (
     NOVEL_EXPRESSION,
     NOVEL_VIEW,
@@ -86,7 +97,8 @@ VARIANTS = {
 GROUPS = {"view": HELD_VIEW, "expression": HELD_EXPRESSION, "unseen": NOVEL_VIEW,
           "unseen_expression": NOVEL_EXPRESSION}  # fmt: skip
 DIGITS = {"psnr_db": 2, "ssim": 3, "lpips": 3}
-SHOWN = ("psnr_db", "psnr_head_db", "ssim", "rmse", "lpips")
+SHOWN = (*PSNRS, "ssim", "rmse", "lpips")
+CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,6 +111,8 @@ class Ablation:
         config: of the full model; its budget is every row's.
         protocol: how unseen people are fitted.
         subjects: unseen people; empty: all that the training split lacks.
+        seeds: how often each row is trained; intervals need two or more.
+        test: folders of shards whose people are fitted, and nobody is trained on; empty: ``roots``.
     """
 
     roots: Sequence[Path]
@@ -106,11 +120,20 @@ class Ablation:
     config: Config
     protocol: FitProtocol
     subjects: Sequence[str] = ()
+    seeds: int = 1
+    test: Sequence[Path] = ()
 
-    def unseen(self, views: HeadViews) -> list[str]:
-        """List the people to fit: no row trains on them."""
+    def unseen(self) -> tuple[Source, list[str]]:
+        """List the people to fit, which no row trains on, with the source of their views."""
+        source = open_shards(self.test or self.roots, "*")
         trained = {key.subject for key in open_shards(self.roots, "train").keys}
-        return list(self.subjects) or sorted({key.subject for key in views.keys} - trained)
+        known = {key.subject for key in source.keys}
+        if self.test and (both := sorted(known & trained)):
+            raise ConfigError(
+                f"{', '.join(map(str, self.test))}: {', '.join(both)} are trained on too; expected"
+                " other people in shards to test on"
+            )
+        return source, list(self.subjects) or sorted(known - trained)
 
 
 def ablate(run: Ablation, names: Sequence[str] = ()) -> dict[str, Any]:
@@ -126,19 +149,19 @@ def ablate(run: Ablation, names: Sequence[str] = ()) -> dict[str, Any]:
     variants = variants_of(run.roots, names)
     if not config.model.identity_modes:
         variants.pop("no_modes", None)
-    source = open_shards(run.roots, "*")
+    source, people = run.unseen()
     head = load_head(source.head)
-    views = HeadViews(source, head)
-    for subject in run.unseen(views):  # before hours of training
-        given_views(views, subject, run.protocol)
+    for subject in people:  # before hours of training
+        given_views(HeadViews(source, head), subject, run.protocol)
     # Every row has as many Gaussians as the full model.
     config = with_map_size(config, HeadViews(open_shards(run.roots, "train"), head))
     run = replace(run, config=config)
-    rows: dict[str, dict] = {}
+    rows: dict[str, list[dict]] = {}
     table: dict[str, Any] = {}
-    for name, variant in variants.items():
-        rows[name] = _row(run, name, variant)
-        table = write_tables(run.out, rows, config)
+    for seed in range(run.seeds):
+        for name, variant in variants.items():
+            rows.setdefault(name, []).append(_row(run, name, variant, seed))
+            table = write_tables(run.out, rows, config)
     return table
 
 
@@ -171,30 +194,32 @@ def changed(config: Config, variant: Variant, used: Sequence[Path]) -> Config:
     return from_tables(tables)
 
 
-def _row(run: Ablation, name: str, variant: Variant) -> dict:
+def _row(run: Ablation, name: str, variant: Variant, seed: int) -> dict:
     """Measure one row, or read it from its file if it was measured with the same settings."""
     used = [root for root in run.roots if root != variant.without]
     settings = changed(run.config, variant, used)
+    settings = replace(settings, train=replace(settings.train, seed=settings.train.seed + seed))
     content = {  # everything that the numbers depend on, except the code
-        "shards": [file_sha256(root / "index.json") for root in run.roots],
+        "shards": [file_sha256(root / "index.json") for root in (*run.roots, *run.test)],
         "used": [run.roots.index(root) for root in used],
         "config": as_tables(settings),
         "protocol": asdict(run.protocol),
         "subjects": list(run.subjects),
     }
     digest = hashlib.sha256(dump_json(content)).hexdigest()
-    path = run.out / name / "row.json"
+    ending = f".seed{seed}" if seed else ""
+    path = run.out / f"{name}{ending}" / "row.json"
     if path.exists():
         row = read_json_table(path, FormatError, "delete it to measure again")
         if row.get("digest") == digest:
-            log(f"ablate: {name} is measured")
+            log(f"ablate: {name}{ending} is measured")
             return row
-        log(f"ablate: {name} was measured with other settings: again")
-    folder = run.out / (variant.trains_as or name)
+        log(f"ablate: {name}{ending} was measured with other settings: again")
+    folder = run.out / f"{variant.trains_as or name}{ending}"
     if not variant.trains_as:
         _train(used, folder, settings)
     loaded = load_checkpoint(folder / "checkpoint.pt", best_device())
-    log(f"ablate: measuring {name}")
+    log(f"ablate: measuring {name}{ending}")
     row = measure(run, replace(loaded, config=settings), used)
     row |= {"digest": digest, "label": variant.label, "paper_db": variant.paper_db}
     row["against"] = variant.against
@@ -227,8 +252,10 @@ def measure(run: Ablation, loaded: Loaded, used: Sequence[Path]) -> dict:
             own = [i for i in drawn if kind(views.keys[i]) == held]
             chosen = spread(own, run.protocol.images or len(own))
             rows += evaluate(views, chosen, render, judge, kind)
-    for subject in run.unseen(views):
-        found, effort = evaluate_unseen(loaded, views, subject, run.protocol, judge)
+    source, people = run.unseen()
+    strangers = loaded.views(source)
+    for subject in people:
+        found, effort = evaluate_unseen(loaded, strangers, subject, run.protocol, judge)
         rows += found
         efforts.append(effort)
     groups = {}
@@ -267,17 +294,31 @@ def variants_of(roots: Sequence[Path], names: Sequence[str] = ()) -> dict[str, V
     return {name: row for name, row in rows.items() if not names or name in wanted}
 
 
-def write_tables(out: Path, rows: Mapping[str, dict], config: Config) -> dict[str, Any]:
-    """Write ablation.json and ablation.md of the rows measured so far; returns the former."""
+def write_tables(out: Path, rows: Mapping[str, list[dict]], config: Config) -> dict[str, Any]:
+    """Write ablation.json and ablation.md of the rows measured so far; returns the former.
+
+    Numbers are means over the seeds. Differences are taken seed by seed, to the row that a row is
+    compared with; ``interval_db`` is half of their mean's 95 % interval (Student's), None of one.
+    """
     table: dict[str, Any] = {}
-    for name, row in rows.items():
-        other = rows.get(row["against"], rows["full"])["groups"]
-        gains = {
-            group: round(numbers["psnr_db"] - other[group]["psnr_db"], 3)
-            for group, numbers in row["groups"].items()
-            if group in other and None not in (numbers["psnr_db"], other[group]["psnr_db"])
-        }
-        table[name] = row | {"difference_db": gains}
+    for name, runs in rows.items():
+        others = rows.get(runs[0]["against"], rows["full"])
+        row: dict[str, Any] = runs[-1] | {"seeds": len(runs), "difference_db": {}}
+        row |= {"groups": {}, "interval_db": {}, "regions_db": {}}
+        for group, numbers in runs[0]["groups"].items():
+            row["groups"][group] = {
+                key: _average([run["groups"][group][key] for run in runs]) for key in numbers
+            }
+            pairs = [
+                (run["groups"][group], other["groups"].get(group, {}))
+                for run, other in zip(runs, others, strict=False)
+            ]
+            found = {key: gain for key in PSNRS if (gain := compared(pairs, key))}
+            whole = found.pop("psnr_db", None)
+            if whole is not None:
+                row["difference_db"][group], row["interval_db"][group] = whole
+            row["regions_db"][group] = found
+        table[name] = row
     budget = {"seconds": config.train.seconds or None, "iterations": config.train.iterations}
     missing = PerceptualMetrics(config.metrics).missing()
     cameras = list(config.data.holdout_cameras)
@@ -287,22 +328,46 @@ def write_tables(out: Path, rows: Mapping[str, dict], config: Config) -> dict[st
     return content
 
 
+def compared(pairs: Sequence[tuple[dict, dict]], key: str) -> tuple[float, float | None] | None:
+    """Return a number's mean difference over pairs and half of its interval; None: unknown."""
+    both = [(a.get(key), b.get(key)) for a, b in pairs]
+    gains = [a - b for a, b in both if a is not None and b is not None]
+    if not gains:
+        return None
+    if len(gains) < 2:
+        return round(gains[0], 3), None
+    spread_db = float(np.std(gains, ddof=1)) / len(gains) ** 0.5
+    half = float(student_t.ppf(0.5 + CONFIDENCE / 2, len(gains) - 1)) * spread_db
+    return round(float(np.mean(gains)), 3), round(half, 3)
+
+
+def _average(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return round(sum(known) / len(known), 4) if known else None
+
+
 def markdown(table: Mapping[str, dict], missing: Mapping[str, str]) -> str:
     """Format the table as the paper does: a row per model; PSNR, SSIM and LPIPS per protocol."""
     groups = [g for g in GROUPS if any(g in row["groups"] for row in table.values())]
     head = ["Method"]
     for group in groups:
-        head += [f"{GROUPS[group]}: PSNR", "SSIM", "LPIPS", "dB over full"]
+        head += [f"{GROUPS[group]}: PSNR", "SSIM", "LPIPS", "dB over full", "mouth"]
     lines = []
     for row in table.values():
         cells = [row["label"]]
         for group in groups:
             numbers = row["groups"].get(group, {})
             cells += [_cell(numbers.get(name), d) for name, d in DIGITS.items()]
-            cells.append(_cell(row["difference_db"].get(group), 2, sign=True))
+            gain = row["difference_db"].get(group), row["interval_db"].get(group)
+            mouth = row["regions_db"].get(group, {}).get("psnr_mouth_db", (None, None))
+            cells += [_interval(*gain), _interval(*mouth)]
         lines.append([*cells, _cell(row["paper_db"], 2, sign=True)])
     text = "\n".join(markdown_table([*head, "paper, dB"], lines)) + "\n"
     return text + "".join(f"\n{name.upper()}: {reason}\n" for name, reason in missing.items())
+
+
+def _interval(value: float | None, half: float | None) -> str:
+    return _cell(value, 2, sign=True) + ("" if half is None else f" ± {half:.2f}")
 
 
 def _cell(value: float | None, digits: int, sign: bool = False) -> str:

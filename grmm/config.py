@@ -194,9 +194,6 @@ class FitConfig:
     one or two views say little about how colours change with the direction."""
     texture_warm_start: bool = False
     """Start stage 2 from the colours that the given images show."""
-    random_background: bool = False
-    """Draw the grey behind footage and rendering anew in every step of stage 2: before black, dark
-    hair may be transparent. G15."""
     locality: float = 0.1
     """Weight of the locality loss."""
     locality_every: int = 1
@@ -249,7 +246,7 @@ PLUS: Preset = {
     "model": {"refine_alpha": True},
     "loss": {"laplacian": 0.0, "displacement": 0.01},
     "train": {"warm_start": True},
-    "fit": {"texture_warm_start": True, "random_background": True},
+    "fit": {"texture_warm_start": True},
 }
 
 

@@ -155,22 +155,22 @@ class Item:
         state: tracked head.
         view: camera in head space.
         target: (3, H, W) footage composited on the background.
-        background: its grey, sRGB in [0, 1].
         mask: (H, W) bool, footage alpha over 0.5, and counts.
         counts: (H, W) bool, False on a torso that is ignored (DataConfig.torso).
         depth: (H, W) metres.
         depth_valid: (H, W) bool.
+        parts: (H, W) uint8 of segmentation_labels.LABELS. None: the shards have none.
     """
 
     key: SampleKey
     state: HeadState
     view: PinholeView
     target: Tensor
-    background: float
     mask: Tensor
     counts: Tensor
     depth: Tensor
     depth_valid: Tensor
+    parts: np.ndarray | None
 
     def comparable(self, image: Tensor) -> Tensor:
         """Return ``image`` (3, H, W) with the footage where pixels do not count."""
@@ -215,13 +215,12 @@ class HeadViews:
         """Return the ids of all samples."""
         return self.source.keys
 
-    def item(self, index: int, *, crop: bool = False, background: float | None = None) -> Item:
-        """Return one sample as tensors on the device, on a grey or the configured ``background``.
+    def item(self, index: int, *, crop: bool = False) -> Item:
+        """Return one sample as tensors on the device.
 
         With ``crop`` only the window around head and matte, as training takes it: outside it,
         footage and rendering are both the background.
         """
-        background = self.background if background is None else background
         sample, state = self.sample(index), self.state(index)
         height, width = sample.alpha.shape
         view = self.view_of(sample.place)
@@ -236,18 +235,18 @@ class HeadViews:
         depth = np.zeros_like(alpha) if sample.depth is None else sample.depth[rows, columns]
         known = self._tensor(np.where(torso, 0, depth))
         weight = (self._tensor(alpha) / 255)[..., None]
-        target = self._tensor(image) / 255 * weight + background * (1 - weight)
+        target = self._tensor(image) / 255 * weight + self.background * (1 - weight)
         counts = torch.from_numpy(~(torso & self.ignore_torso)).to(self.head.device)
         return Item(
             key=self.keys[index],
             state=state,
             view=view,
             target=target.permute(2, 0, 1).contiguous(),
-            background=background,
             mask=(weight[..., 0] > 0.5) & counts,
             counts=counts,
             depth=known,
             depth_valid=known > 0,
+            parts=None if sample.parts is None else sample.parts[rows, columns],
         )
 
     def _torso(self, index: int, sample: Sample, state: HeadState, view: PinholeView) -> np.ndarray:

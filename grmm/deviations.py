@@ -105,10 +105,6 @@ REASONS: dict[str, tuple[str, str]] = {
         "the given pictures show most texels' colours",
         "+0.35 dB on held-out views (two views given, 28.44 to 28.79)",
     ),
-    "fit.random_background": (
-        "before black, dark hair may turn transparent",
-        NOT_MEASURED,
-    ),
     "fit.shuffle_directions": (
         "one or two views say little about how colours change with the direction",
         NOT_MEASURED,

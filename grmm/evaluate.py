@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from express50.contract.segmentation_labels import label_mask
 from express50.errors import FormatError, TrainError
 from express50.files.atomic import write_bytes, write_json
 from express50.files.images import read_image, write_image
@@ -32,13 +33,20 @@ Row = dict[str, str | float]
 Window = Callable[[int], tuple[slice, slice, tuple[int, int]]]
 """Rows and columns of a sample's picture that its camera saw, and the picture's (H, W)."""
 IDS = ("subject", "expression", "camera", "kind")
+REGIONS = {
+    "mouth": ("lips", "teeth", "tongue", "mouth"), "eyes": ("eyes",), "skin": ("skin", "ears"),
+    "hair": ("hair",),
+}  # fmt: skip
+LEAST_PX = 20  # of a region; the PSNR of fewer is chance
+PSNRS = ("psnr_db", "psnr_head_db", *(f"psnr_{region}_db" for region in REGIONS))
 NUMBERS = (
-    "psnr_db", "psnr_head_db", "ssim", "ssim_head", "rmse", "rmse_head",
+    *PSNRS, "ssim", "ssim_head", "rmse", "rmse_head",
     "lpips", "psnr_unrefined_db", "depth_mm",
 )  # fmt: skip
 SEEN, HELD_VIEW, HELD_EXPRESSION, HELD_IDENTITY = (
     "seen view", "held-out view", "held-out expression", "held-out identity",
 )  # fmt: skip
+COMPONENTS = {"z_exp": "z_exp", "mesh_decoder": "mesh", "refinement": "refinement"}
 SUFFIXES = (".png", ".jpg", ".jpeg")
 NO_NETWORKS = PerceptualMetrics(MetricsConfig())
 NAMED = 5  # how many wrong files an error names
@@ -95,7 +103,8 @@ def compare(image: Tensor, item: Item, judge: PerceptualMetrics, kind: str = "")
     """Compare one picture (3, H, W) in [0, 1] with its footage; the judge remembers it for FID.
 
     ``psnr_db``, ``ssim``, ``rmse``, ``lpips`` count every pixel, but a torso that is ignored;
-    ``*_head`` pixels of the footage's matte only, so that an easy background cannot flatter.
+    ``*_head`` pixels of the footage's matte only, so that an easy background cannot flatter;
+    those of REGIONS pixels with such labels (NaN without labels, and under LEAST_PX).
 
     Raises:
         TrainError: the picture is not finite; a mean would pass over it in silence.
@@ -112,12 +121,52 @@ def compare(image: Tensor, item: Item, judge: PerceptualMetrics, kind: str = "")
         "kind": kind,
         "psnr_db": psnr_db(image, item.target, item.counts),
         "psnr_head_db": psnr_db(image, item.target, item.mask),
+        **_regions(image, item),
         "ssim": ssim_score(shown, item.target),
         "ssim_head": ssim_score(shown, item.target, item.mask),
         "rmse": rmse(image, item.target, item.counts),
         "rmse_head": rmse(image, item.target, item.mask),
         "lpips": judge.lpips_of(shown, item.target),
     }
+
+
+def _regions(image: Tensor, item: Item) -> Row:
+    numbers: Row = {}
+    for region, labels in REGIONS.items():
+        mask = np.zeros((1, 1), bool) if item.parts is None else label_mask(item.parts, *labels)
+        shown = torch.from_numpy(mask).to(image.device)
+        known = mask.sum() >= LEAST_PX
+        numbers[f"psnr_{region}_db"] = psnr_db(image, item.target, shown) if known else math.nan
+    return numbers
+
+
+def component_effects(
+    model: GRMM, views: HeadViews, indices: Sequence[int]
+) -> dict[str, dict[str, float | None]]:
+    """Measure what samples gain, dB, by each component that the model has; 0: it is inert.
+
+    ``z_exp`` is set to 0, the mesh decoder and the refinement are left out; the rest stays as it
+    was trained with them.
+    """
+    whole, effects = evaluate(views, indices, training_render(model, views)), {}
+    for name, attribute in COMPONENTS.items():
+        part = getattr(model, attribute)
+        if part is None or (name == "z_exp" and not model.config.residual_codes):
+            continue
+        try:
+            zero = torch.nn.Parameter(torch.zeros_like(part)) if name == "z_exp" else None
+            setattr(model, attribute, zero)
+            rows = evaluate(views, indices, training_render(model, views))
+        finally:
+            setattr(model, attribute, part)
+        effects[name] = {number: difference(whole, rows, number) for number in PSNRS}
+    return effects
+
+
+def difference(rows: Sequence[Row], others: Sequence[Row], name: str) -> float | None:
+    """Return the mean of one number less that of other rows; None if either has none."""
+    a, b = mean(rows, name), mean(others, name)
+    return None if a is None or b is None else round(a - b, 4)
 
 
 @torch.no_grad()

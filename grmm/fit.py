@@ -176,7 +176,9 @@ def invert_codes(state: FitState, until: float = math.inf) -> int:
         optimizer.param_groups[0]["lr"] = STAGE1_LR * STAGE1_FINAL_LR**share
         optimizer.zero_grad()
         z_exp = state.z_exp[item.key.expression]
-        rendering = state.model.render(state.z_id, z_exp, item.state, item.view, item.background)
+        rendering = state.model.render(
+            state.z_id, z_exp, item.state, item.view, state.views.background
+        )
         loss = state.config.loss.codes * losses.codes(state.z_id, z_exp)
         _finite(_footage_loss(state, rendering, item) + loss, number, 1).backward()
         optimizer.step()
@@ -191,14 +193,13 @@ def tune_decoders(state: FitState, until: float = math.inf) -> int:
     settings = state.config.fit
     optimizer = _decoder_optimizer(state)
     rng = np.random.default_rng(state.config.train.seed)
-    greys = rng if settings.random_background else None
     done = 0
-    for number, _, item in _items(state, settings.stage2_iterations, until, greys):
+    for number, _, item in _items(state, settings.stage2_iterations, until):
         optimizer.zero_grad()
         z_exp = state.z_exp[item.key.expression]
         shade = random_camera(state, rng) if rng.random() < settings.shuffle_directions else None
         rendering = state.model.render(
-            state.z_id, z_exp, item.state, item.view, item.background, shade
+            state.z_id, z_exp, item.state, item.view, state.views.background, shade
         )
         loss = _footage_loss(state, rendering, item)
         if settings.locality and number % settings.locality_every == 0:
@@ -211,21 +212,17 @@ def tune_decoders(state: FitState, until: float = math.inf) -> int:
     return done
 
 
-def _items(
-    state: FitState, iterations: int, until: float, greys: np.random.Generator | None = None
-) -> Iterator[tuple[int, float, Item]]:
+def _items(state: FitState, iterations: int, until: float) -> Iterator[tuple[int, float, Item]]:
     """Yield given views in shuffled order until iterations or time run out; at least one.
 
-    Each comes with its number and the share of the iterations or of the time that is used up;
-    ``greys`` draws its background.
+    Each comes with its number and the share of the iterations or of the time that is used up.
     """
     shuffle, began = Shuffle(state.given, state.config.train.seed), time.perf_counter()
     for number in range(iterations):
         used = (time.perf_counter() - began) / max(until - began, 1e-9)
         if number > 0 and used >= 1:
             return
-        grey = None if greys is None else float(greys.random())
-        item = state.views.item(shuffle.next(), crop=True, background=grey)
+        item = state.views.item(shuffle.next(), crop=True)
         yield number, max(number / iterations, min(used, 1.0)), item
 
 
@@ -300,7 +297,7 @@ def locality_loss(state: FitState, item: Item, rng: np.random.Generator) -> Tens
         tracked=state.views.place(own).tracked,
     )
     head = between(trained_head(state.loaded, *frame), mine, LOCALITY_T)
-    scene = (head.z_id, head.z_exp, head.state(state.loaded), view, item.background)
+    scene = (head.z_id, head.z_exp, head.state(state.loaded), view, state.views.background)
     tuned = state.model.render(*scene)
     with torch.no_grad():
         before = state.loaded.model.render(*scene)

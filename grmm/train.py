@@ -27,7 +27,7 @@ from grmm import losses
 from grmm.checkpoint import collect_gallery
 from grmm.config import Config
 from grmm.data import HeadViews, Item, Source, spread
-from grmm.evaluate import evaluate, mean, training_render
+from grmm.evaluate import REGIONS, component_effects, evaluate, mean, training_render
 from grmm.metrics import PerceptualMetrics
 from grmm.model import Rendering
 from grmm.rasterize import NotFiniteTensorError
@@ -147,7 +147,7 @@ def step(state: TrainState, parallel: torch.nn.Module, config: Config) -> None:
         item = state.views.item(state.shuffle.next(), crop=True)
         try:
             rows = state.model.rows(*item.key.frame)
-            rendering = parallel(*rows, item.state, item.view, item.background)
+            rendering = parallel(*rows, item.state, item.view, state.views.background)
         except NotFiniteTensorError as error:
             raise TrainError(
                 f"iteration {state.iteration}: training diverged ({error}); lower train.lr and "
@@ -205,7 +205,14 @@ def report(
     metrics: dict[str, object] = {
         "psnr_train_db": mean(training, "psnr_db"),
         "psnr_heldout_view_db": mean(holdout, "psnr_db"),
-        "psnr_heldout_view_head_db": mean(holdout, "psnr_head_db"),
+        **{
+            f"psnr_heldout_view_{region}_db": mean(holdout, f"psnr_{region}_db")
+            for region in ("head", *REGIONS)
+        },
+        "components_gain_on": "held-out views" if held else "training views",
+        "components_gain_db": component_effects(
+            model, views, spread(held or state.training, count)
+        ),
         "psnr_heldout_expression_db": mean(expressions, "psnr_db"),
         "ssim": mean(holdout or training, "ssim"),
         "rmse": mean(holdout or training, "rmse"),

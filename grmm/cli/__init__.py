@@ -102,6 +102,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--background": {"type": float, "default": 0.0, "help": "grey, 0 to 1"},
     "--torso": {"default": TORSO[0], "choices": TORSO, "help": "its pixels (background)"},
     "--partial": FLAG | {"help": "score the pictures that exist"},
+    "--seeds": {"type": at_least(1), "default": 1, "help": "train rows so often (1)"},
+    "--test": REPEATED | {"type": Path, "metavar": "SHARDS", "help": "fit their people only"},
     "--rows": {"default": "", "help": "full,no_residuals,..; default: all"},
     "--json": FLAG | {"help": "print the result as JSON"},
     # A head and what is drawn of it
@@ -242,7 +244,8 @@ COMMANDS = {
     ),
     "ablate": GrmmCommand(
         handler=commands.ablate,
-        options=f"shards out {TRAINING} --rows --fit-subjects --images {PROTOCOL} --json",
+        options=f"shards out {TRAINING} --rows --seeds --test --fit-subjects --images {PROTOCOL}"
+        " --json",
         help="train and measure the paper's ablations under one budget",
         example="grmm ablate express/pack/shards out --also renderme/pack/shards --preset small "
         "--budget 2h --fit-cameras cam03 --fit-budget 60s",

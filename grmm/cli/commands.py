@@ -271,6 +271,8 @@ def ablate(args: argparse.Namespace) -> int:
         config=config,
         protocol=_protocol(args),
         subjects=_split_names(args.fit_subjects),
+        seeds=args.seeds,
+        test=args.test,
     )
     table = ablate(run, _split_names(args.rows))
     return _print(args, table, (args.out / "ablation.md").read_text(encoding="utf-8"))

@@ -169,3 +169,33 @@ def test_missing_and_mis_sized_pictures_are_named(evaluated, roots, tmp_path, ca
         assert "cannot be read" in capsys.readouterr().err
     finally:
         write_image(path, whole)
+
+
+def test_seeds_give_intervals_and_test_shards_give_people_alone(tmp_path, capsys):
+    source = EllipsoidSource(subjects=4, size=32, expressions=1, cameras=2)
+    roots = [
+        write_shards(tmp_path / name, source, test_subjects=(), subjects=people)
+        for name, people in (("train", ("S000", "S001")), ("test", ("S002", "S003")))
+    ]
+    arguments = [
+        "ablate", str(roots[0]), str(tmp_path / "out"), *TINY, "--fit-expression=e0",
+        "--holdout-cameras=cam01", "--fit-cameras=cam00", "--rows=no_mesh_decoder",
+    ]  # fmt: skip
+    assert main([*arguments, f"--test={roots[1]}", "--seeds=2"]) == 0
+    table = json.loads((tmp_path / "out" / "ablation.json").read_text())["rows"]
+    assert set(table) == {"full", "no_mesh_decoder"}
+    row, runs = table["no_mesh_decoder"], []
+    for ending in ("", ".seed1"):
+        folders = [tmp_path / "out" / f"{name}{ending}" for name in ("no_mesh_decoder", "full")]
+        groups = [json.loads((f / "row.json").read_text())["groups"] for f in folders]
+        runs.append([group["unseen"]["psnr_db"] for group in groups])
+    gains = [own - full for own, full in runs]
+    assert gains[0] != gains[1] and row["seeds"] == 2
+    assert row["difference_db"]["unseen"] == pytest.approx(np.mean(gains), abs=1e-3)
+    # Student's 97.5 % point of one degree of freedom is 12.706; half of two values' spread
+    assert row["interval_db"]["unseen"] == pytest.approx(
+        12.706 * abs(gains[0] - gains[1]) / 2, abs=2e-3
+    )
+    assert row["groups"]["unseen"]["images"] == 2 and " ± " in capsys.readouterr().out
+    assert main([*arguments, f"--test={roots[0]}"]) == 2
+    assert "S000, S001 are trained on too" in capsys.readouterr().err

@@ -23,7 +23,7 @@ def test_paper_preset_has_the_papers_numbers():
     assert (model.refine_alpha, config.train.warm_start, loss.displacement) == (False, False, 0)
     assert (config.data.torso, config.train.final_lr) == ("background", 1.0)
     fit = config.fit
-    assert not (fit.texture_warm_start or fit.random_background or fit.shuffle_directions)
+    assert not (fit.texture_warm_start or fit.shuffle_directions)
     with torch.device("meta"):
         networks = Networks(model, load_head("procedural"), 2, 3)
     assert networks.refinement.enter[0].in_channels == 3 + 32 + 1  # colours, features, depth

@@ -134,19 +134,6 @@ def test_a_short_budget_decays_by_time(loaded, views):
     assert [share for _, share, _ in fit_module._items(state, 4, math.inf)] == [0, 0.25, 0.5, 0.75]
 
 
-def test_stage_two_draws_other_backgrounds_where_asked(loaded, views):
-    greys = {}
-    for random in (False, True):
-        state = start(loaded, views, unseen(views))
-        draw = np.random.default_rng(0) if random else None
-        items = [item for _, _, item in fit_module._items(state, 4, math.inf, draw)]
-        greys[random] = {item.background for item in items}
-        for item in items:
-            corner = item.target[:, 0, 0]
-            torch.testing.assert_close(corner, torch.full((3,), item.background))
-    assert greys[False] == {0.0} and len(greys[True]) == 4
-
-
 def test_views_of_two_subjects_are_refused(loaded, views, tmp_path):
     with pytest.raises(TrainError, match="2 subjects"):
         fit(loaded, views, [0, len(views.keys) - 1], [], tmp_path)

@@ -1,18 +1,31 @@
 import io
 import json
+import math
 import os
 import signal
 import time
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+from express50.contract.segmentation_labels import LABELS
 from express50.errors import ConfigError, DiskFullError, FormatError, TrainError
 from express50.files.atomic import write_with
 from grmm import checkpoint
 from grmm import train as train_module
 from grmm.data import HeadViews
-from grmm.evaluate import evaluate, summarise, training_render, write_evaluation
+from grmm.evaluate import (
+    NO_NETWORKS,
+    compare,
+    component_effects,
+    evaluate,
+    mean,
+    summarise,
+    training_render,
+    write_evaluation,
+)
 from grmm.losses import LAYERS, load_vgg
 from grmm.train import train
 from grmm.train_state import budget_used, prepare, set_rates, split_samples
@@ -318,3 +331,46 @@ def test_a_rendering_with_nan_is_refused_not_passed_over(views):
 
     with pytest.raises(TrainError, match="the rendering holds NaN"):
         evaluate(views, [0], damaged)
+
+
+class Parted(EllipsoidSource):
+    """The toy head with lips on its upper half and hair on the lower; a few pixels are eyes."""
+
+    def read(self, index):
+        sample = super().read(index)
+        parts = np.where(sample.alpha > 0, LABELS.index("hair"), 0).astype(np.uint8)
+        parts[: self.size // 2][sample.alpha[: self.size // 2] > 0] = LABELS.index("lips")
+        parts[self.size // 2, 14:18] = LABELS.index("eyes")
+        return replace(sample, parts=parts)
+
+
+def test_regions_are_measured_by_labels():
+    views = HeadViews(Parted(size=32), ellipsoid_head())
+    item = views.item(0)
+    image = item.target.clone()
+    image[:, :16] += 0.1 * torch.from_numpy(item.parts[:16] == LABELS.index("lips"))
+    row = compare(image, item, NO_NETWORKS)
+    assert row["psnr_mouth_db"] == pytest.approx(20, abs=0.3) and row["psnr_hair_db"] == 100
+    assert math.isnan(row["psnr_skin_db"]) and math.isnan(row["psnr_eyes_db"])  # none; four pixels
+    assert math.isnan(compare(image, replace(item, parts=None), NO_NETWORKS)["psnr_mouth_db"])
+
+
+def test_metrics_tell_what_each_component_gains(tmp_path):
+    config = tiny_config(data={"holdout_cameras": ("cam01",)}, train={"iterations": 30, "lr": 5e-3})
+    metrics = train(Parted(size=32), ellipsoid_head(), tmp_path, config)
+    gains = metrics["components_gain_db"]
+    assert set(gains) == {"z_exp", "mesh_decoder", "refinement"}
+    assert metrics["components_gain_on"] == "held-out views"
+    assert all(gain["psnr_db"] != 0 for gain in gains.values())
+    assert gains["refinement"]["psnr_mouth_db"] is not None
+    loaded = checkpoint.load_checkpoint(tmp_path / "checkpoint.pt")
+    views = HeadViews(Parted(size=32), ellipsoid_head())
+    held = [i for i, key in enumerate(views.keys) if key.camera == "cam01"]
+    rows = evaluate(views, held, training_render(loaded.model, views))
+    assert gains["refinement"]["psnr_db"] == pytest.approx(
+        mean(rows, "psnr_db") - mean(rows, "psnr_unrefined_db"), abs=1e-3
+    )
+    before = {name: value.clone() for name, value in loaded.model.state_dict().items()}
+    component_effects(loaded.model, views, held[:1])
+    after = loaded.model.state_dict()
+    assert after.keys() == before.keys() and all(torch.equal(before[k], after[k]) for k in after)
