@@ -35,6 +35,7 @@ from pipelines.calibrate.timing import CameraTiming, estimate_timing, in_step
 
 LADDER = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")  # from few to many parameters
 WEAK_CORNERS, WEAK_FRAMES = 200, 8  # cameras with less are reported
+WEAK_TILTS_DEG = 10.0  # at 3 degrees about each axis, focal lengths were off by 1.3 %
 FITTING = 0.75  # share of a camera's corners; cameras that moved meanwhile keep less
 LEAST_CORNERS = 24  # that must fit the other cameras, or a camera is dropped
 REJECT_SIGMA = 4.0
@@ -292,6 +293,23 @@ def _weak(rig: BoardRig, found: BoardCorners, kept: BoardCorners) -> dict[str, s
             weak[name] = f"{int(mine.sum())} corners, expected {WEAK_CORNERS} or more"
         elif len(rig.cameras) > 1 and tied < WEAK_FRAMES:
             weak[name] = f"{tied} board images shared, expected {WEAK_FRAMES} or more"
+        elif (tilts := _tilt_spread(rig, seen[name])) < WEAK_TILTS_DEG:
+            weak[name] = (
+                f"the board's tilt differs by {tilts:.1f} degrees in its {len(seen[name])} images,"
+                f" expected {WEAK_TILTS_DEG:.0f} or more: its focal length cannot be known well;"
+                " tilt the board to every side"
+            )
         elif covered < 0.25:
             weak[name] = f"corners cover {covered:.0%} of its image, expected 25 % or more"
     return weak
+
+
+def _tilt_spread(rig: BoardRig, frames: Collection[int]) -> float:
+    """Return the largest angle between the board's normals in these frames, degrees.
+
+    Parallel boards share a vanishing line: any focal length fits them at some tilt.
+
+    Source: Sturm and Maybank 1999, "On plane-based camera calibration".
+    """
+    normals = np.stack([rig.boards[frame][:3, 2] for frame in frames])
+    return float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1).min())))
