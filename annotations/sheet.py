@@ -225,13 +225,9 @@ class Pictures:
 def render_sheet(
     dataset: Dataset, sheet: Sheet, *, faces: FaceFinder | None = None, around: int = 0
 ) -> str:
-    """Render the page as text.
+    """Render the page as text, with ``around`` frames before and after each label.
 
-    Args:
-        dataset: where the proxies are.
-        sheet: what to show.
-        faces: crops to the faces; whole frames without it.
-        around: how many frames before and after each label to add.
+    Pictures are cropped to the faces; without a finder of faces they are whole frames.
     """
     pictures = {
         (tile.subject, tile.expression): take_pictures(dataset, tile, faces, around)

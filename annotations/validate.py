@@ -125,11 +125,8 @@ def disagreements(
 ) -> list[Disagreement]:
     """List the disagreements, worst first: a flag against a mark, then the widest spread.
 
-    Args:
-        dataset: the dataset.
-        beyond: marks at most this many frames apart agree.
-        settled: also list what was settled already.
-        subjects: only these; all that are not excluded by default.
+    Marks at most ``beyond`` frames apart agree. What was settled already is left out unless
+    ``settled``, and so are excluded subjects unless they are named.
     """
     found = []
     for subject in subjects or included_subjects(dataset):

@@ -197,15 +197,11 @@ STEADY_FRAMES = 1.0  # heads turn slowly: their motion is averaged over this man
 def find_points(
     net: LandmarkNet, images: Sequence[np.ndarray], smallest: float = SMALLEST
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find landmarks (T, 68, 2), corner-origin pixels, and scores (T,) of a clip.
+    """Find landmarks (T, 68, 2), corner-origin pixels, and scores (T,) in T frames (H, W, 3) uint8.
 
-    The face is searched for in the middle frame only; all frames and their mirror images are then
-    looked at through the same window, except those where the face has left it.
-
-    Args:
-        net: from ``load_network``.
-        images: T frames (H, W, 3) uint8, at least one.
-        smallest: windows that are searched, see `detect`.
+    The face is searched for in the middle frame only, in windows from ``smallest`` on (`detect`);
+    all frames and their mirror images are then looked at through the same window, except those
+    where the face has left it.
     """
     middle = detect(net, images[len(images) // 2], smallest=smallest)
     centre, side = face_box(middle.points)

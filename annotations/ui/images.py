@@ -135,10 +135,7 @@ class SixelPainter(Painter):
 
 
 def cell_colours(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Choose the block character and the two colours of every cell.
-
-    Args:
-        picture: (2 h, 2 w, 3) uint8.
+    """Choose the block character and two colours of each cell, of a picture (2 h, 2 w, 3) uint8.
 
     Returns:
         Glyphs (h, w) as strings of one character, foreground and background (h, w, 3) uint8.

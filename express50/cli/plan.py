@@ -233,14 +233,9 @@ def estimate(
     measured: Mapping[str, Measured],
     workers: int,
 ) -> list[Row]:
-    """Estimate one row per stage.
+    """Estimate one row per stage for a campaign, from what each cost on the measured footage.
 
-    Args:
-        known: the stages in order.
-        target: the campaign.
-        footage: that was measured.
-        measured: what each stage cost on it.
-        workers: processes of one core each.
+    Workers are processes of one core each.
     """
     rows = []
     for stage in known:

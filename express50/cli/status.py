@@ -196,12 +196,9 @@ def _rate(ends: list[float], begun: float, now: float) -> float:
 
 
 def status_page(name: str, table: Sequence[StageStatus], refresh_s: float | None) -> str:
-    """Render the page.
+    """Render the page of a dataset's stages.
 
-    Args:
-        name: of the dataset.
-        table: its stages.
-        refresh_s: seconds until a browser loads it again; None if it stays as it is.
+    A browser loads it again after ``refresh_s`` seconds; with None it stays as it is.
     """
     import jinja2
 

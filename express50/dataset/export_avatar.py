@@ -286,11 +286,8 @@ def _is_flame(model: HeadModel) -> bool:
 def write_parameters(head: Head, steps: list[str], shift: np.ndarray, out: Path) -> None:
     """Write a file of parameters per time step, the canonical one, and meshes if not FLAME.
 
-    Args:
-        head: the head.
-        steps: its expressions, in the order of the time steps.
-        shift: (3,) metres taken off the world.
-        out: folder of the data set.
+    ``steps`` are expressions in the order of the time steps; ``shift`` (3,), metres, is taken off
+    the world.
     """
     flame, shapes = _is_flame(head.model), head.model.shape_dirs.shape[2]
     for folder in ("flame_param",) if flame else ("flame_param", "meshes"):

@@ -231,12 +231,9 @@ def read_sequence(path: Path) -> Sequence:
 def _checked(
     arrays: dict[str, np.ndarray], names: np.ndarray, further: dict[str, tuple[int | None, ...]]
 ) -> dict[str, np.ndarray]:
-    """Return the numbers of a track with their final types.
+    """Return the numbers of E expressions or cues with their final types.
 
-    Args:
-        arrays: as they were read.
-        names: (E,) expressions or cues.
-        further: expected shapes of arrays that only one kind of file has.
+    ``further`` are the shapes of arrays that only one kind of file has.
 
     Raises:
         ValueError: one has another shape or kind, or holds what it must not.

@@ -130,12 +130,8 @@ def withdraw(
     """Remove a subject and search what is left for its id.
 
     A record of it is kept (`withdrawn_file`), so that ingest refuses to take the person in again.
-
-    Args:
-        dataset: the dataset.
-        subject: id.
-        checkpoints: files outside the dataset to redact, beside those below ``grmm``.
-        redact: removes a subject from a checkpoint, True where it was in there.
+    ``checkpoints`` lie outside the dataset; they and those below ``grmm`` are handed to ``redact``,
+    which removes a subject from one and returns True where it was in there.
 
     Raises:
         StageError: the dataset knows no such subject, or a stage runs.

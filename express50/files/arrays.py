@@ -52,12 +52,7 @@ def read_arrays(
 ) -> dict[str, np.ndarray]:
     """Read the arrays of an ``.npz`` file by name, none of them of objects.
 
-    Args:
-        path: the file.
-        kind: class of the errors.
-        what: it is expected to be, for messages, such as "a track".
-        wanted: names of arrays that are required.
-        fix: how to fix a damaged file, for messages.
+    For messages: ``what`` it is expected to be, such as "a track", and how to ``fix`` it.
 
     Raises:
         Express50Error: of the given kind: it is missing, damaged, lacks a wanted array, or unpacks
@@ -371,12 +366,8 @@ def to_array(value: object, name: str, where: str) -> np.ndarray:
 def read_weights(path: Path, kind: Kind, where: str, what: str, fix: str = AGAIN) -> Any:  # noqa: ANN401
     """Read a file of ``torch.save`` to the CPU.
 
-    Args:
-        path: the file.
-        kind: class of the errors.
-        where: how messages name the file.
-        what: it is expected to be, such as "a torch state dict".
-        fix: how to fix it.
+    For messages: ``where`` it is, ``what`` it is expected to be, such as "a torch state dict", and
+    how to ``fix`` it.
 
     Raises:
         Express50Error: of the given kind: it is missing, damaged, or names what ``weights_only``

@@ -66,9 +66,7 @@ def files_of(folder: Path) -> list[Path]:
 def path_digest(path: Path, sha256: Callable[[Path], str] = file_sha256) -> str:
     """Digest a file's content, or the names and contents of a folder's files.
 
-    Args:
-        path: file or folder.
-        sha256: digest of one file; the ledger passes a cached one.
+    ``sha256`` digests one file; the ledger passes one that remembers.
 
     Raises:
         StageError: the path does not exist.

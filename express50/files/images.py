@@ -129,13 +129,9 @@ def read_alpha(path: Path) -> np.ndarray:
 
 
 def write_image(path: Path, image: np.ndarray, quality: int = 95, half: bool = False) -> None:
-    """Write (H, W) or (H, W, C) uint8, uint16 or float32; the ending chooses the format.
+    """Write (H, W) or (H, W, C) RGB, uint8, uint16 or float32, as .png, .jpg, .tif or .exr.
 
-    Args:
-        path: target; .png .jpg .tif .exr.
-        image: the pixels, RGB.
-        quality: JPEG quality, 1 to 100 (4:4:4 from 95 upwards).
-        half: store floats as half (EXR, TIFF).
+    JPEG's ``quality`` is 1 to 100, 4:4:4 from 95 upwards; ``half`` stores floats as half.
 
     Raises:
         FormatError: the file cannot be written.

@@ -219,11 +219,7 @@ def _field(dist: bytes) -> float:
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Project world points into a camera, distortion included.
-
-    Args:
-        camera: the camera.
-        points: (N, 3) world points, metres.
+    """Project world points (N, 3), metres, into a camera, distortion included.
 
     Returns:
         pixels (N, 2) as (x, y), NaN where depth <= 0 and where the lens folds; depth (N,), camera

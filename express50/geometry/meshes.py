@@ -22,14 +22,10 @@ _AGAIN = "run 'express50 depth' again"
 def write_ply(
     path: Path, vertices: np.ndarray, faces: np.ndarray, columns: Mapping[str, np.ndarray]
 ) -> None:
-    """Write a little-endian PLY file of a mesh.
+    """Write a little-endian PLY file of vertices (V, 3), as float32, and faces (F, 3).
 
-    Args:
-        path: target.
-        vertices: (V, 3), stored as float32.
-        faces: (F, 3) indices.
-        columns: further properties of the vertices by name, each (V,): uint8, else stored as
-            float32.
+    ``columns`` are further properties of the vertices by name, each (V,): uint8, else stored as
+    float32.
     """
     values = dict(zip("xyz", vertices.T, strict=True)) | dict(columns)
     kinds = [(name, "|u1" if v.dtype == np.uint8 else "<f4") for name, v in values.items()]
@@ -101,15 +97,10 @@ def write_obj(
     uv_faces: np.ndarray,
     texture: str | None = None,
 ) -> None:
-    """Write an OBJ file with texture coordinates, and with a texture the .mtl that names it.
+    """Write an OBJ file of vertices (V, 3) and faces (F, 3) with texture coordinates.
 
-    Args:
-        path: target; the .mtl gets its name.
-        vertices: (V, 3).
-        faces: (F, 3) indices of vertices.
-        uv: (T, 2) texture coordinates.
-        uv_faces: (F, 3) indices of texture coordinates.
-        texture: file name of the picture, beside the OBJ.
+    These are ``uv`` (T, 2) and ``uv_faces`` (F, 3). ``texture`` is the file name of a picture
+    beside the OBJ; an .mtl of the OBJ's name then names it.
     """
     lines = []
     if texture is not None:
@@ -134,17 +125,11 @@ def write_glb(
     uv: np.ndarray | None = None,
     **material: Any,
 ) -> None:
-    """Write a binary glTF file of one rough, not metallic mesh.
+    """Write a binary glTF file of one rough, not metallic mesh: vertices (V, 3) and faces (F, 3).
 
-    Args:
-        path: target.
-        name: of the mesh.
-        vertices: (V, 3).
-        faces: (F, 3) indices.
-        normals: (V, 3) of unit length.
-        colours: (V, 4) uint8, linear light, as glTF 2.0 (3.9.2) takes COLOR_0.
-        uv: (V, 2) texture coordinates.
-        material: further properties of trimesh's PBRMaterial, such as its texture.
+    Normals (V, 3) have unit length; colours (V, 4) are uint8, linear light, as glTF 2.0 (3.9.2)
+    takes COLOR_0; ``uv`` is (V, 2). What is in ``material`` are further properties of trimesh's
+    PBRMaterial, such as its texture.
     """
     import trimesh
 

@@ -38,12 +38,7 @@ def barycentrics(hits: dict[str, o3d.core.Tensor], hit: np.ndarray) -> np.ndarra
 def visible_faces(
     vertices: np.ndarray, faces: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the face that each pixel centre sees first.
-
-    Args:
-        vertices: (V, 3) world, metres.
-        faces: (F, 3) vertex ids.
-        camera: pinhole camera.
+    """Find the face of a mesh (V, 3), (F, 3), metres, that each pixel centre of a pinhole sees.
 
     Returns:
         Face ids (H, W) int64, -1 where there is none, and depth (H, W) float64, camera z in

@@ -69,12 +69,9 @@ def undistorted_mask(camera: Camera) -> np.ndarray:
 def bilinear(image: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Interpolate an image (H, W[, C]) at points (N, 2) quickly: (N[, C]) of the image's type.
 
-    Outside the image the outermost pixels repeat. OpenCV rounds places to 1/32 pixel; use
-    `bilinear_slope` where that matters.
-
-    Args:
-        image: uint8, uint16, float32 or float64; at most 4 channels.
-        points: x, y with the corner of the first pixel as origin.
+    The image is uint8, uint16, float32 or float64, of at most 4 channels; points are x, y with the
+    corner of the first pixel as origin. Outside the outermost pixels repeat. OpenCV rounds places
+    to 1/32 pixel; use `bilinear_slope` where that matters.
     """
     count = len(points)
     columns = min(_COLUMNS, max(count, 1))

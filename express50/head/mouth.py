@@ -254,13 +254,8 @@ def place_charts(
 ) -> tuple[np.ndarray, ...]:
     """Find free rectangles (left, bottom, right, top), one per wanted (width, height).
 
-    Each is shrunk until it fits; the first free place from the top of the map is taken.
-
-    Args:
-        uv: (T, 2), v up.
-        uv_faces: (F, 3).
-        sizes: wanted sizes, the most important first.
-        name: of the head model, for errors.
+    The most important comes first. Each is shrunk until it fits; the first free place from the top
+    of the map is taken. The map is ``uv`` (T, 2), v up, of ``uv_faces`` (F, 3).
 
     Raises:
         HeadModelError: a chart does not fit even at LEAST of its size.

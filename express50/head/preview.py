@@ -64,13 +64,9 @@ def expression_vector(model: HeadModel, controls: Mapping[str, float]) -> torch.
 def render_preview(
     model: HeadModel, vertices: Array | torch.Tensor, *, yaw: float = 0.0, size: int = 384
 ) -> Array:
-    """Render posed vertices: picture (size,size,3) uint8 sRGB, four rays per pixel.
+    """Render posed vertices (V, 3), metres, as (size, size, 3) uint8 sRGB, four rays per pixel.
 
-    Args:
-        model: The head whose faces and regions are used.
-        vertices: (V,3) metres.
-        yaw: Degrees the camera goes round to the subject's left.
-        size: Side of the picture, pixels.
+    The camera goes round to the subject's left by ``yaw`` degrees.
     """
     points = np.asarray(vertices, np.float32)
     faces = model.faces.cpu().numpy()

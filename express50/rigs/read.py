@@ -126,13 +126,10 @@ def read_rig(
     size: tuple[int, int] | None = None,
     metres_per_unit: float = 1.0,
 ) -> dict[str, Camera]:
-    """Read the cameras of a calibration that another tool wrote.
+    """Read the cameras of a calibration that another tool wrote, a file or a folder.
 
-    Args:
-        path: file or folder.
-        kind: one of FORMATS; None guesses.
-        size: width and height of the footage; K is scaled to it.
-        metres_per_unit: what one unit of the file's world is, metres.
+    ``kind`` is one of FORMATS, None guesses; K is scaled to ``size``, width and height of the
+    footage; the file's world is in units of ``metres_per_unit``.
 
     Raises:
         CalibrationError: no format fits, or the content does not fit the format.

@@ -32,9 +32,8 @@ def _file(path: Path) -> Path:
 def read_transforms(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
     """Read one camera per frame, or per camera index where time steps share cameras.
 
-    Args:
-        path: the file, or the folder that holds transforms.json.
-        size: width and height of the images where the file does not say.
+    The path may be the folder of transforms.json; ``size`` is width and height where that does not
+    say.
 
     Raises:
         CalibrationError: a frame lacks what a camera needs, or a camera moves between frames.

@@ -33,11 +33,8 @@ class Pool:
     ) -> None:
         """Choose the workers; nothing is started yet.
 
-        Args:
-            workers: local processes; 0 or 1 item runs in this one.
-            scheduler: address of a dask scheduler to use instead.
-            threads: that an item may use.
-            slurm: jobs of each stage to use instead.
+        These are local processes (with 0, and for 1 item, this one), or those of a dask scheduler
+        at an address, or SLURM jobs by stage. An item may use so many ``threads``.
         """
         self.workers = workers
         self.scheduler = scheduler
@@ -57,16 +54,12 @@ class Pool:
         settle: Callable[[Receipt], None],
         begin: Callable[[Task], None] = lambda task: None,
     ) -> None:
-        """Run every task of one stage and hand each receipt to ``settle`` as it comes.
+        """Run tasks of one stage and configuration; hand each receipt to ``settle`` as it comes.
 
-        A task whose worker died is tried again when nothing else runs, so that neighbours that
-        died with it are not blamed, and is set aside when that fails too. SLURM jobs do not share
-        memory but a time limit, so there all of those are tried again together.
-
-        Args:
-            tasks: of one stage and configuration.
-            settle: takes each receipt.
-            begin: called as a task is handed to a worker.
+        ``begin`` is called as a task is handed to a worker. A task whose worker died is tried again
+        when nothing else runs, so that neighbours that died with it are not blamed, and is set
+        aside when that fails too. SLURM jobs do not share memory but a time limit, so there all of
+        those are tried again together.
 
         Raises:
             StageError: the scheduler cannot be reached or went away, or offers no GPU that the

@@ -312,11 +312,8 @@ class Ledger:
     ) -> None:
         """Remove what is of a subject or names it, and overwrite the database's freed pages.
 
-        Args:
-            subject: id; its items are the id itself or begin with it and a slash.
-            root: folder of the dataset.
-            paths: files and folders below it that were removed: their receipts and digests go.
-            names: True if a text names the subject. Others' reasons, inputs and footage may.
+        Of ``paths``, which were removed below the dataset's ``root``, receipts and digests go; of
+        others the reasons, inputs and footage in which ``names`` finds the subject.
         """
         below = [path.relative_to(root) for path in paths]
         items = {(one.parts[0], "/".join(one.parts[1:])) for one in below}

@@ -80,12 +80,9 @@ class SlurmJob:
 
 
 def read_slurm(text: str, stages: Iterable[str]) -> dict[str, SlurmJob]:
-    """Read what the jobs of every stage ask for.
+    """Read what the jobs of every stage ask for: ``key=value,...``, or a TOML file of such keys.
 
-    Args:
-        text: ``key=value,...``, or a TOML file of such keys, in which a table named after a stage
-            replaces some for that stage.
-        stages: names of all stages.
+    In the file, a table named after one of the ``stages`` replaces some for that stage.
 
     Raises:
         ConfigError: no such file, unknown keys, wrong values, or time or memory are missing.
@@ -139,14 +136,9 @@ def check_slurm(submit: bool = True) -> None:
 
 
 def job_script(job: SlurmJob, address: str, name: str, threads: int, logs: Path) -> str:
-    """Write the script of one job.
+    """Write the script of one job, whose workers have a name and report to a scheduler's address.
 
-    Args:
-        job: what it asks for.
-        address: of the scheduler that its workers report to.
-        name: of the workers.
-        threads: that an item may use.
-        logs: folder of the jobs' output.
+    An item may use so many ``threads``; the job's output goes to the folder ``logs``.
     """
     from dask_jobqueue.slurm import SLURMJob
 

@@ -41,14 +41,7 @@ class Task:
 def input_digests(
     stage: Stage, dataset: Dataset, item: str, config: Any, digest: Callable[[Path], str]
 ) -> dict[str, str]:
-    """Compute the digest of every input of an item, by name.
-
-    Args:
-        stage: the stage.
-        dataset: the dataset.
-        item: item id.
-        config: resolved config.
-        digest: content digest of a file or folder.
+    """Compute the digest of every input of an item, by name; ``digest`` is of a file or folder.
 
     Raises:
         Express50Error: an input is missing or cannot be read.

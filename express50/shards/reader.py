@@ -125,11 +125,7 @@ class ShardReader:
         return ShardReader(self.root, chosen)
 
     def members(self, number: int, names: Collection[str] | None = None) -> dict[str, bytes]:
-        """Read the bytes of a sample's members by name, checked by CRC-32.
-
-        Args:
-            number: of the sample.
-            names: the members wanted; all by default.
+        """Read the bytes of a sample's members by name, all by default, checked by CRC-32.
 
         Raises:
             FormatError: the member is missing, or its bytes are damaged.
@@ -313,17 +309,21 @@ def _shard_entries(root: Path, shard: dict) -> Iterator[Entry]:
         yield Entry(**ids, split=shard["split"], shard=name, members=members)
 
 
-def sample_picture(sample: dict) -> np.ndarray:
-    """Lay RGB, alpha, depth (near is bright) and any labels side by side, (H, 3 or 4 W, 3)."""
+def sample_panels(sample: dict) -> list[np.ndarray]:
+    """Draw RGB, alpha, depth (near is bright) and labels, black where there are none, uint8."""
     depth, valid = sample["depth"], sample["valid"]
-    shade = np.zeros(depth.shape, np.uint8)
-    if valid.any():
-        low, high = np.percentile(depth[valid], [1, 99])
-        near = np.clip((high - depth) / max(float(high - low), 1e-6), 0, 1)
-        shade = np.where(valid, 55 + 200 * near, 0).astype(np.uint8)
+    low, high = np.percentile(depth[valid], [1, 99]) if valid.any() else (0.0, 1.0)
+    near = np.clip((high - depth) / max(float(high - low), 1e-6), 0, 1)
+    shade = np.where(valid, 55 + 200 * near, 0).astype(np.uint8)
     alpha = (sample["alpha"] * 255).astype(np.uint8)
-    parts = [] if sample["parts"] is None else [COLOURS[sample["parts"]]]
-    return contact_sheet([[sample["rgb"], alpha, shade, *parts]], tile=depth.shape)
+    parts = np.zeros(valid.shape, np.uint8) if sample["parts"] is None else sample["parts"]
+    return [sample["rgb"], alpha, shade, COLOURS[parts]]
+
+
+def sample_picture(sample: dict) -> np.ndarray:
+    """Lay a sample's panels side by side, (H, 3 or 4 W, 3)."""
+    panels = sample_panels(sample)[: 3 if sample["parts"] is None else 4]
+    return contact_sheet([panels], tile=sample["depth"].shape)
 
 
 def subject_file(root: Path, subject: str, name: str) -> Path:

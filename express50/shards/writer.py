@@ -194,9 +194,7 @@ def _padded(size: int) -> int:
 def write_manifest(root: Path, digests: Mapping[str, str] | None = None) -> None:
     """Write ``manifest.json``: size and SHA-256 of every file beside it.
 
-    Args:
-        root: folder of shards.
-        digests: SHA-256 by name of files that were hashed as they were written; others are read.
+    ``digests`` are those of files that were hashed as they were written; others are read.
     """
     files = {}
     for path in sorted(root.iterdir()):

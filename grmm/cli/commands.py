@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from express50.console import OK, log, say, say_json
+from express50.console import OK, answer, log, say
 from express50.contract.config import config_toml, known_assignments
 from express50.errors import ConfigError
 from express50.files.atomic import write_bytes, write_json
@@ -44,7 +44,7 @@ def train(args: argparse.Namespace) -> int:
     metrics = train(source, load_head(source.head), args.out, config, resume=resume)
     names = ("psnr_heldout_view_db", "psnr_train_db", "ssim", "iterations", "gaussians")
     lines = [f"{name}: {metrics.get(name)}" for name in names]
-    return _print(args, metrics, *lines, f"wrote {args.out / 'checkpoint.pt'}")
+    return answer(args, metrics, *lines, f"wrote {args.out / 'checkpoint.pt'}")
 
 
 def train_config(args: argparse.Namespace) -> Config:
@@ -103,7 +103,7 @@ def fit(args: argparse.Namespace) -> int:
     metrics = fit(loaded, views, given, rest, args.out)
     reached = f"{metrics['seconds']} s, {metrics['iterations']} iterations"
     line = f"psnr_db: {metrics['psnr_db']} ({metrics['psnr_is_of']}), after {reached}"
-    return _print(args, metrics, line, f"wrote {args.out}")
+    return answer(args, metrics, line, f"wrote {args.out}")
 
 
 def render(args: argparse.Namespace) -> int:
@@ -255,7 +255,7 @@ def _report(args: argparse.Namespace, rows: list, judge: PerceptualMetrics) -> i
     from grmm.evaluate import summary_lines, write_evaluation
 
     summary = write_evaluation(args.out, rows, judge)
-    return _print(args, summary, *summary_lines(summary))
+    return answer(args, summary, *summary_lines(summary))
 
 
 def ablate(args: argparse.Namespace) -> int:
@@ -275,7 +275,7 @@ def ablate(args: argparse.Namespace) -> int:
         test=args.test,
     )
     table = ablate(run, _split_names(args.rows))
-    return _print(args, table, (args.out / "ablation.md").read_text(encoding="utf-8"))
+    return answer(args, table, (args.out / "ablation.md").read_text(encoding="utf-8"))
 
 
 def _protocol(args: argparse.Namespace) -> FitProtocol:
@@ -316,16 +316,7 @@ def study_table(args: argparse.Namespace) -> int:
     summary = summarise(study, read_answers(args.out, study))
     write_json(args.out / "table.json", summary)
     write_bytes(args.out / "table.md", markdown(summary).encode())
-    return _print(args, summary, markdown(summary))
-
-
-def _print(args: argparse.Namespace, result: object, *lines: str) -> int:
-    """Print lines, or with --json the result; returns the exit code."""
-    if args.json:
-        say_json(result)
-    else:
-        say(*lines)
-    return OK
+    return answer(args, summary, markdown(summary))
 
 
 def _no_file(out: Path) -> None:

@@ -314,12 +314,9 @@ def _labels(view: MatteView, evidence: Evidence, guess: np.ndarray) -> np.ndarra
 
 
 def soft_alpha(frame: np.ndarray, valid: np.ndarray, cut: Cut) -> np.ndarray:
-    """Solve opacity (H, W) float32 about an outline.
+    """Solve opacity (H, W) float32 about an outline that was cut in a reduced picture.
 
-    Args:
-        frame: (H, W, 3) uint8, without lens distortion.
-        valid: (H, W) bool, pixels with footage; others get 0.
-        cut: of a reduced picture of it.
+    The frame is (H, W, 3) uint8, without lens distortion; what is not ``valid`` (H, W) gets 0.
     """
     height, width = valid.shape
     mask = cv2.resize(cut.mask.astype(np.float32), (width, height)) > 0.5

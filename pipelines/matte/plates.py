@@ -115,12 +115,8 @@ class MatchedPlate:
 def match_plate(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> MatchedPlate:
     """Bring a plate to a frame that a camera took from a little further on, or in other light.
 
-    The person fills the middle of a frame as a rule: what counts are its top and its sides.
-
-    Args:
-        plate: (H, W, 3) uint8.
-        frame: (H, W, 3) uint8.
-        valid: (H, W) bool, pixels with footage.
+    Both are (H, W, 3) uint8, ``valid`` (H, W) bool marks the pixels with footage. The person fills
+    the middle of a frame as a rule: what counts are its top and its sides.
     """
     rim = valid & _rim(valid.shape, RIM)
     as_it_is = MatchedPlate(plate, 0.0, 0.0, _explained(plate, frame, rim))

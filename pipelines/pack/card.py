@@ -58,14 +58,10 @@ def write_card(
     statistics: Mapping[str, object],
     people: Sequence[Mapping],
 ) -> str:
-    """Write the datasheet of the packed samples as Markdown.
+    """Write the datasheet of the packed samples, of which these are the metas, as Markdown.
 
-    Args:
-        splits: subjects by split.
-        metas: meta.json of every sample.
-        dropped: samples and subjects that were left out, with reasons.
-        statistics: further named numbers.
-        people: the facts in capture.toml about each packed subject; only counted, never quoted.
+    ``dropped`` are samples and subjects that were left out, with reasons, ``statistics`` further
+    named numbers. ``people`` are the facts in capture.toml; they are counted, never quoted.
     """
     subjects = sorted({meta["subject"] for meta in metas})
     expressions = sorted({meta["expression"] for meta in metas})

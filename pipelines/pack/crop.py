@@ -36,12 +36,7 @@ class Crop:
 
 
 def head_crop(camera: Camera, vertices: np.ndarray, alpha: np.ndarray) -> Crop:
-    """Find the crop around a tracked head.
-
-    Args:
-        camera: pinhole camera.
-        vertices: (V, 3) tracked mesh in the world, metres.
-        alpha: (H, W) uint8.
+    """Find the crop around a tracked head: vertices (V, 3), metres, alpha (H, W) uint8, a pinhole.
 
     Raises:
         StageError: the head is not in the image, or the matte is empty.
@@ -95,16 +90,10 @@ def _window(image: np.ndarray, crop: Crop) -> np.ndarray:
 def cut_depth(
     depth: np.ndarray, valid: np.ndarray, crop: Crop, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Cut a depth map to (size, size), and its validity; surfaces are never blended.
+    """Cut depth (H, W), metres, and its validity to (size, size); surfaces are never blended.
 
     Each new pixel's centre takes the bilinear mean of inverse depth, which is exact on planes,
     where its four neighbours are valid and lie on one surface; else its nearest pixel.
-
-    Args:
-        depth: (H, W) metres.
-        valid: (H, W) bool.
-        crop: the square.
-        size: side of the result, pixels.
     """
     window, known = _window(depth, crop), _window(valid, crop)
     inverse = np.where(known, 1.0 / np.where(known, window, 1.0), 0.0)
@@ -129,12 +118,8 @@ def cut_own_colours(
 ) -> np.ndarray:
     """Cut a frame to (size, size, 3) with the subject's own colour in soft pixels.
 
-    Args:
-        frame: (H, W, 3) uint8 sRGB.
-        matte: (H, W) uint8 of everything that stands before the plate, torso included.
-        plate: (H, W, 3) uint8 clean plate, or None.
-        crop: the square to cut.
-        size: side of the result, pixels.
+    Frame and clean plate, or None, are (H, W, 3) uint8 sRGB; the matte (H, W) uint8 is of
+    everything that stands before the plate, torso included.
     """
     behind = None
     if plate is not None:
@@ -143,12 +128,9 @@ def cut_own_colours(
 
 
 def own_colours(image: np.ndarray, alpha: np.ndarray, plate: np.ndarray | None) -> np.ndarray:
-    """Replace the colours of an image (H, W, 3) uint8 sRGB where 0 < alpha < 1.
+    """Replace the colours of an image (H, W, 3) uint8 sRGB where 0 < alpha < 1, of (H, W) uint8.
 
-    Args:
-        image: the frame, (H, W, 3) uint8 sRGB.
-        alpha: (H, W) uint8.
-        plate: what stands behind, in the frame's exposure, (H, W, 3) in 8-bit steps; or None.
+    The plate is what stands behind, in the frame's exposure, (H, W, 3) in 8-bit steps; or None.
 
     Raises:
         ValueError: sizes differ.

@@ -9,12 +9,11 @@ import numpy as np
 
 from express50.capture.readers.read import read_people
 from express50.contract.layout import Dataset, exclusion_reason
-from express50.contract.segmentation_labels import COLOURS
 from express50.contract.stage import Note, Result
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.atomic import write_json
 from express50.files.images import contact_sheet, write_image
-from express50.shards.reader import ShardReader, write_offsets, write_registered
+from express50.shards.reader import ShardReader, sample_panels, write_offsets, write_registered
 from express50.shards.writer import PackedSample, ShardWriter, write_manifest
 from pipelines.pack.card import split_subjects, write_card
 from pipelines.pack.config import PackConfig
@@ -151,21 +150,14 @@ def warn_of_gaps(metas: list[dict]) -> list[Note]:
 
 def _write_contact_sheet(out: Path, reader: ShardReader) -> float:
     """Draw evenly chosen samples; returns the share of their mattes that has depth."""
-    rows: list[list[np.ndarray]] = [[], [], [], []]
-    covered = []
+    columns, covered = [], []
     for number in np.unique(np.linspace(0, len(reader) - 1, QC_SAMPLES).astype(int)):
         sample = reader.sample(int(number))
         inside = sample["alpha"] > 0.5
         covered.append(float(sample["valid"][inside].mean()) if inside.any() else 0.0)
-        depth, valid = sample["depth"], sample["valid"]
-        low, high = np.percentile(depth[valid], [1, 99]) if valid.any() else (0.0, 1.0)
-        near = np.clip((high - depth) / max(float(high - low), 1e-6), 0, 1)
-        rows[0].append(sample["rgb"])
-        rows[1].append((sample["alpha"] * 255).astype(np.uint8))
-        rows[2].append(np.where(valid, 55 + 200 * near, 0).astype(np.uint8))
-        blank = np.zeros(valid.shape, np.uint8)
-        rows[3].append(COLOURS[blank if sample["parts"] is None else sample["parts"]])
+        columns.append(sample_panels(sample))
     (out / "qc").mkdir(exist_ok=True)
+    rows = [list(row) for row in zip(*columns, strict=True)]
     sheet = contact_sheet(rows, ["rgb", "alpha", "depth", "parts"], tile=(160, 160))
     write_image(out / "qc" / "samples.jpg", sheet, quality=90)
     return round(float(np.mean(covered)), 4)

@@ -69,13 +69,9 @@ class LaidMesh:
 
 
 def lay(model: HeadModel, start: np.ndarray, surface: GivenSurface, detail: float) -> LaidMesh:
-    """Lay a mesh (V, 3) of a head model onto a surface.
+    """Lay a head model's mesh onto a surface in the same world, from ``start`` (V, 3), metres, on.
 
-    Args:
-        model: the mesh's head model.
-        start: (V, 3) the tracked mesh, metres.
-        surface: in the same world.
-        detail: wavelength of the finest detail that is followed, metres.
+    ``detail`` is the wavelength of the finest detail that is followed, metres.
     """
     search, trusted = SurfaceSearch(surface), trusted_vertices(model)
     faces, free = model.faces.numpy(), movable_vertices(model)

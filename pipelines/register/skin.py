@@ -30,15 +30,8 @@ def skin_trust(
 ) -> np.ndarray:
     """Weigh a surface's vertices (N,) from 0 to 1: how likely they are skin, and well placed.
 
-    Bare skin is what lies near the middle of the tracked face; its colours and its confidence are
-    the measure.
-
-    Args:
-        model: head model of the mesh.
-        mesh: (V, 3) the tracked mesh, metres.
-        vertices: (N, 3) of the surface, metres.
-        colors: (N, 3) uint8 sRGB.
-        confidence: (N,) from 0 to 1.
+    Bare skin is what lies near the middle of the tracked face, the mesh (V, 3); its colours (N, 3),
+    uint8 sRGB, and its confidence (N,), 0 to 1, are the measure. Places are in metres.
     """
     bare = in_regions(model, FACE) & ~in_regions(model, NOT_BARE)
     distance, nearest = cKDTree(vertices).query(mesh[bare])

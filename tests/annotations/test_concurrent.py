@@ -132,7 +132,9 @@ def test_full_disk_raises_and_loses_no_other_mark(suggested, monkeypatch):
     assert [label.frame for label in read_labels(suggested, "S001")] == [20, 22]
 
 
-@pytest.mark.parametrize("tail", [b"\0" * 4096, b'{"action": "ma\xff\xfe', b"\xe2\x82", b"[1, 2]x"])
+@pytest.mark.parametrize(
+    "tail", [b"\0" * 4096, b'{"action": "ma\xff\xfe', b"\xe2\x82", b"[1, 2]x", b'{"subj']
+)
 def test_corrupt_last_line_is_skipped(suggested, tail):
     index = read_index(suggested, "S001")
     append_label(suggested, make_mark(index, "smile", 20, "cam00", "ann"))

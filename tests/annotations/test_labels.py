@@ -1,7 +1,6 @@
 """The label store: nothing is lost, people stand above suggestions, undo is a record."""
 
 import json
-import multiprocessing
 import time
 from dataclasses import replace
 
@@ -82,15 +81,6 @@ def test_automatic_labels_do_not_change_the_human_digest(tmp_path):
     assert human_digest(dataset, "S1") != before
 
 
-def test_torn_line_is_skipped_and_later_lines_are_read(tmp_path):
-    dataset = Dataset(tmp_path)
-    append_label(dataset, _mark(3, "ann", 1.0))
-    with dataset.labels_file("S1").open("a") as file:
-        file.write('{"subject": "S1", "expre')
-    append_label(dataset, _mark(4, "ann", 2.0))
-    assert [label.frame for label in read_labels(dataset, "S1")] == [3, 4]
-
-
 def test_line_that_is_not_an_event_raises_with_its_number(tmp_path):
     dataset = Dataset(tmp_path)
     append_label(dataset, _mark(3, "ann", 1.0))
@@ -98,23 +88,6 @@ def test_line_that_is_not_an_event_raises_with_its_number(tmp_path):
         file.write(json.dumps({"subject": "S1"}) + "\n")
     with pytest.raises(AnnotationError, match="line 2"):
         read_labels(dataset, "S1")
-
-
-def _append_many(root, annotator):
-    for number in range(50):
-        append_label(Dataset(root), _mark(number, annotator, float(number)))
-
-
-def test_concurrent_annotators_lose_no_labels(tmp_path):
-    context = multiprocessing.get_context("fork")
-    workers = [context.Process(target=_append_many, args=(tmp_path, f"a{i}")) for i in range(3)]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join()
-    labels = read_labels(Dataset(tmp_path), "S1")
-    for i in range(3):
-        assert [x.frame for x in labels if x.annotator == f"a{i}"] == list(range(50))
 
 
 def test_adjudication_outranks_later_marks_and_keeps_the_originals(tmp_path):

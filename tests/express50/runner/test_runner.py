@@ -258,17 +258,6 @@ def test_items_that_never_were_made_may_all_fail(tmp_path):
     assert set(statuses(run_toy(dataset, files=-1)).values()) == {"failed"}
 
 
-def test_an_unreachable_scheduler_leaves_what_is_made(tmp_path):
-    dataset = make_dataset(tmp_path / "data", ["a", "b"])
-    run_toy(dataset)
-    with pytest.raises(StageError):
-        run_stage(
-            toy.STAGE, dataset, toy.ToyConfig(word="b"), scheduler="tcp://127.0.0.1:1",
-            progress=False,
-        )  # fmt: skip
-    assert statuses(run_toy(dataset)) == {"a": "skipped", "b": "skipped"}
-
-
 def test_outputs_of_vanished_items_are_set_aside_only_by_a_full_run(tmp_path):
     dataset = make_dataset(tmp_path / "data", ["a", "b"])
     run_toy(dataset)
@@ -329,15 +318,16 @@ def test_stage_without_items_and_unmatched_pattern_are_errors(tmp_path):
         select_items(toy.STAGE, dataset, "S01")
 
 
-def test_unreachable_scheduler_is_one_error(tmp_path, monkeypatch):
+def test_unreachable_scheduler_is_one_error_and_leaves_what_is_made(tmp_path, monkeypatch):
     from express50.runner import clusters
 
     dataset = make_dataset(tmp_path / "data", ["a", "b"])
+    run_toy(dataset)
     monkeypatch.setattr(clusters, "CONNECT_SECONDS", 0.5)
+    config, nowhere = toy.ToyConfig(word="b"), "tcp://127.0.0.1:9"
     with pytest.raises(StageError, match="scheduler tcp://127.0.0.1:9: cannot connect"):
-        run_stage(
-            toy.STAGE, dataset, toy.ToyConfig(), scheduler="tcp://127.0.0.1:9", progress=False
-        )
+        run_stage(toy.STAGE, dataset, config, scheduler=nowhere, progress=False)
+    assert statuses(run_toy(dataset)) == {"a": "skipped", "b": "skipped"}
 
 
 def test_given_scheduler_is_used_and_left_running(tmp_path):
