@@ -12,6 +12,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 from collections.abc import Collection, Iterable
 from dataclasses import MISSING, asdict, fields, replace
 from pathlib import Path
@@ -36,6 +37,7 @@ from express50.errors import AnnotationError
 from express50.files.text import NAME, parse_json, read_text
 
 LARGEST = 2**63
+_FORMULA = re.compile(r"'*[=+\-@\t\r]")  # quotes before it too, so that reading is exact
 _FIELDS = tuple(field.name for field in fields(Label))
 _REQUIRED = tuple(field.name for field in fields(Label) if field.default is MISSING)
 
@@ -56,7 +58,9 @@ def export_labels(labels: Iterable[Label], path: Path) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, _FIELDS)
         writer.writeheader()
-        writer.writerows(rows)
+        # Spreadsheets run a cell that begins like a formula; a quote before it makes it text.
+        for row in rows:
+            writer.writerow({k: f"'{v}" if _FORMULA.match(str(v)) else v for k, v in row.items()})
 
 
 def import_labels(dataset: Dataset, path: Path) -> tuple[int, int]:
@@ -96,11 +100,18 @@ def read_table(path: Path) -> list[Label]:
         if not isinstance(rows, list):
             raise AnnotationError(f"{path}: expected a list of events, got {type(rows).__name__}")
     else:
-        rows = csv.DictReader(io.StringIO(text, newline=""))
+        table = csv.DictReader(io.StringIO(text, newline=""))
+        rows = ({k: _unquoted(v) for k, v in row.items()} for row in table)
     try:
         return [_label(row, f"{path}: row {number}") for number, row in enumerate(rows, 1)]
     except csv.Error as error:
         raise AnnotationError(f"{path}: not CSV ({error}); export it again") from None
+
+
+def _unquoted(cell: object) -> object:
+    if isinstance(cell, str) and cell.startswith("'") and _FORMULA.match(cell):
+        return cell[1:]
+    return cell
 
 
 def _check_format(path: Path) -> None:

@@ -33,7 +33,7 @@ def run_handler(
             sys.stdout.flush()
         return code
     except Exception as error:  # noqa: BLE001 (nobody is helped by a page of a library's files)
-        sys.stderr.write(f"{program}: {_line_of(error)}\n")
+        log(f"{program}: {_line_of(error)}")
         if os.environ.get(DEBUG):
             traceback.print_exception(error)
         return USAGE if isinstance(error, ConfigError) else FAILED
@@ -116,14 +116,25 @@ def say(*lines: str) -> None:
     """Write lines to standard output."""
     with readers_may_leave(sys.stdout):
         for line in lines:
-            sys.stdout.write(line + "\n")
+            sys.stdout.write(printable(line) + "\n")
 
 
 def log(line: str) -> None:
     """Write a line of progress to standard error: standard output is for results."""
     with readers_may_leave(sys.stderr):
-        sys.stderr.write(line + "\n")
+        sys.stderr.write(printable(line) + "\n")
         sys.stderr.flush()
+
+
+def printable(text: str) -> str:
+    """Return text with control characters written out: names from outside may hold them.
+
+    They could move a terminal's cursor, change its title or hide a line.
+    """
+    if text.isprintable():
+        return text
+    shown = ("\n", "\t")
+    return "".join(c if c.isprintable() or c in shown else ascii(c)[1:-1] for c in text)
 
 
 def say_json(value: object) -> None:

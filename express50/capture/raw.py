@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import math
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -158,7 +157,8 @@ def check_identity(path: Path, subject: object, fps: object) -> None:
     """
     if not isinstance(subject, str) or not ID.fullmatch(subject):
         raise CaptureError(
-            f"{path}: subject is {subject!r}, expected letters, digits, '_' and '-', such as 'S001'"
+            f"{path}: subject is {subject!r:.130}, expected at most 120 letters, digits, '_'"
+            " and '-', such as 'S001'"
         )
     if isinstance(fps, bool) or not isinstance(fps, int | float):
         raise CaptureError(f"{path}: fps is {fps!r}, expected a number such as 24")
@@ -282,9 +282,10 @@ def read_cues(path: Path) -> tuple[Cue, ...]:
 
 def _read_cue(path: Path, line: int, row: dict[str, str]) -> Cue:
     name = (row["expression_id"] or "").strip()
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_]*", name):
+    if not ID.fullmatch(name) or "-" in name:
         raise CaptureError(
-            f"{path}:{line}: expression_id is {name!r}, expected letters, digits and '_'"
+            f"{path}:{line}: expression_id is {name[:130]!r}, expected at most 120 letters, digits"
+            " and '_'"
         )
     try:
         start, end = int(row["start_frame"]), int(row["end_frame"])

@@ -1,5 +1,6 @@
 """Every verb of ``express50 annotate`` without a screen, through the command line."""
 
+import csv
 import json
 
 import numpy as np
@@ -103,13 +104,21 @@ def test_export_and_import_round_trip_without_loss_or_duplicates(
     mark(annotate, "ann", "smile", 14)
     annotate("flag", "S002", "smile", "failed: blinked, twice", "--annotator", "bob")
     annotate("exclude", "S002", "heavy makeup", "--annotator", "bob")
+    annotate("flag", "S001", "neutral", '=cmd|" /C calc"!A0', "--annotator", "'-'")
+    annotate("flag", "S002", "neutral", "'quoted' = said", "--annotator", "ann")
     file = tmp_path / f"labels.{ending}"
-    assert annotate("export", str(file))["events"] == 3
-    assert annotate("import", str(file)) == {"file": str(file), "new": 0, "known": 3}
+    assert annotate("export", str(file))["events"] == 5
+    if ending == "csv":  # a spreadsheet must not run a reason
+        assert not any(
+            cell.startswith("=")
+            for row in csv.reader(file.read_text().splitlines())
+            for cell in row
+        )
+    assert annotate("import", str(file)) == {"file": str(file), "new": 0, "known": 5}
     before = {s: dataset.labels_file(s).read_text() for s in ("S001", "S002")}
     for subject in before:
         dataset.labels_file(subject).unlink()
-    assert annotate("import", str(file))["new"] == 3
+    assert annotate("import", str(file))["new"] == 5
     assert {s: dataset.labels_file(s).read_text() for s in before} == before
 
 

@@ -30,7 +30,7 @@ def test_whole_capture_is_read(raw):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("subject = 3\nfps = 24", "subject is 3, expected letters"),
+        ("subject = 3\nfps = 24", "subject is 3, expected at most 120 letters"),
         ('subject = "../x"\nfps = 24', "subject is '../x'"),
         ('subject = "a"', "fps is None, expected a number"),
         ('subject = "a"\nfps = true', "fps is True"),
@@ -128,6 +128,7 @@ def test_board_is_listed_by_camera(raw):
         ("expression_id,start_frame,end_frame\nsmile,5,4\n", ":2: smile runs from 5 to 4"),
         ("expression_id,start_frame,end_frame\nsmile,-1,4\n", "0 <= start <= end"),
         ("expression_id,start_frame,end_frame\na.b,0,4\n", "expression_id is 'a.b'"),
+        (f"expression_id,start_frame,end_frame\n{'y' * 300},0,4\n", "at most 120 letters"),
         ("expression_id,start_frame,end_frame\na,0,4\na,5,6\n", "a appears twice"),
     ],
 )

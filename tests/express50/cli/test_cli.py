@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from express50.cli.main import main
-from express50.console import run_handler
+from express50.console import log, run_handler, say
 from tests.synth import make_capture
 
 COMMANDS = [
@@ -87,6 +87,14 @@ def test_a_defect_is_one_line_unless_its_traceback_is_asked_for(capsys, monkeypa
     assert line.startswith("express50: KeyError: 'absent") and "in test_cli.py line " in line
     assert "set EXPRESS50_DEBUG=1" in line
     assert more[:1] == (["Traceback (most recent call last):"] if debug else [])
+
+
+def test_names_from_outside_send_no_control_sequences(capsys):
+    say("camera \x1b[31mred \u202eevil", "tab\tä \udcff")
+    log("cleared \x1b[2J\r\x9b")
+    both = capsys.readouterr()
+    assert both.out == "camera \\x1b[31mred \\u202eevil\ntab\tä \\udcff\n"
+    assert both.err == "cleared \\x1b[2J\\r\\x9b\n"
 
 
 def test_json_is_alone_on_standard_output(data, capture):
