@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
@@ -205,6 +206,8 @@ class HeadViews:
         self.source, self.head = source, head
         self.background, self.ignore_torso = data.background, data.torso == "ignore"
         self._samples: Cache[int, Sample] = Cache(CACHE_BYTES, lambda sample: sample.nbytes)
+        self._coming: dict[int, Future[Sample]] = {}
+        self._reader = ThreadPoolExecutor(max_workers=1)
         self._torsos: Cache[int, np.ndarray] = Cache(CACHE_BYTES // 8, lambda bits: bits.nbytes)
         self._states: Cache[tuple[str, str], HeadState] = Cache(
             CACHE_BYTES // 2, lambda state: state.vertices.nbytes
@@ -268,13 +271,20 @@ class HeadViews:
         bits = np.unpackbits(self._torsos.get(index, make), count=size[0] * size[1])
         return bits.reshape(size).astype(bool)
 
+    def prefetch(self, index: int) -> None:
+        """Start to decode a sample that will be asked for next, beside the present step."""
+        if index not in self._samples.entries and index not in self._coming:
+            self._coming = {index: self._reader.submit(self._read, index)}
+
     def sample(self, index: int) -> Sample:
         """Return the decoded sample, checked and from memory if it is there.
 
         Raises:
             FormatError: its images differ in size, or its parameters do not fit the head model.
         """
-        return self._samples.get(index, lambda: self._read(index))
+        coming = self._coming.pop(index, None)
+        make = (lambda: self._read(index)) if coming is None else coming.result
+        return self._samples.get(index, make)
 
     def _read(self, index: int) -> Sample:
         sample = self.source.read(index)
@@ -378,6 +388,12 @@ class Shuffle:
             self._epoch, self._order = epoch, order
         self.taken += self.world
         return int(self._order[position])
+
+    def peek(self) -> int:
+        """Return what `next` will return."""
+        taken, index = self.taken, self.next()
+        self.taken = taken
+        return index
 
     def state(self) -> dict[str, int]:
         """Return the state that `restore` takes."""

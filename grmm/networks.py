@@ -241,10 +241,9 @@ def normalise_depth(depth: Tensor, alpha: Tensor) -> Tensor:
     The limits are detached (G10). A constant or empty depth map gives zeros, not 0 / 0.
     """
     mask = (alpha > 0.5) & torch.isfinite(depth)
-    if not bool(mask.any()):
-        return torch.zeros_like(depth)
     known = torch.where(mask, depth, 0.0)
-    inner = known.detach()[mask]
-    low, extent = inner.min(), inner.max() - inner.min()
+    inner, most = known.detach(), torch.finfo(depth.dtype).max
+    low = torch.where(mask, inner, most).min()  # without asking a GPU whether there are any
+    extent = torch.where(mask, inner, -most).max() - low
     scaled = (known - low) / extent.clamp_min(EMPTY_RANGE_M)
     return torch.where(mask, scaled.clamp(0, 1), 0.0)

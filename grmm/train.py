@@ -8,6 +8,7 @@ steers the rate.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from datetime import timedelta
@@ -33,6 +34,7 @@ from grmm.model import Rendering
 from grmm.rasterize import NotFiniteTensorError
 from grmm.render import comparison_sheet
 from grmm.train_state import (
+    Terms,
     TrainState,
     append_log,
     best_device,
@@ -58,13 +60,19 @@ GLOO_SECONDS = 0.5  # for Gloo's threads to free tensors; 0.2 was enough in ever
 
 
 def train(
-    source: Source, head: HeadModel, out: Path, config: Config, *, resume: bool = False
+    source: Source,
+    head: HeadModel,
+    out: Path,
+    config: Config,
+    *,
+    resume: bool = False,
+    own_terms: Terms | None = None,
 ) -> dict[str, object]:
     """Train on a source and write OUT/checkpoint.pt, OUT/metrics.json and OUT/preview/*.jpg.
 
     ``source.head`` is how `load_head` finds ``head`` again. ``resume`` goes on from
-    OUT/checkpoint.pt, whose settings must agree except for the budget. Returns what metrics.json
-    holds.
+    OUT/checkpoint.pt, whose settings must agree except for the budget. ``own_terms`` adds terms to
+    the objective. Returns what metrics.json holds.
 
     Raises:
         TrainError: nothing to train on, or the objective is not finite.
@@ -77,12 +85,15 @@ def train(
     views = HeadViews(source, head.to(device), config.data)
     config = with_map_size(config, views)
     state = prepare(views, config, rank, world)
+    state.own_terms = own_terms
     checkpoint = out / "checkpoint.pt"
     if resume:
         restore(state, checkpoint, config, device)
     elif config.train.warm_start:
         warm_start(state.model, views, state.training)
-    parallel = DistributedDataParallel(state.model) if world > 1 else state.model
+    parallel: torch.nn.Module = state.model
+    if world > 1:  # buffers are constants of the head model
+        parallel = DistributedDataParallel(state.model, broadcast_buffers=False)
     if rank == 0:
         out.mkdir(parents=True, exist_ok=True)
         check_space(out)
@@ -143,26 +154,38 @@ def step(state: TrainState, parallel: torch.nn.Module, config: Config) -> None:
         TrainError: Gaussians or objective are not finite.
     """
     state.optimizer.zero_grad(set_to_none=True)
-    for _ in range(config.train.accumulate):
+    for left in reversed(range(config.train.accumulate)):
         item = state.views.item(state.shuffle.next(), crop=True)
-        try:
-            rows = state.model.rows(*item.key.frame)
-            rendering = parallel(*rows, item.state, item.view, state.views.background)
-        except NotFiniteTensorError as error:
-            raise TrainError(
-                f"iteration {state.iteration}: training diverged ({error}); lower train.lr and "
-                "start over with --anew"
-            ) from None
-        terms = objective(state, rendering, item, config)
-        loss = torch.stack(list(terms.values())).sum()
-        state.terms = {name: float(term.detach()) for name, term in terms.items()}
-        if not bool(torch.isfinite(loss)):
-            raise TrainError(
-                f"iteration {state.iteration}: the objective is not finite at {item.key}: "
-                f"{state.terms}; expected finite terms. Lower train.lr or look at this sample"
-            )
-        (loss / config.train.accumulate).backward()
+        state.views.prefetch(state.shuffle.peek())
+        shared = left == 0 or not isinstance(parallel, DistributedDataParallel)
+        # Gradients are exchanged once per step, with the last view's.
+        with contextlib.nullcontext() if shared else parallel.no_sync():
+            _add_gradients(state, parallel, item, config)
     state.optimizer.step()
+
+
+def _add_gradients(
+    state: TrainState, parallel: torch.nn.Module, item: Item, config: Config
+) -> None:
+    """Render one view and add its share of the step's gradient."""
+    try:
+        rows = state.model.rows(*item.key.frame)
+        rendering = parallel(*rows, item.state, item.view, state.views.background)
+    except NotFiniteTensorError as error:
+        raise TrainError(
+            f"iteration {state.iteration}: training diverged ({error}); lower train.lr and "
+            "start over with --anew"
+        ) from None
+    terms = objective(state, rendering, item, config)
+    loss = torch.stack(list(terms.values())).sum()
+    state.terms = {name: term.detach() for name, term in terms.items()}
+    if not bool(torch.isfinite(loss)):
+        shown = {name: float(term) for name, term in state.terms.items()}
+        raise TrainError(
+            f"iteration {state.iteration}: the objective is not finite at {item.key}: "
+            f"{shown}; expected finite terms. Lower train.lr or look at this sample"
+        )
+    (loss / config.train.accumulate).backward()
 
 
 def objective(
@@ -177,9 +200,10 @@ def objective(
     if state.perceptual is not None:
         for name, image in images.items():
             terms[f"perceptual_{name}"] = losses.PERCEPTUAL * state.perceptual(image, item.target)
-    if bool(item.depth_valid.any()):
-        error = losses.depth_dm2(rendering.depth, rendering.alpha, item.depth, item.depth_valid)
-        terms["depth"] = weights.depth * error
+    error = losses.depth_dm2(rendering.depth, rendering.alpha, item.depth, item.depth_valid)
+    terms["depth"] = weights.depth * error
+    if state.own_terms is not None:
+        terms |= state.own_terms(state, rendering, item)
     codes, gaussians = model.codes(*model.rows(*item.key.frame)), rendering.gaussians
     return terms | {
         "scale": weights.scale * losses.scale_mm(gaussians.scales_mm),
@@ -230,7 +254,7 @@ def report(
         "iterations": state.iteration,
         "seconds": round(state.seconds, 2),
         "iterations_per_second": round(state.iteration / max(state.seconds, 1e-9), 3),
-        "terms": {name: round(value, 6) for name, value in state.terms.items()},
+        "terms": {name: round(float(value), 6) for name, value in state.terms.items()},
     }
     metrics |= perceptual.missing()
     for name, indices in (("training", state.training), ("heldout", state.holdout)):
@@ -262,5 +286,5 @@ def progress_line(state: TrainState, config: Config) -> str:
     rate = state.iteration / max(state.seconds, 1e-9)
     used = budget_used(state, config)
     left = timedelta(seconds=round(state.seconds * (1 - used) / used if used > 0 else 0))
-    terms = " ".join(f"{name} {value:.4f}" for name, value in state.terms.items())
+    terms = " ".join(f"{name} {float(value):.4f}" for name, value in state.terms.items())
     return f"iteration {state.iteration}  {rate:.2f}/s  {left} left  {terms}"

@@ -8,7 +8,7 @@ import json
 import math
 import os
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event, current_thread, main_thread
@@ -23,12 +23,16 @@ from express50.files.text import read_text
 from grmm import losses
 from grmm.checkpoint import Gallery, load_checkpoint, save_checkpoint
 from grmm.config import Config, as_tables
-from grmm.data import HeadViews, SampleKey, Shuffle, spread
-from grmm.model import GRMM
+from grmm.data import HeadViews, Item, SampleKey, Shuffle, spread
+from grmm.model import GRMM, Rendering
 
 COVERED_TEXELS = 0.75  # of a map that head models' layouts use
 LARGEST_MAP = 512  # the paper's
 CHANGEABLE = {"iterations", "seconds", "save_seconds", "evaluate_images"}  # when a run is resumed
+
+
+Terms = Callable[["TrainState", Rendering, Item], dict[str, Tensor]]
+"""Terms of one's own in the objective, 0-d tensors by name, weights included."""
 
 
 @dataclass(kw_only=True)
@@ -45,7 +49,8 @@ class TrainState:
     edges: Tensor
     iteration: int = 0
     seconds: float = 0.0
-    terms: dict[str, float] = field(default_factory=dict)
+    terms: dict[str, Tensor] = field(default_factory=dict)
+    own_terms: Terms | None = None
 
 
 def prepare(views: HeadViews, config: Config, rank: int = 0, world: int = 1) -> TrainState:
@@ -90,7 +95,9 @@ def best_device() -> torch.device:
     """Return the CUDA device of this process as ``torchrun`` numbers them, else the CPU."""
     if not torch.cuda.is_available():
         return torch.device("cpu")
-    return torch.device(f"cuda:{os.environ.get('LOCAL_RANK', '0')}")
+    device = torch.device(f"cuda:{os.environ.get('LOCAL_RANK', '0')}")
+    torch.cuda.set_device(device)  # gsplat's kernels and NCCL take the current one
+    return device
 
 
 def split_samples(keys: Sequence[SampleKey], config: Config) -> tuple[list[int], list[int]]:
@@ -265,7 +272,8 @@ def start_log(path: Path, iteration: int) -> None:
 
 def append_log(path: Path, state: TrainState) -> None:
     """Append where a run is to OUT/log.jsonl, one JSON object per line."""
-    numbers = {"loss": sum(state.terms.values())} | state.terms
+    terms = {name: float(value) for name, value in state.terms.items()}
+    numbers = {"loss": sum(terms.values())} | terms
     entry = {"iteration": state.iteration, "seconds": round(state.seconds, 3)}
     entry |= {name: round(value, 8) for name, value in numbers.items()}
     try:

@@ -133,10 +133,9 @@ def _check(splats: Splats, camera: Pinhole, background: Tensor | None) -> None:
             )
         if tensor.device != device:
             raise ValueError(f"{name} is on {tensor.device}, expected {device} as means")
-        _check_finite(name, tensor)
+    K = _check_values(tensors)
     if camera.width < 1 or camera.height < 1:
         raise ValueError(f"image size is {camera.width} x {camera.height}, expected at least 1 x 1")
-    K = camera.K.detach().tolist()
     (fx, skew, _), (below, fy, _), bottom = K
     if fx <= 0 or fy <= 0 or skew != 0 or below != 0 or bottom != [0.0, 0.0, 1.0]:
         raise ValueError(
@@ -144,13 +143,21 @@ def _check(splats: Splats, camera: Pinhole, background: Tensor | None) -> None:
         )
 
 
-def _check_finite(name: str, tensor: Tensor) -> None:
-    """Refuse NaN, Inf and numbers whose squares would overflow."""
-    if tensor.numel() == 0:
-        return
-    low, high = torch.aminmax(tensor.detach())
-    if float(low) > -LIMIT and float(high) < LIMIT:
-        return
+def _check_values(tensors: dict[str, Tensor]) -> list[list[float]]:
+    """Refuse NaN, Inf and numbers whose squares would overflow; returns K.
+
+    All extremes leave the device at once: each transfer would wait for all that was queued.
+    """
+    parts = {name: torch.aminmax(t.detach()) for name, t in tensors.items() if t.numel()}
+    ends = [end.double() for pair in parts.values() for end in pair]
+    values = torch.cat([torch.stack(ends), tensors["K"].detach().double().flatten()]).tolist()
+    for name, low, high in zip(parts, values[::2], values[1::2], strict=False):
+        if not (low > -LIMIT and high < LIMIT):
+            _refuse(name, tensors[name])
+    return [values[-9:-6], values[-6:-3], values[-3:]]
+
+
+def _refuse(name: str, tensor: Tensor) -> None:
     bad = ~(tensor.detach().abs() < LIMIT)
     first = tuple(bad.nonzero()[0].tolist())
     raise NotFiniteTensorError(

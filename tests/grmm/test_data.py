@@ -1,3 +1,4 @@
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -117,3 +118,35 @@ def test_ranks_share_one_order_without_overlap():
 def test_spread_takes_both_ends():
     assert spread(range(10), 4) == [0, 3, 6, 9]
     assert spread([1, 2], 4) == [1, 2]
+
+
+def test_the_next_sample_is_decoded_beside_the_step():
+    threads = {}
+
+    class Noted(EllipsoidSource):
+        def read(self, index):
+            threads[index] = threading.current_thread()
+            return super().read(index)
+
+    views = HeadViews(Noted(size=32), ellipsoid_head())
+    shuffle, order = Shuffle(range(6), seed=1), [Shuffle(range(6), seed=1).next()]
+    taken = shuffle.next()
+    assert taken == order[0]
+    for _ in range(4):
+        views.sample(taken)
+        following = shuffle.peek()
+        views.prefetch(following)
+        views.prefetch(following)  # asked again, read once
+        taken = shuffle.next()
+        assert taken == following
+    ours = threading.main_thread()
+    assert list(threads.values()).count(ours) == 1  # the first, which nobody announced
+    expected = EllipsoidSource(size=32).read(taken).image
+    np.testing.assert_array_equal(views.sample(taken).image, expected)
+
+
+def test_a_damaged_sample_is_named_when_it_is_needed():
+    views = HeadViews(Changed(alpha=np.zeros((3, 3), np.uint8)), ellipsoid_head())
+    views.prefetch(0)
+    with pytest.raises(FormatError, match="S000/e0/cam00: alpha"):
+        views.sample(0)

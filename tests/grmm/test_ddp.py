@@ -13,14 +13,14 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.slow
-def test_two_processes_equal_one_that_accumulates_two_views(tmp_path):
+def test_two_processes_of_two_views_equal_one_that_accumulates_four(tmp_path):
     command = [
         sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2",
         str(REPOSITORY / "tests" / "grmm" / "ddp_run.py"), str(tmp_path / "two"),
     ]  # fmt: skip
     environment = os.environ | {"PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
     subprocess.run(command, check=True, env=environment, cwd=REPOSITORY, timeout=240)
-    settings = {"iterations": 2, "accumulate": 2}
+    settings = {"iterations": 2, "accumulate": 4}
     train(
         EllipsoidSource(size=32),
         ellipsoid_head(),

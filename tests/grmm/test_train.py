@@ -28,7 +28,7 @@ from grmm.evaluate import (
 )
 from grmm.losses import LAYERS, load_vgg
 from grmm.train import train
-from grmm.train_state import budget_used, prepare, set_rates, split_samples
+from grmm.train_state import best_device, budget_used, prepare, set_rates, split_samples
 from grmm.warm_start import fill_texels, project_texture, warm_start
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
@@ -374,3 +374,28 @@ def test_metrics_tell_what_each_component_gains(tmp_path):
     component_effects(loaded.model, views, held[:1])
     after = loaded.model.state_dict()
     assert after.keys() == before.keys() and all(torch.equal(before[k], after[k]) for k in after)
+
+
+def test_terms_of_ones_own_join_the_objective(tmp_path, source):
+    def opaque(state, rendering, item):
+        return {"opaque": 10 * (1 - rendering.gaussians.opacities).mean()}
+
+    config = tiny_config(train={"iterations": 12, "lr": 5e-3})
+    found = {}
+    for name, own in (("plain", None), ("own", opaque)):
+        metrics = train(source, ellipsoid_head(), tmp_path / name, config, own_terms=own)
+        loaded = checkpoint.load_checkpoint(tmp_path / name / "checkpoint.pt")
+        views = HeadViews(source, ellipsoid_head())
+        with torch.no_grad():
+            gaussians = loaded.model.geometry(*loaded.model.codes(0, 0), views.state(0))
+        found[name] = float(gaussians.opacities.mean()), "opaque" in metrics["terms"]
+    assert found["own"][0] > found["plain"][0] + 0.01
+    assert (found["plain"][1], found["own"][1]) == (False, True)
+
+
+def test_a_process_takes_its_own_gpu(monkeypatch):
+    chosen = []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "set_device", chosen.append)
+    monkeypatch.setenv("LOCAL_RANK", "3")
+    assert best_device() == torch.device("cuda:3") and chosen == [torch.device("cuda:3")]
