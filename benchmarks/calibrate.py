@@ -85,6 +85,10 @@ RIG = TwinConfig(
     plates=False,
 )
 """60 board poses, so that the outermost cameras, too, see it some fifteen times."""
+FACES = ("neutral", "smile_open", "surprise", "laugh", "sadness", "pucker")
+APART = replace(RIG, cameras=8, expressions=FACES, board_frames=0)  # neighbours 40 degrees apart
+SCENES = {"twin_six_expressions": replace(APART, cameras=24), "twin_40_degrees_apart": APART}
+"""Rigs solved from footage alone, besides the one with the board."""
 
 
 def main() -> int:
@@ -135,7 +139,7 @@ def main() -> int:
         "seconds_detection": detected - start,
         "corners": len(solution.errors),
         "dropped": len(solution.dropped),
-        **footage_figures(index, true, (observations, points), config),
+        **footage_figures(index, true, (observations, points), config, args.recording),
         "baseline": {"opencv_chain": rounded(baseline)},
     }
     if args.dataset is None:
@@ -162,6 +166,7 @@ def footage_figures(
     true: Mapping[str, Camera],
     board: tuple[BoardCorners, np.ndarray],
     config: CalibrateConfig,
+    folder: Path,
 ) -> dict[str, object]:
     """Measure rigs solved from footage alone and perturbed ones refined, the twin's and foreign.
 
@@ -173,6 +178,12 @@ def footage_figures(
         {"twin": sfm_figures(seen, true, config)},
         {"twin": refine_figures(seen, true, figures, board)},
     )
+    for name, scene in SCENES.items():
+        dataset, truth = recorded(scene, folder / name)
+        subject = dataset.subjects()[0]
+        other = truth.cameras(subject)
+        seen = see_capture(read_index(dataset, subject).capture, other, config.solve_frame_sets)
+        sfm[name] = sfm_figures(seen, other, config)
     for root in sorted((shared / "captures").glob("*/calibration.json")):
         given = read_cameras(root)
         seen = see_capture(root.parent, given, config.solve_frame_sets)

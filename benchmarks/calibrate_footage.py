@@ -19,13 +19,16 @@ import pycolmap
 from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera
 from express50.geometry.transforms import matrix_to_axis_angle, similarity_fit
+from express50.rigs.camera_builder import in_metres
+from express50.rigs.world_frame import meeting_point
 from pipelines.calibrate.adjuster import move_pose
 from pipelines.calibrate.board import BoardCorners
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.footage import find_points, read_raw_footage, reduced_camera
-from pipelines.calibrate.footage_rig import solve_footage
+from pipelines.calibrate.footage_rig import FootageSolution, solve_footage
 from pipelines.calibrate.given_rig import RefinedRig, refine_by_board, refine_by_footage
 from pipelines.calibrate.tracks import FrameSetPoints, match_descriptors
+from pipelines.calibrate.uncertainty import camera_errors, head_points
 
 BUMP_DEG, BUMP_MM = 0.3, 5.0
 RigJudge = Callable[[Mapping[str, Camera], Mapping[str, Camera]], dict[str, float]]
@@ -58,11 +61,27 @@ def sfm_figures(
                 eye_distance_mm=config.eye_distance_mm,
             )  # fmt: skip
             row = similar(solved.cameras, rig) | {"weak": len(solved.weak)}
+            row["stated_to_true_error"] = stated_to_true(solved, rig)
         except CalibrationError as error:
             row = {"cameras_registered": 0, "cameras": len(rig), "refused": str(error)}
         rows[key] = row | {"seconds": round(time.process_time() - started, 2)}
     rows["baseline"] = {"colmap_mapping": similar(colmap_mapping(seen, rig), rig)}
     return rows
+
+
+def stated_to_true(solved: FootageSolution, true: Mapping[str, Camera]) -> float | None:
+    """Return stated over true error at the head, rms over cameras, after a similarity."""
+    names, middle = sorted(solved.cameras), meeting_point(true)
+    if len(names) < 3 or middle is None:
+        return None
+    centers = [np.stack([rig[n].center for n in names]) for rig in (solved.cameras, true)]
+    scaled = in_metres(solved.cameras, similarity_fit(*centers)[0])
+    off = camera_errors(scaled, {n: true[n] for n in names}, head_points() + middle)
+    squares = [
+        np.mean([solved.uncertainty[n].px ** 2 for n in names]),
+        np.mean(np.square(list(off.values()))),
+    ]
+    return _five(float(np.sqrt(squares[0] / squares[1])))
 
 
 def similar(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> dict[str, object]:

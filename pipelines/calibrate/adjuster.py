@@ -30,9 +30,9 @@ BEHIND = 1e4  # residual of a point behind its camera, in sigmas
 class RigPriors:
     """Standard deviations of the unknowns about their expected values: 0 holds, inf frees them.
 
-    `focal` and `focal_spread` (against the mean of all cameras) are shares of the focal length,
-    `centre` is a share of the image's diagonal. `bend` is the first radial term's effect at the
-    image's corner, as a share of half the diagonal.
+    `focal` and `focal_spread` (against the mean of pictures as large) are shares of the focal
+    length, `centre` is a share of the image's diagonal. `bend` is the first radial term's effect at
+    the image's corner, as a share of half the diagonal.
     """
 
     turn_rad: float = np.inf
@@ -85,9 +85,7 @@ def adjust_rig(
     """
     rig = [cameras[name] for name in tracks.names]
     information, columns = _information(rig, priors, free)
-    ties = np.zeros((len(rig), len(rig)))  # of log focal lengths to their common mean
-    if priors.focal > 0 and np.isfinite(priors.focal_spread):
-        ties = (np.eye(len(rig)) - 1 / len(rig)) / priors.focal_spread**2
+    ties = _ties(rig, priors)
     moved = np.zeros((len(rig), UNKNOWNS))
     if expected is not None:
         moved[:, 6:] = [_lens(camera) - _lens(expected[camera.id]) for camera in rig]
@@ -129,6 +127,45 @@ def adjust_rig(
                 break
     found = dict(zip(tracks.names, rig, strict=True))
     return AdjustedRig(found, points, at.errors, at.cost(scales[-1]))
+
+
+def cameras_covariance(
+    fit: AdjustedRig, tracks: PointTracks, priors: RigPriors, scale: float
+) -> np.ndarray:
+    """Return the covariance (10 C, 10 C) of a fit's unknowns, all of its cameras being free.
+
+    Where the rig stands, and how large it is, is held: a similarity changes no picture. It is as
+    much larger as errors, weighted by Cauchy's loss, exceed their sigmas.
+    """
+    rig = [fit.cameras[name] for name in tracks.names]
+    at = _linearise(rig, tracks, fit.points)
+    normal = _eliminate_points(at, tracks, scale, len(rig), 0.0)
+    information, columns = _information(rig, priors, None)
+    H = normal.cameras + np.diag(information.reshape(-1))
+    H[6::UNKNOWNS, 6::UNKNOWNS] += _ties(rig, priors)
+    same = np.zeros((len(rig), UNKNOWNS, 7))
+    for row, camera in zip(same, rig, strict=True):
+        R, t = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
+        row[:3, :3], row[3:6, :3] = -R, np.cross(R.T, t).T
+        row[3:6, 3:6], row[3:6, 6] = -R, t
+    unit = 1 / np.sqrt(np.diag(H)[columns])
+    held = np.linalg.qr(same.reshape(H.shape[0], 7)[columns] / unit[:, None])[0]
+    inverse = np.linalg.inv(H[np.ix_(columns, columns)] * unit * unit[:, None] + held @ held.T)
+    covariance = np.zeros_like(H)
+    covariance[np.ix_(columns, columns)] = inverse * unit * unit[:, None]
+    weight = 1 / (1 + (at.sizes / scale) ** 2)
+    spare = max(2 * weight.sum() - 3 * len(fit.points) - len(columns), 0.1 * weight.sum())
+    return covariance * max(1.0, float((weight * at.sizes**2).sum() / spare))
+
+
+def derive_points(cameras: Sequence[Camera], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Derive pixels of points (K, 3) by the camera (C, K, 2, 10) and the points (C, K, 2, 3)."""
+    count, size = len(cameras), len(points)
+    names = tuple(camera.id for camera in cameras)
+    rows = np.repeat(np.arange(count), size), np.tile(np.arange(size), count)
+    tracks = PointTracks(names, *rows, np.zeros((count * size, 2)), np.ones(count * size))
+    at = _linearise(list(cameras), tracks, points)
+    return at.by_camera.reshape(count, size, 2, -1), at.by_point.reshape(count, size, 2, 3)
 
 
 def single_camera_gains(
@@ -223,6 +260,15 @@ def _information(
     information = np.zeros_like(sigma)
     information[sigma > 0] = sigma[sigma > 0] ** -2.0
     return information, np.flatnonzero(sigma)
+
+
+def _ties(rig: list[Camera], priors: RigPriors) -> np.ndarray:
+    """Return the information (C, C) that ties log focal lengths to those of pictures as large."""
+    sizes = np.array([(camera.width, camera.height) for camera in rig])
+    alike = (sizes[:, None] == sizes).all(2)
+    ties = np.eye(len(rig)) - alike / alike.sum(1)
+    free = priors.focal > 0 and np.isfinite(priors.focal_spread)
+    return ties / priors.focal_spread**2 if free else np.zeros_like(ties)
 
 
 def _linearise(rig: list[Camera], tracks: PointTracks, points: np.ndarray) -> _Linear:

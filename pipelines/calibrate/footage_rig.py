@@ -20,7 +20,12 @@ from express50.geometry.cameras import Camera, triangulate
 from express50.geometry.transforms import invert_transform, make_transform, rigid_fit
 from express50.rigs.camera_builder import in_metres
 from express50.rigs.world_frame import canonical_from_rig, move_cameras
-from pipelines.calibrate.adjuster import AdjustedRig, RigPriors, adjust_rig, triangulate_tracks
+from pipelines.calibrate.adjuster import (
+    AdjustedRig,
+    RigPriors,
+    adjust_rig,
+    triangulate_tracks,
+)
 from pipelines.calibrate.board_guess import as_model, join_rig, mean_transform
 from pipelines.calibrate.config import AUTO
 from pipelines.calibrate.tracks import (
@@ -32,18 +37,21 @@ from pipelines.calibrate.tracks import (
     join_tracks,
     match_looks,
 )
+from pipelines.calibrate.uncertainty import HeadError, footage_uncertainty, head_error_of
 
 FACE_SCALES, FEATURE_SCALES = (6.0, 2.0), (3.0, 1.5)  # of Cauchy's loss, in sigmas
 BANDS = (0.04, 0.015)
 """How far features may be from their epipolar lines while the rig is still rough, as a share of
 the diagonal."""
-KNOWN_FOCAL, GUESSED_FOCAL, FOCAL_SPREAD = 0.02, 0.6, 0.03
+KNOWN_FOCAL, GUESSED_FOCAL, FOCAL_SPREAD, SAME_LENS = 0.02, 0.6, 0.03, 0.002
 """Standard deviations of log focal lengths. Known ones come from EXIF in whole millimetres. Guessed
 ones assume that faces are `calibrate.distance_m` away: a factor of 1.8 either way. The spread is
-that of one rig's focal lengths about their mean."""
+that of one rig's focal lengths about the mean of pictures as large, and of lenses said to be the
+same."""
 CENTRE, BEND = 0.005, 0.02
 """Standard deviations of principal points, as a share of the diagonal, and of how far lenses bend
 the image's corner, as a share of half of it: footage alone says little about either."""
+LOOSE = 0.02  # of the diagonal: a camera that may be off by more at the head is not placed
 OUTLIER = 4.0  # sigmas; features with larger errors are mismatches and not reported
 EYES = (slice(36, 42), slice(42, 48))
 NOMINAL = 2.5  # focal length, in longer sides, at which distances are first estimated
@@ -68,6 +76,7 @@ class FootageSolution:
     inliers: np.ndarray
     dropped: dict[str, str]
     weak: dict[str, str]
+    uncertainty: dict[str, HeadError]
     eye_frames: int
     eye_spread: float
 
@@ -81,12 +90,13 @@ def solve_footage(
     model: str,
     distance_m: float,
     eye_distance_mm: float,
+    same_lens: bool = False,
 ) -> FootageSolution:
     """Solve a rig from points that its cameras saw at the same instants.
 
     `seen` holds points by frame number; `sizes` are (width, height), `focals` the known focal
-    lengths, pixels. The other settings are those of `CalibrateConfig`; `where` names the capture
-    in errors.
+    lengths, pixels; `same_lens` says that pictures of one size have one. The other settings are
+    those of `CalibrateConfig`; `where` names the capture in errors.
 
     Raises:
         CalibrationError: fewer than two cameras see one face at one time, so that nothing starts
@@ -116,7 +126,13 @@ def solve_footage(
             " with board.toml, then run 'express50 ingest' again"
         )
     known = all(name in focals for name in sizes)
-    tracks, adjusted = _adjust(rig, start, seen, KNOWN_FOCAL if known else GUESSED_FOCAL)
+    priors = RigPriors(
+        focal=KNOWN_FOCAL if known else GUESSED_FOCAL,
+        focal_spread=SAME_LENS if same_lens else FOCAL_SPREAD,
+        centre=CENTRE,
+        bend=BEND,
+    )
+    tracks, adjusted, expected = _adjust(rig, start, seen, priors)
     shapes = _landmark_points(adjusted.cameras, seen)
     gaps = np.array([np.linalg.norm(p[EYES[0]].mean(0) - p[EYES[1]].mean(0)) for p in shapes])
     gaps = gaps[gaps > 0]
@@ -132,8 +148,8 @@ def solve_footage(
     up = np.mean([rigid_fit(head, p)[0] for p in shapes], axis=0)[:, 1]
     lone = "it sees a face, but never together with the cameras of the largest group"
     blind = (
-        f"it sees no face well, and fewer than {LEAST_INLIERS} of its features fit points that two"
-        " other cameras know: add board images or calibration.json"
+        "it sees no face well, and too few of its features fit points that other cameras know:"
+        " add a camera between it and the next, board images or calibration.json"
     )
     return FootageSolution(
         cameras=move_cameras(metric, canonical_from_rig(metric, middle, up)),
@@ -143,6 +159,10 @@ def solve_footage(
         & (np.linalg.norm(adjusted.errors, axis=1) / tracks.sigma < OUTLIER),
         dropped={n: lone if n in faces else blind for n in sorted(sizes) if n not in metric},
         weak=_weak(tracks),
+        uncertainty={
+            n: head_error_of(metric[n], px**2, float(np.linalg.norm(metric[n].center - middle)))
+            for n, px in expected.items()
+        },
         eye_frames=len(gaps),
         eye_spread=1.4826 * float(np.median(np.abs(gaps - eyes))) / eyes,
     )
@@ -152,11 +172,12 @@ def _adjust(
     rig: dict[str, Camera],
     start: Mapping[str, Camera],
     seen: Mapping[int, FrameSetPoints],
-    focal: float,
-) -> tuple[PointTracks, AdjustedRig]:
-    """Adjust a rig first to landmarks, then to features, and place cameras without a face."""
-    priors = RigPriors(focal=focal, focal_spread=FOCAL_SPREAD, centre=CENTRE, bend=BEND)
+    priors: RigPriors,
+) -> tuple[PointTracks, AdjustedRig, dict[str, float]]:
+    """Adjust a rig first to landmarks, then to features, and place cameras without a face.
 
+    The last value is the error, pixels, to be expected of each camera at the head.
+    """
     looks = match_looks({frame: points.features for frame, points in seen.items()})
 
     def with_features(
@@ -180,12 +201,28 @@ def _adjust(
         if not more:
             break
         wider, wide = with_features(fit.cameras | more, BANDS[:1])
-        loose = set(_weak(wider)) & set(more)  # held by neither a face nor features
+        expected = _expected(wide, wider, seen, priors)
+        loose = {n for n in more if not expected.get(n, np.inf) < _most(start[n])}
         refused |= loose
         if set(more) - loose:
             held = {n: c for n, c in wide.cameras.items() if n not in loose}
             tracks, fit = with_features(held, BANDS)
-    return tracks, fit
+    return tracks, fit, _expected(fit, tracks, seen, priors)
+
+
+def _expected(
+    fit: AdjustedRig, tracks: PointTracks, seen: Mapping[int, FrameSetPoints], priors: RigPriors
+) -> dict[str, float]:
+    faces = np.stack(_landmark_points(fit.cameras, seen))
+    radius = 1.5 * float(np.median(np.linalg.norm(faces - faces.mean(1, keepdims=True), axis=2)))
+    middle = np.median(faces.mean(1), axis=0)
+    found = footage_uncertainty(fit, tracks, priors, FEATURE_SCALES[-1], middle, radius)
+    # What stands still is off by the same in every frame set, which thus count as one.
+    return {name: px * len(seen) ** 0.5 for name, px in found.items()}
+
+
+def _most(camera: Camera) -> float:
+    return LOOSE * float(np.hypot(camera.width, camera.height))
 
 
 def _landmark_points(

@@ -279,8 +279,10 @@ def _from_footage(index: Index, config: CalibrateConfig) -> CalibratedRig:
         model=config.camera_model,
         distance_m=config.distance_m,
         eye_distance_mm=config.eye_distance_mm,
+        same_lens=index.meta.get("same_lens") is True,
     )
     cameras = {n: at_footage_size(camera, blank[n]) for n, camera in solved.cameras.items()}
+    at_full = {name: camera.width / small[name].width for name, camera in cameras.items()}
     check_meeting(cameras, str(index.capture))
     squared, good = np.sum(solved.errors**2, axis=1), solved.inliers
     scale = (
@@ -301,6 +303,10 @@ def _from_footage(index: Index, config: CalibrateConfig) -> CalibratedRig:
             "known_focals": sorted(set(focals) & set(solved.cameras)),
             "eye_frame_sets": solved.eye_frames,
             "eye_spread": round(solved.eye_spread, 5),
+            "uncertainty": {
+                name: {"px": round(error.px * at_full[name], 4), "mm": round(error.mm, 4)}
+                for name, error in solved.uncertainty.items()
+            },
         },
         dropped=_notes(solved.dropped),
         warnings=(*_notes(solved.weak), Note("scale", scale)),

@@ -102,17 +102,18 @@ def join_tracks(
     matches: dict[int, list[tuple[str, str, np.ndarray]]] = {frame: [] for frame in seen}
     for a, b in _neighbours(cameras):
         both = {f: (views[a], views[b]) for f, views in ideal.items() if a in views and b in views}
-        reach = band * np.hypot(cameras[b].width, cameras[b].height)
-        near = {
-            frame: epipolar_distance(cameras[a], cameras[b], p[0], q[0]) < reach
-            for frame, (p, q) in both.items()
-        }
+        rig, reach = (cameras[a], cameras[b]), band * np.hypot(cameras[b].width, cameras[b].height)
         found = verified_pairs(both, None if looks is None else looks[a, b]) if verified else {}
         if not found:  # less can be mistaken where only what is near the lines is compared
-            found = {f: match_descriptors(p[1], q[1], near[f]) for f, (p, q) in both.items()}
+            found = {
+                f: match_descriptors(p[1], q[1], epipolar_distance(*rig, p[0], q[0]) < reach)
+                for f, (p, q) in both.items()
+            }
             found = verified_pairs(both, found) if verified else found
         for frame, pairs in found.items():
-            matches[frame].append((a, b, pairs[near[frame][pairs[:, 0], pairs[:, 1]]]))
+            ends = (both[frame][i][0][pairs[:, i]] for i in (0, 1))
+            near = epipolar_distance(*rig, *ends).diagonal() < reach
+            matches[frame].append((a, b, pairs[near]))
     rows: list[tuple[int, int, np.ndarray, float]] = []
     count = 0
     for frame, points in seen.items():

@@ -1,4 +1,4 @@
-"""State how far the cameras of a board rig may be off, in the place of the head.
+"""State how far the cameras of a rig may be off, in the place of the head.
 
 The covariance of all cameras follows from the derivatives of the corners' errors, boards' poses
 eliminated. It is carried over to points in the head's place, after worlds are laid on each other by
@@ -17,7 +17,13 @@ import numpy as np
 
 from express50.geometry.cameras import Camera, project, triangulate
 from express50.geometry.transforms import rigid_fit
-from pipelines.calibrate.adjuster import eliminate
+from pipelines.calibrate.adjuster import (
+    AdjustedRig,
+    RigPriors,
+    cameras_covariance,
+    derive_points,
+    eliminate,
+)
 from pipelines.calibrate.board import BoardCorners
 from pipelines.calibrate.board_adjust import (
     BoardRig,
@@ -29,6 +35,7 @@ from pipelines.calibrate.board_adjust import (
     rigid_steps,
 )
 from pipelines.calibrate.board_rig import LEAST_CORNERS, BoardSolution
+from pipelines.calibrate.tracks import PointTracks
 
 HEAD_RADIUS_M = 0.13
 DRAWS = 3  # of independent errors, to compare those of whole images with
@@ -58,8 +65,9 @@ def state_uncertainty(solution: BoardSolution, points: np.ndarray) -> dict[str, 
 
     def expected(corners: BoardCorners) -> dict[str, float]:
         names, covariance, excess = _covariance(rig, corners, points, sigma)
-        moved = _move_head([rig.cameras[name] for name in names], head)
-        squared = np.einsum("ckip,pq,ckiq->ck", moved, covariance, moved, optimize=True).mean(1)
+        derived = zip(*[derive(rig.cameras[name], head) for name in names], strict=True)
+        by_camera, by_point = (np.stack(part) for part in derived)
+        squared = _squared_errors(by_camera, by_point, rigid_steps(head), covariance)
         return dict(zip(names, (excess * squared).tolist(), strict=True))
 
     squared = expected(solution.corners)
@@ -69,12 +77,14 @@ def state_uncertainty(solution: BoardSolution, points: np.ndarray) -> dict[str, 
         variance = [expected(half) for half in halves]
         for name, off in camera_errors(one, other, head).items():
             squared[name] *= max(1.0, (1 + off**2 / sum(half[name] for half in variance)) / 2)
-    return {name: _head_error(solution.cameras[name], squared[name]) for name in names}
+    depth = {name: solution.cameras[name].cam_from_world[2, 3] for name in names}
+    return {n: head_error_of(solution.cameras[n], squared[n], depth[n]) for n in names}
 
 
-def _head_error(camera: Camera, squared_px: float) -> HeadError:
+def head_error_of(camera: Camera, squared_px: float, distance_m: float) -> HeadError:
+    """Return the error of a camera so far from the head, from its square in pixels."""
     focal, px = np.sqrt(camera.K[0, 0] * camera.K[1, 1]), np.sqrt(squared_px)
-    return HeadError(float(px), float(1e3 * px * camera.cam_from_world[2, 3] / focal))
+    return HeadError(float(px), float(1e3 * px * distance_m / focal))
 
 
 def head_points() -> np.ndarray:
@@ -148,22 +158,43 @@ def _together(errors: np.ndarray, corners: BoardCorners) -> float:
     return float(np.sum(np.square(sums)) / np.sum(errors**2))
 
 
-def _move_head(cameras: list[Camera], head: np.ndarray) -> np.ndarray:
-    """Derive pixels (C, K, 2) of points (K, 3) by all cameras' unknowns: (C, K, 2, 14 C).
+def _squared_errors(
+    by_camera: np.ndarray, by_point: np.ndarray, motions: np.ndarray, covariance: np.ndarray
+) -> np.ndarray:
+    """Return the expected squared errors (C,), pixels, to first order as `camera_errors` measures.
 
-    To first order, what `camera_errors` measures.
+    Pixels of K points are derived by their camera's unknowns (C, K, 2, U) and by the points (C, K,
+    2, 3), the points by the motions (K, 3, M) that lay worlds on each other.
     """
-    count, derived = len(cameras), [derive(camera, head) for camera in cameras]
-    by_camera, by_point = (np.stack(part) for part in zip(*derived, strict=True))
+    count, own = len(by_camera), np.arange(len(by_camera))
     inverse = np.linalg.inv(np.einsum("ckij,ckil->kjl", by_point, by_point))
     shift = -np.einsum("kjl,ckil,ckip->kjcp", inverse, by_point, by_camera, optimize=True)
-    turned = rigid_steps(head)
-    flat = shift.reshape(3 * len(head), -1)
-    motion = np.linalg.lstsq(turned.reshape(-1, 6), flat, rcond=None)[0]
-    moved = np.einsum("ckij,kjm,mp->ckip", by_point, turned, motion, optimize=True)
-    own = np.arange(count)
+    flat = shift.reshape(motions.shape[0] * 3, -1)
+    motion = np.linalg.lstsq(motions.reshape(len(flat), -1), flat, rcond=None)[0]
+    moved = np.einsum("ckij,kjm,mp->ckip", by_point, motions, motion, optimize=True)
     moved.reshape(*moved.shape[:3], count, -1)[own, :, :, own] += by_camera
-    return moved
+    return np.einsum("ckip,pq,ckiq->ck", moved, covariance, moved, optimize=True).mean(1)
+
+
+def footage_uncertainty(
+    fit: AdjustedRig,
+    tracks: PointTracks,
+    priors: RigPriors,
+    scale: float,
+    middle: np.ndarray,
+    radius: float,
+) -> dict[str, float]:
+    """Estimate each camera's error, pixels, about the middle (3,) of a head: of a rig from footage.
+
+    Worlds are laid on each other by similarities, as nothing in footage is sure of the metre.
+    """
+    points = middle + radius / HEAD_RADIUS_M * head_points()
+    turned = rigid_steps(points - middle)
+    motions = np.concatenate([turned, (points - middle)[..., None]], axis=2)
+    derived = derive_points([fit.cameras[name] for name in tracks.names], points)
+    covariance = cameras_covariance(fit, tracks, priors, scale)
+    squared = _squared_errors(*derived, motions, covariance)
+    return dict(zip(tracks.names, np.sqrt(squared).tolist(), strict=True))
 
 
 def _halves(corners: BoardCorners) -> tuple[BoardCorners, BoardCorners]:

@@ -14,10 +14,12 @@ from express50.errors import CalibrationError, ConfigError
 from express50.files.calibration import camera_rows
 from express50.files.images import write_image
 from express50.geometry.transforms import similarity_fit
+from express50.rigs.camera_builder import in_metres
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.footage_rig import pose_of_face, resect, solve_footage, start_camera
 from pipelines.calibrate.given_rig import refine_by_board, refine_by_footage
 from pipelines.calibrate.tracks import FrameSetPoints
+from pipelines.calibrate.uncertainty import camera_errors, head_points
 from tests.pipelines.board_rigs import POINTS, board_motion, make_rig, observe, rig_errors
 from tests.pipelines.face_rigs import SIZE, face, face_cameras, perturbed, see
 
@@ -55,6 +57,23 @@ def test_a_rig_is_solved_in_metres_from_faces_and_features(solved):
     assert rotation < 0.8 and position < 0.04 and focal < 4
     kept = structure.errors[structure.inliers]
     assert 0.2 < np.sqrt(np.mean(np.sum(kept**2, axis=1))) < 0.8
+
+
+def test_the_stated_error_at_the_head_is_about_the_true_one(solved):
+    rig, structure = solved
+    scaled = in_metres(structure.cameras, scale_to(structure.cameras, rig))
+    off = camera_errors(scaled, rig, head_points())
+    stated = [structure.uncertainty[name].px for name in rig]
+    assert 0.4 < np.linalg.norm(stated) / np.linalg.norm(list(off.values())) < 2.5
+    for name, camera in rig.items():
+        error = structure.uncertainty[name]
+        assert error.mm == pytest.approx(1100 * error.px / camera.K[0, 0], rel=0.1)
+
+
+def test_cameras_said_to_have_the_same_lens_have_nearly_one_focal_length():
+    rig = face_cameras()
+    focals = [c.K[0, 0] for c in solve(rig, see(rig), same_lens=True).cameras.values()]
+    assert np.ptp(np.log(focals)) < 0.004
 
 
 def test_known_focal_lengths_are_kept_and_other_eyes_scale_the_rig(solved):
