@@ -8,7 +8,7 @@ PRESET ?= standard
 WORKERS ?= 2
 SET ?=
 SLURM ?=
-TRAIN ?= --preset measured --budget 1h
+TRAIN ?= --budget 1h
 STAGE_FLAGS = --preset $(PRESET) --workers $(WORKERS) $(foreach kv,$(SET),--set $(kv)) $(if $(SLURM),--slurm $(SLURM))
 
 .PHONY: help setup demo test check bench tradeoff report clean \
@@ -51,7 +51,7 @@ ingest: $(READY) ## index CAPTURES="dir ..." into DATASET
 calibrate align frames matte track depth register regions pack: $(READY) ## one stage over DATASET
 	$(BIN)/express50 $@ $(DATASET) $(STAGE_FLAGS)
 
-train: $(READY) ## train GRMM on DATASET's shards, or go on with it; TRAIN="--preset paper" on a GPU
+train: $(READY) ## train GRMM on DATASET's shards, or go on with it, sized for the machine and an hour
 	$(BIN)/grmm train $(DATASET)/pack/shards $(DATASET)/grmm $(TRAIN)
 
 report: $(READY) ## gather DATASET's QC into one HTML page

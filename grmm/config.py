@@ -330,8 +330,7 @@ def resolve(
     """
     if name not in PRESETS:
         raise ConfigError(
-            f"preset is {name!r}, expected one of {', '.join(PRESETS)} (of 'grmm train': or"
-            " measured)"
+            f"preset is {name!r}, expected one of {', '.join(PRESETS)} (of 'grmm train': or auto)"
         )
     tables = as_tables(Config())
     for layer in (PRESETS[name], changes or {}, read_tables(file, list(TABLES)) if file else {}):

@@ -89,12 +89,12 @@ REASONS: dict[str, tuple[str, str]] = {
     ),
     "train.warm_start": (
         "projection gives at once the colours that the first thousands of steps would find",
-        NOT_MEASURED,
+        "+0.27 dB, on training views +1.2 (400 steps of demo, 27.60 to 27.88)",
     ),
     "loss.laplacian": (
         "the Laplacian of the mesh costs the head's own curvature; the displacement is kept small"
         " instead",
-        NOT_MEASURED,
+        "both terms instead of the Laplacian of the mesh: +0.25 dB (400 steps of demo)",
     ),
     "loss.displacement": (
         "where the footage has no say, the decoded mesh drifts off the tracked surface",

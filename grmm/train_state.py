@@ -100,6 +100,15 @@ def best_device() -> torch.device:
     return device
 
 
+def gpu() -> tuple[str, float] | None:
+    """Return the name and the memory, GiB, of this process' GPU; None where there is none."""
+    device = best_device()
+    if device.type == "cpu":
+        return None
+    found = torch.cuda.get_device_properties(device)
+    return found.name, found.total_memory / 2**30
+
+
 def split_samples(keys: Sequence[SampleKey], config: Config) -> tuple[list[int], list[int]]:
     """Split samples into those to train on and those held out by camera or expression.
 

@@ -19,7 +19,7 @@ from grmm.config import PRESETS, TABLES, TORSO
 
 DESCRIPTION = "Train the Gaussian Residual Morphable Model on packed shards, and use it."
 EPILOG = """example:
-  grmm train DATASET/pack/shards OUT --preset measured --budget 10m
+  grmm train DATASET/pack/shards OUT --budget 10m
 exit codes: 0 done, 1 failed, 2 wrong usage or configuration"""
 PATTERNS = "ids or patterns, joined by commas"
 
@@ -71,7 +71,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     # Training
     "--preset": {
         "default": "paper",
-        "help": f"{', '.join(PRESETS)}, or {commands.MEASURED}: the best in --budget (paper)",
+        "help": f"{', '.join(PRESETS)} (paper), or {commands.AUTO}: what suits the machine and the"
+        " --budget",
     },
     "--config": {"type": Path, "help": "TOML file over the preset"},
     "--set": REPEATED | {
@@ -178,7 +179,14 @@ COMMANDS = {
         help="train on packed shards",
         example="grmm train data/pack/shards run --preset demo --seconds 240; the same again goes "
         "on from run/checkpoint.pt",
-        changes={"out": {"help": "folder for checkpoint.pt, metrics.json, preview/"}},
+        changes={
+            "out": {"help": "folder for checkpoint.pt, metrics.json, preview/"},
+            "--preset": {
+                "default": commands.AUTO,
+                "help": f"{', '.join(PRESETS)}, or {commands.AUTO}: what suits the machine and the"
+                " --budget (auto)",
+            },
+        },
     ),
     "fit": GrmmCommand(
         handler=commands.fit,

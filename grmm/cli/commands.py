@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from grmm.identity_evaluation import FitProtocol
     from grmm.metrics import PerceptualMetrics
 
-MEASURED = "measured"  # in place of a preset
+AUTO = "auto"  # in place of a preset
+PAPER_GIB = 20  # a GPU's memory for the paper's size; a step takes 3.5 on a CPU, networks beside
 HOLDOUTS = ("holdout_cameras", "holdout_expressions")
 CHANGEABLE = ("fit", "metrics", "loss")  # tables that may differ from those of training
 
@@ -49,22 +50,35 @@ def train(args: argparse.Namespace) -> int:
 
 def train_config(args: argparse.Namespace) -> Config:
     """Return the resolved configuration of ``grmm train``: its own flags stand above --set."""
-    name, changes = args.preset, {}
-    if name == MEASURED:
-        if args.seconds is None:
-            raise ConfigError(f"--preset {MEASURED} needs a time, such as --budget 4m")
-        choice = choose(args.seconds)
-        log(
-            f"measured: {choice.setting} ({choice.psnr_db:.1f} dB in {choice.budget_s:.0f} s "
-            "where measured)"
-        )
-        name, changes = "demo", choice.changes
+    name: str = args.preset
+    changes: dict[str, dict[str, Any]] = {}
+    if name == AUTO:
+        name, changes = _machines_choice(args.seconds)
     config = resolve(name, args.config, [*args.set, *_metric_settings(args)], changes)
     if args.seconds is not None:
         config = replace(config, train=replace(config.train, seconds=args.seconds))
     given = {name: _split_names(getattr(args, name)) for name in HOLDOUTS}
     held: dict[str, Any] = {name: ids for name, ids in given.items() if ids}
     return replace(config, data=replace(config.data, **held))
+
+
+def _machines_choice(seconds: float | None) -> tuple[str, dict[str, dict[str, Any]]]:
+    """Choose a preset and changes to it by what the machine has, and say so."""
+    from grmm.train_state import gpu
+
+    if found := gpu():
+        name, memory = found
+        preset = "paper-plus" if memory >= PAPER_GIB else "small"
+        log(f"auto: {preset}, for {name} with {memory:.0f} GiB")
+        return preset, {}
+    if seconds is None:
+        raise ConfigError(f"no GPU here, and on a CPU --preset {AUTO} needs a time: --budget 1h")
+    choice = choose(seconds)
+    log(
+        f"auto: no GPU here; demo with {choice.setting}, which reached {choice.psnr_db:.1f} dB in "
+        f"{choice.budget_s:.0f} s of one core, the longest measured time that fits"
+    )
+    return "demo", choice.changes
 
 
 def config(args: argparse.Namespace) -> int:

@@ -2,9 +2,10 @@ import pytest
 
 from express50.errors import ConfigError
 from express50.files.atomic import write_json
+from grmm import train_state
 from grmm.cli import build_parser
 from grmm.cli.commands import train_config
-from grmm.config import choose
+from grmm.config import choose, resolve
 
 
 @pytest.fixture
@@ -37,16 +38,24 @@ def arguments(*words):
 def test_command_line_takes_the_measured_setting(capsys):
     """The shipped table: whatever it says reaches the configuration, and --set stands above it."""
     choice = choose(60)
-    config = train_config(arguments("--preset", "measured", "--budget", "60s"))
+    config = train_config(arguments("--preset", "auto", "--budget", "60s"))
     for table, values in choice.changes.items():
         for key, value in values.items():
             found = getattr(getattr(config, table), key)
             assert (list(found) if isinstance(found, tuple) else found) == value
     assert config.train.seconds == 60 and choice.setting in capsys.readouterr().err
-    above = arguments("--preset", "measured", "--budget", "60s", "--set", "model.n_g=32")
+    above = arguments("--preset", "auto", "--budget", "60s", "--set", "model.n_g=32")
     assert train_config(above).model.n_g == 32
 
 
-def test_a_measured_setting_needs_a_time():
+@pytest.mark.parametrize(("memory", "preset"), [(80, "paper-plus"), (8, "small")])
+def test_a_gpu_is_trained_on_at_the_size_that_it_holds(monkeypatch, capsys, memory, preset):
+    monkeypatch.setattr(train_state, "gpu", lambda: ("Some GPU", memory))
+    args = build_parser().parse_args(["train", "shards", "out"])
+    assert train_config(args) == resolve(preset)
+    assert f"{preset}, for Some GPU with {memory} GiB" in capsys.readouterr().err
+
+
+def test_a_cpu_needs_a_time():
     with pytest.raises(ConfigError, match="--budget"):
-        train_config(arguments("--preset", "measured"))
+        train_config(build_parser().parse_args(["train", "shards", "out"]))
