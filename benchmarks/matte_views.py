@@ -197,7 +197,7 @@ def measure(keyed: list[Keyed], config: MatteConfig, sheet: Path | None) -> Figu
     if ball is None:
         sys.exit("the rig looks at no one place; name another --dataset")
     views = [make_view(k.shot.camera, ball, k.shot.frame, k.alpha, config.side) for k in keyed]
-    found = agree(views, config.cells, config.strand)
+    found = agree(views, config.cells)
     after = [
         corrected(k.alpha, found.removed.get(k.shot.camera.id), found.filled.get(k.shot.camera.id))
         for k in keyed

@@ -15,6 +15,7 @@ from numpy.polynomial import Polynomial
 
 from express50.geometry.conventions import cell_centres
 from express50.geometry.shapes import check_shape
+from express50.geometry.transforms import invert_transform
 
 # Where each COLMAP parameter goes: focal x, focal y, then OpenCV's k1 k2 p1 p2 k3 k4 k5 k6.
 MODELS: dict[str, tuple[str, ...]] = {
@@ -70,10 +71,7 @@ class Camera:
     @property
     def world_from_cam(self) -> np.ndarray:
         """Return the inverse (4, 4) of ``cam_from_world``."""
-        R, t = self.cam_from_world[:3, :3], self.cam_from_world[:3, 3]
-        out = np.eye(4)
-        out[:3, :3], out[:3, 3] = R.T, -R.T @ t
-        return out
+        return invert_transform(self.cam_from_world)
 
     @property
     def center(self) -> np.ndarray:
@@ -247,8 +245,7 @@ def unproject(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarr
     """Return world points (N, 3) at pixels (N, 2) and camera depths (N,), metres."""
     pixels = np.asarray(pixels, dtype=np.float64)
     check_shape("pixels", pixels, (None, 2))
-    K = camera.K
-    xy = undistort(camera, (pixels - K[:2, 2]) / (K[0, 0], K[1, 1]))
+    xy = normalised(camera, pixels)
     p = np.concatenate([xy, np.ones((len(xy), 1))], axis=1) * np.asarray(depth)[:, None]
     return (p - camera.cam_from_world[:3, 3]) @ camera.cam_from_world[:3, :3]
 

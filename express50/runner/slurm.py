@@ -204,8 +204,16 @@ class SlurmWorkers(RemoteWorkers):
         here |= {name.rpartition("-")[0] for name in here}  # dask numbers the workers of one job
         self._seen |= {number for number, name in self._names.items() if name in here}
         queue = _call("squeue", "--noheader", "--format=%A", f"--user={getpass.getuser()}")
-        if queue.returncode == 0:  # else it does not answer
-            self._bury(set(queue.stdout.split()))
+        there = queue.stdout.split() if queue.returncode == 0 else self._names  # else no answer
+        for number in sorted(set(self._names) - set(there)):
+            del self._names[number]
+            self._silent = 0 if number in self._seen else self._silent + 1
+            if self._silent >= SILENT_JOBS:
+                raise StageError(
+                    f"{SILENT_JOBS} SLURM jobs in a row ended before their workers reached "
+                    f"this machine; {self.logs / f'{number}.out'} may say why, --print-job "
+                    "shows their script"
+                )
         processes = self.job.processes(self.threads)
         while len(self._names) < min(self.job.jobs, -(-tasks // processes)):
             try:
@@ -217,18 +225,6 @@ class SlurmWorkers(RemoteWorkers):
                 return
             if self._count == 1:
                 sys.stderr.write(f"SLURM jobs are submitted; their output is in {self.logs}\n")
-
-    def _bury(self, queue: set[str]) -> None:
-        """Forget the jobs that have left the queue; stop when too many did no work."""
-        for number in sorted(set(self._names) - queue):
-            del self._names[number]
-            self._silent = 0 if number in self._seen else self._silent + 1
-            if self._silent >= SILENT_JOBS:
-                raise StageError(
-                    f"{SILENT_JOBS} SLURM jobs in a row ended before their workers reached "
-                    f"this machine; {self.logs / f'{number}.out'} may say why, --print-job "
-                    "shows their script"
-                )
 
     def _submit(self) -> None:
         name = f"express50-{os.getpid()}-{self._count}"

@@ -13,10 +13,7 @@ WITHOUT_PLATE = ("grabcut", "salient")
 
 @dataclass(frozen=True, kw_only=True)
 class MatteConfig:
-    """Set how each camera is matted, and whether the cameras of a peak correct each other.
-
-    Lengths are shares of the image's longer side; differences are in deviations of noise.
-    """
+    """Set how each camera is matted, and whether the cameras of a peak correct each other."""
 
     method: Literal["key", "grabcut", "bgmv2", "salient"] = "key"
     """Key against the plate, and without one cut by colours and by what the other cameras see
@@ -30,10 +27,6 @@ class MatteConfig:
     """Longest side, pixels, of a tile that bgmv2 sees; larger frames are cut into tiles."""
     scale: float = 1.0
     """Key at this share of the resolution; the matte is enlarged afterwards."""
-    low: float = 1.2
-    """Difference that is as likely noise as subject; alpha is 0 below it."""
-    high: float = 6.0
-    """Difference that proves foreground; weaker pixels must touch such ones."""
     shadow: float = 0.25
     """Broad darkening of the plate up to this share is a shadow; 0 turns this off."""
     agree: bool = True
@@ -42,17 +35,11 @@ class MatteConfig:
     """Longest side, pixels, of the images that are compared between cameras."""
     cells: int = 96
     """Cells along each side of the cube in which the cameras are compared."""
-    strand: float = 0.03
-    """What reaches no further than this beyond the other cameras' hull may be hair and is kept."""
 
     def __post_init__(self) -> None:
         """Refuse values that matte nothing or everything."""
         if not 0.1 <= self.scale <= 1.0:
             raise ConfigError(f"matte.scale is {self.scale}, expected 0.1 to 1")
-        if not 0 < self.low < self.high:
-            raise ConfigError(
-                f"matte.low {self.low} and matte.high {self.high}: expected 0 < low < high"
-            )
         if not 0.0 <= self.shadow < 1.0:
             raise ConfigError(f"matte.shadow is {self.shadow}, expected 0 to below 1")
         if (self.method in NETWORKS) != bool(self.weights):
@@ -67,8 +54,6 @@ class MatteConfig:
                 f"matte.side {self.side} and matte.cells {self.cells}: expected 16 to 2048 pixels"
                 " and 16 to 256 cells"
             )
-        if not 0.01 <= self.strand < 1:
-            raise ConfigError(f"matte.strand is {self.strand}, expected 0.01 to below 1")
 
 
 PRESETS: dict[str, dict[str, object]] = {

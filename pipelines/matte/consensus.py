@@ -71,7 +71,7 @@ class Agreement:
     unchanged: str = ""
 
 
-def agree(views: Sequence[MatteView], cells: int, strand: float) -> Agreement:
+def agree(views: Sequence[MatteView], cells: int) -> Agreement:
     """Compare the views of one frame set."""
     doubted = {view.name: why for view in views if (why := _useless(view))}
     while True:
@@ -79,7 +79,7 @@ def agree(views: Sequence[MatteView], cells: int, strand: float) -> Agreement:
         if len(used) < FEWEST:
             few = f"{len(used)} usable cameras, expected {FEWEST} or more to overrule one"
             return Agreement(warnings=_named(doubted), unchanged=few)
-        removed, filled, misfits = _compare(used, cells, strand)
+        removed, filled, misfits = _compare(used, cells)
         worst = max(misfits, key=lambda name: misfits[name].size)
         # Most cameras must be right; otherwise it is unknown which is wrong.
         if misfits[worst].size <= 1 or len(doubted) >= len(views) // 3:
@@ -102,7 +102,7 @@ def _useless(view: MatteView) -> str:
 
 
 def _compare(
-    views: Sequence[MatteView], cells: int, strand: float
+    views: Sequence[MatteView], cells: int
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, Misfit]]:
     """Find what to remove and to fill in each view, and how badly it fits the others."""
     longest = max(max(view.alpha.shape) for view in views)
@@ -115,7 +115,7 @@ def _compare(
     misfits: dict[str, Misfit] = {}
     for view in views:
         mine = found[view.name]
-        bad = ruled_out(view, mine, strand)
+        bad = ruled_out(view, mine)
         spots, lacking = missed(view, mine, views, subject)
         opaque = view.alpha > INSIDE
         stray = float((opaque & ~mine.likely).sum()) / int(opaque.sum())

@@ -31,6 +31,8 @@ LARGEST_HOLE = 0.05  # share of the image that a plate-coloured hole in the subj
 REACH = 0.012  # share of the longer side: least distance from which colours are taken
 SURE = 2.0  # deviations by which a pixel of the solid must be open to count as a gap
 SPREAD = 0.2  # share by which hair may be brighter or darker than what is seen of it nearby
+LOW = 1.2  # deviations of noise: as likely noise as subject; alpha is 0 below it
+HIGH = 6.0  # deviations of noise that prove foreground; weaker pixels must touch such ones
 FIRM = 0.5  # share of the local foreground's difference that may belong to the solid inside
 CORE = 0.018  # radius of the disc that must fit inside a part of the subject for it to be solid
 FILL = 0.012  # spots and gaps in the solid subject are filled this far from its edge
@@ -75,7 +77,7 @@ def alpha_of(
     image = frame.astype(np.float32)
     difference = plate_difference(image, model, config.shadow, length)
     difference[~valid] = 0.0
-    region = subject_region(difference, config.high)
+    region = subject_region(difference)
     if not region.any():
         return alpha
     # All else happens around the subject only.
@@ -86,9 +88,9 @@ def alpha_of(
     ]
     part = PlateModel(model.plate[window], model.sigma[window], model.whiten)
     image, difference, region = image[window], difference[window], region[window]
-    support = find_support(difference > 2 * config.low, region, length)
+    support = find_support(difference > 2 * LOW, region, length)
     if support.core.any():
-        firm = firm_pixels(image, difference, support.core, part, length, config.low)
+        firm = firm_pixels(image, difference, support.core, part, length)
         support = find_support(firm, region, length)
     alpha[window] = _opacity(image, difference, support, part, length, config)
     alpha[~valid] = 0.0
@@ -126,7 +128,7 @@ def _opacity(
     value, deviation, at_zero = solve_opacity(light[todo], behind, mean, covariance, noise)
     # In the core what is not surely open is solid, off it what is not surely subject is plate.
     solid = 1 - shrunk(1 - value, SURE * deviation)
-    strand = shrunk(value, config.low * at_zero)
+    strand = shrunk(value, LOW * at_zero)
     alpha[todo] = np.clip(np.where(core[todo], solid, strand), 0, 1)
     return alpha
 
@@ -200,14 +202,14 @@ def _darkened(
     return dark, opened(shaded < 3.0, _pixels(0.01, length)), shaded
 
 
-def subject_region(difference: np.ndarray, high: float) -> np.ndarray:
+def subject_region(difference: np.ndarray) -> np.ndarray:
     """Return the pixels (H, W) of large connected parts that differ, each with a sure pixel."""
     smooth = np.sqrt(cv2.blur(difference**2, (3, 3)))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(
         (smooth > 2.2).astype(np.uint8), connectivity=8
     )
     sure = np.zeros(count, bool)
-    sure[np.unique(labels[smooth > high])] = True
+    sure[np.unique(labels[smooth > HIGH])] = True
     sure[0] = False
     if not sure.any():
         return np.zeros(difference.shape, bool)
@@ -249,7 +251,6 @@ def firm_pixels(
     core: np.ndarray,
     model: PlateModel,
     length: int,
-    low: float,
 ) -> np.ndarray:
     """Return the pixels (H, W) bool that look opaque, given the colours of a first core.
 
@@ -259,13 +260,13 @@ def firm_pixels(
     off = image - model.plate
     own = subject_colour(image, core, length) - model.plate
     reach = _length(own, model)
-    firm = difference > np.maximum(FIRM * reach, 2 * low)
+    firm = difference > np.maximum(FIRM * reach, 2 * LOW)
     white = cv2.transform(own / model.sigma, model.whiten)
     along = np.einsum("...i,...i->...", cv2.transform(off / model.sigma, model.whiten), white)
     share = np.clip(along / (3 * np.maximum(reach, 1e-3) ** 2), 0, 1)
     misfit = _length(off - share[..., None] * own, model)
     # Half of the difference at least: light mixes along a curve in 8-bit steps.
-    return firm | (core & (misfit > np.maximum(2 * low, 0.5 * difference)))
+    return firm | (core & (misfit > np.maximum(2 * LOW, 0.5 * difference)))
 
 
 def subject_colour(image: np.ndarray, core: np.ndarray, length: int) -> np.ndarray:

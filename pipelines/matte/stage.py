@@ -72,7 +72,7 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
         for name, matte in mattes.items()
     ]
     if compares:
-        found = agree(views, config.cells, config.strand)
+        found = agree(views, config.cells)
     elif config.agree:
         found = Agreement(unchanged="the cameras do not look at one place")
     else:

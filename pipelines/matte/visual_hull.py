@@ -23,6 +23,7 @@ from express50.rigs.world_frame import meeting_point
 CUBE = 1.6  # half side of the cube, in radii of the ball
 BODY = 0.8  # radii that the subject may reach on from where it leaves the ball
 FAINT = 0.03  # alpha below this is clear background
+STRAND = 0.03  # share of the longer side that hair may reach beyond the other cameras' hull
 INSIDE = 0.5  # alpha from which a pixel shows the subject
 OUT, CLEAR, RIM, SOLID = range(4)  # what a view says of a cell
 
@@ -240,7 +241,7 @@ def _thick(view: MatteView, cells: np.ndarray) -> np.ndarray:
     return chord >= THICK * np.median(chord[opaque]) if opaque.any() else opaque
 
 
-def ruled_out(view: MatteView, evidence: Evidence, strand: float) -> np.ndarray:
+def ruled_out(view: MatteView, evidence: Evidence) -> np.ndarray:
     """Return pixels (h, w) bool of matte that show nothing which the other views leave possible.
 
     They are whole connected parts that reach further from the possible pixels than hair does.
@@ -254,7 +255,7 @@ def ruled_out(view: MatteView, evidence: Evidence, strand: float) -> np.ndarray:
     np.maximum.at(reach, parts, away)
     area = np.bincount(parts.ravel(), minlength=count)
     known = np.bincount(parts.ravel(), weights=evidence.known.ravel(), minlength=count)
-    far = (reach > strand * max(loose.shape)) & (known > 0.5 * area)
+    far = (reach > STRAND * max(loose.shape)) & (known > 0.5 * area)
     far[0] = False
     wrong = far[parts]
     # What hangs together with it is wrong by a single view's word, up to the hull of them all.

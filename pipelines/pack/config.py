@@ -15,8 +15,6 @@ class PackConfig:
     profile: Literal["compact", "fast", "lossless"] = "fast"
     """rgb as JPEG q90 4:2:0 (compact), JPEG q95 4:4:4 (fast) or PNG (lossless); alpha, parts and
     depth as PNG, or as zstd and LERC (fast), which decode in a fraction of the time."""
-    foreground: bool = True
-    """Where a pixel mixes subject and background, store the subject's own colour alone."""
     even_colour: bool = True
     """Divide out the cameras' different response to the same light, where calibration measured
     it."""

@@ -203,7 +203,7 @@ def load_sample(
     if config.min_confidence > 0:
         sure = read_image(folder / f"{camera.id}_confidence.png")
         valid = valid & (sure >= round(255 * config.min_confidence))
-    plate = read_plate_image(dataset, subject.name, camera.id) if config.foreground else None
+    plate = read_plate_image(dataset, subject.name, camera.id)
     return LoadedSample(rgb, plate, matte, alpha, depth, valid, parts, torso)
 
 
@@ -246,10 +246,7 @@ def encode_sample(
         raise StageError(
             f"its depth reaches {farthest:.2f} m; shards hold less than {DEPTH_LIMIT_M:.2f} m"
         )
-    if config.foreground:
-        rgb = cut_own_colours(loaded.rgb, loaded.matte, loaded.plate, crop, config.size)
-    else:
-        rgb = cut_image(loaded.rgb, crop, config.size)
+    rgb = cut_own_colours(loaded.rgb, loaded.matte, loaded.plate, crop, config.size)
     parts = None if loaded.parts is None else cut_labels(loaded.parts, crop, config.size)
     sample_key(subject.name, expression, camera.id)  # raises where an id cannot be a file name
     gain = subject.gains.get(camera.id, np.ones(3)) if config.even_colour else np.ones(3)

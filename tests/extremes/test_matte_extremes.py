@@ -16,7 +16,7 @@ from pipelines.matte.visual_hull import MatteView, ball_of
 from tests.pipelines.bump_head import ring
 from tests.pipelines.matte_rig import SIZE, disc, make_views, shots, with_alpha
 
-OPTIONS = {"cells": 64, "strand": 0.03}
+OPTIONS = {"cells": 64}
 
 
 def disturbed(views: list[MatteView]) -> list[MatteView]:
@@ -100,7 +100,7 @@ def test_pictures_a_pixel_wide_are_survived(size):
         alpha = np.full((size[1], size[0]), value, np.uint8)
         alpha[: size[1] // 2] = 255
         views = [make_view(camera, ball, image, alpha, 192) for camera in rig]
-        found = agree(views, 96, 0.03)
+        found = agree(views, 96)
         for view in views:
             out = corrected(alpha, found.removed.get(view.name), found.filled.get(view.name))
             assert out.shape == alpha.shape and out.dtype == np.uint8
@@ -123,6 +123,6 @@ def test_more_cameras_than_a_byte_counts(monkeypatch):
     monkeypatch.setattr(visual_hull, "VOTES", 40)  # each view is there 23 times
     views = disturbed(make_views())
     many = [replace(v, name=f"{v.name}-{k}") for k in range(23) for v in views]
-    found = agree(many, cells=16, strand=0.03)
+    found = agree(many, cells=16)
     assert len(many) == 276
     assert {name[:5] for name in found.removed} == {"cam04"}

@@ -14,7 +14,7 @@ from pipelines.matte.consensus import agree
 from pipelines.matte.stage import corrected
 from tests.pipelines.matte_rig import SIZE, disc, make_views, with_alpha
 
-OPTIONS = {"cells": 64, "strand": 0.03}
+OPTIONS = {"cells": 64}
 BACKDROP = np.array([77, 128, 102], np.uint8)
 
 

@@ -195,7 +195,7 @@ def test_pixels_without_footage_are_transparent() -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"low": 7.0}, {"scale": 0.0}, {"shadow": 1.0}, {"side": 4}, {"cells": 1000}, {"strand": 0.0}],
+    [{"scale": 0.0}, {"shadow": 1.0}, {"side": 4}, {"cells": 1000}],
 )
 def test_wrong_settings_are_refused(change) -> None:
     with pytest.raises(ConfigError, match="matte"):
