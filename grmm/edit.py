@@ -30,6 +30,15 @@ from grmm.model import HeadState
 
 ANGLES = {"neck": 3, "jaw": 3, "eyes": 6}  # axis-angles by name, radians
 CODES = ("z_id", "z_exp")
+POSES = {  # sliders of joints: controls, range in radians
+    "jaw open": (("jaw.0",), (-0.1, 0.6)),
+    "jaw sideways": (("jaw.1",), (-0.2, 0.2)),
+    "neck nod": (("neck.0",), (-0.5, 0.5)),
+    "neck turn": (("neck.1",), (-0.7, 0.7)),
+    "neck tilt": (("neck.2",), (-0.4, 0.4)),
+    "gaze up, down": (("eyes.0", "eyes.3"), (-0.4, 0.4)),
+    "gaze sideways": (("eyes.1", "eyes.4"), (-0.5, 0.5)),
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

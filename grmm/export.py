@@ -12,7 +12,6 @@ import torch
 import trimesh
 from PIL import Image
 
-from express50.errors import ConfigError
 from express50.files.atomic import write_bytes
 from express50.geometry.shapes import check_finite
 from express50.head.model import HeadModel
@@ -21,8 +20,6 @@ from grmm.config import SCALE_RANGE_MM
 from grmm.edit import HeadCodes
 from grmm.model import PinholeView
 
-OPAQUE = 0.3  # fainter Gaussians are left out of a GLB: its points cannot be translucent
-FORMATS = (".ply", ".glb", ".npz")
 SH_DC = 0.5 / math.sqrt(math.pi)  # value of the constant spherical harmonic
 
 
@@ -45,26 +42,17 @@ class GaussianCloud:
     colors: np.ndarray
 
 
-def write_export(
-    path: Path, loaded: Loaded, head: HeadCodes, view: PinholeView, points: bool = False
-) -> str:
-    """Write a head in the format of the extension; returns a description of what was written.
+def write_export(path: Path, loaded: Loaded, head: HeadCodes, view: PinholeView, form: str) -> str:
+    """Write a head in a format; returns a description of what was written.
 
-    ``.ply`` holds Gaussians in the 3DGS layout; ``.glb`` the textured mesh, or with ``points`` the
-    Gaussians' centres; ``.npz`` the arrays of `GaussianCloud`, mesh, codes and parameters.
-
-    Raises:
-        ConfigError: another extension.
+    ``ply`` holds Gaussians in the 3DGS layout; ``glb`` the textured mesh; ``npz`` the arrays of
+    `GaussianCloud`, mesh, codes and parameters.
     """
-    if path.suffix not in FORMATS:
-        raise ConfigError(f"{path}: unknown kind of file, expected one of {', '.join(FORMATS)}")
     gaussians, vertices, texture = decoded(loaded, head, view)
-    if path.suffix == ".ply":
+    if form == "ply":
         content = ply_bytes(gaussians)
-    elif path.suffix == ".npz":
+    elif form == "npz":
         content = arrays_npz(loaded, head, gaussians, vertices)
-    elif points:
-        content = points_glb(gaussians)
     else:
         write_bytes(path, mesh_glb(loaded.head, vertices, texture))
         return f"mesh of {len(vertices)} vertices, texture {len(texture)} px"
@@ -158,11 +146,3 @@ def mesh_glb(head: HeadModel, vertices: np.ndarray, texture: np.ndarray) -> byte
         vertices[pairs[:, 0]], faces.reshape(-1, 3), visual=visual, process=False
     )
     return bytes(mesh.export(file_type="glb"))
-
-
-def points_glb(gaussians: GaussianCloud) -> bytes:
-    """Encode as binary glTF the centres of Gaussians whose opacity is over OPAQUE."""
-    shown = gaussians.opacities > OPAQUE
-    colours = np.round(255 * gaussians.colors[shown].clip(0, 1)).astype(np.uint8)
-    points = trimesh.PointCloud(gaussians.means[shown], colors=colours)
-    return bytes(trimesh.Scene(points).export(file_type="glb"))

@@ -263,15 +263,20 @@ def driven(
     Raises:
         ConfigError: the clips were tracked with another head model.
     """
+    check_clips(loaded, clips)
+    for row in range(len(clips.frames)):
+        moved = {name: getattr(clips, name)[row] for name in ("expression", "neck", "jaw", "eyes")}
+        yield picture(loaded, replace(head, tracked=replace(head.tracked, **moved)), view)
+
+
+def check_clips(loaded: Loaded, clips: Sequence) -> None:
+    """Refuse, with a ConfigError, clips that were tracked with another head model."""
     known = loaded.head.expression_dirs.shape[2]
     if Path(clips.head).name != Path(loaded.head_spec).name or clips.expression.shape[1] > known:
         raise ConfigError(
             f"the clips were tracked with head model {clips.head!r} of {clips.expression.shape[1]}"
             f" expressions, the checkpoint has {loaded.head_spec!r} of {known}; track them with it"
         )
-    for row in range(len(clips.frames)):
-        moved = {name: getattr(clips, name)[row] for name in ("expression", "neck", "jaw", "eyes")}
-        yield picture(loaded, replace(head, tracked=replace(head.tracked, **moved)), view)
 
 
 def read_clips(path: Path, cue: str | None = None) -> Sequence:

@@ -28,7 +28,7 @@ from express50.console import stdout_to_stderr
 from express50.geometry.transforms import invert_transform, make_transform, quat_to_matrix
 from express50.local_server import Door
 from grmm.checkpoint import Loaded
-from grmm.edit import HeadCodes, between, controlled, principal_directions, trained_head
+from grmm.edit import POSES, HeadCodes, between, controlled, principal_directions, trained_head
 from grmm.head_crop import draw_window
 from grmm.model import Maps, PinholeView
 from grmm.render import frontal, strongest_coefficients, to_uint8
@@ -36,15 +36,6 @@ from grmm.render import frontal, strongest_coefficients, to_uint8
 REST_SECONDS = 0.35  # without a change, before the still picture is drawn
 COEFFICIENTS, DIRECTIONS = 10, 4  # sliders of each kind
 QUALITY = {True: 80, False: 95}  # JPEG, while moving and at rest
-POSES = {  # sliders of joints: controls, range in radians
-    "jaw open": (("jaw.0",), (-0.1, 0.6)),
-    "jaw sideways": (("jaw.1",), (-0.2, 0.2)),
-    "neck nod": (("neck.0",), (-0.5, 0.5)),
-    "neck turn": (("neck.1",), (-0.7, 0.7)),
-    "neck tilt": (("neck.2",), (-0.4, 0.4)),
-    "gaze up, down": (("eyes.0", "eyes.3"), (-0.4, 0.4)),
-    "gaze sideways": (("eyes.1", "eyes.4"), (-0.5, 0.5)),
-}
 SAME = "the same"  # residual code as the expression's
 SLOW_SECONDS = 0.04  # colours that take longer are not decoded while the camera moves
 TURN_DEGREES = 1.5  # under this the eye sees no other colours

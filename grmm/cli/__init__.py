@@ -138,7 +138,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--spread": {"type": float, "default": 1.0, "help": "of samples, 1 = as trained"},
     "--seed": {"type": int, "default": 0, "help": "of what is drawn at random"},
     "--columns": {"type": at_least(1), "default": 8, "help": "expressions in grid.jpg"},
-    "--points": FLAG | {"help": ".glb of the Gaussians' centres"},
+    "--format": {"choices": commands.FORMATS, "help": "default: what the file's name ends in"},
+    "--shards": {"type": Path, "help": ".html: measure the loss on this footage"},
     "--still": {"type": at_least(16), "default": 512, "help": "height once they rest, pixels"},
     "--host": {"default": "127.0.0.1", "help": "address to listen on (this machine)"},
     "--port": {"type": at_least(1, 65535), "default": 8080},
@@ -220,10 +221,16 @@ COMMANDS = {
     ),
     "export": GrmmCommand(
         handler=commands.export,
-        options=f"checkpoint out {EDIT} --points",
-        help="write a head as .ply, .glb or .npz",
+        options=f"checkpoint out {EDIT} --format --shards --drive --drive-cue",
+        help="write a head as a page that plays it (.html), .ply, .glb or .npz",
         example="grmm export run/checkpoint.pt head.glb --expression smile",
-        changes={"out": {"help": ".ply: splats; .glb: textured mesh; .npz: all arrays, codes too"}},
+        changes={
+            "out": {
+                "help": ".html: a player; .ply: splats; .glb: textured mesh; .npz: all arrays, "
+                "codes too"
+            },
+            "--drive": {"help": ".html: tracked clips that it plays"},
+        },
     ),
     "view": GrmmCommand(
         handler=commands.view,

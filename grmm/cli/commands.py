@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 AUTO = "auto"  # in place of a preset
 PAPER_GIB = 20  # a GPU's memory for the paper's size; a step takes 3.5 on a CPU, networks beside
+FORMATS = ("html", "ply", "glb", "npz")  # of an exported head
 HOLDOUTS = ("holdout_cameras", "holdout_expressions")
 CHANGEABLE = ("fit", "metrics", "loss")  # tables that may differ from those of training
 
@@ -169,11 +170,25 @@ def render(args: argparse.Namespace) -> int:
 def export(args: argparse.Namespace) -> int:
     """Write one head to a file."""
     from grmm.export import write_export
-    from grmm.render import camera_of
+    from grmm.render import camera_of, read_clips
 
+    form = args.format or args.out.suffix[1:]
+    if form not in FORMATS:
+        expected = ", ".join(f".{name}" for name in FORMATS)
+        raise ConfigError(f"{args.out}: unknown kind of file, expected one of {expected}")
+    _no_file(args.out.parent)
     loaded = _load(args.checkpoint)
     head, view = _edited_head(loaded, args), camera_of(loaded, args.camera, args.size)
-    say(f"wrote {args.out}: {write_export(args.out, loaded, head, view, args.points)}")
+    if form == "html":
+        from grmm.player import export_player
+        from grmm.shard_source import ShardSource
+
+        subject, _ = _frame(loaded, args.subject, None)
+        views = loaded.views(ShardSource(args.shards, "*")) if args.shards else None
+        clips = read_clips(args.drive, args.drive_cue) if args.drive else None
+        say(f"wrote {args.out}: {export_player(args.out, loaded, head, subject, views, clips)}")
+        return OK
+    say(f"wrote {args.out}: {write_export(args.out, loaded, head, view, form)}")
     return OK
 
 

@@ -1,0 +1,176 @@
+"""The browser player: what is distilled is the full model's, and the page draws just that."""
+
+import base64
+import html
+import io
+import json
+import re
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from benchmarks.player import CHROMIUM, chromium
+from express50.dataset.tracks import Sequence
+from express50.errors import ConfigError
+from grmm.checkpoint import load_checkpoint
+from grmm.edit import trained_head
+from grmm.metrics import psnr_db
+from grmm.model import GRMM
+from grmm.player import export_player
+from grmm.player.distillation import (
+    AvatarPose,
+    distil,
+    drawn,
+    front_view,
+    full_picture,
+    person_of,
+    posed,
+    sampled_poses,
+)
+from grmm.player.page import player_page, stored
+from grmm.train import train
+from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
+
+
+@pytest.fixture(scope="module")
+def loaded(tmp_path_factory):
+    """A model whose decoders do something, on a head whose lower half is its jaw."""
+    out = tmp_path_factory.mktemp("run")
+    train(EllipsoidSource(size=32), ellipsoid_head(), out, tiny_config())
+    result = load_checkpoint(out / "checkpoint.pt")
+    head = result.head
+    low = (head.template[:, 1] < 0).float()
+    head.skinning[:, 0], head.skinning[:, 2] = 1 - low, low
+    generator = torch.Generator().manual_seed(0)
+    model: GRMM = result.model
+    with torch.no_grad():
+        for parameter in (model.z_id, model.z_exp, model.colour.bias[:3]):
+            parameter += 0.5 * torch.randn(parameter.shape, generator=generator)
+        for layer in (model.transform.last.weight, model.mesh.expression[-1].weight):
+            layer += 0.02 * torch.randn(layer.shape, generator=generator)
+        model.opacity.bias += 2.0
+    return result
+
+
+@pytest.fixture(scope="module")
+def person(loaded):
+    return person_of(loaded, trained_head(loaded, "S000", "e0"), "S000")
+
+
+@pytest.fixture(scope="module")
+def avatar(person):
+    return distil(person)
+
+
+@pytest.fixture(scope="module")
+def whole(person):
+    return distil(person, keep_all=True)
+
+
+@torch.no_grad()
+def full_means(person, pose):
+    head = person.at(pose)
+    state = head.state(person.loaded)
+    return person.loaded.model.geometry(head.z_id, head.z_exp, state).means
+
+
+def test_the_head_itself_and_training_expressions_are_almost_exact(person, whole):
+    still = AvatarPose(parameters=person.own, weights=torch.zeros(1))
+    shown = AvatarPose(parameters=person.own + person.changes[0], weights=torch.ones(1))
+    for pose, most in ((still, 2e-6), (shown, 3e-4)):
+        ours, _, _ = posed(whole, pose)
+        assert float((ours - full_means(person, pose)).norm(dim=1).max()) < most
+
+
+def test_unseen_poses_follow_the_decoders(person, whole):
+    still = AvatarPose(parameters=person.own, weights=torch.zeros(1))
+    errors, changes = [], []
+    for pose in sampled_poses(person, 5, torch.Generator().manual_seed(7)):
+        truth = full_means(person, pose)
+        errors.append(float((posed(whole, pose)[0] - truth).norm(dim=1).mean()))
+        changes.append(float((full_means(person, still) - truth).norm(dim=1).mean()))
+    assert np.mean(errors) < 0.1 * np.mean(changes)
+
+
+def test_stored_arrays_lose_next_to_nothing(person, avatar):
+    view = front_view(person.loaded, 96)
+    back, _, _ = stored(avatar)
+    for pose in sampled_poses(person, 2, torch.Generator().manual_seed(3)):
+        ours, exact = (drawn(one, pose, view).colors.permute(2, 0, 1) for one in (back, avatar))
+        assert psnr_db(ours.detach(), exact.detach()) > 45
+        assert psnr_db(ours.detach(), full_picture(person, pose, view).detach()) > 25
+
+
+def test_the_page_is_closed_and_names_are_escaped(person, avatar):
+    name = "</title><script>alert(1)</script>"
+    page = player_page(person, avatar, name, None, 24.0)[0].decode()
+    assert "<script>alert" not in page and html.escape(name) in page
+    policy = re.search(r'Content-Security-Policy" content="([^"]+)"', page)[1]
+    assert policy.startswith("default-src 'none'") and "unsafe" not in policy
+    assert not re.search(r'https?://|src="(?!data:)|href=', page)
+
+
+def test_the_report_measures_footage_and_foreign_clips_are_refused(loaded, tmp_path):
+    head = trained_head(loaded, "S000", "e0")
+    views = loaded.views(EllipsoidSource(size=32))
+    report = export_player(tmp_path / "a.html", loaded, head, "S000", views)
+    assert report.images == 6 and report.footage == "seen" and report.loss_db < 3
+    assert "dB lost" in str(report)
+    assert "n/a" in str(replace(report, loss_db=None))
+    with pytest.raises(ConfigError, match="track them"):
+        export_player(tmp_path / "a.html", loaded, head, "S000", None, clip_of("other"))
+
+
+def clip_of(head, frames=3):
+    zeros = np.zeros((frames, 3))
+    return Sequence(
+        head=head, cues=("a",) * frames, frames=np.arange(frames), shape=np.zeros(3),
+        expression=np.zeros((frames, 4)), neck=zeros, jaw=zeros + 0.2, eyes=np.zeros((frames, 6)),
+        R=np.tile(np.eye(3), (frames, 1, 1)), t=zeros,
+    )  # fmt: skip
+
+
+@pytest.mark.skipif(not any(map(shutil.which, CHROMIUM)), reason="chromium is not installed")
+def test_a_browser_draws_what_the_rasteriser_draws(loaded, person, avatar, tmp_path):
+    """Sliders, expression codes, camera and clip, against torch's picture of the same arrays."""
+    path = tmp_path / "player.html"
+    content, back = player_page(person, avatar, "S000", clip_frames(loaded), 24.0)
+    path.write_bytes(content)
+    view = front_view(loaded, 128)
+    jaw = person.own.clone()
+    jaw[4 + 3] += 0.3
+    smile = person.own + person.changes[0]
+    poses = {
+        "0": AvatarPose(parameters=person.own, weights=torch.zeros(1)),
+        "move('jaw open', 0.3)": AvatarPose(parameters=jaw, weights=torch.zeros(1)),
+        "press('reset'); move('e1', 1)": AvatarPose(parameters=smile, weights=torch.ones(1)),
+    }
+    script = """var move = (name, value) => {
+      const input = sliders.find(slider => slider.input.name === name).input;
+      input.value = value; input.oninput(); };"""
+    with chromium(f"file://{path}#size=128", 600, 500) as page:
+        page.value(script)
+        for change, pose in poses.items():
+            page.value(change)
+            page.wait("canvas.dataset.pictures > 0 && restless > 30 && idle.length > 0")
+            page.wait("latest === asked")
+            url = page.value("canvas.toDataURL('image/png')")
+            bytes_ = io.BytesIO(base64.b64decode(url.split(",")[1]))
+            shown = np.asarray(Image.open(bytes_).convert("RGBA")).astype(np.float32) / 255
+            expected = drawn(back, pose, view)
+            ours = torch.from_numpy(shown[..., :3] * shown[..., 3:]).permute(2, 0, 1)
+            assert psnr_db(ours, expected.colors.detach().permute(2, 0, 1)) > 38, change
+        before = page.value("Number(canvas.dataset.pictures)")
+        page.value("press('play')")
+        page.wait(f"canvas.dataset.pictures > {before + 3}")
+        assert json.loads(page.value("JSON.stringify(clip.frames[0])"))[7] == 0.2
+        assert page.value("find('error').hidden")
+
+
+def clip_frames(loaded):
+    clip = clip_of(loaded.head_spec)
+    return np.concatenate([clip.expression, clip.neck, clip.jaw, clip.eyes], 1)
