@@ -5,6 +5,7 @@ A full disk becomes one error, which stops a run before it computes what cannot 
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import json
 import os
@@ -18,6 +19,7 @@ from typing import BinaryIO
 from express50.errors import DiskFullError
 
 LEAST_FREE = 100e6  # bytes; with less a disk counts as full
+AT_FDCWD, RENAME_EXCHANGE = -100, 2  # of Linux
 NO_SPACE = os.strerror(errno.ENOSPC)
 
 
@@ -100,10 +102,13 @@ def _full(path: Path, why: str) -> DiskFullError:
 def folder_in_one_step(aside: Path, target: Path) -> Iterator[Path]:
     """Yield an empty folder aside; on a clean exit it is synced and replaces ``target``.
 
-    When the body raises, a former target stays as it was. A kill between the two renames leaves
-    the target absent, never mixed. What a killed run left aside is deleted.
+    When the body raises, a former target stays as it was. A kill at any moment leaves the former
+    target or the new one; only where the file system cannot swap two folders, a kill between two
+    renames leaves none. What a killed run left aside is deleted.
     """
-    shutil.rmtree(aside, ignore_errors=True)
+    former = aside.with_name(aside.name + ".former")
+    for left in (aside, former):
+        shutil.rmtree(left, ignore_errors=True)
     aside.mkdir(parents=True)
     try:
         yield aside
@@ -112,14 +117,26 @@ def folder_in_one_step(aside: Path, target: Path) -> Iterator[Path]:
                 _sync(Path(folder) / name, os.O_RDONLY)
             sync_directory(Path(folder))
         target.parent.mkdir(parents=True, exist_ok=True)
-        former = aside.with_name(aside.name + ".former")
-        if target.exists():
+        if not target.exists():
+            aside.rename(target)
+        elif not _swap(aside, target):
             target.rename(former)
-        aside.rename(target)
+            aside.rename(target)
         sync_directory(target.parent)
         shutil.rmtree(former, ignore_errors=True)
     finally:
         shutil.rmtree(aside, ignore_errors=True)
+
+
+def _swap(one: Path, other: Path) -> bool:
+    """Exchange two folders in one step; False where the system cannot.
+
+    Source: renameat2(2), RENAME_EXCHANGE, which Python's library does not have.
+    """
+    exchange = getattr(ctypes.CDLL(None), "renameat2", None)  # glibc 2.28 and later
+    return exchange is not None and not exchange(
+        AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other), RENAME_EXCHANGE
+    )
 
 
 def sync_directory(path: Path) -> None:
