@@ -205,13 +205,15 @@ def objective(
     if state.own_terms is not None:
         terms |= state.own_terms(state, rendering, item)
     codes, gaussians = model.codes(*model.rows(*item.key.frame)), rendering.gaussians
-    return terms | {
-        "scale": weights.scale * losses.scale_mm(gaussians.scales_mm),
-        "laplacian": weights.laplacian
-        * losses.laplacian_mm2(item.state.vertices + gaussians.displacement, state.edges),
-        "displacement": weights.displacement * losses.displacement_mm2(gaussians.displacement),
-        "codes": weights.codes * losses.codes(*codes),
-    }
+    terms["scale"] = weights.scale * losses.scale_mm(gaussians.scales_mm)
+    terms["codes"] = weights.codes * losses.codes(*codes)
+    if weights.laplacian:
+        mesh = item.state.vertices + gaussians.displacement
+        terms["laplacian"] = weights.laplacian * losses.laplacian_mm2(mesh, state.edges)
+    if weights.displacement:
+        error = losses.displacement_mm2(gaussians.displacement)
+        terms["displacement"] = weights.displacement * error
+    return terms
 
 
 def report(
