@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,44 +11,26 @@ import trimesh
 from PIL import Image
 
 from express50.files.atomic import write_bytes
-from express50.geometry.shapes import check_finite
 from express50.head.model import HeadModel
 from grmm.checkpoint import Loaded
 from grmm.config import SCALE_RANGE_MM
 from grmm.edit import HeadCodes
 from grmm.model import PinholeView
-
-SH_DC = 0.5 / math.sqrt(math.pi)  # value of the constant spherical harmonic
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class GaussianCloud:
-    """N Gaussians with one colour each, head space.
-
-    Attributes:
-        means: (N, 3) metres.
-        quats: (N, 4) wxyz, unit length.
-        scales: (N, 3) standard deviations, metres.
-        opacities: (N,).
-        colors: (N, 3) in [0, 1], sRGB, as the exported view sees them.
-    """
-
-    means: np.ndarray
-    quats: np.ndarray
-    scales: np.ndarray
-    opacities: np.ndarray
-    colors: np.ndarray
+from grmm.splat_files import GaussianCloud, ply_bytes, splats_glb, spz_bytes
 
 
 def write_export(path: Path, loaded: Loaded, head: HeadCodes, view: PinholeView, form: str) -> str:
     """Write a head in a format; returns a description of what was written.
 
-    ``ply`` holds Gaussians in the 3DGS layout; ``glb`` the textured mesh; ``npz`` the arrays of
+    ``ply`` holds Gaussians in the 3DGS layout, ``spz`` in Niantic's, ``splats`` as GLB with
+    KHR_gaussian_splatting; ``glb`` the textured mesh; ``npz`` the arrays of
     `GaussianCloud`, mesh, codes and parameters.
     """
     gaussians, vertices, texture = decoded(loaded, head, view)
     if form == "ply":
         content = ply_bytes(gaussians)
+    elif form in ("spz", "splats"):
+        content = spz_bytes(gaussians) if form == "spz" else splats_glb(gaussians)
     elif form == "npz":
         content = arrays_npz(loaded, head, gaussians, vertices)
     else:
@@ -86,33 +66,6 @@ def decoded(
     texture[model.texels] = colours
     texture = (255 * texture.clamp(0, 1)).round().byte().view(side, side, 3)
     return cloud, (state.vertices + gaussians.displacement).cpu().numpy(), texture.cpu().numpy()
-
-
-def ply_bytes(gaussians: GaussianCloud) -> bytes:
-    """Encode Gaussians in the layout of 3D Gaussian Splatting (Kerbl et al. 2023), degree 0.
-
-    One ``vertex`` element of floats: x y z, nx ny nz (unused), f_dc_0..2, opacity (logit),
-    scale_0..2 (log) and rot_0..3 (wxyz). Opacities are kept within 1e-6 of 0 and 1 and scales over
-    1e-30, so that logits and logarithms are finite.
-
-    Raises:
-        ValueError: a value is not finite.
-    """
-    for name, array in vars(gaussians).items():
-        check_finite(name, array)
-    alpha = gaussians.opacities.astype(np.float64).clip(1e-6, 1 - 1e-6)
-    columns = {
-        "x y z": gaussians.means,
-        "nx ny nz": np.zeros_like(gaussians.means),
-        "f_dc_0 f_dc_1 f_dc_2": (gaussians.colors.astype(np.float64) - 0.5) / SH_DC,
-        "opacity": np.log(alpha / (1 - alpha))[:, None],
-        "scale_0 scale_1 scale_2": np.log(gaussians.scales.astype(np.float64).clip(min=1e-30)),
-        "rot_0 rot_1 rot_2 rot_3": gaussians.quats,
-    }
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(alpha)}"]
-    header += [f"property float {name}" for names in columns for name in names.split()]
-    table = np.concatenate(list(columns.values()), 1).astype("<f4")
-    return "\n".join([*header, "end_header", ""]).encode("ascii") + table.tobytes()
 
 
 def arrays_npz(

@@ -226,8 +226,8 @@ COMMANDS = {
         example="grmm export run/checkpoint.pt head.glb --expression smile",
         changes={
             "out": {
-                "help": ".html: a player; .ply: splats; .glb: textured mesh; .npz: all arrays, "
-                "codes too"
+                "help": ".html: a player; .ply, .spz, .glb with --format splats: splats; .glb: "
+                "textured mesh; .npz: all arrays, codes too"
             },
             "--drive": {"help": ".html: tracked clips that it plays"},
         },

@@ -156,7 +156,7 @@ def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
         (["config", "trian"], 2, "'trian'"),
         (["render", "{out}/absent.pt", "{out}"], 1, "absent.pt: no such file"),
         (["render", "{checkpoint}", "{out}", "--subject=S9"], 2, "knows no subject S9"),
-        (["export", "{checkpoint}", "{out}/head.obj"], 2, "expected one of .html, .ply"),
+        (["export", "{checkpoint}", "{out}/head.obj"], 2, "expected one of .html, .ply, .spz"),
     ],
 )  # fmt: skip
 def test_errors_are_one_line_and_set_the_exit_code(

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grmm.export import GaussianCloud, ply_bytes
+from grmm.splat_files import GaussianCloud, ply_bytes
 
 
 @pytest.fixture
