@@ -4,12 +4,13 @@ The twin records one person bare and with each of the things, and the stages up 
 run with their defaults; `off` runs ``track``, ``depth`` and ``regions`` without what they do about
 things before the face, on the same mattes.
 
-``iou`` is that of the labels of what hides the face (apparel, hand, hair) against the truth, over
-the pixels at which the face of the bare head mesh would be seen; a lens is apparel. The ratios say
-what a thing costs, with it over without: ``face_error_ratio`` of the rms vertex error of the face,
-hidden or not; ``depth_error_ratio`` and ``depth_coverage_ratio`` of the mean error and the known
-share of the face's skin that is truly seen. ``together`` pools the kinds. Seconds are processor
-seconds of the three stages per expression. The last line is one JSON object.
+``iou`` is that of the label of what hides the face (apparel, hand, hair) against the truth, over
+the pixels at which the face of the bare head mesh would be seen. A lens is apparel; where hair
+truly hides the face, hair alone is asked for. The ratios say what a thing costs, with it over
+without: ``face_error_ratio`` of the rms vertex error of the face, hidden or not;
+``depth_error_ratio`` and ``depth_coverage_ratio`` of the mean error and the known share of the
+face's skin that is truly seen. ``together`` pools the kinds. Seconds are processor seconds of the
+three stages per expression. The last line is one JSON object.
 """
 
 from __future__ import annotations
@@ -48,10 +49,14 @@ from pipelines import depth, regions, track
 KINDS = {"glasses": ("glasses",), "hand": ("hand",), "beard": ("beard", "moustache"),
          "fringe": ("fringe",)}  # fmt: skip
 FURTHER = {"microphone": ("microphone",), "mask": ("mask",)}
-COVERS = ("hair", "apparel", "hand")
+LABEL = {"glasses": "apparel", "microphone": "apparel", "mask": "apparel", "hand": "hand"}
 STAGES = (track.STAGE, depth.STAGE, regions.STAGE)
 # What is replaced for `off`.
-OFF: dict[str, object] = {}
+OFF: dict[str, object] = {
+    "pipelines.track.schedule.under_hair": lambda model, *_: np.zeros(len(model.template), bool),
+    "pipelines.regions.stage.before_face": lambda _, labels, __: np.zeros_like(labels),
+    "pipelines.regions.colour.RELEARNT": 0,
+}
 Row = dict[str, float]
 
 
@@ -66,7 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--cameras", type=int, default=14, help="of these 2 are left out")
     parser.add_argument("--side", type=int, default=448, help="pixels of the recorded footage")
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=[*KINDS, *FURTHER])
-    parser.add_argument("--ways", nargs="+", default=["on"], choices=["off", "on"])
+    parser.add_argument("--ways", nargs="+", default=["off", "on"], choices=["off", "on"])
     options = parser.parse_args(arguments)
     twin = TwinConfig(
         subjects=1, first_subject=options.subject, cameras=options.cameras, width=options.side,
@@ -79,7 +84,7 @@ def main(arguments: list[str] | None = None) -> int:
         rows = {}
         for name, worn in kinds.items():
             source = recorded(replace(twin, wear=worn), options.recording / name)
-            rows[name] = measured(*source, way)
+            rows[name] = measured(*source, way, LABEL.get(name, "hair"))
             print(way, name, summary([rows[name]], [rows["none"]]), file=sys.stderr, flush=True)
         bare = rows.pop("none")
         figures = {name: summary([row], [bare]) for name, row in rows.items()}
@@ -98,7 +103,7 @@ def recorded(config: TwinConfig, folder: Path) -> tuple[Dataset, Truth]:
     return Dataset(folder / "dataset"), Truth(folder / "truth")
 
 
-def measured(dataset: Dataset, truth: Truth, way: str) -> Row:
+def measured(dataset: Dataset, truth: Truth, way: str, label: str) -> Row:
     """Run the stages on a copy of a dataset and sum its figures over expressions and views."""
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         own = Dataset(Path(folder) / "data")
@@ -115,10 +120,10 @@ def measured(dataset: Dataset, truth: Truth, way: str) -> Row:
             if not done.ok:
                 sys.exit(f"{dataset.root}: {stage.name} failed")
         seconds = time.process_time() - began
-        return figures_of(own, truth, seconds)
+        return figures_of(own, truth, seconds, label)
 
 
-def figures_of(dataset: Dataset, truth: Truth, seconds: float) -> Row:
+def figures_of(dataset: Dataset, truth: Truth, seconds: float, label: str) -> Row:
     """Compare labels, mesh and depth maps of the one subject with the truth."""
     (subject,) = dataset.subjects()
     tracked = read_track(dataset.track_file(subject))
@@ -137,8 +142,9 @@ def figures_of(dataset: Dataset, truth: Truth, seconds: float) -> Row:
             first, _ = visible_faces(true, faces, camera)
             face = (first >= 0) & on_face[faces[first]].all(-1)
             labels = read_image(dataset.item_dir("regions", item) / f"{name}.png")
-            found = label_mask(labels, *COVERS) & face
-            hidden = label_mask(true_labels(truth, subject, frame, camera), *COVERS) & face
+            kinds = true_labels(truth, subject, frame, camera)
+            asked = face & ~label_mask(kinds, "hair") if label != "hair" else face
+            found, hidden = (label_mask(part, label) & asked for part in (labels, kinds))
             both, either = both + (found & hidden).sum(), either + (found | hidden).sum()
             path = depth_file(dataset.item_dir("depth", item), name)
             if path is None:

@@ -12,7 +12,8 @@ parameters, with world = R @ head + t in the cameras' world (``offsets`` says wh
 ``<subject>.offsets.npy`` beside the shards is to be added to the rest shape, ``registered`` whether
 ``<subject>.registered.npz`` has the expression's mesh on the surface); ``label`` (who chose the
 frame), ``torso`` (removed or kept in alpha and depth), ``parts`` (whether there are labels),
-``crop``, ``source_size``, ``consent``, ``licence``, ``session``.
+``occluded`` (share of the face that each of hand and apparel hides), ``crop``, ``source_size``,
+``consent``, ``licence``, ``session``.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> Result:
 
 STAGE = Stage(
     name="pack",
-    version=10,
+    version=11,
     config=PackConfig,
     presets=PRESETS,
     items=items,

@@ -10,6 +10,7 @@ import numpy as np
 from express50.capture.frames import read_cameras_of, read_gains, read_peak_frame, read_plate_image
 from express50.capture.index import read_index, read_peaks
 from express50.contract.layout import Dataset
+from express50.contract.segmentation_labels import label_mask
 from express50.contract.stage import Note
 from express50.dataset.depth_files import depth_file, read_depth
 from express50.dataset.tracks import (
@@ -43,6 +44,7 @@ from pipelines.pack.crop import (
     head_crop,
 )
 
+FACE = ("skin", "lips", "eyes", "teeth", "tongue", "mouth")
 PARAMETERS = ("expression", "neck", "jaw", "eyes", "R", "t")
 
 
@@ -226,6 +228,13 @@ def _read_regions(
     return read_alpha(paths[0]), None if torso_unknown else read_alpha(paths[1])
 
 
+def occluded(parts: np.ndarray) -> dict[str, float]:
+    """Measure the share of the face that hands and apparel hide in labels (H, W), by their name."""
+    counts = {name: int(label_mask(parts, name).sum()) for name in ("hand", "apparel")}
+    face = int(label_mask(parts, *FACE).sum()) + sum(counts.values())
+    return {name: round(count / face, 4) for name, count in counts.items() if count}
+
+
 def encode_sample(
     loaded: LoadedSample,
     subject: PackedSubject,
@@ -268,6 +277,7 @@ def encode_sample(
         "frame": subject.peaks[expression],
         "height": config.size,
         "label": subject.labels[expression],
+        "occluded": None if parts is None else occluded(parts),
         "parts": parts is not None,
         "source_size": [camera.width, camera.height],
         "torso": loaded.torso,

@@ -57,7 +57,7 @@ def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> Result
 
 STAGE = Stage(
     name="regions",
-    version=3,
+    version=4,
     config=RegionsConfig,
     presets=PRESETS,
     items=peak_items,
@@ -67,7 +67,7 @@ STAGE = Stage(
     needs_gpu=needs_gpu,
     help="label skin, hair, neck and torso in each view, and cut the torso from the matte",
     purpose="The tracked mesh, each view's colours and depth label skin, ears, lips, eyes, mouth,"
-    " hair, neck and torso; a second matte holds the head alone.",
+    " hair, neck, torso, glasses and hands; a second matte holds the head alone.",
     growth=Growth(
         items=("subjects", "expressions"), time=("views", "pixels"), disk=("views", "pixels")
     ),

@@ -31,6 +31,7 @@ SMOOTH = 1.5  # cells; a few hundred pixels fill a smooth histogram
 LEAST = 30  # fewest pixels that make a histogram
 FEATURES = 0.003  # share of the mesh that eyes and lips fill where a view sees the face
 SHARED = 10_000  # pixels that own and other views' skin colours each count as, if both teach
+RELEARNT = 2  # times that skin's colours are learnt again, without what proved to be hair
 RARE = 1e-6  # share of a cell that no pixel taught: keeps logarithms finite
 UNTAUGHT = 1.2e-4  # share of every cell of a class without pixels: spread over 8000 cells
 
@@ -105,12 +106,16 @@ def by_colour(
         # As much of each: the back of a neck may be in a shadow that no face is in.
         own, others = (c / np.float32(max(c.sum(), 1.0)) for c in (counts[1], skin_colours))
         counts[1] = SHARED * (own + others)
-    likelihoods = np.full((3, *labels.shape), np.log(UNTAUGHT), np.float32)
-    for row, taught in zip(likelihoods, counts, strict=True):
-        if taught.sum() >= LEAST:
-            shares = gaussian_filter(taught, SMOOTH) / taught.sum()
-            row[:] = np.log(np.maximum(shares, 0) + RARE)[cells]
-    best = (likelihoods + _priors(labels, geometry, beyond)).argmax(0)
+    priors = _priors(labels, geometry, beyond)
+    best = (_likelihoods(counts, cells) + priors).argmax(0)
+    for _ in range(RELEARNT):
+        beard = skin & (best == 0)
+        if not beard.any() or (skin & ~beard).sum() < LEAST:
+            break
+        # A beard or a fringe was among the skin that taught: the face is looked at again without.
+        counts[1] = np.maximum(counts[1] - _counts(cells, beard), 0)
+        skin = skin & ~beard
+        best = (_likelihoods(counts, cells) + priors).argmax(0)
     around = (geometry.mesh > 0) | geometry.rim | bare
     kept = np.isin(geometry.near, (SKIN, NECK, EARS)) & around
     skin_label = np.where(kept, geometry.near, SKIN)
@@ -119,6 +124,16 @@ def by_colour(
 
 
 Cells = tuple[np.ndarray, ...]
+
+
+def _likelihoods(counts: list[np.ndarray], cells: Cells) -> np.ndarray:
+    """Return log-likelihoods (3, H, W) of hair, skin and torso from counts (CELLS) of each."""
+    found = np.full((3, *cells[0].shape), np.log(UNTAUGHT), np.float32)
+    for row, taught in zip(found, counts, strict=True):
+        if taught.sum() >= LEAST:
+            shares = gaussian_filter(taught, SMOOTH) / taught.sum()
+            row[:] = np.log(np.maximum(shares, 0) + RARE)[cells]
+    return found
 
 
 def _cells(rgb: np.ndarray) -> Cells:

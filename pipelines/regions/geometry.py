@@ -19,8 +19,10 @@ from express50.head.model import HeadModel
 
 SCALP = len(LABELS)
 """Skin that may bear hair: a label of the mesh alone, never written."""
+APPAREL = LABELS.index("apparel")
 HAIR, TORSO = np.uint8(LABELS.index("hair")), np.uint8(LABELS.index("torso"))
 BEARINGS = 36  # around the neck, at which the height of its lower end is known
+CLEAR_M, HAND_M, WIDTH_M = 0.007, 0.022, 0.006  # off the face; a hand's back; least width
 RIM_M = 0.005  # what juts out this far beyond the mesh is still what the mesh shows there
 # Sheets that are seen from outside only; from inside one looks through the neck's open end.
 _OUTER = tuple(LABELS.index(name) for name in ("skin", "ears", "lips", "neck")) + (SCALP,)
@@ -178,12 +180,14 @@ class HeadGeometry:
         near: (H, W) uint8 label at the nearest pixel of the mesh; 0 if no pixel shows it.
         rim: (H, W) bool, just beyond the mesh.
         height: (H, W) float32 metres above the neck's end; inf if the model does not mark it.
+        off: (H, W) float32 metres from the mesh to what stands before it; 0 where nothing does.
     """
 
     mesh: np.ndarray
     near: np.ndarray
     rim: np.ndarray
     height: np.ndarray
+    off: np.ndarray
 
     def labels(self) -> np.ndarray:
         """Label all pixels (H, W) uint8 by geometry alone, whatever the matte.
@@ -218,7 +222,7 @@ def place(
     hit = mesh > 0
     if not hit.any():
         height = np.full(mesh.shape, np.inf if head.end is None else -np.inf, np.float32)
-        return HeadGeometry(mesh, mesh, hit, height)
+        return HeadGeometry(mesh, mesh, hit, height, np.zeros_like(height))
     row, column, pixels = _nearest(hit)
     surface = mesh_depth[row, column]
     rim = ~hit & (pixels * surface / camera.K[0, 0] <= rim_m)
@@ -227,11 +231,44 @@ def place(
         there = _nearest(known)[:2]
         surface = depth[there]
     height = np.full(mesh.shape, np.inf, np.float32)
+    off = np.zeros(mesh.shape, np.float32)
+    y, x = np.nonzero(alpha > 0)
+    points = unproject(camera, opencv_pixels_to_corner(np.stack([x, y], axis=1)), surface[y, x])
     if head.end is not None:
-        y, x = np.nonzero(alpha > 0)
-        points = unproject(camera, opencv_pixels_to_corner(np.stack([x, y], axis=1)), surface[y, x])
         height[y, x] = head.end.height(points)
-    return HeadGeometry(mesh, mesh[row, column], rim, height)
+    if depth is not None:
+        before = (depth[y, x] > 0) & (mesh_depth[y, x] > depth[y, x])
+        places = o3d.core.Tensor((points[before] - head.center).astype(np.float32))
+        off[y[before], x[before]] = head.scene.compute_distance(places, nthreads=1).numpy()
+    return HeadGeometry(mesh, mesh[row, column], rim, height, off)
+
+
+def before_face(geometry: HeadGeometry, labels: np.ndarray, metre_px: float) -> np.ndarray:
+    """Label what stands off the face (H, W) uint8: hand or apparel, 0 elsewhere.
+
+    A part of the picture counts that is wider than hairs and clear of the mesh; hair, of which
+    `labels` (H, W) tell, is left out. Glasses stand closely before the eyes, hands further off.
+    ``metre_px`` is how many pixels a metre spans at the head.
+    """
+    face = label_mask(geometry.mesh, "skin", "lips", "eyes")
+    clear = face & (geometry.off > CLEAR_M) & (labels != HAIR)
+    size = max(3, int(WIDTH_M * metre_px) // 2 * 2 + 1)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    solid = cv2.morphologyEx(clear.astype(np.uint8), cv2.MORPH_OPEN, kernel)
+    count, part = cv2.connectedComponents(solid, connectivity=8)
+    found = np.zeros(labels.shape, np.uint8)
+    eyes = geometry.mesh == LABELS.index("eyes")
+    for k in range(1, count):
+        here = part == k
+        far = np.quantile(geometry.off[here], 0.9)
+        if far > HAND_M:
+            found[here] = LABELS.index("hand")
+        elif (here & eyes).any():
+            # A lens and its frame bulge; where they end, the surface runs back to the skin.
+            outline = cv2.convexHull(cv2.findNonZero(here.astype(np.uint8)))
+            whole = cv2.fillConvexPoly(np.zeros_like(found), outline, 1)
+            found[(cv2.dilate(whole, kernel) > 0) & (geometry.mesh > 0)] = APPAREL
+    return found
 
 
 def _nearest(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

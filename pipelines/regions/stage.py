@@ -25,6 +25,7 @@ from pipelines.regions.geometry import (
     HAIR,
     SCALP,
     TrackedHead,
+    before_face,
     head_alpha,
     head_labels,
     make_head,
@@ -195,6 +196,10 @@ def label_view(
     geometry = place(head, camera, alpha, depth)
     labels = by_colour(rgb, alpha, geometry, bare, skin_colours)
     labels = np.where(labels == SCALP, SKIN if bare else HAIR, labels)
+    if depth is not None:
+        distance = np.linalg.norm(head.center - camera.center)
+        thing = before_face(geometry, labels, camera.K[0, 0] / distance)
+        labels = np.where(thing > 0, thing, labels)
     return ViewLabels(np.where(alpha > 0, labels, np.uint8(0)), geometry.mesh > 0)
 
 

@@ -25,7 +25,7 @@ from express50.geometry.raycast import mesh_scene
 from express50.geometry.sampling import bilinear_slope
 from express50.head.model import HeadModel, vertex_normals
 from pipelines.track.basis import in_regions
-from pipelines.track.surface import SignedDistance, Visibility, look_up
+from pipelines.track.surface import FEATURES, SignedDistance, Visibility, like_skin, look_up
 from pipelines.track.terms import MeshPlaces, Residuals, huber
 
 # Head outlines count as about this many independent points per view.
@@ -36,13 +36,7 @@ EDGE_SIGMA_M = 0.0015
 # Where hair, cloth or shoulders may stand before the skin: standard deviation of their thickness,
 # and the gap (metres) at which what lies inside the matte stops to pull.
 COVER_SIGMA_M, HAIR_GAP_M, BALD_GAP_M = 0.008, 0.004, 0.03
-FEATURES = (
-    "lips", "left_eye_region", "right_eye_region", "left_eyeball", "right_eyeball",
-    "mouth_interior", "teeth", "tongue",
-)  # fmt: skip
-# Of the natural logarithm of the face's brightness and of its two ratios of colours.
-LEAST_SPREAD = np.array([0.2, 0.03, 0.03])
-WITHIN, BALD_SHARE = 3.0, 0.6
+BALD_SHARE = 0.6
 LEAST_SEEN = 0.06  # of the scalp: temples alone are bare on most people
 COVERED = ("neck", "scalp", "forehead", "left_ear", "right_ear")
 BARE = ("face", "nose", "lips")
@@ -173,9 +167,10 @@ def outline_terms(
     mesh: np.ndarray,
     pictures: int,
     bald: bool,
+    hidden: np.ndarray,
 ) -> list[OutlineTerm]:
-    """Make the outline terms of one frame set on the current mesh (V, 3)."""
-    allowed = in_regions(model, BARE + COVERED) & ~in_regions(model, ("boundary",))
+    """Make a frame set's outline terms on the current mesh (V, 3); `hidden` (V,) is left out."""
+    allowed = in_regions(model, BARE + COVERED) & ~in_regions(model, ("boundary",)) & ~hidden
     covered = in_regions(model, ("neck",) if bald else COVERED)
     faces, terms = model.faces.numpy(), []
     for distance in distances:
@@ -209,10 +204,4 @@ def bare_share(
         return 0.0
     middle = np.full(mesh.shape, np.nan)
     middle[known] = np.nanmedian(values[:, known], axis=0)
-    r, g, b = middle.T
-    # Shading changes brightness much, ratios of colours little.
-    colour = np.stack([(r + g + b) / 3.0, r - g, g - b], axis=1)
-    usual = np.median(colour[face], axis=0)
-    spread = 1.4826 * np.median(np.abs(colour[face] - usual), axis=0)
-    off = np.abs(colour[scalp] - usual) / np.maximum(spread, LEAST_SPREAD)
-    return float((off < WITHIN).all(1).mean())
+    return float(like_skin(middle[scalp], middle[face]).mean())

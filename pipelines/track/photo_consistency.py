@@ -19,12 +19,17 @@ from express50.geometry.cameras import Camera, project_pinhole, project_with_slo
 from express50.geometry.conventions import corner_to_cell
 from express50.geometry.raycast import mesh_scene
 from express50.head.model import HeadModel
+from pipelines.track.basis import in_regions
 from pipelines.track.surface import (
     COVERED,
+    FEATURES,
+    SEEN,
     FrameSetCrops,
     Visibility,
+    like_skin,
     sample_normals,
     spread,
+    view_colours,
     view_weights,
 )
 from pipelines.track.terms import MeshPlaces, NormalTerm
@@ -44,6 +49,10 @@ SIGMA_PX = 0.8
 SLANT = 0.4
 # Hair and cloth may cover neck and ears: fewer samples per sample of the face, and less trust.
 COVERED_SHARE, COVERED_TRUST = 0.25, 0.3
+
+# Share of neighbouring samples that are unlike skin from which on a beard or a fringe covers them;
+# brows and nostrils are narrower.
+BESIDE, COVERING = 40, 0.65
 
 SkinSamples = list[tuple[MeshPlaces, float]]
 """Where the surface is searched for, and the trust in what is found there."""
@@ -219,15 +228,19 @@ def patch_terms(
     mesh: np.ndarray,
     reach: float,
     weight: float,
+    covered: np.ndarray | None = None,
 ) -> list[NormalTerm]:
     """Search a frame set's surface about the current mesh (V, 3).
 
-    `reach` is in metres to either side, `weight` the trust in the result.
+    `reach` is in metres to either side, `weight` the trust in the result; what is `covered` (V,) is
+    left out.
     """
     faces = model.faces.numpy()
     images = [(root @ GREY, camera) for root, camera in pictures.images()]
     visibility, terms = Visibility(mesh, faces), []
     for samples, trust in skin:
+        if covered is not None:
+            samples = samples.some(~covered[samples.vertices].any(1))
         places, normals = samples.at(mesh), sample_normals(samples, mesh)
         views = view_weights(visibility, pictures, places, normals)
         views = np.where(views > SLANT, views**2, 0.0)
@@ -236,3 +249,29 @@ def patch_terms(
         if term is not None:
             terms.append(term)
     return terms
+
+
+def under_hair(
+    model: HeadModel, skin: SkinSamples, pictures: FrameSetCrops, mesh: np.ndarray
+) -> np.ndarray:
+    """Return the vertices (V,) bool of the face that hair hides on the mesh (V, 3), by colour.
+
+    There most of the skin around is unlike the rest of the face: a beard, or a fringe. Views agree
+    on the surface of hair as well as on skin, so that it would be taken for skin.
+    """
+    samples = skin[0][0]
+    samples = samples.some(~in_regions(model, FEATURES)[samples.vertices].any(1))
+    places, normals = samples.at(mesh), sample_normals(samples, mesh)
+    views = view_weights(Visibility(mesh, model.faces.numpy()), pictures, places, normals)
+    seen = np.flatnonzero((views > 0).any(0))
+    hidden = np.zeros(len(mesh), bool)
+    if len(seen) < 2 * BESIDE:
+        return hidden
+    views = views[:, seen, None]
+    logs = np.log(np.maximum(view_colours(pictures.images(), views[..., 0], places[seen]), 0.01))
+    middle = np.nanmedian(np.where(views > 0, logs, np.nan), axis=0)
+    odd = ~like_skin(middle, middle)
+    face = np.flatnonzero(in_regions(model, SEEN))
+    near = cKDTree(places[seen]).query(mesh[face], BESIDE)[1]
+    hidden[face] = odd[near].mean(1) > COVERING
+    return hidden

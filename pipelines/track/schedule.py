@@ -16,17 +16,23 @@ from pipelines.track.eyes_and_jaw import EyeOffsets, with_irises_and_jaw
 from pipelines.track.face_uv import FaceUvMap, make_uv_map, reading_map, slide_term, with_slide
 from pipelines.track.fit import fit
 from pipelines.track.outline import BALD_SHARE, bare_share, outline_terms
-from pipelines.track.photo_consistency import SkinSamples, patch_terms, skin_samples
+from pipelines.track.photo_consistency import (
+    SkinSamples,
+    patch_terms,
+    skin_samples,
+    under_hair,
+)
 from pipelines.track.skin_flow import FINE, flow_term, skin_map
 from pipelines.track.state import State, Target, all_vertices, rotations
 from pipelines.track.surface import FrameSetCrops
-from pipelines.track.terms import NormalTerm, SlideTerm
+from pipelines.track.terms import NormalTerm, SlideTerm, landmark_anchors
 
 LANDMARK_STEPS = 14  # of the first fit, to landmarks alone; 6 measure the same on the twin
 ROUND_STEPS = 4
 EYE_ROUNDS = 2  # irises and visible jaw lines are found anew at least so often
 PATCH_REACH_M = 0.008  # of the first search, to either side of the mesh
 NARROWING, NARROWINGS = 0.6, 3  # factor of the reach from round to round, and how often
+IN_HAIR = 30.0  # times a landmark's standard deviation, where hair is around it
 FOLLOWING = 3  # rounds in which the skin is followed
 # Far from the surface, whole patches of skin may match wrongly together: trust grows by this
 # factor towards the last round.
@@ -141,15 +147,18 @@ def refine(
         flows = skin_flows(model, targets, evidence, meshes) if one.follow_skin else {}
         for index, (target, pictures) in enumerate(zip(targets, evidence.pictures, strict=True)):
             mesh, terms = meshes[index], [*target.terms]
+            hidden = under_hair(model, evidence.skin, pictures, mesh)
             if one.outlines:
-                terms += outline_terms(model, pictures.distances, mesh, outlines, evidence.bald)
+                terms += outline_terms(
+                    model, pictures.distances, mesh, outlines, evidence.bald, hidden
+                )
             if one.patch_reach_m:
                 reach, weight = one.patch_reach_m, one.patch_weight
-                terms += patch_terms(model, evidence.skin, pictures, mesh, reach, weight)
+                terms += patch_terms(model, evidence.skin, pictures, mesh, reach, weight, hidden)
             if one.read_uv and evidence.uv_map is not None:
                 slides[index] = slide_term(model, evidence.uv_map, pictures, mesh)
             terms += flows.get(index, [])
-            seen = replace(target, terms=tuple(terms))
+            seen = replace(target, terms=tuple(terms), sigma=doubted(model, target.sigma, hidden))
             seen = with_irises_and_jaw(model, seen, mesh, turns[index], evidence.eyes)
             found.append(with_slide(seen, slides[index]))
         if one.follow_skin:
@@ -163,6 +172,17 @@ def refine(
         )
         state, _ = fit(basis, found, state, ROUND_STEPS, free)
     return state, found
+
+
+def doubted(model: HeadModel, sigma: np.ndarray, hidden: np.ndarray) -> np.ndarray:
+    """Return landmarks' sigma (views, 68) with those in hair vague, as `hidden` (V,) says.
+
+    Detectors take a beard's rim for the jaw, and shift the mouth within it.
+    """
+    marks = hidden[landmark_anchors(model).vertices].any(1)
+    factor = np.where(marks, IN_HAIR, 1.0)
+    factor[:17][marks[:17]] = np.inf
+    return sigma * factor
 
 
 def skin_flows(

@@ -21,6 +21,10 @@ SEEN = (
     "face", "nose", "lips",
     "left_eye_region", "right_eye_region", "left_eyeball", "right_eyeball",
 )  # fmt: skip
+FEATURES = (
+    "lips", "left_eye_region", "right_eye_region", "left_eyeball", "right_eyeball",
+    "mouth_interior", "teeth", "tongue",
+)  # fmt: skip
 # Skin that hair and cloth may lie before: its shape can be searched for, its colours not trusted.
 COVERED = ("neck", "left_ear", "right_ear")
 HIDDEN = ("mouth_interior", "boundary", "scalp", "teeth", "tongue")
@@ -29,6 +33,8 @@ TOUCH_M = 3e-4
 # What hides a sample is part of the head: rays begin so far before it, none behind its camera.
 HEAD_M = 0.5
 GRAZING = 0.25
+# Of the natural logarithm of the face's brightness and of its two ratios of colours.
+LEAST_SPREAD, WITHIN = np.array([0.2, 0.03, 0.03]), 3.0
 MARGIN = 0.15  # about the head in its crop, as a share of the head's size
 
 
@@ -213,6 +219,19 @@ def view_weights(
         for crop in pictures.crops
     ]
     return np.array(rows).reshape(-1, len(places))
+
+
+def like_skin(values: np.ndarray, face: np.ndarray) -> np.ndarray:
+    """Return which colours (N, 3) are like most of the face's (M, 3); logarithms of root light."""
+
+    def ratios(logs: np.ndarray) -> np.ndarray:
+        # Shading changes brightness much, ratios of colours little.
+        r, g, b = logs.T
+        return np.stack([(r + g + b) / 3.0, r - g, g - b], axis=1)
+
+    usual = np.median(ratios(face), axis=0)
+    spread = 1.4826 * np.median(np.abs(ratios(face) - usual), axis=0)
+    return (np.abs(ratios(values) - usual) < WITHIN * np.maximum(spread, LEAST_SPREAD)).all(1)
 
 
 def view_colours(

@@ -66,11 +66,12 @@ def test_empty_and_full_mattes() -> None:
     assert np.array_equal(labels_of(SCENE.camera, empty + 1, unknown), full)  # knows nothing
 
 
-def test_a_head_that_is_all_hidden_by_something_keeps_its_place() -> None:
-    """A board before the head is beyond what a mesh can know; the labels stay the mesh's."""
+def test_what_hides_all_of_a_face_is_not_the_face() -> None:
     depth = np.full(SCENE.alpha.shape, 0.5, np.float32)
     labels = labels_of(SCENE.camera, np.ones(SCENE.alpha.shape), depth)
-    assert label_mask(labels, "eyes").sum() == label_mask(SCENE.labels, "eyes").sum()
+    assert not label_mask(labels, "eyes").any()
+    face = label_mask(SCENE.labels, "eyes", "lips")
+    assert (labels[face] == LABELS.index("hand")).mean() > 0.9
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 1), (2, 3)])

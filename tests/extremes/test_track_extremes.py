@@ -142,7 +142,9 @@ def test_empty_mattes_show_nobody(tmp_path) -> None:
     assert search(crops, mesh) is None
     assert texture(tmp_path, crops, mesh) is None
     assert signed_distance(empty, rig()[0]) is None
-    assert outline_terms(ball_head(), (), mesh, 0, bald=False) == []
+    assert (
+        outline_terms(ball_head(), (), mesh, 0, bald=False, hidden=np.zeros(len(mesh), bool)) == []
+    )
 
 
 def test_no_camera_at_all(tmp_path) -> None:

@@ -28,7 +28,7 @@ from pipelines.pack import STAGE as PACK
 from pipelines.pack.card import people_lines, split_subjects
 from pipelines.pack.config import PackConfig
 from pipelines.pack.crop import Crop, crop_pinhole, cut_depth, cut_image, cut_labels, head_crop
-from pipelines.pack.sample import nameless
+from pipelines.pack.sample import nameless, occluded
 from pipelines.pack.stage import warn_of_gaps
 from tests.pipelines.bump_dataset import make_dataset, published
 
@@ -392,3 +392,10 @@ def test_labels_are_cut_by_the_nearest_pixel():
     assert set(np.unique(small)) == {0, 7} and (small == 7).sum() == 4 * 200
     assert (cut_labels(labels, Crop(50, 30, 40), 10) == 0).all()
     assert cut_labels(labels, Crop(0, 0, 1), 16).shape == (16, 16)
+
+
+def test_what_hides_the_face_is_measured():
+    parts = np.array([["skin", "lips", "hand", "hand", "hair", "torso", "apparel", "eyes"]])
+    labels = np.vectorize(LABELS.index)(parts).astype(np.uint8)
+    assert occluded(labels) == {"hand": 0.3333, "apparel": 0.1667}
+    assert occluded(labels[:, :2]) == {}

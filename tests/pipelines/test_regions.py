@@ -18,7 +18,15 @@ from express50.head.model import pose
 from pipelines.regions import STAGE
 from pipelines.regions.colour import decide, face_colours, scalp_votes
 from pipelines.regions.config import RegionsConfig
-from pipelines.regions.geometry import SCALP, head_alpha, head_labels, make_head, place, see
+from pipelines.regions.geometry import (
+    SCALP,
+    before_face,
+    head_alpha,
+    head_labels,
+    make_head,
+    place,
+    see,
+)
 from pipelines.regions.stage import label_view
 from tests.pipelines.bump_dataset import make_dataset, published
 from tests.pipelines.region_scenes import COLOURS, RegionScene, camera_at, make_scene, tracked
@@ -281,3 +289,22 @@ def test_items_without_track_or_mattes_fail_in_one_line(tmp_path) -> None:
 def test_settings_out_of_range_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"regions\.image_side"):
         RegionsConfig(image_side=8)
+
+
+@pytest.mark.parametrize(("off", "name"), [(0.03, "hand"), (0.012, "apparel"), (0.002, None)])
+def test_what_stands_off_the_face_is_a_hand_or_glasses(off: float, name: str | None) -> None:
+    head, camera = tracked(), camera_at(0)
+    mesh, depth = see(head, camera)
+    y, x = np.nonzero(mesh == LABELS.index("eyes"))
+    box = np.s_[y.min() - 3 : y.max() + 4, x.min() - 3 : x.max() + 4]
+    thing = np.zeros(mesh.shape, bool)
+    thing[box] = mesh[box] > 0
+    nearer = np.where(thing, depth - off, depth)
+    geometry = place(head, camera, np.ones(mesh.shape, np.float32), nearer)
+    assert (geometry.off[~thing] < 1e-4).all()
+    found = before_face(geometry, geometry.labels(), camera.K[0, 0] / depth[depth > 0].mean())
+    if name is None:
+        assert not found.any()
+    else:
+        assert set(np.unique(found)) == {0, LABELS.index(name)}
+        assert overlap(found, np.where(thing, LABELS.index(name), 0), name) > 0.6
