@@ -12,6 +12,7 @@ from PIL import Image
 
 from express50.files.atomic import write_bytes
 from express50.head.model import HeadModel
+from grmm.arkit import arkit_targets, with_morph_targets
 from grmm.checkpoint import Loaded
 from grmm.config import SCALE_RANGE_MM
 from grmm.edit import HeadCodes
@@ -23,8 +24,8 @@ def write_export(path: Path, loaded: Loaded, head: HeadCodes, view: PinholeView,
     """Write a head in a format; returns a description of what was written.
 
     ``ply`` holds Gaussians in the 3DGS layout, ``spz`` in Niantic's, ``splats`` as GLB with
-    KHR_gaussian_splatting; ``glb`` the textured mesh; ``npz`` the arrays of
-    `GaussianCloud`, mesh, codes and parameters.
+    KHR_gaussian_splatting; ``glb`` the textured mesh, ``arkit`` with morph targets; ``npz`` the
+    arrays of `GaussianCloud`, mesh, codes and parameters.
     """
     gaussians, vertices, texture = decoded(loaded, head, view)
     if form == "ply":
@@ -34,7 +35,8 @@ def write_export(path: Path, loaded: Loaded, head: HeadCodes, view: PinholeView,
     elif form == "npz":
         content = arrays_npz(loaded, head, gaussians, vertices)
     else:
-        write_bytes(path, mesh_glb(loaded.head, vertices, texture))
+        targets = arkit_targets(loaded, head) if form == "arkit" else {}
+        write_bytes(path, mesh_glb(loaded.head, vertices, texture, targets))
         return f"mesh of {len(vertices)} vertices, texture {len(texture)} px"
     write_bytes(path, content)
     return f"{len(gaussians.means)} Gaussians"
@@ -86,8 +88,13 @@ def arrays_npz(
     return buffer.getvalue()
 
 
-def mesh_glb(head: HeadModel, vertices: np.ndarray, texture: np.ndarray) -> bytes:
-    """Encode the textured mesh as binary glTF; vertices are split at the UV map's seams."""
+def mesh_glb(
+    head: HeadModel, vertices: np.ndarray, texture: np.ndarray, targets: dict[str, np.ndarray]
+) -> bytes:
+    """Encode the textured mesh as binary glTF; vertices are split at the UV map's seams.
+
+    ``targets`` (V, 3) by name become morph targets.
+    """
     corners = np.stack([head.faces.cpu().reshape(-1), head.uv_faces.cpu().reshape(-1)], 1)
     pairs, faces = np.unique(corners, axis=0, return_inverse=True)
     material = trimesh.visual.material.PBRMaterial(
@@ -98,4 +105,5 @@ def mesh_glb(head: HeadModel, vertices: np.ndarray, texture: np.ndarray) -> byte
     mesh = trimesh.Trimesh(
         vertices[pairs[:, 0]], faces.reshape(-1, 3), visual=visual, process=False
     )
-    return bytes(mesh.export(file_type="glb"))
+    content = bytes(mesh.export(file_type="glb"))
+    return with_morph_targets(content, pairs[:, 0], targets) if targets else content

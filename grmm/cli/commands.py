@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 AUTO = "auto"  # in place of a preset
 PAPER_GIB = 20  # a GPU's memory for the paper's size; a step takes 3.5 on a CPU, networks beside
-FORMATS = ("html", "ply", "spz", "splats", "glb", "npz")  # of an exported head
+FORMATS = ("html", "ply", "spz", "splats", "arkit", "glb", "npz")  # of an exported head
 HOLDOUTS = ("holdout_cameras", "holdout_expressions")
 CHANGEABLE = ("fit", "metrics", "loss")  # tables that may differ from those of training
 
@@ -174,7 +174,7 @@ def export(args: argparse.Namespace) -> int:
 
     form = args.format or args.out.suffix[1:]
     if form not in FORMATS:
-        expected = ", ".join(f".{name}" for name in FORMATS if name != "splats")
+        expected = ", ".join(f".{name}" for name in FORMATS if name not in ("splats", "arkit"))
         raise ConfigError(f"{args.out}: unknown kind of file, expected one of {expected}")
     _no_file(args.out.parent)
     loaded = _load(args.checkpoint)
