@@ -296,6 +296,7 @@ class HeadViews:
                     f"{where}: {name} is {array.shape}, expected the image's size {size}; pack the "
                     "dataset again"
                 )
+        check_tracked(where, sample.tracked, self.head)
         return sample
 
     def _where(self, index: int) -> str:
