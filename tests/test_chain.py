@@ -20,6 +20,7 @@ from express50.capture.index import read_index, read_peaks
 from express50.cli.main import main
 from express50.contract.layout import Dataset
 from express50.files.images import decode_image
+from express50.runner import worker
 from express50.shards.reader import ShardReader
 
 pytestmark = pytest.mark.slow
@@ -130,6 +131,70 @@ def test_a_second_run_skips_everything(dataset, twin, capsys):
         assert main([*_stage(name, dataset.root, twin), "--workers", "0", "--json"]) == 0
         account = json.loads(capsys.readouterr().out)
         assert account["skipped"] == account["read"], name
+
+
+def wrong_commands(root: Path, twin: Path, junk: Path) -> list[list[str]]:
+    """List what goes wrong by a slip of the hand, for every stage, on a finished dataset."""
+    (junk / "junk.npz").write_bytes(b"no weights")
+    (junk / "junk.toml").write_text("[track\niterations = many")
+    (junk / "old.toml").write_text("[track]\nrender_rounds = 3\n")
+    (junk / "labels.json").write_text('[{"subject": "S001"}]')
+    lost = str(junk / "lost" / "model.pth")
+    wrong = [["--set", "{stage}.unknown=1"], ["--preset", "refrence"], ["--workers", "-1"]]
+    wrong += [["--config", str(junk / name)] for name in ("lost.toml", "junk.toml")]
+    rows = [[*_stage(stage, root, twin), *(w.format(stage=stage) for w in words)]
+            for stage in STAGES for words in wrong]  # fmt: skip
+    for stage, setting in [
+        ("matte", 'method="bgmv2"'), ("matte", f'weights="{lost}"'),
+        ("matte", f'weights="{junk / "junk.npz"}"'), ("matte", 'method="gren"'),
+        ("track", f'landmarks="{junk / "junk.npz"}"'), ("track", 'landmarks="fan:lost.pt"'),
+        ("track", f'head="{lost}"'), ("track", "clip_rounds=maybe"),
+        ("depth", "voxel_mm=-1"), ("depth", "voxel_mm=nan"), ("register", "weight=few"),
+        ("regions", f'segmentation="{lost}"'), ("pack", "size=-4"), ("pack", 'profile="gif"'),
+        ("calibrate", 'camera_model="FISHEYE"'), ("align", 'accept="all"'),
+    ]:  # fmt: skip
+        rows.append([*_stage(stage, root, twin), "--set", f"{stage}.{setting}"])
+    place = str(root)
+    return [
+        *rows,
+        [*_stage("track", root, twin), "--config", str(junk / "old.toml")],
+        ["ingest", place, str(junk / "lost")], ["ingest", place, place],
+        ["track", str(junk / "nowhere")], ["depth", place, "--set", "matte.method=key"],
+        ["subject", "withdraw", place, "S999"], ["dephts", place],
+        ["annotate", "mark", place, "S009", "smile", "3", "--annotator", "me"],
+        ["annotate", "mark", place, "S001", "smile", "99999", "--annotator", "me"],
+        ["annotate", "import", place, str(junk / "labels.json")],
+        ["cameras", "import", place, "S001", str(junk / "junk.npz")],
+        ["export", place, "S001/nothing", str(junk / "out")],
+    ]  # fmt: skip
+
+
+def test_fifty_wrong_commands_change_nothing(dataset, twin, tmp_path, capsys, monkeypatch):
+    before = stage_bytes(dataset.root)
+    labels = {s: dataset.labels_file(s).read_bytes() for s in dataset.subjects()}
+    for command in random.Random(0).sample(wrong_commands(dataset.root, twin, tmp_path), 50):
+        if command[0] in STAGES:
+            command += ["--workers", "0"] * ("--workers" not in command)
+        capsys.readouterr()
+        try:
+            code = main(command)
+        except SystemExit as end:
+            code = end.code
+        error = capsys.readouterr().err
+        assert code in (1, 2), (command, error)
+        assert "Traceback" not in error and "unexpected" not in error, (command, error)
+
+    def interrupted(*args: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:  # new settings by mistake, stopped half way
+        patch.setattr(worker, "_run_and_publish", interrupted)
+        again = [*_stage("depth", dataset.root, twin), "--set", "depth.voxel_mm=3", "--workers=0"]
+        assert main(again) == 130
+    assert stage_bytes(dataset.root) == before
+    assert {s: dataset.labels_file(s).read_bytes() for s in dataset.subjects()} == labels
+    assert main(["check", str(dataset.root)]) == 0, capsys.readouterr()
+    test_a_second_run_skips_everything(dataset, twin, capsys)
 
 
 def test_kills_at_random_moments_change_no_byte(dataset, twin, tmp_path):

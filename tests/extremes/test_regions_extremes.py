@@ -128,7 +128,7 @@ def test_figures_of_nothing_are_numbers_and_named() -> None:
         ("vertices", np.nan, "vertices .*not finite.*; run 'express50 track' again"),
         ("vertices", np.inf, "vertices .*not finite"),
         ("R", np.nan, "R .*not finite"),
-        ("vertices", "short", "expected .* of its head model"),
+        ("vertices", "short", "not a track .*shape"),
         ("head", "missing", "not a track"),
         ("expressions", "other", "it is not tracked"),
     ],
