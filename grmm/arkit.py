@@ -15,6 +15,7 @@ import torch
 from express50.errors import ConfigError
 from grmm.checkpoint import Loaded
 from grmm.edit import HeadCodes, controlled
+from grmm.splat_files import FLOAT, glb_bytes
 
 SIDED = (
     "eyeBlink", "eyeLookDown", "eyeLookIn", "eyeLookOut", "eyeLookUp", "eyeSquint", "eyeWide",
@@ -93,7 +94,7 @@ def with_morph_targets(glb: bytes, positions: np.ndarray, targets: dict[str, np.
         table = np.ascontiguousarray(moved[positions], "<f4")
         view = {"buffer": 0, "byteOffset": len(body), "byteLength": table.nbytes}
         accessor = {
-            "bufferView": len(document["bufferViews"]), "componentType": 5126, "type": "VEC3",
+            "bufferView": len(document["bufferViews"]), "componentType": FLOAT, "type": "VEC3",
             "count": len(table), "min": table.min(0).tolist(), "max": table.max(0).tolist(),
         }  # fmt: skip
         primitive["targets"].append({"POSITION": len(document["accessors"])})
@@ -103,8 +104,4 @@ def with_morph_targets(glb: bytes, positions: np.ndarray, targets: dict[str, np.
     mesh["weights"] = [0.0] * len(targets)
     mesh["extras"] = {"targetNames": list(targets)}
     document["buffers"][0]["byteLength"] = len(body)
-    text = json.dumps(document, separators=(",", ":")).encode("ascii")
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text
-    chunks += struct.pack("<I4s", len(body), b"BIN\0") + body
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+    return glb_bytes(document, body)

@@ -56,13 +56,13 @@ ALWAYS = (
         paper="tracking by VHAP, 68 FAN landmarks",
         ours="our own tracker; FAN's weights are the user's",
         reason="VHAP's licence (CONTRIBUTING.md)",
-        effect="face 1.07 mm from the truth on the twin (docs/TRADEOFFS.md); VHAP was not run",
+        effect="face 1.39 mm from the truth on the twin (docs/LOG.md); VHAP was not run",
     ),
     Deviation(
         paper="depth by ProbeSDF",
         ours="a level set moved to where the views agree (pipelines/depth)",
-        reason="volume rendering gained nothing for 60 to 100 s per frame",
-        effect="median 0.332 mm; with volume rendering +0.003 mm (docs/LOG.md, Depth)",
+        reason="volume rendering gained nothing for a minute more per frame",
+        effect="median 0.293 mm with volume rendering and without (docs/LOG.md, What went)",
     ),
     Deviation(
         paper="mattes by RMBG-2.0 and BackgroundMattingV2, torso by Sapiens",

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from express50.files.images import srgb_to_linear
 from express50.geometry.shapes import check_finite
 
 SH_DC = 0.5 / math.sqrt(math.pi)  # value of the constant spherical harmonic
@@ -77,7 +78,8 @@ def splats_glb(gaussians: GaussianCloud) -> bytes:
         ValueError: a value is not finite.
     """
     _check(gaussians)
-    colours = np.concatenate([_linear(gaussians.colors), gaussians.opacities[:, None]], 1)
+    light = srgb_to_linear(gaussians.colors.clip(0, 1))  # as COLOR_0 holds it
+    colours = np.concatenate([light, gaussians.opacities[:, None]], 1)
     attributes = {
         "POSITION": gaussians.means,
         "COLOR_0": colours,
@@ -117,11 +119,16 @@ def splats_glb(gaussians: GaussianCloud) -> bytes:
         "bufferViews": views,
         "accessors": accessors,
     }
+    return glb_bytes(document, b"".join(parts))
+
+
+def glb_bytes(document: dict, body: bytes) -> bytes:
+    """Encode glTF's JSON and its buffer, whose length is a multiple of 4, as one binary file."""
     text = json.dumps(document, separators=(",", ":")).encode("ascii")
     text += b" " * (-len(text) % 4)
-    body = struct.pack("<I4s", len(text), b"JSON") + text
-    body += struct.pack("<I4s", offset, b"BIN\0") + b"".join(parts)
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks += struct.pack("<I4s", len(body), b"BIN\0") + body
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
 def spz_bytes(gaussians: GaussianCloud) -> bytes:
@@ -166,12 +173,6 @@ def _smallest_three(quats: np.ndarray) -> np.ndarray:
 
 def _bytes(values: np.ndarray) -> bytes:
     return np.floor(values + 0.5).clip(0, 255).astype(np.uint8).tobytes()
-
-
-def _linear(colours: np.ndarray) -> np.ndarray:
-    """Convert sRGB to linear light, which COLOR_0 holds."""
-    colours = colours.clip(0, 1)
-    return np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
 
 
 def _check(gaussians: GaussianCloud) -> None:

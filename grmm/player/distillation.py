@@ -159,15 +159,19 @@ def _parameters(tracked: Tracked, count: int) -> Tensor:
 
 
 @torch.no_grad()
-def distil(person: Person, keep_all: bool = False) -> Avatar:
-    """Distil a person, in twenty seconds at the demo's size; ``keep_all``: prune nothing."""
-    generator = torch.Generator().manual_seed(0)
-    avatar = _exact_parts(person)
-    avatar = _with_mesh_decoder(person, avatar, sampled_poses(person, POSES, generator))
-    if keep_all:
-        return avatar
+def distil(person: Person) -> Avatar:
+    """Distil a person, in twenty seconds at the demo's size, and leave out what never shows."""
+    generator = torch.Generator().manual_seed(2)
     poses = sampled_poses(person, PICTURES, generator)
-    return _pruned(avatar, poses, sampled_views(person.loaded, PICTURES, generator))
+    views = sampled_views(person.loaded, PICTURES, generator)
+    return _pruned(all_gaussians(person), poses, views)
+
+
+@torch.no_grad()
+def all_gaussians(person: Person) -> Avatar:
+    """Distil a person with every Gaussian of the model."""
+    poses = sampled_poses(person, POSES, torch.Generator().manual_seed(0))
+    return _with_mesh_decoder(person, _exact_parts(person), poses)
 
 
 def sampled_poses(person: Person, count: int, generator: torch.Generator) -> list[AvatarPose]:
@@ -380,14 +384,9 @@ def posed(avatar: Avatar, pose: AvatarPose) -> tuple[Tensor, Tensor, Tensor]:
     return means, quats, maps[:, 7:].clamp_min(1e-4)
 
 
-def drawn(
-    avatar: Avatar,
-    pose: AvatarPose | tuple[Tensor, Tensor, Tensor],
-    view: PinholeView,
-    grey: float = 0.0,
-) -> RenderOutput:
-    """Draw the avatar as the player does; a pose may come posed already."""
-    means, quats, scales = posed(avatar, pose) if isinstance(pose, AvatarPose) else pose
+def drawn(avatar: Avatar, pose: AvatarPose, view: PinholeView, grey: float = 0.0) -> RenderOutput:
+    """Draw the avatar as the player does."""
+    means, quats, scales = posed(avatar, pose)
     colours = torch.einsum(
         "k,knc->nc", _direction_features(view).to(avatar.colours), avatar.colours
     )
@@ -408,9 +407,8 @@ def _pruned(avatar: Avatar, poses: list[AvatarPose], views: list[PinholeView]) -
         colours = torch.full_like(avatar.colours, 0.5)
         colours[1:] = 0
         grey = replace(avatar, colours=colours.requires_grad_())
-        where = posed(avatar, pose)
         with torch.enable_grad():
-            drawn(grey, where, view).colors[..., 0].sum().backward()
+            drawn(grey, pose, view).colors[..., 0].sum().backward()
         assert colours.grad is not None
         most = torch.maximum(most, colours.grad[0, :, 0])
     least = max(FAINT_PX, float(most.topk(min(MOST, len(most))).values[-1]))

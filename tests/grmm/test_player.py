@@ -23,6 +23,7 @@ from grmm.model import GRMM
 from grmm.player import export_player
 from grmm.player.distillation import (
     AvatarPose,
+    all_gaussians,
     distil,
     drawn,
     front_view,
@@ -68,7 +69,7 @@ def avatar(person):
 
 @pytest.fixture(scope="module")
 def whole(person):
-    return distil(person, keep_all=True)
+    return all_gaussians(person)
 
 
 @torch.no_grad()
