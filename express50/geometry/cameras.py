@@ -158,7 +158,7 @@ def undistort(camera: Camera, xy: np.ndarray) -> np.ndarray:
     with np.errstate(all="ignore"):  # a point without an inverse may run away
         for _ in range(NEWTON_ROUNDS):
             error = distort(camera, ideal[todo]) - xy[todo]
-            a, b, c = _slopes(camera.dist, ideal[todo])
+            a, b, c = distortion_slopes(camera.dist, ideal[todo])
             step = np.stack([c * error[:, 0] - b * error[:, 1], a * error[:, 1] - b * error[:, 0]])
             ideal[todo] -= (step / (a * c - b * b)).T
             # Newton doubles the digits: half of them before a step are all of them after it.
@@ -173,12 +173,14 @@ def in_field(camera: Camera, xy: np.ndarray) -> np.ndarray:
     """Say which ideal normalised coordinates (N, 2) the lens pictures: not NaN, and not folded."""
     if not camera.dist.any():
         return np.isfinite(xy).all(axis=1)
-    a, b, c = _slopes(camera.dist, xy)
+    a, b, c = distortion_slopes(camera.dist, xy)
     near = (xy**2).sum(axis=1) <= _field(camera.dist.tobytes()) ** 2
     return near & (a > 0) & (a * c > b * b)
 
 
-def _slopes(dist: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def distortion_slopes(
+    dist: np.ndarray, xy: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the derivative of `distort`, symmetric, as (N,) dx/dx, dx/dy and dy/dy."""
     p1, p2 = dist[2:4]
     x, y = xy[:, 0], xy[:, 1]

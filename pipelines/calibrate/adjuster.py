@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csr_array
 
-from express50.geometry.cameras import MODELS, Camera, distort, normalised
+from express50.geometry.cameras import MODELS, Camera, distort, distortion_slopes, normalised
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
 from pipelines.calibrate.tracks import PointTracks
 
@@ -285,8 +285,8 @@ def _linearise(rig: list[Camera], tracks: PointTracks, points: np.ndarray) -> _L
         focal = camera.K[[0, 1], [0, 1]]
         bent, step = distort(camera, xy), 1e-6
         errors[mine] = bent * focal + camera.K[:2, 2] - tracks.pixels[mine]
-        by_xy = [(distort(camera, xy + d) - bent) * (focal / step) for d in step * np.eye(2)]
-        plane = np.stack(by_xy, axis=2)
+        along, cross, down = distortion_slopes(camera.dist, xy)
+        plane = np.stack([along, cross, cross, down], axis=1).reshape(-1, 2, 2) * focal[:, None]
         by_local = np.concatenate([plane, -np.einsum("nij,nj->ni", plane, xy)[..., None]], axis=2)
         by_local /= z[:, None, None]
         by_point[mine] = by_local @ R

@@ -307,9 +307,9 @@ def _weak(rig: BoardRig, found: BoardCorners, kept: BoardCorners) -> dict[str, s
 def _tilt_spread(rig: BoardRig, frames: Collection[int]) -> float:
     """Return the largest angle between the board's normals in these frames, degrees.
 
-    Parallel boards share a vanishing line: any focal length fits them at some tilt.
+    All parallel boards together tell a camera no more about its lens than one of them does.
 
-    Source: Sturm and Maybank 1999, "On plane-based camera calibration".
+    Source: Zhang 2000, "A flexible new technique for camera calibration", section 4.
     """
     normals = np.stack([rig.boards[frame][:3, 2] for frame in frames])
     return float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1).min())))

@@ -31,7 +31,7 @@ from pipelines.calibrate.tracks import FEATURE_SIGMA_PX, Features, FrameSetPoint
 
 LONG_SIDE = 1280  # pixels of reduced images
 FEATURES = 4000  # kept per image, strongest first
-FACE_SCORE = 0.4
+FACE_SCORE = 0.4  # profiles have no more; their landmarks come with a large sigma
 LANDMARK_INFLATION = 3.0  # of sigma, as errors within a view are correlated
 
 Images = Iterable[tuple[int, str, np.ndarray]]
@@ -154,6 +154,20 @@ def without_fixed(features: Mapping[str, Features]) -> dict[str, Features]:
     seen[first, owner[second]] = seen[second, owner[first]] = True
     keep = seen.sum(1) < 2
     return {n: tuple(c[keep[owner == i]] for c in features[n]) for i, n in enumerate(names)}
+
+
+def has_one_lens(index: Index) -> bool:
+    """Return what capture.toml says of `same_lens`: pictures of one size have one focal length.
+
+    Raises:
+        CalibrationError: it is neither true nor false.
+    """
+    value = index.meta.get("same_lens", False)
+    if not isinstance(value, bool):
+        raise CalibrationError(
+            f"{index.capture / 'capture.toml'}: same_lens is {value!r}, expected true or false"
+        )
+    return value
 
 
 def known_focals(index: Index) -> dict[str, float]:

@@ -34,8 +34,8 @@ from pipelines.calibrate.tracks import (
     FrameSetPoints,
     PairMatches,
     PointTracks,
+    candidate_matches,
     join_tracks,
-    match_looks,
 )
 from pipelines.calibrate.uncertainty import HeadError, footage_uncertainty, head_error_of
 
@@ -178,14 +178,14 @@ def _adjust(
 
     The last value is the error, pixels, to be expected of each camera at the head.
     """
-    looks = match_looks({frame: points.features for frame, points in seen.items()})
+    candidates = candidate_matches({frame: points.features for frame, points in seen.items()})
 
     def with_features(
         rig: dict[str, Camera], bands: Sequence[float]
     ) -> tuple[PointTracks, AdjustedRig]:
         for band in bands:
             for scale in FEATURE_SCALES:
-                tracks = join_tracks(rig, seen, band, looks)  # anew, as the rig gets better
+                tracks = join_tracks(rig, seen, band, candidates)  # anew, as the rig gets better
                 points = triangulate_tracks(rig, tracks)
                 fit = adjust_rig(rig, tracks, points, priors, (scale,), expected=start)
                 rig = fit.cameras
@@ -197,7 +197,7 @@ def _adjust(
     tracks, fit = with_features(fit.cameras, BANDS)
     refused = set[str]()
     while others := {n: c for n, c in start.items() if n not in fit.cameras and n not in refused}:
-        more = place_by_features(fit, tracks, others, seen, looks)
+        more = place_by_features(fit, tracks, others, seen, candidates)
         if not more:
             break
         wider, wide = with_features(fit.cameras | more, BANDS[:1])
@@ -337,11 +337,11 @@ def place_by_features(
     tracks: PointTracks,
     others: Mapping[str, Camera],
     seen: Mapping[int, FrameSetPoints],
-    looks: PairMatches,
+    candidates: PairMatches,
 ) -> dict[str, Camera]:
     """Place `others`, which see no face, by features that look like points of an adjusted rig.
 
-    Their focal length becomes the rig's median. `looks` are the matches of all features.
+    Their focal length becomes the rig's median. `candidates` are the matches of all features.
     """
     sure = tracks.features() & (np.linalg.norm(fit.errors, axis=1) < OUTLIER * tracks.sigma)
     place = {
@@ -364,7 +364,7 @@ def place_by_features(
         pairs = [np.zeros((0, 5))]
         for (frame, other), at in known.items():
             first, second = sorted((name, other))
-            matches = looks[first, second].get(frame)
+            matches = candidates[first, second].get(frame)
             if matches is not None:
                 mine, theirs = matches.T if first == name else matches.T[::-1]
                 pairs.append(np.column_stack([seen[frame].features[name][0][mine], at[theirs]]))

@@ -30,6 +30,7 @@ from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.footage import (
     at_footage_size,
     find_points,
+    has_one_lens,
     known_focals,
     read_footage,
     reduced_camera,
@@ -279,7 +280,7 @@ def _from_footage(index: Index, config: CalibrateConfig) -> CalibratedRig:
         model=config.camera_model,
         distance_m=config.distance_m,
         eye_distance_mm=config.eye_distance_mm,
-        same_lens=index.meta.get("same_lens") is True,
+        same_lens=has_one_lens(index),
     )
     cameras = {n: at_footage_size(camera, blank[n]) for n, camera in solved.cameras.items()}
     at_full = {name: camera.width / small[name].width for name, camera in cameras.items()}

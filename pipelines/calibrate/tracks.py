@@ -84,17 +84,17 @@ def join_tracks(
     cameras: Mapping[str, Camera],
     seen: Mapping[int, FrameSetPoints],
     band: float,
-    looks: PairMatches | None = None,
+    candidates: PairMatches | None = None,
     verified: bool = True,
 ) -> PointTracks:
     """Join landmarks and matched features of frames into tracks.
 
-    A match is at most `band` off its epipolar line, as a share of the image's diagonal. `looks` are
-    matches by descriptors where these are known already, of `match_looks`. `verified`
-    matches by descriptors and the pair's own fundamental matrix over all frames; `cameras` only
-    give the band. Such matches can show that a whole rig is a little off, which matches searched
-    along wrong lines would confirm. False searches along the lines: more matches if most cameras
-    are right.
+    A match is at most `band` off its epipolar line, as a share of the image's diagonal.
+    `candidates` are those of `candidate_matches`, if they are known already. `verified` matches
+    agree on a fundamental matrix of their own pair of cameras over all frames, so that they can
+    show that a whole rig is a little off, which matches searched along wrong lines would confirm.
+    Where no matrix holds, the search along the lines offers candidates that a matrix must explain.
+    Unverified matches come from the lines alone: they are more, if most cameras are right.
     """
     names = tuple(sorted(cameras))
     ideal = {f: {n: _undistorted(cameras[n], p.features[n]) for n in names if n in p.features}
@@ -103,7 +103,11 @@ def join_tracks(
     for a, b in _neighbours(cameras):
         both = {f: (views[a], views[b]) for f, views in ideal.items() if a in views and b in views}
         rig, reach = (cameras[a], cameras[b]), band * np.hypot(cameras[b].width, cameras[b].height)
-        found = verified_pairs(both, None if looks is None else looks[a, b]) if verified else {}
+        found = (
+            verified_pairs(both, None if candidates is None else candidates[a, b])
+            if verified
+            else {}
+        )
         if not found:  # less can be mistaken where only what is near the lines is compared
             found = {
                 f: match_descriptors(p[1], q[1], epipolar_distance(*rig, p[0], q[0]) < reach)
@@ -216,7 +220,7 @@ def epipolar_distance(
     return np.abs(lines @ np.column_stack([pixels_b, np.ones(len(pixels_b))]).T)
 
 
-def match_looks(features: Mapping[int, Mapping[str, Features]]) -> PairMatches:
+def candidate_matches(features: Mapping[int, Mapping[str, Features]]) -> PairMatches:
     """Match the features of all pairs of cameras, by name, in each frame by descriptors alone."""
     names = sorted({name for found in features.values() for name in found})
     return {
@@ -230,21 +234,22 @@ def match_looks(features: Mapping[int, Mapping[str, Features]]) -> PairMatches:
 
 
 def verified_pairs(
-    features: Mapping[int, tuple[Features, Features]], looks: dict[int, np.ndarray] | None = None
+    features: Mapping[int, tuple[Features, Features]],
+    candidates: dict[int, np.ndarray] | None = None,
 ) -> dict[int, np.ndarray]:
     """Return the matches (M, 2) by frame that one fundamental matrix of two cameras explains.
 
-    `looks` are matches by descriptors. Empty where it explains fewer than 12 and an eighth of the
-    matches: of false ones, a matrix fitted to them explains about eight and a twentieth.
+    `candidates` are matches by descriptors. The result is empty where the matrix explains fewer
+    than 12 plus an eighth of them: of false ones it explains about 8 plus a twentieth.
     """
-    if looks is None:
-        looks = {frame: match_descriptors(a[1], b[1]) for frame, (a, b) in features.items()}
-    looks = {frame: looks[frame] for frame in features}
-    counts = [len(pairs) for pairs in looks.values()]
+    if candidates is None:
+        candidates = {frame: match_descriptors(a[1], b[1]) for frame, (a, b) in features.items()}
+    candidates = {frame: candidates[frame] for frame in features}
+    counts = [len(pairs) for pairs in candidates.values()]
     if sum(counts) < LEAST_INLIERS:
         return {}
     p, q = (
-        np.concatenate([features[f][i][0][pairs[:, i]] for f, pairs in looks.items()])
+        np.concatenate([features[f][i][0][pairs[:, i]] for f, pairs in candidates.items()])
         for i in range(2)
     )
     F, mask = cv2.findFundamentalMat(p, q, cv2.USAC_MAGSAC, 1.5, 0.999, 10_000)
@@ -252,4 +257,4 @@ def verified_pairs(
     if good.sum() < LEAST_INLIERS + CHANCE * len(good):
         return {}
     parts = np.split(good, np.cumsum(counts)[:-1])
-    return {f: pairs[ok] for (f, pairs), ok in zip(looks.items(), parts, strict=True)}
+    return {f: pairs[ok] for (f, pairs), ok in zip(candidates.items(), parts, strict=True)}

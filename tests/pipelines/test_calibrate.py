@@ -313,7 +313,7 @@ def test_a_wrong_board_is_refused(change: dict, message: str) -> None:
 
 @pytest.mark.parametrize("moved", [False, True])
 def test_a_board_that_is_never_tilted_is_named(moved):
-    """Focal lengths were 4 to 13 % off without a word; shifted alone, the board is no better."""
+    """A board that stands still, or is only shifted, leaves focal lengths open (Zhang 2000)."""
     rig = make_rig(3, span_deg=40.0)
     still = board_motion(1, seed=0, span_deg=0.0)[0]
     shifts = np.random.default_rng(0).uniform(-0.1, 0.1, (15, 3)) * moved

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from express50.files.images import write_image
 from express50.geometry.transforms import similarity_fit
 from express50.rigs.camera_builder import in_metres
 from pipelines.calibrate.config import CalibrateConfig
+from pipelines.calibrate.footage import has_one_lens
 from pipelines.calibrate.footage_rig import pose_of_face, resect, solve_footage, start_camera
 from pipelines.calibrate.given_rig import refine_by_board, refine_by_footage
 from pipelines.calibrate.tracks import FrameSetPoints
@@ -68,6 +71,19 @@ def test_the_stated_error_at_the_head_is_about_the_true_one(solved):
     for name, camera in rig.items():
         error = structure.uncertainty[name]
         assert error.mm == pytest.approx(1100 * error.px / camera.K[0, 0], rel=0.1)
+
+
+@pytest.mark.parametrize(("value", "one"), [(None, False), (True, True), (False, False)])
+def test_capture_toml_says_whether_lenses_are_the_same(value, one):
+    meta = {} if value is None else {"same_lens": value}
+    assert has_one_lens(SimpleNamespace(meta=meta, capture=Path("cap"))) is one
+
+
+@pytest.mark.parametrize("value", ["yes", 1, ["cam00"]])
+def test_a_wrong_same_lens_is_one_clear_error(value):
+    index = SimpleNamespace(meta={"same_lens": value}, capture=Path("cap"))
+    with pytest.raises(CalibrationError, match="same_lens is .*expected true or false"):
+        has_one_lens(index)
 
 
 def test_cameras_said_to_have_the_same_lens_have_nearly_one_focal_length():
