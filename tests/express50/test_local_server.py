@@ -121,6 +121,6 @@ def test_a_bug_in_a_page_is_one_line(capsys):
     assert "KeyError" in error and "\n" not in error
 
 
-def test_a_port_that_is_none_is_one_error():
+def test_a_port_out_of_range_is_one_error():
     with pytest.raises(ConfigError, match="choose another port"):
         PageServer(page, None, "127.0.0.1", 70000)
