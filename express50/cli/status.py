@@ -17,7 +17,7 @@ from rich.filesize import decimal
 
 from express50.console import FAILED, OK, add_command, answer, format_table, say
 from express50.contract.layout import Dataset, existing_dataset
-from express50.contract.stage import stages
+from express50.contract.stage import stages, typical_error
 from express50.files.atomic import write_bytes
 from express50.local_server import NOT_FOUND, PageServer, Reply
 from express50.runner.ledger import COLUMNS, Ledger, Receipt, Run
@@ -65,6 +65,10 @@ class StageStatus:
         """Count the items by what became of them."""
         failed, running = len(self.failed), len(self.running)
         return {"done": self.done, "failed": failed, "running": running, "missing": self.missing}
+
+    def expected_error(self) -> str:
+        """Say how wrong the typical item probably is; empty where the stage states nothing."""
+        return str(typical_error(r.metrics for r in self.receipts) or "")
 
 
 def add_commands(subparsers: Any) -> None:
@@ -129,12 +133,22 @@ def _serve(dataset: Dataset, port: int) -> int:
 
 
 def _lines(table: list[StageStatus]) -> Iterator[str]:
-    header = ["stage", "done", "failed", "running", "missing", "seconds", "peak MB", "state"]
+    header = [
+        "stage",
+        "done",
+        "failed",
+        "running",
+        "missing",
+        "seconds",
+        "peak MB",
+        "state",
+        "expected error",
+    ]
     rows = []
     for row in table:
         counts = [str(count) for count in row.counts().values()]
         work = [f"{row.seconds:.1f}", f"{row.peak_memory / 1e6:.0f}"]
-        rows.append([row.stage, *counts, *work, row.state])
+        rows.append([row.stage, *counts, *work, row.state, row.expected_error()])
     yield from format_table(header, rows)
     for row in table:
         for receipt in row.failed:
@@ -262,6 +276,7 @@ def _row(stage: StageStatus) -> dict[str, Any]:
         "left": "" if stage.left_s is None else format_seconds(stage.left_s),
         "seconds": format_seconds(stage.seconds) if stage.receipts else "",
         "memory": decimal(stage.peak_memory) if stage.receipts else "",
+        "error": stage.expected_error(),
     }
 
 

@@ -14,11 +14,14 @@ above it: a package names what it offers in its ``pyproject.toml``::
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any
+from statistics import median
+from typing import Any, Literal, get_args
 
 from express50.contract.layout import Dataset
 from express50.errors import ConfigError, StageError
@@ -32,6 +35,58 @@ class Note:
     why: str
 
 
+Unit = Literal["mm", "px", "frames", "alpha", "dB"]
+
+
+@dataclass(frozen=True)
+class ExpectedError:
+    """How wrong a result probably is, judged without ground truth.
+
+    Attributes:
+        value: the error to expect, in the stage's own measure (docs/FORMAT.md).
+        low, high: the interval that holds the true error nine times in ten.
+        unit: of all three.
+    """
+
+    value: float
+    low: float
+    high: float
+    unit: Unit
+
+    def __post_init__(self) -> None:
+        """Refuse what is not an interval around the value.
+
+        Raises:
+            StageError: a figure is not finite, they are not in order, or the unit is unknown.
+        """
+        figures = (self.low, self.value, self.high)
+        if not all(map(math.isfinite, figures)) or list(figures) != sorted(figures):
+            raise StageError(
+                f"expected error: got low, value, high = {figures}; expected finite numbers in"
+                " rising order (state None where the error is not known)"
+            )
+        if self.unit not in get_args(Unit):
+            raise StageError(
+                f"expected error: unit {self.unit!r}; expected one of {', '.join(get_args(Unit))}"
+            )
+
+    def __str__(self) -> str:
+        """Format for people: ``0.31 mm (0.22 to 0.5)``."""
+        return f"{self.value:.2g} {self.unit} ({self.low:.2g} to {self.high:.2g})"
+
+
+def typical_error(metrics: Iterable[Mapping[str, Any]]) -> ExpectedError | None:
+    """Return the median of what items expect, from their metrics; None if none states any."""
+    stated = []
+    for row in metrics:
+        with suppress(TypeError, StageError):  # absent, or a file that somebody changed
+            stated.append(ExpectedError(**row.get("expected_error")))  # type: ignore[arg-type]
+    if not stated:
+        return None
+    value, low, high = (median(getattr(e, key) for e in stated) for key in ("value", "low", "high"))
+    return ExpectedError(value, low, high, stated[0].unit)
+
+
 @dataclass(frozen=True)
 class Result:
     """The outcome of one item, besides the files it wrote.
@@ -40,16 +95,20 @@ class Result:
         metrics: deterministic figures that JSON can hold.
         dropped: parts of the item that were left out.
         warnings: parts that were kept although something about them is doubtful.
+        expected_error: how wrong the item probably is; None where the stage cannot say.
     """
 
     metrics: Mapping[str, Any] = field(default_factory=dict)
     dropped: Sequence[Note] = ()
     warnings: Sequence[Note] = ()
+    expected_error: ExpectedError | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of ``metrics.json``."""
         notes = {"dropped": self.dropped, "warnings": self.warnings}
-        return {**self.metrics, **{key: [asdict(n) for n in rows] for key, rows in notes.items()}}
+        stated = {"expected_error": asdict(self.expected_error)} if self.expected_error else {}
+        rows = {key: [asdict(note) for note in parts] for key, parts in notes.items()}
+        return {**self.metrics, **rows, **stated}
 
 
 def no_gpu(config: Any) -> bool:

@@ -13,7 +13,7 @@ import matplotlib as mpl
 from markupsafe import Markup
 
 from express50.contract.layout import Dataset
-from express50.contract.stage import stages
+from express50.contract.stage import stages, typical_error
 from express50.errors import FormatError
 from express50.files.images import encode_jpeg, read_image, resize_area
 from express50.files.text import parse_json, read_json_table, read_text
@@ -96,6 +96,7 @@ def _stage_view(dataset: Dataset, stage: str, receipts: list[Receipt]) -> dict:
         "failed": [(r.item, r.reason) for r in receipts if r.reason],
         "dropped": _reasons(metrics, "dropped"),
         "noted": _reasons(metrics, "warnings"),
+        "error": typical_error(metrics.values()) or "n/a",
         "seconds": number(round(sum(r.seconds for r in receipts), 1)),
         "columns": columns,
         "rows": [

@@ -14,7 +14,7 @@ from unittest.mock import Mock
 import pytest
 
 from express50.cli.status import read_status
-from express50.contract.stage import Note
+from express50.contract.stage import ExpectedError, Note
 from express50.errors import CaptureError, ConfigError, DiskFullError, StageError
 from express50.runner.clusters import RemoteWorkers
 from express50.runner.executor import Pool
@@ -297,6 +297,19 @@ def test_receipt_counts_time_and_memory(tmp_path):
     assert json.loads((dataset.item_dir("toy", "a") / "metrics.json").read_text()) == (
         receipt.metrics
     )
+
+
+def test_receipt_and_metrics_hold_the_expected_error(tmp_path):
+    stated = ExpectedError(0.4, 0.3, 0.6, "mm")
+    stage = dataclasses.replace(
+        toy.STAGE,
+        run=lambda *task: dataclasses.replace(toy.STAGE.run(*task), expected_error=stated),
+    )
+    dataset = make_dataset(tmp_path / "data", ["a"])
+    run_stage(stage, dataset, toy.ToyConfig(), workers=0, progress=False)
+    metrics = json.loads((dataset.item_dir("toy", "a") / "metrics.json").read_text())
+    assert receipts(dataset)["a"].metrics == metrics
+    assert metrics["expected_error"] == {"value": 0.4, "low": 0.3, "high": 0.6, "unit": "mm"}
 
 
 def test_resolved_config_is_saved_and_can_be_given_back(tmp_path):
