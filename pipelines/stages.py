@@ -18,5 +18,6 @@ STAGES = (
     depth.STAGE,
     register.STAGE,
     regions.STAGE,
+    pack.ENCODE,
     pack.STAGE,
 )

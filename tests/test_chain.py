@@ -27,9 +27,10 @@ pytestmark = pytest.mark.slow
 
 STAGES = (
     "ingest", "calibrate", "observe", "align", "frames", "matte", "track", "depth",
-    "register", "regions", "pack",
+    "register", "regions", "encode", "pack",
 )  # fmt: skip
-SETTINGS = {"pack": ["--set", "pack.size=96", "--set", 'pack.test_subjects=["S002"]']}
+SIZE = ["--set", "encode.size=96"]
+SETTINGS = {"encode": SIZE, "pack": [*SIZE, "--set", 'pack.test_subjects=["S002"]']}
 RECORDING = [
     "--subjects=2", "--cameras=6", "--give-calibration", "--width=192", "--height=192",
     "--frames-per-expression=4",
@@ -150,7 +151,7 @@ def wrong_commands(root: Path, twin: Path, junk: Path) -> list[list[str]]:
         ("track", f'landmarks="{junk / "junk.npz"}"'), ("track", 'landmarks="fan:lost.pt"'),
         ("track", f'head="{lost}"'), ("track", "clip_rounds=maybe"),
         ("depth", "voxel_mm=-1"), ("depth", "voxel_mm=nan"), ("register", "weight=few"),
-        ("regions", f'segmentation="{lost}"'), ("pack", "size=-4"), ("pack", 'profile="gif"'),
+        ("regions", f'segmentation="{lost}"'), ("encode", "size=-4"), ("encode", 'profile="gif"'),
         ("calibrate", 'camera_model="FISHEYE"'), ("align", 'accept="all"'),
     ]:  # fmt: skip
         rows.append([*_stage(stage, root, twin), "--set", f"{stage}.{setting}"])
@@ -209,7 +210,7 @@ def test_kills_at_random_moments_change_no_byte(dataset, twin, tmp_path):
     moments = random.Random(5)
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
     for name in STAGES:
-        if name not in ("ingest", "matte", "depth", "pack"):
+        if name not in ("ingest", "matte", "depth", "encode"):
             assert main([*_stage(name, root, twin), "--workers", "0"]) == 0
             continue
         command = [sys.executable, "-m", "express50", *_stage(name, root, twin), "--workers=2"]

@@ -22,8 +22,9 @@ from grmm.model import GRMM
 from grmm.shard_source import ShardSource
 from pipelines.depth import STAGE as DEPTH
 from pipelines.depth.config import DepthConfig
+from pipelines.pack import ENCODE
 from pipelines.pack import STAGE as PACK
-from pipelines.pack.config import PackConfig
+from pipelines.pack.config import EncodeConfig, PackConfig
 from tests.express50.dataset.tracked import track_arrays, world_vertices, write_track
 from tests.grmm.synthetic import tiny_config
 from tests.pipelines.bump_dataset import make_dataset, published
@@ -49,7 +50,8 @@ def packed(tmp_path_factory):
     damaged = dataset.registration_file("S002", "neutral")
     damaged.parent.mkdir(parents=True)
     damaged.write_bytes(b"PK")
-    published(dataset, PACK, PackConfig(size=32, test_subjects=("S002",)))
+    published(dataset, ENCODE, EncodeConfig(size=32))
+    published(dataset, PACK, PackConfig(test_subjects=("S002",)))
     return dataset.item_dir("pack", "shards"), arrays
 
 
@@ -132,7 +134,12 @@ def test_registered_meshes_are_packed_and_others_are_named(packed) -> None:
     metrics = json.loads((root / "metrics.json").read_text())
     assert metrics["registered"] == 3 and metrics["kept"] == 12
     assert "| registered mesh | 3 of 12 samples |" in (root / "card.md").read_text()
-    why = {row["what"]: row["why"] for row in metrics["warnings"]}
+    encoded = root.parents[1] / "encode"
+    why = {
+        row["what"]: row["why"]
+        for subject in ("S001", "S002")
+        for row in json.loads((encoded / subject / "metrics.json").read_text())["warnings"]
+    }
     assert "of another track; run 'express50 register' again" in why["S001/neutral"]
     assert "not a registration" in why["S002/neutral"]
 

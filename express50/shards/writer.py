@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import tarfile
 from collections.abc import Mapping, Sequence
@@ -25,6 +26,7 @@ from express50.shards.reader import (
     SHARD_NAME,
     SUBJECT_FILES,
     ShardReader,
+    read_entries,
     subject_file,
 )
 
@@ -121,9 +123,7 @@ class ShardWriter:
     def close(self) -> None:
         """Finish the last shard and write ``index.json``."""
         self._finish_shard()
-        index = {"schema": SCHEMA, "shards": self._shards}
-        text = json.dumps(index, separators=(",", ":"), sort_keys=True, allow_nan=False)
-        (self.root / "index.json").write_text(text + "\n", encoding="utf-8")
+        _write_index(self.root, self._shards)
 
     def _open_for(self, split: str, size: int) -> BinaryIO:
         file = self._file
@@ -131,9 +131,7 @@ class ShardWriter:
         if file is None or full or self._shards[-1]["split"] != split:
             self._finish_shard()
             number = self._counts.get(split, 0)
-            name = f"{split}-{number:06d}.tar"
-            if not SHARD_NAME.fullmatch(name):
-                raise FormatError(f"split {split!r}: expected letters, digits, _ and -")
+            name = shard_name(split, number)
             self._counts[split] = number + 1
             self._shards.append({"file": name, "split": split, "samples": []})
             file = self._file = (self.root / name).open("xb")  # never over an old shard
@@ -154,6 +152,24 @@ class ShardWriter:
         self.digests[shard["file"]], self._hash = self._hash.hexdigest(), hashlib.sha256()
         self._file.close()
         self._file = None
+
+
+def shard_name(split: str, number: int) -> str:
+    """Make the name of a split's shard.
+
+    Raises:
+        FormatError: the split's name has other characters than letters, digits, ``_`` and ``-``.
+    """
+    name = f"{split}-{number:06d}.tar"
+    if not SHARD_NAME.fullmatch(name):
+        raise FormatError(f"split {split!r}: expected letters, digits, _ and -")
+    return name
+
+
+def _write_index(root: Path, shards: Sequence[dict]) -> None:
+    index = {"schema": SCHEMA, "shards": shards}
+    text = json.dumps(index, separators=(",", ":"), sort_keys=True, allow_nan=False)
+    (root / "index.json").write_text(text + "\n", encoding="utf-8")
 
 
 def _tar_members(sample: PackedSample, start: int) -> tuple[list[bytes], dict[str, list[int]]]:
@@ -189,6 +205,40 @@ def tar_header(name: str, size: int) -> bytes:
 
 def _padded(size: int) -> int:
     return size + -size % BLOCK
+
+
+def gather_shards(sources: Sequence[tuple[Path, str]], out: Path) -> dict[str, str]:
+    """Gather folders of shards in one, each as the split beside it; returns SHA-256 by file.
+
+    Shards are hard links to the sources' where the file system has them, so that no sample is read
+    or stored twice; they are numbered anew within each split. ``index.json`` is written, cards and
+    manifest are not.
+
+    Raises:
+        FormatError: a source is damaged or has no manifest.
+    """
+    shards: list[dict] = []
+    digests: dict[str, str] = {}
+    for root, split in sources:
+        read_entries(root)  # checks what is read below
+        known = _manifest_digests(root)
+        for shard in read_json(root / "index.json", FormatError)["shards"]:
+            name = shard_name(split, sum(row["split"] == split for row in shards))
+            shards.append(shard | {"file": name, "split": split})
+            digests[name] = known[shard["file"]]
+            _link(root / shard["file"], out / name)
+        for name in (one for one in known if one.endswith(SUBJECT_FILES)):
+            digests[name] = known[name]
+            _link(root / name, out / name)
+    _write_index(out, shards)
+    return digests
+
+
+def _link(source: Path, target: Path) -> None:
+    try:
+        os.link(source, target)
+    except OSError:  # another file system, or one without hard links
+        shutil.copyfile(source, target)
 
 
 def write_manifest(root: Path, digests: Mapping[str, str] | None = None) -> None:
@@ -236,17 +286,27 @@ def verify(root: Path) -> list[str]:
     return faults
 
 
-def _manifest_faults(root: Path) -> list[str]:
+def _manifest_digests(root: Path) -> dict[str, str]:
+    """Read the SHA-256 of the files beside a manifest, by name.
+
+    Raises:
+        FormatError: it is missing or malformed.
+    """
     path = root / "manifest.json"
     if not path.exists():
-        return [f"{path}: the manifest is missing; rerun 'express50 pack'"]
+        raise FormatError(f"{path}: the manifest is missing; rerun 'express50 pack'")
+    files = read_json(path, FormatError)
     try:
-        files = read_json(path, FormatError)["files"]
-        expected = {name: str(row["sha256"]) for name, row in files.items()}
+        return {name: str(row["sha256"]) for name, row in files["files"].items()}
+    except (KeyError, TypeError, AttributeError) as error:
+        raise FormatError(f"{path}: malformed ({error}); rerun 'express50 pack'") from None
+
+
+def _manifest_faults(root: Path) -> list[str]:
+    try:
+        expected = _manifest_digests(root)
     except FormatError as error:
         return [str(error)]
-    except (KeyError, TypeError, AttributeError) as error:
-        return [f"{path}: malformed ({error}); rerun 'express50 pack'"]
     faults = []
     for name, digest in sorted(expected.items()):
         if not NAME.fullmatch(name) or not (root / name).is_file():

@@ -1,4 +1,8 @@
-"""Pack cropped samples of every subject, expression and camera into checksummed shards."""
+"""Two stages write the shards: encode a subject's samples, and pack all subjects' in one folder.
+
+Encoding is the work, and runs subject by subject; ``express50 pack`` runs it first. Packing gathers
+what is there: a subject that joins or leaves costs no other subject's samples.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,32 @@ from pathlib import Path
 
 from express50.contract.layout import Dataset, exclusion_reason
 from express50.contract.stage import Growth, Result, Stage
-from pipelines.pack.config import PRESETS, PackConfig
+from pipelines.pack.config import ENCODE_PRESETS, EncodeConfig, PackConfig
+
+
+def included(dataset: Dataset) -> list[str]:
+    """List the subjects that no annotator excluded."""
+    return [name for name in dataset.subjects() if exclusion_reason(dataset, name) is None]
+
+
+def encode_inputs(dataset: Dataset, item: str, config: EncodeConfig) -> dict[str, Path | str]:
+    """Name the outputs of every earlier stage for the subject, as far as they exist."""
+    stages = ("frames", "matte", "depth", "register", "regions")
+    parts = {stage: dataset.item_dir(stage, item) for stage in stages} | {
+        "calibrate": dataset.cameras_file(item),
+        "gains": dataset.gains_file(item),
+        "align": dataset.peaks_file(item),
+        "track": dataset.track_file(item),
+    }
+    found: dict[str, Path | str] = {"index": dataset.index_file(item)}
+    return found | {name: path for name, path in parts.items() if path.exists()}
+
+
+def encode_run(dataset: Dataset, item: str, config: EncodeConfig, out: Path) -> Result:
+    """Write the subject's samples as shards with index and manifest."""
+    from pipelines.pack.stage import encode
+
+    return encode(dataset, item, config, out)
 
 
 def items(dataset: Dataset) -> list[str]:
@@ -15,54 +44,57 @@ def items(dataset: Dataset) -> list[str]:
 
 
 def inputs(dataset: Dataset, item: str, config: PackConfig) -> dict[str, Path | str]:
-    """Name the outputs of every earlier stage for every subject, as far as they exist."""
+    """Name the encoded subjects, and say who is excluded."""
     from express50.capture.readers.read import read_people
     from pipelines.pack.card import people_lines
 
     found: dict[str, Path | str] = {}
-    included = []
     for subject in dataset.subjects():
         if (reason := exclusion_reason(dataset, subject)) is not None:
             found[f"{subject} excluded"] = reason
             continue
-        included.append(subject)
-        found[f"{subject} index"] = dataset.index_file(subject)
-        parts = {
-            "frames": dataset.item_dir("frames", subject),
-            "calibrate": dataset.cameras_file(subject),
-            "gains": dataset.gains_file(subject),
-            "align": dataset.peaks_file(subject),
-            "track": dataset.track_file(subject),
-            "matte": dataset.item_dir("matte", subject),
-            "depth": dataset.item_dir("depth", subject),
-            "register": dataset.item_dir("register", subject),
-            "regions": dataset.item_dir("regions", subject),
-        }
-        found |= {f"{subject} {name}": path for name, path in parts.items() if path.exists()}
+        folder = dataset.item_dir("encode", subject)
+        for name in ("manifest.json", "metrics.json"):
+            if (folder / name).exists():
+                found[f"{subject} {name}"] = folder / name
     # The receipt keeps no more about people than the card: nothing where they are too few.
-    return found | {"people": "\n".join(people_lines(read_people(dataset, included)))}
+    return found | {"people": "\n".join(people_lines(read_people(dataset, included(dataset))))}
 
 
 def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> Result:
-    """Write shards, index, manifest, splits and card."""
-    from pipelines.pack.stage import run as work
+    """Gather the shards, and write index, manifest, splits and card."""
+    from pipelines.pack.stage import pack
 
-    return work(dataset, config, out)
+    return pack(dataset, config, out)
 
+
+ENCODE = Stage(
+    name="encode",
+    version=1,
+    config=EncodeConfig,
+    presets=ENCODE_PRESETS,
+    items=included,
+    inputs=encode_inputs,
+    run=encode_run,
+    help="crop and encode each subject's samples (pack runs it first)",
+    purpose="Each subject's samples, cropped to the head and encoded.",
+    growth=Growth(
+        items=("subjects",),
+        time=("expressions", "views", "pixels"),
+        disk=("expressions", "views"),
+    ),
+)
 
 STAGE = Stage(
     name="pack",
-    version=11,
+    version=12,
     config=PackConfig,
-    presets=PRESETS,
+    presets={"draft": {}, "standard": {}, "reference": {}},
     items=items,
     inputs=inputs,
     run=run,
     help="write shards, splits and dataset card",
     purpose="Samples packed into shards.",
-    growth=Growth(
-        items=(),
-        time=("subjects", "expressions", "views", "pixels"),
-        disk=("subjects", "expressions", "views"),
-    ),
+    runs_first=(ENCODE.name,),
+    growth=Growth(items=(), time=("subjects", "expressions", "views"), disk=("subjects",)),
 )

@@ -1,4 +1,4 @@
-"""Define the settings of the pack stage and its presets."""
+"""Define the settings of the encode and pack stages."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Literal
 
 
 @dataclass(frozen=True, kw_only=True)
-class PackConfig:
-    """Size, codecs and split of the packed samples."""
+class EncodeConfig:
+    """Size and codecs of the samples."""
 
     size: int = 512
     """Side of a sample, pixels, 16 to 8192."""
@@ -22,10 +22,6 @@ class PackConfig:
     """Alpha without or with shoulders and clothes, where the regions stage separated them."""
     min_confidence: float = 0.0
     """Depth pixels with less confidence count as not valid, 0 to 1."""
-    test_subjects: tuple[str, ...] = ()
-    """Subjects of the test split; empty: chosen by test_fraction."""
-    test_fraction: float = 0.1
-    """Share of subjects in the test split, chosen by a hash of their ids; 0: no test split."""
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -33,11 +29,24 @@ class PackConfig:
             raise ValueError(f"size is {self.size}, expected 16 to 8192")
         if not 0 <= self.min_confidence <= 1:
             raise ValueError(f"min_confidence is {self.min_confidence}, expected 0 to 1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PackConfig:
+    """Split of the packed subjects."""
+
+    test_subjects: tuple[str, ...] = ()
+    """Subjects of the test split; empty: chosen by test_fraction."""
+    test_fraction: float = 0.1
+    """Share of subjects in the test split, chosen by a hash of their ids; 0: no test split."""
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
         if not 0 <= self.test_fraction < 1:
             raise ValueError(f"test_fraction is {self.test_fraction}, expected 0 to under 1")
 
 
-PRESETS: dict[str, dict[str, object]] = {
+ENCODE_PRESETS: dict[str, dict[str, object]] = {
     "draft": {"size": 256, "profile": "compact"},
     "standard": {},
     "reference": {"size": 1024, "profile": "lossless"},

@@ -34,7 +34,7 @@ from express50.files.text import read_json_table
 from express50.geometry.cameras import Camera
 from express50.shards.codecs import encode_pictures
 from express50.shards.writer import PackedSample, sample_key
-from pipelines.pack.config import PackConfig
+from pipelines.pack.config import EncodeConfig
 from pipelines.pack.crop import (
     crop_pinhole,
     cut_depth,
@@ -172,7 +172,7 @@ class LoadedSample:
 
 
 def load_sample(
-    dataset: Dataset, subject: PackedSubject, expression: str, camera: Camera, config: PackConfig
+    dataset: Dataset, subject: PackedSubject, expression: str, camera: Camera, config: EncodeConfig
 ) -> LoadedSample:
     """Load one view from the outputs of the earlier stages.
 
@@ -240,7 +240,7 @@ def encode_sample(
     subject: PackedSubject,
     expression: str,
     camera: Camera,
-    config: PackConfig,
+    config: EncodeConfig,
 ) -> tuple[PackedSample, dict]:
     """Cut one view to the square around its tracked head, and encode its files.
 

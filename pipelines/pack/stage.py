@@ -1,8 +1,10 @@
-"""Write the shards of the whole dataset with splits, checksums, card and contact sheet."""
+"""Encode a subject's samples; gather all subjects' shards with splits, card and contact sheet."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,113 +15,61 @@ from express50.contract.stage import Note, Result
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.atomic import write_json
 from express50.files.images import contact_sheet, write_image
+from express50.files.text import read_json_table
 from express50.shards.reader import ShardReader, sample_panels, write_offsets, write_registered
-from express50.shards.writer import PackedSample, ShardWriter, write_manifest
+from express50.shards.writer import PackedSample, ShardWriter, gather_shards, write_manifest
 from pipelines.pack.card import split_subjects, write_card
-from pipelines.pack.config import PackConfig
+from pipelines.pack.config import EncodeConfig, PackConfig
 from pipelines.pack.sample import PackedSubject, encode_sample, load_sample, read_subject
 
 SHARD_BYTES = 256_000_000  # a shard is closed at this size; an expression is never split
 QC_SAMPLES = 12
+ON_CARD = ("subject", "expression", "camera", "label", "licence", "consent", "head", "parts")
 
 Pair = tuple[PackedSample, dict]
 """A sample and the content of its meta.json."""
 
 
-def run(dataset: Dataset, config: PackConfig, out: Path) -> Result:
-    """Write shards, index, manifest, splits and card.
+def encode(dataset: Dataset, name: str, config: EncodeConfig, out: Path) -> Result:
+    """Write one subject's shards, index and manifest.
 
     Raises:
-        StageError: no sample can be packed, or the split is impossible.
+        StageError: no sample of the subject can be encoded.
+        FormatError, CaptureError: what its samples share cannot be read.
     """
     cv2.setNumThreads(1)
-    subjects, dropped = _read_subjects(dataset)
-    read = len(dropped)
-    if not subjects:
-        why = "; ".join(f"{note.what}: {note.why}" for note in dropped[:3])
-        raise StageError(f"shards: no subject can be packed ({why}); run the earlier stages")
-    names = [subject.name for subject in subjects]
-    splits = split_subjects(names, config.test_subjects, config.test_fraction)
+    subject = read_subject(dataset, name)
     writer = ShardWriter(out, SHARD_BYTES)
     metas: list[dict] = []
-    for split, chosen in splits.items():
-        for subject in (one for one in subjects if one.name in chosen):
-            for expression in sorted(subject.peaks):
-                group, left_out = _pack_group(dataset, subject, expression, config)
-                read += len(group) + len(left_out)
-                dropped += left_out
-                if group:
-                    writer.add_group(split, [sample for sample, _ in group])
-                metas += [meta | {"split": split} for _, meta in group]
+    dropped: list[Note] = []
+    for expression in sorted(subject.peaks):
+        group, left_out = _encode_group(dataset, subject, expression, config)
+        dropped += left_out
+        if group:
+            writer.add_group("subject", [sample for sample, _ in group])
+        metas += [meta for _, meta in group]
     writer.close()
     if not metas:
         why = "; ".join(sorted({note.why for note in dropped})[:3])
-        raise StageError(f"shards: none of {read} samples can be packed ({why})")
-    packed = sorted({meta["subject"] for meta in metas})
-    for subject in (one for one in subjects if one.name in packed):
-        _write_subject_files(out, subject)
-    how = "named" if config.test_subjects else "hash of the subject's id"
-    write_json(out / "splits.json", splits | {"chosen_by": how})
-    reader = ShardReader(out)
-    shards = sorted({entry.shard for entry in reader.entries})
-    size = sum((out / shard).stat().st_size for shard in shards)
-    with_parts = sum(meta["parts"] for meta in metas)
-    bare = sum(meta["torso"] == "removed" for meta in metas)
-    registered = sum(meta["track"]["registered"] for meta in metas)
-    statistics = {
-        "picture size": f"{config.size} x {config.size}",
-        "profile": config.profile,
-        "labels of parts": f"{with_parts} of {len(metas)} samples",
-        "torso removed": f"{bare} of {len(metas)} samples",
-        "registered mesh": f"{registered} of {len(metas)} samples",
-        "shards": f"{len(shards)}, {size / 1e6:.1f} MB",
-    }
-    card = write_card(splits, metas, dropped, statistics, read_people(dataset, packed))
-    (out / "card.md").write_text(card, encoding="utf-8")
-    metrics = {
-        "read": read,
-        "kept": len(metas),
-        "shards": len(shards),
-        "bytes": size,
-        "bytes_a_sample": round(size / len(metas)),
-        "samples_by_split": {s: sum(meta["split"] == s for meta in metas) for s in splits},
-        "depth_coverage": _write_contact_sheet(out, reader),
-        "with_parts": with_parts,
-        "torso_removed": bare,
-        "registered": registered,
-    }
-    reader.close()
+        raise StageError(f"none of its {len(dropped)} samples can be packed ({why})")
+    _write_subject_files(out, subject)
     write_manifest(out, writer.digests)
-    notes = [note for subject in subjects for note in subject.notes]
-    return Result(metrics, dropped, warn_of_gaps(metas) + notes)
+    metrics = {
+        "read": len(metas) + len(dropped),
+        "kept": len(metas),
+        "with_parts": sum(meta["parts"] for meta in metas),
+        "torso_removed": sum(meta["torso"] == "removed" for meta in metas),
+        "registered": sum(meta["track"]["registered"] for meta in metas),
+        "size": config.size,
+        "profile": config.profile,
+    }
+    return Result(metrics, dropped, warn_of_gaps(metas) + subject.notes)
 
 
-def _read_subjects(dataset: Dataset) -> tuple[list[PackedSubject], list[Note]]:
-    """Read all subjects that can be packed; a note says why another one is left out."""
-    subjects, dropped = [], []
-    for name in dataset.subjects():
-        if (reason := exclusion_reason(dataset, name)) is not None:
-            dropped.append(Note(name, f"excluded: {reason}"))
-            continue
-        try:
-            subjects.append(read_subject(dataset, name))
-        except (StageError, FormatError, CaptureError) as error:
-            dropped.append(Note(name, str(error)))
-    return subjects, dropped
-
-
-def _write_subject_files(out: Path, subject: PackedSubject) -> None:
-    """Write what is stored once per subject, not with every sample."""
-    if subject.offsets is not None:
-        write_offsets(out, subject.name, subject.offsets)
-    if meshes := {name: (one.offsets, one.sigma) for name, one in subject.registered.items()}:
-        write_registered(out, subject.name, meshes)
-
-
-def _pack_group(
-    dataset: Dataset, subject: PackedSubject, expression: str, config: PackConfig
+def _encode_group(
+    dataset: Dataset, subject: PackedSubject, expression: str, config: EncodeConfig
 ) -> tuple[list[Pair], list[Note]]:
-    """Pack all cameras of one expression; a note says why a camera is left out."""
+    """Encode all cameras of one expression; a note says why a camera is left out."""
     group, dropped = [], []
     for camera_id, camera in sorted(subject.cameras.items()):
         try:
@@ -130,9 +80,18 @@ def _pack_group(
     return group, dropped
 
 
+def _write_subject_files(out: Path, subject: PackedSubject) -> None:
+    """Write what is stored once per subject, not with every sample."""
+    if subject.offsets is not None:
+        write_offsets(out, subject.name, subject.offsets)
+    if meshes := {name: (one.offsets, one.sigma) for name, one in subject.registered.items()}:
+        write_registered(out, subject.name, meshes)
+
+
 def warn_of_gaps(metas: list[dict]) -> list[Note]:
-    """Warn of samples without labels of parts, and of subjects without consent or licence."""
+    """Warn of a subject's samples without labels of parts, and without consent or licence."""
     warnings = []
+    name = metas[0]["subject"]
     if bare := sum(not meta["parts"] for meta in metas):
         why = (
             f"{bare} of {len(metas)} samples have no labels of parts, and their alpha holds the"
@@ -140,12 +99,103 @@ def warn_of_gaps(metas: list[dict]) -> list[Note]:
         )
         warnings.append(Note("regions", why))
     keys = {"consent": "consent_id", "licence": "licence"}
-    lacking = {meta["subject"]: [keys[k] for k in keys if meta[k] is None] for meta in metas}
-    return warnings + [
-        Note(name, f"capture.toml gives no {' and no '.join(what)}; its samples lack it")
-        for name, what in sorted(lacking.items())
-        if what
+    if lacking := [keys[key] for key in keys if metas[0][key] is None]:
+        why = f"capture.toml gives no {' and no '.join(lacking)}; its samples lack it"
+        warnings.append(Note(name, why))
+    return warnings
+
+
+def pack(dataset: Dataset, config: PackConfig, out: Path) -> Result:
+    """Gather the encoded subjects' shards; write index, manifest, splits and card.
+
+    Raises:
+        StageError: no subject is encoded, or the split is impossible.
+        FormatError: a subject's shards are damaged.
+    """
+    accounts, dropped = _read_accounts(dataset)
+    if not accounts:
+        why = "; ".join(f"{note.what}: {note.why}" for note in dropped[:3])
+        raise StageError(f"shards: no subject can be packed ({why}); run the earlier stages")
+    splits = split_subjects(list(accounts), config.test_subjects, config.test_fraction)
+    sources = [(dataset.item_dir("encode", n), split) for split in splits for n in splits[split]]
+    digests = gather_shards(sources, out)
+    how = "named" if config.test_subjects else "hash of the subject's id"
+    write_json(out / "splits.json", splits | {"chosen_by": how})
+    reader = ShardReader(out)
+    totals = _totals(out, reader, accounts)
+    left_out = dropped + [note for account in accounts.values() for note in _left_out(account)]
+    people = read_people(dataset, sorted(accounts))
+    card = write_card(splits, list(_card_rows(reader)), left_out, _statistics(totals), people)
+    (out / "card.md").write_text(card, encoding="utf-8")
+    by_split = {name: sum(entry.split == name for entry in reader.entries) for name in splits}
+    coverage = _write_contact_sheet(out, reader)
+    reader.close()
+    write_manifest(out, digests)
+    metrics = totals | {"samples_by_split": by_split, "depth_coverage": coverage}
+    return Result(metrics, dropped, _warn_of_mixtures(totals))
+
+
+def _read_accounts(dataset: Dataset) -> tuple[dict[str, dict], list[Note]]:
+    """Read the metrics of every encoded subject; a note says why another one is left out."""
+    accounts, dropped = {}, []
+    for name in dataset.subjects():
+        metrics = dataset.item_dir("encode", name) / "metrics.json"
+        if (reason := exclusion_reason(dataset, name)) is not None:
+            dropped.append(Note(name, f"excluded: {reason}"))
+        elif not metrics.is_file():
+            dropped.append(Note(name, "not encoded; see what 'express50 encode' says of it"))
+        else:
+            accounts[name] = read_json_table(metrics, FormatError)
+    return accounts, dropped
+
+
+def _left_out(account: Mapping[str, Any]) -> list[Note]:
+    return [Note(row["what"], row["why"]) for row in account["dropped"]]
+
+
+def _totals(out: Path, reader: ShardReader, accounts: Mapping[str, dict]) -> dict[str, Any]:
+    """Add up the subjects' accounts and the sizes of their shards."""
+    shards = {entry.shard for entry in reader.entries}
+    size = sum((out / shard).stat().st_size for shard in shards)
+    summed = ("read", "kept", "with_parts", "torso_removed", "registered")
+    kinds = {key: {str(one[key]) for one in accounts.values()} for key in ("size", "profile")}
+    return {key: sum(one[key] for one in accounts.values()) for key in summed} | {
+        "shards": len(shards),
+        "bytes": size,
+        "bytes_per_sample": round(size / len(reader)),
+        **{key: ", ".join(sorted(values)) for key, values in kinds.items()},
+    }
+
+
+def _warn_of_mixtures(totals: Mapping[str, Any]) -> list[Note]:
+    """Warn of subjects that were encoded with different settings."""
+    return [
+        Note(
+            key, f"subjects were encoded with {totals[key]}; run 'express50 pack' without a subset"
+        )
+        for key in ("size", "profile")
+        if "," in totals[key]
     ]
+
+
+def _statistics(totals: Mapping[str, Any]) -> dict[str, str]:
+    """Name the totals as the card shows them."""
+    kept = totals["kept"]
+    return {
+        "picture size": f"{totals['size']} pixels square",
+        "profile": totals["profile"],
+        "labels of parts": f"{totals['with_parts']} of {kept} samples",
+        "torso removed": f"{totals['torso_removed']} of {kept} samples",
+        "registered mesh": f"{totals['registered']} of {kept} samples",
+        "shards": f"{totals['shards']}, {totals['bytes'] / 1e6:.1f} MB",
+    }
+
+
+def _card_rows(reader: ShardReader) -> Iterator[dict]:
+    """Yield what the card counts; whole metas of a large dataset would fill the memory."""
+    for number in range(len(reader)):
+        meta = reader.meta(number)
+        yield {key: meta[key] for key in ON_CARD}
 
 
 def _write_contact_sheet(out: Path, reader: ShardReader) -> float:

@@ -19,8 +19,9 @@ from express50.runner.runner import run_stage
 from pipelines.depth import STAGE
 from pipelines.depth.config import DepthConfig
 from pipelines.depth.maps import PhotoErrors, compared_view, photo_errors
+from pipelines.pack import ENCODE
 from pipelines.pack import STAGE as PACK
-from pipelines.pack.config import PackConfig
+from pipelines.pack.config import EncodeConfig
 from tests.pipelines.bump_dataset import make_dataset, published
 from tests.pipelines.bump_head import mesh, render, ring
 
@@ -77,7 +78,6 @@ def test_normal_maps_are_the_slope_of_the_depth_maps(dataset, written):
 def test_every_format_holds_the_same_depth_and_is_packed_alike(tmp_path):
     data = make_dataset(tmp_path, cameras=3, size=64)
     shards, depths = {}, {}
-    config = PackConfig(size=64, test_fraction=0.0)
     for kind in ("png16", "exr32"):
         published(data, STAGE, DepthConfig(**QUICK, depth_format=kind, normal_maps="none"))
         folder = data.item_dir("depth", ITEMS[0])
@@ -85,7 +85,8 @@ def test_every_format_holds_the_same_depth_and_is_packed_alike(tmp_path):
         assert path.suffix == {"png16": ".png", "exr32": ".exr"}[kind]
         assert not list(folder.glob("*_normals.png"))
         depths[kind], _ = read_depth(path)
-        facts = published(data, PACK, config)["shards"]
+        published(data, ENCODE, EncodeConfig(size=64))
+        facts = published(data, PACK, PACK.config())["shards"]
         assert facts["kept"] == 6 and not facts["dropped"]
         shards[kind] = facts["depth_coverage"]
     assert np.abs(depths["png16"] - depths["exr32"]).max() < 2.6e-5
@@ -162,7 +163,7 @@ def test_one_camera_gets_the_tracked_heads_depth_at_low_confidence(tmp_path):
     assert both.sum() > 0.9 * (shot.depth > 0).sum()
     assert np.median(np.abs(depth - shot.depth)[both]) < 1.5e-3
     assert read_image(folder / f"{camera.id}_confidence.png").max() < 80
-    assert published(dataset, PACK, PackConfig(size=64))["shards"]["kept"] == len(ITEMS)
+    assert published(dataset, ENCODE, EncodeConfig(size=64))["S001"]["kept"] == len(ITEMS)
 
     dataset.track_file("S001").unlink()
     config = DepthConfig(voxel_mm=3.0)

@@ -24,15 +24,17 @@ from express50.shards.reader import ShardReader
 from express50.shards.writer import verify
 from pipelines.depth import STAGE as DEPTH
 from pipelines.depth.config import DepthConfig
+from pipelines.pack import ENCODE
 from pipelines.pack import STAGE as PACK
 from pipelines.pack.card import people_lines, split_subjects
-from pipelines.pack.config import PackConfig
+from pipelines.pack.config import EncodeConfig, PackConfig
 from pipelines.pack.crop import Crop, crop_pinhole, cut_depth, cut_image, cut_labels, head_crop
 from pipelines.pack.sample import nameless, occluded
 from pipelines.pack.stage import warn_of_gaps
 from tests.pipelines.bump_dataset import make_dataset, published
 
-SMALL = PackConfig(size=64, test_subjects=("S002",))
+SMALL = EncodeConfig(size=64)
+SPLIT = PackConfig(test_subjects=("S002",))
 
 
 @pytest.fixture(scope="module")
@@ -46,8 +48,16 @@ def dataset(tmp_path_factory) -> Dataset:
 @pytest.fixture(scope="module")
 def packed(dataset):
     """(folder, metrics) of the packed dataset."""
-    metrics = published(dataset, PACK, SMALL)["shards"]
-    return dataset.item_dir("pack", "shards"), metrics
+    encoded = published(dataset, ENCODE, SMALL)
+    metrics = published(dataset, PACK, SPLIT)["shards"]
+    return dataset.item_dir("pack", "shards"), metrics | {"encoded": encoded}
+
+
+def pack_into(dataset, out, config=SMALL):
+    """Encode all subjects, and gather their shards in a folder; returns the stages' results."""
+    encoded = published(dataset, ENCODE, config)
+    out.mkdir(exist_ok=True)
+    return encoded, PACK.run(dataset, "shards", SPLIT, out)
 
 
 coordinates = st.floats(-0.15, 0.15)
@@ -178,9 +188,10 @@ def test_samples_carry_consent_and_licence_and_lack_of_them_is_a_warning(packed)
     assert {(m["subject"], m["consent"], m["licence"]) for m in metas} == {
         (name, f"C-{name}", "CC0-1.0") for name in ("S001", "S002")
     }
-    assert not [row for row in metrics["warnings"] if "consent" in row["why"]]
+    warnings = [row for one in metrics["encoded"].values() for row in one["warnings"]]
+    assert not [row for row in warnings if "consent" in row["why"]]
     whole = [meta | {"parts": True} for meta in metas]
-    (note,) = warn_of_gaps([whole[0] | {"consent": None, "licence": None}, whole[-1]])
+    (note,) = warn_of_gaps([whole[0] | {"consent": None, "licence": None}])
     assert note.what == "S001" and "consent_id" in note.why and "licence" in note.why
     assert warn_of_gaps(whole) == []
 
@@ -233,9 +244,20 @@ def test_samples_of_two_cameras_agree_on_the_surface(packed):
 
 
 def test_packing_twice_gives_the_same_bytes(dataset, packed, tmp_path):
-    PACK.run(dataset, "shards", SMALL, tmp_path)
-    for path in sorted(p for p in tmp_path.rglob("*") if p.is_file()):
-        assert path.read_bytes() == (packed[0] / path.relative_to(tmp_path)).read_bytes(), path
+    for stage, item, config in ((ENCODE, "S001", SMALL), (PACK, "shards", SPLIT)):
+        out = tmp_path / stage.name
+        out.mkdir()
+        stage.run(dataset, item, config, out)
+        for path in sorted(p for p in out.rglob("*") if p.is_file()):
+            before = dataset.item_dir(stage.name, item) / path.relative_to(out)
+            assert path.read_bytes() == before.read_bytes(), path
+
+
+def test_packing_gathers_the_encoded_shards_and_stores_no_sample_twice(dataset, packed):
+    for split, subject in (("train", "S001"), ("test", "S002")):
+        source = dataset.item_dir("encode", subject) / "subject-000000.tar"
+        assert verify(source.parent) == []
+        assert source.samefile(packed[0] / f"{split}-000000.tar")
 
 
 def test_what_is_missing_is_dropped_with_its_reason(dataset, tmp_path):
@@ -245,25 +267,26 @@ def test_what_is_missing_is_dropped_with_its_reason(dataset, tmp_path):
     depth.unlink()
     write_image(matte, np.zeros((96, 96), np.uint8))
     try:
-        result = PACK.run(dataset, "shards", SMALL, tmp_path)
+        encoded, result = pack_into(dataset, tmp_path)
     finally:
         for path, data in kept.items():
             path.write_bytes(data)
-    assert result.metrics["read"] == result.metrics["kept"] + len(result.dropped) == 24
-    why = {note.what: note.why for note in result.dropped}
+    dropped = encoded["S001"]["dropped"]
+    assert result.metrics["read"] == result.metrics["kept"] + len(dropped) == 24
+    why = {row["what"]: row["why"] for row in dropped}
     assert why.keys() == {"S001/neutral/cam02", "S001/smile/cam01"}
     assert f"1 x {why['S001/smile/cam01']}" in (tmp_path / "card.md").read_text()
 
 
 def test_unsure_depth_can_be_left_out(dataset, packed, tmp_path):
-    PACK.run(dataset, "shards", PackConfig(size=64, min_confidence=0.6), tmp_path)
+    pack_into(dataset, tmp_path, EncodeConfig(size=64, min_confidence=0.6))
     strict = ShardReader(tmp_path).select(subjects=["S001"])
     loose = ShardReader(packed[0]).select(subjects=["S001"])
     assert strict.sample(0)["valid"].sum() < loose.sample(0)["valid"].sum()
 
 
 def test_lossless_profile_keeps_pixels(dataset, tmp_path):
-    PACK.run(dataset, "shards", PackConfig(size=64, profile="lossless"), tmp_path)
+    pack_into(dataset, tmp_path, EncodeConfig(size=64, profile="lossless"))
     reader = ShardReader(tmp_path)
     assert "rgb.png" in reader.entries[0].members
     assert reader.sample(0)["rgb"].shape == (64, 64, 3)
@@ -275,9 +298,8 @@ def test_what_cameras_make_differently_of_light_is_divided_out(dataset, packed, 
     write_json(gains, {name: [1.25, 1.0, 1.0]})
     try:
         for even in (True, False):
-            config = PackConfig(size=64, profile="lossless", even_colour=even)
-            (tmp_path / str(even)).mkdir()
-            PACK.run(dataset, "shards", config, tmp_path / str(even))
+            config = EncodeConfig(size=64, profile="lossless", even_colour=even)
+            pack_into(dataset, tmp_path / str(even), config)
     finally:
         gains.unlink()
     evened, raw = (
@@ -320,9 +342,9 @@ def test_an_excluded_subject_is_left_out_with_its_reason(dataset, tmp_path):
     event = {"subject": "S002", "expression": "", "action": "exclude", "annotator": "ann"}
     file.write_text(before + json.dumps(event | {"time": 1.0, "reason": "heavy makeup"}) + "\n")
     try:
-        config = PackConfig(size=64)
-        assert PACK.inputs(dataset, "shards", config)["S002 excluded"] == "heavy makeup"
-        result = PACK.run(dataset, "shards", config, tmp_path)
+        assert PACK.inputs(dataset, "shards", SPLIT)["S002 excluded"] == "heavy makeup"
+        assert ENCODE.items(dataset) == ["S001"]
+        result = PACK.run(dataset, "shards", PackConfig(), tmp_path)
     finally:
         file.write_text(before)
     assert [note.what for note in result.dropped] == ["S002"]
@@ -349,7 +371,7 @@ def cut_regions(
 def test_a_torso_that_was_not_separated_is_not_called_removed(dataset, tmp_path):
     try:
         cut_regions(dataset, "S001/neutral", "cam02", 60, missing=("torso",))
-        metrics = PACK.run(dataset, "shards", SMALL, tmp_path).metrics
+        metrics = pack_into(dataset, tmp_path)[1].metrics
     finally:
         shutil.rmtree(dataset.stage_dir("regions"))
     assert metrics["with_parts"] == 1 and metrics["torso_removed"] == 0
@@ -357,20 +379,20 @@ def test_a_torso_that_was_not_separated_is_not_called_removed(dataset, tmp_path)
 
 def test_the_torso_leaves_alpha_and_depth_and_its_labels_are_packed(dataset, packed, tmp_path):
     assert packed[1]["with_parts"] == packed[1]["torso_removed"] == 0
-    assert packed[1]["warnings"][0]["what"] == "regions"
+    assert packed[1]["encoded"]["S001"]["warnings"][0]["what"] == "regions"
     before = ShardReader(packed[0]).select(subjects=["S001"], cameras=["cam02"])
     assert before.sample(0)["parts"] is None and before.meta(0)["torso"] == "kept"
     try:
         for expression in ("neutral", "smile"):
             cut_regions(dataset, f"S001/{expression}", "cam02", 60)
-        result = PACK.run(dataset, "shards", SMALL, tmp_path / "remove")
-        keep = replace(SMALL, torso="keep")
-        PACK.run(dataset, "shards", keep, tmp_path / "keep")
-        assert "S001 regions" in PACK.inputs(dataset, "shards", SMALL)
+        encoded, result = pack_into(dataset, tmp_path / "remove")
+        pack_into(dataset, tmp_path / "keep", replace(SMALL, torso="keep"))
+        assert "regions" in ENCODE.inputs(dataset, "S001", SMALL)
     finally:
         shutil.rmtree(dataset.stage_dir("regions"))
     assert result.metrics["with_parts"] == result.metrics["torso_removed"] == 2
-    assert result.warnings[0].what == "regions" and "22 of 24" in result.warnings[0].why
+    (warning,) = encoded["S001"]["warnings"]
+    assert warning["what"] == "regions" and "10 of 12" in warning["why"]
     assert "| torso removed | 2 of 24 samples |" in (tmp_path / "remove" / "card.md").read_text()
     removed, kept = (
         ShardReader(tmp_path / how).select(subjects=["S001"], cameras=["cam02"]).sample(0)
