@@ -165,6 +165,11 @@ def stdout_to_stderr() -> Iterator[None]:
             os.close(saved)
 
 
+def count(number: int, noun: str) -> str:
+    """Return a number with its noun: ``1 file``, ``2 files``, ``0 files``."""
+    return f"{number:,} {noun}" + ("" if number == 1 else "s")
+
+
 def format_table(header: list[str], rows: list[list[str]]) -> Iterator[str]:
     """Yield the lines of a table with aligned columns."""
     widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]

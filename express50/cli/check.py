@@ -1,20 +1,23 @@
-"""``express50 check`` audits a dataset; ``express50 subject`` withdraws a person from one."""
+"""``express50 check`` audits a dataset, ``prune`` frees space, ``subject`` withdraws a person."""
 
 from __future__ import annotations
 
 import argparse
+import shutil
 import time
 from pathlib import Path
 from typing import Any
 
-from express50.console import FAILED, OK, add_command, answer, stdout_to_stderr
-from express50.contract.layout import Dataset
+from rich.filesize import decimal
+
+from express50.console import FAILED, OK, add_command, answer, count, stdout_to_stderr
+from express50.contract.layout import Dataset, existing_dataset
 from express50.contract.stage import hook, stages
 from express50.errors import StageError
 
 
 def add_commands(subparsers: Any) -> None:
-    """Add ``check`` and ``subject withdraw``."""
+    """Add ``check``, ``prune`` and ``subject withdraw``."""
     check = add_command(
         subparsers,
         "check",
@@ -32,6 +35,16 @@ def add_commands(subparsers: Any) -> None:
         "--fix",
         action="store_true",
         help="set wrong outputs aside, so that their stage makes them again; delete leftovers",
+    )
+    add_command(
+        subparsers,
+        "prune",
+        run_prune,
+        "delete outputs that were replaced or set aside",
+        description="Stages keep the two outputs that each item had before its present one, as "
+        "long as the disk has 2 GB left: going back to their settings or inputs is then a rename. "
+        "This command deletes these and what was set aside because it was wrong. Nothing that any "
+        "command reads is lost.",
     )
     subject = subparsers.add_parser("subject", help="withdraw a person from a dataset")
     withdraw = add_command(
@@ -87,12 +100,25 @@ def run_check(args: argparse.Namespace) -> int:
         for one in result.findings
     ]
     lines += [f"note: {note}" for note in result.notes]
-    count, fixed = len(result.findings), sum(one.fixed for one in result.findings)
-    verdict = f"{count} findings, {fixed} fixed, {count - fixed} left" if count else "sound"
-    looked = f"{result.files} files, {result.bytes / 1e6:.1f} MB"
+    found, fixed = len(result.findings), sum(one.fixed for one in result.findings)
+    verdict = f"{count(found, 'finding')}, {fixed} fixed, {found - fixed} left"
+    verdict = verdict if found else "sound"
+    looked = f"{count(result.files, 'file')}, {result.bytes / 1e6:.1f} MB"
     read = f"{result.hashed / 1e6:.1f} MB read"
     answer(args, data, *lines, f"{args.dataset}: {verdict} ({looked}, {read}, {seconds:.1f} s)")
     return OK if result.sound else FAILED
+
+
+def run_prune(args: argparse.Namespace) -> int:
+    """Delete replaced and stale outputs, and say what that freed."""
+    from express50.runner.replaced import empty, size_of
+
+    dataset = existing_dataset(args.dataset)
+    stale = size_of(dataset.stale_dir)
+    shutil.rmtree(dataset.stale_dir, ignore_errors=True)
+    files, size = map(sum, zip(empty(dataset), stale, strict=True))
+    line = f"{args.dataset}: freed {decimal(size)} in {count(files, 'file')}"
+    return answer(args, {"files": files, "bytes": size}, line)
 
 
 def run_withdraw(args: argparse.Namespace) -> int:

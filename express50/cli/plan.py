@@ -130,6 +130,8 @@ def run_plan(args: argparse.Namespace) -> int:
         *format_table(columns, cells),
         "s per item: of one core; stages one after the other, no item split over workers",
         "peak memory: as measured; more footage may need more",
+        "disk: without outputs that were replaced; stages keep two of each item while there are 2 "
+        "GB left, and 'express50 prune' deletes them",
     ]
     if total["not_measured"]:
         lines.append(f"the sum lacks {', '.join(total['not_measured'])}")

@@ -175,14 +175,19 @@ def config_values(config: Any) -> dict[str, object]:
     return {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
 
 
+def config_texts(config: Any) -> dict[str, str]:
+    """Return field values of a config dataclass, in order, as TOML has them."""
+    # A number, text, list or truth is written in TOML as in JSON.
+    return {k: json.dumps(v, ensure_ascii=False) for k, v in config_values(config).items()}
+
+
 def config_toml(name: str, config: Any) -> str:
     """Return the TOML table of a config, each field under the words that document it."""
     documents = field_documents(type(config))
     lines = [f"[{name}]"]
-    for key, value in config_values(config).items():
+    for key, text in config_texts(config).items():
         lines += [f"# {line}" for line in textwrap.wrap(documents.get(key, ""), 98)]
-        # A number, text, list or truth is written in TOML as in JSON.
-        lines.append(f"{key} = {json.dumps(value, ensure_ascii=False)}")
+        lines.append(f"{key} = {text}")
     return "\n".join(lines) + "\n"
 
 

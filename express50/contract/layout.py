@@ -174,6 +174,11 @@ class Dataset:
         return self.root / ".stale"
 
     @property
+    def replaced_dir(self) -> Path:
+        """Return the folder of outputs that others replaced, kept for going back to them."""
+        return self.root / ".replaced"
+
+    @property
     def slurm_dir(self) -> Path:
         """Return the folder of the output of SLURM jobs, one file per job."""
         return self.root / "logs" / "slurm"

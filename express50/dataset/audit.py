@@ -24,6 +24,7 @@ from express50.errors import AnnotationError, ConfigError, Express50Error, Forma
 from express50.files.digests import file_sha256, files_of, path_digest, text_digest
 from express50.runner.ledger import FileMark, Ledger, Made, Receipt
 from express50.runner.publish import clean_leftovers, hold_stages, is_running, set_aside
+from express50.runner.replaced import size_of
 from express50.runner.worker import fingerprint, input_digests
 from express50.shards.reader import read_entries
 from express50.shards.writer import verify
@@ -116,13 +117,15 @@ def audit(
             with Ledger(dataset.ledger, read_only) as ledger:
                 _StageAudit(dataset, stages, ledger, result, deep, fix).run()
         result.findings += _person_findings(dataset, checkpoints)
-    stale = [path for path in dataset.stale_dir.rglob("*") if path.is_file()]
-    if stale:
-        size = sum(path.stat().st_size for path in stale) / 1e6
-        result.notes.append(
-            f".stale: {len(stale)} files, {size:.1f} MB, of outputs set aside earlier, which"
-            " nothing reads; making an item again removes its own"
-        )
+    what = {dataset.stale_dir: "set aside earlier, which nothing reads"}
+    what[dataset.replaced_dir] = "that others replaced, kept for going back to their settings"
+    for folder, words in what.items():
+        files, size = size_of(folder)
+        if files:
+            result.notes.append(
+                f"{folder.name}: {size / 1e6:.1f} MB ({files} files) of outputs {words};"
+                f" 'express50 prune {dataset.root}' deletes them"
+            )
     return result
 
 

@@ -114,7 +114,8 @@ def _mixed_paths(dataset: Dataset) -> Iterator[Path]:
         for metrics in base.glob("*/*/metrics.json"):
             if metrics.parent.name not in subjects and base.joinpath("grmm") not in metrics.parents:
                 yield metrics.parent
-    yield from (p for p in (dataset.report_dir, dataset.root / "accuracy") if p.exists())
+    whole = (dataset.report_dir, dataset.root / "accuracy", dataset.replaced_dir)
+    yield from (path for path in whole if path.exists())
     yield from (path for path in dataset.staging_dir.glob("*") if path.is_dir())
     for path in (dataset.root / "grmm").rglob("*"):  # pictures and figures of whoever was trained
         if path.is_file() and path.suffix != ".pt":

@@ -99,8 +99,12 @@ def _full(path: Path, why: str) -> DiskFullError:
 
 
 @contextmanager
-def folder_in_one_step(aside: Path, target: Path) -> Iterator[Path]:
+def folder_in_one_step(
+    aside: Path, target: Path, keep: Callable[[Path], None] | None = None
+) -> Iterator[Path]:
     """Yield an empty folder aside; on a clean exit it is synced and replaces ``target``.
+
+    ``keep`` may move the folder that was replaced to another place; else it is deleted.
 
     When the body raises, a former target stays as it was. A kill at any moment leaves the former
     target or the new one; only where the file system cannot swap two folders, a kill between two
@@ -117,12 +121,18 @@ def folder_in_one_step(aside: Path, target: Path) -> Iterator[Path]:
                 _sync(Path(folder) / name, os.O_RDONLY)
             sync_directory(Path(folder))
         target.parent.mkdir(parents=True, exist_ok=True)
+        replaced = None
         if not target.exists():
             aside.rename(target)
-        elif not _swap(aside, target):
+        elif _swap(aside, target):
+            replaced = aside
+        else:
             target.rename(former)
             aside.rename(target)
+            replaced = former
         sync_directory(target.parent)
+        if replaced is not None and keep is not None:
+            keep(replaced)
         shutil.rmtree(former, ignore_errors=True)
     finally:
         shutil.rmtree(aside, ignore_errors=True)

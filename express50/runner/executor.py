@@ -137,7 +137,8 @@ class Pool:
                     size = _next_size(size, batch, receipts)
                     waiting.extendleft(reversed(batch[len(receipts) :]))
                     for receipt in receipts:
-                        settle(replace(receipt, attempts=attempt))
+                        # A restored output stays marked by 0 attempts.
+                        settle(replace(receipt, attempts=receipt.attempts and attempt))
         return killed
 
     def _workers_for(self, task: Task) -> LocalWorkers | RemoteWorkers:

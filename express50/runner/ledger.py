@@ -31,10 +31,19 @@ class FileMark:
 
 @dataclass(frozen=True)
 class Made:
-    """Digests of the inputs that an item was made from, and the files that it consists of."""
+    """Says what an item was made from and with, and the files that it consists of.
+
+    Attributes:
+        inputs: their digests.
+        files: what was published.
+        settings: of the stage, as written in TOML; empty in ledgers that did not keep them.
+        version: of the stage; 0 where that is not known.
+    """
 
     inputs: dict[str, str]
     files: dict[str, FileMark]
+    settings: dict[str, str] = field(default_factory=dict)
+    version: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,6 +118,10 @@ CREATE TABLE IF NOT EXISTS made (
     stage TEXT NOT NULL, item TEXT NOT NULL, inputs TEXT NOT NULL, files TEXT NOT NULL,
     PRIMARY KEY (stage, item)
 );
+CREATE TABLE IF NOT EXISTS settings (
+    stage TEXT NOT NULL, item TEXT NOT NULL, version INTEGER NOT NULL, settings TEXT NOT NULL,
+    PRIMARY KEY (stage, item)
+);
 CREATE TABLE IF NOT EXISTS digests (
     path TEXT PRIMARY KEY, size INTEGER NOT NULL, mtime_ns INTEGER NOT NULL,
     inode INTEGER NOT NULL, sha256 TEXT NOT NULL
@@ -118,7 +131,8 @@ CREATE TABLE IF NOT EXISTS runs (
     begun REAL NOT NULL, seen REAL NOT NULL, ended REAL NOT NULL, running TEXT NOT NULL
 );
 """
-TABLES = {"receipts", "made", "digests", "runs"}
+OF_ITEMS = ("receipts", "made", "settings")
+TABLES = {*OF_ITEMS, "digests", "runs"}
 DELETE = "delete it and run the stages again, the same outputs will be made"
 COLUMNS = tuple(one.name for one in fields(Receipt) if one.name != "made")
 KINDS = {"item": str, "fingerprint": str, "status": str, "reason": str, "metrics": dict}
@@ -210,12 +224,14 @@ class Ledger:
         key = (receipt.stage, receipt.item)
         with self._change() as database:
             self._replace("receipts", row)
-            if receipt.made is None:
-                database.execute("DELETE FROM made WHERE stage = ? AND item = ?", key)
-            else:
-                files = {name: list(vars(m).values()) for name, m in receipt.made.files.items()}
-                texts = (json.dumps(t, sort_keys=True) for t in (receipt.made.inputs, files))
-                database.execute("INSERT OR REPLACE INTO made VALUES (?, ?, ?, ?)", (*key, *texts))
+            for table in OF_ITEMS[1:]:
+                database.execute(f"DELETE FROM {table} WHERE stage = ? AND item = ?", key)
+            if (made := receipt.made) is not None:
+                files = {name: list(vars(m).values()) for name, m in made.files.items()}
+                texts = [json.dumps(t, sort_keys=True) for t in (made.inputs, files, made.settings)]
+                database.execute("INSERT INTO made VALUES (?, ?, ?, ?)", (*key, *texts[:2]))
+                settings = (*key, made.version, texts[2])
+                database.execute("INSERT INTO settings VALUES (?, ?, ?, ?)", settings)
 
     def note_attempt(self, last: Receipt) -> None:
         """Note reason and time of an item's last attempt beside the receipt of what stands."""
@@ -243,18 +259,20 @@ class Ledger:
         return found
 
     def made(self, stage: str) -> dict[str, Made]:
-        """Read inputs and files of a stage's items, sorted.
+        """Read what a stage's items were made from and with, and their files, sorted.
 
         Raises:
             FormatError: a row is damaged.
         """
         found = {}
+        kept = self._rows(("item", "version", "settings"), "settings WHERE stage = ?", stage)
+        settings = {k["item"]: (self._parsed(k["settings"], stage), k["version"]) for k in kept}
         columns = ("item", "inputs", "files")
         for row in self._rows(columns, "made WHERE stage = ? ORDER BY item", stage):
             inputs, files = (self._parsed(row[name], stage) for name in columns[1:])
             with self._damage():
                 marks = {name: FileMark(*mark) for name, mark in files.items()}
-                found[row["item"]] = Made(dict(inputs), marks)
+                found[row["item"]] = Made(dict(inputs), marks, *settings.get(row["item"], ()))
         return found
 
     def write_run(self, run: Run) -> None:
@@ -303,7 +321,7 @@ class Ledger:
         with self._damage():
             self._database.execute("PRAGMA synchronous=FULL")
             with self._change() as database:
-                for table in ("receipts", "made"):
+                for table in OF_ITEMS:
                     database.executemany(f"DELETE FROM {table} WHERE stage = ? AND item = ?", keys)
             self._database.execute("PRAGMA synchronous=NORMAL")
 
@@ -323,7 +341,7 @@ class Ledger:
             database.create_function("names", 1, lambda text: names((text or "").encode()))
             database.execute("PRAGMA synchronous=FULL")
             database.execute("PRAGMA secure_delete=ON")
-            for table in ("receipts", "made"):
+            for table in OF_ITEMS:
                 database.executemany(f"DELETE FROM {table} WHERE stage = ? AND item = ?", items)
                 database.execute(
                     f"DELETE FROM {table} WHERE item = ? OR substr(item, 1, ?) = ?",
@@ -336,6 +354,7 @@ class Ledger:
             database.execute("DELETE FROM digests WHERE names(path)")
             database.execute("DELETE FROM receipts WHERE names(reason) OR names(metrics)")
             database.execute("DELETE FROM made WHERE names(inputs) OR names(files)")
+            database.execute("DELETE FROM settings WHERE names(settings)")
             database.execute("DELETE FROM runs")  # they count the person's items
             database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             database.execute("VACUUM")

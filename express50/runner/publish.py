@@ -6,7 +6,7 @@ import fcntl
 import shutil
 import time
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import IO
@@ -17,18 +17,26 @@ from express50.files.atomic import folder_in_one_step, sync_directory
 
 
 @contextmanager
-def publishing(dataset: Dataset, stage: str, item: str) -> Iterator[Path]:
+def publishing(
+    dataset: Dataset, stage: str, item: str, keep: Callable[[Path], None] | None = None
+) -> Iterator[Path]:
     """Yield an empty folder aside; on a clean exit it becomes the item's folder in one rename.
 
-    When the body raises, the item's former folder stays as it was.
+    When the body raises, the item's former folder stays as it was. A former folder that was
+    replaced is deleted, unless ``keep`` moves it to another place.
     """
     aside = dataset.staging_dir / f"{stage}-{item.replace('/', '+')}-{uuid.uuid4().hex}"
-    with folder_in_one_step(aside, dataset.item_dir(stage, item)):
+    with folder_in_one_step(aside, dataset.item_dir(stage, item), keep):
         yield aside
 
 
-def set_aside(dataset: Dataset, stage: str, item: str) -> None:
-    """Move a published item to the stale folder, so that no later stage reads it."""
+def set_aside(
+    dataset: Dataset, stage: str, item: str, keep: Callable[[Path], None] | None = None
+) -> None:
+    """Move a published item to the stale folder, so that no later stage reads it.
+
+    ``keep`` may move it on from there.
+    """
     target = dataset.item_dir(stage, item)
     if not target.exists():
         return
@@ -41,6 +49,8 @@ def set_aside(dataset: Dataset, stage: str, item: str) -> None:
     while folder != dataset.stage_dir(stage) and not any(folder.iterdir()):
         folder.rmdir()
         folder = folder.parent
+    if keep is not None:
+        keep(stale)
 
 
 def discard_stale(dataset: Dataset, stage: str, item: str) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import fnmatch
 import functools
 import time
-import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
@@ -21,8 +20,10 @@ from express50.files.atomic import check_space, write_bytes
 from express50.files.digests import file_version, path_digest
 from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger, Made, Receipt
+from express50.runner.outdated import why_outdated
 from express50.runner.progress import RunLog, showing
 from express50.runner.publish import clean_leftovers, discard_stale, set_aside, stage_lock
+from express50.runner.replaced import keeping, make_room
 from express50.runner.worker import (
     Task,
     failed_receipt,
@@ -33,14 +34,14 @@ from express50.runner.worker import (
 
 WARNINGS = 12  # lines; more of them would hide the account
 ALIKE = 3  # so many first items that fail for one reason show a wrong setting
-NAMED = 3  # changed inputs that are named
 
 
 @dataclass(frozen=True)
 class Outcome:
     """The result of one item: ``done``, ``skipped`` (was current) or ``failed``.
 
-    ``again`` says why an item was made that a former run had made already.
+    ``again`` says why an item was made that a former run had made already; it was ``restored``
+    where the same output had been made before and was replaced since.
     """
 
     item: str
@@ -50,6 +51,7 @@ class Outcome:
     dropped: tuple[Note, ...] = ()
     warnings: tuple[Note, ...] = ()
     again: str = ""
+    restored: bool = False
 
 
 @dataclass(frozen=True)
@@ -88,8 +90,9 @@ class Summary:
         """Yield the account for people, then what was made again, dropped or failed, and why."""
         counts = " + ".join(f"{self.count(s)} {s}" for s in ("done", "skipped", "failed"))
         yield f"{self.stage}: read {len(self.outcomes)} = {counts} in {self.seconds:.1f} s"
-        for why, count in Counter(o.again for o in self.outcomes if o.again).most_common():
-            yield f"  made again {count}: {why}"
+        again = Counter((o.restored, o.again) for o in self.outcomes if o.again or o.restored)
+        for (restored, why), count in again.most_common():
+            yield f"  {'restored' if restored else 'made again'} {count}: {why or 'same as before'}"
         for outcome in self.outcomes:
             if outcome.status == "failed":
                 yield f"  failed {outcome.item}: {outcome.reason}"
@@ -158,15 +161,15 @@ def run_stage(
     shared = nullcontext(pool) if pool else Pool(workers, scheduler)
     with shared as workers_pool, stage_lock(dataset, stage.name), Ledger(dataset.ledger) as ledger:
         clean_leftovers(dataset, stage.name)
-        changed = _save_config(dataset, stage, config)
+        _save_config(dataset, stage, config)
         if items is None:
             gone = sorted(set(ledger.read(stage.name)) - set(chosen))
             for item in gone:
-                set_aside(dataset, stage.name, item)
+                _retire(dataset, ledger, stage.name, item)
             ledger.forget(stage.name, gone)
         with RunLog(dataset.ledger, stage.name, len(chosen)) as log:
             threads = workers_pool.threads
-            work = _sort_items(stage, dataset, config, chosen, ledger, threads, changed)
+            work = _sort_items(stage, dataset, config, chosen, ledger, threads)
             outcomes = _run_items(stage, dataset, work, ledger, workers_pool, progress, log)
     missing = set(chosen) - set(outcomes)
     if missing:  # read = done + skipped + failed
@@ -203,7 +206,6 @@ def _sort_items(
     chosen: list[str],
     ledger: Ledger,
     threads: int,
-    changed: list[str],
 ) -> _Work:
     """Sort items into those that are up to date, that cannot be read, and that are to do."""
     receipts, made = ledger.read(stage.name), ledger.made(stage.name)
@@ -227,7 +229,7 @@ def _sort_items(
         digest = fingerprint(stage, config, inputs)
         task = Task(stage, dataset, item, config, digest, inputs, threads)
         if item in done:
-            _compare(task, done[item], made.get(item), ledger, changed, work)
+            _compare(task, done[item], made.get(item), ledger, work)
         else:
             work.tasks.append(task)
     ledger.keep_digests()
@@ -243,7 +245,6 @@ def _compare(
     former: Receipt,
     made: Made | None,
     ledger: Ledger,
-    changed: Sequence[str],
     work: _Work,
 ) -> None:
     """Sort an item that a former run made: it is up to date, or is to be made again."""
@@ -254,13 +255,13 @@ def _compare(
             ledger.note_attempt(current)
         work.current[task.item] = _outcome(current, status="skipped")
         return
-    work.tasks.append(task)
+    work.tasks.append(replace(task, former=replace(former, made=made)) if there else task)
     if same:
         work.again[task.item] = "output missing"
         return
-    before = made.inputs if made is not None else task.inputs
-    work.again[task.item] = _why_again(task.stage, before, task.inputs, changed)
-    if there and not _other_data(task, before):
+    made = made or Made(task.inputs, {})
+    work.again[task.item] = why_outdated(task.stage, task.config, made, task.inputs)
+    if there and not _other_data(task, made.inputs):
         work.stands.add(task.item)
 
 
@@ -293,18 +294,6 @@ def _other_data(task: Task, before: Mapping[str, str]) -> bool:
     return any(before.get(name) != task.inputs.get(name) for name in names)
 
 
-def _why_again(
-    stage: Stage, before: Mapping[str, str], inputs: Mapping[str, str], changed: Sequence[str]
-) -> str:
-    """Say which inputs (digests by name), settings or version differ from the former run's."""
-    names = [n for n in sorted({*before, *inputs}) if before.get(n) != inputs.get(n)]
-    if names:
-        return f"inputs changed: {', '.join(names[:NAMED])}{', ...' if names[NAMED:] else ''}"
-    if changed:
-        return f"settings changed: {', '.join(changed)}"
-    return f"stage version changed, it is {stage.version} now"
-
-
 def _run_items(
     stage: Stage,
     dataset: Dataset,
@@ -319,6 +308,7 @@ def _run_items(
     log.current(len(outcomes))
 
     def begin(task: Task) -> None:
+        make_room(dataset)
         check_space(dataset.root)
         log.begin(task.item)
 
@@ -364,7 +354,7 @@ def _record(dataset: Dataset, ledger: Ledger, receipt: Receipt, stands: bool) ->
         ledger.note_attempt(receipt)
         return
     if receipt.status == "failed":
-        set_aside(dataset, receipt.stage, receipt.item)
+        _retire(dataset, ledger, receipt.stage, receipt.item)
     else:
         discard_stale(dataset, receipt.stage, receipt.item)
         dataset.log_file(receipt.stage, receipt.item).unlink(missing_ok=True)
@@ -373,18 +363,20 @@ def _record(dataset: Dataset, ledger: Ledger, receipt: Receipt, stands: bool) ->
         ledger.know(dataset.item_dir(receipt.stage, receipt.item), receipt.made.files)
 
 
-def _save_config(dataset: Dataset, stage: Stage, config: Any) -> list[str]:
-    """Save the resolved config of a stage; returns the settings that changed."""
-    path, text = dataset.config_file(stage.name), config_toml(stage.name, config)
-    former = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
-    if former == text:
-        return []
-    write_bytes(path, text.encode())
-    try:
-        before, now = (tomllib.loads(t).get(stage.name, {}) for t in (former, text))
-    except (tomllib.TOMLDecodeError, AttributeError):
-        return []
-    return sorted(k for k in before.keys() | now.keys() if before.get(k) != now.get(k))
+def _retire(dataset: Dataset, ledger: Ledger, stage: str, item: str) -> None:
+    """Set an output aside that no later stage may read; it is kept for when it is right again."""
+    if not dataset.item_dir(stage, item).exists():
+        return
+    receipt, made = ledger.read(stage).get(item), ledger.made(stage).get(item)
+    former = None if receipt is None else replace(receipt, made=made)
+    set_aside(dataset, stage, item, keeping(dataset, former))
+
+
+def _save_config(dataset: Dataset, stage: Stage, config: Any) -> None:
+    """Save the resolved config of a stage where it has changed."""
+    path, data = dataset.config_file(stage.name), config_toml(stage.name, config).encode()
+    if not path.is_file() or path.read_bytes() != data:
+        write_bytes(path, data)
 
 
 def _outcome(receipt: Receipt, status: str = "", again: str = "") -> Outcome:
@@ -399,4 +391,5 @@ def _outcome(receipt: Receipt, status: str = "", again: str = "") -> Outcome:
         dropped=notes("dropped"),
         warnings=notes("warnings"),
         again=again,
+        restored=receipt.status == "done" and not receipt.attempts and not status,
     )

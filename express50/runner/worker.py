@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from express50.contract.config import config_texts
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
 from express50.errors import DiskFullError, Express50Error, StageError
@@ -20,6 +21,7 @@ from express50.files.atomic import dump_json, naming_full_disk, write_bytes
 from express50.files.digests import files_of, value_digest
 from express50.runner.ledger import FileMark, Made, Receipt, mark_file
 from express50.runner.publish import publishing
+from express50.runner.replaced import empty, keeping, restore
 from express50.runner.threads import cap_threads
 
 BATCH_SECONDS = 0.2  # a batch begins no further item after so long
@@ -27,7 +29,7 @@ BATCH_SECONDS = 0.2  # a batch begins no further item after so long
 
 @dataclass(frozen=True)
 class Task:
-    """An item to run, with all that a worker needs."""
+    """An item to run, with all that a worker needs; ``former`` is the receipt of its output."""
 
     stage: Stage
     dataset: Dataset
@@ -36,6 +38,7 @@ class Task:
     fingerprint: str
     inputs: dict[str, str]
     threads: int = 1
+    former: Receipt | None = None
 
 
 def input_digests(
@@ -95,11 +98,15 @@ def run_tasks(tasks: list[Task]) -> list[Receipt]:
 def run_task(task: Task) -> Receipt:
     """Run one item and publish its outputs; any failure of the item becomes a receipt.
 
-    Only a receipt travels back to the driver, never data.
+    An output that was made from the same and replaced later is published again instead. Only a
+    receipt travels back to the driver, never data.
 
     Raises:
         DiskFullError: the disk has no room for the outputs; the other items' would fail alike.
     """
+    where = task.dataset, task.stage.name, task.item
+    if (restored := restore(*where, task.fingerprint, task.former)) is not None:
+        return restored
     cap_threads(task.threads)
     reset_peak_memory()
     started = time.perf_counter()
@@ -108,9 +115,11 @@ def run_task(task: Task) -> Receipt:
     try:
         with naming_full_disk(task.dataset.root):
             metrics, files = _run_and_publish(task)
-        made = Made(task.inputs, files)
+        made = Made(task.inputs, files, config_texts(task.config), task.stage.version)
     except DiskFullError:
-        raise
+        if not empty(task.dataset)[0]:
+            raise
+        return run_task(task)  # with the space of what was replaced earlier
     except Exception as error:  # noqa: BLE001 (a defect that one item shows must not stop others)
         reason = failure_reason(task.dataset, task.stage.name, task.item, error)
     return Receipt(
@@ -135,7 +144,8 @@ def _run_and_publish(task: Task) -> tuple[dict, dict[str, FileMark]]:
                 f"{task.stage.name} needs a GPU as it is configured; torch finds no CUDA device"
                 " here"
             )
-    with publishing(task.dataset, task.stage.name, task.item) as out:
+    keep = keeping(task.dataset, task.former)
+    with publishing(task.dataset, task.stage.name, task.item, keep) as out:
         # Standard output is for data; libraries' messages go to standard error.
         with contextlib.redirect_stdout(sys.stderr):
             result = task.stage.run(task.dataset, task.item, task.config, out)

@@ -25,6 +25,7 @@ from express50.errors import CaptureError, FormatError, StageError
 from express50.files.digests import text_digest
 from express50.runner.ledger import Ledger, Made, Receipt, Run, mark_file
 from express50.runner.publish import publishing, stage_lock
+from express50.runner.replaced import keeping
 from pipelines import ingest
 from tests.faults.toy import tree
 from tests.synth import make_capture
@@ -76,6 +77,27 @@ def test_nothing_of_the_subject_stays_and_the_others_are_untouched(dataset):
     assert dataset.subjects() == ["S002"]
     with Ledger(dataset.ledger) as ledger:
         assert list(ledger.read("ingest")) == ["S002"]
+
+
+def test_outputs_that_were_replaced_go_too(dataset):
+    """S002's goes as well: it may hold what others were matched to."""
+    for name in ("S001", "S002"):
+        former = Receipt(
+            stage="matte", item=f"{name}/cam00", fingerprint="f", status="done", made=Made({}, {})
+        )
+        with publishing(dataset, "matte", f"{name}/cam00", keeping(dataset, former)) as out:
+            (out / "metrics.json").write_text("{}")
+    assert len(list(dataset.replaced_dir.rglob("metrics.json"))) == 2
+    assert main(["subject", "withdraw", str(dataset.root), "S001"]) == 0
+    assert dataset.replaced_dir.exists()  # it was only listed
+    assert withdraw(dataset, "S001").remaining == ()
+    assert not dataset.replaced_dir.exists()
+
+    entry = dataset.replaced_dir / "matte/S001+cam00/f"  # restored from a backup, say
+    entry.mkdir(parents=True)
+    (entry / "cam00.png").write_bytes(b"pixels")
+    digests = withdrawn(dataset)
+    assert list(files_that(names_any_of(digests), dataset.root)) == [entry / "cam00.png"]
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "../..", "S001/", "S001/cam00", "shards", "S009"])

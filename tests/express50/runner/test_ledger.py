@@ -104,4 +104,4 @@ def test_receipts_are_gone_for_good_before_their_outputs_change(ledger):
     full, normal = words.index("PRAGMA synchronous=FULL"), words.index("PRAGMA synchronous=NORMAL")
     gone = [k for k, text in enumerate(words[:normal]) if text.startswith("DELETE")]
     assert full < gone[0] < gone[-1] < words.index("COMMIT") < normal
-    assert [words[k].split()[2] for k in gone] == ["receipts", "made"]
+    assert [words[k].split()[2] for k in gone] == ["receipts", "made", "settings"]

@@ -16,6 +16,7 @@ import pytest
 from express50.cli.status import read_status
 from express50.contract.stage import ExpectedError, Note
 from express50.errors import CaptureError, ConfigError, DiskFullError, StageError
+from express50.runner import replaced
 from express50.runner.clusters import RemoteWorkers
 from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger
@@ -84,9 +85,9 @@ def test_what_is_made_again_is_said_with_its_reason(tmp_path):
     assert again() == ["", ""]
     (dataset.root / "in" / "a.txt").write_text("other")
     assert again() == ["inputs changed: text", ""]
-    assert again(word="c") == ["settings changed: word"] * 2
+    assert again(word="c") == ['settings changed: word was "a", is "c"'] * 2
     newer = dataclasses.replace(toy.STAGE, version=2)
-    assert again(newer, word="c") == ["stage version changed, it is 2 now"] * 2
+    assert again(newer, word="c") == ["stage version changed: it was 1, is 2"] * 2
     shutil.rmtree(dataset.item_dir("toy", "b"))
     assert again(newer, word="c") == ["", "output missing"]
 
@@ -107,7 +108,10 @@ def test_lost_output_is_made_again(tmp_path):
     assert tree(dataset.stage_dir("toy")) == before
 
 
-def test_stale_output_of_a_failed_item_is_set_aside_and_success_clears_it(tmp_path):
+@pytest.mark.parametrize("room", [True, False])
+def test_output_of_an_item_that_failed_on_newer_data_is_not_read(tmp_path, room, monkeypatch):
+    if not room:
+        monkeypatch.setattr(replaced, "LEAST_ROOM", float("inf"))
     dataset = make_dataset(tmp_path / "data", ["bad1"])
     source = dataset.root / "in" / "bad1.txt"
     source.write_text("repaired")
@@ -115,9 +119,9 @@ def test_stale_output_of_a_failed_item_is_set_aside_and_success_clears_it(tmp_pa
     source.write_text("broken")
     assert not run_toy(dataset).ok
     assert not dataset.item_dir("toy", "bad1").exists()
-    assert (dataset.stale_dir / "toy" / "bad1" / "metrics.json").is_file()
+    assert (dataset.stale_dir / "toy" / "bad1" / "metrics.json").is_file() == (not room)
     source.write_text("repaired")
-    assert run_toy(dataset).ok
+    assert [(o.status, o.restored) for o in run_toy(dataset).outcomes] == [("done", room)]
     assert not (dataset.stale_dir / "toy" / "bad1").exists()
 
 

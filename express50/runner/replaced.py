@@ -1,0 +1,135 @@
+"""Keep outputs that were replaced, so that going back to their settings or inputs is a rename.
+
+An entry of this store is an output's folder with its receipt, named by its fingerprint. Any of it
+may be lost at any moment without harm: what is missing or damaged is made again. It therefore
+gives way where a disk has little space.
+"""
+
+from __future__ import annotations
+
+import functools
+import shutil
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from express50.contract.layout import Dataset
+from express50.errors import DiskFullError, Express50Error, FormatError
+from express50.files.atomic import write_json
+from express50.files.digests import file_sha256, files_of
+from express50.files.text import read_json_table
+from express50.runner.ledger import FileMark, Made, Receipt
+from express50.runner.publish import publishing
+
+GENERATIONS = 2  # replaced outputs per item; more would keep mistakes rather than choices
+LEAST_ROOM = 2e9  # bytes; with less left on the disk the store is emptied
+RECEIPT = ".receipt.json"
+
+Keep = Callable[[Path], None]
+
+
+def keeping(dataset: Dataset, former: Receipt | None) -> Keep | None:
+    """Return a function that moves the folder of a replaced output into the store.
+
+    It moves nothing where there is little space; whatever else goes wrong costs the entry alone.
+    None for an output whose receipt is not known.
+    """
+    if former is None or former.made is None:
+        return None
+    return functools.partial(_keep, dataset, former)
+
+
+def _keep(dataset: Dataset, former: Receipt, folder: Path) -> None:
+    entry = _entry(dataset, former.stage, former.item, former.fingerprint)
+    with suppress(OSError, DiskFullError):  # others may empty the store meanwhile
+        if make_room(dataset):
+            return
+        write_json(folder / RECEIPT, asdict(former))
+        shutil.rmtree(entry, ignore_errors=True)
+        entry.parent.mkdir(parents=True, exist_ok=True)
+        folder.rename(entry)
+        # The receipt's file was the last change in each.
+        newest_first = sorted(entry.parent.iterdir(), key=lambda p: -p.stat().st_mtime_ns)
+        for old in newest_first[GENERATIONS:]:
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def restore(
+    dataset: Dataset, stage: str, item: str, fingerprint: str, former: Receipt | None
+) -> Receipt | None:
+    """Publish an output of the store again, if it has this fingerprint and all of its bytes.
+
+    Args:
+        dataset: the dataset.
+        stage: stage name.
+        item: item id.
+        fingerprint: of what is asked for.
+        former: receipt of the published output, which goes into the store in exchange.
+
+    Returns:
+        The receipt, with 0 attempts as nothing was made; None where the store has no such output.
+        A damaged one is deleted.
+    """
+    entry = _entry(dataset, stage, item, fingerprint)
+    if not entry.is_dir():
+        return None
+    try:
+        receipt = _whole_receipt(entry)
+        if (receipt.stage, receipt.item, receipt.fingerprint) == (stage, item, fingerprint):
+            with publishing(dataset, stage, item, keeping(dataset, former)) as out:
+                entry.rename(out)  # over the empty folder, in one step
+                (out / RECEIPT).unlink()
+            return replace(receipt, reason="", attempts=0, time=time.time())
+    except (OSError, Express50Error, TypeError, KeyError, AttributeError):
+        pass  # it is made instead, which also says what is wrong with the disk
+    shutil.rmtree(entry, ignore_errors=True)
+    return None
+
+
+def _whole_receipt(entry: Path) -> Receipt:
+    """Read an entry's receipt and compare all of its files with it.
+
+    Raises:
+        FormatError: they differ.
+    """
+    row = read_json_table(entry / RECEIPT, FormatError)
+    made = row.pop("made")
+    marks = {name: FileMark(**mark) for name, mark in made.pop("files").items()}
+    found = {path.relative_to(entry).as_posix(): path for path in files_of(entry)}
+    if {name: mark.sha256 for name, mark in marks.items()} != {
+        name: file_sha256(path) for name, path in found.items()
+    }:
+        raise FormatError(f"{entry}: not as published")
+    return Receipt(**row, made=Made(files=marks, **made))
+
+
+def make_room(dataset: Dataset) -> bool:
+    """Empty the store where the disk has little space; returns whether it has."""
+    usage = shutil.disk_usage(dataset.root)
+    short = bool(usage.total) and usage.free < LEAST_ROOM
+    if short:
+        empty(dataset)
+    return short
+
+
+def empty(dataset: Dataset) -> tuple[int, int]:
+    """Delete all replaced outputs; returns how many files and bytes that freed."""
+    freed = size_of(dataset.replaced_dir)
+    shutil.rmtree(dataset.replaced_dir, ignore_errors=True)
+    return freed
+
+
+def size_of(folder: Path) -> tuple[int, int]:
+    """Count the files below a folder and their bytes."""
+    sizes = []
+    for path in folder.rglob("*"):
+        with suppress(OSError):  # a run may take one out meanwhile
+            if path.is_file():
+                sizes.append(path.stat().st_size)
+    return len(sizes), sum(sizes)
+
+
+def _entry(dataset: Dataset, stage: str, item: str, fingerprint: str) -> Path:
+    return dataset.replaced_dir / stage / item.replace("/", "+") / fingerprint
