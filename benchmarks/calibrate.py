@@ -139,7 +139,7 @@ def main() -> int:
         "seconds_detection": detected - start,
         "corners": len(solution.errors),
         "dropped": len(solution.dropped),
-        **footage_figures(index, true, (observations, points), config, args.recording),
+        **footage_figures(index, true, config, args.recording),
         "baseline": {"opencv_chain": rounded(baseline)},
     }
     if args.dataset is None:
@@ -164,7 +164,6 @@ def gain_figures(palette: WhiteCollector, names: list[str]) -> dict[str, float]:
 def footage_figures(
     index: Index,
     true: Mapping[str, Camera],
-    board: tuple[BoardCorners, np.ndarray],
     config: CalibrateConfig,
     folder: Path,
 ) -> dict[str, object]:
@@ -176,7 +175,7 @@ def footage_figures(
     seen = see_capture(index.capture, true, config.solve_frame_sets)
     sfm, refine = (
         {"twin": sfm_figures(seen, true, config)},
-        {"twin": refine_figures(seen, true, figures, board)},
+        {"twin": refine_figures(seen, true, figures)},
     )
     for name, scene in SCENES.items():
         dataset, truth = recorded(scene, folder / name)

@@ -22,11 +22,10 @@ from express50.geometry.transforms import matrix_to_axis_angle, similarity_fit
 from express50.rigs.camera_builder import in_metres
 from express50.rigs.world_frame import meeting_point
 from pipelines.calibrate.adjuster import move_pose
-from pipelines.calibrate.board import BoardCorners
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.footage import find_points, read_raw_footage, reduced_camera
 from pipelines.calibrate.footage_rig import FootageSolution, solve_footage
-from pipelines.calibrate.given_rig import RefinedRig, refine_by_board, refine_by_footage
+from pipelines.calibrate.given_rig import RefinedRig, refine_by_footage
 from pipelines.calibrate.tracks import FrameSetPoints, match_descriptors
 from pipelines.calibrate.uncertainty import camera_errors, head_points
 
@@ -112,7 +111,6 @@ def refine_figures(
     seen: Mapping[int, FrameSetPoints],
     true: Mapping[str, Camera],
     judge: RigJudge,
-    board: tuple[BoardCorners, np.ndarray] | None = None,
 ) -> dict[str, object]:
     """Return errors of a perturbed rig before and after, and whether the true one is left as it is.
 
@@ -127,18 +125,10 @@ def refine_figures(
             turn_deg=config.refine_turn_deg, move_mm=config.refine_move_mm, lenses=False,
         )  # fmt: skip
 
-    rows: dict[str, object] = {
+    return {
         "before": _of(judge(bumped, true)),
         "footage": _row(by_footage, bumped, true, judge),
     }
-    if board is not None:
-        observations, points = board
-
-        def by_board(rig: Mapping[str, Camera]) -> RefinedRig:
-            return refine_by_board(rig, observations, points, rounds=config.rounds, lenses=False)
-
-        rows["board"] = _row(by_board, bumped, true, judge)
-    return rows
 
 
 def _row(

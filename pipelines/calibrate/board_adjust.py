@@ -49,10 +49,8 @@ def adjust_board_rig(
     corners: BoardCorners,
     points: np.ndarray,
     loss_scale_px: float,
-    lenses: bool = True,
-    cameras: bool = True,
 ) -> BoardRig:
-    """Refine board poses, and if asked `lenses` and the poses of `cameras`, over the corners.
+    """Refine the cameras' lenses and poses, and the board's poses, over the corners.
 
     Every observed camera and frame must be in `rig`; `points` (P, 3) are corners on the board,
     metres. The Cauchy loss begins to flatten at `loss_scale_px`.
@@ -61,10 +59,7 @@ def adjust_board_rig(
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_points3D = False
-    options.refine_focal_length = lenses
-    options.refine_sensor_from_rig = cameras
-    options.refine_principal_point = lenses
-    options.refine_extra_params = lenses
+    options.refine_principal_point = True
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = loss_scale_px
     # There are no free points to eliminate, so COLMAP's choice by image count (an iterative

@@ -31,12 +31,13 @@ class CalibrateConfig:
     """Distance between the subject's pupils, which gives a solution from footage its metre. Adult
     mean (Dodgson 2004, Variation and extrema of human interpupillary distance); measure it."""
     refine: str = "none"
-    """What the board, or else the footage, corrects in a given calibration: "none", "poses", or
-    "all" (lenses too). Cameras are only changed if held-out points then fit better."""
+    """What the footage corrects in a given calibration: "none", "poses", or "all" (lenses too).
+    Cameras are only changed if held-out points then fit better. Where there is a board, leave the
+    calibration out of the capture instead: a rig solved from the board is better."""
     refine_turn_deg: float = 0.2
-    """How far given cameras may be turned, without a board (a standard deviation)."""
+    """How far given cameras may be turned (a standard deviation)."""
     refine_move_mm: float = 3.0
-    """How far given cameras may have moved, without a board (a standard deviation)."""
+    """How far given cameras may have moved (a standard deviation)."""
     check_frame_sets: int = 2
     """Number of frame sets in which to look for cameras that have moved; 0: no check."""
 

@@ -3,7 +3,7 @@
 To find cameras that have moved, points are fitted with one camera free after the other; the one
 that explains most has moved, and the rest are tried again. So a bump is not blamed on neighbours.
 
-Refinement by footage or by a board changes all cameras, but only if held-out points then fit
+Refinement changes all cameras, but only if held-out points then fit
 clearly better.
 """
 
@@ -16,23 +16,13 @@ import numpy as np
 
 from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera, pinhole, project
-from express50.geometry.transforms import make_transform, matrix_to_axis_angle, rigid_fit
-from express50.rigs.world_frame import move_cameras
+from express50.geometry.transforms import matrix_to_axis_angle
 from pipelines.calibrate.adjuster import (
     AdjustedRig,
     RigPriors,
     adjust_rig,
     single_camera_gains,
     triangulate_tracks,
-)
-from pipelines.calibrate.board import BoardCorners
-from pipelines.calibrate.board_adjust import BoardRig, adjust_board_rig, corner_errors
-from pipelines.calibrate.board_guess import (
-    NEAR,
-    all_board_poses,
-    board_views,
-    rig_from_boards,
-    with_ideal,
 )
 from pipelines.calibrate.footage import at_footage_size, reduced_camera
 from pipelines.calibrate.tracks import LEAST_POINTS, FrameSetPoints, PointTracks, join_tracks
@@ -47,7 +37,7 @@ MOVE_PRIORS = RigPriors(turn_rad=np.radians(1.0), move_m=0.01)
 MOVE_SCALES, ITERATIONS = (6.0, 3.0, 1.5), 4
 """Residuals flatten at so many sigmas: a camera that is off by a few pixels must not be rejected
 together with the mismatches. Four iterations per scale name the cameras that convergence names."""
-HELD = 5  # every fifth point, or board image, judges and is not adjusted to
+HELD = 5  # every fifth point judges and is not adjusted to
 CLEARLY = 0.8
 """Held-out errors must fall to this share of what they were; even true rigs gain up to 6 %."""
 REFINE_BAND = 0.03  # of features about the given rig's epipolar lines, as a share of the diagonal
@@ -189,7 +179,6 @@ class RefinedRig:
     """
 
     cameras: dict[str, Camera]
-    by: str
     before_px: float
     after_px: float
     kept: str
@@ -205,7 +194,6 @@ class RefinedRig:
             for error in (self.before_px, self.after_px)
         )
         return {
-            "by": self.by,
             "held_out_before_px": before,
             "held_out_after_px": later,
             "kept_given": bool(self.kept),
@@ -239,7 +227,7 @@ def refine_by_footage(
     held, fit = (tracks.select((tracks.point % HELD == 0) == side) for side in (True, False))
     if len(names) < 3 or len(held.camera) < LEAST_POINTS:
         why = "cameras share too few points"
-        return RefinedRig(dict(given), "footage", np.nan, np.nan, why)
+        return RefinedRig(dict(given), np.nan, np.nan, why)
     priors = replace(
         LENS if lenses else RigPriors(), turn_rad=np.radians(turn_deg), move_m=move_mm * 1e-3
     )
@@ -249,12 +237,12 @@ def refine_by_footage(
     after, after_px = _judge(found, held)
     if not after < CLEARLY * before:
         why = "held-out points fit no better"
-        return RefinedRig(dict(given), "footage", before_px, after_px, why)
+        return RefinedRig(dict(given), before_px, after_px, why)
     refined = dict(given)
     for name, camera in found.items():
         full = at_footage_size(camera, given[name]) if lenses else given[name]
         refined[name] = replace(full, cam_from_world=camera.cam_from_world)
-    return RefinedRig(refined, "footage", before_px, after_px, "")
+    return RefinedRig(refined, before_px, after_px, "")
 
 
 def _judge(cameras: Mapping[str, Camera], held: PointTracks) -> tuple[float, float]:
@@ -265,86 +253,3 @@ def _judge(cameras: Mapping[str, Camera], held: PointTracks) -> tuple[float, flo
     features = errors[held.features()]
     median = float(np.median(features if len(features) else errors))
     return fit.cost / len(errors), median
-
-
-def refine_by_board(
-    given: Mapping[str, Camera],
-    corners: BoardCorners,
-    points: np.ndarray,
-    *,
-    rounds: int,
-    lenses: bool,
-) -> RefinedRig:
-    """Refine cameras, and if asked `lenses`, by a ChArUco board that several see at once.
-
-    The scale becomes the print's; where the rig stands is kept, by a rigid motion. `points` (P, 3)
-    are corners on the board, metres. Each of `rounds` takes its loss scale from the errors before.
-    """
-    held = corners.frame % HELD == 0
-    fit, judge = corners.select(~held), corners.select(held)
-    start = _with_boards(given, fit, points)
-    fit = fit.select(_near(start, fit, points))
-    if len(set(fit.camera)) < 2 or len(start.boards) < 4:
-        why = "cameras share too few corners"
-        return RefinedRig(dict(given), "board", np.nan, np.nan, why)
-    loss = max(2 * _median_error(start, fit, points), 0.1)
-    solved = start
-    for _ in range(max(rounds, 2)):
-        solved = adjust_board_rig(solved, fit, points, loss, lenses=lenses)
-        loss = max(2 * _median_error(solved, fit, points), 0.02)
-    found = _over(solved.cameras, given)
-    before = _median_error(_with_boards(given, judge, points), judge, points)
-    after = _median_error(_with_boards({**given, **found}, judge, points), judge, points)
-    if not after < CLEARLY * before:
-        why = "held-out corners fit no better"
-        return RefinedRig(dict(given), "board", before, after, why)
-    return RefinedRig({**given, **found}, "board", before, after, "")
-
-
-def _with_boards(
-    cameras: Mapping[str, Camera], corners: BoardCorners, points: np.ndarray
-) -> BoardRig:
-    """Add the board poses that fit the cameras best, with the cameras held."""
-    views = {}
-    for name in sorted(set(corners.cameras) & set(cameras)):
-        size = (cameras[name].width, cameras[name].height)
-        mine = board_views(corners, name, points, size)
-        if mine:
-            views[name] = {v.frame: with_ideal(cameras[name], v) for v in mine}
-    placed = {name: cameras[name].cam_from_world for name in views}
-    boards = rig_from_boards(placed, cameras, views, all_board_poses(views))
-    rig = BoardRig({name: cameras[name] for name in views}, boards)
-    kept = corners.select(_near(rig, corners, points))
-    if len(kept.camera) == 0:
-        return rig
-    loss = max(2 * _median_error(rig, kept, points), 0.1)
-    held = adjust_board_rig(rig, kept, points, loss, lenses=False, cameras=False)
-    return BoardRig(rig.cameras, {**rig.boards, **held.boards})
-
-
-def _near(rig: BoardRig, corners: BoardCorners, points: np.ndarray) -> np.ndarray:
-    """Mark the rows (N,) that the rig explains roughly."""
-    errors = np.linalg.norm(corner_errors(rig, corners, points), axis=1)
-    widths = [np.hypot(c.width, c.height) for c in rig.cameras.values()]
-    return errors < 2 * NEAR * max(widths, default=0.0)
-
-
-def _median_error(rig: BoardRig, corners: BoardCorners, points: np.ndarray) -> float:
-    errors = np.linalg.norm(corner_errors(rig, corners, points), axis=1)
-    errors = errors[np.isfinite(errors)]
-    return float(np.median(errors)) if len(errors) else float("nan")
-
-
-def _over(solved: Mapping[str, Camera], given: Mapping[str, Camera]) -> dict[str, Camera]:
-    """Lay solved cameras over the given ones by the rigid motion that most of them agree on."""
-    names = sorted(solved)
-    new, old = (np.stack([rig[n].center for n in names]) for rig in (solved, given))
-    if len(names) < 3:
-        motion = given[names[0]].world_from_cam @ solved[names[0]].cam_from_world
-        return move_cameras(solved, motion)
-    weights = np.ones(len(names))
-    for _ in range(10):  # a camera that was bumped must not drag the others along
-        R, t = rigid_fit(new, old, weights)
-        off = np.linalg.norm(new @ R.T + t - old, axis=1)
-        weights = 1 / (1 + (off / max(float(np.median(off)), 1e-6)) ** 2)
-    return move_cameras(solved, make_transform(R, t))

@@ -40,7 +40,6 @@ from pipelines.calibrate.given_rig import (
     FootageCheck,
     RefinedRig,
     check_footage,
-    refine_by_board,
     refine_by_footage,
 )
 from pipelines.calibrate.timing import CameraTiming
@@ -144,21 +143,17 @@ def _given(index: Index, path: Path, has_board: bool, config: CalibrateConfig) -
     refined: RefinedRig | None = None
     gains: ColourGains | None = None
     warnings: tuple[Note, ...] = ()
-    lenses = config.refine == "all"
-    if config.refine != "none" and has_board:
-        corners, points, whites = _read_board(index, config.board_frames)
-        gains = whites.gains(sorted(cameras))
-        refined = refine_by_board(cameras, corners, points, rounds=config.rounds, lenses=lenses)
-    elif config.refine != "none":
+    if config.refine != "none":
         # One bumped camera is corrected first. Where several seem to have moved, the whole rig is
         # off, and the check cannot say which camera is at fault.
         check = _check_footage(index, cameras, max(1, config.check_frame_sets))
         refined = refine_by_footage(
             cameras, find_points(read_footage(index, cameras, config.solve_frame_sets)),
-            turn_deg=config.refine_turn_deg, move_mm=config.refine_move_mm, lenses=lenses,
+            turn_deg=config.refine_turn_deg, move_mm=config.refine_move_mm,
+            lenses=config.refine == "all",
             start=check.cameras if check is not None and len(check.moved) == 1 else None,
         )  # fmt: skip
-    elif has_board:
+    if has_board:
         try:
             gains = _read_board(index, COLOUR_FRAMES)[2].gains(sorted(cameras))
         except (CalibrationError, CaptureError) as error:
