@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
@@ -21,6 +21,7 @@ from express50.contract.stage import stages, typical_error
 from express50.files.atomic import write_bytes
 from express50.local_server import NOT_FOUND, PageServer, Reply
 from express50.runner.ledger import COLUMNS, Ledger, Receipt, Run
+from express50.runner.outdated import few, outdated
 
 PAGE_SECONDS = 3.0  # between two pages while a run goes on
 SILENT_SECONDS = 15.0  # a run that shows no sign for so long was killed
@@ -90,9 +91,17 @@ def show_status(args: argparse.Namespace) -> int:
         table = _keep_page(dataset, args.page)
     else:
         table = _read(dataset)
+        with Ledger(dataset.ledger, read_only=True) as ledger:
+            why = {(s, i): w for s, i, w in outdated(dataset, list(stages().values()), ledger)}
         # Receipts but for their files, which `express50 check` looks at.
-        rows = {s.stage: [{k: getattr(r, k) for k in COLUMNS} for r in s.receipts] for s in table}
-        answer(args, rows, *_lines(table))
+        rows = {
+            s.stage: [
+                {k: getattr(r, k) for k in COLUMNS} | {"outdated": why.get((s.stage, r.item), "")}
+                for r in s.receipts
+            ]
+            for s in table
+        }
+        answer(args, rows, *_lines(table), *_outdated_lines(dataset, why))
     return FAILED if any(row.failed for row in table) else OK
 
 
@@ -153,6 +162,19 @@ def _lines(table: list[StageStatus]) -> Iterator[str]:
     for row in table:
         for receipt in row.failed:
             yield f"failed {receipt.stage} {receipt.item}: {receipt.reason}"
+
+
+def _outdated_lines(dataset: Dataset, why: Mapping[tuple[str, str], str]) -> Iterator[str]:
+    groups: dict[tuple[str, str], list[str]] = {}
+    for (stage, item), words in why.items():
+        groups.setdefault((stage, words), []).append(item)
+    for (stage, words), items in groups.items():
+        yield f"outdated {stage} {few(items, 2)}: {words}"
+    if groups:
+        yield (
+            f"a run with the settings of the last one ({dataset.root}/config) makes these again; "
+            "one with those that they were made with keeps them"
+        )
 
 
 def read_status(

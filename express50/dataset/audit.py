@@ -16,13 +16,15 @@ from pathlib import Path
 from typing import Any
 
 from express50.capture.demographics import PUBLIC_KEYS
+from express50.console import count
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset, footage_root
 from express50.contract.stage import Stage
 from express50.dataset.withdraw import files_that, names_any_of, says, withdrawn
 from express50.errors import AnnotationError, ConfigError, Express50Error, FormatError
-from express50.files.digests import file_sha256, files_of, path_digest, text_digest
-from express50.runner.ledger import FileMark, Ledger, Made, Receipt
+from express50.files.digests import file_sha256, files_of
+from express50.runner.ledger import FileMark, Ledger, Receipt
+from express50.runner.outdated import BAD_INPUT, differing, few, published_digest, why_outdated
 from express50.runner.publish import clean_leftovers, hold_stages, is_running, set_aside
 from express50.runner.replaced import size_of
 from express50.runner.worker import fingerprint, input_digests
@@ -31,8 +33,6 @@ from express50.shards.writer import verify
 
 WRONG_LABELS = ("identity", "window", "unknown", "unreadable")
 LabelProblems = Callable[[Dataset, list[str]], Iterable[Any]]
-# Damaged inputs may fail in any of these ways before a stage has checked them.
-BAD_INPUT = (Express50Error, OSError, ValueError, KeyError, TypeError)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,7 +228,7 @@ class _StageAudit:
         self.receipts = {stage.name: ledger.read(stage.name) for stage in stages}
         self.made = {stage.name: ledger.made(stage.name) for stage in stages}
         sha256 = file_sha256 if deep else ledger.sha256
-        self.digest = _published_digest(dataset, self.made, sha256)
+        self.digest = published_digest(dataset, self.made, sha256)
 
     def run(self) -> None:
         """Audit each stage; what an earlier one lacks is not held against a later one."""
@@ -267,10 +267,10 @@ class _StageAudit:
         # None of these has an output: what was made of a former one is right once it is back.
         self.broken |= {item.split("/")[0] for item in wrong | failed | to_do}
         if to_do and receipts:
-            count = f"{len(to_do)} of {len(known or ())} items are to do"
-            self._note(stage, f"{count}; run 'express50 {stage.name}'")
+            words = f"{len(to_do)} of {count(len(known or ()), 'item')} to do"
+            self._note(stage, f"{words}; run 'express50 {stage.name}'")
         if failures := sum(bool(receipt.reason) for receipt in receipts.values()):
-            self._note(stage, f"{failures} items failed; see status")
+            self._note(stage, f"{count(failures, 'item')} failed; see status")
 
     def _output_faults(self, stage: str) -> Iterator[Fault]:
         """Find outputs that are missing, changed or unaccounted for, at most one fault per item."""
@@ -297,7 +297,7 @@ class _StageAudit:
         other = [name for name in shared if self._differs(there[name], marks[name])]
         foreign = sorted(there.keys() - marks.keys())
         states = {"gone": gone, "not as published": other, "written by no run": foreign}
-        words = [f"{_few(names)} {state}" for state, names in states.items() if names]
+        words = [f"{few(names)} {state}" for state, names in states.items() if names]
         if words:
             kind = "missing" if gone else "changed" if other else "foreign"
             return Fault(item, kind, ", ".join(words), bool(foreign))
@@ -308,7 +308,7 @@ class _StageAudit:
             faults = verify(folder) if self.deep else []
         except FormatError as error:
             faults = [str(error)]
-        return Fault(item, "shards", _few(faults)) if faults else None
+        return Fault(item, "shards", few(faults)) if faults else None
 
     def _differs(self, path: Path, mark: FileMark) -> bool:
         """Compare a file's bytes; a copy has another time, so time alone is not evidence."""
@@ -360,7 +360,7 @@ class _StageAudit:
             self._find("config", f"config/{path.name}", str(error), how)
             return
         unreadable: dict[str, list[str]] = {}
-        other_settings = 0
+        to_make: dict[str, list[str]] = {}
         for item, receipt in receipts.items():
             try:
                 now = input_digests(stage, self.dataset, item, config, self.digest)
@@ -369,22 +369,21 @@ class _StageAudit:
                 continue
             if fingerprint(stage, config, now) == receipt.fingerprint:
                 continue
-            before = self.made[name][item].inputs
-            changed = [k for k in sorted(before.keys() | now.keys()) if before.get(k) != now.get(k)]
+            made = self.made[name][item]
+            changed = differing(made.inputs, now)
             if not changed:
-                other_settings += 1
+                to_make.setdefault(why_outdated(stage, config, made, now), []).append(item)
             elif self._waits(item):
                 self._note(stage, f"{item} cannot be judged before what it reads is made again")
             else:
-                what = f"made from another {_few(changed)} than is there now"
+                what = f"made from another {few(changed)} than is there now"
                 self._settle(name, Fault(item, "outdated", what), True)
         for reason, items in unreadable.items():
             if not all(self._waits(item) for item in items):
                 what = f"its inputs cannot be read: {reason}"
-                self._find("unreadable", f"{name} {_few(items, 1)}", what, again)
-        if other_settings:
-            words = "items were made with other settings or by another version"
-            self._note(stage, f"{other_settings} {words}; the next run makes them again")
+                self._find("unreadable", f"{name} {few(items, 1)}", what, again)
+        for why, items in to_make.items():
+            self._note(stage, f"outdated {few(items, 1)}: {why}; the next run makes them again")
 
     def _waits(self, item: str) -> bool:
         """Return True if something that the item may read is broken."""
@@ -398,39 +397,3 @@ class _StageAudit:
     def _find(self, kind: str, where: str, what: str, how: str, fixed: bool = False) -> None:
         finding = Finding(kind=kind, where=where, what=what, fix=how, fixed=fixed)
         self.result.findings.append(finding)
-
-
-def _published_digest(
-    dataset: Dataset, made: Mapping[str, Mapping[str, Made]], sha256: Callable[[Path], str]
-) -> Callable[[Path], str]:
-    """Return a function that digests paths as `path_digest` does, with files as published.
-
-    A damaged file is made again to the same bytes, and does not make wrong what was made of the
-    good one. Paths that no stage published count as they are.
-    """
-    known: dict[Path, str] = {}
-    below: dict[Path, list[Path]] = {}
-    for stage, items in made.items():
-        for item, row in items.items():
-            for name, mark in row.files.items():
-                path = dataset.item_dir(stage, item) / name
-                known[path] = mark.sha256
-                for parent in path.parents[: len(path.relative_to(dataset.root).parts) - 1]:
-                    below.setdefault(parent, []).append(path)
-
-    def digest(path: Path) -> str:
-        if path not in known and path not in below:
-            known[path] = path_digest(path, sha256)
-        elif path not in known:
-            files = sorted(below[path])
-            rows = (f"{file.relative_to(path).as_posix()} {known[file]}" for file in files)
-            known[path] = text_digest("\n".join(rows))
-        return known[path]
-
-    return digest
-
-
-def _few(names: Sequence[str], count: int = 3) -> str:
-    """List the first names, then how many more there are."""
-    more = f" and {len(names) - count} more" if len(names) > count else ""
-    return ", ".join(names[:count]) + more

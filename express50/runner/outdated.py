@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
-from express50.contract.config import config_texts
+from express50.contract.config import config_texts, resolve_config
+from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
-from express50.runner.ledger import Made
+from express50.errors import ConfigError, Express50Error
+from express50.files.digests import path_digest, text_digest
+from express50.runner.ledger import Ledger, Made
+from express50.runner.worker import fingerprint, input_digests
+
+# Damaged inputs may fail in any of these ways before a stage has checked them.
+BAD_INPUT = (Express50Error, OSError, ValueError, KeyError, TypeError)
 
 NAMED = 3  # inputs or settings that are named
 
@@ -22,7 +31,7 @@ def why_outdated(stage: Stage, config: Any, made: Made, inputs: Mapping[str, str
         inputs: digests of the present inputs by name.
     """
     words = []
-    if changed := _differing(made.inputs, inputs):
+    if changed := differing(made.inputs, inputs):
         words.append(f"inputs changed: {few(changed, NAMED)}")
     if settings := other_settings(made, config):
         words.append(f"settings changed: {few(settings, NAMED)}")
@@ -34,7 +43,7 @@ def why_outdated(stage: Stage, config: Any, made: Made, inputs: Mapping[str, str
 def other_settings(made: Made, config: Any) -> list[str]:
     """List the settings that an output was made with and that differ from the given ones."""
     then, now = made.settings, config_texts(config)
-    names = _differing(then, now) if then else []
+    names = differing(then, now) if then else []
     return [f"{n} was {then.get(n, 'unknown')}, is {now.get(n, 'gone')}" for n in names]
 
 
@@ -44,5 +53,59 @@ def few(names: Sequence[str], count: int = 3) -> str:
     return ", ".join(names[:count]) + more
 
 
-def _differing(one: Mapping[str, str], other: Mapping[str, str]) -> list[str]:
+def differing(one: Mapping[str, str], other: Mapping[str, str]) -> list[str]:
+    """List the keys under which two tables have other values, or one has none."""
     return [n for n in sorted(one.keys() | other.keys()) if one.get(n) != other.get(n)]
+
+
+def outdated(
+    dataset: Dataset, stages: Sequence[Stage], ledger: Ledger
+) -> Iterator[tuple[str, str, str]]:
+    """Yield stage, item and reason of each output that the next run would make again.
+
+    The settings are those of each stage's last run. Outputs whose inputs cannot be read are left
+    out: `express50 check` finds these. Of what stages published, the ledger's digests are taken.
+    """
+    made = {stage.name: ledger.made(stage.name) for stage in stages}
+    digest = published_digest(dataset, made, ledger.sha256)
+    for stage in stages:
+        with suppress(ConfigError):  # of settings that are no more; the next run says so
+            path = dataset.config_file(stage.name)
+            config = resolve_config(stage, "standard", path, (), [s.name for s in stages])
+            for item, receipt in ledger.read(stage.name).items():
+                if item in made[stage.name]:
+                    with suppress(*BAD_INPUT):
+                        now = input_digests(stage, dataset, item, config, digest)
+                        if fingerprint(stage, config, now) != receipt.fingerprint:
+                            row = made[stage.name][item]
+                            yield stage.name, item, why_outdated(stage, config, row, now)
+
+
+def published_digest(
+    dataset: Dataset, made: Mapping[str, Mapping[str, Made]], sha256: Callable[[Path], str]
+) -> Callable[[Path], str]:
+    """Return a function that digests paths as `path_digest` does, with files as published.
+
+    A damaged file is made again to the same bytes, and does not make wrong what was made of the
+    good one. Paths that no stage published count as they are.
+    """
+    known: dict[Path, str] = {}
+    below: dict[Path, list[Path]] = {}
+    for stage, items in made.items():
+        for item, row in items.items():
+            for name, mark in row.files.items():
+                path = dataset.item_dir(stage, item) / name
+                known[path] = mark.sha256
+                for parent in path.parents[: len(path.relative_to(dataset.root).parts) - 1]:
+                    below.setdefault(parent, []).append(path)
+
+    def digest(path: Path) -> str:
+        if path not in known and path not in below:
+            known[path] = path_digest(path, sha256)
+        elif path not in known:
+            files = sorted(below[path])
+            rows = (f"{file.relative_to(path).as_posix()} {known[file]}" for file in files)
+            known[path] = text_digest("\n".join(rows))
+        return known[path]
+
+    return digest

@@ -19,6 +19,7 @@ from express50.cli.main import main
 from express50.cli.status import SILENT_SECONDS, format_seconds, read_status, status_page
 from express50.runner.ledger import Ledger, Receipt, Run
 from tests.faults import toy
+from tests.synth import make_capture
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 
@@ -237,3 +238,30 @@ def test_status_reads_ledgers_of_before_runs_were_kept_and_writes_nothing(tmp_pa
     assert json.loads(out[out.index("{") :])["ingest"][0]["reason"] == "StageError: dark"
     assert "StageError: dark" in (tmp_path / "p.html").read_text()
     assert (tmp_path / "ledger.sqlite").read_bytes() == before
+
+
+def test_outdated_outputs_are_said_with_what_they_were_made_with(tmp_path, capsys):
+    make_capture(tmp_path / "S001", subject="S001", cameras=2, frames=4)
+    root = tmp_path / "data"
+    ingest = ["ingest", str(root), str(tmp_path / "S001"), "--workers", "0"]
+    assert main(ingest) == 0
+    capsys.readouterr()
+    assert main(["status", str(root)]) == 0
+    assert "outdated" not in capsys.readouterr().out
+
+    config = root / "config" / "ingest.toml"  # as a run writes it that fails or is stopped
+    config.write_text(config.read_text().replace("proxy_quality = 85", "proxy_quality = 70"))
+    why = "settings changed: proxy_quality was 85, is 70"
+    assert main(["status", str(root)]) == 0
+    assert f"outdated ingest S001: {why}" in capsys.readouterr().out
+    assert main(["status", str(root), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["ingest"][0]["outdated"] == why
+    assert main(["check", str(root)]) == 0
+    assert f"note: ingest: outdated S001: {why}" in capsys.readouterr().out
+
+    assert main(ingest) == 0  # the settings that it was made with
+    assert "1 skipped" in capsys.readouterr().out
+    footage = next((tmp_path / "S001").rglob("*.png"))
+    footage.write_bytes(footage.read_bytes() + b"x")
+    assert main(["status", str(root)]) == 0
+    assert "outdated ingest S001: inputs changed: " in capsys.readouterr().out
