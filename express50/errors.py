@@ -32,6 +32,10 @@ class ConfigError(Express50Error):
     """A configuration key or value is unknown or out of range."""
 
 
+class NotReadyError(ConfigError):
+    """The machine lacks what a command asks for: space, memory, a GPU, a scheduler, a folder."""
+
+
 class FormatError(Express50Error):
     """A file does not follow its format."""
 

@@ -8,11 +8,11 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from express50.console import FAILED, OK, add_command, say, say_json, stdout_to_stderr
+from express50.console import FAILED, OK, USAGE, add_command, log, say, say_json, stdout_to_stderr
 from express50.contract.config import PRESETS, config_toml, resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage, stages, with_required
-from express50.errors import ConfigError, Express50Error, StageError
+from express50.errors import ConfigError, StageError
 
 
 def add_commands(subparsers: Any) -> None:
@@ -69,16 +69,6 @@ def config_of(stage: Stage, args: argparse.Namespace) -> Any:
     return resolve_config(stage, args.preset, args.config, args.set, stages())
 
 
-def _tried_config(stage: Stage, args: argparse.Namespace) -> Any:
-    """Build the configuration of a stage, and try the files that it names."""
-    config = config_of(stage, args)
-    try:
-        stage.try_files(config)
-    except Express50Error as error:
-        raise ConfigError(str(error)) from error
-    return config
-
-
 def run_one(args: argparse.Namespace) -> int:
     """Run one stage, and what its command runs first."""
     chosen = with_required([args.stage])
@@ -103,13 +93,14 @@ def run_all(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None) -> int:
     from express50.runner.executor import Pool
+    from express50.runner.preflight import problems
     from express50.runner.runner import run_stage
     from express50.runner.threads import cap_threads
 
-    if args.workers < 0 or args.threads < 1:
-        raise ConfigError(
-            f"--workers {args.workers} --threads {args.threads}: expected at least 0 and 1"
-        )
+    if args.workers < 0:
+        raise ConfigError(f"--workers {args.workers}: expected 0 or more")
+    if args.threads < 1:
+        raise ConfigError(f"--threads {args.threads}: expected 1 or more")
     # Before NumPy comes in with a stage: its BLAS reads the cap when it is loaded.
     cap_threads(args.threads)
     dataset = Dataset(args.dataset)
@@ -127,9 +118,13 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
         stdout_to_stderr() if args.json else nullcontext(),
         Pool(args.workers, args.scheduler, args.threads, slurm) as pool,
     ):
-        # Every configuration is checked before the first stage spends hours.
-        configs = [_tried_config(stage, args) for stage in chosen]
-        for stage, config in zip(chosen, configs, strict=True):
+        # All of it is checked before the first stage spends hours.
+        work = [(stage, config_of(stage, args)) for stage in chosen]
+        if found := list(problems(dataset, work, pool, all_items=pattern is None)):
+            for line in found:
+                log(f"express50: {line}")
+            return USAGE
+        for stage, config in work:
             items = _items(stage, dataset, args, pattern)
             summaries.append(run_stage(stage, dataset, config, items, pool=pool))
             if not args.json:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import logging
 import os
 import shutil
+import socket
 import subprocess
 import sys
 import time
 from typing import Any
+from urllib.parse import urlsplit
 
 from express50.errors import StageError
 from express50.runner.threads import thread_environment
@@ -16,6 +18,7 @@ from express50.runner.threads import thread_environment
 GPU = "GPU"  # name of the resource, of which a worker offers 1 for the device that it sees
 GPU_SECONDS = 60.0  # a GPU worker that died may take so long to come back
 CONNECT_SECONDS = 20.0
+KNOCK_SECONDS = 3.0
 
 
 class LocalWorkers:
@@ -62,6 +65,20 @@ class LocalWorkers:
         self._cluster.close(timeout=10)
 
 
+def _knock(address: str) -> None:
+    """Open a connection and close it: dask itself tries for half a minute where nobody answers.
+
+    Raises:
+        ValueError: the address has no port.
+        OSError: nobody answers.
+    """
+    parts = urlsplit(address if "://" in address else f"tcp://{address}")
+    if parts.hostname is None or parts.port is None:
+        raise ValueError("it has no port")
+    if parts.scheme in ("tcp", "tls"):
+        socket.create_connection((parts.hostname, parts.port), KNOCK_SECONDS).close()
+
+
 class RemoteWorkers:
     """Workers of a scheduler that somebody else runs."""
 
@@ -79,12 +96,13 @@ class RemoteWorkers:
         from distributed import Client
 
         try:
+            _knock(address)
             client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
             has_workers = bool(client.nthreads())
-        except (OSError, TimeoutError, ValueError) as error:
+        except (OSError, TimeoutError, ValueError, MemoryError) as error:  # of another server, too
             raise StageError(
-                f"scheduler {address}: cannot connect ({error}); expected an address "
-                "such as tcp://host:8786 of a running dask scheduler"
+                f"scheduler {address}: cannot connect ({error}); expected the address of a running"
+                " dask scheduler, such as tcp://host:8786"
             ) from error
         if not has_workers:
             sys.stderr.write(f"scheduler {address} has no workers yet; waiting\n")

@@ -10,10 +10,17 @@ from dataclasses import replace
 from typing import Any
 
 from express50.errors import DiskFullError, StageError
-from express50.runner.clusters import GPU, LocalWorkers, RemoteWorkers
+from express50.runner.clusters import GPU, LocalWorkers, RemoteWorkers, cuda_devices, no_gpu
 from express50.runner.ledger import Receipt
-from express50.runner.slurm import SlurmJob, SlurmWorkers
-from express50.runner.worker import BATCH_SECONDS, Task, failed_receipt, run_task, run_tasks
+from express50.runner.slurm import SlurmJob, SlurmWorkers, check_job_gpu
+from express50.runner.worker import (
+    BATCH_SECONDS,
+    Task,
+    failed_receipt,
+    run_task,
+    run_tasks,
+    torch_sees_cuda,
+)
 
 ATTEMPTS = 2  # an item that killed its worker this often is set aside
 SLURM_ATTEMPTS = 3  # the same where a worker may also have come to its job's time limit
@@ -47,6 +54,28 @@ class Pool:
 
     def __exit__(self, *unused: object) -> None:
         self.close()
+
+    def reach(self) -> None:
+        """Connect to the scheduler where one was given.
+
+        Raises:
+            StageError: it cannot be reached.
+        """
+        if self.scheduler is not None and self._workers is None:
+            self._workers = RemoteWorkers.reach(self.scheduler)
+
+    def check_gpu(self, stage: str) -> None:
+        """See that a stage that needs a GPU gets one.
+
+        Raises:
+            StageError: it does not.
+        """
+        if self.slurm is not None:
+            check_job_gpu(self.slurm[stage], stage)
+        elif self._workers is not None:
+            self._workers.slots(stage, gpu=True)
+        elif not cuda_devices() and (self.workers or not torch_sees_cuda()):
+            raise no_gpu(stage, "nvidia-smi lists none on this machine")
 
     def run(
         self,

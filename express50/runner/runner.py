@@ -21,6 +21,7 @@ from express50.files.digests import file_version, path_digest
 from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger, Made, Receipt
 from express50.runner.outdated import why_outdated
+from express50.runner.preflight import check_expected_space
 from express50.runner.progress import RunLog, showing
 from express50.runner.publish import clean_leftovers, discard_stale, set_aside, stage_lock
 from express50.runner.replaced import keeping, make_room
@@ -151,6 +152,7 @@ def run_stage(
     Raises:
         StageError: the stage has no items, or another run holds it.
         DiskFullError: the dataset's disk is nearly full.
+        NotReadyError: it has no room for the items, as far as some were measured.
     """
     started = time.perf_counter()
     dataset = Dataset(dataset.root.resolve())
@@ -169,6 +171,7 @@ def run_stage(
             ledger.forget(stage.name, gone)
         with RunLog(dataset.ledger, stage.name, len(chosen)) as log:
             threads = workers_pool.threads
+            check_expected_space(dataset, ledger, stage.name, chosen)
             work = _sort_items(stage, dataset, config, chosen, ledger, threads)
             outcomes = _run_items(stage, dataset, work, ledger, workers_pool, progress, log)
     missing = set(chosen) - set(outcomes)

@@ -172,6 +172,16 @@ def job_script(job: SlurmJob, address: str, name: str, threads: int, logs: Path)
     ).job_script()
 
 
+def check_job_gpu(job: SlurmJob, stage: str) -> None:
+    """Refuse jobs without a GPU for a stage that needs one.
+
+    Raises:
+        StageError: the jobs have none.
+    """
+    if not job.gpus:
+        raise no_gpu(stage, f"--slurm asks for none; add gpus=1, or a table [{stage}] with it")
+
+
 class SlurmWorkers(RemoteWorkers):
     """A scheduler here and the jobs that work for it; one that has ended is replaced."""
 
@@ -187,8 +197,8 @@ class SlurmWorkers(RemoteWorkers):
 
     def slots(self, stage: str, gpu: bool) -> int:
         """Return the number of tasks that may run at once; 1 before the first worker is there."""
-        if gpu and not self.job.gpus:
-            raise no_gpu(stage, f"--slurm asks for none; add gpus=1, or a table [{stage}] with it")
+        if gpu:
+            check_job_gpu(self.job, stage)
         return super().slots(stage, gpu)
 
     def keep(self, tasks: int) -> None:

@@ -135,15 +135,18 @@ def run_task(task: Task) -> Receipt:
     )
 
 
-def _run_and_publish(task: Task) -> tuple[dict, dict[str, FileMark]]:
-    if task.stage.needs_gpu(task.config):
-        import torch
+def torch_sees_cuda() -> bool:
+    """Say whether this process can use a GPU; importing torch takes seconds."""
+    import torch
 
-        if not torch.cuda.is_available():
-            raise StageError(
-                f"{task.stage.name} needs a GPU as it is configured; torch finds no CUDA device"
-                " here"
-            )
+    return torch.cuda.is_available()
+
+
+def _run_and_publish(task: Task) -> tuple[dict, dict[str, FileMark]]:
+    if task.stage.needs_gpu(task.config) and not torch_sees_cuda():
+        raise StageError(
+            f"{task.stage.name} needs a GPU as it is configured; torch finds no CUDA device here"
+        )
     keep = keeping(task.dataset, task.former)
     with publishing(task.dataset, task.stage.name, task.item, keep) as out:
         # Standard output is for data; libraries' messages go to standard error.

@@ -1,0 +1,156 @@
+"""Ask before the work whether files, folders, memory, space, GPU and scheduler are there."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import psutil
+from rich.filesize import decimal
+
+from express50.console import count
+from express50.contract.layout import Dataset
+from express50.contract.stage import Stage
+from express50.errors import Express50Error, FormatError, NotReadyError, StageError
+from express50.files.atomic import LEAST_FREE
+from express50.runner.executor import Pool
+from express50.runner.ledger import Ledger
+from express50.runner.replaced import size_of
+
+WORKER_SHARE = 0.9 * 0.95  # of memory: what workers get, and where dask ends one
+CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")  # of containers and jobs
+
+
+def problems(
+    dataset: Dataset, work: Sequence[tuple[Stage, Any]], pool: Pool, all_items: bool = True
+) -> Iterator[str]:
+    """Yield, one line each, what would stop stages with these configurations; nothing is written.
+
+    Memory and disk space are judged by the receipts of items that were made in this dataset; the
+    space for some of the items is left to `check_expected_space`.
+    """
+    chosen = [stage for stage, _ in work]
+    yield from _folder_problems(dataset, chosen)
+    for stage, config in work:
+        try:
+            stage.try_files(config)
+        except Express50Error as error:
+            yield str(error)
+    yield from _worker_problems(work, pool)
+    needs = []
+    with suppress(FormatError):  # a damaged ledger: the first stage says so
+        if dataset.ledger.is_file():
+            with Ledger(dataset.ledger, read_only=True) as ledger:
+                yield from _memory_problems(ledger, chosen, pool)
+                needs = [_need(dataset, ledger, stage) for stage in chosen if all_items]
+    yield from _space_problems(dataset, [need for need in needs if need])
+
+
+def _folder_problems(dataset: Dataset, stages: Iterable[Stage]) -> Iterator[str]:
+    """Write a file without a name into each folder that the stages write to."""
+    inside = [dataset.stage_dir(stage.name) for stage in stages]
+    inside += [dataset.staging_dir, dataset.config_file("").parent]
+    for folder in [_existing(dataset.root), *(one for one in inside if one.exists())]:
+        try:
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+        except NotADirectoryError:
+            yield f"{folder}: a file, expected a folder that can be written to"
+        except OSError as error:
+            yield f"{folder}: cannot be written to ({error.strerror}); check whose it is"
+
+
+def _worker_problems(work: Sequence[tuple[Stage, Any]], pool: Pool) -> Iterator[str]:
+    try:
+        pool.reach()
+    except StageError as error:
+        yield str(error)
+        return
+    for stage, config in work:
+        if stage.needs_gpu(config):
+            try:
+                pool.check_gpu(stage.name)
+            except StageError as error:
+                yield str(error)
+
+
+def _memory_problems(ledger: Ledger, stages: Iterable[Stage], pool: Pool) -> Iterator[str]:
+    if pool.scheduler is not None or pool.slurm is not None:
+        return
+    total = psutil.virtual_memory().total
+    if CGROUP_LIMIT.is_file() and (text := CGROUP_LIMIT.read_text().strip()).isdigit():
+        total = min(total, int(text))
+    for stage in stages:
+        done = (r.peak_memory for r in ledger.read(stage.name).values() if r.status == "done")
+        peak = max(done, default=0)
+        fit = max(math.floor(total * WORKER_SHARE / max(peak, 1)), 1)
+        if pool.workers > fit:
+            yield (
+                f"{stage.name}: {pool.workers} workers need {decimal(peak)} each, as the largest "
+                f"item did, and this machine has {decimal(total)}; use --workers {fit}"
+            )
+
+
+def _need(dataset: Dataset, ledger: Ledger, stage: Stage) -> tuple[str, int, float] | None:
+    """Return a stage's name, items to do that have no output yet, and bytes of an item."""
+    try:
+        items = stage.items(dataset)
+    except Express50Error:  # what names them is damaged: the stage says so
+        return None
+    return expected_bytes(ledger, stage.name, items)
+
+
+def expected_bytes(
+    ledger: Ledger, stage: str, items: Iterable[str]
+) -> tuple[str, int, float] | None:
+    """Return the stage, how many items have no output yet, and the mean bytes of those that have.
+
+    None where nothing is left to do, or nothing was measured.
+    """
+    made = ledger.made(stage)
+    new = len(set(items) - made.keys())
+    sizes = [sum(mark.size for mark in row.files.values()) for row in made.values()]
+    return (stage, new, sum(sizes) / len(sizes)) if new and sizes else None
+
+
+def check_expected_space(dataset: Dataset, ledger: Ledger, stage: str, items: list[str]) -> None:
+    """Refuse to begin a stage whose outputs will not fit, as far as its items were measured.
+
+    Raises:
+        NotReadyError: they will not.
+    """
+    if need := expected_bytes(ledger, stage, items):
+        for problem in _space_problems(dataset, [need]):
+            raise NotReadyError(problem)
+
+
+def _space_problems(dataset: Dataset, needs: Sequence[tuple[str, int, float]]) -> Iterator[str]:
+    usage = shutil.disk_usage(_existing(dataset.root))
+    if not usage.total:  # some network drives do not report their size
+        return
+    need = sum(new * size for _, new, size in needs)
+    # What was replaced gives way.
+    room = usage.free - LEAST_FREE + size_of(dataset.replaced_dir)[1]
+    if room < 0:
+        yield (
+            f"{dataset.root}: the disk is nearly full: {decimal(usage.free)} are left, expected "
+            f"{decimal(int(LEAST_FREE))}; free some space"
+        )
+    elif need > room:
+        largest = max(needs, key=lambda one: one[1] * one[2])
+        yield (
+            f"{dataset.root}: about {decimal(int(need))} are needed, most of it by {largest[0]} "
+            f"({count(largest[1], 'item')} of {decimal(int(largest[2]))}), and "
+            f"{decimal(int(room))} can be used; free some space, or make fewer items with --items"
+        )
+
+
+def _existing(path: Path) -> Path:
+    """Return a path, or the nearest folder above it that is there."""
+    path = path.resolve()
+    return next(one for one in (path, *path.parents) if one.exists())
