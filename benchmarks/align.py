@@ -31,7 +31,7 @@ from benchmarks.document import replace_section
 from benchmarks.replay import measure_steps, replay
 from express50.capture.frames import read_proxy
 from express50.capture.index import Cue, read_index
-from express50.contract.config import build_config
+from express50.contract.config import PRESETS, build_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
 from express50.files.images import write_image
@@ -56,7 +56,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--truth", type=Path, help="truth folder of the recording")
     parser.add_argument("--subjects", type=int, default=6)
     parser.add_argument("--frames", type=int, default=12, help="frames an expression")
-    parser.add_argument("--preset", default="standard", choices=sorted(observe.STAGE.presets))
+    parser.add_argument("--preset", default="standard", choices=PRESETS)
     parser.add_argument("--doc", type=Path, help="write the acceptance table into this document")
     options = parser.parse_args(arguments)
     if (options.dataset is None) != (options.truth is None):
@@ -119,7 +119,7 @@ def within(errors: list[int], frames: int) -> float:
 
 def run(stage: Stage, dataset: Dataset, preset: str, **values: object) -> None:
     """Run a stage in this process; stops the benchmark when an item fails."""
-    config = build_config(stage, {**stage.presets[preset], **values})
+    config = build_config(stage, {**stage.presets.get(preset, {}), **values})
     summary = run_stage(stage, dataset, config, workers=0, progress=False)
     if not summary.ok:
         sys.exit("\n".join(summary.lines()))

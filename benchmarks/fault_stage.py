@@ -59,7 +59,6 @@ STAGE = Stage(
     name="faults",
     version=1,
     config=FaultConfig,
-    presets={"draft": {}, "standard": {}, "reference": {}},
     items=items,
     inputs=inputs,
     run=run,

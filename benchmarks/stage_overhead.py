@@ -48,7 +48,6 @@ STAGE = Stage(
     name="empty",
     version=1,
     config=EmptyConfig,
-    presets={"draft": {}, "standard": {}, "reference": {}},
     items=items,
     inputs=inputs,
     run=run,

@@ -175,7 +175,8 @@ def benchmark(source: Reference, presets: tuple[str, ...], count: int, clip: boo
     subjects = dataset.subjects()[:count]
     views = {s: held_out_views(dataset, truth, s, captures) for s in subjects}
     load_head(build_config(STAGE, {}).head)  # else the first preset alone would pay for it
-    settings = {"landmark_only": LANDMARK_ONLY} | {name: STAGE.presets[name] for name in presets}
+    settings = {"landmark_only": LANDMARK_ONLY}
+    settings |= {name: STAGE.presets.get(name, {}) for name in presets}
     result: dict = {
         "subjects": subjects,
         "cameras": len(read_cameras_of(dataset, subjects[0])),
@@ -316,7 +317,7 @@ def narrowed(
 
 def scaling(scratch: Path) -> list[dict]:
     """Return seconds and face error of `standard` over views and pixels of a new subject."""
-    config, rows = build_config(STAGE, STAGE.presets["standard"]), []
+    config, rows = build_config(STAGE, {}), []
     for side in SCALING_SIDES:
         cameras = max(SCALING_VIEWS) + HELD_OUT
         dataset, truth, _ = prepare(twin_config(1, cameras, side), scratch / f"scaling_{side}")

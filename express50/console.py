@@ -176,3 +176,15 @@ def format_table(header: list[str], rows: list[list[str]]) -> Iterator[str]:
     for row in [header, *rows]:
         cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
         yield "  ".join(cells).rstrip()
+
+
+def format_seconds(seconds: float) -> str:
+    """Format a duration for people: ``42 s``, ``3:05 min``, ``2:10 h``, ``3 d 4 h``."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60}:{whole % 60:02d} min"
+    if whole < 86400:
+        return f"{whole // 3600}:{whole % 3600 // 60:02d} h"
+    return f"{whole // 86400} d {whole % 86400 // 3600} h"

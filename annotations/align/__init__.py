@@ -57,7 +57,6 @@ STAGE = Stage(
     name="align",
     version=5,
     config=AlignConfig,
-    presets={"draft": {}, "standard": {}, "reference": {}},
     items=Dataset.subjects,
     inputs=inputs,
     run=run,

@@ -18,7 +18,7 @@ from rich.filesize import decimal
 
 from express50.capture.index import read_index
 from express50.console import add_command, answer, format_table, stdout_to_stderr
-from express50.contract.config import config_toml, resolve_config
+from express50.contract.config import PRESETS, config_toml, resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage, stages
 from express50.errors import ConfigError, StageError
@@ -201,7 +201,7 @@ def preset_of(dataset: Dataset, stage: Stage) -> str:
     """Return the preset whose values a stage last ran with, or ``own`` and a digest of these."""
     path = dataset.config_file(stage.name)
     text = path.read_text(encoding="utf-8") if path.is_file() else ""
-    for preset in stage.presets:
+    for preset in PRESETS:
         if config_toml(stage.name, resolve_config(stage, preset)) == text:
             return preset
     return f"own {text_digest(text)[:6]}"

@@ -15,7 +15,7 @@ from typing import Any
 
 from rich.filesize import decimal
 
-from express50.console import FAILED, OK, add_command, answer, format_table, say
+from express50.console import FAILED, OK, add_command, answer, format_seconds, format_table, say
 from express50.contract.layout import Dataset, existing_dataset
 from express50.contract.stage import stages, typical_error
 from express50.files.atomic import write_bytes
@@ -300,15 +300,3 @@ def _row(stage: StageStatus) -> dict[str, Any]:
         "memory": decimal(stage.peak_memory) if stage.receipts else "",
         "error": stage.expected_error(),
     }
-
-
-def format_seconds(seconds: float) -> str:
-    """Format a duration for people: ``42 s``, ``3:05 min``, ``2:10 h``, ``3 d 4 h``."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{seconds:.1f} s" if seconds < 10 else f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60}:{whole % 60:02d} min"
-    if whole < 86400:
-        return f"{whole // 3600}:{whole % 3600 // 60:02d} h"
-    return f"{whole // 86400} d {whole % 86400 // 3600} h"

@@ -11,7 +11,7 @@ import math
 import textwrap
 import tomllib
 import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -45,19 +45,31 @@ def resolve_config(
         ConfigError: unknown preset, table or key (the nearest known one is named), wrong type,
             or a value that the dataclass refuses.
     """
-    if preset not in stage.presets:
+    if preset not in PRESETS:
         raise ConfigError(
-            f"{stage.name}: unknown preset {preset!r}{nearest(preset, stage.presets)}; "
-            f"expected one of {', '.join(stage.presets)}"
+            f"{stage.name}: unknown preset {preset!r}{nearest(preset, PRESETS)}; "
+            f"expected one of {', '.join(PRESETS)}"
         )
     tables = sorted({stage.name, *known_stages})
-    values: dict[str, object] = dict(stage.presets[preset])
+    values: dict[str, object] = dict(stage.presets.get(preset, {}))
     if file is not None:
         values |= read_tables(file, tables).get(stage.name, {})
     for table, key, value in known_assignments(assignments, tables, "stage"):
         if table == stage.name:
             values[key] = value
     return build_config(stage, values)
+
+
+def distinct_settings(stage: Stage, resolve: Callable[[Stage, str], Any]) -> dict[str, Any]:
+    """Return the configurations of a stage's presets by name; one that is standard's is that.
+
+    Args:
+        stage: the stage.
+        resolve: ``resolve(stage, preset)`` builds a configuration.
+    """
+    standard = resolve(stage, "standard")
+    found = {preset: resolve(stage, preset) for preset in PRESETS}
+    return {k: c for k, c in found.items() if k == "standard" or c != standard}
 
 
 def read_tables(file: Path, known: Sequence[str]) -> dict[str, dict[str, object]]:

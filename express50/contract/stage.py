@@ -146,12 +146,13 @@ class Stage:
         name: command, table in TOML and folder of the outputs.
         version: raise it when the same inputs and config give other outputs.
         config: frozen keyword-only dataclass; a string under each field documents it.
-        presets: ``draft``, ``standard`` and ``reference`` values that differ from the defaults.
         items: ids of the work items of a dataset; ``S001`` or nested ``S001/cam03``.
         inputs: what one item reads: paths are digested by content, strings are literal digests.
         run: ``run(dataset, item, config, out_dir)`` writes every file into ``out_dir`` and
             returns a ``Result`` (the runner writes it to ``metrics.json``). Raises Express50Error
             when the data of this item are bad.
+        presets: values of ``draft`` and ``reference`` that differ from the defaults, which are
+            ``standard``; a stage without a trade between time and error has none.
         try_files: opens the files that settings name; commands call it before any stage runs.
             Raises Express50Error where one cannot be used.
         needs_gpu: whether items of this config may only run where there is a GPU; one at a time
@@ -168,10 +169,10 @@ class Stage:
     name: str
     version: int
     config: type
-    presets: dict[str, dict[str, object]]
     items: Callable[[Dataset], list[str]]
     inputs: Callable[[Dataset, str, Any], dict[str, Path | str]]
     run: Callable[[Dataset, str, Any, Path], Result]
+    presets: dict[str, dict[str, object]] = field(default_factory=dict)
     try_files: Callable[[Any], None] = no_files
     needs_gpu: Callable[[Any], bool] = no_gpu
     help: str = ""

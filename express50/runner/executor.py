@@ -82,13 +82,14 @@ class Pool:
         tasks: Iterable[Task],
         settle: Callable[[Receipt], None],
         begin: Callable[[Task], None] = lambda task: None,
+        closed: Callable[[], bool] = lambda: False,
     ) -> None:
         """Run tasks of one stage and configuration; hand each receipt to ``settle`` as it comes.
 
-        ``begin`` is called as a task is handed to a worker. A task whose worker died is tried again
-        when nothing else runs, so that neighbours that died with it are not blamed, and is set
-        aside when that fails too. SLURM jobs do not share memory but a time limit, so there all of
-        those are tried again together.
+        ``begin`` is called as a task is handed to a worker; none is once ``closed`` says so. A task
+        whose worker died is tried again when nothing else runs, so that neighbours that died with
+        it are not blamed, and is set aside when that fails too. SLURM jobs do not share memory but
+        a time limit, so there all of those are tried again together.
 
         Raises:
             StageError: the scheduler cannot be reached or went away, or offers no GPU that the
@@ -99,6 +100,8 @@ class Pool:
         here = self.scheduler is None and self.slurm is None
         if here and (self.workers == 0 or len(tasks) <= 1):  # processes would cost more than gain
             for task in tasks:
+                if closed():
+                    return
                 begin(task)
                 settle(run_task(task))
             return
@@ -107,10 +110,11 @@ class Pool:
         workers = self._workers = self._workers_for(tasks[0])
         job = workers.job if isinstance(workers, SlurmWorkers) else None
         last = SLURM_ATTEMPTS if job else ATTEMPTS
-        left = self._run_window(workers, tasks, settle, begin, 1)
+        left = self._run_window(workers, tasks, settle, begin, closed, 1)
         for attempt in range(2, last + 1):
             groups = [left] if job and left else [[task] for task in left]
-            left = [t for g in groups for t in self._run_window(workers, g, settle, begin, attempt)]
+            again = [self._run_window(workers, g, settle, begin, closed, attempt) for g in groups]
+            left = [task for group in again for task in group]
         why, fix = "out of memory or a crash in native code", "give it more memory"
         if job is not None:
             why += f", or its job reached {job.time}"
@@ -128,6 +132,7 @@ class Pool:
         tasks: list[Task],
         settle: Callable[[Receipt], None],
         begin: Callable[[Task], None],
+        closed: Callable[[], bool],
         attempt: int,
     ) -> list[Task]:
         """Keep one batch per worker submitted; returns the tasks whose worker died."""
@@ -140,6 +145,8 @@ class Pool:
         while waiting or running:
             with _loss_is_one_error():
                 slots = workers.slots(name, gpu)
+                if waiting and closed():
+                    waiting.clear()
                 workers.keep(len(waiting) + sum(map(len, running.values())))
                 while waiting and len(running) < slots:
                     fair = max(1, len(waiting) // (2 * slots))  # the last ones end together
@@ -188,6 +195,21 @@ class Pool:
         if self._workers is not None:
             self._workers.close()
         self._workers = None
+
+    def width(self) -> int:
+        """Return how many items may be worked at at once.
+
+        Raises:
+            StageError: the scheduler cannot be reached.
+        """
+        if self.slurm:
+            each = (job.jobs * max(1, job.cores // self.threads) for job in self.slurm.values())
+            return min(each)
+        if self.scheduler is None:
+            return max(1, self.workers)
+        if self._workers is None:
+            self._workers = RemoteWorkers.reach(self.scheduler)
+        return self._workers.slots("", False)
 
 
 def _next_size(size: int, batch: list[Task], receipts: list[Receipt]) -> int:

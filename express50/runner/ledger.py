@@ -59,6 +59,7 @@ class Receipt:
             still stand: then the status stays ``done``, and all but this and the time are of it.
         metrics: what the stage returned.
         seconds: wall time of the attempt.
+        core_seconds: processor time of the attempt; 0 in receipts of older versions.
         peak_memory: largest resident memory while it ran, bytes.
         attempts: number of tries in that run.
         time: when the last attempt ended, seconds since 1970.
@@ -72,6 +73,7 @@ class Receipt:
     reason: str = ""
     metrics: dict = field(default_factory=dict)
     seconds: float = 0.0
+    core_seconds: float = 0.0
     peak_memory: int = 0
     attempts: int = 1
     time: float = field(default_factory=time.time)
@@ -112,6 +114,7 @@ CREATE TABLE IF NOT EXISTS receipts (
     stage TEXT NOT NULL, item TEXT NOT NULL, fingerprint TEXT NOT NULL, status TEXT NOT NULL,
     reason TEXT NOT NULL, metrics TEXT NOT NULL, seconds REAL NOT NULL,
     peak_memory INTEGER NOT NULL, attempts INTEGER NOT NULL, time REAL NOT NULL,
+    core_seconds REAL NOT NULL DEFAULT 0,
     PRIMARY KEY (stage, item)
 );
 CREATE TABLE IF NOT EXISTS made (
@@ -172,6 +175,10 @@ class Ledger:
             # after each would slow every item. `forget` waits, as its removals must not be lost.
             self._database.execute("PRAGMA synchronous=NORMAL")
             self._database.executescript(SCHEMA)
+            if "core_seconds" not in self._columns():  # made by an older version
+                self._database.execute(
+                    "ALTER TABLE receipts ADD COLUMN core_seconds REAL NOT NULL DEFAULT 0"
+                )
 
     def __enter__(self) -> Ledger:
         return self
@@ -248,7 +255,9 @@ class Ledger:
             FormatError: a row is damaged.
         """
         found = {}
-        for values in self._rows(COLUMNS, "receipts WHERE stage = ? ORDER BY item", stage):
+        older = self._columns() or COLUMNS  # no table, where nothing was made yet
+        columns = tuple(name for name in COLUMNS if name in older)
+        for values in self._rows(columns, "receipts WHERE stage = ? ORDER BY item", stage):
             values["metrics"] = self._parsed(values["metrics"], stage)
             receipt = Receipt(**values)
             if any(type(getattr(receipt, k)) is not kind for k, kind in KINDS.items()):
@@ -257,6 +266,10 @@ class Ledger:
                 )
             found[receipt.item] = receipt
         return found
+
+    def _columns(self) -> set[str]:
+        with self._damage():
+            return {row[1] for row in self._database.execute("PRAGMA table_info(receipts)")}
 
     def made(self, stage: str) -> dict[str, Made]:
         """Read what a stage's items were made from and with, and their files, sorted.

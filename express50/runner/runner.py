@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from express50.contract.config import config_toml, nearest
 from express50.contract.layout import Dataset
@@ -37,9 +37,19 @@ WARNINGS = 12  # lines; more of them would hide the account
 ALIKE = 3  # so many first items that fail for one reason show a wrong setting
 
 
+class Gate(Protocol):
+    """Watches the items of a run, and decides whether further ones may begin."""
+
+    def settled(self, receipt: Receipt) -> None:
+        """Take note of an item that ended."""
+
+    def closed(self) -> bool:
+        """Return whether no further item may begin."""
+
+
 @dataclass(frozen=True)
 class Outcome:
-    """The result of one item: ``done``, ``skipped`` (was current) or ``failed``.
+    """The result of one item: ``done``, ``skipped`` (was current), ``failed`` or ``left``.
 
     ``again`` says why an item was made that a former run had made already; it was ``restored``
     where the same output had been made before and was replaced since.
@@ -69,8 +79,8 @@ class Summary:
 
     @property
     def ok(self) -> bool:
-        """Return whether no item failed."""
-        return self.count("failed") == 0
+        """Return whether no item failed, and none was left."""
+        return self.count("failed") + self.count("left") == 0
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON form, which is also what a stage command prints with --json."""
@@ -80,6 +90,7 @@ class Summary:
             "done": self.count("done"),
             "skipped": self.count("skipped"),
             "failed": self.count("failed"),
+            "left": self.count("left"),
             "seconds": round(self.seconds, 3),
             "items": [
                 asdict(outcome) | {"seconds": round(outcome.seconds, 3)}
@@ -89,7 +100,8 @@ class Summary:
 
     def lines(self) -> Iterator[str]:
         """Yield the account for people, then what was made again, dropped or failed, and why."""
-        counts = " + ".join(f"{self.count(s)} {s}" for s in ("done", "skipped", "failed"))
+        said = ("done", "skipped", "failed", *(("left",) if self.count("left") else ()))
+        counts = " + ".join(f"{self.count(status)} {status}" for status in said)
         yield f"{self.stage}: read {len(self.outcomes)} = {counts} in {self.seconds:.1f} s"
         again = Counter((o.restored, o.again) for o in self.outcomes if o.again or o.restored)
         for (restored, why), count in again.most_common():
@@ -132,6 +144,7 @@ def run_stage(
     scheduler: str | None = None,
     progress: bool = True,
     pool: Pool | None = None,
+    gate: Gate | None = None,
 ) -> Summary:
     """Bring a stage's outputs up to date.
 
@@ -145,6 +158,7 @@ def run_stage(
         scheduler: address of a dask scheduler to use in place of local processes.
         progress: show progress on standard error.
         pool: workers shared with other stages, in place of the two arguments above.
+        gate: sees every receipt, and says when no further item may begin.
 
     Returns:
         The account of all items. A bad item is in it; it does not raise.
@@ -173,9 +187,11 @@ def run_stage(
             threads = workers_pool.threads
             check_expected_space(dataset, ledger, stage.name, chosen)
             work = _sort_items(stage, dataset, config, chosen, ledger, threads)
-            outcomes = _run_items(stage, dataset, work, ledger, workers_pool, progress, log)
+            outcomes = _run_items(stage, dataset, work, ledger, workers_pool, progress, log, gate)
     missing = set(chosen) - set(outcomes)
-    if missing:  # read = done + skipped + failed
+    if gate is not None and gate.closed():
+        outcomes |= {item: Outcome(item, "left") for item in missing}
+    elif missing:  # read = done + skipped + failed + left
         raise StageError(f"{stage.name}: no account of {', '.join(sorted(missing))}; run it again")
     seconds = time.perf_counter() - started
     return Summary(stage.name, tuple(outcomes[item] for item in chosen), seconds)
@@ -305,6 +321,7 @@ def _run_items(
     pool: Pool,
     progress: bool,
     log: RunLog,
+    gate: Gate | None,
 ) -> dict[str, Outcome]:
     """Run what is to do and settle each item as it ends; returns the outcomes of all."""
     outcomes, ended = dict(work.current), []
@@ -323,6 +340,8 @@ def _run_items(
             outcomes[receipt.item] = _outcome(receipt, again=work.again.get(receipt.item, ""))
             show(receipt)
             log.settle(receipt.item)
+            if gate is not None:
+                gate.settled(receipt)
 
         def settle_task(receipt: Receipt) -> None:
             settle(receipt)
@@ -332,7 +351,7 @@ def _run_items(
 
         for receipt in work.unreadable:
             settle(receipt)
-        pool.run(work.tasks, settle_task, begin)
+        pool.run(work.tasks, settle_task, begin, gate.closed if gate else lambda: False)
     ledger.keep_digests()
     return outcomes
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import resource
 import sys
 import time
@@ -109,7 +110,7 @@ def run_task(task: Task) -> Receipt:
         return restored
     cap_threads(task.threads)
     reset_peak_memory()
-    started = time.perf_counter()
+    started, cores = time.perf_counter(), core_seconds()
     reason, made = "", None
     metrics: dict = {}
     try:
@@ -130,6 +131,7 @@ def run_task(task: Task) -> Receipt:
         reason=" ".join(reason.split()),
         metrics=metrics,
         seconds=time.perf_counter() - started,
+        core_seconds=core_seconds() - cores,
         peak_memory=peak_memory(),
         made=made,
     )
@@ -163,6 +165,11 @@ def _run_and_publish(task: Task) -> tuple[dict, dict[str, FileMark]]:
         # Their bytes are still in memory; a rename changes neither time nor inode.
         files = {p.relative_to(out).as_posix(): mark_file(p) for p in files_of(out)}
     return json.loads(metrics), files
+
+
+def core_seconds() -> float:
+    """Return the processor time of this process and of its children that ended."""
+    return sum(os.times()[:4])
 
 
 def reset_peak_memory() -> None:

@@ -62,9 +62,7 @@ class CalibrateConfig:
                 raise ConfigError(f"calibrate.{name} is {value}; expected a positive number")
 
 
+# More board images and frame sets than standard's take longer and gain nothing (docs/TRADEOFFS.md).
 PRESETS: dict[str, dict[str, object]] = {
     "draft": {"board_frames": 36, "rounds": 1, "solve_frame_sets": 4, "check_frame_sets": 0},
-    "standard": {},
-    # More board images and frame sets take longer and gain nothing (docs/TRADEOFFS.md).
-    "reference": {},
 }

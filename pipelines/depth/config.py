@@ -50,6 +50,5 @@ class DepthConfig:
 
 PRESETS: dict[str, dict[str, object]] = {
     "draft": {"voxel_mm": 4.0, "image_side": 512},
-    "standard": {},
     "reference": {"voxel_mm": 1.0, "image_side": 2048},
 }

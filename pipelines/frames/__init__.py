@@ -57,7 +57,6 @@ STAGE = Stage(
     name="frames",
     version=2,
     config=FramesConfig,
-    presets={"draft": {}, "standard": {}, "reference": {}},
     items=items,
     inputs=inputs,
     run=run,

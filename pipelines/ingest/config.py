@@ -36,6 +36,5 @@ class IngestConfig:
 
 PRESETS: dict[str, dict[str, object]] = {
     "draft": {"proxy_long_side": 320, "proxy_quality": 80, "focus_every": 96},
-    "standard": {},
     "reference": {"proxy_long_side": 960, "proxy_quality": 92, "focus_every": 8},
 }

@@ -41,6 +41,4 @@ class MatteConfig:
 
 PRESETS: dict[str, dict[str, object]] = {
     "draft": {"scale": 0.5, "side": 128, "cells": 64},
-    "standard": {},
-    "reference": {"side": 256, "cells": 128},
 }

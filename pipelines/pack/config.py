@@ -48,6 +48,5 @@ class PackConfig:
 
 ENCODE_PRESETS: dict[str, dict[str, object]] = {
     "draft": {"size": 256, "profile": "compact"},
-    "standard": {},
     "reference": {"size": 1024, "profile": "lossless"},
 }

@@ -7,7 +7,7 @@ from pathlib import Path
 from express50.capture.index import peak_items
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
-from pipelines.regions.config import PRESETS, RegionsConfig
+from pipelines.regions.config import RegionsConfig
 
 
 def inputs(dataset: Dataset, item: str, config: RegionsConfig) -> dict[str, Path | str]:
@@ -41,7 +41,6 @@ STAGE = Stage(
     name="regions",
     version=4,
     config=RegionsConfig,
-    presets=PRESETS,
     items=peak_items,
     inputs=inputs,
     run=run,

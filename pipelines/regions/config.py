@@ -1,4 +1,4 @@
-"""Define the settings of the regions stage and its presets."""
+"""Define the settings of the regions stage."""
 
 from __future__ import annotations
 
@@ -23,11 +23,3 @@ class RegionsConfig:
         """Check ranges."""
         if self.image_side < 16:
             raise ConfigError(f"regions.image_side is {self.image_side}, expected 16 or more")
-
-
-# Larger labels than standard's have never measured better: reference has nothing to trade.
-PRESETS: dict[str, dict[str, object]] = {
-    "draft": {"image_side": 512, "depth": False},
-    "standard": {},
-    "reference": {},
-}

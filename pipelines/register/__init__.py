@@ -37,7 +37,6 @@ STAGE = Stage(
     name="register",
     version=1,
     config=RegisterConfig,
-    presets={"draft": {}, "standard": {}, "reference": {}},
     items=peak_items,
     inputs=inputs,
     run=run,

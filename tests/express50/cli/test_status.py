@@ -16,7 +16,8 @@ import pytest
 
 from express50.cli import status as status_cli
 from express50.cli.main import main
-from express50.cli.status import SILENT_SECONDS, format_seconds, read_status, status_page
+from express50.cli.status import SILENT_SECONDS, read_status, status_page
+from express50.console import format_seconds
 from express50.runner.ledger import Ledger, Receipt, Run
 from tests.faults import toy
 from tests.synth import make_capture

@@ -92,6 +92,32 @@ def test_what_is_made_again_is_said_with_its_reason(tmp_path):
     assert again(newer, word="c") == ["", "output missing"]
 
 
+class OneItem:
+    """A gate that lets one item through."""
+
+    def __init__(self):
+        self.seen = []
+
+    def settled(self, receipt):
+        self.seen.append(receipt)
+
+    def closed(self):
+        return bool(self.seen)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_closed_gate_leaves_items_that_the_next_run_makes(tmp_path, workers):
+    dataset, gate = make_dataset(tmp_path, ["a", "b", "c", "d", "e", "f"]), OneItem()
+    config = toy.ToyConfig(seconds=0.1)
+    with Pool(workers) as pool:
+        summary = run_stage(toy.STAGE, dataset, config, pool=pool, progress=False, gate=gate)
+    left = [o.item for o in summary.outcomes if o.status == "left"]
+    assert 3 <= len(left) <= 5 and not summary.ok and f"{len(left)} left" in next(summary.lines())
+    assert len(gate.seen) + len(left) == 6 and all(r.core_seconds > 0 for r in gate.seen)
+    rest = run_stage(toy.STAGE, dataset, config, workers=0, progress=False)
+    assert rest.ok and rest.count("done") == len(left)
+
+
 def test_touched_input_with_the_same_content_is_skipped(tmp_path):
     dataset = make_dataset(tmp_path / "data", ["a"])
     run_toy(dataset)
