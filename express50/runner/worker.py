@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import resource
 import sys
 import time
@@ -169,7 +168,8 @@ def _run_and_publish(task: Task) -> tuple[dict, dict[str, FileMark]]:
 
 def core_seconds() -> float:
     """Return the processor time of this process and of its children that ended."""
-    return sum(os.times()[:4])
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + children.ru_utime + children.ru_stime
 
 
 def reset_peak_memory() -> None:
