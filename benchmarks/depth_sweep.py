@@ -63,7 +63,7 @@ def measure(dataset_root: Path, truth_root: Path, item: str, axis: str, value: f
         count = min(int(value), len(views))
         views = [views[k] for k in np.linspace(0, len(views) - 1, count).round().astype(int)]
     start = time.process_time()
-    solid, _ = read_tracked(dataset, item, views, config.track_agreement)
+    solid, _ = read_tracked(dataset, item, views)
     surface = reconstruct(views, solid, config.voxel_mm, config.voxel_px, config.noise)
     seconds = time.process_time() - start
     found = score((surface.vertices, surface.faces), truth, subject, frame, pictures)

@@ -38,7 +38,7 @@ def packed(tmp_path_factory):
     S002's is damaged.
     """
     dataset = make_dataset(tmp_path_factory.mktemp("offsets"), ("S001", "S002"), cameras=3, size=64)
-    published(dataset, DEPTH, DepthConfig(voxel_mm=8, use_track=False))
+    published(dataset, DEPTH, DepthConfig(voxel_mm=8))
     arrays = track_arrays("procedural", turn=0.1)
     # The bump head stands in the middle of the rig.
     arrays["t"] -= arrays["vertices"].mean(1)

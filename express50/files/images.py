@@ -128,10 +128,10 @@ def read_alpha(path: Path) -> np.ndarray:
     return alpha
 
 
-def write_image(path: Path, image: np.ndarray, quality: int = 95, half: bool = False) -> None:
+def write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:
     """Write (H, W) or (H, W, C) RGB, uint8, uint16 or float32, as .png, .jpg, .tif or .exr.
 
-    JPEG's ``quality`` is 1 to 100, 4:4:4 from 95 upwards; ``half`` stores floats as half.
+    JPEG's ``quality`` is 1 to 100, 4:4:4 from 95 upwards.
 
     Raises:
         FormatError: the file cannot be written.
@@ -140,7 +140,7 @@ def write_image(path: Path, image: np.ndarray, quality: int = 95, half: bool = F
     if image.dtype == np.float64:
         image = image.astype(np.float32)
     channels = 1 if image.ndim == 2 else image.shape[2]
-    kind = "half" if half else {"uint8": "uint8", "uint16": "uint16"}.get(str(image.dtype), "float")
+    kind = {"uint8": "uint8", "uint16": "uint16"}.get(str(image.dtype), "float")
     spec = oiio.ImageSpec(image.shape[1], image.shape[0], channels, kind)
     ending = Path(path).suffix.lower()
     spec.attribute("Compression", f"jpeg:{quality}" if ending in (".jpg", ".jpeg") else "zip")

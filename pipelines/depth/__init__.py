@@ -24,7 +24,7 @@ def inputs(dataset: Dataset, item: str, config: DepthConfig) -> dict[str, Path |
         if path.is_file():
             found[f"matte {camera}"] = path
     track = dataset.track_file(subject)
-    if config.use_track and track.is_file():
+    if track.is_file():
         found["track"] = track
     return found
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 from express50.errors import ConfigError
 
 
 @dataclass(frozen=True, kw_only=True)
 class DepthConfig:
-    """How finely the surface is modelled, what it starts from, and what is written."""
+    """How finely the surface is modelled."""
 
     voxel_mm: float = 1.6
     """Finest voxel of the last level, millimetres, 0.3 to 20."""
@@ -20,18 +19,6 @@ class DepthConfig:
     """Longest side, pixels, of the images that silhouettes and photo-consistency use."""
     noise: float = 0.8
     """Texture under this standard deviation (8-bit steps, after blurring) does not count."""
-    use_track: bool = True
-    """Start from the tracked mesh where it agrees with the mattes."""
-    track_agreement: float = 0.85
-    """Share of the tracked mesh's pixels that must lie in the mattes for it to be used."""
-    min_views: int = 2
-    """Fewest usable cameras; at least 2."""
-    depth_format: Literal["png16", "exr16", "exr32"] = "png16"
-    """Depth maps on disk: 16-bit PNG (0.05 mm steps to 3.27 m), half-float or float EXR."""
-    normal_maps: Literal["png8", "png16", "none"] = "png8"
-    """Normal maps on disk, camera axes: 8 or 16 bits per component, or none."""
-    glb: bool = True
-    """Write the mesh as surface.glb too, for viewers; surface.ply is always written."""
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -40,8 +27,6 @@ class DepthConfig:
             ("voxel_px", 0, 8),
             ("image_side", 16, 32768),
             ("noise", 1e-6, 255),
-            ("track_agreement", 0, 1),
-            ("min_views", 2, 10_000),
         ):
             value = getattr(self, name)
             if not low <= value <= high:

@@ -26,22 +26,22 @@ from pipelines.depth.views import DepthView, make_view, without_contradiction
 ERROR_STEPS = 30.0  # 8-bit steps at the bright end of the error maps
 BLANK = 24  # grey of unknown pixels
 SHOWN = 4  # cameras in the contact sheet
+AGREEMENT = 0.85  # share of the tracked mesh that must lie in the mattes for it to be used
 
 
 def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> Result:
     """Write every camera's maps, the coloured surface and a contact sheet."""
     cv2.setNumThreads(1)  # the runner counts one core per item
     fineness = config.voxel_mm, config.voxel_px, config.noise
-    agreement = config.track_agreement if config.use_track else None
     views, pictures, dropped = read_views(dataset, item, config.image_side)
     one_camera = len(views) == 1 and not dropped  # a photograph, or a video of one camera
-    if len(views) < config.min_views and not one_camera:
+    if len(views) < 2 and not one_camera:
         why = "; ".join(f"{note.what}: {note.why}" for note in dropped)
         raise StageError(
-            f"{item}: {len(views)} usable cameras, expected at least {config.min_views} with a"
+            f"{item}: {len(views)} usable cameras, expected at least 2 with a"
             f" matte of the head ({why or 'no others are calibrated'}); run 'express50 matte'"
         )
-    solid, track = read_tracked(dataset, item, views, agreement)
+    solid, track = read_tracked(dataset, item, views)
     if one_camera and solid is None:
         raise StageError(
             f"{item}: with one camera, depth is that of the tracked head, which was not used"
@@ -53,10 +53,9 @@ def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> Result:
         surface = reconstruct(views, solid, *fineness)
     maps, photo = surface_maps(surface, pictures)
     write_ply(out / "surface.ply", surface)
-    if config.glb:
-        write_glb(out / "surface.glb", surface)
+    write_glb(out / "surface.glb", surface)
     for camera_id, seen in maps.items():
-        write_maps(out, camera_id, seen, config.depth_format, config.normal_maps)
+        write_maps(out, camera_id, seen)
     write_picture(out, pictures, maps, photo)
     return Result(figures_of(surface, maps, photo) | {"track": track}, dropped)
 
@@ -87,17 +86,13 @@ def read_views(
 
 
 def read_tracked(
-    dataset: Dataset, item: str, views: list[DepthView], least: float | None
+    dataset: Dataset, item: str, views: list[DepthView]
 ) -> tuple[TrackedSolid | None, dict]:
-    """Read the tracked mesh if it agrees with the mattes, and describe it for the metrics.
-
-    ``least`` is the share of the mesh that must lie in the mattes; None leaves the track out.
-    """
+    """Read the tracked mesh if it agrees with the mattes, and describe it for the metrics."""
     subject, expression = item.split("/")
     path = dataset.track_file(subject)
-    if least is None or not path.is_file():
-        why = "depth.use_track is off" if least is None else "it is not tracked"
-        return None, {"used": False, "why": why}
+    if not path.is_file():
+        return None, {"used": False, "why": "it is not tracked"}
     track = read_track(path)
     if expression not in track.expressions:
         return None, {"used": False, "why": f"{expression} is not tracked"}
@@ -109,30 +104,26 @@ def read_tracked(
             " run 'express50 track' again"
         )
     agreement = matte_agreement(views, vertices, faces)
-    if agreement < least:
-        why = f"only {agreement:.0%} of it lies in the mattes, under {least:.0%}"
+    if agreement < AGREEMENT:
+        why = f"only {agreement:.0%} of it lies in the mattes, under {AGREEMENT:.0%}"
         return None, {"used": False, "why": why, "agreement": agreement}
     return close_mesh(vertices, faces), {"used": True, "agreement": agreement}
 
 
-def write_maps(
-    out: Path, camera_id: str, maps: DepthMaps, depth_format: str, normal_maps: str
-) -> None:
-    """Write ``<camera>.png`` or ``.exr``, ``<camera>_confidence.png``, ``<camera>_normals.png``."""
+def write_maps(out: Path, camera_id: str, maps: DepthMaps) -> None:
+    """Write ``<camera>.png`` or ``.exr``, ``<camera>_confidence.png``, ``<camera>_normals.png``.
+
+    Raises:
+        StageError: the depth is more than any file holds.
+    """
     try:
-        write_depth(out, camera_id, maps.depth, maps.valid, depth_format)
+        write_depth(out, camera_id, maps.depth, maps.valid)
     except ValueError as error:
-        raise StageError(
-            f"{camera_id}: depth up to {maps.depth.max():.4g} m does not fit"
-            f" {depth_format} ({error}); if it is right, set depth.depth_format=exr32"
-        ) from None
-    write_image(
-        out / f"{camera_id}_confidence.png", np.rint(maps.confidence * 255).astype(np.uint8)
-    )
-    if normal_maps != "none":
-        path = out / f"{camera_id}_normals.png"
-        known = maps.valid & (np.linalg.norm(maps.normals, axis=-1) > 0.5)
-        write_normals(path, maps.normals, known, normal_maps)
+        raise StageError(f"{camera_id}: {error}") from None
+    confidence = np.rint(maps.confidence * 255).astype(np.uint8)
+    write_image(out / f"{camera_id}_confidence.png", confidence)
+    known = maps.valid & (np.linalg.norm(maps.normals, axis=-1) > 0.5)
+    write_normals(out / f"{camera_id}_normals.png", maps.normals, known)
 
 
 def write_ply(path: Path, surface: HeadSurface) -> None:
