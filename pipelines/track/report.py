@@ -1,4 +1,4 @@
-"""Show whether a track is right: overlays, a sheet, residuals, and cameras that seem wrong."""
+"""Show whether a track is right: overlays, a sheet and residuals."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ import torch
 
 from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.contract.layout import Dataset
-from express50.contract.stage import Note
 from express50.files.images import fit_into, write_image
 from express50.geometry.cameras import Camera, project_pinhole
 from express50.geometry.conventions import affine_to_opencv
 from express50.geometry.raycast import mesh_scene
 from express50.head.model import HeadModel, landmarks
-from pipelines.track.observe import LandmarkView, facing
+from pipelines.track.observe import facing
 from pipelines.track.outline import OutlineTerm
 from pipelines.track.state import Target
 from pipelines.track.terms import PixelTerm
@@ -31,15 +30,6 @@ ODD = 1.5  # times the median: such residuals are drawn in ALARM
 PLAIN, ALARM, GROUND, DIM = (225, 225, 225), (255, 120, 90), 24, (110, 160, 210)
 ResidualTable = Mapping[str, Mapping[str, float]]
 SEEN_COLOR, FITTED_COLOR = (255, 210, 0), (0, 255, 120)
-
-# Cameras that are off in the same way in every expression.
-LEAST_EXPRESSIONS, LEAST_CAMERAS = 3, 3
-# They are off by a multiple of the other cameras' deviation, and of its own standard error; and by
-# at least 0.03 of the face's size, 0.06 of its scale or 0.06 radians.
-OVER_OTHERS, OVER_ERROR = 3.0, 3.0
-FACING = 0.2  # landmarks of nearer profiles are too poor to accuse a camera
-# Columns of a deviation: offset in pixels and as a share of the face, ln scale, roll.
-PIXELS, SHARE, SCALE, ROLL = slice(0, 2), slice(2, 4), slice(4, 5), slice(5, 6)
 
 
 def draw_overlays(
@@ -266,84 +256,3 @@ def track_metrics(model: HeadModel, targets: list[Target], vertices: np.ndarray)
         "marked_views": marked,
         "head": model.name,
     }
-
-
-def suspect_cameras(
-    targets: list[Target], marks: np.ndarray, rotations: np.ndarray, middles: np.ndarray
-) -> dict[str, dict[str, object]]:
-    """Find cameras whose landmarks are displaced in the same way in every expression.
-
-    A detector errs differently from face to face; a camera that was moved or calibrated wrongly is
-    off by the same pixels, scale or turn every time. `calibrate` checks cameras too, on features of
-    its own frames; this check sees the frames that are tracked, and so a camera that was moved
-    between calibration and take.
-
-    Args:
-        targets: E expressions; views that were refused count here too.
-        marks: (E, 68, 3) fitted landmarks, world.
-        rotations: (E, 3, 3) world from head.
-        middles: (E, 3) middle of each head, world.
-
-    Returns:
-        Camera to `offset_px` (mean offset x, y from the expected place), `of_face` (that as a
-        share of the face's size), `scale` (seen over expected), `roll_deg` (clockwise in the
-        picture) and `expressions` (their number).
-    """
-    seen: dict[str, list[np.ndarray]] = {}
-    for target, points, rotation, middle in zip(targets, marks, rotations, middles, strict=True):
-        for view in (*target.observation.views, *target.observation.refused):
-            known = np.isfinite(view.sigma)
-            known[:17] = False
-            if facing(view, rotation, middle) > FACING and known.any():
-                seen.setdefault(view.camera_id, []).append(_deviation(view, points, known))
-    enough = {name: np.stack(rows) for name, rows in seen.items() if len(rows) >= LEAST_EXPRESSIONS}
-    if len(enough) < LEAST_CAMERAS:
-        return {}
-    # What all cameras have in common in scale and roll is the fit's error.
-    common = np.median([rows.mean(0) for rows in enough.values()], axis=0) * [0, 0, 0, 0, 1, 1]
-    off = set()
-    for kind, least in (SHARE, 0.03), (SCALE, 0.06), (ROLL, 0.06):
-        table = {name: (rows - common)[:, kind] for name, rows in enough.items()}
-        lengths = {name: float(np.linalg.norm(rows.mean(0))) for name, rows in table.items()}
-        for name, rows in table.items():
-            others = float(np.median([lengths[other] for other in table if other != name]))
-            error = float(np.linalg.norm(rows.std(0, ddof=1))) / len(rows) ** 0.5
-            if lengths[name] > max(least, OVER_OTHERS * others, OVER_ERROR * error):
-                off.add(name)
-    return {
-        name: {
-            "offset_px": [round(float(value), 2) for value in rows[:, PIXELS].mean(0)],
-            "of_face": round(float(np.linalg.norm(rows[:, SHARE].mean(0))), 4),
-            "scale": round(math.exp(rows[:, SCALE].mean()), 3),
-            "roll_deg": round(math.degrees(rows[:, ROLL].mean()), 2),
-            "expressions": len(rows),
-        }
-        for name, rows in sorted(enough.items()) if name in off
-    }  # fmt: skip
-
-
-def _deviation(view: LandmarkView, points: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Compare a view's known landmarks with the fitted ones (68, 3): PIXELS, SHARE, SCALE, ROLL."""
-    pixels, _ = project_pinhole(view.camera, points)
-    size = max(float(np.ptp(pixels, axis=0).max()), 1.0)
-    offset = np.median((view.points - pixels)[known], axis=0)
-    seen, expected = (
-        (p[known] - np.median(p[known], axis=0)) @ [1, 1j] for p in (view.points, pixels)
-    )
-    ratio = complex((seen * expected.conj()).sum() / max(float((abs(expected) ** 2).sum()), 1e-12))
-    if abs(ratio) < 1e-6:  # all seen points coincide
-        ratio = 1.0 + 0j
-    return np.r_[offset, offset / size, math.log(abs(ratio)), math.atan2(ratio.imag, ratio.real)]
-
-
-def camera_warnings(suspects: dict[str, dict[str, object]]) -> list[Note]:
-    """Write the result of `suspect_cameras` as warnings."""
-    return [
-        Note(
-            f"camera {name}",
-            f"its landmarks are off by {row['offset_px']} px ({row['of_face']:.0%} of the face),"
-            f" {row['scale']} times the expected size and turned by {row['roll_deg']} degrees, in"
-            " every expression; check its calibration",
-        )
-        for name, row in suspects.items()
-    ]

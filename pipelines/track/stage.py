@@ -34,9 +34,7 @@ from pipelines.track.read_inputs import (
     read_clip,
 )
 from pipelines.track.report import (
-    camera_warnings,
     draw_overlays,
-    suspect_cameras,
     track_metrics,
     write_sheet,
 )
@@ -105,9 +103,7 @@ def run(
     metrics = track_metrics(basis.model, targets, meshes)
     tiles = draw_overlays(dataset, item, out / "qc", basis.model, targets, meshes, turns)
     write_sheet(out / "qc", tiles, metrics["landmark_rms_px"])
-    marks = landmarks(basis.model, torch.from_numpy(meshes)).numpy()
-    suspects = suspect_cameras(targets, marks, turns, meshes.mean(1))
-    metrics |= {"schedule": schedule_table(schedule), "suspect_cameras": suspects}
+    metrics["schedule"] = schedule_table(schedule)
     if config.frames == "clips":
         shape = split_shape(basis.model, state.shape)[0]
         tracker = ClipTracker(
@@ -126,7 +122,7 @@ def run(
             dataset.windows_dir(item), identity,
         )  # fmt: skip
         dropped += lost
-    return Result(metrics, dropped, camera_warnings(suspects))
+    return Result(metrics, dropped)
 
 
 def fit_landmarks(

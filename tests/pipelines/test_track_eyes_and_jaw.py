@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from express50.geometry.cameras import project, triangulate
-from express50.geometry.transforms import axis_angle_to_matrix
 from express50.head.load import load_head
 from express50.head.model import HeadModel, landmarks, vertex_normals
 from express50.landmarks.eyes_and_lips import Irises
@@ -23,7 +22,6 @@ from pipelines.track.eyes_and_jaw import (
 )
 from pipelines.track.fit import fit
 from pipelines.track.observe import LandmarkView, agree, landmark_sigma, point_covariance
-from pipelines.track.report import camera_warnings, suspect_cameras
 from pipelines.track.state import Target, initial_pose, start_state
 from pipelines.track.terms import MeshPlaces, PixelTerm, Sighting
 from tests.pipelines.test_track import RIG, make_camera, make_scene, make_views
@@ -182,56 +180,3 @@ def test_a_camera_given_ten_times_counts_as_one() -> None:
             assert view.redundancy >= 8.9
     error = np.linalg.norm(observation.points - scene.marks, axis=1)
     assert np.nanmedian(error) < 2.5e-3
-
-
-def suspects_of(
-    shifts: dict[int, np.ndarray],
-    scenes: int = 4,
-    turned: complex = 1.0,
-    camera: int = 1,
-    blind: int = 0,
-) -> dict:
-    cameras = [make_camera(angle) for angle in (-0.7, -0.35, 0.0, 0.35, 0.7)]
-    targets, marks = [], []
-    for seed in range(scenes):
-        scene = make_scene(seed)
-        views = make_views(scene.marks, 1.0, cameras)
-        for number, shift in shifts.items():
-            views[number].points[:] += shift
-            if seed < blind:  # knows the jaw's line alone
-                views[number].sigma[17:] = np.inf
-        middle = views[camera].points.mean(0)
-        seen = ((views[camera].points - middle) @ [1, 1j]) * turned
-        views[camera].points[:] = np.stack([seen.real, seen.imag], axis=1) + middle
-        observation, _ = agree(f"e{seed}", seed, views)
-        targets.append(Target(observation, landmark_sigma(observation), False))
-        marks.append(scene.marks)
-    turns = np.tile(axis_angle_to_matrix(np.zeros(3)), (scenes, 1, 1))
-    return suspect_cameras(targets, np.stack(marks), turns, np.zeros((scenes, 3)))
-
-
-def test_a_wrongly_calibrated_camera_is_named_with_its_offset() -> None:
-    found = suspects_of({1: np.array([25.0, -8.0])})
-    assert list(found) == [make_camera(-0.35).id]
-    np.testing.assert_allclose(next(iter(found.values()))["offset_px"], [25.0, -8.0], atol=1.5)
-
-
-def test_expressions_in_which_a_camera_knows_no_point_say_nothing_for_it() -> None:
-    (row,) = suspects_of({1: np.array([25.0, -8.0])}, scenes=8, blind=4).values()
-    assert row["expressions"] == 4
-    np.testing.assert_allclose(row["offset_px"], [25.0, -8.0], atol=1.5)
-
-
-def test_a_wrong_focal_length_and_a_turned_camera_are_named() -> None:
-    (row,) = suspects_of({}, turned=1.15).values()
-    assert row["scale"] == pytest.approx(1.15, abs=0.02) and abs(row["roll_deg"]) < 1
-    (row,) = suspects_of({}, turned=np.exp(0.15j)).values()
-    assert row["roll_deg"] == pytest.approx(np.degrees(0.15), abs=1.0)
-    assert suspects_of({}, turned=1.02 * np.exp(0.02j)) == {}
-    (line,) = camera_warnings(suspects_of({}, turned=1.15))
-    assert line.what.startswith("camera ") and "1.15" in line.why
-
-
-def test_sound_cameras_and_single_slips_are_not_named() -> None:
-    assert suspects_of({}) == {}
-    assert suspects_of({1: np.array([25.0, 0.0])}, scenes=2) == {}
