@@ -91,15 +91,21 @@ def record_twin(
     workers: int,
     twin: Mapping[str, int] = TWIN,
     expressions: Sequence[str] = EXPRESSIONS,
+    options: Sequence[str] = (),
 ) -> list[Step]:
     """Record the synthetic captures unless the same ones are there already."""
-    settings = json.dumps({**twin, "expressions": expressions})
+    settings = json.dumps({**twin, "expressions": expressions, "options": options})
     stamp = root / "recorded.json"
     if stamp.exists() and stamp.read_text() == settings:
         return []
     shutil.rmtree(root, ignore_errors=True)
     flags = [f"--{key}={value}" for key, value in twin.items()]
-    flags += [f"--expressions={','.join(expressions)}", f"--workers={workers}", "--seed=0"]
+    flags += [
+        f"--expressions={','.join(expressions)}",
+        f"--workers={workers}",
+        "--seed=0",
+        *options,
+    ]
     step = run_step("record", "express50", "twin", "record", str(root), *flags)
     stamp.write_text(settings)
     return [step]
