@@ -66,7 +66,7 @@ ALWAYS = (
     ),
     Deviation(
         paper="mattes by RMBG-2.0 and BackgroundMattingV2, torso by Sapiens",
-        ours="keys, cut-outs and parts of our own",
+        ours="keys, cut-outs and parts of our own; these networks with the user's weights",
         reason="we ship no weights of others",
     ),
     Deviation(

@@ -146,11 +146,12 @@ def wrong_commands(root: Path, twin: Path, junk: Path) -> list[list[str]]:
     rows = [[*_stage(stage, root, twin), *(w.format(stage=stage) for w in words)]
             for stage in STAGES for words in wrong]  # fmt: skip
     for stage, setting in [
-        ("matte", 'method="gren"'), ("matte", "cells=few"),
+        ("matte", 'method="bgmv2"'), ("matte", f'weights="{lost}"'),
+        ("matte", f'weights="{junk / "junk.npz"}"'), ("matte", 'method="gren"'),
         ("track", f'landmarks="{junk / "junk.npz"}"'), ("track", 'landmarks="fan:lost.pt"'),
         ("track", f'head="{lost}"'), ("track", "clip_rounds=maybe"),
         ("depth", "voxel_mm=-1"), ("depth", "voxel_mm=nan"), ("register", "weight=few"),
-        ("regions", 'scalp="bald"'), ("encode", "size=-4"), ("encode", 'profile="gif"'),
+        ("regions", f'segmentation="{lost}"'), ("encode", "size=-4"), ("encode", 'profile="gif"'),
         ("calibrate", 'camera_model="FISHEYE"'), ("align", 'accept="all"'),
     ]:  # fmt: skip
         rows.append([*_stage(stage, root, twin), "--set", f"{stage}.{setting}"])

@@ -7,11 +7,11 @@ from pathlib import Path
 from express50.capture.index import peak_items
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
-from pipelines.matte.config import PRESETS, MatteConfig
+from pipelines.matte.config import NETWORKS, PRESETS, WITHOUT_PLATE, MatteConfig
 
 
 def inputs(dataset: Dataset, item: str, config: MatteConfig) -> dict[str, Path | str]:
-    """Name the cameras, the frames, and the plates that the method uses."""
+    """Name the cameras, the frames, the plates that the method uses, and the weights."""
     from express50.capture.frames import frame_inputs, read_cameras_of
 
     subject, expression = item.split("/")
@@ -19,10 +19,23 @@ def inputs(dataset: Dataset, item: str, config: MatteConfig) -> dict[str, Path |
         "cameras": dataset.cameras_file(subject),
         **frame_inputs(dataset, subject, expression),
     }
-    if config.method == "key":
+    if config.method not in WITHOUT_PLATE:
         plates = {c: dataset.plate_file(subject, c) for c in read_cameras_of(dataset, subject)}
         found |= {f"plate {c}": path for c, path in plates.items() if path.is_file()}
+    if config.weights:
+        from pipelines.networks import weights_file  # torch takes seconds to import
+
+        found["weights"] = weights_file(config.weights, "matte.weights")
     return found
+
+
+def try_files(config: MatteConfig) -> None:
+    """Load the network."""
+    if config.weights:
+        from pipelines.matte.learned import BGMV2, SALIENT
+        from pipelines.networks import load_network
+
+        load_network(config.weights, SALIENT if config.method == "salient" else BGMV2)
 
 
 def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
@@ -30,6 +43,11 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
     from pipelines.matte.stage import run as work
 
     return work(dataset, item, config, out)
+
+
+def needs_gpu(config: MatteConfig) -> bool:
+    """Say whether a network must run on CUDA."""
+    return config.method in NETWORKS and config.device == "cuda"
 
 
 STAGE = Stage(
@@ -40,6 +58,8 @@ STAGE = Stage(
     items=peak_items,
     inputs=inputs,
     run=run,
+    try_files=try_files,
+    needs_gpu=needs_gpu,
     help="separate the head from the background in every camera, and let the cameras agree",
     purpose="The opacity of the subject in every peak frame, keyed per camera; what the other"
     " cameras ruled out is red in the pictures, what they filled green.",

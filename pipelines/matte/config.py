@@ -7,14 +7,24 @@ from typing import Literal
 
 from express50.errors import ConfigError
 
+NETWORKS = ("bgmv2", "salient")
+WITHOUT_PLATE = ("grabcut", "salient")
+
 
 @dataclass(frozen=True, kw_only=True)
 class MatteConfig:
     """Set how each camera is matted, and whether the cameras of a peak correct each other."""
 
-    method: Literal["key", "grabcut"] = "key"
-    """Key against the plate, and without one cut by colours and by what the other cameras see;
-    grabcut ignores all plates."""
+    method: Literal["key", "grabcut", "bgmv2", "salient"] = "key"
+    """Key against the plate, and without one cut by colours and by what the other cameras see
+    (grabcut does so everywhere), or run a network."""
+    weights: str = ""
+    """File of the network's weights, TorchScript or ONNX; such a file is a program, so trust its
+    origin."""
+    device: Literal["auto", "cuda"] = "auto"
+    """Run the network on CUDA if available (auto), or only on CUDA."""
+    tile: int = 2048
+    """Longest side, pixels, of a tile that bgmv2 sees; larger frames are cut into tiles."""
     scale: float = 1.0
     """Key at this share of the resolution; the matte is enlarged afterwards."""
     shadow: float = 0.25
@@ -32,6 +42,13 @@ class MatteConfig:
             raise ConfigError(f"matte.scale is {self.scale}, expected 0.1 to 1")
         if not 0.0 <= self.shadow < 1.0:
             raise ConfigError(f"matte.shadow is {self.shadow}, expected 0 to below 1")
+        if (self.method in NETWORKS) != bool(self.weights):
+            raise ConfigError(
+                f"matte.method {self.method!r} with matte.weights {self.weights!r}: key and grabcut"
+                " take none, bgmv2 and salient need the file of the network's weights"
+            )
+        if self.tile < 512 or self.tile % 64:
+            raise ConfigError(f"matte.tile is {self.tile}, expected a multiple of 64, 512 or more")
         if not 16 <= self.side <= 2048 or not 16 <= self.cells <= 256:
             raise ConfigError(
                 f"matte.side {self.side} and matte.cells {self.cells}: expected 16 to 2048 pixels"

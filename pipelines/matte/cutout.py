@@ -182,7 +182,8 @@ def _place_head(views: Sequence[CutView]) -> HeadPlace:
     best = max((face.score for face in faces), default=0.0)
     raise NoFaceError(
         f"no face found (score {best:.2f}, expected {FACE_SCORE} or more), and without a plate a"
-        " person is found by the face; give plates"
+        " person is found by the face; set matte.method to salient and matte.weights, or give"
+        " plates"
     )
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,11 +18,11 @@ from express50.errors import CaptureError, NoFaceError, StageError
 from express50.files.images import shrink, tile_sheet, write_image
 from express50.geometry.cameras import Camera, pinhole, resized
 from express50.geometry.sampling import undistorted_mask
-from pipelines.matte.config import MatteConfig
+from pipelines.matte.config import NETWORKS, WITHOUT_PLATE, MatteConfig
 from pipelines.matte.consensus import Agreement, agree
 from pipelines.matte.cutout import CutView, cut_out, make_cut_view, soft_alpha
 from pipelines.matte.key import key_alpha
-from pipelines.matte.plates import LEAST_SHARE, match_plate
+from pipelines.matte.plates import LEAST_SHARE, exposed, exposure_gain, match_plate
 from pipelines.matte.visual_hull import (
     INSIDE,
     Ball,
@@ -36,6 +37,9 @@ RED, GREEN = (235, 50, 40), (50, 220, 80)
 EMPTY = 0.003  # share of the image below which a matte counts as empty
 # Share of the image's top or of a side that the subject may cover before it counts as cut off.
 MOST_CONTACT = 0.02
+
+Matter = Callable[[np.ndarray, Any, np.ndarray], np.ndarray]
+"""Frame (H, W, 3) uint8, plate or None and valid pixels (H, W) to opacity (H, W) float32."""
 
 
 @dataclass(frozen=True)
@@ -106,6 +110,7 @@ def camera_mattes(
     """
     subject, expression = item.split("/")
     read = partial(read_peak_frame, dataset, subject, expression)
+    matter = _matter(config)
     found: dict[str, CameraMatte] = {}
     seen: list[CutView] = []
     dropped: list[Note] = []
@@ -114,8 +119,8 @@ def camera_mattes(
         try:
             frame, valid, alpha = read(name), valid_pixels(camera), None
             plate, why = _plate(dataset, subject, name, frame, valid, config)
-            if plate is not None:
-                alpha = eight_bit(key_alpha(frame, plate, valid, config), valid)
+            if plate is not None or config.method in NETWORKS:
+                alpha = eight_bit(matter(frame, plate, valid), valid)
                 found[name] = CameraMatte(alpha, shrink(frame, config.side))
         except (CaptureError, StageError) as error:
             dropped.append(Note(name, str(error)))
@@ -140,9 +145,17 @@ def _plate(
     config: MatteConfig,
 ) -> tuple[np.ndarray | None, str]:  # fmt: skip
     """Read a plate and bring it to the frame; also returns a warning, empty if all is well."""
-    plate = read_plate_image(dataset, subject, camera) if config.method == "key" else None
-    if plate is None:
+    if config.method in WITHOUT_PLATE:
         return None, ""
+    plate = read_plate_image(dataset, subject, camera)
+    if plate is None and config.method == "bgmv2":
+        raise StageError(
+            f"no clean plate of {camera}; photograph the empty set as plates/{camera}.png and run"
+            " 'express50 ingest' and 'express50 frames' again, or set matte.method to key, grabcut"
+            " or salient"
+        )
+    if plate is None or config.method == "bgmv2":
+        return plate, ""
     matched = match_plate(plate, frame, valid)
     if matched.share >= LEAST_SHARE:
         return matched.plate, ""
@@ -161,6 +174,21 @@ def valid_pixels(camera: Camera) -> np.ndarray:
 def eight_bit(alpha: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Return opacity (H, W) as uint8, 0 where no pixel is valid."""
     return np.rint(np.where(valid, alpha, np.float32(0)) * 255).astype(np.uint8)
+
+
+def _matter(config: MatteConfig) -> Matter:
+    """Make the function that mattes one frame. Networks are imported here: torch is slow to."""
+    if config.method in ("key", "grabcut"):
+        return lambda frame, plate, valid: key_alpha(frame, plate, valid, config)
+    from pipelines.matte.learned import BGMV2, SALIENT, background_alpha, salient_alpha
+    from pipelines.networks import load_network as load_weights
+
+    network = load_weights(config.weights, SALIENT if config.method == "salient" else BGMV2)
+    if config.method == "salient":
+        return lambda frame, plate, valid: salient_alpha(network, frame)
+    return lambda frame, plate, valid: background_alpha(
+        network, frame, exposed(plate, exposure_gain(frame, plate)), config.tile
+    )
 
 
 def make_view(

@@ -62,7 +62,8 @@ def add_commands(subparsers: Any) -> None:
     parser.add_argument(
         "--matte",
         action="store_true",
-        help="matte too, by colours about the face, and fit outlines",
+        help="matte too, and fit outlines; by colours about the face, or by a network of yours:"
+        " --set matte.method=salient --set matte.weights=FILE",
     )
     add_config_options(parser)
     parser.add_argument("--json", action="store_true", help="print the account as JSON")

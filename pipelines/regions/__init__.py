@@ -11,7 +11,7 @@ from pipelines.regions.config import RegionsConfig
 
 
 def inputs(dataset: Dataset, item: str, config: RegionsConfig) -> dict[str, Path | str]:
-    """List cameras, frames, track, mattes and depth maps of the expression."""
+    """List cameras, frames, track, mattes and depth maps of the expression, and the weights."""
     from express50.capture.frames import frame_inputs, read_cameras_of
     from express50.dataset.depth_files import depth_file
     from express50.dataset.tracks import existing_track
@@ -27,7 +27,25 @@ def inputs(dataset: Dataset, item: str, config: RegionsConfig) -> dict[str, Path
         depth = depth_file(dataset.item_dir("depth", item), camera)
         found |= {f"matte {camera}": matte} if matte.is_file() else {}
         found |= {f"depth {camera}": depth} if config.depth and depth else {}
+    if config.segmentation:
+        from pipelines.networks import weights_file  # torch takes seconds to import
+
+        found["segmentation"] = weights_file(config.segmentation, "regions.segmentation")
     return found
+
+
+def needs_gpu(config: RegionsConfig) -> bool:
+    """Ask for a GPU if the network must run on one."""
+    return bool(config.segmentation) and config.device == "cuda"
+
+
+def try_files(config: RegionsConfig) -> None:
+    """Load the network."""
+    if config.segmentation:
+        from pipelines.networks import load_network
+        from pipelines.regions.sapiens import SAPIENS
+
+        load_network(config.segmentation, SAPIENS)
 
 
 def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> Result:
@@ -44,6 +62,8 @@ STAGE = Stage(
     items=peak_items,
     inputs=inputs,
     run=run,
+    try_files=try_files,
+    needs_gpu=needs_gpu,
     help="label skin, hair, neck and torso in each view, and cut the torso from the matte",
     purpose="The tracked mesh, each view's colours and depth label skin, ears, lips, eyes, mouth,"
     " hair, neck, torso, glasses and hands; a second matte holds the head alone.",

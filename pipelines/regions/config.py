@@ -12,6 +12,10 @@ from express50.errors import ConfigError
 class RegionsConfig:
     """The sources of the labels, and their size."""
 
+    segmentation: str = ""
+    """File of Sapiens' body-part weights, TorchScript; its labels replace those of the mesh."""
+    device: Literal["auto", "cuda"] = "auto"
+    """Run the network on CUDA if there is a GPU, or refuse to run without one."""
     image_side: int = 1536
     """Longest side, pixels, at which views are labelled; larger frames get enlarged labels."""
     depth: bool = True

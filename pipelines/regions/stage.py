@@ -54,7 +54,7 @@ class ViewLabels:
 def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> Result:
     """Write labels and the head's matte for each camera, and a contact sheet."""
     cv2.setNumThreads(1)  # the runner counts one core per item
-    side, use_depth = config.image_side, config.depth
+    side, use_depth, weights = config.image_side, config.depth, config.segmentation
     subject, expression = item.split("/")
     head = read_head(dataset, subject, expression)
     scalp, skin, frames = study_person(dataset, item, head)
@@ -71,18 +71,19 @@ def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> Result
             dropped.append(Note(name, str(error)))
             continue
         view = label_view(head, camera, rgb, alpha, depth, scalp.is_skin, side, skin)
-        figures[name], rows[name] = _write_view(out, name, rgb, alpha, view)
+        figures[name], rows[name] = _write_view(out, name, rgb, alpha, view, weights)
     if not figures:
         why = "; ".join(f"{note.what}: {note.why}" for note in dropped[:3])
         raise StageError(f"{item}: no camera has a matte to label ({why}); run 'express50 matte'")
     write_picture(out, rows, figures)
     doubts = {name: view_warning(row) for name, row in figures.items()}
     warnings = [Note(name, why) for name, why in doubts.items() if why]
-    if "torso" in head.labels.missing:
+    if "torso" in head.labels.missing and not weights:
         why = "the head model does not mark the neck's end, so that the torso cannot be cut off"
         warnings.append(Note("torso", why))
     there = [row["mesh_in_matte"] for row in figures.values() if row["mesh_in_frame"]]
     metrics = {
+        "method": "network and mesh" if weights else "mesh",
         "missing": list(head.labels.missing),
         "scalp": {
             "label": "skin" if scalp.is_skin else "hair",
@@ -216,16 +217,22 @@ def _shrunk(
 
 
 def _write_view(
-    out: Path, name: str, rgb: np.ndarray, alpha: np.ndarray, view: ViewLabels
+    out: Path, name: str, rgb: np.ndarray, alpha: np.ndarray, view: ViewLabels, weights: str
 ) -> tuple[dict, list[np.ndarray]]:
     """Write one camera's labels and head matte at full size; return figures and pictures."""
 
     def enlarged(image: np.ndarray) -> np.ndarray:
         return cv2.resize(image, alpha.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
 
+    labels, large = view.labels, enlarged(view.labels)
     mesh = enlarged(view.mesh.astype(np.uint8)) > 0
-    large = np.where(alpha > 0.5, enlarged(view.labels), np.uint8(0))
-    head = head_alpha(alpha, view.labels)
+    if weights:
+        from pipelines.regions.sapiens import network_labels  # torch takes seconds to import
+
+        labels = large = network_labels(weights, rgb, large)
+    else:
+        large = np.where(alpha > 0.5, large, np.uint8(0))
+    head = head_alpha(alpha, labels)
     write_image(out / f"{name}.png", large)
     write_image(out / f"{name}_head.png", np.rint(head * 255).astype(np.uint8))
     figures = {

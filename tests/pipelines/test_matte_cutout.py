@@ -14,7 +14,7 @@ from express50.capture.frames import read_cameras_of
 from express50.capture.index import read_index
 from express50.cli.main import main
 from express50.contract.layout import Dataset
-from express50.errors import StageError
+from express50.errors import ConfigError, StageError
 from express50.files.images import read_alpha, write_image
 from express50.geometry.cameras import pinhole
 from express50.runner.runner import run_stage
@@ -96,8 +96,10 @@ def test_small_and_large_pictures_are_cut_alike(alpha: np.ndarray, scale: float)
 
 
 def test_what_shows_no_face_is_refused() -> None:
-    with pytest.raises(StageError, match="no face found.*give plates"):
+    with pytest.raises(StageError, match="no face found.*matte.method to salient"):
         alpha_of(np.repeat(data.brick()[..., None], 3, axis=2))
+    with pytest.raises(ConfigError, match="key and grabcut take none"):
+        MatteConfig(method="grabcut", weights="net.pt")
 
 
 def test_a_photograph_becomes_a_sample_of_shards_without_plate_or_weights(tmp_path: Path) -> None:

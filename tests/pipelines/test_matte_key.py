@@ -13,6 +13,7 @@ from express50.errors import ConfigError
 from express50.files.images import linear_to_srgb, srgb_to_linear
 from pipelines.matte.config import MatteConfig
 from pipelines.matte.key import dilated, eroded, key_alpha, plate_difference
+from pipelines.matte.learned import MattingLaplacian
 from pipelines.matte.plates import (
     LEAST_SHARE,
     exposed,
@@ -152,6 +153,20 @@ def test_shrinking_drops_doubt_and_keeps_what_is_sure() -> None:
 def test_strands_before_a_shadow_are_measured_against_the_darkened_plate() -> None:
     lit, shaded = make_scene(17, "black"), make_scene(17, "black", shadow=0.2)
     assert mae(key(shaded), shaded) < 1.2 * mae(key(lit), lit) + 1e-3
+
+
+def test_the_matting_laplacian_is_symmetric_and_ignores_affine_functions_of_colour() -> None:
+    rng = np.random.default_rng(14)
+    image, band = rng.random((12, 15, 3)), np.ones((12, 15), bool)
+    laplacian = MattingLaplacian(image, band)
+    assert np.abs(laplacian.product(np.full((12, 15), 0.7))).max() < 1e-9
+    affine = image @ [0.3, -0.5, 0.2] + 0.4
+    assert abs(np.sum(affine * laplacian.product(affine))) < 1e-2
+    a, b = rng.random((2, 12, 15))
+    assert np.sum(a * laplacian.product(b)) == pytest.approx(np.sum(b * laplacian.product(a)))
+    one = np.zeros((12, 15))
+    one[4, 6] = 1.0
+    assert laplacian.product(one)[4, 6] == pytest.approx(laplacian.diagonal()[4, 6])
 
 
 def test_discs_by_distance_are_the_morphology() -> None:

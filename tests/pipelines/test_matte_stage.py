@@ -1,4 +1,4 @@
-"""The matte stage with and without plates, as the runner runs it."""
+"""The matte stage with networks and without plates, as the runner runs it."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from express50.capture.frames import (
 )
 from express50.capture.index import read_index
 from express50.contract.layout import Dataset
+from express50.errors import ConfigError
 from express50.files.images import read_image, write_image
 from express50.runner.runner import Summary, run_stage
 from pipelines import calibrate, ingest
@@ -26,6 +27,7 @@ from pipelines.matte.config import MatteConfig
 from tests.pipelines.bump_dataset import make_dataset as bump_dataset
 from tests.pipelines.matte_rig import SIZE, disc
 from tests.pipelines.matte_scenes import make_scene
+from tests.pipelines.stand_ins import Bad, Difference, onnx_bright, torchscript
 from tests.synth import make_capture, write_peak_frames
 
 BACKDROP = np.array([77, 128, 102], np.uint8)
@@ -85,6 +87,66 @@ def unplated(root: Path) -> Path:
         image = 200 * alpha + 40 * (1 - alpha) + rng.normal(0, 1, (128, 128, 3))
         write_image(frame, np.rint(image).astype(np.uint8))
     return path
+
+
+def test_background_matting_sees_frame_and_plate(aligned, tmp_path) -> None:
+    weights = torchscript(Difference(), tmp_path / "net.pt")
+    assert run(aligned, method="bgmv2", weights=str(weights)).ok
+    learned = read_image(aligned.matte_file("S001", "smile", "cam00"))
+    figures = metrics_of(aligned)
+    assert figures["method"] == "bgmv2"
+    assert run(aligned).ok
+    keyed = read_image(aligned.matte_file("S001", "smile", "cam00"))
+    assert ((learned > 127) == (keyed > 127)).mean() > 0.97 and learned.shape == keyed.shape
+
+
+def test_other_weights_run_again_and_the_same_do_not(aligned, tmp_path) -> None:
+    settings = {"method": "bgmv2", "weights": str(tmp_path / "net.pt")}
+    torchscript(Difference(), tmp_path / "net.pt")
+    first = run(aligned, **settings)
+    assert first.ok and run(aligned, **settings).count("skipped") == 2
+    path = aligned.matte_file("S001", "neutral", "cam00")
+    before = path.read_bytes()
+    other = Difference()
+    other.gain.data.fill_(2.0)
+    torchscript(other, tmp_path / "net.pt")
+    assert run(aligned, **settings).count("done") == 2
+    assert path.read_bytes() != before
+
+
+def test_a_salient_network_needs_no_plate(tmp_path) -> None:
+    dataset = make_dataset(tmp_path, [unplated(tmp_path / "raw")])
+    settings = {
+        "method": "salient",
+        "weights": str(onnx_bright(tmp_path / "net.onnx", 128)),
+    }
+    assert run(dataset, **settings).ok
+    folder = dataset.item_dir("matte", "S001/smile")
+    alpha = read_image(folder / "cam00.png")
+    assert alpha[64, 64] == 255 and alpha[2, 2] == 0
+    before = {p: p.read_bytes() for p in folder.rglob("*.*")}
+    assert run(dataset, **settings, scale=0.9).count("done") == 2  # run anew, the same bytes
+    assert {p: p.read_bytes() for p in folder.rglob("*.*")} == before
+
+
+@pytest.mark.parametrize(("how", "message"), [("nan", "gave NaN"), ("pair", "takes 2")])
+def test_a_bad_network_fails_items_in_one_line_each(aligned, tmp_path, how, message) -> None:
+    path = tmp_path / "net.pt"
+    if how == "nan":
+        torchscript(Bad(how), path)
+    if how == "pair":
+        torchscript(Difference(), path)
+    summary = run(aligned, method="salient", weights=str(path))
+    assert summary.count("failed") == 2
+    for outcome in summary.outcomes:
+        assert "matte.weights" in outcome.reason and message in outcome.reason
+
+
+def test_weights_that_are_not_there_are_said_once_and_cost_nothing(aligned, tmp_path) -> None:
+    assert run(aligned).count("done") == 2
+    with pytest.raises(ConfigError, match="matte.weights .*no such file"):
+        run(aligned, method="salient", weights=str(tmp_path / "net.pt"))
+    assert run(aligned).count("skipped") == 2
 
 
 def test_a_camera_without_a_plate_or_a_frame_is_dropped(aligned) -> None:

@@ -30,6 +30,7 @@ from pipelines.regions.geometry import (
 from pipelines.regions.stage import label_view
 from tests.pipelines.bump_dataset import make_dataset, published
 from tests.pipelines.region_scenes import COLOURS, RegionScene, camera_at, make_scene, tracked
+from tests.pipelines.stand_ins import Thirds, torchscript
 
 
 def labels_of(scene: RegionScene, bare: bool = False) -> np.ndarray:
@@ -258,11 +259,28 @@ def test_a_track_beside_the_matte_and_missing_mattes_are_reported(tmp_path) -> N
     json.dumps(result.to_json(), allow_nan=False)
 
 
+def test_the_networks_labels_go_first_and_the_mesh_refines_its_skin(dataset, tmp_path) -> None:
+    weights = torchscript(Thirds(), tmp_path / "parts.pt")
+    config = RegionsConfig(segmentation=str(weights))
+    result = STAGE.run(dataset, "S001/smile", config, tmp_path)
+    assert result.metrics["method"] == "network and mesh"
+    labels = read_image(tmp_path / "cam02.png")
+    # Thirds calls the rows above a quarter hair, those under seven tenths torso, skin between.
+    assert label_mask(labels[5:20, 40:56], "hair").all()
+    assert label_mask(labels[75:, 40:56], "torso").all()
+    middle = {LABELS[k] for k in np.unique(labels[30:60, 30:66])}
+    assert {"skin", "eyes"} <= middle and "hair" not in middle
+    head = read_image(tmp_path / "cam02_head.png")
+    assert head[75:, 40:56].max() == 0 and head[40, 48] == 255
+
+
 def test_items_without_track_or_mattes_fail_in_one_line(tmp_path) -> None:
     dataset = make_dataset(tmp_path)
     shutil.rmtree(dataset.item_dir("matte", "S001/smile"))
     with pytest.raises(StageError, match="express50 matte"):
         STAGE.run(dataset, "S001/smile", RegionsConfig(), tmp_path)
+    with pytest.raises(ConfigError, match=r"regions\.segmentation nowhere"):
+        STAGE.inputs(dataset, "S001/smile", RegionsConfig(segmentation="nowhere.pt"))
     dataset.track_file("S001").unlink()
     with pytest.raises(StageError, match="S001' is not tracked; run 'express50 track'"):
         STAGE.inputs(dataset, "S001/neutral", RegionsConfig())

@@ -58,8 +58,10 @@ def test_ingest_then_skip_then_status(run, data, capture):
 @pytest.mark.parametrize(
     "settings",
     [
+        ["matte.method=bgmv2", "matte.weights"],
         ["track.landmarks"],
         ["track.head"],
+        ["regions.segmentation"],
     ],
     ids=lambda settings: settings[-1],
 )

@@ -12,6 +12,7 @@ from express50.runner.clusters import LocalWorkers, RemoteWorkers, cuda_devices
 from express50.runner.executor import Pool
 from express50.runner.runner import run_stage
 from express50.runner.slurm import SlurmJob
+from pipelines import matte, regions
 from tests.faults import toy
 
 
@@ -131,3 +132,16 @@ def test_jobs_without_a_gpu_are_refused_before_the_first_is_submitted(tmp_path, 
     ):
         run_stage(GREEDY, dataset, toy.ToyConfig(), pool=jobs, progress=False)
     assert not submitted.exists()
+
+
+@pytest.mark.parametrize(
+    ("stage", "without", "more"),
+    [
+        (matte.STAGE, {"method": "salient", "weights": "x.pt"}, {"device": "cuda"}),
+        (regions.STAGE, {"segmentation": "x.pt"}, {"device": "cuda"}),
+        (regions.STAGE, {"device": "cuda"}, {"segmentation": "x.pt"}),
+    ],
+)
+def test_a_configuration_that_asks_for_cuda_needs_it(stage, without, more):
+    assert not stage.needs_gpu(stage.config(**without))
+    assert stage.needs_gpu(stage.config(**without | more))

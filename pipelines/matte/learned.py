@@ -1,0 +1,258 @@
+"""Run the user's matting network.
+
+- ``bgmv2``: BackgroundMattingV2 (Lin et al. 2021) sees frame and clean plate, ``src`` and ``bgr``,
+  RGB in [0, 1], sides multiples of 4; it gives ``pha`` first (its ``doc/model_usage.md``).
+- ``salient``: RMBG-2.0 and BiRefNet (Zheng et al. 2024) see the frame alone, squeezed to their own
+  square, less ImageNet's mean and over its deviation; RMBG-2.0's ONNX file takes ``pixel_values``
+  and gives ``alphas``; others end before the sigmoid, which the range of their values shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+from scipy.sparse.linalg import LinearOperator, cg
+
+from express50.files.images import resize_area
+from pipelines.networks import Network, Role
+
+BGMV2 = Role(setting="matte.weights", inputs=("src", "bgr"), outputs=("pha",))
+SALIENT = Role(
+    setting="matte.weights", inputs=("pixel_values",), outputs=("alphas", "output_image"), place=-1
+)
+MULTIPLE = 4  # BackgroundMattingV2 refines patches of 4 x 4 pixels
+LEAST_SIDE = 64  # below this its encoder has nothing left to see
+OVERLAP = 256  # pixels; half of it is context that a tile sees and does not write
+SIDE = 1024  # of the salient networks, where the file does not say
+MEAN = np.array([0.485, 0.456, 0.406], np.float32)  # ImageNet's
+DEVIATION = np.array([0.229, 0.224, 0.225], np.float32)
+# Weight of the enlarged alpha against smoothness along colours: small, as it knows no detail.
+ENLARGED_WEIGHT = 0.01
+REFINE_TILE, REFINE_OVERLAP = 1024, 64
+FLAT = 1e-5  # variance of colour (of 1) that counts as flat, so that noise is not an edge
+ITERATIONS = 30
+
+
+def background_alpha(
+    network: Network, frame: np.ndarray, plate: np.ndarray, tile: int, overlap: int = OVERLAP
+) -> np.ndarray:
+    """Return opacity (H, W) float32 of a frame and its plate (H, W, 3), both in 8-bit steps.
+
+    Frames beyond `tile` pixels are cut up. The network pools over all it sees, so tiles differ a
+    little from a whole; where memory allows, let `tile` hold the frame.
+
+    Raises:
+        StageError: the network failed, or gave another size or numbers that are not finite.
+    """
+
+    def compute(rows: slice, columns: slice) -> np.ndarray:
+        pair = [_padded(x[rows, columns].astype(np.float32) / 255) for x in (frame, plate)]
+        answer = network(*pair)
+        _check_shape(network, answer, pair[0].shape[:2])
+        return answer[0, : rows.stop - rows.start, : columns.stop - columns.start]
+
+    alpha = in_tiles(frame.shape[:2], tile, overlap, compute)
+    return np.clip(alpha, 0, 1)
+
+
+def salient_alpha(network: Network, frame: np.ndarray) -> np.ndarray:
+    """Return the opacity (H, W) float32 of what stands out in a frame (H, W, 3) uint8.
+
+    The network sees the frame at its own size; where that is smaller, the enlarged alpha follows
+    the frame's colours in the uncertain band.
+
+    Raises:
+        StageError: the network failed, or gave another size or numbers that are not finite.
+    """
+    height, width = network.size or (SIDE, SIDE)
+    small = resize_area(frame, width, height).astype(np.float32)
+    answer = network((small / 255 - MEAN) / DEVIATION)
+    _check_shape(network, answer, (height, width))
+    alpha = as_opacity(answer[0])
+    if (height, width) == frame.shape[:2]:
+        return alpha
+    alpha = np.clip(resize_area(alpha, frame.shape[1], frame.shape[0]), 0, 1)
+    return refined(frame, alpha, max(frame.shape[0] / height, frame.shape[1] / width))
+
+
+def as_opacity(values: np.ndarray) -> np.ndarray:
+    """Return opacities of values that may be logits.
+
+    Those leave [0, 1], what a sigmoid gave does not.
+    """
+    if values.min() >= -1e-3 and values.max() <= 1 + 1e-3:
+        return np.clip(values, 0, 1)
+    return (1 / (1 + np.exp(-np.clip(values, -60, 60)))).astype(np.float32)
+
+
+def refined(frame: np.ndarray, alpha: np.ndarray, factor: float) -> np.ndarray:
+    """Refine an enlarged alpha (H, W) along the colours of a frame (H, W, 3) uint8."""
+    if factor <= 1:
+        return alpha
+    unsure = ((alpha > 0.01) & (alpha < 0.99)).astype(np.uint8)
+    side = 2 * round(factor) + 1
+    band = cv2.dilate(unsure, np.ones((side, side), np.uint8)) > 0
+
+    def compute(rows: slice, columns: slice) -> np.ndarray:
+        part = np.s_[rows, columns]
+        return smooth_alpha(frame[part], alpha[part], band[part])
+
+    return in_tiles(alpha.shape, REFINE_TILE, REFINE_OVERLAP, compute)
+
+
+def _padded(image: np.ndarray) -> np.ndarray:
+    """Repeat an image's (H, W, 3) last row and column up to a size that the network takes."""
+    height, width = (max(LEAST_SIDE, n + -n % MULTIPLE) for n in image.shape[:2])
+    down, right = height - image.shape[0], width - image.shape[1]
+    return cv2.copyMakeBorder(image, 0, down, 0, right, cv2.BORDER_REPLICATE)
+
+
+def _check_shape(network: Network, answer: np.ndarray, size: tuple[int, ...]) -> None:
+    """Raise StageError unless an answer is one channel of a size (height, width)."""
+    if answer.shape != (1, *size):
+        raise network.error(
+            f"gave shape {answer.shape}, expected {(1, *size)}; does matte.method fit the file?"
+        )
+
+
+def smooth_alpha(image: np.ndarray, alpha: np.ndarray, band: np.ndarray) -> np.ndarray:
+    """Smooth alpha (H, W) in `band` (H, W) by an image (H, W, 3) in 8-bit steps; the rest stays.
+
+    Minimises a' L a + ENLARGED_WEIGHT |a - alpha|^2 over the band by conjugate gradients.
+    """
+    if not band.any() or min(band.shape) < 3:
+        return alpha
+    laplacian = MattingLaplacian(image / 255.0, band)
+    count = int(band.sum())
+
+    def product(values: np.ndarray) -> np.ndarray:
+        spread = np.zeros(band.shape)
+        spread[band] = values
+        return laplacian.product(spread)[band] + ENLARGED_WEIGHT * values
+
+    key = alpha[band].astype(np.float64)
+    fixed = np.where(band, 0.0, alpha)
+    right = ENLARGED_WEIGHT * key - laplacian.product(fixed)[band]
+    # Preconditioned by its diagonal: windows at image borders and flat ones differ in scale.
+    inverse = 1.0 / (laplacian.diagonal()[band] + ENLARGED_WEIGHT)
+    solved, _ = cg(
+        LinearOperator((count, count), product, dtype=np.float64),
+        right,
+        x0=key,
+        rtol=1e-2,
+        maxiter=ITERATIONS,
+        M=LinearOperator((count, count), lambda v: inverse * v, dtype=np.float64),
+    )
+    out = alpha.copy()
+    out[band] = np.clip(solved, 0.0, 1.0)
+    return out
+
+
+class MattingLaplacian:
+    """The matting Laplacian of the 3 x 3 windows that touch a band, as an operator on images."""
+
+    def __init__(self, image: np.ndarray, band: np.ndarray) -> None:
+        """Prepare for an image (H, W, 3) with colours in [0, 1] and a band (H, W) bool."""
+        self.image = np.ascontiguousarray(image, dtype=np.float64)
+        windows = cv2.dilate(band.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        # Only windows that lie wholly inside the image.
+        windows[[0, -1]] = windows[:, [0, -1]] = False
+        self.windows = windows
+        mean = _mean(self.image)[windows]  # (M, 3)
+        squares = self.image[..., :, None] * self.image[..., None, :]
+        products = _mean(squares.reshape(*band.shape, 9))[windows].reshape(-1, 3, 3)
+        covariance = products - mean[:, :, None] * mean[:, None, :]
+        self.inverse = np.linalg.inv(covariance + FLAT / 9 * np.eye(3))
+        self.mean = mean
+
+    def product(self, values: np.ndarray) -> np.ndarray:
+        """Return L @ values, both (H, W); right where the band is."""
+        average = _mean(values)[self.windows]
+        together = _mean(self.image * values[..., None])[self.windows]
+        slope = np.einsum("mij,mj->mi", self.inverse, together - self.mean * average[:, None])
+        offset = average - np.einsum("mi,mi->m", slope, self.mean)
+        slopes = self._summed(slope)
+        rest = self._summed(np.stack([offset, np.ones_like(offset)], axis=1))
+        fitted = np.einsum("...i,...i->...", slopes, self.image) + rest[..., 0]
+        return rest[..., 1] * values - fitted
+
+    def diagonal(self) -> np.ndarray:
+        """Return the diagonal (H, W) of L; right where the band is."""
+        pulled = np.einsum("mij,mj->mi", self.inverse, self.mean)
+        constant = np.einsum("mi,mi->m", pulled, self.mean)
+        inverse = self._summed(self.inverse.reshape(-1, 9)).reshape(*self.windows.shape, 3, 3)
+        rest = self._summed(np.column_stack([pulled, constant, np.ones_like(constant)]))
+        form = np.einsum("...i,...ij,...j->...", self.image, inverse, self.image)
+        form -= 2 * np.einsum("...i,...i->...", self.image, rest[..., :3])
+        return rest[..., 4] - (rest[..., 4] + form + rest[..., 3]) / 9
+
+    def _summed(self, values: np.ndarray) -> np.ndarray:
+        """Sum (H, W, C) over the windows that hold each pixel of values (M, C), one a window."""
+        spread = np.zeros((*self.windows.shape, values.shape[1]))
+        spread[self.windows] = values
+        return _box(spread, normalize=False)
+
+
+def _mean(image: np.ndarray) -> np.ndarray:
+    return _box(image, normalize=True)
+
+
+def _box(image: np.ndarray, normalize: bool) -> np.ndarray:
+    return cv2.boxFilter(
+        image, cv2.CV_64F, (3, 3), normalize=normalize, borderType=cv2.BORDER_CONSTANT
+    )
+
+
+def in_tiles(
+    shape: tuple[int, int],
+    tile: int,
+    overlap: int,
+    compute: Callable[[slice, slice], np.ndarray],
+) -> np.ndarray:
+    """Call ``compute(rows, columns)`` for tiles of an image, and join them to (H, W) float32.
+
+    In an overlap the outer quarter of each tile, whose surroundings it did not see, is not used,
+    and the half between fades from one tile to the other; where the two agree the result is
+    exactly theirs.
+
+    Args:
+        shape: (H, W) of the image.
+        tile: longest side of a tile, pixels; a multiple of 64, so that networks that halve the
+            picture stay in phase.
+        overlap: pixels that neighbours share; a multiple of 64, less than ``tile``.
+        compute: gives (rows, columns) values of one tile.
+    """
+    whole = np.zeros(shape, np.float32)
+    row_end = 0
+    for rows in spans(shape[0], tile, overlap):
+        strip = np.zeros((rows.stop - rows.start, shape[1]), np.float32)
+        end = 0
+        for columns in spans(shape[1], tile, overlap):
+            _join(strip, compute(rows, columns), columns.start, end)
+            end = columns.stop
+        _join(whole.T, strip.T, rows.start, row_end)
+        row_end = rows.stop
+    return whole
+
+
+def spans(length: int, tile: int, overlap: int) -> list[slice]:
+    """Give slices that cover a length; neighbours share ``overlap``."""
+    starts = [0]
+    while starts[-1] + tile < length:
+        starts.append(starts[-1] + tile - overlap)
+    return [slice(start, min(start + tile, length)) for start in starts]
+
+
+def _join(whole: np.ndarray, piece: np.ndarray, start: int, end: int) -> None:
+    """Put a piece into the columns from ``start``; those before ``end`` exist and fade."""
+    shared = end - start
+    if shared > 0:
+        place = np.arange(shared) + 0.5
+        share = np.clip((place - shared / 4) / (shared / 2), 0, 1).astype(np.float32)
+        old = whole[:, start:end]
+        new = piece[:, :shared]
+        old[:] = np.where(share < 1, old + share * (new - old), new)
+        piece, start = piece[:, shared:], end
+    whole[:, start : start + piece.shape[1]] = piece
