@@ -38,6 +38,8 @@ class Reply(NamedTuple):
 NOT_FOUND = Reply(HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
 Get = Callable[[str], Reply]
 """The address after the token, without its slash, to its reply."""
+Post = Callable[[str, str, Callable[[int], bytes | None]], Reply]
+"""The address, the media type, and a function that reads a body of at most so many bytes."""
 
 
 @dataclass(frozen=True)
@@ -72,13 +74,13 @@ class PageServer(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, get: Get, host: str, port: int) -> None:
+    def __init__(self, get: Get, post: Post | None, host: str, port: int) -> None:
         """Listen, without serving yet.
 
         Raises:
             ConfigError: the port is taken, or is not one.
         """
-        self.door, self.get = Door(host), get
+        self.door, self.get, self.post = Door(host), get, post
         self._free = BoundedSemaphore(AT_ONCE)
         try:
             super().__init__((host, port), _Handler)
@@ -125,12 +127,25 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = LONGEST_S / 2  # without a byte
 
     def do_GET(self) -> None:  # noqa: N802
+        self._answer(self.server.get)
+
+    def do_POST(self) -> None:  # noqa: N802
+        post, kind = self.server.post, self.headers.get("Content-Type", "")
+        self._answer(lambda path: post(path, kind, self._body) if post else NOT_FOUND)
+
+    def _body(self, limit: int) -> bytes | None:
+        length = self.headers.get("Content-Length", "")
+        if not length.isdecimal() or len(length) > 9 or int(length) > limit:
+            return None
+        return self.rfile.read(int(length))
+
+    def _answer(self, get: Get) -> None:
         refusal = self.server.door.refusal(self.headers["Host"], self.headers["Origin"])
         path = self.server.door.inside(self.path)
         if refusal is not None:
             status, kind, body = HTTPStatus.FORBIDDEN, "text/plain", refusal.encode()
         else:
-            status, kind, body = NOT_FOUND if path is None else self.server.get(path)
+            status, kind, body = NOT_FOUND if path is None else get(path)
         self.send_response(status)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(body)))

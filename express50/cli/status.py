@@ -135,7 +135,7 @@ def _serve(dataset: Dataset, port: int) -> int:
         page = status_page(dataset.root.resolve().name, _read(dataset), PAGE_SECONDS)
         return Reply(HTTPStatus.OK, "text/html; charset=utf-8", page.encode())
 
-    with PageServer(get, "127.0.0.1", port) as server:
+    with PageServer(get, None, "127.0.0.1", port) as server:
         say(f"{server.address} (Ctrl-C stops it)")
         server.serve_forever()
     return OK

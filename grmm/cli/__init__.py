@@ -143,6 +143,13 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--still": {"type": at_least(16), "default": 512, "help": "height once they rest, pixels"},
     "--host": {"default": "127.0.0.1", "help": "address to listen on (this machine)"},
     "--port": {"type": at_least(1, 65535), "default": 8080},
+    # Studies
+    "--reference": {"type": Path, "required": True, "help": "pictures of the truth"},
+    "--ours": {"type": Path, "required": True, "help": "a method's pictures, named alike"},
+    "--theirs": {"type": Path, "required": True, "help": "the other method's"},
+    "--names": {"nargs": 2, "default": ["Ours", "Theirs"], "metavar": "NAME"},
+    "--examples": {"type": int, "default": 15, "help": "a participant sees (15)"},
+    "--participants": {"type": int, "default": 20},
 }  # fmt: skip
 ALIASES = {"--seconds": ["--budget"]}
 
@@ -260,6 +267,27 @@ COMMANDS = {
         changes={"out": {"help": "for a folder per row, ablation.md and ablation.json"}},
     ),
 }
+STUDY_ACTIONS = {
+    "make": GrmmCommand(
+        handler=commands.study_make,
+        options="out --reference --ours --theirs --names --examples --participants --seed",
+        help="choose examples and assign A and B, counterbalanced",
+        example="grmm study make study --reference truth --ours grmm --theirs md",
+        changes={"out": {"help": "folder for study.json and pictures/"}},
+    ),
+    "serve": GrmmCommand(
+        handler=commands.study_serve,
+        options="out --host --port",
+        help="show the page and collect answers",
+        changes={"out": {"help": "folder of the study"}, "--port": {"default": 8000}},
+    ),
+    "table": GrmmCommand(
+        handler=commands.study_table,
+        options="out --json",
+        help="the paper's table, with confidence intervals",
+        changes={"out": {"help": "folder of the study"}},
+    ),
+}
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -274,6 +302,10 @@ def build_parser() -> argparse.ArgumentParser:
     group = parser.add_subparsers(required=True, metavar="COMMAND")
     for name, command in COMMANDS.items():
         _add(group, name, command)
+    study = group.add_parser("study", help="ask people which of two methods is better")
+    actions = study.add_subparsers(required=True, metavar="ACTION")
+    for name, command in STUDY_ACTIONS.items():
+        _add(actions, name, command)
     return parser
 
 

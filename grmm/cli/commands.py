@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from express50.console import OK, answer, log, say
 from express50.contract.config import config_toml, known_assignments
 from express50.errors import ConfigError
+from express50.files.atomic import write_bytes, write_json
 from grmm.config import TABLES, Config, as_tables, choose, from_tables, resolve
 from grmm.deviations import paper_diff
 
@@ -312,6 +313,39 @@ def _protocol(args: argparse.Namespace) -> FitProtocol:
     return FitProtocol(
         cameras=_split_names(args.fit_cameras), expression=args.fit_expression, images=args.images
     )
+
+
+def study_make(args: argparse.Namespace) -> int:
+    """Write a study of two methods' pictures."""
+    from grmm.study import make_study
+
+    methods = list(zip(args.names, (args.ours, args.theirs), strict=True))
+    study = make_study(
+        args.out, args.reference, methods, args.examples, args.participants, args.seed
+    )
+    say(f"wrote {args.out / 'study.json'}: {len(study['examples'])} examples")
+    return OK
+
+
+def study_serve(args: argparse.Namespace) -> int:
+    """Serve a study until Ctrl-C."""
+    from grmm.study.server import make_server
+
+    with make_server(args.out, args.host, args.port) as server:
+        say(f"{server.address}  (Ctrl-C stops; answers are kept)")
+        server.serve_forever()
+    return OK
+
+
+def study_table(args: argparse.Namespace) -> int:
+    """Write and print the table of a study's answers."""
+    from grmm.study import markdown, read_answers, read_study, summarise
+
+    study = read_study(args.out)
+    summary = summarise(study, read_answers(args.out, study))
+    write_json(args.out / "table.json", summary)
+    write_bytes(args.out / "table.md", markdown(summary).encode())
+    return answer(args, summary, markdown(summary))
 
 
 def _no_file(out: Path) -> None:

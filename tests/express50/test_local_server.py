@@ -18,9 +18,14 @@ def page(path):
     return Reply(HTTPStatus.OK, "text/plain", b"a face") if path in ("", "x") else NOT_FOUND
 
 
+def take(path, kind, body):
+    content = body(10)
+    return NOT_FOUND if content is None else Reply(HTTPStatus.OK, "text/plain", content)
+
+
 @contextmanager
 def served(get=page):
-    with PageServer(get, "127.0.0.1", 0) as server:
+    with PageServer(get, take, "127.0.0.1", 0) as server:
         thread = threading.Thread(target=server.serve_forever, args=[0.02])
         thread.start()
         try:
@@ -30,9 +35,9 @@ def served(get=page):
             thread.join()
 
 
-def ask(server, path, **headers):
+def ask(server, path, method="GET", body=None, **headers):
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=5)
-    connection.request("GET", path, None, {"Host": f"127.0.0.1:{server.server_port}"} | headers)
+    connection.request(method, path, body, {"Host": f"127.0.0.1:{server.server_port}"} | headers)
     return connection.getresponse()
 
 
@@ -45,7 +50,7 @@ def test_only_the_address_that_was_printed_gives_the_page():
         outside = ["/", "/x", f"/{token}", f"/{token[:-1]}/", "/?/", "/../"]
         for path in outside + [f"/{token}/../x", f"/{token}//etc/passwd"]:
             assert ask(server, path).status == 404
-        again = PageServer(page, "127.0.0.1", 0)
+        again = PageServer(page, None, "127.0.0.1", 0)
         again.server_close()
         assert again.door.token != token
 
@@ -62,8 +67,9 @@ def test_only_the_address_that_was_printed_gives_the_page():
 )
 def test_other_sites_are_refused_even_with_the_token(headers):
     with served() as server:
-        reply = ask(server, f"/{server.door.token}/", **headers)
-        assert reply.status == 403 and b"face" not in reply.read()
+        for method in ("GET", "POST"):
+            reply = ask(server, f"/{server.door.token}/", method, **headers)
+            assert reply.status == 403 and b"face" not in reply.read()
 
 
 def test_a_server_for_other_machines_checks_token_and_origin():
@@ -73,14 +79,24 @@ def test_a_server_for_other_machines_checks_token_and_origin():
     assert door.inside("/secret/a") == "a" and door.inside("/secre/a") is None
 
 
+def test_bodies_are_bounded():
+    with served() as server:
+        post = f"/{server.door.token}/a"
+        assert ask(server, post, "POST", b"answer").read() == b"answer"
+        assert ask(server, post, "POST", b"x" * 11).status == 404
+        assert ask(server, post, "POST", **{"Content-Length": "-1"}).status == 404
+        assert ask(server, post, "POST", **{"Content-Length": "9" * 30}).status == 404
+
+
 def test_slow_requests_and_floods_end(monkeypatch):
     monkeypatch.setattr(local_server, "LONGEST_S", 0.3)
     monkeypatch.setattr(local_server, "AT_ONCE", 3)
     with served() as server:
         slow = [socket.create_connection(("127.0.0.1", server.server_port)) for _ in range(3)]
         host = f"Host: 127.0.0.1:{server.server_port}"
-        for connection in slow:  # their headers never end
-            connection.sendall(f"GET /{server.door.token}/ HTTP/1.0\r\n{host}\r\n".encode())
+        post = f"POST /{server.door.token}/a HTTP/1.0\r\n{host}\r\nContent-Length: 8\r\n\r\nab"
+        for connection in slow:
+            connection.sendall(post.encode())
         time.sleep(0.1)
         with pytest.raises((OSError, http.client.HTTPException)):
             ask(server, f"/{server.door.token}/")  # no thread is free
@@ -107,4 +123,4 @@ def test_a_bug_in_a_page_is_one_line(capsys):
 
 def test_a_port_out_of_range_is_one_error():
     with pytest.raises(ConfigError, match="choose another port"):
-        PageServer(page, "127.0.0.1", 70000)
+        PageServer(page, None, "127.0.0.1", 70000)

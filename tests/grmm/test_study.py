@@ -1,0 +1,208 @@
+import json
+import threading
+import urllib.error
+import urllib.request
+from collections import Counter
+from itertools import product
+
+import numpy as np
+import pytest
+
+from express50.errors import ConfigError, FormatError
+from express50.files.images import write_image
+from grmm.cli import main
+from grmm.study import (
+    append_answer,
+    check_answer,
+    make_study,
+    markdown,
+    method_of,
+    read_answers,
+    summarise,
+    trials,
+)
+from grmm.study.server import make_server
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """Three folders of 7 pictures named alike; one has an extra."""
+    made = {}
+    for number, name in enumerate(("reference", "ours", "theirs")):
+        made[name] = tmp_path / name
+        made[name].mkdir()
+        for example in range(7 + (name == "ours")):
+            pixels = np.full((8, 8, 3), 20 * example + number, np.uint8)
+            write_image(made[name] / f"S{example:03d}_smile_cam01.png", pixels)
+    return made
+
+
+def made_in(out, folders):
+    methods = (("Ours", folders["ours"]), ("MD", folders["theirs"]))
+    return make_study(out, folders["reference"], methods, examples=6, participants=4)
+
+
+@pytest.fixture
+def study(folders, tmp_path):
+    return tmp_path / "s", made_in(tmp_path / "s", folders)
+
+
+def test_sides_are_counterbalanced_over_examples_and_participants(study):
+    _, made = study
+    for participant in range(4):
+        sides = Counter(method_of(made, participant, e, "A") for e in range(6))
+        assert sides == {"Ours": 3, "MD": 3}
+    for example in range(6):
+        for side in "AB":
+            shown = {method_of(made, p, example, side) for p in (0, 1)}
+            assert shown == {"Ours", "MD"}
+    orders = [tuple(t["example"] for t in trials(made, p)) for p in range(4)]
+    assert len(set(orders)) > 1 and all(sorted(order) == list(range(6)) for order in orders)
+
+
+def test_what_a_participant_sees_names_no_method(study):
+    folder, made = study
+    seen = json.dumps(trials(made, 0))
+    assert not any(word in seen for word in ("Ours", "MD", "smile", "theirs"))
+    for trial in trials(made, 0):
+        for side in ("reference", "A", "B"):
+            assert (folder / trial[side]).is_file()
+
+
+def test_the_same_seed_makes_the_same_study(study, folders, tmp_path):
+    assert made_in(tmp_path / "t", folders) == study[1]
+
+
+def answer_all(folder, made, choose):
+    people, examples = range(made["participants"]), range(len(made["examples"]))
+    for participant, example, question in product(people, examples, made["questions"]):
+        ours = "A" if method_of(made, participant, example, "A") == "Ours" else "B"
+        answer = choose(participant, example, question, ours)
+        ids = {"participant": participant, "example": example, "question": question}
+        append_answer(folder, ids | {"answer": answer})
+
+
+def test_table_turns_sides_back_into_methods(study):
+    folder, made = study
+
+    def choose(participant, example, question, ours):
+        other = "B" if ours == "A" else "A"
+        if question == "identity":
+            return f"{ours}++"
+        return [f"{ours}+", f"{other}++", "="][example % 3]
+
+    answer_all(folder, made, choose)
+    summary = summarise(made, read_answers(folder, made))
+    rows = summary["rows"]
+    assert rows["identity"]["first++"] == 100 and rows["identity"]["first_interval"] == [100, 100]
+    expression = rows["expression"]
+    shares = [expression[name] for name in ("first+", "second++", "tie")]
+    assert shares == pytest.approx([33.33] * 3)
+    assert rows["overall"]["first"] == pytest.approx(66.67)
+    assert summary["judgments"] == summary["judgments_expected"] == 48
+    text = markdown(summary)
+    assert "| Identity | 100.0% | 0.0% | 0.0% | 0.0% | 0.0% |" in text and "MD ++" in text
+
+
+def test_intervals_widen_where_participants_disagree(study):
+    folder, made = study
+    answer_all(folder, made, lambda p, e, q, ours: f"{ours}+" if p < 2 else "=")
+    row = summarise(made, read_answers(folder, made))["rows"]["overall"]
+    low, high = row["first_interval"]
+    assert row["first"] == 50 and low < 10 and high > 90
+    one = [a for a in read_answers(folder, made) if a["participant"] == 0]
+    assert summarise(made, one)["rows"]["overall"]["first_interval"] is None
+
+
+def test_the_last_answer_counts_and_a_torn_line_does_not(study):
+    folder, made = study
+    answer = {"participant": 1, "example": 2, "question": "identity", "answer": "A+"}
+    append_answer(folder, answer)
+    append_answer(folder, answer | {"answer": "="})
+    with (folder / "answers.jsonl").open("a") as file:
+        file.write('{"participant": 1, "exa')
+    assert [a["answer"] for a in read_answers(folder, made)] == ["="]
+    append_answer(folder, answer | {"example": 3})
+    assert [a["example"] for a in read_answers(folder, made)] == [2, 3]
+    (folder / "answers.jsonl").write_text('{"a": 1}\nno\n')
+    with pytest.raises(FormatError, match="line 1"):
+        read_answers(folder, made)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"participant": 4}, "participant is 4, expected 0 to 3"),
+        ({"participant": True}, "participant is True"),
+        ({"example": -1}, "example is -1"),
+        ({"question": "hair"}, "question is 'hair'"),
+        ({"answer": "C"}, "answer is 'C'"),
+    ],
+)
+def test_wrong_answers_are_named(study, change, message):
+    answer = {"participant": 0, "example": 0, "question": "identity", "answer": "="}
+    assert check_answer(study[1], answer | {"more": 1}) == answer
+    with pytest.raises(FormatError, match=message):
+        check_answer(study[1], answer | change)
+
+
+def test_page_shows_trials_and_takes_answers_and_nothing_else(study):
+    folder, made = study
+    with make_server(folder, port=0) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        root = server.address
+
+        def get(path):
+            with urllib.request.urlopen(root + path, timeout=5) as reply:
+                return reply.read()
+
+        def post(body, kind="application/json"):
+            request = urllib.request.Request(root + "answers", body, {"Content-Type": kind})
+            with urllib.request.urlopen(request, timeout=5) as reply:
+                return reply.status
+
+        try:
+            assert b"<title>" in get("")
+            content = json.loads(get("trials?participant=1"))
+            assert content["trials"] == trials(made, 1) and content["done"] == []
+            assert get(content["trials"][0]["A"]).startswith(b"\x89PNG")
+            answer = {"participant": 1, "example": 2, "question": "identity", "answer": "A++"}
+            assert post(json.dumps(answer).encode()) == 200
+            assert json.loads(get("trials?participant=1"))["done"] == [answer]
+            for path in ("study.json", "pictures/../study.json", "answers.jsonl"):
+                with pytest.raises(urllib.error.HTTPError, match="404"):
+                    get(path)
+            with pytest.raises(urllib.error.HTTPError, match="400"):
+                get("trials?participant=9")
+            for body, kind in ((b"{}", "application/json"), (b"x" * 9999, "application/json")):
+                with pytest.raises(urllib.error.HTTPError, match="400"):
+                    post(body, kind)
+            with pytest.raises(urllib.error.HTTPError, match="415"):
+                post(json.dumps(answer).encode(), "text/plain")
+        finally:
+            server.shutdown()
+            thread.join()
+    assert read_answers(folder, made) == [answer]
+
+
+def test_commands_make_and_table(folders, tmp_path, capsys):
+    out = str(tmp_path / "c")
+    make = ["study", "make", out, f"--reference={folders['reference']}"]
+    make += [f"--ours={folders['ours']}", f"--theirs={folders['theirs']}", "--examples=5"]
+    assert main([*make, "--participants=2", "--names", "GRMM", "MD"]) == 0
+    assert main(["study", "table", out]) == 0
+    assert "0 of 20 judgments" in capsys.readouterr().out
+    append_answer(
+        tmp_path / "c", {"participant": 0, "example": 0, "question": "identity", "answer": "="}
+    )
+    assert main([*make, "--names", "GRMM", "MD"]) == 2
+    assert "people have answered" in capsys.readouterr().err
+
+
+def test_too_few_common_pictures_are_said(folders, tmp_path):
+    methods = (("a", folders["ours"]), ("b", folders["theirs"]))
+    with pytest.raises(ConfigError, match="7 pictures"):
+        make_study(tmp_path / "x", folders["reference"], methods, examples=8)
+    with pytest.raises(ConfigError, match="no such folder"):
+        make_study(tmp_path / "x", tmp_path / "absent", methods)
