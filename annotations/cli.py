@@ -19,7 +19,6 @@ from annotations.labels import (
     FLAG_REASONS,
     Label,
     append_label,
-    check_known,
     current_labels,
     is_person,
     last_event,
@@ -40,10 +39,10 @@ from annotations.validate import (
     settlement,
 )
 from annotations.worklist import ORDERS, coverage, effort, progress, worklist
-from express50.capture.index import read_index
-from express50.console import FAILED, OK, answer, format_table
+from express50.capture.index import Index, read_index
+from express50.console import FAILED, OK, answer, count, format_table
 from express50.contract.layout import Dataset, included_subjects
-from express50.errors import AnnotationError
+from express50.errors import AnnotationError, UnknownNameError, check_known
 
 _FIGURES = ("clips", "within_1", "within_2", "within_4", "median_frames", "slip_rate", "alpha")
 AROUND = 4  # frames on either side where one subject or expression is looked at
@@ -225,7 +224,8 @@ def _matching(names: Iterable[str], pattern: str | None, what: str) -> list[str]
     known = list(names)
     found = [name for name in known if fnmatch.fnmatchcase(name, pattern or "*")]
     if pattern is not None and not found:
-        raise AnnotationError(f"no {what} fits {pattern!r}; there are {', '.join(known)}")
+        listed = ", ".join(known)
+        raise UnknownNameError(f"no {what} matches {pattern!r}; expected some of {listed}")
     return found
 
 
@@ -251,9 +251,14 @@ def run_next(args: argparse.Namespace) -> int:
     return answer(args, {"left": len(tasks), "tasks": head}, *lines, f"{len(tasks)} left")
 
 
+def _index(args: argparse.Namespace) -> Index:
+    chosen_subjects(args.dataset, [args.subject])
+    return read_index(args.dataset, args.subject)
+
+
 def run_mark(args: argparse.Namespace) -> int:
     """Append a mark by a person."""
-    index = read_index(args.dataset, args.subject)
+    index = _index(args)
     hint = read_suggestions(args.dataset, args.subject).get(args.expression)
     camera = args.camera or (hint.camera if hint else "") or next(iter(index.cameras))
     mark = make_mark(
@@ -261,32 +266,32 @@ def run_mark(args: argparse.Namespace) -> int:
     )
     if hint is not None:
         mark = replace(mark, suggested=hint.frame, confidence=hint.confidence)
-    return _keep(args, mark, f"marked frame {args.frame}")
+    return _keep(args, mark, f"frame {args.frame} marked")
 
 
 def run_flag(args: argparse.Namespace) -> int:
     """Append a flag with its reason."""
-    index = read_index(args.dataset, args.subject)
+    index = _index(args)
     flag = make_flag(index, args.expression, args.reason, args.annotator)
-    return _keep(args, flag, "flagged")
+    return _keep(args, flag, f"flagged {flag.reason!r}")
 
 
 def run_undo(args: argparse.Namespace) -> int:
     """Append an undo."""
-    index = read_index(args.dataset, args.subject)
+    index = _index(args)
     undo = make_event(index, args.expression, "undo", args.annotator)
     events = read_labels(args.dataset, args.subject)
     if last_event(events, args.expression, args.annotator) is None:
         raise AnnotationError(
             f"{args.subject} {args.expression}: {args.annotator} has no label on it to undo"
         )
-    return _keep(args, undo, "took the last event back")
+    return _keep(args, undo, "last event taken back")
 
 
 def _keep(args: argparse.Namespace, label: Label, said: str) -> int:
     append_label(args.dataset, label)
     words = (
-        f"{label.subject} {label.expression}: {said} as {label.annotator};"
+        f"{label.subject} {label.expression}: {said} by {label.annotator};"
         f" run 'express50 align {args.dataset.root}' to use it"
     )
     return answer(args, asdict(label), words)
@@ -411,7 +416,7 @@ def run_rule(args: argparse.Namespace) -> int:
     marks = [m for i in indexes for m in last_frame_marks(args.dataset, i, args.expression)]
     for mark in marks:
         append_label(args.dataset, mark)
-    words = f"{len(marks)} marks by {LAST_FRAME} in {len(chosen)} subjects"
+    words = f"{count(len(marks), 'mark')} by {LAST_FRAME} in {count(len(chosen), 'subject')}"
     return answer(args, [asdict(mark) for mark in marks], words)
 
 
@@ -435,7 +440,7 @@ def run_export(args: argparse.Namespace) -> int:
     chosen = chosen_subjects(args.dataset, args.subject) or args.dataset.subjects()
     events = [label for subject in chosen for label in read_labels(args.dataset, subject)]
     export_labels(events, args.file)
-    words = f"{args.file}: {len(events)} events of {len(chosen)} subjects"
+    words = f"{args.file}: {count(len(events), 'event')} of {count(len(chosen), 'subject')}"
     return answer(args, {"file": str(args.file), "events": len(events)}, words)
 
 
@@ -443,4 +448,4 @@ def run_import(args: argparse.Namespace) -> int:
     """Append the new events."""
     new, known = import_labels(args.dataset, args.file)
     data = {"file": str(args.file), "new": new, "known": known}
-    return answer(args, data, f"{args.file}: {new} new events, {known} known already")
+    return answer(args, data, f"{args.file}: {count(new, 'new event')}, {known} known already")

@@ -24,7 +24,6 @@ from annotations.labels import (
     RULE_PREFIX,
     Label,
     append_label,
-    check_known,
     check_texts,
     current_labels,
     make_mark,
@@ -33,7 +32,7 @@ from annotations.labels import (
 from annotations.validate import footage_problems
 from express50.capture.index import Index, read_index
 from express50.contract.layout import Dataset
-from express50.errors import AnnotationError
+from express50.errors import AnnotationError, check_known
 from express50.files.text import NAME, parse_json, read_text
 
 LARGEST = 2**63
@@ -75,9 +74,12 @@ def import_labels(dataset: Dataset, path: Path) -> tuple[int, int]:
     labels = read_table(path)
     for number, label in enumerate(labels, 1):
         where = f"{path}: row {number}"
-        check_known(where, "subject", [label.subject], dataset.subjects())
+        check_known(where, "subject", [label.subject], dataset.subjects(), AnnotationError)
+        index = read_index(dataset, label.subject)
+        cues = [cue.expression_id for cue in index.cues]
+        check_known(where, "expression", [label.expression or cues[0]], cues, AnnotationError)
         check_texts(label)
-        for kind, what in footage_problems(read_index(dataset, label.subject), label):
+        for kind, what in footage_problems(index, label):
             if kind != "window":
                 raise AnnotationError(f"{where}: {what}; was it made on other footage?")
     held = {subject: set(read_labels(dataset, subject)) for subject in {x.subject for x in labels}}
@@ -130,7 +132,7 @@ def _label(row: object, where: str) -> Label:
         raise AnnotationError(f"{where}: unknown columns {unknown}, missing {missing}")
     if not NAME.fullmatch(str(given["subject"])):  # it becomes the name of a file
         raise AnnotationError(f"{where}: subject {given['subject']!r} is not an id")
-    check_known(where, "action", [given["action"]], ACTIONS)
+    check_known(where, "action", [given["action"]], ACTIONS, AnnotationError)
     framed = given["action"] == "mark" or (given["action"] == "settle" and "reason" not in given)
     needed = {"frame", "camera", "dhash"} if framed else set()
     needed |= {"reason"} if given["action"] == "flag" else set()

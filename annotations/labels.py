@@ -12,14 +12,14 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import get_type_hints
 
 from express50 import __version__
 from express50.capture.index import Cue, Index
 from express50.contract.layout import Dataset
-from express50.errors import AnnotationError
+from express50.errors import AnnotationError, check_known
 from express50.files.atomic import sync_directory
 from express50.files.text import parse_json, read_bytes
 
@@ -128,7 +128,7 @@ def make_event(index: Index, expression: str, action: str, annotator: str) -> La
     """Make an event that names no frame, such as an undo.
 
     Raises:
-        AnnotationError: the expression is not in the cues.
+        UnknownNameError: the expression is not in the cues.
     """
     find_cue(index, expression)
     return Label(
@@ -144,24 +144,11 @@ def find_cue(index: Index, expression: str) -> Cue:
     """Find the cue window of an expression.
 
     Raises:
-        AnnotationError: it is not in the cues.
+        UnknownNameError: it is not in the cues.
     """
     cues = {cue.expression_id: cue for cue in index.cues}
     check_known(index.subject, "expression", [expression], cues)
     return cues[expression]
-
-
-def check_known(where: str, what: str, wanted: Iterable[str], known: Collection[str]) -> None:
-    """Refuse names that are not known.
-
-    Raises:
-        AnnotationError: one is not; it lists those that are.
-    """
-    for name in wanted:
-        if name not in known:
-            raise AnnotationError(
-                f"{where}: no {what} {name!r}; expected one of {', '.join(known) or 'none'}"
-            )
 
 
 def shows_labelled_frame(index: Index, label: Label) -> bool:

@@ -13,7 +13,6 @@ import numpy as np
 
 from annotations.labels import (
     Label,
-    check_known,
     current_labels,
     origin,
     read_labels,
@@ -26,7 +25,7 @@ from express50.capture.expressions import expression_words
 from express50.capture.frames import read_proxy
 from express50.capture.index import Index, read_index
 from express50.contract.layout import Dataset, exclusion_reason, included_subjects
-from express50.errors import Express50Error, FormatError
+from express50.errors import Express50Error, FormatError, check_known
 from express50.files.images import encode_jpeg
 
 STATES = ("person", "rule", "auto", "suggestion", "flagged", "missing")

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from annotations.labels import check_known, current_labels, read_labels
+from annotations.labels import current_labels, read_labels
 from express50.contract.layout import Dataset, included_subjects
-from express50.errors import AnnotationError, FormatError, StageError
+from express50.errors import AnnotationError, FormatError, StageError, check_known
 from express50.files.atomic import write_json
 from express50.files.text import read_json_table
 

@@ -9,7 +9,6 @@ from statistics import median
 
 from annotations.labels import (
     Label,
-    check_known,
     current_labels,
     is_person,
     labels_of,
@@ -21,6 +20,7 @@ from express50.capture.demographics import age_counts, gender_counts, shown_coun
 from express50.capture.index import read_index
 from express50.capture.readers.read import read_people
 from express50.contract.layout import Dataset, exclusion_reason, included_subjects
+from express50.errors import check_known
 
 ORDERS = ("doubt", "expression", "subject")
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import json
 import os
+import re
 import signal
 import sys
 import traceback
@@ -13,10 +15,37 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
-from express50.errors import ConfigError, Express50Error
+from express50.errors import ConfigError, Express50Error, nearest
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 DEBUG = "EXPRESS50_DEBUG"  # variable of the environment
+REMEDY = "check the path, its permissions and the free disk space"
+REMEDIES = {
+    errno.ENOENT: "check the path",
+    errno.EEXIST: "give another path",
+    errno.ENOTDIR: "give another path",
+    errno.EISDIR: "give the path of a file",
+    errno.EACCES: "check whose it is, or give another path",
+    errno.EPERM: "check whose it is, or give another path",
+    errno.EROFS: "give a path that can be written to",
+    errno.ENOSPC: "free some space",
+    errno.EDQUOT: "free some space, your quota is used up",
+}
+
+
+class Parser(argparse.ArgumentParser):
+    """Parses a command line; names the nearest known word where one is unknown."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        """Take ``-4m`` and ``-1e3`` for values, which their options then refuse by name."""
+        super().__init__(*arguments, **options)
+        self._negative_number_matcher = re.compile(r"-\.?\d\S*")
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            known = [str(choice) for choice in action.choices]
+            words = f"unknown {value!r}{nearest(str(value), known)}; expected {', '.join(known)}"
+            raise argparse.ArgumentError(action, words)
 
 
 def run_handler(
@@ -51,7 +80,7 @@ def _line_of(error: Exception) -> str:
     if isinstance(error, OSError):  # the machine's, not a defect: permissions, a folder
         place = f" {error.filename}:" if error.filename is not None else ""
         words = error.strerror or words or "no reason given"
-        return f"{name}:{place} {words}; check the path, its permissions and the free disk space"
+        return f"{name}:{place} {words}; {REMEDIES.get(error.errno or 0, REMEDY)}"
     last = traceback.extract_tb(error.__traceback__)[-1]
     return (
         f"{name}: {Express50Error(words)} (unexpected, in {Path(last.filename).name} line "
@@ -165,9 +194,10 @@ def stdout_to_stderr() -> Iterator[None]:
             os.close(saved)
 
 
-def count(number: int, noun: str) -> str:
-    """Return a number with its noun: ``1 file``, ``2 files``, ``0 files``."""
-    return f"{number:,} {noun}" + ("" if number == 1 else "s")
+def count(number: float, noun: str) -> str:
+    """Return a number with its noun: ``1 file``, ``2 files``, ``0 files``, ``1.5 files``."""
+    words = f"{number:,}" if isinstance(number, int) else f"{number:.6g}"
+    return f"{words} {noun}" + ("" if number == 1 else "s")
 
 
 def format_table(header: list[str], rows: list[list[str]]) -> Iterator[str]:

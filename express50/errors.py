@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Collection, Iterable
+
+FEW = 8  # names in a list that is read at a glance
 LONGEST = 1200  # characters; what a hostile file says must not fill a terminal
 
 
@@ -30,6 +34,10 @@ class CalibrationError(Express50Error):
 
 class ConfigError(Express50Error):
     """A configuration key or value is unknown or out of range."""
+
+
+class UnknownNameError(ConfigError):
+    """A command names a subject, an expression or a camera that is not there."""
 
 
 class NotReadyError(ConfigError):
@@ -62,3 +70,29 @@ class HeadModelError(Express50Error):
 
 class TrainError(Express50Error):
     """Training or fitting cannot go on."""
+
+
+def check_known(
+    where: str,
+    what: str,
+    wanted: Iterable[str],
+    known: Collection[str],
+    kind: type[Express50Error] = UnknownNameError,
+) -> None:
+    """Refuse names that are not known.
+
+    Raises:
+        UnknownNameError: one is not, or an error of another ``kind``; it lists those that are.
+    """
+    for name in wanted:
+        if name not in known:
+            near = nearest(name, known) if len(known) > FEW else ""
+            listed = ", ".join(known) or "none"
+            raise kind(f"{where}: no {what} {name!r}{near}; expected one of {listed}")
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """Return the words ``, did you mean 'x'?`` when a known name is near, else nothing."""
+    names = list(known)
+    close = difflib.get_close_matches(word, names, n=1)
+    return f", did you mean {close[0]!r}?" if close else ""

@@ -18,8 +18,7 @@ import numpy as np
 from scipy.stats import t as student_t
 
 from express50.console import log
-from express50.contract.config import nearest
-from express50.errors import ConfigError, FormatError
+from express50.errors import ConfigError, FormatError, nearest
 from express50.files.atomic import dump_json, write_bytes, write_json
 from express50.files.digests import file_sha256
 from express50.files.text import markdown_table, read_json_table

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from express50.contract.config import nearest
-from express50.errors import ConfigError
+from express50.console import count
+from express50.errors import ConfigError, nearest
 from express50.geometry.transforms import (
     axis_angle_to_matrix,
     matrix_to_axis_angle,
@@ -223,14 +223,12 @@ def sample_expression(
     return replace(head, z_exp=z_exp, tracked=tracked)
 
 
-def _sample_weights(count: int, rng: np.random.Generator, spread: float, what: str) -> np.ndarray:
-    """Return weights (count,) that sum to 1; a weighted sum has the rows' mean and covariance."""
-    if count < 2:
-        raise ConfigError(
-            f"the checkpoint has {count} of {what}, expected two or more to draw from"
-        )
-    noise = spread * rng.standard_normal(count) / np.sqrt(count - 1)
-    return 1 / count + noise - noise.mean()
+def _sample_weights(rows: int, rng: np.random.Generator, spread: float, what: str) -> np.ndarray:
+    """Return weights (rows,) that sum to 1; a weighted sum has the rows' mean and covariance."""
+    if rows < 2:
+        raise ConfigError(f"the checkpoint has {rows} of {what}, expected two or more to draw from")
+    noise = spread * rng.standard_normal(rows) / np.sqrt(rows - 1)
+    return 1 / rows + noise - noise.mean()
 
 
 def _combine(rows: Sequence[np.ndarray], weights: np.ndarray) -> np.ndarray:
@@ -263,9 +261,13 @@ def _with_parameter(
     return replace(tracked, **{table: changed})
 
 
-def _numbers(values: Sequence[float], count: int, name: str) -> Sequence[float]:
-    if len(values) != count:
-        raise ConfigError(f"control {name}: got {len(values)} numbers, expected {count}")
+def _numbers(values: Sequence[float], size: int, name: str) -> Sequence[float]:
+    if len(values) != size:
+        one = f", or {name}.0 to {name}.{size - 1} with one" if "." not in name else ""
+        raise ConfigError(
+            f"control {name}: got {count(len(values), 'number')}, expected {size} with commas"
+            f" between{one}"
+        )
     return values
 
 

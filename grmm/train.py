@@ -20,7 +20,7 @@ import torch.distributed as distributed
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
-from express50.console import log
+from express50.console import count, log
 from express50.errors import TrainError
 from express50.files.atomic import check_space, write_json
 from express50.head.model import HeadModel
@@ -99,10 +99,10 @@ def train(
         check_space(out)
         start_log(out / "log.jsonl", state.iteration)
         gallery = collect_gallery(views, state.training)
-        count, texels = len(state.model.texels), config.model.n_g**2
+        covered, texels = len(state.model.texels), config.model.n_g**2
         log(
-            f"{count} Gaussians of {texels} texels ({100 * count / texels:.0f} % covered); "
-            f"{len(state.training)} views to train on"
+            f"{covered} Gaussians of {texels} texels ({100 * covered / texels:.0f} % covered); "
+            f"{count(len(state.training), 'view')} to train on"
         )
         if state.perceptual is None:
             log("the perceptual term is off: loss.vgg16 names no weights")

@@ -13,7 +13,6 @@ from rich.filesize import decimal
 from express50.console import FAILED, OK, add_command, answer, count, stdout_to_stderr
 from express50.contract.layout import Dataset, existing_dataset
 from express50.contract.stage import hook, stages
-from express50.errors import StageError
 
 
 def add_commands(subparsers: Any) -> None:
@@ -72,8 +71,8 @@ def run_check(args: argparse.Namespace) -> int:
     from express50.dataset.audit import audit
 
     started = time.perf_counter()
-    if not (args.dataset / "ingest").exists() and not (args.dataset / "ledger.sqlite").exists():
-        raise StageError(f"{args.dataset}: not a dataset; run 'express50 ingest' first")
+    if not (args.dataset / "ingest").exists():  # with it, a ledger that is gone is a finding
+        existing_dataset(args.dataset)
     for path in args.checkpoint:
         hook("read_checkpoint")(path)
     with stdout_to_stderr():

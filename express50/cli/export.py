@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from express50.console import OK, add_command, say, say_json
+from express50.console import OK, add_command, count, say, say_json
 from express50.contract.layout import Dataset
 from express50.errors import ConfigError, StageError
 
@@ -107,7 +107,7 @@ def run_export(args: argparse.Namespace) -> int:
                 meta = export_avatar(dataset, head, options, folder)
             else:
                 meta = export_meshes(head, args.format, folder)
-        what = {"of": "frames"} if args.frames == "clips" else {}
+        what = {"of": "frame" if args.frames == "clips" else "expression"}
         accounts.append({"folder": str(args.out / subject), **what, **meta})
         if not args.json:
             say(*_lines(accounts[-1]))
@@ -117,9 +117,9 @@ def run_export(args: argparse.Namespace) -> int:
 
 
 def _lines(account: dict) -> list[str]:
-    words = f"{account['folder']}: {len(account['expressions'])} {account.get('of', 'expressions')}"
+    words = f"{account['folder']}: {count(len(account['expressions']), account['of'])}"
     if "views" in account:
-        words += f", {account['views']} of {account['read']} views"
+        words += f", {account['views']} of {count(account['read'], 'view')}"
     lines = [words]
     lines += [f"left out {row['what']}: {row['why']}" for row in account.get("dropped", [])]
     if account.get("cameras_centred"):

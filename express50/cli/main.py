@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from express50 import __version__
 from express50.cli import check, export, plan, shards, stages, status
-from express50.console import USAGE, run_handler
+from express50.console import USAGE, Parser, run_handler
 from express50.contract.stage import commands
 from express50.errors import Express50Error
 from express50.twin import record as twin
@@ -25,7 +25,7 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
 
     Other packages' commands are loaded when they are asked for; else they are only listed.
     """
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="express50",
         description=DESCRIPTION,
         epilog=EPILOG,

@@ -17,7 +17,7 @@ from typing import Any
 from rich.filesize import decimal
 
 from express50.capture.index import read_index
-from express50.console import add_command, answer, format_table, stdout_to_stderr
+from express50.console import add_command, answer, count, format_table, stdout_to_stderr
 from express50.contract.config import PRESETS, config_toml, resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage, stages
@@ -147,10 +147,10 @@ def _cells(row: Row) -> list[str]:
 
 
 def _words(footage: Footage) -> str:
-    sizes = {name: f"{value:.6g}" for name, value in vars(footage).items()}
     return (
-        f"{sizes['subjects']} subjects x {sizes['expressions']} expressions x {sizes['views']} "
-        f"cameras of {footage.pixels / 1e6:.3g} megapixels, {sizes['frames']} frames per camera"
+        f"{count(footage.subjects, 'subject')} x {count(footage.expressions, 'expression')} x "
+        f"{count(footage.views, 'camera')} of {footage.pixels / 1e6:.3g} megapixels, "
+        f"{count(footage.frames, 'frame')} per camera"
     )
 
 

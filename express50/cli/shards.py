@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from express50.console import FAILED, OK, add_command, answer, say, say_json
+from express50.console import FAILED, OK, add_command, answer, count, say, say_json
 from express50.errors import FormatError
 
 
@@ -50,7 +50,7 @@ def run_split(args: argparse.Namespace) -> int:
 
     wanted = (args.subject, args.expression, args.camera, args.split)
     reader = ShardReader(args.directory).select(*wanted)
-    say(f"{args.out}: {copy_samples([reader], args.out, args.shard_mb)} samples")
+    say(f"{args.out}: {count(copy_samples([reader], args.out, args.shard_mb), 'sample')}")
     return OK
 
 
@@ -60,7 +60,7 @@ def run_merge(args: argparse.Namespace) -> int:
     from express50.shards.writer import copy_samples
 
     readers = [ShardReader(directory) for directory in args.directories]
-    say(f"{args.out}: {copy_samples(readers, args.out, args.shard_mb)} samples")
+    say(f"{args.out}: {count(copy_samples(readers, args.out, args.shard_mb), 'sample')}")
     return OK
 
 
@@ -69,7 +69,7 @@ def run_verify(args: argparse.Namespace) -> int:
     from express50.shards.writer import verify
 
     faults = verify(args.directory)
-    verdict = f"{args.directory}: {len(faults)} faults" if faults else "all is well"
+    verdict = f"{args.directory}: {count(len(faults), 'fault')}" if faults else "all is well"
     answer(args, {"directory": str(args.directory), "faults": faults}, *faults, verdict)
     return FAILED if faults else OK
 
@@ -81,7 +81,7 @@ def run_ls(args: argparse.Namespace) -> int:
     reader = ShardReader(args.directory).select(subjects=args.subject, split=args.split)
     data = [{"key": e.key, "split": e.split, "shard": e.shard} for e in reader.entries]
     lines = ("  ".join(row.values()) for row in data)
-    return answer(args, data, *lines, f"{len(reader)} samples")
+    return answer(args, data, *lines, count(len(reader), "sample"))
 
 
 def run_show(args: argparse.Namespace) -> int:

@@ -12,7 +12,7 @@ from express50.console import FAILED, OK, USAGE, add_command, log, say, say_json
 from express50.contract.config import PRESETS, config_toml, resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage, stages, with_required
-from express50.errors import ConfigError, StageError
+from express50.errors import ConfigError
 
 
 def add_commands(subparsers: Any) -> None:
@@ -42,7 +42,14 @@ def add_commands(subparsers: Any) -> None:
 def _add_run_options(parser: argparse.ArgumentParser, captures: bool) -> None:
     add = parser.add_argument
     if captures:
-        add("captures", nargs="*", type=Path, metavar="CAPTURE", help="folders of raw captures")
+        add(
+            "captures",
+            nargs="*",
+            default=[],
+            type=Path,
+            metavar="CAPTURE",
+            help="folders of raw captures",
+        )
     add_config_options(parser)
     words = "local processes; 0 runs in this one"
     add("--workers", type=int, default=2, metavar="N", help=words)
@@ -53,6 +60,8 @@ def _add_run_options(parser: argparse.ArgumentParser, captures: bool) -> None:
     add("--print-job", action="store_true", help=words)
     words = "threads an item may use (default 1)"
     add("--threads", type=int, default=1, metavar="N", help=words)
+    words = "exit code 1 also where a part of an item was dropped, such as a camera"
+    add("--strict", action="store_true", help=words)
 
 
 def add_config_options(parser: argparse.ArgumentParser) -> None:
@@ -104,6 +113,7 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
     # Before NumPy comes in with a stage: its BLAS reads the cap when it is loaded.
     cap_threads(args.threads)
     dataset = Dataset(args.dataset)
+    _refuse_swapped(dataset, getattr(args, "captures", ()), args.command)
     slurm = _slurm_jobs(args)
     if slurm is not None and args.print_job:
         from express50.runner.slurm import job_script
@@ -136,7 +146,30 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
         accounts = [summary.to_json() for summary in summaries]
         before = {"before": accounts[:-1]} if len(accounts) > 1 else {}
         say_json(accounts if args.command == "run" else accounts[-1] | before)
-    return OK if all(summary.ok for summary in summaries) else FAILED
+    dropped = args.strict and any(o.dropped for summary in summaries for o in summary.outcomes)
+    return OK if all(summary.ok for summary in summaries) and not dropped else FAILED
+
+
+def _refuse_swapped(dataset: Dataset, captures: Sequence[Path], command: str) -> None:
+    """Refuse a capture in the place of the dataset, and the other way round.
+
+    Raises:
+        ConfigError: something is in the other's place.
+    """
+    from express50.capture.readers.read import is_capture
+
+    root = dataset.root
+    if root.is_dir() and not dataset.ledger.exists() and is_capture(root):
+        raise ConfigError(
+            f"the first argument is the dataset, and {root} is a capture; expected "
+            f"'express50 {command} DATASET" + (f" {root}'" if command in ("ingest", "run") else "'")
+        )
+    for path in captures:
+        if Dataset(path).ledger.exists():
+            raise ConfigError(
+                f"captures come after the dataset, and {path} is a dataset; expected "
+                f"'express50 {command} DATASET CAPTURE'"
+            )
 
 
 def _slurm_jobs(args: argparse.Namespace) -> Mapping[str, Any] | None:
@@ -164,9 +197,11 @@ def _items(
         if args.command != "run" and pattern is None:
             return prepared
     elif not dataset.root.is_dir():
-        raise StageError(
+        raise ConfigError(
             f"{dataset.root}: no such dataset; run 'express50 ingest {dataset.root} CAPTURE'"
         )
+    elif stage.prepare is not None and not stage.items(dataset):
+        raise ConfigError(f"{dataset.root}: it has no captures yet; name a CAPTURE after it")
     if pattern is None:
         return None
     # A stage that another's command runs first may have other items: those of the same subjects.

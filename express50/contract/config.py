@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import dataclasses
-import difflib
 import inspect
 import json
 import math
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from express50.contract.stage import Stage
-from express50.errors import ConfigError
+from express50.errors import ConfigError, nearest
 from express50.files.text import read_toml
 
 PRESETS = ("draft", "standard", "reference")
@@ -132,13 +131,6 @@ def build_dataclass(table: str, kind: type, values: Mapping[str, object], hint: 
         return kind(**checked)
     except ValueError as error:
         raise ConfigError(f"{table}: {error}") from error
-
-
-def nearest(word: str, known: Iterable[str]) -> str:
-    """Return the words ``, did you mean 'x'?`` when a known name is near, else nothing."""
-    names = list(known)
-    close = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
-    return f", did you mean {close[0]!r}?" if close else ""
 
 
 def parse_assignment(text: str) -> tuple[str, str, object]:

@@ -6,7 +6,7 @@ import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from express50.errors import AnnotationError, CaptureError, FormatError, StageError
+from express50.errors import AnnotationError, CaptureError, ConfigError, FormatError
 from express50.files.text import NAME, parse_json, read_bytes, read_json_table, read_toml
 
 
@@ -192,11 +192,11 @@ def existing_dataset(path: Path) -> Dataset:
     """Open the dataset of a folder that has a ledger.
 
     Raises:
-        StageError: it has none.
+        ConfigError: it has none.
     """
     dataset = Dataset(path)
     if not dataset.ledger.is_file():
-        raise StageError(
+        raise ConfigError(
             f"{path}: not a dataset (no ledger.sqlite); run 'express50 ingest {path} CAPTURE'"
         )
     return dataset

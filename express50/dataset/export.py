@@ -26,7 +26,7 @@ from express50.dataset.tracks import (
     read_sequence,
     read_track,
 )
-from express50.errors import FormatError, StageError
+from express50.errors import FormatError, StageError, check_known
 from express50.files.atomic import dump_json, folder_in_one_step
 from express50.files.images import encode_png, read_image
 from express50.geometry.conventions import corner_to_cell
@@ -69,13 +69,11 @@ def tracked_subjects(dataset: Dataset, wanted: Sequence[str]) -> list[str]:
     """List the wanted subjects, or all that are tracked and not excluded.
 
     Raises:
-        StageError: a wanted one is unknown, excluded or not tracked, or none is tracked.
+        UnknownNameError: a wanted one is not ingested.
+        StageError: one is excluded or not tracked, or none is tracked.
     """
-    known = dataset.subjects()
+    check_known(str(dataset.root), "subject", wanted, dataset.subjects())
     for name in wanted:
-        if name not in known:
-            listed = ", ".join(known) or "none"
-            raise StageError(f"{dataset.root}: no subject {name!r}; expected one of {listed}")
         if (reason := exclusion_reason(dataset, name)) is not None:
             raise StageError(f"{name}: is excluded ({reason}); it is not exported")
         existing_track(dataset, name)
@@ -91,18 +89,14 @@ def read_tracked(dataset: Dataset, subject: str, expressions: Sequence[str]) -> 
     """Read a subject's head with the wanted expressions, or all, in the track's order.
 
     Raises:
-        StageError: the subject or a wanted expression is not tracked.
+        UnknownNameError: a wanted expression is not tracked.
+        StageError: the subject is not.
         FormatError: the track is damaged or does not fit its head model.
         HeadModelError: the head model cannot be loaded.
     """
     path = existing_track(dataset, subject)
     track = read_track(path)
-    unknown = sorted(set(expressions) - set(track.expressions))
-    if unknown:
-        raise StageError(
-            f"{subject}: {', '.join(unknown)} not tracked; expected some of"
-            f" {', '.join(track.expressions)}"
-        )
+    check_known(subject, "tracked expression", expressions, track.expressions)
     model = load_head(track.head)
     counts = {
         "vertices": (track.vertices.shape[1], len(model.template)),

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from express50.contract.layout import Dataset
-from express50.errors import FormatError, StageError
+from express50.errors import FormatError, check_known
 from express50.files.atomic import write_json
 from express50.files.digests import text_digest
 from express50.files.text import NAME, read_json, read_json_table
@@ -67,14 +67,13 @@ def plan(dataset: Dataset, subject: str) -> list[Path]:
     """List files and folders of a dataset to remove so that nothing of a subject stays.
 
     Raises:
-        StageError: the dataset knows no such subject.
+        UnknownNameError: the dataset knows no such subject.
     """
     known = {*dataset.captures(), *dataset.subjects()}
     labelled = NAME.fullmatch(subject) and dataset.labels_file(subject).is_file()
     # Nothing else may pass: '', '..' or 'shards' would name other folders than a person's.
     if not (subject in known or labelled or text_digest(subject) in withdrawn(dataset)):
-        there = ", ".join(sorted(known)) or "none"
-        raise StageError(f"{dataset.root}: no subject {subject!r}; subjects: {there}")
+        check_known(str(dataset.root), "subject", [subject], sorted(known))
     paths = sorted(_own_paths(dataset, subject)) + sorted(_mixed_paths(dataset))
     # Others' outputs that name the subject, such as peaks matched to the reference person's.
     gone, naming = set(paths), []
@@ -135,7 +134,8 @@ def withdraw(
     which removes a subject from one and returns True where it was in there.
 
     Raises:
-        StageError: the dataset knows no such subject, or a stage runs.
+        UnknownNameError: the dataset knows no such subject.
+        StageError: a stage runs.
         FormatError: the ledger is damaged; then nothing was removed.
     """
     with hold_stages(dataset, sorted(p.stem for p in (dataset.root / "config").glob("*.toml"))):

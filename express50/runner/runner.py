@@ -12,10 +12,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from express50.contract.config import config_toml, nearest
+from express50.contract.config import config_toml
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Stage
-from express50.errors import ConfigError, StageError
+from express50.errors import ConfigError, StageError, nearest
 from express50.files.atomic import check_space, write_bytes
 from express50.files.digests import file_version, path_digest
 from express50.runner.executor import Pool

@@ -21,8 +21,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from express50.contract.config import build_dataclass, nearest
-from express50.errors import ConfigError, StageError
+from express50.contract.config import build_dataclass
+from express50.errors import ConfigError, StageError, nearest
 from express50.files.text import read_toml
 from express50.runner.clusters import GPU, RemoteWorkers, no_gpu, start_cluster
 from express50.runner.threads import thread_environment

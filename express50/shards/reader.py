@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from express50.contract.segmentation_labels import COLOURS
-from express50.errors import FormatError
+from express50.errors import FormatError, check_known
 from express50.files.arrays import read_arrays, read_npy
 from express50.files.images import contact_sheet
 from express50.files.text import parse_json, read_json
@@ -107,7 +107,7 @@ class ShardReader:
         """Return a reader of the samples that match all the given ids; None matches all.
 
         Raises:
-            FormatError: an id or a split is unknown (the known ones are named).
+            UnknownNameError: an id or a split is unknown (the known ones are named).
         """
         wanted = {"subject": subjects, "expression": expressions, "camera": cameras}
         wanted["split"] = None if split is None else [split]
@@ -116,12 +116,7 @@ class ShardReader:
             if values is None:
                 continue
             known = {getattr(entry, name) for entry in self.entries}
-            unknown = sorted(set(values) - known)
-            if unknown:
-                raise FormatError(
-                    f"{self.root}: no {name} {', '.join(unknown)}; expected one of"
-                    f" {', '.join(sorted(known))}"
-                )
+            check_known(str(self.root), name, sorted(values), sorted(known))
             chosen = tuple(entry for entry in chosen if getattr(entry, name) in values)
         return ShardReader(self.root, chosen)
 

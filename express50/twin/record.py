@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from express50.capture.expressions import select
+from express50.console import count
 from express50.contract.config import field_documents
 from express50.errors import CaptureError
 from express50.files.atomic import dump_json, write_json
@@ -89,7 +90,8 @@ def record_command(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({"captures": str(args.out / "captures"), "recorded": recorded}))
     else:
-        print(f"{len(recorded)} subjects recorded in {args.out / 'captures'}; the rest was there")
+        new = count(len(recorded), "subject")
+        print(f"{new} recorded in {args.out / 'captures'}; the rest was there")
     return 0
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from express50 import __version__
-from express50.console import run_handler
+from express50.console import Parser, run_handler
 from grmm.cli import commands
 from grmm.config import PRESETS, TABLES, TORSO
 
@@ -292,7 +292,7 @@ STUDY_ACTIONS = {
 
 def build_parser() -> argparse.ArgumentParser:
     """Build the argument parser with all commands."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="grmm",
         description=DESCRIPTION,
         epilog=EPILOG,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from express50.console import count
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
 from express50.errors import FormatError
@@ -47,9 +48,11 @@ def account(dataset: Dataset, subjects: Sequence[str]) -> Iterator[str]:
         found = read_json_table(path, FormatError, "ingest again")
         counts = sorted({found["frame_count"], *found["frame_count_differs"].values()})
         frames = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
+        frames += " frame each" if counts == [1] else " frames each"
         yield (
-            f"  {subject} ({found.get('layout', 'express50')}): {found['cameras']} cameras, "
-            f"{frames} frames each, {found['expressions']} expressions"
+            f"  {subject} ({found.get('layout', 'express50')}): "
+            f"{count(found['cameras'], 'camera')}, {frames}, "
+            f"{count(found['expressions'], 'expression')}"
         )
 
 

@@ -96,7 +96,7 @@ def open_picture(path: Path) -> PhotoSource:
         return PhotoSource(path, video=True, orientation=ORIENTATION[turns])
     if suffix not in PHOTO_SUFFIXES:
         raise CaptureError(
-            f"{path}: is not a photograph or video by its name; expected one of "
+            f"{path}: not a file name of a photograph or video; expected one that ends in "
             f"{' '.join(PHOTO_SUFFIXES + VIDEO_SUFFIXES)}"
         )
     try:

@@ -252,3 +252,20 @@ def test_the_toolkits_own_names_are_refused(dataset, name):
     words = ["S001", "smile", "failed", "--annotator", name]
     assert main(["annotate", "flag", str(dataset.root), *words]) != 0
     assert not dataset.labels_file("S001").exists()
+
+
+def test_a_flag_is_said_with_its_reason_and_who_gave_it(dataset, tmp_path, capsys):
+    root = str(dataset.root)
+    assert main(["annotate", "flag", root, "S001", "smile", "failed", "--annotator", "me"]) == 0
+    assert capsys.readouterr().out.startswith("S001 smile: flagged 'failed' by me; run ")
+    assert main(["annotate", "export", root, str(tmp_path / "l.csv"), "--subject", "S001"]) == 0
+    assert "1 event of 1 subject\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "words", [["S009", "smile", "3"], ["S001", "smil", "3"], ["S001", "smile", "9", "--camera=x"]]
+)
+def test_a_name_that_is_not_there_is_wrong_usage(dataset, words, capsys):
+    assert main(["annotate", "mark", str(dataset.root), *words]) == 2
+    assert "expected one of" in capsys.readouterr().err
+    assert not dataset.labels_file("S001").exists()

@@ -15,7 +15,7 @@ from annotations.ui.frames import crop_to
 from express50.capture.frames import read_proxy
 from express50.capture.index import read_index
 from express50.cli.main import main
-from express50.errors import AnnotationError
+from express50.errors import UnknownNameError
 from express50.files.images import decode_image
 from tests.annotations.footage import suggest
 
@@ -110,7 +110,7 @@ def test_row_uses_one_camera_where_subjects_have_it(labelled):
     [({"subjects": ["S9"]}, "S9"), ({"expressions": ["x"]}, "x"), ({"camera": "top"}, "top")],
 )
 def test_unknown_selection_raises_with_its_name(labelled, selection, named):
-    with pytest.raises(AnnotationError, match=named):
+    with pytest.raises(UnknownNameError, match=named):
         make_sheet(labelled, **selection)
 
 
@@ -158,5 +158,5 @@ def test_the_command_writes_the_page_and_counts(labelled, tmp_path, capsys):
     assert said["tiles"]["flagged"] == 1 and said["tiles"]["missing"] == 1
     page = Page(file.read_text())
     assert set(page.tiles["S002", "neutral"]) >= {"data-strip"}
-    assert main([*words[:4], "--camera", "top"]) == 1
+    assert main([*words[:4], "--camera", "top"]) == 2
     assert "top" in capsys.readouterr().err

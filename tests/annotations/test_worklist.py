@@ -7,7 +7,7 @@ from annotations.suggestions import canonical, choose_reference, read_suggestion
 from annotations.worklist import worklist
 from express50.capture.index import read_index
 from express50.contract.layout import exclusion_reason, included_subjects
-from express50.errors import AnnotationError, FormatError
+from express50.errors import AnnotationError, FormatError, UnknownNameError
 from tests.annotations.labelled import make_dataset, suggest
 
 
@@ -41,7 +41,7 @@ def test_reference_is_the_chosen_or_first_included_subject(tmp_path):
     assert reference_subject(dataset) == "S002"
     choose_reference(dataset, "S003")
     assert reference_subject(dataset) == "S003"
-    with pytest.raises(AnnotationError, match="S002, S003"):
+    with pytest.raises(UnknownNameError, match="S002, S003"):
         choose_reference(dataset, "S001")
     _exclude(dataset, "S003")
     with pytest.raises(AnnotationError, match="'S003'"):
@@ -88,7 +88,7 @@ def test_only_labels_of_the_annotator_count_as_done(tmp_path):
 
 def test_unknown_subject_or_file_raises_with_its_name(tmp_path):
     dataset = make_dataset(tmp_path)
-    with pytest.raises(AnnotationError, match="'S009'"):
+    with pytest.raises(UnknownNameError, match="'S009'"):
         worklist(dataset, "ann", ["S009"])
     suggest(dataset, "S001", {})
     dataset.suggestions_file("S001").write_text('{"smile": {"x": 1}}')

@@ -157,6 +157,8 @@ def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
         (["render", "{out}/absent.pt", "{out}"], 1, "absent.pt: no such file"),
         (["render", "{checkpoint}", "{out}", "--subject=S9"], 2, "knows no subject S9"),
         (["export", "{checkpoint}", "{out}/head.obj"], 2, "expected one of .html, .ply, .spz"),
+        (["export", "{checkpoint}", "{out}/head.ply", "--control=jaw=3"], 2,
+         "got 1 number, expected 3 with commas between, or jaw.0 to jaw.2 with one"),
     ],
 )  # fmt: skip
 def test_errors_are_one_line_and_set_the_exit_code(
@@ -282,3 +284,16 @@ def test_a_head_is_driven_by_tracked_clips(checkpoint, tmp_path, capsys):
     np.savez(path, schema="express50.sequence/1", head="flame2023.pkl", **arrays)
     assert main(render) == 2
     assert "head model 'flame2023.pkl'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["train", "a", "b", "--budget", "-4m"], "'-4m' is not a time, expected for example 60s"),
+        (["trian"], "unknown 'trian', did you mean 'train'?"),
+    ],
+)
+def test_wrong_usage_is_said_with_what_was_given(arguments, message, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 2 and message in capsys.readouterr().err

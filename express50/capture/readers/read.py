@@ -113,6 +113,11 @@ def detect(path: Path, name: object = None) -> Layout:
     )
 
 
+def is_capture(path: Path) -> bool:
+    """Return whether a folder is, or is meant as, a capture of some layout."""
+    return (path / "capture.toml").is_file() or any(layout.fits(path) for layout in LAYOUTS)
+
+
 def is_ours(path: Path) -> bool:
     """Return whether a path is a capture in our own layout, or is meant as one."""
     meta = read_capture_toml(path)

@@ -1,6 +1,7 @@
 """The command line: output, exit codes, one line for an error, only one area imported."""
 
 import argparse
+import dataclasses
 import json
 import os
 import subprocess
@@ -11,6 +12,7 @@ import pytest
 
 from express50.cli.main import main
 from express50.console import log, run_handler, say
+from express50.contract.stage import Note, Result, stages
 from tests.synth import make_capture
 
 COMMANDS = [
@@ -122,8 +124,8 @@ def test_bad_item_gives_exit_code_1_and_is_named(run, data, capture, tmp_path):
     ("arguments", "code", "message"),
     [
         (["ingest", "DATA", "absent"], 1, "CaptureError: "),
-        (["ingest", "DATA"], 1, "no such dataset"),
-        (["status", "DATA"], 1, "not a dataset"),
+        (["ingest", "DATA"], 2, "no such dataset"),
+        (["status", "DATA"], 2, "not a dataset"),
         (["ingest", "DATA", "CAP", "--set", "ingest.proxy_long=3"], 2, "mean 'proxy_long_side'"),
         (["ingest", "DATA", "CAP", "--set", "track.x=3"], 2, "runs ingest only"),
         (["ingest", "DATA", "CAP", "--preset", "fast"], 2, "unknown preset"),
@@ -132,7 +134,14 @@ def test_bad_item_gives_exit_code_1_and_is_named(run, data, capture, tmp_path):
         (["run", "DATA", "CAP", "--first", "track", "--last", "ingest"], 2, "comes after"),
         (["config", "trak"], 2, "unknown stage 'trak'"),
         (["ingest"], 2, "required: DATASET"),
-        (["nonsense"], 2, "invalid choice"),
+        (["nonsense"], 2, "unknown 'nonsense'; expected ingest, "),
+        (["ingset"], 2, "did you mean 'ingest'?"),
+        (["shards", "vrify"], 2, "did you mean 'verify'?"),
+        (["ingest", "DATA", "--workers=-1"], 2, "--workers -1: expected 0 or more"),
+        (["ingest", "DATA", "--threads", "-1"], 2, "--threads -1: expected 1 or more"),
+        (["ingest", "CAP"], 2, "is a capture; expected 'express50 ingest DATASET "),
+        (["matte", "CAP"], 2, "is a capture; expected 'express50 matte DATASET'"),
+        (["ingest", "CAP", "CAP"], 2, "is a capture; expected"),
         ([], 2, "required: COMMAND"),
     ],
 )
@@ -144,6 +153,41 @@ def test_errors_are_one_line_with_their_exit_code(run, data, capture, arguments,
     assert message in last
     assert last.startswith("express50")
     assert "Traceback" not in err
+
+
+def test_a_dataset_in_the_place_of_a_capture_is_refused(run, data, capture):
+    assert run("ingest", data, capture)[0] == 0
+    code, _, err = run("ingest", data.parent / "new", data)
+    assert code == 2 and f"{data} is a dataset; expected 'express50 ingest DATASET CAPTURE'" in err
+    assert not (data.parent / "new").exists()
+
+
+def test_what_to_ingest_must_be_said_once(run, data):
+    data.mkdir()
+    for command in ("ingest", "run"):
+        code, _, err = run(command, data)
+        assert code == 2 and "has no captures yet; name a CAPTURE" in err
+
+
+def test_one_of_a_thing_is_not_many(run, tmp_path):
+    make_capture(tmp_path / "one", subject="S001", cameras=1, frames=1, expressions=("smile",))
+    code, out, _ = run("ingest", tmp_path / "data", tmp_path / "one")
+    assert code == 0 and "1 camera, 1 frame each, 1 expression\n" in out
+    (tmp_path / "data/ingest/S001/proxies/cam00.tar").unlink()
+    code, out, _ = run("check", tmp_path / "data")
+    assert code == 1 and "1 finding, 0 fixed, 1 left" in out
+
+
+def test_a_dropped_camera_ends_a_strict_run_with_1(run, data, capture):
+    def dropping(dataset, item, config, out):
+        return Result({}, [Note("camera cam01", "dark")])
+
+    ingest = dataclasses.replace(stages()["ingest"], run=dropping, account=None)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(stages(), "ingest", ingest)
+        assert run("ingest", data, capture)[0] == 0
+        code, out, _ = run("ingest", data, "--strict")
+        assert code == 1 and "1 skipped" in out and "dropped camera cam01 of S001: dark" in out
 
 
 def test_config_prints_toml_that_config_accepts(run, data, capture, tmp_path):

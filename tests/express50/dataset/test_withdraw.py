@@ -21,7 +21,7 @@ from express50.dataset.withdraw import (
     withdrawn,
     withdrawn_file,
 )
-from express50.errors import CaptureError, FormatError, StageError
+from express50.errors import CaptureError, FormatError, StageError, UnknownNameError
 from express50.files.digests import text_digest
 from express50.runner.ledger import Ledger, Made, Receipt, Run, mark_file
 from express50.runner.publish import publishing, stage_lock
@@ -103,9 +103,9 @@ def test_outputs_that_were_replaced_go_too(dataset):
 @pytest.mark.parametrize("name", ["", ".", "..", "../..", "S001/", "S001/cam00", "shards", "S009"])
 def test_what_is_no_subject_removes_nothing(dataset, name):
     before = tree(dataset.root.parent)
-    with pytest.raises(StageError, match="no subject .*; subjects: S001, S002"):
+    with pytest.raises(UnknownNameError, match="no subject .*; expected one of S001, S002"):
         withdraw(dataset, name)
-    assert main(["subject", "withdraw", str(dataset.root), name, "--yes"]) == 1
+    assert main(["subject", "withdraw", str(dataset.root), name, "--yes"]) == 2
     after = tree(dataset.root.parent)
     assert {k: v for k, v in after.items() if "ledger" not in k and "staging" not in k} == {
         k: v for k, v in before.items() if "ledger" not in k and "staging" not in k
@@ -164,7 +164,7 @@ def test_withdrawn_subject_is_not_taken_in_again(dataset):
 
 
 def test_unknown_subject_is_an_error(dataset):
-    with pytest.raises(StageError, match="no subject 'S00'; subjects: S001, S002"):
+    with pytest.raises(UnknownNameError, match="no subject 'S00'; expected one of S001, S002"):
         withdraw(dataset, "S00")
 
 

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from express50.cli.main import main
-from express50.errors import FormatError
+from express50.errors import FormatError, UnknownNameError
 from express50.files.images import depth_to_uint16, encode_jpeg, encode_png, image_size
 from express50.shards.reader import ShardReader
 from express50.shards.writer import (
@@ -148,7 +148,7 @@ def test_select_by_ids_and_split(shards):
     assert some.keys == ["S002_neutral_cam01", "S002_jaw_open_cam01"]
     assert some.sample(1)["key"] == "S002_jaw_open_cam01"
     assert len(reader.select(split="test")) == 6
-    with pytest.raises(FormatError, match="expected one of S001, S002, S003"):
+    with pytest.raises(UnknownNameError, match="expected one of S001, S002, S003"):
         reader.select(subjects=["S009"])
 
 
