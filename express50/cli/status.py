@@ -160,6 +160,9 @@ def _lines(table: list[StageStatus]) -> Iterator[str]:
         rows.append([row.stage, *counts, *work, row.state, row.expected_error()])
     yield from format_table(header, rows)
     for row in table:
+        if imported := sum(receipt.imported for receipt in row.receipts):
+            yield f"imported {row.stage}: {imported} of its items were made elsewhere"
+    for row in table:
         for receipt in row.failed:
             yield f"failed {receipt.stage} {receipt.item}: {receipt.reason}"
 

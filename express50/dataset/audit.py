@@ -23,6 +23,7 @@ from express50.contract.stage import Stage
 from express50.dataset.withdraw import files_that, names_any_of, says, withdrawn
 from express50.errors import AnnotationError, ConfigError, Express50Error, FormatError
 from express50.files.digests import file_sha256, files_of
+from express50.runner.imported import AGAIN, import_trouble
 from express50.runner.ledger import FileMark, Ledger, Receipt
 from express50.runner.outdated import BAD_INPUT, differing, few, published_digest, why_outdated
 from express50.runner.publish import clean_leftovers, hold_stages, is_running, set_aside
@@ -337,7 +338,10 @@ class _StageAudit:
     def _settle(self, stage: str, fault: Fault, known: bool) -> None:
         """Set a faulty item aside where its stage can make it again."""
         again, fixed = f"express50 {stage} {self.dataset.root}", False
-        if fault.foreign:
+        receipt = self.receipts[stage].get(fault.item)
+        if receipt is not None and receipt.imported:  # no run can make it again
+            how = AGAIN
+        elif fault.foreign:
             how = "move what no run wrote out of the folder, then check again"
         elif not known and fault.kind == "unknown":
             how = f"{stage} has no such item now; move it away if nobody needs it"
@@ -362,6 +366,11 @@ class _StageAudit:
         unreadable: dict[str, list[str]] = {}
         to_make: dict[str, list[str]] = {}
         for item, receipt in receipts.items():
+            if receipt.imported:
+                made = self.made[name].get(item)
+                if why := import_trouble(self.dataset, receipt, made, self.digest):
+                    self._find("outdated", f"{name} {item}", why, AGAIN)
+                continue
             try:
                 now = input_digests(stage, self.dataset, item, config, self.digest)
             except BAD_INPUT as error:

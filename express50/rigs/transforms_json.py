@@ -58,7 +58,7 @@ def read_transforms(path: Path, size: tuple[int, int] | None) -> dict[str, Camer
             )
         where = f"{path}: frame {number} ({name})"
         try:
-            camera = _camera(where, name, table | frame, size)
+            camera = frame_camera(where, name, table | frame, size)
         except (TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
             raise CalibrationError(f"{where}: a value has the wrong kind ({error})") from None
         earlier = found.setdefault(name, camera)
@@ -79,7 +79,13 @@ def camera_names(frames: list[dict]) -> list[str]:
     )
 
 
-def _camera(where: str, name: str, row: dict, size: tuple[int, int] | None) -> Camera:
+def frame_camera(where: str, name: str, row: dict, size: tuple[int, int] | None) -> Camera:
+    """Make the camera of one frame's row; ``size`` is its picture's where the row does not say.
+
+    Raises:
+        CalibrationError: the row lacks what a camera needs.
+        TypeError, ValueError, OverflowError, ZeroDivisionError: a value has the wrong kind.
+    """
     model = str(row.get("camera_model", "OPENCV"))
     if model not in _HELD:
         raise CalibrationError(

@@ -46,6 +46,9 @@ class Made:
     version: int = 0
 
 
+IMPORTED = "imported "  # begins the fingerprint of what no stage made
+
+
 @dataclass(frozen=True, kw_only=True)
 class Receipt:
     """The state of one item: what is published, and how its last attempt ended.
@@ -78,6 +81,11 @@ class Receipt:
     attempts: int = 1
     time: float = field(default_factory=time.time)
     made: Made | None = None
+
+    @property
+    def imported(self) -> bool:
+        """Return whether another tool made the item (``express50 import``)."""
+        return self.fingerprint.startswith(IMPORTED)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -73,7 +73,7 @@ def outdated(
             path = dataset.config_file(stage.name)
             config = resolve_config(stage, "standard", path, (), [s.name for s in stages])
             for item, receipt in ledger.read(stage.name).items():
-                if item in made[stage.name]:
+                if item in made[stage.name] and not receipt.imported:
                     with suppress(*BAD_INPUT):
                         now = input_digests(stage, dataset, item, config, digest)
                         if fingerprint(stage, config, now) != receipt.fingerprint:

@@ -19,6 +19,7 @@ from express50.errors import ConfigError, StageError, nearest
 from express50.files.atomic import check_space, write_bytes
 from express50.files.digests import file_version, path_digest
 from express50.runner.executor import Pool
+from express50.runner.imported import import_trouble
 from express50.runner.ledger import Ledger, Made, Receipt
 from express50.runner.outdated import why_outdated
 from express50.runner.preflight import check_expected_space
@@ -35,6 +36,7 @@ from express50.runner.worker import (
 
 WARNINGS = 12  # lines; more of them would hide the account
 ALIKE = 3  # so many first items that fail for one reason show a wrong setting
+KEPT = "imported; the stage does not make it"
 
 
 class Gate(Protocol):
@@ -106,6 +108,8 @@ class Summary:
         again = Counter((o.restored, o.again) for o in self.outcomes if o.again or o.restored)
         for (restored, why), count in again.most_common():
             yield f"  {'restored' if restored else 'made again'} {count}: {why or 'same as before'}"
+        if imported := sum(o.reason == KEPT for o in self.outcomes):
+            yield f"  kept {imported} imported: 'express50 import remove' gives them up"
         for outcome in self.outcomes:
             if outcome.status == "failed":
                 yield f"  failed {outcome.item}: {outcome.reason}"
@@ -233,6 +237,17 @@ def _sort_items(
     # Items share inputs; what a stage reads does not change while it runs.
     digest_of = functools.cache(lambda path: path_digest(path, ledger.sha256))
     for item in chosen:
+        was_imported = item in receipts and receipts[item].imported
+        if was_imported:
+            why = import_trouble(dataset, receipts[item], made.get(item), digest_of)
+            task = Task(stage, dataset, item, config, receipts[item].fingerprint, {}, threads)
+            if why:
+                work.unreadable.append(failed_receipt(task, why, 0))
+                continue
+            if _is_there(task, made.get(item), ledger):
+                kept = _outcome(receipts[item], status="skipped")
+                work.current[item] = replace(kept, reason=KEPT)
+                continue
         try:
             inputs = input_digests(stage, dataset, item, config, digest_of)
         except ConfigError:  # a setting is wrong, not an item: former outputs stay
@@ -247,7 +262,10 @@ def _sort_items(
             continue
         digest = fingerprint(stage, config, inputs)
         task = Task(stage, dataset, item, config, digest, inputs, threads)
-        if item in done:
+        if was_imported:
+            work.tasks.append(task)
+            work.again[item] = "its import is gone"
+        elif item in done:
             _compare(task, done[item], made.get(item), ledger, work)
         else:
             work.tasks.append(task)
@@ -390,7 +408,10 @@ def _retire(dataset: Dataset, ledger: Ledger, stage: str, item: str) -> None:
     if not dataset.item_dir(stage, item).exists():
         return
     receipt, made = ledger.read(stage).get(item), ledger.made(stage).get(item)
-    former = None if receipt is None else replace(receipt, made=made)
+    # The store may be emptied, and nobody makes an import again.
+    former = None
+    if receipt is not None and not receipt.imported:
+        former = replace(receipt, made=made)
     set_aside(dataset, stage, item, keeping(dataset, former))
 
 

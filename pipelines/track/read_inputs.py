@@ -82,7 +82,7 @@ def observe_peaks(
     for expression in sorted(peaks, key=lambda name: name != neutral):
         read = partial(read_peak_frame, dataset, subject, expression)
         try:
-            views = _views(read, cameras, peaks[expression], source)
+            views = face_views(read, cameras, peaks[expression], source)
         except CaptureError as error:
             dropped.append(Note(expression, str(error)))
             continue
@@ -150,7 +150,7 @@ def _look(
         if follow is not None and found is None and np.isfinite(place).all():
             found = _agreed(cue, frame, _followed(read, cameras, follow, place))
     if found is None:
-        found = _agreed(cue, frame, _views(read, cameras, frame, source))
+        found = _agreed(cue, frame, face_views(read, cameras, frame, source))
     # A clip may be one long blink: the peaks show what open eyes look like.
     return None if found is None else shut_lids([found], peaks)[0]
 
@@ -211,7 +211,7 @@ def _frame_crops(
     return FrameSetCrops((), crops, tuple(root_light(crop) for crop in crops))
 
 
-def _views(
+def face_views(
     read: Read, cameras: dict[str, Camera], frame: int, source: Source
 ) -> list[LandmarkView]:
     """Return the views with a face; a camera whose footage lacks the frame is skipped.

@@ -1,0 +1,95 @@
+"""Publish what another tool made in a stage's place, with a receipt that says so.
+
+An imported item is the stage's own output to all later stages. A run keeps it whatever the stage's
+settings are. It belongs to the cameras and peak frames that it was imported for: with others it is
+set aside, and the stage does not make the item until it is imported again or given up.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from express50.capture.index import read_peaks
+from express50.contract.layout import Dataset
+from express50.contract.stage import Result, Stage
+from express50.errors import Express50Error
+from express50.files.digests import path_digest, value_digest
+from express50.runner.ledger import IMPORTED, Ledger, Made, Receipt
+from express50.runner.publish import discard_stale, set_aside
+from express50.runner.worker import Task, run_task
+
+Digest = Callable[[Path], str]
+AGAIN = "import it again, or give it up with 'express50 import remove'"
+
+
+@dataclass(frozen=True)
+class NoSettings:
+    """Nothing to set: no stage's settings concern an import."""
+
+
+def import_inputs(dataset: Dataset, item: str, digest: Digest = path_digest) -> dict[str, str]:
+    """Return the digests of what an import belongs to: the cameras, and each peak's frame.
+
+    ``item`` is a subject, or an expression of one.
+
+    Raises:
+        Express50Error: cameras or peaks are missing or damaged.
+    """
+    subject, _, expression = item.partition("/")
+    frames = read_peaks(dataset, subject).items()
+    chosen = {f"frame of {e}": str(n) for e, n in frames if expression in ("", e)}
+    return {"cameras": digest(dataset.cameras_file(subject)), **chosen}
+
+
+def publish_import(
+    dataset: Dataset, stage: Stage, item: str, write: Callable[[Path], Result], ledger: Ledger
+) -> Receipt:
+    """Publish an item that ``write`` writes into an empty folder; the caller holds the stage.
+
+    A receipt with a reason was not published, and what was there stands.
+    """
+    inputs = import_inputs(dataset, item)
+    former = ledger.read(stage.name).get(item)
+    if former is not None:
+        former = replace(former, made=ledger.made(stage.name).get(item))
+    writer = replace(stage, run=lambda *given: write(given[-1]), needs_gpu=lambda config: False)
+    # Each import is another one: what replaced outputs hold of a former one must not come back.
+    fingerprint = IMPORTED + value_digest([inputs, time.time_ns()])
+    task = Task(writer, dataset, item, NoSettings(), fingerprint, inputs, former=former)
+    receipt = run_task(task)
+    if not receipt.reason:
+        discard_stale(dataset, stage.name, item)
+        dataset.log_file(stage.name, item).unlink(missing_ok=True)
+        ledger.write(receipt)
+        if receipt.made is not None:
+            ledger.know(dataset.item_dir(stage.name, item), receipt.made.files)
+    return receipt
+
+
+def remove_imports(dataset: Dataset, stage: str, pattern: Callable[[str], bool]) -> list[str]:
+    """Set aside a stage's imported items whose id fits, so that the stage makes them; list them."""
+    with Ledger(dataset.ledger) as ledger:
+        found = ledger.read(stage).items()
+        chosen = [item for item, receipt in found if receipt.imported and pattern(item)]
+        for item in chosen:
+            set_aside(dataset, stage, item)
+        ledger.forget(stage, chosen)
+    return chosen
+
+
+def import_trouble(
+    dataset: Dataset, receipt: Receipt, made: Made | None, digest: Digest
+) -> str | None:
+    """Say why an imported item no longer holds; None if it does."""
+    if receipt.status != "done" or made is None:
+        return receipt.reason or f"it was imported, and has no receipt; {AGAIN}"
+    try:
+        now: Mapping[str, str] = import_inputs(dataset, receipt.item, digest)
+    except Express50Error as error:
+        return f"what it was imported for cannot be read ({error})"
+    # Peaks that were labelled later were not imported; they do not concern it.
+    changed = [name for name, value in made.inputs.items() if now.get(name) != value]
+    return f"it was imported for another {', '.join(changed[:3])}; {AGAIN}" if changed else None

@@ -1,0 +1,204 @@
+"""Compare what is imported to the faces that the footage shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from functools import partial
+
+import cv2
+import numpy as np
+
+from express50.capture.frames import read_cameras_of, read_peak_frame
+from express50.contract.layout import Dataset
+from express50.errors import CaptureError, StageError
+from express50.geometry.cameras import Camera, project_pinhole
+from express50.landmarks.sources import EMBEDDED
+from pipelines.imports.places import PeakFrame
+from pipelines.track.observe import Observation, agree
+from pipelines.track.read_inputs import MIN_LANDMARKS, face_views, open_landmarks
+
+# Of a face's height. Tracks of the twin are 0.012 to 0.017 off the landmarks that are found, those
+# of another person in the same place 0.04 to 0.15.
+LEAST_OFF = 0.035
+INSIDE_SHARE = 0.7  # of a face's landmarks that masks must hold
+# Mattes of the twin have 4 and 5, those of other people 1.0 to 1.6.
+LEAST_CONTRAST, BESIDE, RIM = 2.0, 0.04, 3
+LEAST_MARKS = 8
+# Depth of the twin is 0.003 m off the landmarks that are triangulated, that of others 0.01 to 0.02.
+DEPTH_OFF_M = 0.008
+SEARCH = 0.25  # smallest window searched for a face, as in tracking
+INNER = slice(17, 68)  # landmarks that are not on the jaw's outline
+
+
+def observe_peak(dataset: Dataset, subject: str, peak: PeakFrame) -> Observation | None:
+    """Find the face of a peak frame in the footage; None where the cameras agree on none."""
+    source = open_landmarks(dataset, subject, EMBEDDED, SEARCH)
+    read = partial(read_peak_frame, dataset, subject, peak.expression)
+    views = []
+    with suppress(CaptureError):
+        views = face_views(read, read_cameras_of(dataset, subject), peak.frame, source)
+    found = agree(peak.expression, peak.frame, views)[0] if views else None
+    if found is None or found.inliers.sum(1).max(initial=0) < MIN_LANDMARKS:
+        return None
+    return found
+
+
+def check_in_view(cameras: Mapping[str, Camera], vertices: np.ndarray, where: str) -> None:
+    """Refuse a mesh (V, 3), world, whose middle at most half of the cameras have in the picture.
+
+    Raises:
+        StageError: it is so.
+    """
+    middle, seen = vertices.mean(0, dtype=np.float64)[None], 0
+    for camera in cameras.values():
+        pixels, ahead = project_pinhole(camera, middle)
+        inside = (pixels >= 0).all() and (pixels < (camera.width, camera.height)).all()
+        seen += bool(ahead[0] > 0 and inside)
+    if 2 * seen <= len(cameras):
+        raise StageError(
+            f"{where}: {seen} of {len(cameras)} cameras have the head in their picture: the track"
+            " is of another world than the cameras; name the calibration it was made with"
+            " (--cameras)"
+        )
+
+
+def landmark_error(observation: Observation, marks: np.ndarray) -> float:
+    """Return the median distance of landmarks (68, 3), world, over the height of the face seen."""
+    errors = []
+    for view, agreed in zip(observation.views, observation.inliers, strict=True):
+        used = agreed[INNER]
+        if used.sum() < LEAST_MARKS:
+            continue
+        pixels, ahead = project_pinhole(view.camera, marks[INNER])
+        away = np.linalg.norm(pixels - view.points[INNER], axis=1)
+        away[(ahead <= 0) | ~np.isfinite(away)] = np.inf
+        errors.append(np.median(away[used]) / max(float(np.ptp(view.points[:, 1])), 1.0))
+    return float(np.median(errors)) if errors else 0.0
+
+
+def check_landmarks(observation: Observation | None, marks: np.ndarray, where: str) -> float | None:
+    """Return how far a track's landmarks (68, 3) are off those seen; None where none are.
+
+    Raises:
+        StageError: it is not this face in this frame.
+    """
+    if observation is None:
+        return None
+    error = landmark_error(observation, marks)
+    if error > LEAST_OFF:
+        raise StageError(
+            f"{where}: its landmarks are {100 * min(error, 99):.0f} % of the face's height off"
+            f" those that the footage shows, expected under {100 * LEAST_OFF:.0f} %: it is of"
+            " another subject, frame or world"
+        )
+    return round(error, 4)
+
+
+def check_masks_show_face(
+    observation: Observation | None, masks: Mapping[str, np.ndarray], where: str
+) -> None:
+    """Refuse masks (H, W) uint8 by camera that leave out the face which their cameras show.
+
+    Raises:
+        StageError: most of them do.
+    """
+    shares, covers = [], []
+    pairs = () if observation is None else zip(observation.views, observation.inliers, strict=True)
+    for view, agreed in pairs:
+        alpha = masks[view.camera_id]
+        pixels = view.points[INNER][agreed[INNER]].astype(int)
+        pixels = pixels[((pixels >= 0) & (pixels < alpha.shape[::-1])).all(1)]
+        if len(pixels) >= LEAST_MARKS:
+            shares.append((alpha[pixels[:, 1], pixels[:, 0]] > 127).mean())
+            covers.append((alpha > 127).mean())
+    if not shares or (inside := float(np.median(shares))) >= INSIDE_SHARE:
+        return
+    words = "they cut into the face"
+    if inside < 1 - INSIDE_SHARE:
+        most = np.median(covers) > 0.5
+        words = "they are inverted" if most else "they are of another subject, frame or camera"
+    raise StageError(f"{where}: its masks hold {inside:.0%} of the face's landmarks: {words}")
+
+
+def edge_contrast(picture: np.ndarray, alpha: np.ndarray) -> float:
+    """Return how much steeper a picture (H, W, 3) uint8 is at a mask's outline than beside it.
+
+    ``alpha`` (H, W) is uint8; beside it is 4 % of the mask's size inside and outside.
+    """
+    smooth = cv2.GaussianBlur(picture, (0, 0), 1.0).astype(np.float32)
+    steep = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
+    steep = np.linalg.norm(steep, axis=2)
+    mask = (alpha > 127).astype(np.uint8)
+    away = max(2, int(BESIDE * np.sqrt(mask.sum())))
+
+    def level(shape: np.ndarray) -> float:
+        line = cv2.dilate(shape, _disc(1)) > cv2.erode(shape, _disc(1))
+        line[:RIM], line[-RIM:], line[:, :RIM], line[:, -RIM:] = False, False, False, False
+        return float(steep[line].mean()) if line.any() else 0.0
+
+    beside = level(cv2.dilate(mask, _disc(away))) + level(cv2.erode(mask, _disc(away)))
+    return level(mask) / max(beside / 2, 1e-3)
+
+
+def _disc(radius: int) -> np.ndarray:
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+
+
+def check_outlines(
+    pictures: Mapping[str, np.ndarray], masks: Mapping[str, np.ndarray], where: str
+) -> float:
+    """Return the median edge contrast of masks (H, W) uint8 in pictures (H, W, 3) by camera.
+
+    Raises:
+        StageError: their outlines are not where the pictures have edges.
+    """
+    found = float(np.median([edge_contrast(pictures[name], masks[name]) for name in masks]))
+    if found < LEAST_CONTRAST:
+        raise StageError(
+            f"{where}: the pictures are {found:.1f} times as steep at the masks' outlines as beside"
+            f" them, expected {LEAST_CONTRAST}: they are of another subject or frame, or distorted"
+            " (--distorted)"
+        )
+    return round(found, 2)
+
+
+def check_face_depth(
+    observation: Observation | None, cameras: Mapping[str, Camera], depths: Mapping, where: str
+) -> float | None:
+    """Return the median metres between maps (H, W), metres, and triangulated landmarks.
+
+    None where the footage shows no face that two cameras agree on.
+
+    Raises:
+        StageError: they are too far apart.
+    """
+    if observation is None:
+        return None
+    off: list[float] = []
+    ratios: list[float] = []
+    for view in observation.views:
+        if view.camera_id not in depths:
+            continue
+        depth = depths[view.camera_id]
+        pixels, z = project_pinhole(cameras[view.camera_id], observation.points[INNER])
+        known = np.isfinite(pixels).all(1) & (z > 0)
+        x, y = np.where(known[:, None], pixels, 0).astype(int).T
+        known &= (x >= 0) & (y >= 0) & (x < depth.shape[1]) & (y < depth.shape[0])
+        found = depth[y[known], x[known]]
+        off += np.abs(found - z[known])[found > 0].tolist()
+        ratios += (z[known][found > 0] / found[found > 0]).tolist()
+    if len(off) < LEAST_MARKS:
+        return None
+    middle, ratio = float(np.median(off)), float(np.median(ratios))
+    if not 0.8 < ratio < 1.25:
+        raise StageError(
+            f"{where}: the face that the footage shows is {ratio:.3g} times as far away as it says:"
+            f" its unit is {ratio:.3g} times the one given"
+        )
+    if middle > DEPTH_OFF_M:
+        raise StageError(
+            f"{where}: is {1e3 * middle:.0f} mm (median) off the face that the footage shows,"
+            f" expected under {1e3 * DEPTH_OFF_M:.0f} mm: it is of another subject or frame"
+        )
+    return round(middle, 5)

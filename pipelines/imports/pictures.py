@@ -1,0 +1,213 @@
+"""Read the masks and depth maps of other tools, and check them against cameras and footage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from express50.errors import FormatError, StageError
+from express50.files.arrays import read_npy
+from express50.files.images import read_image
+from express50.geometry.cameras import Camera, pinhole, project_pinhole, triangulate, unproject
+from express50.geometry.conventions import cell_centres, cell_to_corner
+from express50.geometry.sampling import undistort_image, undistort_maps
+
+SAMPLES = 1500  # pixels per view that are compared to the other views
+NEAR_M = 0.01  # a surface point of one view and of another are the same within this
+MOST_OFF = 0.6  # of half a mask's extent: its middle from that of what all masks show
+AGREE_SHARE = 0.4  # of the pixels that two views know, which must be the same surface
+LEAST_COSINE = 0.5  # between the directions of two views that are compared
+FINE_M, FINER_SHARE = 0.003, 0.1  # what another measure must gain closely, to be the right one
+FACTORS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+Change = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Make depth of sampled depth and of the lengths of its rays at camera z 1."""
+
+
+def read_mask(path: Path, camera: Camera, distorted: bool) -> np.ndarray:
+    """Read a mask as opacity (H, W) uint8 of the camera's undistorted picture.
+
+    The opacity of a picture with four channels counts; masks of 0 and 1 are black and white.
+
+    Raises:
+        FormatError: it is missing, no mask, or not of the camera's size.
+    """
+    image = read_image(path)
+    if image.ndim == 3:
+        if image.shape[2] == 3 and not (image == image[..., :1]).all():
+            raise FormatError(f"{path}: holds colours, expected a grey mask or opacity (RGBA)")
+        image = image[..., -1] if image.shape[2] in (2, 4) else image[..., 0]
+    most = {"u1": 255.0, "u2": 65535.0}.get(image.dtype.str[1:], 1.0)
+    if image.dtype.kind == "u" and image.max(initial=0) == 1:
+        most = 1.0
+    if not (
+        np.isfinite(image).all() and image.min(initial=0) >= 0 and image.max(initial=0) <= most
+    ):
+        raise FormatError(f"{path}: holds values outside of 0 to {most:g}, expected opacity")
+    alpha = np.rint(image * (255.0 / most)).astype(np.uint8)
+    _check_size(path, alpha, camera)
+    return undistort_image(alpha, camera) if distorted else alpha
+
+
+def read_foreign_depth(
+    path: Path, camera: Camera, metres: float, along_ray: bool, distorted: bool
+) -> np.ndarray:
+    """Read depth (H, W) float32, camera z in metres of the undistorted picture; 0 is unknown.
+
+    Args:
+        path: 16-bit PNG or TIFF, EXR, or .npy.
+        camera: of the picture, with its distortion.
+        metres: per unit of the file.
+        along_ray: whether the file holds the length of the ray.
+        distorted: whether its pixels are those of the footage as recorded.
+
+    Raises:
+        FormatError: it is missing, no depth map, or not of the camera's size.
+    """
+    if path.suffix == ".npy":
+        values = read_npy(path, FormatError, "a depth map")
+    else:
+        values = read_image(path)
+        if values.dtype == np.uint8:
+            raise FormatError(f"{path}: has 8 bits, expected 16-bit PNG, EXR or .npy")
+    if values.ndim == 3 and (values == values[..., :1]).all():
+        values = values[..., 0]
+    if values.ndim != 2 or values.dtype.kind not in "fui":
+        raise FormatError(f"{path}: {values.dtype} {values.shape}, expected (H, W) depth")
+    _check_size(path, values, camera)
+    known = np.isfinite(values) & (values != 0)
+    depth = np.where(known, values, 0).astype(np.float32)
+    if known.any() and (depth[known] < 0).mean() > 0.5:
+        raise FormatError(
+            f"{path}: is negative: it is z of OpenGL's axes, expected depth in front of the camera;"
+            " change its sign"
+        )
+    depth = np.maximum(depth, 0) * np.float32(metres)
+    if distorted and camera.dist.any():
+        x, y = undistort_maps(camera)
+        depth = cv2.remap(depth, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+    return depth / ray_lengths(pinhole(camera)) if along_ray else depth
+
+
+def ray_lengths(camera: Camera) -> np.ndarray:
+    """Return the length (H, W) float32 of the rays of a pinhole camera at camera z 1."""
+    x = (cell_centres(camera.width) - camera.K[0, 2]) / camera.K[0, 0]
+    y = (cell_centres(camera.height) - camera.K[1, 2]) / camera.K[1, 1]
+    return np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2).astype(np.float32)
+
+
+def _check_size(path: Path, image: np.ndarray, camera: Camera) -> None:
+    height, width = image.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        words = "export it at the footage's size"
+        if (height, width) == (camera.width, camera.height):
+            words = "it lies on its side; turn it"
+        raise FormatError(
+            f"{path}: {width}x{height}, expected the {camera.width}x{camera.height} of camera"
+            f" {camera.id}; {words}"
+        )
+
+
+def check_masks(cameras: Mapping[str, Camera], masks: Mapping[str, np.ndarray], where: str) -> None:
+    """Refuse masks (H, W) uint8 by camera that are empty, full, or not of one thing.
+
+    Raises:
+        StageError: one is; the middle of what the masks show must lie within each of them.
+    """
+    middles = []
+    for name, alpha in masks.items():
+        inside = alpha > 127
+        if not inside.any() or inside.all():
+            raise StageError(
+                f"{where}: the mask of {name} is {'full' if inside.any() else 'empty'}; expected"
+                " the subject"
+            )
+        y, x = np.nonzero(inside)
+        middles.append([x.mean() + 0.5, y.mean() + 0.5])
+    if len(masks) < 3:
+        return
+    views = [cameras[name] for name in masks]
+    middle = triangulate(views, np.array(middles)[:, None])
+    off = {}
+    for name, camera, seen in zip(masks, views, middles, strict=True):
+        y, x = np.nonzero(masks[name] > 127)
+        half = 0.5 * np.array([np.ptp(x) + 1, np.ptp(y) + 1])
+        off[name] = float((np.abs(project_pinhole(camera, middle)[0][0] - seen) / half).max())
+    worst = max(off, key=lambda name: off[name] if np.isfinite(off[name]) else np.inf)
+    if not off[worst] < MOST_OFF:
+        raise StageError(
+            f"{where}: the mask of {worst} does not show what the other cameras' masks show; is it"
+            " of another camera or frame, or mirrored?"
+        )
+
+
+def check_depths(
+    cameras: Mapping[str, Camera], depths: Mapping[str, np.ndarray], where: str
+) -> float | None:
+    """Return the share of pixels on which views (H, W), metres, agree; None where none overlap.
+
+    Raises:
+        StageError: too few do, or many more would by another unit or measure, which it names.
+    """
+    share = agreement(cameras, depths, _as_it_is)
+    if share is None:
+        return None
+    best, words = share, "its cameras, subject or frame are others"
+    if share < AGREE_SHARE:
+        for factor in FACTORS:
+            other = agreement(cameras, depths, partial(_times, factor))
+            if other is not None and other > max(best, AGREE_SHARE):
+                best, words = other, f"its unit is {factor:g} times as large as the one given"
+        raise StageError(
+            f"{where}: views agree on {share:.0%} of what they share, expected {AGREE_SHARE:.0%}:"
+            f" {words}"
+        )
+    closely = agreement(cameras, depths, _as_it_is, FINE_M) or 0.0
+    for change, words in ((np.divide, "give --ray"), (np.multiply, "leave --ray out")):
+        if (agreement(cameras, depths, change, FINE_M) or 0.0) > closely + FINER_SHARE:
+            raise StageError(f"{where}: views agree better if lengths of rays are meant; {words}")
+    return round(share, 4)
+
+
+def _times(factor: float, depth: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    return factor * depth
+
+
+def _as_it_is(depth: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    return depth
+
+
+def agreement(
+    cameras: Mapping[str, Camera],
+    depths: Mapping[str, np.ndarray],
+    change: Change,
+    near: float = NEAR_M,
+) -> float | None:
+    """Return the share of pixels whose surface point other views know at the same place.
+
+    Pairs of views that look the same way within 60 degrees are compared; None without any. Points
+    that leave the other's known pixels count against it.
+    """
+    same = total = 0
+    for name, depth in depths.items():
+        camera, (y, x) = cameras[name], np.nonzero(depth)
+        chosen = np.unique(np.linspace(0, len(y) - 1, min(SAMPLES, len(y))).astype(int))
+        y, x = y[chosen], x[chosen]
+        z = change(depth[y, x], ray_lengths(camera)[y, x])
+        points = unproject(camera, cell_to_corner(np.stack([x, y], 1).astype(float)), z)
+        for other, there in depths.items():
+            facing = cameras[other].cam_from_world[2, :3] @ camera.cam_from_world[2, :3]
+            if other == name or facing < LEAST_COSINE or not len(points):
+                continue
+            pixels, ahead = project_pinhole(cameras[other], points)
+            size = (cameras[other].width, cameras[other].height)
+            inside = (ahead > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)
+            column, row = pixels[inside].astype(int).T
+            found = change(there[row, column], ray_lengths(cameras[other])[row, column])
+            total += len(points)
+            same += int((np.abs(found - ahead[inside]) < near).sum())
+    return same / total if total else None

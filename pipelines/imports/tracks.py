@@ -1,0 +1,322 @@
+"""Read tracks of VHAP and GaussianAvatars, FLAME's parameters by time step, as a `Track`.
+
+Read are a folder with ``transforms.json`` and the files of parameters that it names, and VHAP's own
+``tracked_flame_params_N.npz``. FLAME turns a head about its root joint J, we about the origin:
+world = R (x - J) + J + T, so that t = T - R J + J.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from express50.capture.frames import read_cameras_of
+from express50.contract.layout import Dataset
+from express50.contract.stage import Note
+from express50.dataset.tracks import Track
+from express50.errors import CalibrationError, ConfigError, FormatError, StageError
+from express50.files.arrays import read_arrays
+from express50.files.text import read_json_table
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import FLIP_YZ
+from express50.geometry.transforms import axis_angle_to_matrix
+from express50.head.load import load_head
+from express50.head.model import HeadModel, pose, rest_vertices
+from express50.rigs.read import read_rig
+from express50.rigs.transforms_json import frame_camera, is_transforms
+from pipelines.imports.cameras import aligning_transform
+from pipelines.imports.places import PeakFrame, fill
+
+WHAT = "FLAME parameters of a tracker"
+# Names and widths of the arrays with one row per time step.
+POSES = {"translation": 3, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6}
+ROWS = (*POSES, "expr")
+NUMBER = re.compile(r"(\d+)$")
+SAME = 1e-5  # metres and coefficients: what the steps must share may be rounded
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlameStep:
+    """Holds the parameters of one time step, in the dataset's world.
+
+    Attributes:
+        where: its file, for messages.
+        arrays: by name, one row each.
+        shared: ``shape`` and ``static_offset``, which all time steps have in common.
+        motion: (4, 4) rigid, from the other tool's world.
+        dynamic_mm: largest displacement that this step alone has.
+    """
+
+    where: str
+    arrays: Mapping[str, np.ndarray]
+    shared: Mapping[str, np.ndarray]
+    motion: np.ndarray
+    dynamic_mm: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackSource:
+    """Says where a subject's tracks are.
+
+    Attributes:
+        pattern: path of a folder or file; with an expression in it, of each expression's own.
+        head: the head model, as ``load_head`` takes it.
+        axes: of the camera matrices, ``opengl`` or ``opencv``.
+        cameras: the other tool's rig, where the tracks do not bring it.
+    """
+
+    pattern: str
+    head: str
+    axes: str = "opengl"
+    cameras: Path | None = None
+
+
+def read_foreign_track(
+    dataset: Dataset, subject: str, peaks: list[PeakFrame], source: TrackSource
+) -> tuple[Track, list[Note]]:
+    """Read a subject's track in its peak frames, and what is doubtful about it.
+
+    Raises:
+        ConfigError: the source is of no known kind.
+        CalibrationError: its cameras are not the dataset's.
+        StageError: peak frames are missing, or it is another subject's.
+        FormatError: parameters are damaged, or do not fit the head model.
+    """
+    ours = read_cameras_of(dataset, subject)
+    rig = None if source.cameras is None else read_rig(source.cameras, None, None, 1.0)
+    steps: dict[str, FlameStep] = {}
+    if "{expression}" in source.pattern:
+        for peak in peaks:
+            path = fill(source.pattern, subject, peak)
+            steps |= _read_steps(path, subject, [peak], ours, source.axes, rig, in_clip=True)
+    else:
+        path = fill(source.pattern, subject)
+        steps = _read_steps(path, subject, peaks, ours, source.axes, rig, in_clip=False)
+    return _make_track(source.head, peaks, steps)
+
+
+def _read_steps(
+    path: Path,
+    subject: str,
+    peaks: list[PeakFrame],
+    ours: Mapping[str, Camera],
+    axes: str,
+    rig: Mapping[str, Camera] | None,
+    in_clip: bool,
+) -> dict[str, FlameStep]:
+    """Read the time steps of peaks, by expression."""
+    if is_transforms(path):
+        return _steps_of_transforms(path, subject, peaks, ours, axes, in_clip)
+    if path.is_dir():
+        # VHAP writes one per epoch; the last is the best.
+        files = sorted(path.glob("tracked_flame_params*.npz"), key=lambda p: (len(p.name), p.name))
+        if not files:
+            raise ConfigError(
+                f"{path}: holds neither transforms.json nor tracked_flame_params_*.npz"
+            )
+        path = files[-1]
+    if path.suffix != ".npz":
+        raise ConfigError(f"{path}: no such file; expected a folder or {WHAT} (.npz)")
+    return _steps_of_npz(path, peaks, ours, rig, in_clip)
+
+
+def _steps_of_transforms(
+    path: Path,
+    subject: str,
+    peaks: list[PeakFrame],
+    ours: Mapping[str, Camera],
+    axes: str,
+    in_clip: bool,
+) -> dict[str, FlameStep]:
+    file = path / "transforms.json" if path.is_dir() else path
+    folder, frames = file.parent, read_json_table(file, FormatError)["frames"]
+    other = folder / "export.json"
+    if other.is_file() and (named := read_json_table(other, FormatError).get("subject")) != subject:
+        raise StageError(f"{folder}: is of subject {named}, expected {subject}")
+    rows: dict[str, dict] = {}
+    cameras: dict[str, Camera] = {}
+    for number, row in enumerate(frames):
+        where = f"{file}: frame {number}"
+        name = str(row.get("camera_id", row.get("camera_index", "")))
+        cameras.setdefault(name, _camera_of(where, name, row, axes))
+        rows.setdefault(str(row.get("timestep_id", row.get("timestep_index", number))), row)
+    motion = aligning_transform(cameras, ours, str(file))
+    chosen = _choose(list(rows), peaks, in_clip, str(file))
+    steps = {}
+    for expression, key in chosen.items():
+        row = rows[key]
+        if "flame_param_path" not in row:
+            raise FormatError(f"{file}: its frames name no flame_param_path; export parameters")
+        frame = row.get("timestep_index_original")
+        peak = next(one for one in peaks if one.expression == expression)
+        if key == expression and frame != peak.frame:
+            raise StageError(
+                f"{file}: {expression} is of frame {frame}, its peak is frame {peak.frame} now;"
+                " track that frame"
+            )
+        member = folder / row["flame_param_path"]
+        if not member.resolve().is_relative_to(folder.resolve()):
+            raise FormatError(f"{file}: flame_param_path {row['flame_param_path']} leaves it")
+        steps[expression] = _step(member, read_arrays(member, FormatError, WHAT), 0, motion)
+    return steps
+
+
+def _camera_of(where: str, name: str, row: dict, axes: str) -> Camera:
+    try:
+        if axes == "opencv":
+            matrix = np.array(row["transform_matrix"], float)
+            row = row | {"transform_matrix": (matrix @ FLIP_YZ).tolist()}
+        return frame_camera(where, name, row, None)
+    except (KeyError, TypeError, ValueError, OverflowError, np.linalg.LinAlgError) as error:
+        raise CalibrationError(f"{where}: its camera cannot be read ({error})") from None
+
+
+def _steps_of_npz(
+    path: Path,
+    peaks: list[PeakFrame],
+    ours: Mapping[str, Camera],
+    rig: Mapping[str, Camera] | None,
+    in_clip: bool,
+) -> dict[str, FlameStep]:
+    arrays = read_arrays(path, FormatError, WHAT, ROWS)
+    if "focal_length" in arrays and rig is None:
+        raise CalibrationError(
+            f"{path}: was tracked without calibrated cameras (it has a focal_length); track it with"
+            " those of the dataset, or import the folder that its export wrote"
+        )
+    motion = np.eye(4) if rig is None else aligning_transform(rig, ours, str(path))
+    count = len(arrays["translation"])
+    names = [str(n) for n in np.ravel(arrays.get("timestep_id", np.arange(count)))]
+    chosen = _choose(names[:count], peaks, in_clip, str(path))
+    return {e: _step(path, arrays, names.index(key), motion) for e, key in chosen.items()}
+
+
+def _choose(keys: list[str], peaks: list[PeakFrame], in_clip: bool, where: str) -> dict[str, str]:
+    """Find each peak's time step: by the expression's id, else by the frame's number.
+
+    Raises:
+        StageError: some are missing.
+    """
+    numbers: dict[int, str] = {}
+    if not any(peak.expression in keys for peak in peaks):  # ids may end in numbers too
+        numbers = {int(match[1]): key for key in keys if (match := NUMBER.search(key))}
+    found, missing = {}, []
+    for peak in peaks:
+        number = peak.clip_frame if in_clip else peak.frame
+        key = peak.expression if peak.expression in keys else numbers.get(number)
+        if key is None:
+            missing.append(f"{peak.expression} (frame {number})")
+        else:
+            found[peak.expression] = key
+    if missing:
+        more = f" and {len(missing) - 6} more" if missing[6:] else ""
+        raise StageError(
+            f"{where}: has no time step of {', '.join(missing[:6])}{more}; it has"
+            f" {len(keys)}: {', '.join(keys[:3])}{', ...' if keys[3:] else ''}"
+        )
+    return found
+
+
+def _step(path: Path, arrays: Mapping[str, np.ndarray], row: int, motion: np.ndarray) -> FlameStep:
+    """Take one row of arrays.
+
+    Raises:
+        FormatError: one is missing, of another shape, or not finite.
+    """
+    where = f"{path}: row {row}"
+    if missing := [name for name in (*ROWS, "shape") if name not in arrays]:
+        raise FormatError(f"{where}: has no {', '.join(missing)}; expected {WHAT}")
+    found: dict[str, np.ndarray] = {}
+    for name in ROWS:
+        array, width = np.asarray(arrays[name]), POSES.get(name)
+        if array.ndim != 2 or row >= len(array) or width not in (None, array.shape[1]):
+            raise FormatError(f"{where}: {name} is {array.shape}, expected (T, {width or 'X'})")
+        found[name] = array[row].astype(np.float64)
+    shared: dict[str, np.ndarray] = {"shape": np.ravel(arrays["shape"]).astype(np.float64)}
+    offset = np.asarray(arrays.get("static_offset", np.zeros((0, 3))), np.float64)
+    shared["static_offset"] = offset.reshape(-1, 3)
+    for name, array in (*found.items(), *shared.items()):
+        if not np.isfinite(array).all():
+            raise FormatError(f"{where}: {name} holds NaN or Inf")
+    moving = np.abs(np.asarray(arrays.get("dynamic_offset", 0.0))).max(initial=0)
+    return FlameStep(
+        where=where, arrays=found, shared=shared, motion=motion, dynamic_mm=1e3 * float(moving)
+    )
+
+
+def _make_track(
+    head: str, peaks: list[PeakFrame], steps: Mapping[str, FlameStep]
+) -> tuple[Track, list[Note]]:
+    model = load_head(head).to(dtype=torch.float64)
+    first = steps[peaks[0].expression]
+    for name, value in first.shared.items():
+        for step in steps.values():
+            if step.shared[name].shape != value.shape or (
+                value.size and np.abs(step.shared[name] - value).max() > SAME
+            ):
+                raise FormatError(
+                    f"{step.where}: its {name} differs from {first.where}'s; a subject has one:"
+                    " track its sequences together"
+                )
+    shape = _fitted(first.shared["shape"], model.shape_dirs.shape[2], "shape", first.where)
+    offsets = _offsets(first, model)
+    rows = [_posed(steps[peak.expression], model, shape, offsets) for peak in peaks]
+    stacked = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+    frames = np.array([peak.frame for peak in peaks], np.int64)
+    moving = max(step.dynamic_mm for step in steps.values())
+    why = f"displacements of single time steps, up to {moving:.2f} mm, are left out"
+    return Track(
+        head=head, expressions=tuple(peak.expression for peak in peaks), frames=frames,
+        shape=shape, offsets=offsets.astype(np.float32), **stacked,
+    ), [Note("dynamic_offset", why)] if moving > 0 else []  # fmt: skip
+
+
+def _fitted(values: np.ndarray, count: int, name: str, where: str) -> np.ndarray:
+    """Cut coefficients to a head model's number; more that are not 0 are an error."""
+    if np.any(values[count:]):
+        raise FormatError(
+            f"{where}: {len(values)} {name} coefficients, the head model has {count};"
+            " name the model that it was tracked with (--head)"
+        )
+    return values[:count]
+
+
+def _offsets(step: FlameStep, model: HeadModel) -> np.ndarray:
+    given, count = step.shared["static_offset"], len(model.template)
+    if len(given) > count:
+        raise FormatError(
+            f"{step.where}: static_offset of {len(given)} vertices, the head model has {count};"
+            " name the model that it was tracked with (--head)"
+        )
+    return np.vstack([given, np.zeros((count - len(given), 3))])
+
+
+def _posed(
+    step: FlameStep, model: HeadModel, shape: np.ndarray, offsets: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Make one row of a track's arrays, its vertices among them."""
+    arrays = step.arrays
+    count = model.expression_dirs.shape[2]
+    expression = _fitted(arrays["expr"], count, "expression", step.where)
+    tensors = {
+        name: torch.from_numpy(np.ascontiguousarray(value))[None]
+        for name, value in {
+            "shape": shape, "expression": expression, "offsets": offsets,
+            "neck": arrays["neck_pose"], "jaw": arrays["jaw_pose"], "eyes": arrays["eyes_pose"],
+        }.items()
+    }  # fmt: skip
+    rest = rest_vertices(model, *(tensors[k] for k in ("shape", "expression", "offsets")))[0]
+    joint = (model.joint_regressor[0] @ rest).numpy()
+    turn = axis_angle_to_matrix(arrays["rotation"])
+    R = step.motion[:3, :3] @ turn
+    t = step.motion[:3, :3] @ (arrays["translation"] + joint - turn @ joint) + step.motion[:3, 3]
+    vertices = pose(model, **tensors)[0].numpy() @ R.T + t
+    return {
+        "expression": expression, "neck": arrays["neck_pose"], "jaw": arrays["jaw_pose"],
+        "eyes": arrays["eyes_pose"], "R": R, "t": t, "vertices": vertices.astype(np.float32),
+    }  # fmt: skip
