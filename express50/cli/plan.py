@@ -8,7 +8,6 @@ separate, so it is given as measured: a lower bound.
 from __future__ import annotations
 
 import argparse
-import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,11 +15,11 @@ from typing import Any
 
 from rich.filesize import decimal
 
-from express50.capture.index import read_index
 from express50.console import add_command, answer, count, format_table, stdout_to_stderr
 from express50.contract.config import PRESETS, config_toml, resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage, stages
+from express50.dial.footage import Footage, footage_of
 from express50.errors import ConfigError, StageError
 from express50.files.digests import files_of, text_digest
 from express50.runner.ledger import Ledger
@@ -32,21 +31,6 @@ TARGETS: dict[str, dict[str, float]] = {
     "express-50": {"subjects": 50, "expressions": 60, "views": 24, "pixels": 3840 * 2160},
     "renderme-360": {"subjects": 280, "expressions": 12, "views": 60, "pixels": 2448 * 2048},
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class Footage:
-    """Holds the size of a campaign; means over subjects where it was measured."""
-
-    subjects: float
-    expressions: float
-    views: float
-    pixels: float
-    frames: float
-
-    def work(self, factors: Sequence[str]) -> float:
-        """Multiply some of its sizes."""
-        return math.prod(getattr(self, name) for name in factors)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,25 +135,6 @@ def _words(footage: Footage) -> str:
         f"{count(footage.subjects, 'subject')} x {count(footage.expressions, 'expression')} x "
         f"{count(footage.views, 'camera')} of {footage.pixels / 1e6:.3g} megapixels, "
         f"{count(footage.frames, 'frame')} per camera"
-    )
-
-
-def footage_of(dataset: Dataset) -> Footage:
-    """Average the size of a dataset's footage.
-
-    Raises:
-        StageError: nothing is ingested.
-    """
-    indices = [read_index(dataset, subject) for subject in dataset.subjects()]
-    if not indices:
-        raise StageError(f"{dataset.root}: nothing is ingested, so nothing was measured")
-    cameras = [camera for index in indices for camera in index.cameras.values()]
-    return Footage(
-        subjects=len(indices),
-        expressions=sum(len(index.cues) for index in indices) / len(indices),
-        views=len(cameras) / len(indices),
-        pixels=sum(camera.width * camera.height for camera in cameras) / len(cameras),
-        frames=sum(camera.frames for camera in cameras) / len(cameras),
     )
 
 

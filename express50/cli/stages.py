@@ -22,7 +22,7 @@ def add_commands(subparsers: Any) -> None:
             subparsers, stage.name, run_one, stage.help, description=stage.help,
             epilog=f"options of the stage: express50 config {stage.name}",
         )  # fmt: skip
-        _add_run_options(parser, captures=stage.prepare is not None)
+        add_run_options(parser, captures=stage.prepare is not None)
         parser.add_argument("--items", metavar="GLOB", help="only items that match, such as 'S00*'")
         parser.set_defaults(stage=stage.name)
     words, names = "run all stages in order", list(stages())
@@ -30,7 +30,7 @@ def add_commands(subparsers: Any) -> None:
         subparsers, "run", run_all, words, description=words,
         epilog="options of a stage: express50 config STAGE",
     )  # fmt: skip
-    _add_run_options(parser, captures=True)
+    add_run_options(parser, captures=True)
     parser.add_argument("--first", metavar="STAGE", choices=names, help="start here")
     parser.add_argument("--last", metavar="STAGE", choices=names, help="end here")
     words = "print the configuration of stages as TOML"
@@ -39,7 +39,8 @@ def add_commands(subparsers: Any) -> None:
     add_config_options(parser)
 
 
-def _add_run_options(parser: argparse.ArgumentParser, captures: bool) -> None:
+def add_run_options(parser: argparse.ArgumentParser, captures: bool) -> None:
+    """Add the options that say with what and where stages run."""
     add = parser.add_argument
     if captures:
         add(
@@ -66,7 +67,8 @@ def _add_run_options(parser: argparse.ArgumentParser, captures: bool) -> None:
 
 def add_config_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that make up a configuration."""
-    parser.add_argument("--preset", default="standard", metavar="P", help=", ".join(PRESETS))
+    words = f"{', '.join(PRESETS)} (default standard)"
+    parser.add_argument("--preset", metavar="P", help=words)
     parser.add_argument("--config", type=Path, metavar="FILE", help="TOML, one table per stage")
     parser.add_argument(
         "--set", action="append", default=[], metavar="STAGE.KEY=VALUE", help="set one value"
@@ -75,7 +77,7 @@ def add_config_options(parser: argparse.ArgumentParser) -> None:
 
 def config_of(stage: Stage, args: argparse.Namespace) -> Any:
     """Build the configuration of a stage from the command's options."""
-    return resolve_config(stage, args.preset, args.config, args.set, stages())
+    return resolve_config(stage, args.preset or "standard", args.config, args.set, stages())
 
 
 def run_one(args: argparse.Namespace) -> int:
@@ -106,15 +108,12 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
     from express50.runner.runner import run_stage
     from express50.runner.threads import cap_threads
 
-    if args.workers < 0:
-        raise ConfigError(f"--workers {args.workers}: expected 0 or more")
-    if args.threads < 1:
-        raise ConfigError(f"--threads {args.threads}: expected 1 or more")
+    check_workers(args)
     # Before NumPy comes in with a stage: its BLAS reads the cap when it is loaded.
     cap_threads(args.threads)
     dataset = Dataset(args.dataset)
-    _refuse_swapped(dataset, getattr(args, "captures", ()), args.command)
-    slurm = _slurm_jobs(args)
+    refuse_swapped(dataset, getattr(args, "captures", ()), args.command)
+    slurm = slurm_jobs(args)
     if slurm is not None and args.print_job:
         from express50.runner.slurm import job_script
 
@@ -138,10 +137,7 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
             items = _items(stage, dataset, args, pattern)
             summaries.append(run_stage(stage, dataset, config, items, pool=pool))
             if not args.json:
-                say(*summaries[-1].lines())
-                if stage.account is not None:
-                    done = [o.item for o in summaries[-1].outcomes if o.status == "done"]
-                    say(*stage.account(dataset, done))
+                say_account(stage, dataset, summaries[-1])
     if args.json:
         accounts = [summary.to_json() for summary in summaries]
         before = {"before": accounts[:-1]} if len(accounts) > 1 else {}
@@ -150,7 +146,7 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
     return OK if all(summary.ok for summary in summaries) and not dropped else FAILED
 
 
-def _refuse_swapped(dataset: Dataset, captures: Sequence[Path], command: str) -> None:
+def refuse_swapped(dataset: Dataset, captures: Sequence[Path], command: str) -> None:
     """Refuse a capture in the place of the dataset, and the other way round.
 
     Raises:
@@ -172,7 +168,27 @@ def _refuse_swapped(dataset: Dataset, captures: Sequence[Path], command: str) ->
             )
 
 
-def _slurm_jobs(args: argparse.Namespace) -> Mapping[str, Any] | None:
+def say_account(stage: Stage, dataset: Dataset, summary: Any) -> None:
+    """Print what a stage did."""
+    say(*summary.lines())
+    if stage.account is not None:
+        done = [o.item for o in summary.outcomes if o.status == "done"]
+        say(*stage.account(dataset, done))
+
+
+def check_workers(args: argparse.Namespace) -> None:
+    """Check the numbers of workers and threads.
+
+    Raises:
+        ConfigError: there are too few.
+    """
+    if args.workers < 0:
+        raise ConfigError(f"--workers {args.workers}: expected 0 or more")
+    if args.threads < 1:
+        raise ConfigError(f"--threads {args.threads}: expected 1 or more")
+
+
+def slurm_jobs(args: argparse.Namespace) -> Mapping[str, Any] | None:
     """Read what the jobs of every stage ask for, where stages run in SLURM jobs."""
     if args.slurm is None:
         if args.print_job:

@@ -7,15 +7,14 @@ import pytest
 from express50.cli.main import main
 from express50.cli.plan import (
     TARGETS,
-    Footage,
     Measured,
     estimate,
-    footage_of,
     measure,
     target_of,
 )
 from express50.contract.layout import Dataset
 from express50.contract.stage import stages
+from express50.dial.footage import Footage, footage_of
 from express50.errors import ConfigError
 from express50.runner.ledger import Ledger
 from pipelines import ingest

@@ -1,0 +1,125 @@
+"""Run the chain within a budget, and ``tune``, which measures what time buys on a dataset."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from typing import Any
+
+from express50.cli.stages import (
+    add_run_options,
+    check_workers,
+    refuse_swapped,
+    run_all,
+    say_account,
+    slurm_jobs,
+)
+from express50.console import (
+    FAILED,
+    OK,
+    USAGE,
+    add_command,
+    answer,
+    log,
+    say,
+    say_json,
+    stdout_to_stderr,
+)
+from express50.contract.config import distinct_settings, resolve_config
+from express50.contract.layout import Dataset
+from express50.contract.stage import Stage, stages
+from express50.errors import ConfigError
+
+
+def add_commands(subparsers: Any) -> None:
+    """Add ``tune``, and ``--budget`` and ``--error`` to ``run``."""
+    run = subparsers.choices["run"]
+    words = "choose the settings for this time: 45m, 2h, 1h30m; 40ch are core hours"
+    run.add_argument("--budget", metavar="TIME", help=words)
+    words = "choose the quickest settings with this expected error, such as 0.5mm"
+    run.add_argument("--error", metavar="ERROR", help=words)
+    run.set_defaults(handler=run_chain)
+    words = "measure what time buys on this dataset: error of the whole chain against time"
+    parser = add_command(
+        subparsers, "tune", run_tune, words, description=words,
+        example="express50 tune DATASET && express50 report DATASET",
+    )  # fmt: skip
+    add_run_options(parser, captures=True)
+
+
+def run_chain(args: argparse.Namespace) -> int:
+    """Run all stages with the settings that suit a budget or a goal, if one is given."""
+    if args.budget is None and args.error is None:
+        return run_all(args)
+    from express50.dial.budget import parse_budget, parse_goal
+    from express50.dial.run import closing_lines, run_within
+
+    if args.first or args.last:
+        raise ConfigError("--budget and --error run the whole chain; leave --first and --last out")
+    budget = None if args.budget is None else parse_budget(args.budget)
+    goal = None if args.error is None else parse_goal(args.error)
+
+    def ended(stage: Stage, summary: Any) -> None:
+        if not args.json:
+            say_account(stage, chain.dataset, summary)
+
+    with _chain(args) as chain:
+        if chain is None:
+            return USAGE
+        summaries, state = run_within(chain, budget, goal, ended)
+    if args.json:
+        say_json({"run": vars(state), "stages": [summary.to_json() for summary in summaries]})
+    else:
+        say(*closing_lines(state, summaries))
+    return OK if state.finished and all(summary.ok for summary in summaries) else FAILED
+
+
+def run_tune(args: argparse.Namespace) -> int:
+    """Measure every setting of every stage on a few items, and write the front."""
+    from express50.dial.tune import tune
+
+    with _chain(args) as chain:
+        if chain is None:
+            return USAGE
+        table, lines = tune(chain)
+    return answer(args, table, *lines)
+
+
+@contextmanager
+def _chain(args: argparse.Namespace) -> Iterator[Any]:
+    """Open the chain of a dataset with all settings of its stages; None where it cannot run."""
+    from express50.dial.run import Chain
+    from express50.runner.executor import Pool
+    from express50.runner.preflight import problems
+    from express50.runner.threads import cap_threads
+
+    if args.preset is not None:
+        raise ConfigError("--preset: settings are measured and chosen here; leave it out, or --set")
+    if args.print_job:
+        raise ConfigError("--print-job: settings are not chosen yet; give --preset instead")
+    check_workers(args)
+    cap_threads(args.threads)
+    known, dataset = list(stages().values()), Dataset(args.dataset.resolve())
+    refuse_swapped(dataset, args.captures, args.command)
+    ladders = {
+        stage.name: distinct_settings(
+            stage, lambda s, preset: resolve_config(s, preset, args.config, args.set, stages())
+        )
+        for stage in known
+    }
+    slurm = slurm_jobs(args)
+    with (
+        stdout_to_stderr() if args.json else nullcontext(),
+        Pool(args.workers, args.scheduler, args.threads, slurm) as pool,
+    ):
+        work = [(stage, config) for stage in known for config in ladders[stage.name].values()]
+        if found := list(problems(dataset, work, pool)):
+            for line in found:
+                log(f"express50: {line}")
+            yield None
+            return
+        for stage in known:
+            if stage.prepare is not None and args.captures:
+                stage.prepare(dataset, args.captures)
+        yield Chain(known, dataset, ladders, pool, log if args.json else say)

@@ -1,0 +1,118 @@
+"""Read budgets and goals as people write them, and count what a run has spent of its budget."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import get_args
+
+from express50.contract.stage import Unit
+from express50.errors import ConfigError
+from express50.runner.ledger import Receipt
+
+SECONDS = {"s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ch": 3600.0}
+PART = re.compile(r"(\d+(?:\.\d+)?)(s|min|m|ch|h|d)")
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Seconds that a run may take: of the clock, or of all cores together.
+
+    Attributes:
+        text: as it was written.
+        seconds: of the clock, or processor seconds of the items.
+        cores: whether processor seconds count.
+    """
+
+    text: str
+    seconds: float
+    cores: bool
+
+
+@dataclass(frozen=True)
+class Goal:
+    """An error that a result is to keep below, in the result's unit, and as it was written."""
+
+    text: str
+    value: float
+    unit: str
+
+
+def parse_budget(text: str) -> Budget:
+    """Read a budget: ``90s``, ``45m``, ``2h``, ``1h30m``, ``1d``; ``40ch`` are core hours.
+
+    Raises:
+        ConfigError: the text is no such time, or is 0.
+    """
+    parts = PART.findall(text)
+    seconds = sum(float(number) * SECONDS[unit] for number, unit in parts)
+    cores = any(unit == "ch" for _, unit in parts)
+    if "".join(map("".join, parts)) != text or not seconds > 0 or (cores and len(parts) > 1):
+        raise ConfigError(
+            f"--budget {text!r}: expected a time such as 45m, 2h or 1h30m, or core hours such as"
+            " 40ch"
+        )
+    return Budget(text, seconds, cores)
+
+
+def parse_goal(text: str) -> Goal:
+    """Read a goal: ``0.5mm``, ``0.004alpha``.
+
+    Raises:
+        ConfigError: the text is no number with a unit.
+    """
+    found = re.fullmatch(r"(\d*\.?\d+)\s*([A-Za-z]+)", text)
+    if found is None or found[2] not in get_args(Unit) or not float(found[1]) > 0:
+        units = ", ".join(get_args(Unit))
+        raise ConfigError(f"--error {text!r}: expected such as 0.5mm; units: {units}")
+    return Goal(text, float(found[1]), found[2])
+
+
+@dataclass
+class Clock:
+    """Counts what a run spends, over all its sessions; a `Gate` of the runner.
+
+    Attributes:
+        budget: what may be spent; None for no limit.
+        spent: of earlier sessions, seconds.
+        keep: stores what is spent; called about every two seconds while items end.
+        item: expected cost of an item of the stage that runs, which must still fit.
+        early: seconds before which the budget counts as spent, for what follows.
+    """
+
+    budget: Budget | None
+    spent: float = 0.0
+    keep: Callable[[float], None] = lambda spent: None
+    item: float = 0.0
+    early: float = 0.0
+    core: float = 0.0
+    began: float = field(default_factory=time.monotonic)
+    _kept: float = 0.0
+    _closed: bool = False
+
+    def now(self) -> float:
+        """Return what was spent up to now."""
+        cores = self.budget is not None and self.budget.cores
+        return self.spent + (self.core if cores else time.monotonic() - self.began)
+
+    def left(self) -> float:
+        """Return what may still be spent."""
+        return float("inf") if self.budget is None else self.budget.seconds - self.now()
+
+    def expect(self, item: float, early: float = 0.0) -> None:
+        """Say what an item of the next stage costs, and what to keep for the time after it."""
+        self.item, self.early, self._closed = item, early, False
+
+    def settled(self, receipt: Receipt) -> None:
+        """Count an item; one with 0 attempts was not made but restored."""
+        self.core += receipt.core_seconds if receipt.attempts else 0.0
+        if time.monotonic() - self._kept > 2.0:
+            self._kept = time.monotonic()
+            self.keep(self.now())
+
+    def closed(self) -> bool:
+        """Return whether a further item would probably end after the budget."""
+        self._closed = self._closed or self.left() - self.early < self.item
+        return self._closed

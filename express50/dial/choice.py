@@ -1,0 +1,293 @@
+"""Choose settings: predict time and errors of the whole chain from a pilot, and find the front.
+
+What a stage's cheaper setting does to a result is independent of what the others do: squares of
+differences add up, over what the dearest settings leave. That rest is what stages state of their
+own errors; where none does, only the differences are known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from statistics import median
+
+from express50.contract.stage import Stage
+from express50.dial.budget import Goal
+from express50.dial.footage import Footage
+from express50.dial.pilot import Cost, Ladder, PilotFigures, Trial, standard_of
+from express50.dial.results import RESULTS, ResultKind
+from express50.errors import ConfigError
+
+LEAST_REST = 0.25  # of the error that was stated: differences may not explain it all
+STATES = 400  # partial choices that are kept; far more than a front has points
+
+
+@dataclass(frozen=True)
+class Expected:
+    """A result's expected error: value and interval.
+
+    Where no stage states this error, ``stated`` is false, and all three figures are how far the
+    result differs from that of the dearest settings tried.
+    """
+
+    value: float
+    low: float
+    high: float
+    unit: str
+    stated: bool
+
+
+@dataclass(frozen=True)
+class Point:
+    """A choice of settings.
+
+    Attributes:
+        settings: name of each stage's.
+        seconds: of the clock, or of all cores, for all that is not made yet.
+        each: the same by stage.
+        worse: sum over the results of the error, relative to that at the dearest settings.
+        errors: expected error of each result.
+    """
+
+    settings: dict[str, str]
+    seconds: float
+    each: dict[str, float]
+    worse: float
+    errors: dict[str, Expected]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Workload:
+    """What is to be made.
+
+    Attributes:
+        stages: in order.
+        ladders: settings of each stage.
+        measured: of the pilot.
+        footage: of all that is to be made.
+        width: items that are worked at at once.
+        cores: whether seconds of all cores count.
+        fixed: settings of stages that have begun.
+        kinds: results of the chain.
+        done: per stage, the setting that its folder was made with and the share that is there.
+    """
+
+    stages: Sequence[Stage]
+    ladders: Mapping[str, Ladder]
+    measured: PilotFigures
+    footage: Footage
+    width: int
+    cores: bool
+    fixed: Mapping[str, str] = field(default_factory=dict)
+    done: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+    kinds: Sequence[ResultKind] = RESULTS
+
+
+def cost_at(load: Workload, name: str, label: str) -> tuple[Cost, Trial] | None:
+    """Find what a stage cost in the pilot, and in which trial; None where it was not measured."""
+    base, *others = load.measured.trials
+    for trial in [base, *others]:
+        whole = trial.footage.expressions == base.footage.expressions
+        ran = trial.settings[name] == label and name not in trial.failed
+        if whole and ran and name in trial.costs:
+            return trial.costs[name], trial
+    return None
+
+
+def labels_of(load: Workload, name: str) -> list[str]:
+    """List the settings of a stage to choose from, cheapest first: those that were measured."""
+    if name in load.fixed:
+        return [load.fixed[name]]
+    if name not in load.measured.losses:
+        return [standard_of(load.ladders[name])]
+    tried = [label for label in load.ladders[name] if cost_at(load, name, label)]
+    return tried or [standard_of(load.ladders[name])]
+
+
+def item_seconds(load: Workload, stage: Stage, label: str) -> tuple[int, float]:
+    """Return how many items a stage has, and seconds of one at a setting."""
+    found = cost_at(load, stage.name, label) or cost_at(
+        load, stage.name, load.measured.trials[0].settings[stage.name]
+    )
+    per = stage.growth.items
+    if found is None:
+        return max(1, round(load.footage.work(per))), 0.0
+    cost, trial = found
+    share = cost.items / max(trial.footage.work(per), 1e-9)
+    first = load.measured.trials[0]
+    if stage.name in first.costs and first is not trial:  # a trial makes only what changes
+        share = first.costs[stage.name].items / max(first.footage.work(per), 1e-9)
+    count = max(1, round(share * load.footage.work(per)))
+    ratio = load.footage.work(stage.growth.time) / trial.footage.work(stage.growth.time)
+    growing = growing_share(load.measured, stage)
+    seconds = cost.core_seconds if load.cores else cost.seconds
+    return count, seconds * (1 - growing + growing * ratio)
+
+
+def growing_share(measured: PilotFigures, stage: Stage) -> float:
+    """Return the share of an item's time that grows with its footage, from trials of two sizes."""
+    base, *others = measured.trials
+    small = next((t for t in others if t.footage.expressions < base.footage.expressions), None)
+    if small is None or not {stage.name} <= base.costs.keys() & small.costs.keys():
+        return 1.0
+    work = [t.footage.work(stage.growth.time) for t in (small, base)]
+    if work[0] >= work[1]:
+        return 1.0
+    few, many = (t.costs[stage.name].core_seconds for t in (small, base))
+    slope = (many - few) / (work[1] - work[0])
+    return min(1.0, max(0.0, slope * work[1] / max(many, 1e-9)))
+
+
+def stage_seconds(load: Workload, stage: Stage, label: str, left: float = 1.0) -> float:
+    """Return the seconds of a stage at a setting, for the share of its items that is left."""
+    count, seconds = item_seconds(load, stage, label)
+    count = math.ceil(count * left)
+    if count == 0 or load.cores:
+        return count * seconds
+    extra = max((t.costs[stage.name].extra for t in load.measured.trials[:1]
+                 if stage.name in t.costs), default=0.0)  # fmt: skip
+    return count * seconds / min(load.width, count) + extra
+
+
+def rest_of(load: Workload, result: str) -> tuple[float, float, float] | None:
+    """Return the squared error that the dearest settings leave, and its interval as two ratios.
+
+    None where no stage states this error.
+    """
+    losses = load.measured.losses
+    rests, ratios = [], []
+    for trial in load.measured.trials:
+        if result not in trial.errors:
+            continue
+        value, low, high = trial.errors[result]
+        lost = sum(
+            losses[name].get(trial.settings[name], {}).get(result, 0.0) ** 2 for name in losses
+        )
+        rests.append(max(value**2 - lost, (LEAST_REST * value) ** 2))
+        ratios.append((low / max(value, 1e-12), high / max(value, 1e-12)))
+    if not rests:
+        return None
+    return median(rests), median(r[0] for r in ratios), median(r[1] for r in ratios)
+
+
+def expected_errors(load: Workload, lost: Mapping[str, float]) -> dict[str, Expected]:
+    """Return the errors that follow from squared differences of the results."""
+    found = {}
+    for kind in load.kinds:
+        rest = rest_of(load, kind.name)
+        if rest is not None:
+            value = math.sqrt(rest[0] + lost.get(kind.name, 0.0))
+            found[kind.name] = Expected(value, value * rest[1], value * rest[2], kind.unit, True)
+        elif kind.name in lost:
+            value = math.sqrt(lost[kind.name])
+            found[kind.name] = Expected(value, value, value, kind.unit, False)
+    return found
+
+
+def front(load: Workload) -> list[Point]:
+    """Return the choices that no other beats in time and error, the quickest first."""
+    scale = _scales(load)
+    states: list[tuple[dict[str, str], dict[str, float], dict[str, float], bool]]
+    states = [({}, {}, dict.fromkeys(scale, 0.0), True)]
+    for stage in load.stages:
+        grown = []
+        for settings, each, lost, same in states:
+            for label in labels_of(load, stage.name):
+                there, share = load.done.get(stage.name, ("", 0.0))
+                kept = same and label == there
+                seconds = stage_seconds(load, stage, label, 1.0 - share if kept else 1.0)
+                more = load.measured.losses.get(stage.name, {}).get(label, {})
+                squares = {r: lost[r] + more.get(r, 0.0) ** 2 for r in lost}
+                grown.append(
+                    ({**settings, stage.name: label}, {**each, stage.name: seconds}, squares, kept)
+                )
+        states = _best(grown, scale)
+    points = [_point(load, scale, *state[:3]) for state in states]
+    points.sort(key=lambda p: (p.seconds, p.worse))
+    kept_points: list[Point] = []
+    for point in points:
+        if not kept_points or point.worse < kept_points[-1].worse - 1e-9:
+            kept_points.append(point)
+    return kept_points
+
+
+def _scales(load: Workload) -> dict[str, float]:
+    """Return what a result's error is counted in: what the dearest settings leave, or differences.
+
+    Results that no setting changes are left out.
+    """
+    found = {}
+    for kind in load.kinds:
+        changes = [
+            row.get(kind.name, 0.0) for ladder in load.measured.losses.values()
+            for row in ladder.values()
+        ]  # fmt: skip
+        rest = rest_of(load, kind.name)
+        size = math.sqrt(rest[0]) if rest else max(changes, default=0.0)
+        if any(changes):
+            found[kind.name] = max(size, 1e-12)
+    return found
+
+
+def _worse(scale: Mapping[str, float], errors: Mapping[str, Expected]) -> float:
+    return sum(errors[name].value / size for name, size in scale.items())
+
+
+def _best(states: list, scale: Mapping[str, float]) -> list:
+    """Drop partial choices that another one beats in time and in every result."""
+    states.sort(key=lambda s: (sum(s[1].values()), sum(s[2][r] / scale[r] ** 2 for r in scale)))
+    kept: list = []
+    for state in states:
+        beaten = any(
+            (other[3] or not state[3]) and all(other[2][r] <= state[2][r] for r in scale)
+            for other in kept
+        )
+        if not beaten:
+            kept.append(state)
+    return kept[:STATES]
+
+
+def _point(
+    load: Workload,
+    scale: Mapping[str, float],
+    settings: dict[str, str],
+    each: dict[str, float],
+    lost: Mapping[str, float],
+) -> Point:
+    errors = expected_errors(load, lost)
+    return Point(settings, sum(each.values()), each, _worse(scale, errors), errors)
+
+
+def point_of(load: Workload, settings: Mapping[str, str]) -> Point:
+    """Predict time and errors of given settings."""
+    (point,) = front(replace(load, fixed=settings))
+    return point
+
+
+def goal_result(load: Workload, goal: Goal) -> str:
+    """Return the name of the first result whose error is stated in a goal's unit.
+
+    Raises:
+        ConfigError: no stage states an error in it.
+    """
+    for kind in load.kinds:
+        if kind.unit == goal.unit and rest_of(load, kind.name) is not None:
+            return kind.name
+    raise ConfigError(
+        f"--error: no stage states its error in {goal.unit}; give --budget, or another unit"
+    )
+
+
+def choose(points: Sequence[Point], seconds: float, goal: tuple[str, float] | None) -> Point:
+    """Return the best point within the time; with a goal, the quickest that reaches it.
+
+    Where none fits, the quickest.
+    """
+    fitting = [point for point in points if point.seconds <= seconds] or [points[0]]
+    if goal is not None:
+        name, value = goal
+        reaching = [p for p in fitting if p.errors[name].value <= value]
+        if reaching:
+            return reaching[0]
+    return fitting[-1]

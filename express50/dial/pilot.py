@@ -1,0 +1,383 @@
+"""Measure on a few items what the settings of every stage cost, and what they do to the results.
+
+A trial is a small dataset below ``.staging/pilot``: one subject, cut to a few peaks once these are
+known. The first trial runs every stage at its cheapest setting. Each other trial starts as a linked
+copy of it with one stage set higher; the runner then makes only what that changes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from statistics import mean, median
+from typing import Any
+
+from express50.capture.index import read_index
+from express50.contract.layout import Dataset
+from express50.contract.stage import Stage, typical_error
+from express50.dial.budget import Clock
+from express50.dial.footage import Footage, footage_of
+from express50.dial.results import RESULTS, ResultKind, differences, whole_peaks
+from express50.errors import ConfigError, DiskFullError, Express50Error, FormatError
+from express50.files.atomic import write_json
+from express50.files.digests import files_of, value_digest
+from express50.files.text import read_json_table
+from express50.runner.executor import Pool
+from express50.runner.ledger import Ledger, Receipt
+from express50.runner.replaced import keeping
+from express50.runner.runner import run_stage
+
+PEAKS = 3  # expressions of a trial
+STEEPER = 3.0  # a setting that was not tried may cost so many times the one below it
+Ladder = Mapping[str, Any]  # configurations of a stage by the name of the setting, cheapest first
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cost:
+    """What an item of a stage costs: typical seconds, and bytes; the most memory.
+
+    ``extra`` are seconds of the clock that the stage took beside its items.
+    """
+
+    seconds: float
+    core_seconds: float
+    bytes: float
+    memory: float
+    items: int
+    extra: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """One run of the chain on a few items.
+
+    Attributes:
+        settings: name of the setting of each stage.
+        footage: what it ran on.
+        scripted: expressions of the whole capture.
+        costs: of each stage.
+        errors: ``[value, low, high]`` that stages state of each result.
+        failed: why a stage made nothing.
+        folder: of its outputs.
+    """
+
+    settings: dict[str, str]
+    footage: Footage
+    scripted: float
+    costs: dict[str, Cost]
+    errors: dict[str, list[float]]
+    failed: dict[str, str]
+    folder: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class PilotFigures:
+    """What was measured of a dataset.
+
+    Attributes:
+        key: digest of stages, settings and machine; figures of another key say nothing.
+        trials: the first at the cheapest settings, the second of one peak, then one step each.
+        losses: per stage, setting and result: the difference to the dearest setting tried.
+        untried: settings that there was no time to try, by stage.
+    """
+
+    key: str
+    trials: list[Trial]
+    losses: dict[str, dict[str, dict[str, float]]]
+    untried: dict[str, list[str]] = field(default_factory=dict)
+
+
+def key_of(known: Sequence[Stage], ladders: Mapping[str, Ladder], threads: int) -> str:
+    """Return a digest of everything that measured figures depend on but the footage."""
+    steps = {
+        stage.name: [stage.version, {k: vars(c) for k, c in ladders[stage.name].items()}]
+        for stage in known
+    }
+    return value_digest([steps, os.cpu_count(), threads])[:16]
+
+
+def read_measured(path: Path, key: str | None = None) -> PilotFigures | None:
+    """Read what was measured; None where nothing was, or with another key."""
+    if not path.is_file():
+        return None
+    table = read_json_table(path, FormatError, "delete it, and it is measured again")
+    try:
+        if key is not None and table["key"] != key:
+            return None
+        trials = [_trial_of(row) for row in table["trials"]]
+        return PilotFigures(
+            key=table["key"], trials=trials, losses=table["losses"], untried=table["untried"]
+        )
+    except (KeyError, TypeError) as error:
+        raise FormatError(f"{path}: not figures of a pilot ({error}); delete it") from error
+
+
+def _trial_of(row: Mapping[str, Any]) -> Trial:
+    costs = {name: Cost(**cost) for name, cost in row["costs"].items()}
+    return Trial(**{**row, "costs": costs, "footage": Footage(**row["footage"])})
+
+
+@dataclass
+class Pilot:
+    """Runs trials.
+
+    Attributes:
+        dataset: the dataset to measure.
+        subject: whose footage the trials use.
+        stages: in order.
+        ladders: settings of each stage.
+        pool: workers.
+        clock: counts what trials spend, and stops them.
+        tell: takes a line for people.
+        kinds: results that are compared.
+    """
+
+    dataset: Dataset
+    subject: str
+    stages: Sequence[Stage]
+    ladders: Mapping[str, Ladder]
+    pool: Pool
+    clock: Clock
+    tell: Callable[[str], None]
+    kinds: Sequence[ResultKind] = RESULTS
+
+    def trial(self, settings: Mapping[str, str], peaks: int, source: Trial | None) -> Trial:
+        """Run one trial, or read it if it ran before."""
+        name = value_digest([dict(settings), peaks, self.subject])[:12]
+        root = pilot_dir(self.dataset) / name
+        record = root / "trial.json"
+        if record.is_file():
+            return _trial_of(json.loads(record.read_text(encoding="utf-8")))
+        shutil.rmtree(root, ignore_errors=True)
+        if source is None:
+            self._begin(root)
+        else:
+            shutil.copytree(source.folder, root, copy_function=_link)
+            (root / "trial.json").unlink()
+        dataset = Dataset(root)
+        costs, failed = dict(source.costs) if source else {}, {}
+        for stage in self.stages:
+            try:
+                cost, why = self._run(
+                    stage, dataset, self.ladders[stage.name][settings[stage.name]]
+                )
+            except (ConfigError, DiskFullError):
+                raise
+            except Express50Error as error:  # an earlier stage made nothing, perhaps
+                cost, why = None, str(error)
+            if cost is not None:
+                costs[stage.name] = cost
+            if why:
+                failed[stage.name] = why
+            _cut_peaks(dataset, self.subject, peaks)
+        count = len(_rows(dataset.peaks_file(self.subject)))
+        whole = footage_of(dataset)
+        footage = replace(whole, expressions=float(max(1, count)))
+        errors = stated_errors(dataset, [stage.name for stage in self.stages], self.kinds)
+        done = Trial(
+            settings=dict(settings),
+            footage=footage,
+            scripted=whole.expressions,
+            costs=costs,
+            errors=errors,
+            failed=failed,
+            folder=str(root),
+        )
+        if not self.clock.closed():
+            write_json(record, asdict(done))
+        return done
+
+    def _begin(self, root: Path) -> None:
+        """Start a dataset with one capture, and the labels that people gave."""
+        capture = self.dataset.captures()[self.subject]
+        root.mkdir(parents=True)
+        write_json(root / "captures.json", {self.subject: str(capture.resolve())})
+        if (self.dataset.root / "labels").is_dir():
+            shutil.copytree(self.dataset.root / "labels", root / "labels")
+
+    def _run(self, stage: Stage, dataset: Dataset, config: Any) -> tuple[Cost | None, str]:
+        """Run a stage; returns what an item cost, if any was made, and why all failed."""
+        if not stage.items(dataset):
+            return None, "an earlier stage made nothing for it"
+        summary = run_stage(stage, dataset, config, pool=self.pool, progress=False, gate=self.clock)
+        made = {o.item for o in summary.outcomes if o.status == "done"}
+        failures = [o.reason for o in summary.outcomes if o.status == "failed"]
+        with Ledger(dataset.ledger, read_only=True) as ledger:
+            receipts = [r for i, r in ledger.read(stage.name).items() if i in made]
+        why = failures[0] if len(failures) == len(summary.outcomes) else ""
+        if not receipts:
+            return None, why
+        width = min(self.pool.width(), len(receipts))
+        extra = max(0.0, summary.seconds - sum(r.seconds for r in receipts) / width)
+        return cost_of(dataset, stage.name, receipts, extra), why
+
+
+def cost_of(dataset: Dataset, stage: str, receipts: Sequence[Receipt], extra: float = 0.0) -> Cost:
+    """Sum up what items cost; a first item that loads libraries counts little in the median."""
+    typical = median if len(receipts) > 2 else mean
+    folders = [dataset.item_dir(stage, receipt.item) for receipt in receipts]
+    return Cost(
+        seconds=typical(r.seconds for r in receipts),
+        core_seconds=typical(r.core_seconds or r.seconds for r in receipts),
+        bytes=mean(sum(p.stat().st_size for p in files_of(folder)) for folder in folders),
+        memory=max(r.peak_memory for r in receipts),
+        items=len(receipts),
+        extra=extra,
+    )
+
+
+def pilot_dir(dataset: Dataset) -> Path:
+    """Return the folder of a dataset's trials."""
+    return dataset.staging_dir / "pilot"
+
+
+def keep_for_run(dataset: Dataset, trials: Sequence[Trial], settings: Mapping[str, str]) -> None:
+    """Move what trials made at chosen settings to the store of replaced outputs.
+
+    The run takes an output from there where it would make the same.
+    """
+    for name, label in settings.items():
+        moved: set[str] = set()
+        for trial in trials:
+            if trial.settings[name] != label or not trial.folder:
+                continue
+            folder = Dataset(Path(trial.folder))
+            for subject in folder.subjects():
+                with suppress(FileNotFoundError):  # the peaks before they were cut
+                    whole_peaks(folder, subject).rename(folder.peaks_file(subject))
+            with Ledger(folder.ledger, read_only=True) as ledger:
+                receipts, made = ledger.read(name), ledger.made(name)
+            for item in made.keys() - moved:
+                keep = keeping(dataset, replace(receipts[item], made=made[item]))
+                if keep is not None and folder.item_dir(name, item).is_dir():
+                    keep(folder.item_dir(name, item))
+                    moved.add(item)
+
+
+def _link(source: str, target: str) -> None:
+    """Link a file that is only ever replaced; copy one that is written to."""
+    written = Path(source).name.startswith("ledger.sqlite") or source.endswith(".jsonl")
+    (shutil.copy2 if written else os.link)(source, target)
+
+
+def _rows(path: Path) -> dict[str, Any]:
+    return read_json_table(path, FormatError) if path.is_file() else {}
+
+
+def _cut_peaks(dataset: Dataset, subject: str, count: int) -> None:
+    """Leave a few peaks, spread over the script, the first of it among them."""
+    path, whole = dataset.peaks_file(subject), whole_peaks(dataset, subject)
+    if not path.is_file():
+        return
+    if not whole.is_file():
+        shutil.copy2(path, whole)
+    rows = _rows(whole)
+    order = [cue.expression_id for cue in read_index(dataset, subject).cues]
+    names = sorted(rows, key=lambda name: order.index(name) if name in order else len(order))
+    kept = {names[round(k * (len(names) - 1) / max(1, count - 1))] for k in range(count)} & {*names}
+    if kept != _rows(path).keys():
+        write_json(path, {name: rows[name] for name in rows if name in kept})
+
+
+def stated_errors(
+    dataset: Dataset, names: Sequence[str], kinds: Sequence[ResultKind]
+) -> dict[str, list[float]]:
+    """Return what stages state about the error of each result: value, low and high."""
+    found = {}
+    with Ledger(dataset.ledger, read_only=True) as ledger:
+        for kind in kinds:
+            for name in kind.made_by(names):
+                error = typical_error(r.metrics for r in ledger.read(name).values())
+                if error is not None and error.unit == kind.unit and kind.name not in found:
+                    found[kind.name] = [error.value, error.low, error.high]
+    return found
+
+
+def tradable(
+    names: Sequence[str], ladders: Mapping[str, Ladder], kinds: Sequence[ResultKind]
+) -> list[str]:
+    """List the stages that have a choice and stand before the last measured result.
+
+    What a later stage's settings do cannot be measured here, so it keeps its standard one.
+    """
+    makers = [name for kind in kinds for name in kind.made_by(names)]
+    last = max((list(names).index(name) for name in makers), default=-1)
+    return [name for name in names[: last + 1] if len(ladders[name]) > 1]
+
+
+def measure(pilot: Pilot, allowance: float) -> PilotFigures:
+    """Run trials, the cheapest first, as far as the allowance of time goes.
+
+    The first one, at the cheapest settings, always runs to its end or to that of the budget.
+    """
+    names = [stage.name for stage in pilot.stages]
+    choices = tradable(names, pilot.ladders, pilot.kinds)
+    cheapest = {n: next(iter(pilot.ladders[n])) if n in choices else standard_of(pilot.ladders[n])
+                for n in names}  # fmt: skip
+    pilot.tell(f"measuring on {PEAKS} expressions of one subject; every stage at its cheapest")
+    base = pilot.trial(cheapest, PEAKS, None)
+    began, trials = pilot.clock.now(), [base]
+    untried: dict[str, list[str]] = {}
+    key = key_of(pilot.stages, pilot.ladders, pilot.pool.threads)
+    if pilot.clock.closed():
+        return PilotFigures(key=key, trials=trials, losses={})
+    steps = [(name, label) for name in choices for label in list(pilot.ladders[name])[1:]]
+    steps.sort(key=lambda step: _guess(base, names, step[0]))
+    grown: dict[str, float] = {}
+    if base.footage.expressions > 1 and _guess(base, names, names[0]) < allowance:
+        trials.append(pilot.trial(cheapest, 1, base))
+    for name, label in steps:
+        factor = grown.get(name, STEEPER)
+        expected = _guess(base, names, name, factor)
+        if pilot.clock.now() - began + expected > allowance:
+            untried.setdefault(name, []).append(label)
+            continue
+        pilot.tell(f"measuring {name} {label}")
+        trial = pilot.trial(cheapest | {name: label}, PEAKS, base)
+        if pilot.clock.closed():
+            untried.setdefault(name, []).append(label)
+            break
+        trials.append(trial)
+        if name in trial.costs and name in base.costs:
+            ratio = trial.costs[name].core_seconds / max(base.costs[name].core_seconds, 1e-9)
+            grown[name] = STEEPER * max(1.0, ratio)
+    losses = {name: _losses(pilot, trials, cheapest, name) for name in choices}
+    return PilotFigures(key=key, trials=trials, losses=losses, untried=untried)
+
+
+def standard_of(ladder: Ladder) -> str:
+    """Return the name of the standard setting, or of the one there is."""
+    return "standard" if "standard" in ladder else next(iter(ladder))
+
+
+def _guess(base: Trial, names: Sequence[str], name: str, factor: float = 1.0) -> float:
+    """Guess the seconds of a trial that changes a stage: it, and all that follows."""
+    later = names[names.index(name) :]
+    known = [(n, base.costs[n]) for n in later if n in base.costs]
+    each = (cost.seconds * cost.items * (factor if n == name else 1.0) for n, cost in known)
+    return sum(each)
+
+
+def _losses(
+    pilot: Pilot, trials: Sequence[Trial], cheapest: Mapping[str, str], name: str
+) -> dict[str, dict[str, float]]:
+    """Compare the results at each tried setting of a stage with those at the dearest."""
+    full = [t for t in trials if t.footage.expressions == trials[0].footage.expressions]
+    tried = {
+        label: next((t for t in full if t.settings == {**cheapest, name: label}), None)
+        for label in pilot.ladders[name]
+    }
+    good = {label: t for label, t in tried.items() if t is not None and name not in t.failed}
+    if not good:
+        return {}
+    best = Dataset(Path(list(good.values())[-1].folder))
+    found = {}
+    for label, trial in good.items():
+        other = Dataset(Path(trial.folder))
+        found[label] = differences(other, best, pilot.subject, pilot.kinds) if other != best else {}
+    return found

@@ -1,0 +1,44 @@
+"""Budgets and goals as people write them."""
+
+import pytest
+
+from express50.dial.budget import Clock, parse_budget, parse_goal
+from express50.errors import ConfigError
+from express50.runner.ledger import Receipt
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds", "cores"),
+    [("90s", 90, False), ("45m", 2700, False), ("45min", 2700, False), ("1h30m", 5400, False),
+     ("1.5h", 5400, False), ("2d", 172800, False), ("40ch", 144000, True)],
+)  # fmt: skip
+def test_budgets_are_read(text, seconds, cores):
+    budget = parse_budget(text)
+    assert (budget.seconds, budget.cores) == (seconds, cores)
+
+
+@pytest.mark.parametrize("text", ["", "2", "h", "0h", "2x", "1h2", "-1h", "1h 2m", "1h3ch", "nan"])
+def test_what_is_no_time_is_refused(text):
+    with pytest.raises(ConfigError, match="expected a time such as 45m"):
+        parse_budget(text)
+
+
+def test_goals_are_read():
+    assert (parse_goal("0.5mm").value, parse_goal(".004alpha").unit) == (0.5, "alpha")
+    for text in ("mm", "0mm", "0.5", "0.5 parsec", "-1mm"):
+        with pytest.raises(ConfigError, match=r"expected such as 0\.5mm"):
+            parse_goal(text)
+
+
+def test_a_clock_counts_sessions_and_closes_before_what_does_not_fit():
+    clock = Clock(parse_budget("100ch"), spent=100 * 3600 - 10.0)
+    assert not clock.closed()
+    receipt = Receipt(stage="s", item="i", fingerprint="f", status="done", core_seconds=4.0)
+    clock.settled(receipt)
+    assert clock.left() == pytest.approx(6.0)
+    clock.expect(item=7.0)
+    assert clock.closed()
+    clock.expect(item=5.0, early=2.0)  # what comes later needs two
+    assert clock.closed()
+    clock.expect(item=5.0)
+    assert not clock.closed()

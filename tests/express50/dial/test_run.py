@@ -1,0 +1,196 @@
+"""Budgeted runs of a toy chain: what is chosen, promised and kept, and how they go on."""
+
+import itertools
+import json
+import shutil
+
+import pytest
+
+from express50.contract.layout import Dataset
+from express50.dial.budget import parse_budget, parse_goal
+from express50.dial.pilot import pilot_dir
+from express50.dial.run import closing_lines, dial_dir, run_within
+from express50.dial.tune import tune
+from express50.errors import ConfigError
+from express50.runner.runner import run_stage
+from tests.express50.dial.toy_chain import (
+    FAILS,
+    PAUSE,
+    STOPS,
+    StepsConfig,
+    captures_of,
+    chain_of,
+    error_of,
+)
+from tests.faults.toy import tree
+
+STEPS = {"draft": 1, "standard": 4, "reference": 16}
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory):
+    return captures_of(tmp_path_factory.mktemp("captures"))
+
+
+def go(root, captures, budget=None, goal=None, said=None):
+    chain = chain_of(root, captures, said)
+    budget = None if budget is None else parse_budget(budget)
+    goal = None if goal is None else parse_goal(goal)
+    return run_within(chain, budget, goal, lambda stage, summary: None)
+
+
+def outputs(root):
+    dataset = Dataset(root)
+    return {name: tree(dataset.stage_dir(name)) for name in ("ingest", "align", "solve", "map")}
+
+
+def test_much_time_buys_the_dearest_settings_and_the_promise_is_the_error(tmp_path, captures):
+    said = []
+    summaries, state = go(tmp_path / "d", captures, "5m", said=said)
+    assert state.finished and all(summary.ok for summary in summaries)
+    assert state.settings == {
+        "ingest": "standard", "align": "standard", "solve": "reference", "map": "reference"
+    }  # fmt: skip
+    promised = state.promised["value"]
+    assert promised["value"] == pytest.approx(error_of(state.settings), rel=0.05)
+    assert promised["low"] < error_of(state.settings) < promised["high"]
+    assert any("expected: value 0.5" in line for line in said)
+    assert any("draft:" in line and "less, value +" in line for line in said)
+    assert not pilot_dir(Dataset(tmp_path / "d")).exists()
+    for path in dial_dir(Dataset(tmp_path / "d")).iterdir():  # figures name nobody
+        assert "S0" not in path.read_text() and "S1" not in path.read_text()
+
+
+def test_the_front_is_the_one_that_trying_everything_gives(tmp_path, captures, monkeypatch):
+    monkeypatch.setenv(PAUSE, "0.02")  # seconds that a busy machine does not drown
+    table, lines = tune(chain_of(tmp_path / "d", captures))
+    peaks, subjects = 4, 3
+    cost = {  # map takes two pauses per step and peak
+        (solve, fit): subjects * peaks * (STEPS[solve] + 2 * STEPS[fit])
+        for solve, fit in itertools.product(STEPS, STEPS)
+    }
+    error = {c: error_of({"solve": c[0], "map": c[1]}) for c in cost}
+    best = {
+        c for c in cost
+        if not any(cost[o] <= cost[c] and error[o] < error[c] - 1e-9 for o in cost)
+        and not any(cost[o] < cost[c] and error[o] <= error[c] + 1e-9 for o in cost)
+    }  # fmt: skip
+    found = [(p["settings"]["solve"], p["settings"]["map"]) for p in table["front"]]
+    assert set(found) == best
+    errors = [p["errors"]["value"]["value"] for p in table["front"]]
+    assert errors == sorted(errors, reverse=True)
+    for choice, value in zip(found, errors, strict=True):
+        assert value == pytest.approx(error[choice], rel=0.12)
+    head, *rows = (dial_dir(Dataset(tmp_path / "d")) / "front.csv").read_text().splitlines()
+    assert head.startswith("point,seconds,value_mm,value_mm_low,value_mm_high,ingest")
+    assert len(rows) == len(found) + 3 and any("reference" in line for line in lines)
+
+
+def test_a_tight_budget_takes_the_best_that_fits(tmp_path, captures, monkeypatch):
+    monkeypatch.setenv(PAUSE, "0.02")
+    table, _ = tune(chain_of(tmp_path / "d", captures))
+    middle = table["front"][len(table["front"]) // 2]
+    budget = f"{middle['seconds'] * 1.2 + 0.5:.1f}s"
+    _, state = go(tmp_path / "d", captures, budget)
+    assert state.promised["value"]["value"] <= middle["errors"]["value"]["value"]
+    assert state.promised["value"]["value"] > table["front"][-1]["errors"]["value"]["value"]
+    assert state.finished and state.spent <= parse_budget(budget).seconds * 1.1
+
+
+def test_a_budget_below_the_cheapest_settings_says_what_the_least_is(tmp_path, captures):
+    with pytest.raises(ConfigError, match=r"the cheapest settings need about .* give --budget"):
+        go(tmp_path / "d", captures, "1s")
+    assert not (tmp_path / "d" / "map").exists()
+
+
+def test_a_goal_is_reached_in_the_least_time_or_refused(tmp_path, captures):
+    _, state = go(tmp_path / "d", captures, goal="0.8mm")
+    assert error_of(state.settings) <= 0.8
+    assert state.settings["solve"] == "standard" and state.settings["map"] == "standard"
+    with pytest.raises(ConfigError, match=r"--error 0\.1mm: the dearest settings give value 0\.5"):
+        go(tmp_path / "d", captures, goal="0.1mm")
+    with pytest.raises(ConfigError, match="no stage states its error in px"):
+        go(tmp_path / "d", captures, goal="1px")
+
+
+@pytest.mark.parametrize("place", ["solve S1", "map S2/e1"])
+def test_an_interrupted_run_goes_on_with_its_choices_and_ends_alike(
+    tmp_path, captures, monkeypatch, place
+):
+    tune(chain_of(tmp_path / "d", captures))
+    monkeypatch.setenv(STOPS, place)
+    with pytest.raises(KeyboardInterrupt):
+        go(tmp_path / "d", captures, "5m")
+    before = json.loads((dial_dir(Dataset(tmp_path / "d")) / "run.json").read_text())
+    said = []
+    _, state = go(tmp_path / "d", captures, "5m", said=said)
+    assert state.settings == before["settings"] and state.spent > before["spent"] > 0
+    assert any("going on" in line for line in said) and state.finished
+    other = chain_of(tmp_path / "other", captures)
+    for stage in other.stages:
+        config = other.ladders[stage.name][state.settings[stage.name]]
+        run_stage(stage, other.dataset, config, workers=0, progress=False)
+    assert outputs(tmp_path / "d") == outputs(tmp_path / "other")
+
+
+def test_a_finished_run_has_nothing_more_to_do(tmp_path, captures):
+    go(tmp_path / "d", captures, "5m")
+    summaries, state = go(tmp_path / "d", captures, "5m")
+    assert state.finished and all(s.count("done") == 0 for s in summaries)
+
+
+def test_outputs_of_the_pilot_are_not_made_twice(tmp_path, captures):
+    summaries, state = go(tmp_path / "d", captures, "5m")
+    restored = {s.stage: sum(o.restored for o in s.outcomes) for s in summaries}
+    assert restored["ingest"] == 1 and restored["align"] == 1
+
+
+def test_a_slower_machine_than_measured_gets_cheaper_settings(tmp_path, captures, monkeypatch):
+    monkeypatch.setenv(PAUSE, "0.01")
+    tune(chain_of(tmp_path / "d", captures))
+    monkeypatch.setenv(PAUSE, "0.05")
+    said = []
+    _, state = go(tmp_path / "d", captures, "8s", said=said)
+    assert state.settings["map"] != "reference" and any("behind time" in line for line in said)
+    assert state.changes
+
+
+def test_time_that_runs_out_leaves_items_for_a_larger_budget(tmp_path, captures, monkeypatch):
+    def one_setting(budget):
+        chain = chain_of(tmp_path / "d", captures)
+        chain.ladders |= {name: {"standard": StepsConfig()} for name in ("solve", "map")}
+        return run_within(chain, parse_budget(budget), None, lambda stage, summary: None)
+
+    monkeypatch.setenv(PAUSE, "0.02")
+    one_setting("5m")
+    shutil.rmtree(tmp_path / "d" / "map")
+    shutil.rmtree(tmp_path / "d" / "solve")
+    monkeypatch.setenv(PAUSE, "0.1")
+    summaries, state = one_setting("5s")  # 1.9 s at the measured speed, 9.6 s now
+    assert not state.finished and state.spent < 5 * 1.4
+    assert any("left" in line for line in closing_lines(state, summaries))
+    made = len(list((tmp_path / "d" / "map").glob("*/*")))
+    monkeypatch.setenv(PAUSE, "0.001")
+    summaries, state = one_setting("6s")
+    assert state.finished and summaries[-1].count("skipped") == made < 12
+
+
+def test_one_item_is_enough(tmp_path):
+    captures = captures_of(tmp_path / "captures", subjects=1, expressions=1)
+    _, state = go(tmp_path / "d", captures, "5m")
+    assert state.finished and state.settings["map"] == "reference"
+
+
+def test_a_setting_that_fails_in_the_pilot_is_not_chosen(tmp_path, captures, monkeypatch):
+    monkeypatch.setenv(FAILS, "map 1")  # the cheapest, which the first trial runs
+    _, state = go(tmp_path / "d", captures, "5m")
+    assert state.finished and state.settings["map"] == "reference"
+    monkeypatch.setenv(FAILS, "solve 16")
+    _, state = go(tmp_path / "e", captures, "5m")
+    assert state.finished and state.settings["solve"] == "standard"
+
+
+def test_core_hours_count_processor_time_alone(tmp_path, captures):
+    _, state = go(tmp_path / "d", captures, "0.02ch")
+    assert state.finished and state.settings["map"] == "reference"
+    assert 0 < state.spent < 30  # the toys sleep
