@@ -207,8 +207,7 @@ def run_ui(args: argparse.Namespace) -> int:
         order=args.order,
         blind=args.blind,
     )
-    if not (sys.stdin.isatty() and sys.stdout.isatty()):
-        raise AnnotationError("the annotator needs a terminal; use 'express50 annotate mark' here")
+    _check_terminal()
     cell = None
     if args.pictures == "sixel":
         cell = cell_size()
@@ -217,6 +216,28 @@ def run_ui(args: argparse.Namespace) -> int:
     done, total = session.done, len(session.tasks)
     words = f"{done} of {total} done by {session.annotator}"
     return answer(args, {"done": done, "tasks": total}, words)
+
+
+def _check_terminal() -> None:
+    """Refuse terminals that the annotator cannot draw on.
+
+    Raises:
+        AnnotationError: there is none, it cannot place text, or its texts are not in Unicode.
+    """
+    without = "use 'express50 annotate mark' here"
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        raise AnnotationError(f"the annotator needs a terminal; {without}")
+    name = os.environ.get("TERM", "")
+    if name in ("", "dumb", "unknown"):
+        raise AnnotationError(
+            f"TERM is {name!r}, a terminal that cannot place text; set TERM to what yours is, such"
+            f" as xterm-256color, or {without}"
+        )
+    if sys.stdout.encoding.lower().replace("-", "") != "utf8":
+        raise AnnotationError(
+            f"the annotator draws in UTF-8, and this terminal's texts are {sys.stdout.encoding};"
+            f" set LC_ALL=C.UTF-8 and unset PYTHONIOENCODING, or {without}"
+        )
 
 
 def _matching(names: Iterable[str], pattern: str | None, what: str) -> list[str]:

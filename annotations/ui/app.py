@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from rich.text import Text
 from textual import events, work
 from textual.app import App, ComposeResult
 from textual.binding import Binding
 from textual.containers import Horizontal, Vertical
+from textual.filter import LineFilter
 from textual.geometry import Size
 from textual.screen import Screen
 from textual.timer import Timer
@@ -431,6 +432,10 @@ class AnnotateApp(App[None]):
         self.session = session
         self.cache = FrameCache(session.dataset)
         self.desk = Desk(session, self.cache, faces, sixel_cell)
+
+    def get_line_filters(self) -> Sequence[LineFilter]:
+        """Return what lines pass before they are drawn; Textual's own for NO_COLOR leaves greys."""
+        return [theme.UNCOLOURED] if self.no_color else super().get_line_filters()
 
     def on_mount(self) -> None:
         """Show the desk."""

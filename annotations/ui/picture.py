@@ -79,9 +79,16 @@ class PicturePane(Widget):
         painter = self._painter if self.screen.is_active else self._blocks
         shot = shot_of(self.look, painter.shape(self.size))
         try:
-            return painter.strips(shot, self.size, self._cache.get)
+            return painter.strips(shot, self.size, self._read)
         except AnnotationError as error:
             return self._written(str(error))
+
+    def _read(self, crop: FrameCrop) -> np.ndarray:
+        picture = self._cache.get(crop)
+        if not self.app.no_color:
+            return picture
+        grey = picture @ np.array([0.299, 0.587, 0.114])  # luma, ITU-R BT.601
+        return np.repeat(np.rint(grey).astype(np.uint8)[..., None], 3, axis=2)
 
     def _written(self, words: str) -> list[Strip]:
         """Write words in the middle of the pane."""
@@ -89,7 +96,10 @@ class PicturePane(Widget):
         text = Text(words, style=theme.DIM, justify="center")
         middle = Align.center(text, theme.PLAIN, vertical="middle", width=max(1, width - 4))
         options = self.app.console.options.update(width=width, height=height)
-        return [Strip(line, width) for line in self.app.console.render_lines(middle, options)]
+        lines = [Strip(line, width) for line in self.app.console.render_lines(middle, options)]
+        if not self.app.no_color:
+            return lines
+        return [line.apply_filter(theme.UNCOLOURED, self.background_colors[1]) for line in lines]
 
 
 AHEAD = 64  # frames about the cursor that are decoded before they are asked for

@@ -6,9 +6,13 @@ keys, and the help shows them.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
+from rich.segment import Segment
 from rich.style import Style
+from textual.color import Color
+from textual.filter import LineFilter
 
 GROUND = "#101318"
 PANEL = "#181c23"
@@ -31,6 +35,25 @@ MINE = Style(color=BLUE, bgcolor=GROUND, bold=True)
 PLATEAU = Style(color=BLUE, bgcolor=GROUND)
 CURSOR = Style(bgcolor="#5e4012")
 CURSOR_BAR = Style(color=ACCENT, bgcolor="#5e4012")
+
+
+class Uncoloured(LineFilter):
+    """Takes the colours away, for NO_COLOR; what stands out by its ground is shown in reverse."""
+
+    def apply(self, segments: list[Segment], background: Color) -> list[Segment]:
+        """Return segments without colours."""
+        del background
+        return [Segment(text, s and _uncoloured(s), control) for text, s, control in segments]
+
+
+UNCOLOURED = Uncoloured()
+
+
+@lru_cache(1024)
+def _uncoloured(style: Style) -> Style:
+    ground = style.bgcolor.get_truecolor().hex if style.bgcolor is not None else GROUND
+    stands_out = bool(style.reverse) or ground not in (GROUND, PANEL)
+    return Style(bold=style.bold, underline=style.underline, reverse=stands_out)
 
 
 SCREEN_STYLE = f"""
@@ -112,6 +135,7 @@ LOOK = (
     KeyAction("b", "b", "blink", "blink: reference and frame in one place"),
     KeyAction("space", "Space", "play", "play the window, or stop"),
     KeyAction("question_mark,f1", "?", "help", "this help"),
+    KeyAction("ctrl+z", "Ctrl-Z", "app.suspend_process", "to the shell; fg comes back"),
     KeyAction("q", "q", "app.quit", "leave; every mark is already saved"),
 )
 GROUPS = (MOVE, DECIDE, LOOK)

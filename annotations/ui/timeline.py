@@ -144,6 +144,9 @@ class CurveStrip(Widget):
         """Return the lines of the strip, past Textual's cache of styled lines, which is slower."""
         lines = draw_strip(self._content, *self.size)
         lines += [Strip.blank(self.size.width, theme.PLAIN)] * self.size.height
+        if self.app.no_color:
+            ground = self.background_colors[1]
+            lines = [line.apply_filter(theme.UNCOLOURED, ground) for line in lines]
         return [line.crop(crop.x, crop.right) for line in lines[crop.y : crop.bottom]]
 
 

@@ -270,8 +270,8 @@ def load_fan(path: Path) -> torch.jit.ScriptModule:
         with torch.inference_mode():
             output = _heat(fan, torch.zeros(1, 3, FAN_CROP, FAN_CROP))
     except (*DAMAGE, torch.jit.Error) as error:
-        first = str(error).strip().splitlines()[0] if str(error).strip() else "no reason given"
-        raise ConfigError(f"landmarks: {path} cannot be used ({first}); {wanted}") from error
+        # PyTorch's own words are a page, and guess at what happened to the file.
+        raise ConfigError(f"landmarks: {path} cannot be loaded, or not called; {wanted}") from error
     if tuple(output.shape) != (1, POINTS, HEAT, HEAT):
         raise ConfigError(f"landmarks: {path} gives {tuple(output.shape)}; {wanted}")
     return fan

@@ -14,7 +14,7 @@ import numpy as np
 
 from express50.errors import CalibrationError
 from express50.files.calibration import read_cameras
-from express50.files.text import read_yaml, reason
+from express50.files.text import read_json, read_yaml, reason
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_from_opencv
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
@@ -106,12 +106,14 @@ def guess_format(path: Path) -> str:
     """Return the format of a file or folder.
 
     Raises:
-        CalibrationError: it does not exist or fits none.
+        CalibrationError: it does not exist, is a .json that is not JSON, or fits none.
     """
     if not path.exists():
         raise CalibrationError(f"{path}: does not exist")
     found = next((name for name, known in FORMATS.items() if known.fits(path)), None)
     if found is None:
+        if path.suffix == ".json":
+            read_json(path, CalibrationError)  # says what is wrong where it is not JSON
         titles = [known.title for known in FORMATS.values()]
         raise CalibrationError(
             f"{path}: no known calibration; expected {', '.join(titles[:-1])} or {titles[-1]}:"

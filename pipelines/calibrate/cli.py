@@ -134,7 +134,9 @@ def _report(
     say(*(f"warning: {warning}" for warning in verdict.warnings))
     if verdict.problem:
         say(f"wrong: {verdict.problem}")
-        say(f"remedy: {verdict.remedy or 'none of the usual misreadings explains it'}")
+        say(
+            f"remedy: {verdict.remedy or 'not known: no common misreading of conventions explains it'}"
+        )
     elif out is not None:
         say(f"wrote {out}")
     if footage is None:

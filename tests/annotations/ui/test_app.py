@@ -2,12 +2,15 @@
 
 import asyncio
 import json
+import re
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from rich.text import Text
 
+from annotations import cli
 from annotations.labels import append_label, current_labels, make_mark, read_labels
 from annotations.ui import app as app_module
 from annotations.ui.picture import Aim, PicturePane, other_cameras
@@ -16,6 +19,7 @@ from annotations.ui.theme import GROUPS
 from annotations.ui.timeline import CurveStrip
 from annotations.ui.words import fit, hint_line
 from express50.capture.index import read_index
+from express50.errors import AnnotationError
 from tests.annotations.footage import suggest
 
 
@@ -400,3 +404,60 @@ def test_reference_of_another_camera_set_falls_back_to_its_own(suggested, make_a
 def test_no_key_is_bound_twice():
     keys = [k for group in GROUPS for key in group for k in key.keys.split(",")]
     assert len(keys) == len(set(keys))
+
+
+def test_no_color_leaves_words_without_colours_and_pictures_in_grey(
+    suggested, make_app, monkeypatch
+):
+    monkeypatch.setenv("NO_COLOR", "1")
+
+    def colours(app):
+        desk, found = app.desk, {}
+        for name in ("status", "message", "strip", "frame"):
+            widget = desk.query_one(f"#{name}")
+            lines = widget.render_lines(widget.size.region)
+            styles = [s.style for row in lines for s in row if s.style]
+            shades = {c.get_truecolor() for s in styles for c in (s.color, s.bgcolor) if c}
+            shades = {c for c in shades if c != (0, 0, 0)} if name != "frame" else shades
+            found[name] = shades, any(style.reverse for style in styles)
+        return found
+
+    found = drive(make_app(suggested), size=(120, 40), check=colours)
+    for name in ("status", "message", "strip"):
+        assert not found[name][0], name
+    assert found["status"][1] and found["strip"][1]  # what stands out is in reverse
+    assert len(found["frame"][0]) > 3
+    assert all(red == green == blue for red, green, blue in found["frame"][0])
+
+
+def test_ctrl_z_is_bound_and_in_the_help(suggested, make_app, monkeypatch):
+    stopped = []
+
+    def stop(app):
+        stopped.append(app)
+
+    monkeypatch.setattr(app_module.AnnotateApp, "action_suspend_process", stop)
+    app = make_app(suggested)
+    drive(app, "ctrl+z")
+    assert stopped == [app]
+
+
+@pytest.mark.parametrize(
+    ("term", "encoding", "message"),
+    [
+        ("dumb", "utf-8", "TERM is 'dumb', a terminal that cannot place text"),
+        ("", "utf-8", "TERM is '', a terminal that cannot place text"),
+        ("xterm-256color", "ascii", "set LC_ALL=C.UTF-8"),
+    ],
+)
+def test_terminals_that_cannot_be_drawn_on_are_refused(
+    suggested, monkeypatch, term, encoding, message
+):
+    terminal = SimpleNamespace(isatty=lambda: True, fileno=lambda: 1, encoding=encoding)
+    monkeypatch.setattr(cli, "sys", SimpleNamespace(stdin=terminal, stdout=terminal))
+    monkeypatch.setenv("TERM", term)
+    with pytest.raises(AnnotationError, match=re.escape(message)):
+        cli._check_terminal()
+    monkeypatch.setenv("TERM", "one-of-tomorrow")  # not in this machine's list
+    terminal.encoding = "UTF-8"
+    cli._check_terminal()

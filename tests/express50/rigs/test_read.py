@@ -259,11 +259,26 @@ def test_units_become_metres(tmp_path):
 def test_rubbish_is_one_clear_error(tmp_path, content):
     path = tmp_path / "rubbish.json"
     path.write_text(content)
-    with pytest.raises(CalibrationError, match="no known calibration"):
+    with pytest.raises(CalibrationError, match="no known calibration|not JSON"):
         read_rig(path)
     for kind in ("transforms", "nersemble", "express50", "renderme360"):
         with pytest.raises(CalibrationError, match="rubbish.json"):
             read_rig(path, kind)
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("[" * 10**6, "nested too deeply"),
+        ('{"cameras": {"a": 1e400}}', "line 1 holds 1e400"),
+        ('{"cameras": {"a": ', "not JSON"),
+    ],
+)
+def test_json_that_cannot_be_read_is_said(tmp_path, content, reason):
+    path = tmp_path / "rig.json"
+    path.write_text(content)
+    with pytest.raises(CalibrationError, match=reason):
+        read_rig(path)
 
 
 def test_thin_prism_distortion_is_refused(tmp_path):
