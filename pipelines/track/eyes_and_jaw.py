@@ -254,8 +254,7 @@ def _shut(observation: Observation, sides: np.ndarray) -> Observation:
             points[upper] = points[lower] + GAP * (points[upper] - points[lower])
         views.append(replace(view, points=points))
     found, _ = agree(observation.expression, observation.frame, views)
-    refused = observation.refused + found.refused
-    return replace(found, refused=refused, shut=tuple(np.flatnonzero(sides).tolist()))
+    return replace(found, shut=tuple(np.flatnonzero(sides).tolist()))
 
 
 @dataclass(frozen=True)

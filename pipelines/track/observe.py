@@ -58,7 +58,6 @@ class Observation:
         inliers: (views, 68) bool, landmarks that agree with the other views.
         points: (68, 3) triangulated, metres in the world; NaN where under two views agree.
         covariance: (68, 3, 3) of the points, square metres; NaN with them.
-        refused: views left out, as they disagree with the rest.
         shut: eyes that are known to be, as indices of `iris.EYES`.
     """
 
@@ -68,7 +67,6 @@ class Observation:
     inliers: np.ndarray
     points: np.ndarray
     covariance: np.ndarray
-    refused: tuple[LandmarkView, ...] = ()
     shut: tuple[int, ...] = ()
 
 
@@ -78,7 +76,7 @@ def agree(expression: str, frame: int, views: list[LandmarkView]) -> tuple[Obser
     Returns:
         The observation and the ids of the cameras left out.
     """
-    refused: list[LandmarkView] = []
+    refused: list[str] = []
     views = with_redundancy(views)
     while True:
         points, inliers = robust_triangulate(views)
@@ -87,11 +85,11 @@ def agree(expression: str, frame: int, views: list[LandmarkView]) -> tuple[Obser
         if len(views) <= 2 or share.min() >= MIN_SHARE:
             covariance = point_covariance(views, points, inliers & known)
             found = Observation(
-                expression, frame, tuple(views), inliers & known, points, covariance, tuple(refused)
+                expression, frame, tuple(views), inliers & known, points, covariance
             )
-            return found, [view.camera_id for view in refused]
+            return found, refused
         worst = int(np.argmin(share))
-        refused.append(views[worst])
+        refused.append(views[worst].camera_id)
         views = views[:worst] + views[worst + 1 :]
 
 
