@@ -42,7 +42,7 @@ GONE: dict[str, dict[str, object]] = {
         "l1": 0.8, "perceptual": 0.04, "depth_erode_px": 2, "perceptual_crop_px": 0,
         "perceptual_every": 1,
     },
-    "data": {"crop_margin_px": 16, "split": ANY, "cache_mb": ANY},
+    "data": {"crop_margin_px": 16, "split": ANY, "cache_mb": ANY, "torso": ANY},
     "train": {
         "ema": 0.0, "clip_norm": 0.0, "overfit": 0, "shuffle_directions": 0.0, "betas": ANY,
         "tensorboard": ANY, "warm_start_images": ANY, "save_every": ANY,
@@ -221,8 +221,6 @@ def _current_settings(path: Path, tables: dict[str, dict[str, Any]]) -> dict[str
                 )
         kept = {key: value for key, value in values.items() if key not in gone}
         current[table] = UNSAID.get(table, {}) | kept
-    if current["data"].get("torso") == "keep":  # what the matte held was the head
-        current["data"]["torso"] = "background"
     return current
 
 

@@ -17,7 +17,6 @@ from express50.contract.config import build_dataclass, known_assignments, read_t
 from express50.errors import ConfigError
 
 FRAMES = ("head", "tangent")
-TORSO = ("background", "ignore")
 SCALE_RANGE_MM = (0.1, 10.0)  # of Gaussians, from the paper; its unit is G2's
 
 
@@ -126,13 +125,8 @@ class DataConfig:
     Another subject must show the expression, or it has no code."""
     background: float = 0.0
     """Grey behind footage and renderings, sRGB in [0, 1]. G15."""
-    torso: str = "background"
-    """Shoulders and clothes are ``background``, as in the paper, or ``ignore`` them: neither losses
-    nor metrics count their pixels, and Gaussians at the neck's end are free."""
 
     def __post_init__(self) -> None:
-        if self.torso not in TORSO:
-            raise ConfigError(f"data.torso is {self.torso!r}, expected one of {', '.join(TORSO)}")
         _in_range("data.background", self.background, 0.0, 1.0)
 
 

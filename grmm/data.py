@@ -21,12 +21,12 @@ from express50.errors import FormatError
 from express50.geometry.transforms import make_transform
 from express50.head.model import HeadModel, pose
 from grmm.config import DataConfig
-from grmm.head_crop import crop_view, grown, head_window, torso_mask
+from grmm.head_crop import crop_view, head_window
 from grmm.model import HeadState, PinholeView
 
 NO_OFFSETS = np.zeros((0, 3), np.float32)
 CACHE_BYTES = 512 << 20  # of decoded samples: some hundred of 512 px
-DEFAULTS = DataConfig()  # black behind the head, torso too
+DEFAULTS = DataConfig()  # black behind the head
 Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
 
@@ -156,8 +156,7 @@ class Item:
         state: tracked head.
         view: camera in head space.
         target: (3, H, W) footage composited on the background.
-        mask: (H, W) bool, footage alpha over 0.5, and counts.
-        counts: (H, W) bool, False on a torso that is ignored (DataConfig.torso).
+        mask: (H, W) bool, footage alpha over 0.5.
         depth: (H, W) metres.
         depth_valid: (H, W) bool.
         parts: (H, W) uint8 of segmentation_labels.LABELS. None: the shards have none.
@@ -168,14 +167,9 @@ class Item:
     view: PinholeView
     target: Tensor
     mask: Tensor
-    counts: Tensor
     depth: Tensor
     depth_valid: Tensor
     parts: np.ndarray | None
-
-    def comparable(self, image: Tensor) -> Tensor:
-        """Return ``image`` (3, H, W) with the footage where pixels do not count."""
-        return torch.where(self.counts, image, self.target)
 
 
 class Cache(Generic[Key, Value]):
@@ -204,11 +198,10 @@ class HeadViews:
     def __init__(self, source: Source, head: HeadModel, data: DataConfig = DEFAULTS) -> None:
         """Wrap a source whose parameters belong to ``head``, on whose device items will be."""
         self.source, self.head = source, head
-        self.background, self.ignore_torso = data.background, data.torso == "ignore"
+        self.background = data.background
         self._samples: Cache[int, Sample] = Cache(CACHE_BYTES, lambda sample: sample.nbytes)
         self._coming: dict[int, Future[Sample]] = {}
         self._reader = ThreadPoolExecutor(max_workers=1)
-        self._torsos: Cache[int, np.ndarray] = Cache(CACHE_BYTES // 8, lambda bits: bits.nbytes)
         self._states: Cache[tuple[str, str], HeadState] = Cache(
             CACHE_BYTES // 2, lambda state: state.vertices.nbytes
         )
@@ -221,55 +214,36 @@ class HeadViews:
     def item(self, index: int, *, crop: bool = False) -> Item:
         """Return one sample as tensors on the device.
 
-        With ``crop`` only the window around head and matte, as training takes it: outside it,
-        footage and rendering are both the background.
+        Shoulders and clothes are background, where the shards leave them out or label them. With
+        ``crop`` only the window around head and matte, as training takes it: outside it, footage
+        and rendering are both the background.
         """
         sample, state = self.sample(index), self.state(index)
         height, width = sample.alpha.shape
         view = self.view_of(sample.place)
-        torso = self._torso(index, sample, state, view)
-        matte = np.where(torso, 0, sample.alpha)
+        matte = sample.alpha
+        depth = np.zeros_like(matte) if sample.depth is None else sample.depth
+        if sample.parts is not None and not sample.bare:
+            torso = sample.parts == TORSO
+            matte, depth = np.where(torso, 0, matte), np.where(torso, 0, depth)
         rows, columns = slice(0, height), slice(0, width)
         if crop:
             rows, columns = head_window(state.vertices, view, matte)
             view = crop_view(view, rows, columns)
-        torso, image = torso[rows, columns], sample.image[rows, columns]
-        alpha = (sample.alpha if self.ignore_torso else matte)[rows, columns]
-        depth = np.zeros_like(alpha) if sample.depth is None else sample.depth[rows, columns]
-        known = self._tensor(np.where(torso, 0, depth))
-        weight = (self._tensor(alpha) / 255)[..., None]
-        target = self._tensor(image) / 255 * weight + self.background * (1 - weight)
-        counts = torch.from_numpy(~(torso & self.ignore_torso)).to(self.head.device)
+        known = self._tensor(depth[rows, columns])
+        weight = (self._tensor(matte[rows, columns]) / 255)[..., None]
+        image = self._tensor(sample.image[rows, columns]) / 255
+        target = image * weight + self.background * (1 - weight)
         return Item(
             key=self.keys[index],
             state=state,
             view=view,
             target=target.permute(2, 0, 1).contiguous(),
-            mask=(weight[..., 0] > 0.5) & counts,
-            counts=counts,
+            mask=weight[..., 0] > 0.5,
             depth=known,
             depth_valid=known > 0,
             parts=None if sample.parts is None else sample.parts[rows, columns],
         )
-
-    def _torso(self, index: int, sample: Sample, state: HeadState, view: PinholeView) -> np.ndarray:
-        """Find the torso pixels (H, W) of a sample; masks that take long are kept as bits.
-
-        Ignored ones are dilated, as footage and matte blend at the border.
-        """
-        size = sample.alpha.shape
-        if sample.bare and not self.ignore_torso:
-            return np.zeros(size, bool)
-        if sample.parts is not None:
-            labelled = sample.parts == TORSO
-            return grown(labelled) if self.ignore_torso else labelled
-
-        def make() -> np.ndarray:
-            mask = torso_mask(self.head, state.vertices, view, sample.alpha, sample.depth)
-            return np.packbits(mask)
-
-        bits = np.unpackbits(self._torsos.get(index, make), count=size[0] * size[1])
-        return bits.reshape(size).astype(bool)
 
     def prefetch(self, index: int) -> None:
         """Start to decode a sample that will be asked for next, beside the present step."""

@@ -1,8 +1,7 @@
-"""Select the pixels that count: the window around the head, without the torso.
+"""Find the window around the head, and draw in it.
 
 Training crops to the window, and pictures are drawn in it: what lies outside is neither rasterised
-nor refined. Shards that `express50 regions` labelled say which pixels are torso. Shards of other
-datasets have no labels; for them the tracked mesh and the depth map decide.
+nor refined.
 """
 
 from __future__ import annotations
@@ -10,15 +9,10 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt
-from scipy.spatial import cKDTree
 from torch import Tensor
 
-from express50.geometry.conventions import cell_to_corner
-from express50.head.model import HeadModel
 from grmm.config import SCALE_RANGE_MM
 from grmm.model import GRMM, Gaussians, PinholeView, Rendering
 from grmm.rasterize.projection import ALPHA_MIN, NEAR_M
@@ -26,9 +20,6 @@ from grmm.rasterize.projection import ALPHA_MIN, NEAR_M
 CROP_MARGIN_PX = 16  # of the window that training and drawing take
 WINDOW_STEP = 32  # pixels; windows have sides of whole steps
 NEAR_VERTEX_M = 1e-3
-STAND_OFF_M = 0.025  # a point this far off the neck belongs to a shirt, or to hair upon it
-END_M = 0.01  # a point this far off the neck's lower end lies below it
-GROW_PX = 2  # blurred borders
 
 
 def draw_window(
@@ -139,56 +130,3 @@ def crop_view(view: PinholeView, rows: slice, columns: slice) -> PinholeView:
     K[0, 2] -= columns.start
     K[1, 2] -= rows.start
     return replace(view, K=K, width=columns.stop - columns.start, height=rows.stop - rows.start)
-
-
-def torso_mask(
-    head: HeadModel,
-    vertices: Tensor,
-    view: PinholeView,
-    alpha: np.ndarray,
-    depth: np.ndarray | None,
-) -> np.ndarray:
-    """Mark the pixels (H, W) bool that show the torso.
-
-    Args:
-        head: its regions ``neck`` and ``boundary`` say where the torso begins; without them
-            nothing is torso.
-        vertices: (V, 3) tracked mesh, head space.
-        view: camera in head space.
-        alpha: (H, W) uint8 matte.
-        depth: (H, W) camera z, metres, 0 where unknown; there the nearest known pixel's is taken.
-            None: the mesh's own mean depth stands in.
-    """
-    foreground = alpha > 12
-    neck, end = head.regions.get("neck"), head.regions.get("boundary")
-    if neck is None or end is None or not bool(neck.any()) or not foreground.any():
-        return np.zeros_like(foreground)
-    rows, columns = np.nonzero(foreground)
-    K, camera = view.K.cpu().numpy(), view.cam_from_head.cpu().numpy()
-    z = _filled(depth, foreground, vertices, view)[rows, columns].astype(np.float64)
-    x = (cell_to_corner(columns) - K[0, 2]) / K[0, 0] * z
-    y = (cell_to_corner(rows) - K[1, 2]) / K[1, 1] * z
-    points = (np.stack([x, y, z], 1) - camera[:3, 3]) @ camera[:3, :3]
-    tree = cKDTree(vertices.detach().cpu().double().numpy())
-    distance, nearest = tree.query(points)
-    on_neck, on_end = (region.cpu().numpy()[nearest] for region in (neck, end))
-    torso = np.zeros_like(foreground)
-    torso[rows, columns] = (on_neck & (distance > STAND_OFF_M)) | (on_end & (distance > END_M))
-    return grown(torso)
-
-
-def _filled(
-    depth: np.ndarray | None, foreground: np.ndarray, vertices: Tensor, view: PinholeView
-) -> np.ndarray:
-    """Fill the gaps of a depth map (H, W)."""
-    if depth is None or not (depth > 0).any():
-        camera = view.cam_from_head.to(vertices.dtype)
-        return np.full(foreground.shape, float((vertices @ camera[2, :3] + camera[2, 3]).mean()))
-    index = distance_transform_edt(~(depth > 0), return_distances=False, return_indices=True)
-    return depth[tuple(index)]
-
-
-def grown(mask: np.ndarray) -> np.ndarray:
-    """Dilate a mask (H, W) bool by GROW_PX."""
-    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-    return cv2.dilate(mask.astype(np.uint8), cross, iterations=GROW_PX, borderValue=0) > 0

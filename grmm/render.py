@@ -64,7 +64,7 @@ def comparison_sheet(path: Path, views: HeadViews, indices: Many[int], render: R
         out = render(item)
         pictures = [to_uint8(image) for image in (item.target, out.image, out.rgb)]
         pictures.append(depth_picture(out.depth, out.alpha))
-        pictures.append(to_uint8(4 * (item.comparable(out.image) - item.target).abs()))
+        pictures.append(to_uint8(4 * (out.image - item.target).abs()))
         rows.append(pictures)
         labels.append(f"{item.key.subject} {item.key.expression} {item.key.camera}")
     write_sheet(path, rows, labels)

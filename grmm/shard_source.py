@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from express50.console import log
 from express50.errors import ConfigError, FormatError
 from express50.files.digests import text_digest
 from express50.shards.reader import ShardReader
@@ -39,7 +40,13 @@ class ShardSource:
             SampleKey(subject=entry.subject, expression=entry.expression, camera=entry.camera)
             for entry in self.reader.entries
         ]
-        self.head = str(self.reader.meta(0).get("head"))
+        first = self.reader.meta(0)
+        self.head = str(first.get("head"))
+        if first.get("torso") != "removed" and not first.get("parts"):
+            log(
+                f"{root}: has no labels of parts, so shoulders count as head; to leave them out run"
+                " 'express50 regions' and pack the dataset again"
+            )
         lines = (
             f"{entry.key} {name} {size} {crc:08x}\n"
             for entry in self.reader.entries

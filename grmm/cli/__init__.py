@@ -15,7 +15,7 @@ from typing import Any
 from express50 import __version__
 from express50.console import Parser, run_handler
 from grmm.cli import commands
-from grmm.config import PRESETS, TABLES, TORSO
+from grmm.config import PRESETS, TABLES
 
 DESCRIPTION = "Train the Gaussian Residual Morphable Model on packed shards, and use it."
 EPILOG = """example:
@@ -101,7 +101,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--fit-expression": {"default": "neutral", "help": "and this expression"},
     "--fit-budget": {"type": parse_seconds, "help": "time for a fit: 60s, 5m"},
     "--background": {"type": float, "default": 0.0, "help": "grey, 0 to 1"},
-    "--torso": {"default": TORSO[0], "choices": TORSO, "help": "its pixels (background)"},
     "--partial": FLAG | {"help": "score the pictures that exist"},
     "--seeds": {"type": at_least(1), "default": 1, "help": "train rows so often (1)"},
     "--test": REPEATED | {"type": Path, "metavar": "SHARDS", "help": "fit their people only"},
@@ -253,7 +252,7 @@ COMMANDS = {
     ),
     "score": GrmmCommand(
         handler=commands.score,
-        options=f"renders shards out {CHOICE} --background --torso --partial {METRICS} --json",
+        options=f"renders shards out {CHOICE} --background --partial {METRICS} --json",
         help="measure another method's pictures on shards",
         example="grmm score headnerf/ shards out --cameras cam06",
     ),

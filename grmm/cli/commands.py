@@ -267,7 +267,7 @@ def score(args: argparse.Namespace) -> int:
     from grmm.metrics import PerceptualMetrics
     from grmm.shard_source import ShardSource, select
 
-    data = DataConfig(background=args.background, torso=args.torso)
+    data = DataConfig(background=args.background)
     source = ShardSource(args.shards, "*")
     views = HeadViews(source, load_head(source.head), data)
     chosen = select(views.keys, args.subjects, args.expressions, args.cameras)

@@ -124,8 +124,8 @@ def _loss(person: Person, avatar: Avatar, subject: str, views: HeadViews) -> dic
         item = views.item(index)
         pose = person.pose(views.sample(index).tracked, keys[index].expression)
         picture = drawn(avatar, pose, item.view, views.background).colors.permute(2, 0, 1)
-        ours.append(psnr_db(picture, item.target, item.counts))
-        full.append(psnr_db(full_picture(person, pose, item.view), item.target, item.counts))
+        ours.append(psnr_db(picture, item.target))
+        full.append(psnr_db(full_picture(person, pose, item.view), item.target))
     if not chosen:
         return {}
     before, after = float(np.mean(full)), float(np.mean(ours))

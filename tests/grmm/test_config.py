@@ -21,7 +21,7 @@ def test_paper_preset_has_the_papers_numbers():
     assert SCALE_RANGE_MM == (0.1, 10.0)
     assert (model.frame, model.identity_modes, model.refine_unshuffle) == ("head", 0, 1)
     assert (model.refine_alpha, config.train.warm_start, loss.displacement) == (False, False, 0)
-    assert (config.data.torso, config.train.final_lr) == ("background", 1.0)
+    assert config.train.final_lr == 1.0
     fit = config.fit
     assert not (fit.texture_warm_start or fit.shuffle_directions)
     with torch.device("meta"):

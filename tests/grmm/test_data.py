@@ -53,8 +53,8 @@ def test_every_cache_of_views_is_bounded(monkeypatch):
     views = HeadViews(EllipsoidSource(size=32, expressions=4), ellipsoid_head())
     for index in range(len(views.keys)):
         views.item(index)
-    caches = (views._samples, views._states, views._torsos)
-    assert [len(cache.entries) for cache in caches] == [1, 1, 1]
+    caches = (views._samples, views._states)
+    assert [len(cache.entries) for cache in caches] == [1, 1]
 
 
 class Changed(EllipsoidSource):
