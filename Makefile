@@ -8,11 +8,12 @@ PRESET ?= standard
 WORKERS ?= 2
 SET ?=
 SLURM ?=
+BUDGET ?= 2h
 TRAIN ?= --budget 1h
 STAGE_FLAGS = --preset $(PRESET) --workers $(WORKERS) $(foreach kv,$(SET),--set $(kv)) $(if $(SLURM),--slurm $(SLURM))
 
 .PHONY: help setup demo test check bench tradeoff report clean \
-        ingest calibrate align frames matte track depth register regions pack train
+        ingest calibrate align frames matte track depth register regions pack run tune train
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -50,6 +51,12 @@ ingest: $(READY) ## index CAPTURES="dir ..." into DATASET
 
 calibrate align frames matte track depth register regions pack: $(READY) ## one stage over DATASET
 	$(BIN)/express50 $@ $(DATASET) $(STAGE_FLAGS)
+
+run: $(READY) ## every stage within BUDGET=2h, with settings chosen for CAPTURES="dir ..." in DATASET
+	$(BIN)/express50 run $(DATASET) $(CAPTURES) --budget $(BUDGET) --workers $(WORKERS) $(foreach kv,$(SET),--set $(kv)) $(if $(SLURM),--slurm $(SLURM))
+
+tune: $(READY) ## measure what time buys on DATASET: error against time of the whole chain
+	$(BIN)/express50 tune $(DATASET) $(CAPTURES) --workers $(WORKERS)
 
 train: $(READY) ## train GRMM on DATASET's shards, or go on with it, sized for the machine and an hour
 	$(BIN)/grmm train $(DATASET)/pack/shards $(DATASET)/grmm $(TRAIN)

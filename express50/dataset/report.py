@@ -64,6 +64,7 @@ def render_page(dataset: Dataset, title: str | None = None) -> str:
         cards=_cards(dataset, views, summary),
         stages=views,
         accuracy=accuracy,
+        front=_front_view(_table(dataset.root / "dial" / "front.json")),
         grmm=_grmm_view(dataset.root / "grmm"),
     )
 
@@ -251,6 +252,45 @@ def _metric_bars(figures: dict[str, dict[str, float]], columns: list[str]) -> Ma
         axes.spines[["top", "right"]].set_visible(False)
     figure.tight_layout()
     return _svg(figure)
+
+
+def _front_view(table: dict) -> dict | None:
+    """Collect what ``express50 tune`` measured: a panel per result, and a row per point."""
+    if not table:
+        return None
+    points, presets = table["front"], table["presets"]
+    results = list(points[-1]["errors"])
+    figure = Figure(figsize=(3.2 * len(results), 2.6))
+    figure.subplots(1, len(results), squeeze=False)
+    for axes, result in zip(figure.axes, results, strict=True):
+        rows = [(p["seconds"] / 60, p["errors"][result]) for p in points]
+        times = [time for time, _ in rows]
+        axes.fill_between(
+            times, [e["low"] for _, e in rows], [e["high"] for _, e in rows], color=INK, alpha=0.15,
+            lw=0,
+        )  # fmt: skip
+        axes.plot(times, [e["value"] for _, e in rows], "o-", color=INK, lw=1.4, ms=3.5)
+        for line, (name, point) in enumerate(presets.items()):
+            place = point["seconds"] / 60, point["errors"][result]["value"]
+            axes.plot(*place, "s", color="#b3541e", ms=4)
+            # A line apart: presets of one stage's difference share a place.
+            axes.annotate(name, place, (5, 5 + 9 * line), textcoords="offset points", fontsize=7)
+        error = rows[-1][1]
+        axes.set_title(f"{result}, {error['unit']}", fontsize=9)
+        axes.set_xlabel("minutes", fontsize=8)
+        axes.set_ylim(bottom=0)
+        axes.tick_params(labelsize=7)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.tight_layout()
+    stated = [result for result in results if points[-1]["errors"][result]["stated"]]
+    usual = presets["standard"]["settings"]
+    cells = [
+        [f"{p['seconds'] / 60:.2g} min", *(number(p["errors"][r]["value"]) for r in results),
+         ", ".join(f"{n} {k}" for n, k in p["settings"].items() if k != usual[n]) or "standard"]
+        for p in points
+    ]  # fmt: skip
+    heads = [f"{r}, {points[-1]['errors'][r]['unit']}" for r in results]
+    return {"plot": _svg(figure), "heads": heads, "rows": cells, "stated": stated}
 
 
 def _loss_curve(log: Path) -> Markup:

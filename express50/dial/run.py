@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-from express50.console import format_seconds, format_table
+from express50.console import count, format_seconds, format_table
 from express50.contract.config import config_toml
 from express50.contract.layout import Dataset, exclusion_reason
 from express50.contract.stage import Stage
@@ -51,6 +51,7 @@ from express50.runner.runner import Summary, run_stage
 
 PILOT_SHARE = 0.1  # of the budget, for trials that are not what the run makes anyway
 SAFETY = 0.95  # of the time left is planned with: what items take varies
+BELIEVED = 0.1  # of the expected time must have passed before its speed changes choices
 PILOTS = 3  # subjects whose footage is tried, where that of the first is bad
 
 
@@ -223,7 +224,7 @@ def run_within(
         )
     keep(clock.now())
     summaries = []
-    speed = _Speed()
+    speed = _Speed(believed=max(1.0, BELIEVED * (state.seconds - state.spent)))
     for stage in chain.stages:
         state = _choose_rest(chain, measured, clock, state, stage, speed, wanted, cores)
         keep(clock.now())
@@ -259,7 +260,7 @@ def _first_choice(load: Workload, clock: Clock, goal: Goal | None) -> Point:
     left = clock.left()
     if clock.closed() or points[0].seconds > left:
         least = clock.now() + points[0].seconds
-        words = "core time" if load.cores else f"with {load.width} workers"
+        words = "core time" if load.cores else f"with {count(load.width, 'worker')}"
         raise ConfigError(
             f"--budget {clock.budget.text if clock.budget else ''}: the cheapest settings need "
             f"about {format_seconds(least)} {words}, {format_seconds(clock.now())} of them for "
@@ -290,14 +291,15 @@ def budget_text(seconds: float, cores: bool) -> str:
 
 @dataclass
 class _Speed:
-    """How long stages took against what was expected."""
+    """How long stages took against what was expected; believed after so many seconds."""
 
+    believed: float
     real: float = 0.0
     expected: float = 0.0
 
     def ratio(self) -> float:
         """Return the ratio, 1 while too little was seen."""
-        if self.expected < 1.0:
+        if self.expected < self.believed:
             return 1.0
         return min(4.0, max(0.5, self.real / self.expected))
 
@@ -349,7 +351,7 @@ def _run_one(
     load = chain.workload(measured, cores, {})
     label = state.settings[stage.name]
     config = chain.ladders[stage.name][label]
-    count, item = item_seconds(load, stage, label)
+    items, item = item_seconds(load, stage, label)
     later = list(chain.stages)[list(chain.stages).index(stage) + 1 :]
     rest = sum(
         min(stage_seconds(load, other, one) for one in labels_of(load, other.name))
@@ -363,7 +365,7 @@ def _run_one(
     made = sum(o.status == "done" and not o.restored for o in summary.outcomes)
     if made:
         speed.real += clock.now() - before
-        speed.expected += stage_seconds(load, stage, label, min(1.0, made / count))
+        speed.expected += stage_seconds(load, stage, label, min(1.0, made / items))
     return summary
 
 
@@ -378,7 +380,7 @@ def choice_lines(
     load: Workload, point: Point, budget: Budget | None, spent: float
 ) -> Iterator[str]:
     """Yield what is expected of a choice, and why each setting was chosen."""
-    kind = "core time" if load.cores else f"{load.width} workers"
+    kind = "core time" if load.cores else count(load.width, "worker")
     whole = f"budget {budget.text}" if budget else "no budget"
     yield f"{whole}, {kind}: {format_seconds(spent)} spent on measuring"
     errors = ", ".join(error_text(name, error) for name, error in point.errors.items())

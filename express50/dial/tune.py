@@ -36,14 +36,19 @@ def tune(chain: Chain) -> tuple[dict[str, Any], list[str]]:
         "schema": "express50.front/1",
         "footage": asdict(load.footage),
         "workers": load.width,
-        "front": [asdict(point) for point in points],
-        "presets": {name: asdict(point) for name, point in presets.items()},
+        "front": [_row(load, point) for point in points],
+        "presets": {name: _row(load, point) for name, point in presets.items()},
     }
     folder = dial_dir(chain.dataset)
     write_json(folder / "front.json", table)
     write_bytes(folder / "front.csv", _csv(points, presets).encode())
     shutil.rmtree(pilot_dir(chain.dataset), ignore_errors=True)
     return table, [*_lines(load, points, presets), f"wrote {folder}/front.json and front.csv"]
+
+
+def _row(load: Workload, point: Point) -> dict[str, Any]:
+    cores = point_of(replace(load, cores=True), point.settings).seconds
+    return asdict(point) | {"core_seconds": cores}
 
 
 def preset_settings(load: Workload, preset: str) -> dict[str, str]:

@@ -1,0 +1,201 @@
+"""Measure whether budgets are kept: time, error against the best of a grid, and the promise.
+
+``python -m benchmarks.budget build/budget`` records twin captures, runs the chain for five budgets
+from a minute to an hour and with every preset, and measures each run against the truth. ``--quick``
+takes two people of two expressions at 256 px, one pilot for all runs, and three budgets along the
+front, in processor time, which means something on a busy machine too. ``--captures`` takes footage
+without truth: errors are then differences from the dearest run, and promises cannot be checked.
+The last line printed is one JSON object.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import accuracy
+from benchmarks.demo import EXPRESSIONS, record_twin
+from express50.contract.config import PRESETS
+from express50.contract.layout import Dataset
+from express50.contract.stage import stages
+from express50.dial.budget import parse_budget
+from express50.dial.results import RESULTS, differences
+from express50.runner.ledger import Ledger
+from express50.twin.truth import Truth
+
+TWIN = {"subjects": 3, "cameras": 8, "width": 320, "height": 320, "frames-per-expression": 6}
+QUICK = {"subjects": 2, "cameras": 6, "width": 256, "height": 256, "frames-per-expression": 6}
+BUDGETS = ("1m", "5m", "15m", "30m", "1h")
+TRUE = {
+    "mesh": (accuracy.measure_track, "vertex_rmse_mm"),
+    "depth": (accuracy.measure_depth, "abs_error_mm_median"),
+    "mattes": (accuracy.measure_matte, "mae"),
+    "peaks": (accuracy.measure_align, "peak_error_frames_mean"),
+}
+
+
+@dataclass
+class Run:
+    """One run of the chain: what it was asked, took, promised and gave."""
+
+    name: str
+    seconds: float
+    budget: float | None
+    expected: float | None
+    settings: dict[str, str]
+    promised: dict[str, dict]
+    errors: dict[str, float]
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path, nargs="?", default=Path("build/budget"))
+    parser.add_argument("--captures", type=Path, nargs="+", help="footage without truth")
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--workers", type=int, default=2)
+    args = parser.parse_args()
+    truth, captures = None, args.captures
+    if captures is None:
+        size, words = (QUICK, EXPRESSIONS[:2]) if args.quick else (TWIN, EXPRESSIONS)
+        record_twin(args.out / "twin", args.workers, size, words)
+        captures = sorted((args.out / "twin" / "captures").iterdir())
+        truth = Truth(args.out / "twin" / "truth")
+    workers = 0 if args.quick else args.workers
+    tuned = args.out / "tuned"
+    front = tune(tuned, captures, workers)
+    budgets = quick_budgets(front) if args.quick else BUDGETS
+    runs = [
+        run_one(args.out, f"budget-{text}", captures, workers, ["--budget", text], args.quick)
+        for text in budgets
+    ]
+    grid = [
+        run_one(args.out, preset, captures, workers, ["--preset", preset], False)
+        for preset in PRESETS[: 2 if args.quick else 3]
+    ]
+    measure_all(args.out, [*runs, *grid], truth)
+    for run in [*runs, *grid]:
+        print(f"{run.name}: {run.seconds:.0f} s {run.settings} {run.errors}", file=sys.stderr)
+    print(json.dumps(figures(runs, grid, truth is not None) | {"core_time": args.quick}))
+
+
+def tune(root: Path, captures: Sequence[Path], workers: int) -> list[dict]:
+    """Measure the front of the captures; returns its points."""
+    front = root / "dial" / "front.json"
+    if not front.is_file():
+        command = ["tune", str(root), *map(str, captures), "--workers", str(workers)]
+        express50(command)
+    return json.loads(front.read_text())["front"]
+
+
+def express50(arguments: Sequence[str]) -> int:
+    """Run a command of the project; its output goes to standard error."""
+    command = [sys.executable, "-m", "express50", *arguments]
+    return subprocess.run(command, stdout=sys.stderr, check=False).returncode
+
+
+def quick_budgets(front: Sequence[Mapping]) -> list[str]:
+    """Choose processor times along the front: near its cheapest point, its middle and its end."""
+    every = [1.15 * point["core_seconds"] for point in front]
+    low, high = min(every), max(every)
+    return [f"{s / 3600:.4f}ch" for s in (low, math.sqrt(low * high), high)]
+
+
+def run_one(
+    out: Path, name: str, captures: Sequence[Path], workers: int, options: list[str], pilot: bool
+) -> Run:
+    """Run the chain once, unless it has run; with ``pilot`` it need not measure itself."""
+    dataset = Dataset(out / name)
+    if not (dataset.root / "done.json").is_file():
+        if pilot:
+            (dataset.root / "dial").mkdir(parents=True, exist_ok=True)
+            shutil.copy2(out / "tuned" / "dial" / "measured.json", dataset.root / "dial")
+        code = express50(
+            ["run", str(dataset.root), *map(str, captures), "--workers", str(workers), *options]
+        )
+        (dataset.root / "done.json").write_text(json.dumps({"code": code}))
+    record = dataset.root / "dial" / "run.json"
+    if not record.is_file():
+        return Run(name, core_seconds(dataset), None, None, {}, {}, {})
+    row = json.loads(record.read_text())
+    budget = parse_budget(row["budget"]).seconds
+    return Run(name, row["spent"], budget, row["seconds"], row["settings"], row["promised"], {})
+
+
+def core_seconds(dataset: Dataset) -> float:
+    """Sum up the processor time of a dataset's items."""
+    with Ledger(dataset.ledger, read_only=True) as ledger:
+        return sum(r.core_seconds for name in stages() for r in ledger.read(name).values())
+
+
+def measure_all(out: Path, runs: Sequence[Run], truth: Truth | None) -> None:
+    """Measure every run against the truth, or against the dearest of them."""
+    best = Dataset(out / max(runs, key=lambda run: core_seconds(Dataset(out / run.name))).name)
+    for run in runs:
+        dataset = Dataset(out / run.name)
+        if truth is not None:
+            run.errors = {
+                name: float(measure(dataset, truth)[key]) for name, (measure, key) in TRUE.items()
+            }
+        elif dataset.root != best.root:
+            rows = [differences(dataset, best, s, RESULTS) for s in dataset.subjects()]
+            names = rows[0].keys()
+            run.errors = {name: float(np.mean([row[name] for row in rows])) for name in names}
+
+
+def figures(runs: Sequence[Run], grid: Sequence[Run], true: bool) -> dict:
+    """Compute the figures of the issue from all runs."""
+    everyone = [*runs, *grid]
+    scale = {
+        name: max(float(np.median([r.errors[name] for r in everyone if name in r.errors])), 1e-9)
+        for name in TRUE
+        if any(name in r.errors for r in everyone)
+    }
+
+    def final(run: Run) -> float:
+        return float(np.mean([run.errors.get(name, 0.0) / size for name, size in scale.items()]))
+
+    regrets = []
+    for run in runs:
+        fitting = [r for r in everyone if r.seconds <= (run.budget or math.inf) * 1.02]
+        best = min(map(final, fitting), default=final(run))
+        regrets.append(100 * (final(run) / max(best, 1e-9) - 1))
+    kept = [
+        p["low"] <= run.errors[name] <= p["high"]
+        for run in runs for name, p in run.promised.items() if p["stated"] and true
+    ]  # fmt: skip
+    over = [100 * max(0.0, run.seconds / run.budget - 1) for run in runs if run.budget]
+    off = [100 * abs(r.seconds / r.expected - 1) for r in runs if r.expected]
+    return {
+        "time_miss_percent": round(float(np.percentile(over, 90)), 1),
+        "forecast_miss_percent": round(float(np.percentile(off, 90)), 1),
+        "regret_percent": round(max(regrets), 1),
+        "promise_kept_percent": round(100 * float(np.mean(kept)), 1) if kept else None,
+        "promises": len(kept),
+        "time_saved_percent": saved(runs, grid, final),
+        "runs": [vars(run) for run in everyone],
+    }
+
+
+def saved(runs: Sequence[Run], grid: Sequence[Run], final) -> float | None:  # noqa: ANN001
+    """Return the time that the dial saves at the error of the best preset; None where it has not.
+
+    The best preset is the one with the least error, the quicker of two that differ by under 2 %.
+    """
+    least = min(map(final, grid))
+    best = min((r for r in grid if final(r) <= 1.02 * least), key=lambda run: run.seconds)
+    alike = [run.seconds for run in runs if final(run) <= 1.02 * final(best)]
+    return round(100 * (1 - min(alike) / best.seconds), 1) if alike else None
+
+
+if __name__ == "__main__":
+    main()
