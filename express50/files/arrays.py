@@ -222,7 +222,7 @@ def _tensor(
     last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
     if 0 not in size and last >= storage.size:
         raise pickle.UnpicklingError("tensor reaches beyond its storage")
-    if math.prod(size) > VALUES_LIMIT:  # a stride of 0 repeats one number for ever
+    if math.prod(size) > VALUES_LIMIT:  # a stride of 0 repeats one number endlessly
         raise pickle.UnpicklingError(f"tensor of {math.prod(size)} numbers, over {VALUES_LIMIT}")
     steps = [step * storage.itemsize for step in stride]
     return np.lib.stride_tricks.as_strided(storage[offset:], size, steps).copy()
@@ -381,7 +381,7 @@ def read_weights(path: Path, kind: Kind, where: str, what: str, fix: str = AGAIN
         with warnings.catch_warnings(action="ignore"):  # about pickles that are refused below
             return torch.load(path, map_location="cpu", weights_only=True)
     except DAMAGE as error:
-        # Torch's own words tell the reader how to switch the protection off.
+        # Torch's own message says how to switch the protection off.
         why = "it is damaged or of another kind"
         if isinstance(error, pickle.UnpicklingError):
             why = "it holds more than tensors and plain values; nothing in it was run"

@@ -27,7 +27,7 @@ def read_cameras(path: Path) -> dict[str, Camera]:
     """
     if not Path(path).exists():
         raise CalibrationError(f"{path}: the file is missing; run 'express50 calibrate'")
-    return parse_cameras(read_json(path, CalibrationError, "write it anew"), str(path))
+    return parse_cameras(read_json(path, CalibrationError, "write it again"), str(path))
 
 
 def parse_cameras(table: object, where: str) -> dict[str, Camera]:

@@ -213,7 +213,7 @@ class VideoReader:
         return image
 
     def restart(self) -> None:
-        """Go back to the first frame by opening the file anew."""
+        """Go back to the first frame by reopening the file."""
         self._container.close()
         self._container, self._stream = _open(self.path)
         self._frames = _decode(self.path, self._container, self._stream)

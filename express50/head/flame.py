@@ -45,7 +45,7 @@ def load_flame(path: str | Path) -> HeadModel:
 
 
 def read_flame(path: Path) -> HeadModel:
-    """Read FLAME as it is stored, with neither teeth nor the inside of a mouth."""
+    """Read FLAME as stored, without teeth or the inside of the mouth."""
     files = _companions(path)
     arrays = read_flame_arrays(path)
     faces = arrays["f"].astype(np.int64)

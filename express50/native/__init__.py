@@ -43,7 +43,7 @@ def load(variant: str | None = None) -> ctypes.CDLL:
 
     if variant is not None:
         return _open(variant)
-    # The baseline variant runs anywhere and tells what the processor can do.
+    # The baseline variant runs anywhere and reports what the processor can do.
     level = _open("baseline").native_level()
     for name in reversed(list(VARIANTS)[: level + 1]):
         if library_file(name).exists():

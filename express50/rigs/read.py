@@ -42,7 +42,7 @@ YAML = (".yml", ".yaml")
 
 
 class RigFormat(NamedTuple):
-    """How to recognise and read a format; the reader also gets the footage's size, or None."""
+    """A test for a format and its reader; the reader also gets the footage's size, or None."""
 
     title: str
     fits: Callable[[Path], bool]

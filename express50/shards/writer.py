@@ -211,7 +211,7 @@ def gather_shards(sources: Sequence[tuple[Path, str]], out: Path) -> dict[str, s
     """Gather folders of shards in one, each as the split beside it; returns SHA-256 by file.
 
     Shards are hard links to the sources' where the file system has them, so that no sample is read
-    or stored twice; they are numbered anew within each split. ``index.json`` is written, cards and
+    or stored twice; they are renumbered within each split. ``index.json`` is written, cards and
     manifest are not.
 
     Raises:

@@ -162,7 +162,7 @@ def _first_rig(
     if not any(seen_from_front(view) for name in placed for view in views[name].values()):
         raise CalibrationError(
             f"all board images of {', '.join(sorted(placed))} are mirrored: switch mirroring off"
-            " where the pictures are recorded; if the print itself is mirrored, print it anew"
+            " where the pictures are recorded; if the print itself is mirrored, print it again"
         )
     boards = rig_from_boards(placed, cameras, views, poses)
     return BoardRig({n: replace(cameras[n], cam_from_world=T) for n, T in placed.items()}, boards)
@@ -307,7 +307,7 @@ def _weak(rig: BoardRig, found: BoardCorners, kept: BoardCorners) -> dict[str, s
 def _tilt_spread(rig: BoardRig, frames: Collection[int]) -> float:
     """Return the largest angle between the board's normals in these frames, degrees.
 
-    All parallel boards together tell a camera no more about its lens than one of them does.
+    Parallel boards together determine a lens no better than one of them does.
 
     Source: Zhang 2000, "A flexible new technique for camera calibration", section 4.
     """

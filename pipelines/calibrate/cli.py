@@ -135,7 +135,8 @@ def _report(
     if verdict.problem:
         say(f"wrong: {verdict.problem}")
         say(
-            f"remedy: {verdict.remedy or 'not known: no common misreading of conventions explains it'}"
+            "remedy: "
+            + (verdict.remedy or "not known: no common misreading of conventions explains it")
         )
     elif out is not None:
         say(f"wrote {out}")

@@ -23,7 +23,7 @@ LEAST_SHARED = 12  # squares that two cameras must see together to be compared
 
 @dataclass(frozen=True)
 class ColourGains:
-    """How cameras record the same light.
+    """The responses of cameras to the same light.
 
     `gain` is linear light (3,) over the cameras' geometric mean, of the cameras that could be
     measured. `before` and `after` the gains are divided out: median departure of a square's light

@@ -185,7 +185,7 @@ def _adjust(
     ) -> tuple[PointTracks, AdjustedRig]:
         for band in bands:
             for scale in FEATURE_SCALES:
-                tracks = join_tracks(rig, seen, band, candidates)  # anew, as the rig gets better
+                tracks = join_tracks(rig, seen, band, candidates)  # again, as the rig gets better
                 points = triangulate_tracks(rig, tracks)
                 fit = adjust_rig(rig, tracks, points, priors, (scale,), expected=start)
                 rig = fit.cameras
@@ -217,7 +217,7 @@ def _expected(
     radius = 1.5 * float(np.median(np.linalg.norm(faces - faces.mean(1, keepdims=True), axis=2)))
     middle = np.median(faces.mean(1), axis=0)
     found = footage_uncertainty(fit, tracks, priors, FEATURE_SCALES[-1], middle, radius)
-    # What stands still is off by the same in every frame set, which thus count as one.
+    # Errors that stay the same in every frame set do not average out: all sets count as one.
     return {name: px * len(seen) ** 0.5 for name, px in found.items()}
 
 

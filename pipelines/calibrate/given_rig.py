@@ -32,10 +32,10 @@ MOVE_BANDS = ((0.1, 0.015), (0.02, 0.003))
 shift of a moved camera's picture, as shares of the diagonal."""
 LEAST_GAIN, GAIN_RATIO = 30.0, 4.0
 """Freeing a moved camera must lower the robust cost by this much (noise alone: half a chi-square
-of six, under 15), and by so many times what the median other camera would."""
+of six, under 15), and by GAIN_RATIO times what the median other camera would."""
 MOVE_PRIORS = RigPriors(turn_rad=np.radians(1.0), move_m=0.01)
 MOVE_SCALES, ITERATIONS = (6.0, 3.0, 1.5), 4
-"""Residuals flatten at so many sigmas: a camera that is off by a few pixels must not be rejected
+"""Sigmas at which residuals flatten: a camera that is off by a few pixels must not be rejected
 together with the mismatches. Four iterations per scale name the cameras that convergence names."""
 HELD = 5  # every fifth point judges and is not adjusted to
 CLEARLY = 0.8

@@ -314,7 +314,7 @@ def _rms(squared: np.ndarray) -> float | None:
 
 
 def _check_footage(index: Index, cameras: dict[str, Camera], count: int) -> FootageCheck | None:
-    """Search for moved cameras in so many frame sets; None with fewer than three cameras."""
+    """Search `count` frame sets for moved cameras; None with fewer than three cameras."""
     if count < 1 or len(cameras) < 3:
         return None
     return check_footage(cameras, find_points(read_footage(index, cameras, count)))

@@ -27,7 +27,7 @@ LEAST_IMAGES = 6  # in which a board moves, for an estimate
 
 @dataclass(frozen=True)
 class CameraTiming:
-    """How late a camera is, in frames of the board's recording, with standard deviations.
+    """The delay of a camera, in frames of the board's recording, with standard deviations.
 
     `late` is against the median camera; `readout` is how much later its last row is than its first.
     Values that are not surely different from zero are zero.

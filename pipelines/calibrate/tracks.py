@@ -19,12 +19,12 @@ Features: TypeAlias = tuple[np.ndarray, np.ndarray]
 PairMatches: TypeAlias = dict[tuple[str, str], dict[int, np.ndarray]]
 """Matches (M, 2), rows of `Features`, by two cameras in order of name and by frame."""
 LEAST_INLIERS, CHANCE = 12, 0.125
-"""What must agree on one geometry: so many matches, plus such a share of all of them."""
+"""Matches that must agree on one geometry: a number, plus a share of all of them."""
 RATIO = 0.8
 """A match counts if its distance is below this share of the second-best one's (Lowe 2004)."""
 FEATURE_SIGMA_PX = 0.7
 NEIGHBOURS, WIDEST_DEG = 6, 45.0
-"""Features are compared between each camera and so many neighbours, if their axes differ by less
+"""Features are compared between each camera and this many neighbours, if their axes differ by less
 than the angle: beyond it features no longer look alike."""
 LEAST_POINTS = 20  # that a camera must share with two others to be judged by them
 
@@ -53,7 +53,7 @@ class PointTracks:
         return PointTracks(self.names, camera, number, pixels, sigma)
 
     def of_cameras(self, names: tuple[str, ...]) -> PointTracks:
-        """Keep the observations of some cameras and index these anew."""
+        """Keep the observations of some cameras, which are renumbered."""
         number = np.array([names.index(n) if n in names else -1 for n in self.names], int)
         kept = self.select(number[self.camera] >= 0)
         return replace(kept, names=names, camera=number[kept.camera])
@@ -71,7 +71,7 @@ class PointTracks:
 
 @dataclass(frozen=True)
 class FrameSetPoints:
-    """What the cameras of one frame set saw, in recorded pixels.
+    """The points that the cameras of one frame set saw, in recorded pixels.
 
     `landmarks` are camera, points (68, 2) and sigma (68,) of each view of the face.
     """

@@ -9,7 +9,7 @@ from express50.errors import ConfigError
 
 @dataclass(frozen=True, kw_only=True)
 class DepthConfig:
-    """How finely the surface is modelled."""
+    """The fineness of the surface, and the evidence that counts."""
 
     voxel_mm: float = 1.6
     """Finest voxel of the last level, millimetres, 0.3 to 20."""

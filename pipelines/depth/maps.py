@@ -38,7 +38,7 @@ Pictures = list[tuple[Camera, np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """What one camera sees of the surface: maps (H, W), `valid` where it lies inside the matte.
+    """The maps (H, W) of the surface in one camera, `valid` where it lies inside the matte.
 
     Depth is in metres, normals (H, W, 3) in camera axes, both 0 where not valid; confidence is in
     [0, 1]. `covered` is the share of the matte with depth, `spill` that of the surface outside.

@@ -57,7 +57,7 @@ from pipelines.depth.views import (
 )
 
 COARSE_M = 0.006  # voxel of the first level: it spans the gap between hull and face
-LEVEL_RATIO = 1.47  # each level is so many times finer than the one before
+LEVEL_RATIO = 1.47  # of the voxels of one level to those of the next
 INWARD_M = 0.03  # how far below the hull the first level searches: eye sockets are that deep
 FAIR_VOXELS = 1.4  # smoothing before each level; less gains 0.012 mm but fails with three views
 SMALLEST_M, LARGEST_M = 0.03, 3.0  # a head is 0.25 m high, with shoulders under 1 m
@@ -112,7 +112,7 @@ def reconstruct(
 def tracked_surface(
     view: DepthView, solid: TrackedSolid, voxel_mm: float, voxel_px: float, noise: float
 ) -> HeadSurface:
-    """Take the tracked head as it is: a single view says nothing else about depth."""
+    """Take the tracked head unchanged: a single view has no other evidence of depth."""
     voxel = finest_voxel([view], (solid.low + solid.high) / 2, voxel_mm, voxel_px)
     low, high = solid.low - 4 * voxel, solid.high + 4 * voxel
     _check_size(low, high, voxel)

@@ -237,7 +237,7 @@ def without_contradiction(views: Sequence[DepthView]) -> tuple[list[DepthView], 
 
 
 class _Vote(NamedTuple):
-    """What a view says about P cells of space: whether its matte allows them, and their pixels.
+    """The evidence of one view about P cells of space: which its matte allows, and their pixels.
 
     ``pixel`` (P,) is a flat index of ``matte`` (h, w), about one pixel per cell, -1 where unseen.
     """

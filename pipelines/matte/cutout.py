@@ -94,7 +94,7 @@ class CutView:
 
 @dataclass(frozen=True)
 class PersonGuess:
-    """Where a person may be: GrabCut's labels (h, w) uint8, and pixels per metre of the head."""
+    """The area of a person: GrabCut's labels (h, w) uint8, and pixels per metre of the head."""
 
     labels: np.ndarray
     density: float
@@ -102,7 +102,7 @@ class PersonGuess:
 
 @dataclass(frozen=True)
 class HeadPlace:
-    """Where a mean head stands: world = scale * rotation @ head + shift."""
+    """The pose of a mean head: world = scale * rotation @ head + shift."""
 
     scale: float
     rotation: np.ndarray

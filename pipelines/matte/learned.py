@@ -189,7 +189,7 @@ class MattingLaplacian:
         return rest[..., 4] - (rest[..., 4] + form + rest[..., 3]) / 9
 
     def _summed(self, values: np.ndarray) -> np.ndarray:
-        """Sum (H, W, C) over the windows that hold each pixel of values (M, C), one a window."""
+        """Sum (H, W, C) over the windows that hold each pixel of values (M, C), one per window."""
         spread = np.zeros((*self.windows.shape, values.shape[1]))
         spread[self.windows] = values
         return _box(spread, normalize=False)

@@ -44,7 +44,7 @@ Matter = Callable[[np.ndarray, Any, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class CameraMatte:
-    """What one camera alone shows: alpha (H, W) uint8, and its frame reduced to `matte.side`."""
+    """The matte of one camera alone: alpha (H, W) uint8, and its frame reduced to `matte.side`."""
 
     alpha: np.ndarray
     rgb: np.ndarray
@@ -212,7 +212,7 @@ def corrected(
 ) -> np.ndarray:
     """Remove and fill pixels (h, w) bool of an alpha (H, W) uint8, softly at their edges.
 
-    What neither reaches stays as it is to the bit.
+    All other pixels keep their exact values.
     """
     if removed is None and filled is None:
         return alpha

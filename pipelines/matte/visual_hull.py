@@ -358,7 +358,7 @@ def missed(
 
 
 def _depth(mask: np.ndarray) -> np.ndarray:
-    """Return the distance (h, w) of a mask's pixels to its edge; the image's border is none."""
+    """Return the distance (h, w) of a mask's pixels to its edge; the image's border is no edge."""
     if mask.all():
         return np.full(mask.shape, float(max(mask.shape)), np.float32)
     return cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)

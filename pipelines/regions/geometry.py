@@ -246,9 +246,9 @@ def place(
 def before_face(geometry: HeadGeometry, labels: np.ndarray, metre_px: float) -> np.ndarray:
     """Label what stands off the face (H, W) uint8: hand or apparel, 0 elsewhere.
 
-    A part of the picture counts that is wider than hairs and clear of the mesh; hair, of which
-    `labels` (H, W) tell, is left out. Glasses stand closely before the eyes, hands further off.
-    ``metre_px`` is how many pixels a metre spans at the head.
+    Only parts that are wider than hairs and clear of the mesh count, without what `labels` (H, W)
+    call hair. Glasses stand closely before the eyes, hands further off. ``metre_px`` is the number
+    of pixels that a metre spans at the head.
     """
     face = label_mask(geometry.mesh, "skin", "lips", "eyes")
     clear = face & (geometry.off > CLEAR_M) & (labels != HAIR)

@@ -206,7 +206,7 @@ def _lacking_cameras(
     required: Collection[Moment],
     kind: str,
 ) -> dict[str, str]:
-    """Find the cameras that lack so many common moments that they are dropped, with the reason."""
+    """Find the cameras that lack too many common moments to be kept, with the reason."""
     worth = max(LACKING, 1 / max(1, sum(map(bool, pictures.values()))))
     dropped = {}
     for camera, table in pictures.items():

@@ -146,7 +146,7 @@ def pack_uv(mesh: WholeMesh) -> tuple[Array, Array]:
         low, high = uv.min((0, 1)), uv.max((0, 1))
         size = np.array([right - left, top - bottom])
         corner_uv[of_chart] = [left, bottom] + (uv - low) / (high - low) * size
-    # A vertex has one position a chart, two where the chart is cut on the mid plane.
+    # A vertex has one position per chart, two where the chart is cut on the mid plane.
     chart_id = np.unique(mesh.face_chart, return_inverse=True)[1]
     side = (mesh.corner_uv[..., 0] > 0).astype(np.int64)
     key = (mesh.faces * len(RECTANGLES) + chart_id[:, None]) * 2 + side

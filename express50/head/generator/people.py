@@ -54,7 +54,7 @@ OWN_EAR = np.array([
 RIM_POINTS, LOBE = 40, 14  # of a row of the ear; the last place of the table before its front edge
 STIFFNESS = np.geomspace(3000.0, 2.0, 24)  # of the registration, round by round
 EAR_FIRMNESS = 20.0
-NORMAL_MM = 6.0  # a unit of difference between normals counts like so many millimetres
+NORMAL_MM = 6.0  # millimetres that a unit of difference between normals counts as
 LID_MM = 13.2  # least distance of a lid from its eyeball's centre
 TOOTH_GAP_MM = 5.0  # from the meeting lips back to the incisors
 
@@ -93,7 +93,7 @@ class IctSkin:
         return self.points[list(LANDMARKS)]
 
     def ring(self, marks: Array, steps: tuple[int, ...]) -> Array:
-        """Return the vertices so many edges away from the open end that landmarks lie around."""
+        """Return the vertices `steps` edges away from the open end that landmarks lie around."""
         ends = self.ends[np.linalg.norm(self.points[self.ends] - marks.mean(0), axis=1) < 35]
         far = dijkstra(self.edges, indices=ends, unweighted=True, min_only=True)
         return self.points[np.isin(far, steps)]
