@@ -91,8 +91,8 @@ def check_known(
             raise kind(f"{where}: no {what} {name!r}{near}; expected one of {listed}")
 
 
-def nearest(word: str, known: Iterable[str]) -> str:
+def nearest(word: str, known: Iterable[str], likeness: float = 0.5) -> str:
     """Return the words ``, did you mean 'x'?`` when a known name is near, else nothing."""
     names = list(known)
-    close = difflib.get_close_matches(word, names, n=1)
+    close = difflib.get_close_matches(word, names, n=1, cutoff=likeness)
     return f", did you mean {close[0]!r}?" if close else ""

@@ -89,7 +89,7 @@ def test_harm_is_found_fixed_and_made_again_to_the_same_bytes(dataset, kind, har
     assert list(found) == [(kind, "toy S001")] and result.sound
     assert not dataset.item_dir("toy", "S001").exists()
     found, result = look(dataset, fix=True)  # nor because the good one is not back yet
-    assert found == {} and "toy: 1 of 2 items are to do" in result.notes[0]
+    assert found == {} and "toy: 1 of 2 items to do" in result.notes[0]
     assert [o.status for o in toy.run_toy(dataset).outcomes] == ["done", "skipped"]
     assert toy.tree(dataset.stage_dir("toy")) == before
     assert toy.run_stage_of(LATER, dataset).count("skipped") == 2
@@ -271,5 +271,5 @@ def test_command_on_real_stages(tmp_path, capsys):
     assert main(["check", root]) == 1
     said = capsys.readouterr().out.splitlines()
     assert len(said) == 2 and said[0].startswith("captures.json: ")
-    assert main(["check", str(tmp_path / "nothing")]) == 1
+    assert main(["check", str(tmp_path / "nothing")]) == 2
     assert "nothing" in capsys.readouterr().err
