@@ -44,7 +44,8 @@ class Parser(argparse.ArgumentParser):
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:
             known = [str(choice) for choice in action.choices]
-            words = f"unknown {value!r}{nearest(str(value), known, 0.6)}; expected {', '.join(known)}"
+            near = nearest(str(value), known, 0.6)
+            words = f"unknown {value!r}{near}; expected {', '.join(known)}"
             raise argparse.ArgumentError(action, words)
 
 

@@ -98,7 +98,7 @@ def test_principal_directions_rebuild_the_covariance(loaded):
     ("controls", "message"),
     [
         ({"jwa": (1.0,)}, "did you mean 'jaw'"),
-        ({"jaw": (1.0,)}, "got 1 numbers, expected 3"),
+        ({"jaw": (1.0,)}, "got 1 number, expected 3 with commas between, or jaw.0"),
         ({"neck.3": (1.0,)}, "3 neck parameters, 0 to 2"),
         ({"expression.e9": (1.0,)}, "4 expression parameters"),
         ({"expression": (1.0,)}, "say which entry"),
