@@ -125,6 +125,9 @@ class DataConfig:
     Another subject must show the expression, or it has no code."""
     background: float = 0.0
     """Grey behind footage and renderings, sRGB in [0, 1]. G15."""
+    skip_hidden_neck: bool = False
+    """Do not count pixels in which the torso stands before the neck: each camera looks a different
+    way behind the collar. In the paper they are background, which contradicts other views."""
 
     def __post_init__(self) -> None:
         _in_range("data.background", self.background, 0.0, 1.0)
@@ -237,6 +240,7 @@ def _in_range(name: str, value: float, low: float, high: float) -> None:
 Preset = dict[str, dict[str, Any]]
 # What we add to the paper's letter, at any size; docs/PAPER.md has what each was measured to do.
 PLUS: Preset = {
+    "data": {"skip_hidden_neck": True},
     "model": {"refine_alpha": True},
     "loss": {"laplacian": 0.0, "displacement": 0.01},
     "train": {"warm_start": True},

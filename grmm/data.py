@@ -21,7 +21,7 @@ from express50.errors import FormatError
 from express50.geometry.transforms import make_transform
 from express50.head.model import HeadModel, pose
 from grmm.config import DataConfig
-from grmm.head_crop import crop_view, head_window
+from grmm.head_crop import behind_torso, crop_view, head_window
 from grmm.model import HeadState, PinholeView
 
 NO_OFFSETS = np.zeros((0, 3), np.float32)
@@ -160,6 +160,7 @@ class Item:
         depth: (H, W) metres.
         depth_valid: (H, W) bool.
         parts: (H, W) uint8 of segmentation_labels.LABELS. None: the shards have none.
+        hidden: (H, W) bool, where the torso hides the neck (DataConfig.skip_hidden_neck).
     """
 
     key: SampleKey
@@ -170,6 +171,11 @@ class Item:
     depth: Tensor
     depth_valid: Tensor
     parts: np.ndarray | None
+    hidden: Tensor
+
+    def comparable(self, image: Tensor) -> Tensor:
+        """Return ``image`` (3, H, W) with the footage where the neck is hidden."""
+        return torch.where(self.hidden, self.target, image)
 
 
 class Cache(Generic[Key, Value]):
@@ -198,7 +204,8 @@ class HeadViews:
     def __init__(self, source: Source, head: HeadModel, data: DataConfig = DEFAULTS) -> None:
         """Wrap a source whose parameters belong to ``head``, on whose device items will be."""
         self.source, self.head = source, head
-        self.background = data.background
+        self.background, self.skip_hidden = data.background, data.skip_hidden_neck
+        self._hidden: Cache[int, np.ndarray] = Cache(CACHE_BYTES // 8, lambda bits: bits.nbytes)
         self._samples: Cache[int, Sample] = Cache(CACHE_BYTES, lambda sample: sample.nbytes)
         self._coming: dict[int, Future[Sample]] = {}
         self._reader = ThreadPoolExecutor(max_workers=1)
@@ -226,6 +233,7 @@ class HeadViews:
         if sample.parts is not None and not sample.bare:
             torso = sample.parts == TORSO
             matte, depth = np.where(torso, 0, matte), np.where(torso, 0, depth)
+        hidden = self._hidden_neck(index, sample, state, view)
         rows, columns = slice(0, height), slice(0, width)
         if crop:
             rows, columns = head_window(state.vertices, view, matte)
@@ -243,7 +251,23 @@ class HeadViews:
             depth=known,
             depth_valid=known > 0,
             parts=None if sample.parts is None else sample.parts[rows, columns],
+            hidden=torch.from_numpy(hidden[rows, columns]).to(self.head.device),
         )
+
+    def _hidden_neck(
+        self, index: int, sample: Sample, state: HeadState, view: PinholeView
+    ) -> np.ndarray:
+        """Find the pixels (H, W) where the torso hides the neck; the masks are kept as bits."""
+        height, width = sample.alpha.shape
+        if sample.parts is None or not self.skip_hidden:
+            return np.zeros((height, width), bool)
+        torso = sample.parts == TORSO
+
+        def make() -> np.ndarray:
+            return np.packbits(behind_torso(self.head, state.vertices, view, torso))
+
+        bits = np.unpackbits(self._hidden.get(index, make), count=height * width)
+        return bits.reshape(height, width).astype(bool)
 
     def prefetch(self, index: int) -> None:
         """Start to decode a sample that will be asked for next, beside the present step."""

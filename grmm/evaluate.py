@@ -91,7 +91,7 @@ def evaluate(
         both = item.depth_valid & (out.alpha > 0.5)
         error = (out.depth - item.depth)[both].abs()
         row = compare(out.image, item, judge, kind(item.key))
-        row["psnr_unrefined_db"] = psnr_db(out.rgb, item.target)
+        row["psnr_unrefined_db"] = psnr_db(out.rgb, item.target, ~item.hidden)
         row["depth_mm"] = 1e3 * float(error.median()) if len(error) else math.nan
         rows.append(row)
         if keep is not None:
@@ -102,7 +102,7 @@ def evaluate(
 def compare(image: Tensor, item: Item, judge: PerceptualMetrics, kind: str = "") -> Row:
     """Compare one picture (3, H, W) in [0, 1] with its footage; the judge remembers it for FID.
 
-    ``psnr_db``, ``ssim``, ``rmse``, ``lpips`` count every pixel;
+    ``psnr_db``, ``ssim``, ``rmse``, ``lpips`` count every pixel in which no torso hides the neck;
     ``*_head`` pixels of the footage's matte only, so that an easy background cannot flatter;
     those of REGIONS pixels with such labels (NaN without labels, and under LEAST_PX).
 
@@ -114,18 +114,19 @@ def compare(image: Tensor, item: Item, judge: PerceptualMetrics, kind: str = "")
             f"{item.key}: the rendering holds NaN or Inf; expected colours. The checkpoint is "
             "damaged or was trained at too high a rate"
         )
-    judge.remember(kind, image, item.target)
+    shown = item.comparable(image)
+    judge.remember(kind, shown, item.target)
     return {
         **vars(item.key),
         "kind": kind,
-        "psnr_db": psnr_db(image, item.target),
+        "psnr_db": psnr_db(image, item.target, ~item.hidden),
         "psnr_head_db": psnr_db(image, item.target, item.mask),
         **_regions(image, item),
-        "ssim": ssim_score(image, item.target),
-        "ssim_head": ssim_score(image, item.target, item.mask),
-        "rmse": rmse(image, item.target),
+        "ssim": ssim_score(shown, item.target),
+        "ssim_head": ssim_score(shown, item.target, item.mask),
+        "rmse": rmse(image, item.target, ~item.hidden),
         "rmse_head": rmse(image, item.target, item.mask),
-        "lpips": judge.lpips_of(image, item.target),
+        "lpips": judge.lpips_of(shown, item.target),
     }
 
 

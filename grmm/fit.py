@@ -278,7 +278,7 @@ def reconstruction(state: FitState, *pairs: tuple[Tensor, Tensor]) -> Tensor:
 
 def _footage_loss(state: FitState, rendering: Rendering, item: Item) -> Tensor:
     images = (rendering.rgb, rendering.image)
-    return reconstruction(state, *((image, item.target) for image in images))
+    return reconstruction(state, *((item.comparable(image), item.target) for image in images))
 
 
 def locality_loss(state: FitState, item: Item, rng: np.random.Generator) -> Tensor:

@@ -1,4 +1,4 @@
-"""Find the window around the head, and draw in it.
+"""Find the window around the head, draw in it, and find the neck that a torso hides.
 
 Training crops to the window, and pictures are drawn in it: what lies outside is neither rasterised
 nor refined.
@@ -9,10 +9,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
+from express50.geometry.conventions import corner_to_cell
+from express50.head.model import HeadModel
 from grmm.config import SCALE_RANGE_MM
 from grmm.model import GRMM, Gaussians, PinholeView, Rendering
 from grmm.rasterize.projection import ALPHA_MIN, NEAR_M
@@ -20,6 +23,7 @@ from grmm.rasterize.projection import ALPHA_MIN, NEAR_M
 CROP_MARGIN_PX = 16  # of the window that training and drawing take
 WINDOW_STEP = 32  # pixels; windows have sides of whole steps
 NEAR_VERTEX_M = 1e-3
+GROW_PX, FAR_PX = 2, 1e5  # of a silhouette's blurred border; off the picture
 
 
 def draw_window(
@@ -122,6 +126,31 @@ def _span(low: float, high: float, size: int) -> slice:
     length = min(size, math.ceil((high - low) / WINDOW_STEP) * WINDOW_STEP)
     start = min(max(0, round((low + high - length) / 2)), size - length)
     return slice(start, start + length)
+
+
+def behind_torso(
+    head: HeadModel, vertices: Tensor, view: PinholeView, torso: np.ndarray
+) -> np.ndarray:
+    """Mark the pixels (H, W) bool of a torso (H, W) that stand before the neck of the mesh.
+
+    ``vertices`` (V, 3) are those of the tracked mesh, head space, as the view is. A head model
+    without a region ``neck`` has none.
+    """
+    found = np.zeros(torso.shape, np.uint8)
+    regions = [head.regions[name] for name in ("neck", "boundary") if name in head.regions]
+    if not torso.any() or not regions:
+        return found > 0
+    neck = torch.stack(regions).any(0)
+    faces = head.faces[neck[head.faces].any(1)].cpu().numpy()
+    K, camera = view.K.cpu().numpy(), view.cam_from_head.cpu().numpy()
+    points = vertices.detach().cpu().double().numpy() @ camera[:3, :3].T + camera[:3, 3]
+    ahead = (points[:, 2] > NEAR_M)[faces].all(1)
+    with np.errstate(all="ignore"):  # points behind the camera are in no face that is drawn
+        places = corner_to_cell((points @ K.T)[:, :2] / points[:, 2:])
+    for corners in np.round(places[faces[ahead]].clip(-FAR_PX, FAR_PX)).astype(np.int32):
+        cv2.fillConvexPoly(found, corners, 1)
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    return torso & (cv2.dilate(found, cross, iterations=GROW_PX) > 0)
 
 
 def crop_view(view: PinholeView, rows: slice, columns: slice) -> PinholeView:

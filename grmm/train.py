@@ -193,9 +193,9 @@ def objective(
 ) -> dict[str, Tensor]:
     """Compute the weighted terms of the objective by name (paper: Training and Losses)."""
     weights, model = config.loss, state.model
-    images = {"rgb": rendering.rgb}
+    images = {"rgb": item.comparable(rendering.rgb)}
     if model.refinement is not None:
-        images["image"] = rendering.image
+        images["image"] = item.comparable(rendering.image)
     terms = {n: losses.reconstruction(image, item.target, weights) for n, image in images.items()}
     if state.perceptual is not None:
         for name, image in images.items():

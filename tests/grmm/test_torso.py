@@ -1,9 +1,13 @@
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from express50.contract.segmentation_labels import TORSO
+from grmm.config import DataConfig
 from grmm.data import HeadViews
+from grmm.head_crop import behind_torso
+from grmm.model import PinholeView
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head
 
 
@@ -47,3 +51,38 @@ def test_a_matte_without_torso_or_labels_is_taken_as_it_is():
     for source in (Bare, Dressed):
         item = HeadViews(source(size=64), ellipsoid_head()).item(0)
         assert float(item.target[:, 58:, 20:44].min()) == 1 and item.mask[58:].all()
+
+
+def necked_head():
+    """The ellipsoid: its lower third is the neck."""
+    head = ellipsoid_head(24, 32)
+    return replace(head, regions=head.regions | {"neck": head.template[:, 1] < -0.03})
+
+
+def test_a_torso_before_the_neck_hides_it_and_beside_it_nothing():
+    head = necked_head()
+    K = torch.tensor([[140.0, 0, 32], [0, 140, 32], [0, 0, 1]], dtype=torch.float64)
+    camera = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
+    camera[2, 3] = 0.6
+    view = PinholeView(K=K, cam_from_head=camera, width=64, height=64)
+    torso = np.zeros((64, 64), bool)
+    torso[46:] = True
+    hidden = behind_torso(head, head.template, view, torso)
+    assert hidden[48:54, 30:34].all()
+    assert not hidden[:, :12].any() and not hidden[:46].any() and not hidden[62:].any()
+    bare = ellipsoid_head()
+    assert not behind_torso(bare, bare.template, view, torso).any()
+    assert not behind_torso(head, head.template, view, ~torso & torso).any()
+
+
+def test_a_hidden_neck_neither_teaches_nor_counts():
+    plain = HeadViews(Labelled(size=64), necked_head()).item(0)
+    item = HeadViews(Labelled(size=64), necked_head(), DataConfig(skip_hidden_neck=True)).item(0)
+    shirt = torch.from_numpy(Labelled(size=64).read(0).parts == TORSO)
+    assert not plain.hidden.any() and 0 < item.hidden.sum() < shirt.sum()
+    assert not (item.hidden & ~shirt).any() and not (item.hidden & item.mask).any()
+    assert torch.equal(item.target, plain.target)
+    image = torch.rand(3, 64, 64)
+    shown = item.comparable(image)
+    assert torch.equal(shown[:, item.hidden], item.target[:, item.hidden])
+    assert torch.equal(shown[:, ~item.hidden], image[:, ~item.hidden])
