@@ -1,8 +1,9 @@
-"""``express50 plan`` scales a measured dataset's receipts to the cost of a capture campaign.
+"""``express50 plan`` scales measured datasets' receipts to the cost of a capture campaign.
 
-Seconds and bytes per item grow linearly in the product of the sizes that each stage names in its
-`Growth`. Memory has a part that does not grow (libraries, the head model), which one dataset cannot
-separate, so it is given as measured: a lower bound.
+Seconds per item are a constant and a part that grows with the product of the sizes that each stage
+names in its `Growth`; datasets of two sizes tell these apart, and every figure has an interval.
+Bytes are proportional. Memory has a part that does not grow, so it is given as measured: a lower
+bound.
 """
 
 from __future__ import annotations
@@ -10,7 +11,8 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from rich.filesize import decimal
@@ -20,6 +22,8 @@ from express50.contract.config import PRESETS, config_toml, resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage, stages
 from express50.dial.footage import Footage, footage_of
+from express50.dial.laws import Sample, forecast
+from express50.dial.pilot import dial_dir, read_measured
 from express50.errors import ConfigError, StageError
 from express50.files.digests import files_of, text_digest
 from express50.runner.ledger import Ledger
@@ -35,9 +39,12 @@ TARGETS: dict[str, dict[str, float]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Measured:
-    """Holds what one stage cost in a dataset: means per item, peak over items, and the preset."""
+    """Holds what one stage cost in a dataset: per item, peak over items, and the preset.
 
-    seconds: float
+    Seconds are processor time, where the receipts have it.
+    """
+
+    seconds: tuple[float, ...]
     bytes: float
     memory: float
     preset: str
@@ -51,6 +58,9 @@ class Row:
     items: int
     seconds: float | None = None
     core_hours: float | None = None
+    core_hours_low: float | None = None
+    core_hours_high: float | None = None
+    sizes: int = 0
     days: float | None = None
     disk: float | None = None
     memory: float | None = None
@@ -65,11 +75,15 @@ def add_commands(subparsers: Any) -> None:
         subparsers,
         "plan",
         run_plan,
-        "what a campaign costs, from a measured dataset's receipts",
-        description="Scales what every stage of a dataset took to the size of a campaign, linearly "
-        "in what its items grow with. Every figure is from receipts of this machine; what was not "
-        "run is n/a.",
-        example="express50 plan DATASET --target express-50 --workers 32",
+        "what a campaign costs, from measured datasets",
+        description="Scales what every stage of a dataset took to the size of a campaign. Every "
+        "figure is from receipts or from 'express50 tune' on this machine; what was not run is "
+        "n/a. A second dataset with other cameras or sizes tells what does not grow.",
+        example="express50 plan DATASET --also OTHER --target express-50 --workers 32",
+    )
+    words = "another measured dataset, of another size (repeatable)"
+    parser.add_argument(
+        "--also", type=Path, action="append", default=[], metavar="DATASET", help=words
     )
     parser.add_argument("--target", choices=list(TARGETS), help="a named campaign")
     for name in SIZES:
@@ -97,21 +111,27 @@ def run_plan(args: argparse.Namespace) -> int:
     dataset = Dataset(args.dataset)
     with stdout_to_stderr():
         known = list(stages().values())
-        measured, footage = measure(dataset, known), footage_of(dataset)
+        datasets = [dataset, *map(Dataset, args.also)]
+        measured = [pair for one in datasets for pair in measure_sizes(one, known)]
+    footage = measured[0][0]
     target = target_of(args.target, sizes, footage)
-    rows = estimate(known, target, footage, measured, args.workers)
+    rows = estimate(known, target, measured, args.workers)
     total = totals(rows)
-    data = {"target": vars(target), "measured": vars(footage), "workers": args.workers}
+    data = {"target": vars(target), "measured": [vars(f) for f, _ in measured]}
+    data["workers"] = args.workers
     data |= {"stages": [vars(row) for row in rows], "total": total}
     columns = ["stage", "items", "s per item", "core hours", f"days on {args.workers}", "disk"]
-    columns += ["peak memory", "preset", "times what was measured"]
-    hours, days = f"{total['core_hours']:.1f}", f"{total['days']:.2f}"
+    columns += ["peak memory", "preset", "sizes", "times what was measured"]
+    hours = _hours(total["core_hours"], total["core_hours_low"], total["core_hours_high"])
+    days = f"{total['days']:.2f}"
     cells = [_cells(row) for row in rows]
-    cells.append(["sum", "", "", hours, days, decimal(int(total["disk"])), "", "", ""])
+    cells.append(["sum", "", "", hours, days, decimal(int(total["disk"])), "", "", "", ""])
     lines = [
         f"target   {args.target or 'as given'}: {_words(target)}",
-        f"measured {dataset.root}: {_words(footage)}",
+        *dict.fromkeys(f"measured {_words(size)}" for size, _ in measured),
         *format_table(columns, cells),
+        "core hours: with a 90 % interval; a stage measured at one size may have a part that does "
+        "not grow, which --also DATASET of another size would tell",
         "s per item: of one core; stages one after the other, no item split over workers",
         "peak memory: as measured; more footage may need more",
         "disk: without outputs that were replaced; stages keep two of each item while there are 2 "
@@ -124,10 +144,15 @@ def run_plan(args: argparse.Namespace) -> int:
 
 def _cells(row: Row) -> list[str]:
     if row.why:
-        return [row.stage, str(row.items), *["n/a"] * 5, "", row.why]
-    figures = [f"{row.seconds:.1f}", f"{row.core_hours:.1f}", f"{row.days:.2f}"]
+        return [row.stage, str(row.items), *["n/a"] * 5, "", "0", row.why]
+    hours = _hours(row.core_hours, row.core_hours_low, row.core_hours_high)
+    figures = [f"{row.seconds:.1f}", hours, f"{row.days:.2f}"]
     sizes = [decimal(int(row.disk or 0)), f">= {decimal(int(row.memory or 0))}"]
-    return [row.stage, str(row.items), *figures, *sizes, row.preset, row.how]
+    return [row.stage, str(row.items), *figures, *sizes, row.preset, str(row.sizes), row.how]
+
+
+def _hours(value: float | None, low: float | None, high: float | None) -> str:
+    return f"{value:.3g} ({low:.2g} to {high:.2g})"
 
 
 def _words(footage: Footage) -> str:
@@ -136,6 +161,35 @@ def _words(footage: Footage) -> str:
         f"{count(footage.views, 'camera')} of {footage.pixels / 1e6:.3g} megapixels, "
         f"{count(footage.frames, 'frame')} per camera"
     )
+
+
+def measure_sizes(
+    dataset: Dataset, known: Sequence[Stage]
+) -> list[tuple[Footage, dict[str, Measured]]]:
+    """Return what stages cost at each size that was measured: by the run first, then by ``tune``.
+
+    Raises:
+        StageError: nothing was measured.
+    """
+    figures = read_measured(dial_dir(dataset) / "measured.json")
+    trials = figures.trials if figures else []
+    if not trials or dataset.subjects():
+        found = [(footage_of(dataset), measure(dataset, known))]
+    else:
+        seen = trials[0]
+        found = [(replace(seen.footage, expressions=seen.scripted), {})]
+    for trial in trials:
+        table = {
+            name: Measured(
+                seconds=(cost.core_seconds,) * cost.items,
+                bytes=cost.bytes,
+                memory=cost.memory,
+                preset=trial.settings[name],
+            )
+            for name, cost in trial.costs.items()
+        }
+        found.append((trial.footage, table))
+    return found
 
 
 def measure(dataset: Dataset, known: Sequence[Stage]) -> dict[str, Measured]:
@@ -154,7 +208,7 @@ def measure(dataset: Dataset, known: Sequence[Stage]) -> dict[str, Measured]:
             if done:
                 size = sum(path.stat().st_size for one in folders for path in files_of(one))
                 found[stage.name] = Measured(
-                    seconds=sum(r.seconds for r in done) / len(done),
+                    seconds=tuple(r.core_seconds or r.seconds for r in done),
                     bytes=size / len(done),
                     memory=max(r.peak_memory for r in done),
                     preset=preset_of(dataset, stage),
@@ -166,7 +220,7 @@ def preset_of(dataset: Dataset, stage: Stage) -> str:
     """Return the preset whose values a stage last ran with, or ``own`` and a digest of these."""
     path = dataset.config_file(stage.name)
     text = path.read_text(encoding="utf-8") if path.is_file() else ""
-    for preset in PRESETS:
+    for preset in ("standard", *PRESETS):
         if config_toml(stage.name, resolve_config(stage, preset)) == text:
             return preset
     return f"own {text_digest(text)[:6]}"
@@ -196,34 +250,42 @@ def target_of(name: str | None, sizes: Mapping[str, float], measured: Footage) -
 def estimate(
     known: Sequence[Stage],
     target: Footage,
-    footage: Footage,
-    measured: Mapping[str, Measured],
+    measured: Sequence[tuple[Footage, Mapping[str, Measured]]],
     workers: int,
 ) -> list[Row]:
-    """Estimate one row per stage for a campaign, from what each cost on the measured footage.
+    """Estimate one row per stage for a campaign, from what each cost on measured footage.
 
-    Workers are processes of one core each.
+    Workers are processes of one core each. Only datasets of the first one's preset count.
     """
     rows = []
     for stage in known:
-        growth, cost = stage.growth, measured.get(stage.name)
-        items = round(target.work(growth.items))
-        if cost is None:
+        growth = stage.growth
+        items = max(1, round(target.work(growth.items)))
+        runs = [(footage, table[stage.name]) for footage, table in measured if stage.name in table]
+        if not runs:
             rows.append(Row(stage=stage.name, items=items, why="was not run"))
             continue
+        # Of a pilot's settings, standard is what a run would have.
+        footage, cost = next((run for run in runs if run[1].preset == "standard"), runs[0])
+        if stage.name in measured[0][1]:
+            footage, cost = runs[0]
+        alike = [(f, c) for f, c in runs if c.preset == cost.preset]
+        samples = [Sample(f.work(growth.time), c.seconds) for f, c in alike]
+        item = forecast(samples, target.work(growth.time))
         ratio = target.work(growth.time) / footage.work(growth.time)
-        seconds = cost.seconds * ratio
-        hours = items * seconds / 3600
         disk = cost.bytes * target.work(growth.disk) / footage.work(growth.disk)
         rows.append(
             Row(
                 stage=stage.name,
                 items=items,
-                seconds=seconds,
-                core_hours=hours,
-                days=hours / 24 / min(workers, items),
+                seconds=item.value,
+                core_hours=items * item.value / 3600,
+                core_hours_low=items * item.low / 3600,
+                core_hours_high=items * item.high / 3600,
+                sizes=item.sizes,
+                days=items * item.value / 86400 / min(workers, items),
                 disk=items * disk,
-                memory=cost.memory,
+                memory=max(c.memory for _, c in alike),
                 preset=cost.preset,
                 how=f"{' x '.join(growth.time)} = {ratio:.4g}",
             )
@@ -236,6 +298,8 @@ def totals(rows: Sequence[Row]) -> dict[str, Any]:
     known = [row for row in rows if not row.why]
     return {
         "core_hours": sum(row.core_hours or 0.0 for row in known),
+        "core_hours_low": sum(row.core_hours_low or 0.0 for row in known),
+        "core_hours_high": sum(row.core_hours_high or 0.0 for row in known),
         "days": sum(row.days or 0.0 for row in known),
         "disk": sum(row.disk or 0.0 for row in known),
         "presets": dict(Counter(row.preset for row in known)),

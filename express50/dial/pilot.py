@@ -231,6 +231,11 @@ def cost_of(dataset: Dataset, stage: str, receipts: Sequence[Receipt], extra: fl
     )
 
 
+def dial_dir(dataset: Dataset) -> Path:
+    """Return the folder of what was measured and chosen."""
+    return dataset.root / "dial"
+
+
 def pilot_dir(dataset: Dataset) -> Path:
     """Return the folder of a dataset's trials."""
     return dataset.staging_dir / "pilot"

@@ -35,6 +35,7 @@ from express50.dial.pilot import (
     Ladder,
     Pilot,
     PilotFigures,
+    dial_dir,
     keep_for_run,
     key_of,
     measure,
@@ -82,11 +83,6 @@ class RunState:
     seconds: float = 0.0
     changes: list[str] = field(default_factory=list)
     finished: bool = False
-
-
-def dial_dir(dataset: Dataset) -> Path:
-    """Return the folder of what was measured and chosen."""
-    return dataset.root / "dial"
 
 
 @dataclass

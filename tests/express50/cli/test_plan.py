@@ -1,7 +1,9 @@
 """Plans: figures come from receipts, grow by the stated law, or are absent."""
 
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from express50.cli.main import main
@@ -10,27 +12,31 @@ from express50.cli.plan import (
     Measured,
     estimate,
     measure,
+    measure_sizes,
     target_of,
 )
 from express50.contract.layout import Dataset
 from express50.contract.stage import stages
 from express50.dial.footage import Footage, footage_of
+from express50.dial.laws import Sample, forecast
+from express50.dial.tune import tune
 from express50.errors import ConfigError
 from express50.runner.ledger import Ledger
 from pipelines import ingest
+from tests.express50.dial.toy_chain import captures_of, chain_of
 from tests.synth import make_capture
 
 SMALL = Footage(subjects=2, expressions=6, views=8, pixels=1e5, frames=36)
 
 
 def cost(seconds, size=1e6, memory=1e9, preset="draft"):
-    return Measured(seconds=seconds, bytes=size, memory=memory, preset=preset)
+    return Measured(seconds=(seconds,) * 4, bytes=size, memory=memory, preset=preset)
 
 
 def test_express_50_is_scaled_linearly_from_one_dataset():
     target = target_of("express-50", {}, SMALL)
     assert target == Footage(subjects=50, expressions=60, views=24, pixels=8294400, frames=360)
-    (row,) = estimate([stages()["depth"]], target, SMALL, {"depth": cost(2.0)}, workers=10)
+    (row,) = estimate([stages()["depth"]], target, [(SMALL, {"depth": cost(2.0)})], workers=10)
     ratio = 24 * 8294400 / (8 * 1e5)
     assert row.items == 3000 and row.seconds == pytest.approx(2 * ratio)
     assert row.core_hours == pytest.approx(3000 * 2 * ratio / 3600)
@@ -40,19 +46,19 @@ def test_express_50_is_scaled_linearly_from_one_dataset():
 
 
 def test_one_item_is_not_split_over_workers():
-    (row,) = estimate([stages()["pack"]], SMALL, SMALL, {"pack": cost(86400.0)}, workers=32)
+    (row,) = estimate([stages()["pack"]], SMALL, [(SMALL, {"pack": cost(86400.0)})], workers=32)
     assert row.items == 1 and row.days == pytest.approx(1.0)
 
 
 def test_what_was_not_measured_says_so():
     chosen, measured = [stages()["depth"], stages()["track"]], {"depth": cost(2.0)}
-    rows = estimate(chosen, SMALL, SMALL, measured, 1)
+    rows = estimate(chosen, SMALL, [(SMALL, measured)], 1)
     assert [row.why for row in rows] == ["", "was not run"]
     assert rows[1].seconds is rows[1].core_hours is rows[1].disk is rows[1].memory is None
 
 
 def test_every_stage_has_a_law_and_every_target_a_size():
-    rows = estimate(list(stages().values()), SMALL, SMALL, {}, 1)
+    rows = estimate(list(stages().values()), SMALL, [(SMALL, {})], 1)
     assert [row.stage for row in rows] == list(stages())
     for name in TARGETS:
         assert target_of(name, {"frames_per_expression": 90}, SMALL).frames in (5400, 1080)
@@ -70,7 +76,7 @@ def test_figures_are_those_of_the_receipts(tmp_path, capsys):
     with Ledger(dataset.ledger) as ledger:
         receipts = ledger.read("ingest").values()
     found = measure(dataset, [ingest.STAGE])["ingest"]
-    assert found.seconds == pytest.approx(sum(r.seconds for r in receipts) / 2)
+    assert found.seconds == tuple(r.core_seconds for r in receipts)
     assert found.memory == max(r.peak_memory for r in receipts) and found.preset == "draft"
     files = [p for p in dataset.stage_dir("ingest").rglob("*") if p.is_file()]
     assert found.bytes == sum(p.stat().st_size for p in files) / 2
@@ -78,8 +84,43 @@ def test_figures_are_those_of_the_receipts(tmp_path, capsys):
     capsys.readouterr()
     assert main(["plan", str(root), "--size", "128x64", "--subjects", "10", "--json"]) == 0
     first = json.loads(capsys.readouterr().out)["stages"][0]
-    assert first["items"] == 10 and first["seconds"] == pytest.approx(2 * found.seconds)
+    assert first["items"] == 10 and first["seconds"] == pytest.approx(2 * sum(found.seconds) / 2)
     assert main(["plan", str(root), "--target", "renderme-360"]) == 0
     said = capsys.readouterr().out
     assert "was not run" in said and "the sum lacks calibrate" in said
     assert main(["plan", str(root), "--size", "big"]) == 2
+
+
+def test_two_sizes_tell_what_does_not_grow_and_the_interval_holds_a_third():
+    stage = stages()["depth"]
+    large, unseen = (replace(SMALL, pixels=SMALL.pixels * k) for k in (4, 20))
+
+    def seconds(footage):  # 3 s whatever the footage
+        return 3.0 + 2.0 * footage.pixels / SMALL.pixels
+
+    measured = [(f, {"depth": cost(seconds(f))}) for f in (SMALL, large)]
+    (row,) = estimate([stage], unseen, measured, 1)
+    assert row.sizes == 2 and row.seconds == pytest.approx(seconds(unseen))
+    assert row.core_hours_low < row.core_hours < row.core_hours_high < 1.3 * row.core_hours
+    (alone,) = estimate([stage], unseen, measured[:1], 1)
+    assert alone.sizes == 1 and alone.seconds == pytest.approx(20 * 5.0)
+    assert alone.core_hours_low < row.core_hours < alone.core_hours_high
+
+
+def test_intervals_hold_nine_times_in_ten():
+    rng, kept = np.random.default_rng(1), 0
+    for _ in range(200):
+        samples = [Sample(w, rng.normal(2 + w, 0.2 * (2 + w), 8).tolist()) for w in (1.0, 4.0, 9.0)]
+        found = forecast(samples, 16.0)
+        kept += found.low <= 18.0 <= found.high
+    assert 170 <= kept <= 192
+
+
+def test_a_dataset_that_was_only_tuned_is_planned(tmp_path, capsys):
+    captures = captures_of(tmp_path / "captures", subjects=1)
+    tune(chain_of(tmp_path / "data", captures))
+    sizes = measure_sizes(Dataset(tmp_path / "data"), [ingest.STAGE])
+    assert sizes[0][0].expressions == 4 and sizes[1][1]["solve"].preset == "draft"
+    capsys.readouterr()
+    assert main(["plan", str(tmp_path / "data"), "--target", "express-50"]) == 0
+    assert "ingest" in (text := capsys.readouterr().out) and "was not run" in text
