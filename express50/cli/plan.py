@@ -21,9 +21,9 @@ from express50.console import add_command, answer, count, format_table, stdout_t
 from express50.contract.config import PRESETS, config_toml, resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage, stages
+from express50.dial.figures import dial_dir, read_measured
 from express50.dial.footage import Footage, footage_of
-from express50.dial.laws import Sample, forecast
-from express50.dial.pilot import dial_dir, read_measured
+from express50.dial.laws import MeasuredSize, forecast
 from express50.errors import ConfigError, StageError
 from express50.files.digests import files_of, text_digest
 from express50.runner.ledger import Ledger
@@ -270,7 +270,7 @@ def estimate(
         if stage.name in measured[0][1]:
             footage, cost = runs[0]
         alike = [(f, c) for f, c in runs if c.preset == cost.preset]
-        samples = [Sample(f.work(growth.time), c.seconds) for f, c in alike]
+        samples = [MeasuredSize(f.work(growth.time), c.seconds) for f, c in alike]
         item = forecast(samples, target.work(growth.time))
         ratio = target.work(growth.time) / footage.work(growth.time)
         disk = cost.bytes * target.work(growth.disk) / footage.work(growth.disk)

@@ -14,8 +14,9 @@ from statistics import median
 
 from express50.contract.stage import Stage
 from express50.dial.budget import Goal
+from express50.dial.figures import Cost, PilotFigures, Trial
 from express50.dial.footage import Footage
-from express50.dial.pilot import Cost, Ladder, PilotFigures, Trial, standard_of
+from express50.dial.pilot import Ladder, standard_of
 from express50.dial.results import RESULTS, ResultKind
 from express50.errors import ConfigError
 

@@ -17,7 +17,7 @@ ALONE = 0.15  # of an item's seconds: their spread where no size has two items
 
 
 @dataclass(frozen=True)
-class Sample:
+class MeasuredSize:
     """Seconds of each item at one size of footage."""
 
     work: float
@@ -38,7 +38,7 @@ class Forecast:
     sizes: int
 
 
-def forecast(samples: Sequence[Sample], work: float) -> Forecast:
+def forecast(samples: Sequence[MeasuredSize], work: float) -> Forecast:
     """Predict the seconds of an item from samples of some sizes, by a parametric bootstrap."""
     works = np.array([sample.work for sample in samples])
     means = np.array([np.mean(sample.seconds) for sample in samples])
@@ -58,7 +58,7 @@ def forecast(samples: Sequence[Sample], work: float) -> Forecast:
     return Forecast(value, max(0.0, min(float(low), value)), max(float(high), value), sizes)
 
 
-def _errors(samples: Sequence[Sample], means: np.ndarray) -> np.ndarray:
+def _errors(samples: Sequence[MeasuredSize], means: np.ndarray) -> np.ndarray:
     """Return standard errors of means; items of all sizes have one relative spread."""
     counts = np.array([len(sample.seconds) for sample in samples])
     free = int((counts - 1).sum())

@@ -12,7 +12,7 @@ import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import mean, median
 from typing import Any
@@ -21,7 +21,8 @@ from express50.capture.index import read_index
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage, typical_error
 from express50.dial.budget import Clock
-from express50.dial.footage import Footage, footage_of
+from express50.dial.figures import Cost, PilotFigures, Trial, trial_of
+from express50.dial.footage import footage_of
 from express50.dial.results import RESULTS, ResultKind, differences, whole_peaks
 from express50.errors import ConfigError, DiskFullError, Express50Error, FormatError
 from express50.files.atomic import write_json
@@ -37,61 +38,6 @@ STEEPER = 3.0  # a setting that was not tried may cost so many times the one bel
 Ladder = Mapping[str, Any]  # configurations of a stage by the name of the setting, cheapest first
 
 
-@dataclass(frozen=True, kw_only=True)
-class Cost:
-    """What an item of a stage costs: typical seconds, and bytes; the most memory.
-
-    ``extra`` are seconds of the clock that the stage took beside its items.
-    """
-
-    seconds: float
-    core_seconds: float
-    bytes: float
-    memory: float
-    items: int
-    extra: float = 0.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class Trial:
-    """One run of the chain on a few items.
-
-    Attributes:
-        settings: name of the setting of each stage.
-        footage: what it ran on.
-        scripted: expressions of the whole capture.
-        costs: of each stage.
-        errors: ``[value, low, high]`` that stages state of each result.
-        failed: why a stage made nothing.
-        folder: of its outputs.
-    """
-
-    settings: dict[str, str]
-    footage: Footage
-    scripted: float
-    costs: dict[str, Cost]
-    errors: dict[str, list[float]]
-    failed: dict[str, str]
-    folder: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class PilotFigures:
-    """What was measured of a dataset.
-
-    Attributes:
-        key: digest of stages, settings and machine; figures of another key say nothing.
-        trials: the first at the cheapest settings, the second of one peak, then one step each.
-        losses: per stage, setting and result: the difference to the dearest setting tried.
-        untried: settings that there was no time to try, by stage.
-    """
-
-    key: str
-    trials: list[Trial]
-    losses: dict[str, dict[str, dict[str, float]]]
-    untried: dict[str, list[str]] = field(default_factory=dict)
-
-
 def key_of(known: Sequence[Stage], ladders: Mapping[str, Ladder], threads: int) -> str:
     """Return a digest of everything that measured figures depend on but the footage."""
     steps = {
@@ -99,27 +45,6 @@ def key_of(known: Sequence[Stage], ladders: Mapping[str, Ladder], threads: int) 
         for stage in known
     }
     return value_digest([steps, os.cpu_count(), threads])[:16]
-
-
-def read_measured(path: Path, key: str | None = None) -> PilotFigures | None:
-    """Read what was measured; None where nothing was, or with another key."""
-    if not path.is_file():
-        return None
-    table = read_json_table(path, FormatError, "delete it, and it is measured again")
-    try:
-        if key is not None and table["key"] != key:
-            return None
-        trials = [_trial_of(row) for row in table["trials"]]
-        return PilotFigures(
-            key=table["key"], trials=trials, losses=table["losses"], untried=table["untried"]
-        )
-    except (KeyError, TypeError) as error:
-        raise FormatError(f"{path}: not figures of a pilot ({error}); delete it") from error
-
-
-def _trial_of(row: Mapping[str, Any]) -> Trial:
-    costs = {name: Cost(**cost) for name, cost in row["costs"].items()}
-    return Trial(**{**row, "costs": costs, "footage": Footage(**row["footage"])})
 
 
 @dataclass
@@ -152,7 +77,7 @@ class Pilot:
         root = pilot_dir(self.dataset) / name
         record = root / "trial.json"
         if record.is_file():
-            return _trial_of(json.loads(record.read_text(encoding="utf-8")))
+            return trial_of(json.loads(record.read_text(encoding="utf-8")))
         shutil.rmtree(root, ignore_errors=True)
         if source is None:
             self._begin(root)
@@ -173,7 +98,7 @@ class Pilot:
             if cost is not None:
                 costs[stage.name] = cost
             if why:
-                failed[stage.name] = why
+                failed[stage.name] = why.replace(self.subject, "the subject")
             _cut_peaks(dataset, self.subject, peaks)
         count = len(_rows(dataset.peaks_file(self.subject)))
         whole = footage_of(dataset)
@@ -229,11 +154,6 @@ def cost_of(dataset: Dataset, stage: str, receipts: Sequence[Receipt], extra: fl
         items=len(receipts),
         extra=extra,
     )
-
-
-def dial_dir(dataset: Dataset) -> Path:
-    """Return the folder of what was measured and chosen."""
-    return dataset.root / "dial"
 
 
 def pilot_dir(dataset: Dataset) -> Path:

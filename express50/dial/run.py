@@ -30,17 +30,15 @@ from express50.dial.choice import (
     labels_of,
     stage_seconds,
 )
+from express50.dial.figures import PilotFigures, dial_dir, read_measured
 from express50.dial.footage import Footage, footage_of
 from express50.dial.pilot import (
     Ladder,
     Pilot,
-    PilotFigures,
-    dial_dir,
     keep_for_run,
     key_of,
     measure,
     pilot_dir,
-    read_measured,
 )
 from express50.dial.results import RESULTS, ResultKind
 from express50.errors import ConfigError, FormatError, StageError

@@ -14,7 +14,8 @@ from express50.console import format_seconds, format_table
 from express50.contract.config import PRESETS
 from express50.dial.budget import Clock
 from express50.dial.choice import Point, Workload, front, labels_of, point_of
-from express50.dial.pilot import dial_dir, pilot_dir, standard_of
+from express50.dial.figures import dial_dir
+from express50.dial.pilot import pilot_dir, standard_of
 from express50.dial.run import Chain, error_text
 from express50.files.atomic import write_bytes, write_json
 

@@ -18,7 +18,7 @@ from express50.cli.plan import (
 from express50.contract.layout import Dataset
 from express50.contract.stage import stages
 from express50.dial.footage import Footage, footage_of
-from express50.dial.laws import Sample, forecast
+from express50.dial.laws import MeasuredSize, forecast
 from express50.dial.tune import tune
 from express50.errors import ConfigError
 from express50.runner.ledger import Ledger
@@ -110,7 +110,9 @@ def test_two_sizes_tell_what_does_not_grow_and_the_interval_holds_a_third():
 def test_intervals_hold_nine_times_in_ten():
     rng, kept = np.random.default_rng(1), 0
     for _ in range(200):
-        samples = [Sample(w, rng.normal(2 + w, 0.2 * (2 + w), 8).tolist()) for w in (1.0, 4.0, 9.0)]
+        samples = [
+            MeasuredSize(w, rng.normal(2 + w, 0.2 * (2 + w), 8).tolist()) for w in (1.0, 4.0, 9.0)
+        ]
         found = forecast(samples, 16.0)
         kept += found.low <= 18.0 <= found.high
     assert 170 <= kept <= 192

@@ -8,7 +8,8 @@ import pytest
 
 from express50.contract.layout import Dataset
 from express50.dial.budget import parse_budget, parse_goal
-from express50.dial.pilot import dial_dir, pilot_dir
+from express50.dial.figures import dial_dir
+from express50.dial.pilot import pilot_dir
 from express50.dial.run import closing_lines, run_within
 from express50.dial.tune import tune
 from express50.errors import ConfigError

@@ -1,0 +1,95 @@
+"""What a pilot measured of a dataset, as it is kept in ``dial/measured.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from express50.contract.layout import Dataset
+from express50.dial.footage import Footage
+from express50.errors import FormatError
+from express50.files.text import read_json_table
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cost:
+    """What an item of a stage costs: typical seconds, and bytes; the most memory.
+
+    ``extra`` are seconds of the clock that the stage took beside its items.
+    """
+
+    seconds: float
+    core_seconds: float
+    bytes: float
+    memory: float
+    items: int
+    extra: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """One run of the chain on a few items.
+
+    Attributes:
+        settings: name of the setting of each stage.
+        footage: what it ran on.
+        scripted: expressions of the whole capture.
+        costs: of each stage.
+        errors: ``[value, low, high]`` that stages state of each result.
+        failed: why a stage made nothing.
+        folder: of its outputs.
+    """
+
+    settings: dict[str, str]
+    footage: Footage
+    scripted: float
+    costs: dict[str, Cost]
+    errors: dict[str, list[float]]
+    failed: dict[str, str]
+    folder: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class PilotFigures:
+    """What was measured of a dataset.
+
+    Attributes:
+        key: digest of stages, settings and machine; figures of another key say nothing.
+        trials: the first at the cheapest settings, the second of one peak, then one step each.
+        losses: per stage, setting and result: the difference to the dearest setting tried.
+        untried: settings that there was no time to try, by stage.
+    """
+
+    key: str
+    trials: list[Trial]
+    losses: dict[str, dict[str, dict[str, float]]]
+    untried: dict[str, list[str]] = field(default_factory=dict)
+
+
+def dial_dir(dataset: Dataset) -> Path:
+    """Return the folder of what was measured and chosen."""
+    return dataset.root / "dial"
+
+
+def read_measured(path: Path, key: str | None = None) -> PilotFigures | None:
+    """Read what was measured; None where nothing was, or with another key."""
+    if not path.is_file():
+        return None
+    table = read_json_table(path, FormatError, "delete it, and it is measured again")
+    try:
+        if key is not None and table["key"] != key:
+            return None
+        trials = [trial_of(row) for row in table["trials"]]
+        return PilotFigures(
+            key=table["key"], trials=trials, losses=table["losses"], untried=table["untried"]
+        )
+    except (KeyError, TypeError) as error:
+        raise FormatError(f"{path}: not figures of a pilot ({error}); delete it") from error
+
+
+def trial_of(row: Mapping[str, Any]) -> Trial:
+    """Read a trial from its JSON form."""
+    costs = {name: Cost(**cost) for name, cost in row["costs"].items()}
+    return Trial(**{**row, "costs": costs, "footage": Footage(**row["footage"])})
