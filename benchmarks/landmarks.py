@@ -28,8 +28,9 @@ import numpy as np
 import torch
 
 from express50.head.load import load_head
+from express50.landmarks import WEIGHTS
 from express50.landmarks.detector import Detection, detect, detect_many, find_dense
-from express50.landmarks.network import WEIGHTS, LandmarkNet, load_network
+from express50.landmarks.network import LandmarkNet, load_network
 from express50.landmarks.training.dense import Places, carry_places
 from express50.landmarks.training.random_heads import random_head
 from express50.landmarks.training.scene import HeadScene, TrainingView

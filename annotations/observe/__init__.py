@@ -39,7 +39,7 @@ class ObserveConfig:
 
 def inputs(dataset: Dataset, item: str, config: ObserveConfig) -> dict[str, Path | str]:
     """List the subject's index and proxies, and the landmark network's weights."""
-    from express50.landmarks.network import WEIGHTS
+    from express50.landmarks import WEIGHTS
 
     return {"ingest": dataset.item_dir("ingest", item), "weights": WEIGHTS}
 

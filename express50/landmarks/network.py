@@ -23,6 +23,7 @@ from express50.errors import FormatError
 from express50.files.arrays import read_arrays
 from express50.files.text import AGAIN, reason
 from express50.geometry.conventions import cell_centres, corner_to_cell
+from express50.landmarks import WEIGHTS
 
 CROP = 128
 POINTS = 68
@@ -36,7 +37,6 @@ MIRROR = np.array(
      45, 44, 43, 42, 47, 46, 39, 38, 37, 36, 41, 40,
      54, 53, 52, 51, 50, 49, 48, 59, 58, 57, 56, 55, 64, 63, 62, 61, 60, 67, 66, 65]
 )  # fmt: skip
-WEIGHTS = Path(__file__).with_name("weights.npz")
 # Suffix of buffers that are not stored: batch normalisation counts its batches.
 COUNTERS = "num_batches_tracked"
 

@@ -22,9 +22,10 @@ from express50.files.arrays import DAMAGE, read_arrays
 from express50.files.text import read_json
 from express50.geometry.cameras import Camera, normalised
 from express50.geometry.conventions import cell_to_corner
+from express50.landmarks import WEIGHTS
 from express50.landmarks.detector import SMALLEST, Detection, cut_crop, detect, place_crop
 from express50.landmarks.eyes_and_lips import Irises, find_irises, open_lips
-from express50.landmarks.network import WEIGHTS, load_network
+from express50.landmarks.network import load_network
 
 EMBEDDED, FAN = "embedded", "fan:"
 SCHEMA = "express50.landmarks/1"

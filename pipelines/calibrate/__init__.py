@@ -15,7 +15,7 @@ __all__ = ["STAGE", "CalibrateConfig"]
 def inputs(dataset: Dataset, item: str, config: CalibrateConfig) -> dict[str, Path | str]:
     """List the frame index, the landmark weights, and calibration and board images if given."""
     # Imported here, as everything heavy: listing the stages must stay quick.
-    from express50.landmarks.network import WEIGHTS
+    from express50.landmarks import WEIGHTS
 
     index = read_index(dataset, item)
     found: dict[str, Path | str] = {"index": dataset.index_file(item), "weights": WEIGHTS}

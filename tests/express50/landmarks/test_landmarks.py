@@ -10,6 +10,7 @@ import torch
 
 from express50.capture.expressions import load_script
 from express50.head.load import load_head
+from express50.landmarks import WEIGHTS
 from express50.landmarks.detector import (
     detect,
     detect_many,
@@ -21,7 +22,6 @@ from express50.landmarks.network import (
     CROP,
     MIRROR,
     STRETCH,
-    WEIGHTS,
     LandmarkNet,
     expectation,
     face_box,
