@@ -241,7 +241,7 @@ class _StageAudit:
             if found := list(self.dataset.staging_dir.glob(f"{stage.name}-*")):
                 if self.fix:
                     clean_leftovers(self.dataset, stage.name)
-                what = f"{len(found)} unfinished outputs of a run that was killed"
+                what = f"unfinished outputs of {len(found)} runs that were killed"
                 how = "deleted" if self.fix else "--fix deletes them, as the next run would"
                 self._find("leftover", f".staging {stage.name}", what, how, self.fix)
             self._stage(stage)

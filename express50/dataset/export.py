@@ -7,7 +7,6 @@ seams of the texture, as glTF wants them.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -191,10 +190,6 @@ def exporting(out: Path, subject: str) -> Iterator[Path]:
         raise StageError(
             f"{target}: exists and holds no {META}, so it is not an export; name another folder"
         )
-    former = aside.with_name(aside.name + ".former")
-    if former.exists() and not target.exists():
-        former.rename(target)
-    shutil.rmtree(former, ignore_errors=True)
     with folder_in_one_step(aside, target):
         yield aside
 

@@ -12,7 +12,7 @@ import os
 import shutil
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -20,6 +20,7 @@ from express50.errors import DiskFullError
 
 LEAST_FREE = 100e6  # bytes; with less a disk counts as full
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # of Linux
+FORMER = ".former"  # ends the name of a folder that was moved out of the way
 NO_SPACE = os.strerror(errno.ENOSPC)
 
 
@@ -108,34 +109,63 @@ def folder_in_one_step(
 
     When the body raises, a former target stays as it was. A kill at any moment leaves the former
     target or the new one; only where the file system cannot swap two folders, a kill between two
-    renames leaves none. What a killed run left aside is deleted.
+    renames leaves none until the next call, which first puts the former one back. What a killed run
+    left aside is deleted. The folder that ``aside`` is in must be there, or be the target's.
     """
-    former = aside.with_name(aside.name + ".former")
+    former = aside.with_name(aside.name + FORMER)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    put_back(former, target)
     for left in (aside, former):
         shutil.rmtree(left, ignore_errors=True)
-    aside.mkdir(parents=True)
+    aside.mkdir()
     try:
         yield aside
         for folder, _, names in os.walk(aside, topdown=False):
             for name in names:
                 _sync(Path(folder) / name, os.O_RDONLY)
             sync_directory(Path(folder))
-        target.parent.mkdir(parents=True, exist_ok=True)
-        replaced = None
-        if not target.exists():
-            aside.rename(target)
-        elif _swap(aside, target):
-            replaced = aside
-        else:
-            target.rename(former)
-            aside.rename(target)
-            replaced = former
+        _replace(aside, target, former)
         sync_directory(target.parent)
-        if replaced is not None and keep is not None:
-            keep(replaced)
+        for replaced in (aside, former):
+            if keep is not None and replaced.exists():
+                keep(replaced)
         shutil.rmtree(former, ignore_errors=True)
     finally:
         shutil.rmtree(aside, ignore_errors=True)
+
+
+def put_back(former: Path, target: Path) -> None:
+    """Put a former folder back where a kill between two renames has left no target."""
+    if former.is_dir() and not target.exists():
+        target.parent.mkdir(parents=True, exist_ok=True)
+        former.rename(target)
+        sync_directory(target.parent)
+
+
+def _replace(aside: Path, target: Path, former: Path) -> None:
+    """Rename a folder to a target that others may make, replace or move away at the same time.
+
+    To look first, and then to rename, would fail where one of them comes between.
+    """
+    met = False
+    while True:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if _swap(aside, target):
+            return
+        try:
+            aside.rename(target)
+            return
+        except FileNotFoundError:
+            if not aside.exists():  # a later run has taken it away
+                raise
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
+            if met:  # it was not made just after the attempt to swap: the file system cannot
+                shutil.rmtree(former, ignore_errors=True)
+                with suppress(FileNotFoundError):
+                    target.rename(former)
+            met = True
 
 
 def _swap(one: Path, other: Path) -> bool:

@@ -18,7 +18,7 @@ from express50.contract.stage import Result, Stage
 from express50.errors import Express50Error
 from express50.files.digests import path_digest, value_digest
 from express50.runner.ledger import IMPORTED, Ledger, Made, Receipt
-from express50.runner.publish import discard_stale, set_aside
+from express50.runner.publish import discard_stale, run_folder, set_aside
 from express50.runner.worker import Task, run_task
 
 Digest = Callable[[Path], str]
@@ -58,8 +58,11 @@ def publish_import(
     writer = replace(stage, run=lambda *given: write(given[-1]), needs_gpu=lambda config: False)
     # Each import is another one: what replaced outputs hold of a former one must not come back.
     fingerprint = IMPORTED + value_digest([inputs, time.time_ns()])
-    task = Task(writer, dataset, item, NoSettings(), fingerprint, inputs, former=former)
-    receipt = run_task(task)
+    with run_folder(dataset, stage.name) as folder:
+        settings = NoSettings()
+        receipt = run_task(
+            Task(writer, dataset, item, settings, fingerprint, inputs, 1, former, folder)
+        )
     if not receipt.reason:
         discard_stale(dataset, stage.name, item)
         dataset.log_file(stage.name, item).unlink(missing_ok=True)

@@ -2,30 +2,54 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
+import re
 import shutil
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO
+from urllib.parse import quote, unquote
 
 from express50.contract.layout import Dataset
 from express50.errors import StageError
-from express50.files.atomic import folder_in_one_step, sync_directory
+from express50.files.atomic import FORMER, folder_in_one_step, put_back, sync_directory
+
+ASIDE = re.compile(rf"(.+)-[0-9a-f]{{32}}({re.escape(FORMER)})?")
+
+
+@contextmanager
+def run_folder(dataset: Dataset, stage: str) -> Iterator[Path]:
+    """Yield a run's own folder, which its workers need to publish.
+
+    A worker may live on when its run was killed, or was taken for dead. Once the folder is gone, at
+    the end of the run or when the next one begins, such a worker can no longer publish.
+    """
+    folder = dataset.staging_dir / f"{stage}-{uuid.uuid4().hex}"
+    folder.mkdir(parents=True)
+    try:
+        yield folder
+    finally:
+        clean_leftovers(dataset, stage)
 
 
 @contextmanager
 def publishing(
-    dataset: Dataset, stage: str, item: str, keep: Callable[[Path], None] | None = None
+    folder: Path,
+    dataset: Dataset,
+    stage: str,
+    item: str,
+    keep: Callable[[Path], None] | None = None,
 ) -> Iterator[Path]:
     """Yield an empty folder aside; on a clean exit it becomes the item's folder in one rename.
 
-    When the body raises, the item's former folder stays as it was. A former folder that was
-    replaced is deleted, unless ``keep`` moves it to another place.
+    It is made in a run's ``folder``. When the body raises, the item's former folder stays. A former
+    folder that was replaced is deleted, unless ``keep`` moves it to another place.
     """
-    aside = dataset.staging_dir / f"{stage}-{item.replace('/', '+')}-{uuid.uuid4().hex}"
+    aside = folder / f"{quote(item, safe='+')}-{uuid.uuid4().hex}"
     with folder_in_one_step(aside, dataset.item_dir(stage, item), keep):
         yield aside
 
@@ -59,9 +83,43 @@ def discard_stale(dataset: Dataset, stage: str, item: str) -> None:
 
 
 def clean_leftovers(dataset: Dataset, stage: str) -> None:
-    """Delete unfinished outputs of killed runs of one stage."""
-    for path in dataset.staging_dir.glob(f"{stage}-*"):
-        shutil.rmtree(path, ignore_errors=True)
+    """Delete what killed runs of one stage left unfinished; the caller holds the stage's lock.
+
+    It is renamed first, so that no worker publishes what is being deleted. Published folders that a
+    kill between two renames left beside their place are put back.
+    """
+    left = list(dataset.staging_dir.glob(f"{stage}-*"))
+    if not left:
+        return
+    taken = dataset.staging_dir / f"{stage}-leftovers-{uuid.uuid4().hex}"
+    taken.mkdir()
+    for folder in left:
+        _empty(folder, taken)
+    for path in sorted(taken.iterdir(), key=lambda path: not path.name.endswith(FORMER)):
+        name = ASIDE.fullmatch(path.name)
+        item = unquote(name[1]) if name else ""
+        if not item or ".." in item.split("/"):
+            continue
+        target = dataset.item_dir(stage, item)
+        if name and name[2]:
+            put_back(path, target)
+        if target.parent.is_dir():  # what is deleted next must not come back after a power failure
+            sync_directory(target.parent)
+    shutil.rmtree(taken, ignore_errors=True)
+
+
+def _empty(folder: Path, taken: Path) -> None:
+    """Rename what is in a run's folder, and remove that, while its workers may make more."""
+    while folder.is_dir():
+        for path in folder.iterdir():
+            same = (taken / path.name).exists()
+            with suppress(FileNotFoundError):
+                path.rename(taken / (uuid.uuid4().hex if same else path.name))
+        try:
+            folder.rmdir()
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOENT):
+                raise
 
 
 GLANCE_SECONDS = 0.05

@@ -57,11 +57,17 @@ def _keep(dataset: Dataset, former: Receipt, folder: Path) -> None:
 
 
 def restore(
-    dataset: Dataset, stage: str, item: str, fingerprint: str, former: Receipt | None
+    folder: Path,
+    dataset: Dataset,
+    stage: str,
+    item: str,
+    fingerprint: str,
+    former: Receipt | None,
 ) -> Receipt | None:
     """Publish an output of the store again, if it has this fingerprint and all of its bytes.
 
     Args:
+        folder: the run's.
         dataset: the dataset.
         stage: stage name.
         item: item id.
@@ -78,7 +84,7 @@ def restore(
     try:
         receipt = _whole_receipt(entry)
         if (receipt.stage, receipt.item, receipt.fingerprint) == (stage, item, fingerprint):
-            with publishing(dataset, stage, item, keeping(dataset, former)) as out:
+            with publishing(folder, dataset, stage, item, keeping(dataset, former)) as out:
                 entry.rename(out)  # over the empty folder, in one step
                 (out / RECEIPT).unlink()
             return replace(receipt, reason="", attempts=0, time=time.time())

@@ -24,7 +24,13 @@ from express50.runner.ledger import Ledger, Made, Receipt
 from express50.runner.outdated import why_outdated
 from express50.runner.preflight import check_expected_space
 from express50.runner.progress import RunLog, showing
-from express50.runner.publish import clean_leftovers, discard_stale, set_aside, stage_lock
+from express50.runner.publish import (
+    clean_leftovers,
+    discard_stale,
+    run_folder,
+    set_aside,
+    stage_lock,
+)
 from express50.runner.replaced import keeping, make_room
 from express50.runner.worker import (
     Task,
@@ -369,7 +375,10 @@ def _run_items(
 
         for receipt in work.unreadable:
             settle(receipt)
-        pool.run(work.tasks, settle_task, begin, gate.closed if gate else lambda: False)
+        if work.tasks:
+            with run_folder(dataset, stage.name) as folder:
+                tasks = [replace(task, folder=folder) for task in work.tasks]
+                pool.run(tasks, settle_task, begin, gate.closed if gate else lambda: False)
     ledger.keep_digests()
     return outcomes
 

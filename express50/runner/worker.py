@@ -29,7 +29,10 @@ BATCH_SECONDS = 0.2  # a batch begins no further item after so long
 
 @dataclass(frozen=True)
 class Task:
-    """An item to run, with all that a worker needs; ``former`` is the receipt of its output."""
+    """An item to run, with all that a worker needs.
+
+    ``former`` is the receipt of its output, ``folder`` the run's (`run_folder`).
+    """
 
     stage: Stage
     dataset: Dataset
@@ -39,6 +42,7 @@ class Task:
     inputs: dict[str, str]
     threads: int = 1
     former: Receipt | None = None
+    folder: Path = Path()
 
 
 def input_digests(
@@ -104,7 +108,7 @@ def run_task(task: Task) -> Receipt:
     Raises:
         DiskFullError: the disk has no room for the outputs; the other items' would fail alike.
     """
-    where = task.dataset, task.stage.name, task.item
+    where = task.folder, task.dataset, task.stage.name, task.item
     if (restored := restore(*where, task.fingerprint, task.former)) is not None:
         return restored
     cap_threads(task.threads)
@@ -149,7 +153,7 @@ def _run_and_publish(task: Task) -> tuple[dict, dict[str, FileMark]]:
             f"{task.stage.name} needs a GPU as it is configured; torch finds no CUDA device here"
         )
     keep = keeping(task.dataset, task.former)
-    with publishing(task.dataset, task.stage.name, task.item, keep) as out:
+    with publishing(task.folder, task.dataset, task.stage.name, task.item, keep) as out:
         # Standard output is for data; libraries' messages go to standard error.
         with contextlib.redirect_stdout(sys.stderr):
             result = task.stage.run(task.dataset, task.item, task.config, out)

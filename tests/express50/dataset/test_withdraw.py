@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from contextlib import contextmanager
 from dataclasses import replace
 from datetime import datetime
 
@@ -23,12 +24,20 @@ from express50.dataset.withdraw import (
 )
 from express50.errors import CaptureError, FormatError, StageError, UnknownNameError
 from express50.files.digests import text_digest
+from express50.runner import publish
 from express50.runner.ledger import Ledger, Made, Receipt, Run, mark_file
-from express50.runner.publish import publishing, stage_lock
+from express50.runner.publish import stage_lock
 from express50.runner.replaced import keeping
 from pipelines import ingest
 from tests.faults.toy import tree
 from tests.synth import make_capture
+
+
+@contextmanager
+def publishing(dataset, stage, item, keep=None):
+    folder = publish.run_folder(dataset, stage)
+    with folder as run, publish.publishing(run, dataset, stage, item, keep) as out:
+        yield out
 
 
 @pytest.fixture

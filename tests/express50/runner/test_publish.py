@@ -5,8 +5,11 @@ import os
 import pytest
 
 from express50.contract.layout import Dataset
-from express50.files.atomic import dump_json, write_bytes, write_json
-from express50.runner.publish import clean_leftovers, publishing, set_aside
+from express50.files import atomic
+from express50.files.atomic import dump_json, folder_in_one_step, write_bytes, write_json
+from express50.runner.publish import clean_leftovers, publishing, run_folder, set_aside
+
+ITEM = "S001/cam00"
 
 
 @pytest.fixture
@@ -14,8 +17,8 @@ def dataset(tmp_path):
     return Dataset(tmp_path / "data")
 
 
-def publish(dataset, text, item="S001/cam00"):
-    with publishing(dataset, "matte", item) as out:
+def publish(dataset, text, item=ITEM):
+    with run_folder(dataset, "matte") as folder, publishing(folder, dataset, "matte", item) as out:
         (out / "a.txt").write_text(text)
 
 
@@ -24,8 +27,8 @@ def staged(dataset):
 
 
 def test_folder_appears_only_at_the_end_and_replaces_the_former(dataset):
-    target = dataset.item_dir("matte", "S001/cam00")
-    with publishing(dataset, "matte", "S001/cam00") as out:
+    target = dataset.item_dir("matte", ITEM)
+    with run_folder(dataset, "matte") as run, publishing(run, dataset, "matte", ITEM) as out:
         (out / "old.txt").write_text("1")
         assert not target.exists()
     publish(dataset, "2")
@@ -35,10 +38,11 @@ def test_folder_appears_only_at_the_end_and_replaces_the_former(dataset):
 
 def test_error_in_the_body_leaves_the_former_folder(dataset):
     publish(dataset, "1")
-    with pytest.raises(RuntimeError), publishing(dataset, "matte", "S001/cam00") as out:
+    run = run_folder(dataset, "matte")
+    with pytest.raises(RuntimeError), run as at, publishing(at, dataset, "matte", ITEM) as out:
         (out / "a.txt").write_text("half")
         raise RuntimeError
-    assert (dataset.item_dir("matte", "S001/cam00") / "a.txt").read_text() == "1"
+    assert (dataset.item_dir("matte", ITEM) / "a.txt").read_text() == "1"
     assert staged(dataset) == []
 
 
@@ -59,12 +63,75 @@ def test_leftovers_of_killed_runs_are_removed_for_that_stage_only(dataset):
     assert [p.name for p in staged(dataset)] == ["track-S001-456"]
 
 
+def test_a_worker_that_outlives_its_run_publishes_nothing(dataset):
+    publish(dataset, "1")
+    with run_folder(dataset, "matte") as folder:
+        gone = pytest.raises(FileNotFoundError)
+        with gone, publishing(folder, dataset, "matte", ITEM) as out:
+            (out / "a.txt").write_text("2")
+            clean_leftovers(dataset, "matte")  # as the next run does
+        with gone, publishing(folder, dataset, "matte", ITEM):
+            pass
+    assert (dataset.item_dir("matte", ITEM) / "a.txt").read_text() == "1"
+    assert staged(dataset) == []
+
+
+def test_two_workers_publish_an_item_at_once(dataset, monkeypatch):
+    """One comes between the other's attempts to swap and to rename."""
+    target = dataset.item_dir("matte", ITEM)
+
+    def publish_too():
+        with folder_in_one_step(dataset.root / "other", target) as out:
+            (out / "b.txt").write_text("other")
+
+    swap, others = atomic._swap, [publish_too]
+
+    def slow_swap(one, other):
+        done = swap(one, other)
+        if others:
+            others.pop()()
+        return done
+
+    monkeypatch.setattr(atomic, "_swap", slow_swap)
+    publish(dataset, "mine")
+    assert [path.name for path in target.iterdir()] == ["a.txt"]
+    assert staged(dataset) == []
+
+
+def test_publishing_survives_that_a_failed_neighbours_empty_folder_goes(dataset, monkeypatch):
+    publish(dataset, "1", "S001/cam01")
+    swap, others = atomic._swap, [lambda: set_aside(dataset, "matte", "S001/cam01")]
+
+    def slow_swap(one, other):
+        if others:
+            others.pop()()
+        return swap(one, other)
+
+    monkeypatch.setattr(atomic, "_swap", slow_swap)
+    publish(dataset, "2")
+    assert (dataset.item_dir("matte", ITEM) / "a.txt").read_text() == "2"
+
+
+def test_what_a_kill_between_two_renames_moved_away_is_put_back(dataset):
+    publish(dataset, "1", "S001/cam+0")
+    target = dataset.item_dir("matte", "S001/cam+0")
+    with pytest.raises(RuntimeError), run_folder(dataset, "matte") as folder:
+        target.rename(folder / f"S001%2Fcam+0-{'0' * 32}.former")
+        raise RuntimeError
+    assert (target / "a.txt").read_text() == "1" and staged(dataset) == []
+    aside = dataset.root / ".part"
+    target.rename(aside.with_name(".part.former"))
+    with pytest.raises(RuntimeError), folder_in_one_step(aside, target):
+        raise RuntimeError
+    assert (target / "a.txt").read_text() == "1"
+
+
 def test_set_aside_hides_an_item_from_later_stages(dataset):
     publish(dataset, "1")
-    set_aside(dataset, "matte", "S001/cam00")
+    set_aside(dataset, "matte", ITEM)
     assert not dataset.item_dir("matte", "S001").exists()  # no empty folder stays
     assert (dataset.stale_dir / "matte/S001/cam00/a.txt").read_text() == "1"
-    set_aside(dataset, "matte", "S001/cam00")  # there is nothing left to do
+    set_aside(dataset, "matte", ITEM)  # there is nothing left to do
     assert (dataset.stale_dir / "matte/S001/cam00").exists()
 
 

@@ -152,7 +152,7 @@ def test_items_of_a_job_at_its_time_limit_are_tried_again(cluster, tmp_path, mon
     hurt = toy.make_dataset(tmp_path / "hurt", names)
 
     def limit():
-        while not list(hurt.staging_dir.glob("toy-item*")):
+        while not list(hurt.staging_dir.glob("toy-*/item*")):
             time.sleep(0.05)
         slurm_stand_in.end_of_time(slurm_stand_in.pids(cluster)[0])
 
