@@ -110,7 +110,7 @@ def scale_mm(scales_mm: Tensor) -> Tensor:
     small = scales_mm < low
     below = 1.0 / torch.where(small, scales_mm.clamp_min(1e-7), torch.ones_like(scales_mm))
     above = (scales_mm - high).clamp_min(0).square()
-    return torch.where(small, below, above).mean()
+    return torch.where(small, below, above).sum() / max(1, scales_mm.numel())
 
 
 def mesh_edges(faces: Tensor) -> Tensor:
@@ -128,12 +128,12 @@ def laplacian_mm2(vertices: Tensor, edges: Tensor) -> Tensor:
     source, target = edges.unbind(1)
     degree = torch.bincount(source, minlength=len(field))[:, None]
     around = torch.zeros_like(field).index_add(0, source, field[target]) / degree.clamp_min(1)
-    return torch.where(degree > 0, around - field, 0.0).square().sum(1).mean()
+    return torch.where(degree > 0, around - field, 0.0).square().sum() / max(1, len(field))
 
 
 def displacement_mm2(displacement: Tensor) -> Tensor:
     """Average the squared length of vertex displacements (V, 3), metres in, mm^2 out (G12)."""
-    return (1e3 * displacement).square().sum(1).mean()
+    return (1e3 * displacement).square().sum() / max(1, len(displacement))
 
 
 def codes(z_id: Tensor, z_exp: Tensor) -> Tensor:

@@ -22,6 +22,7 @@ from express50.geometry.shapes import PIXEL_LIMIT
 CUT = "truncated: a JPEG without its end; copy it again"
 DEPTH_UNIT_M = 5e-5  # one step of a 16-bit depth map; 3.28 m at most, 0.025 mm rounding
 DEPTH_LIMIT_M = DEPTH_UNIT_M * 65535
+JPEG_SIDE = 65500  # pixels; longer sides the encoder refuses
 # Orientation -> quarter turns counter-clockwise after an optional left-right flip (EXIF 2.3).
 TURNS = {1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (1, True), 6: (3, False),
          7: (3, True), 8: (1, False)}  # fmt: skip
@@ -158,10 +159,17 @@ def write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:
 
 
 def encode_jpeg(image: np.ndarray, quality: int = 95) -> bytes:
-    """Encode an RGB (H, W, 3) or grey (H, W) uint8 image as JPEG; 4:4:4 from quality 95 upwards."""
+    """Encode an RGB (H, W, 3) or grey (H, W) uint8 image as JPEG; 4:4:4 from quality 95 upwards.
+
+    Raises:
+        FormatError: a side is empty, or longer than the format allows.
+    """
     flags = [cv2.IMWRITE_JPEG_QUALITY, quality]
     if quality >= 95:
         flags += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    if max(image.shape[:2]) > JPEG_SIDE or 0 in image.shape:
+        size = f"{image.shape[1]}x{image.shape[0]} pixels"
+        raise FormatError(f"JPEG: {size}, expected sides of 1 to {JPEG_SIDE}; take PNG, or less")
     return cv2.imencode(".jpg", _swap(image), flags)[1].tobytes()
 
 

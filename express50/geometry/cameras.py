@@ -274,7 +274,7 @@ def triangulate(
         weights: (C, N) non-negative; all ones by default.
 
     Returns:
-        (N, 3) world points; NaN where fewer than two cameras see one.
+        (N, 3) world points; NaN where fewer than two cameras see one, or it would be behind all.
 
     Source: linear triangulation (Hartley and Zisserman, 12.2), then Gauss-Newton on pixels.
     """
@@ -310,7 +310,7 @@ def _triangulate_one(P: np.ndarray, xy: np.ndarray, w: np.ndarray, focal: np.nda
     for _ in range(5):
         p = P[:, :, :3] @ point + P[:, :, 3]
         if np.any(p[:, 2] <= 1e-9):
-            return point
+            return point if np.any(p[:, 2] > 0) else np.full(3, np.nan)
         residual = p[:, :2] / p[:, 2:] - xy
         J = (P[:, :2, :3] - (p[:, :2] / p[:, 2:])[:, :, None] * P[:, 2:, :3]) / p[:, 2:, None]
         A = np.einsum("cik,cil,c->kl", J, J, w)

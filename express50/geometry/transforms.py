@@ -23,7 +23,10 @@ def quat_to_matrix(quats: np.ndarray) -> np.ndarray:
     Raises:
         ValueError: a quaternion has zero length.
     """
-    return Rotation.from_quat(quats, scalar_first=True).as_matrix()
+    quats = np.asarray(quats, dtype=np.float64)
+    largest = np.abs(quats).max(-1, keepdims=True)  # the squares of tiny and huge ones are lost
+    scaled = quats / np.where(largest > 0, largest, 1.0)
+    return Rotation.from_quat(scaled, scalar_first=True).as_matrix()
 
 
 def matrix_to_quat(R: np.ndarray) -> np.ndarray:

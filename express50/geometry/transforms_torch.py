@@ -36,8 +36,10 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
 
     A quaternion of zero length becomes the identity, with zero gradient.
     """
+    largest = quats.detach().abs().amax(-1, keepdim=True)  # squares of tiny and huge ones are lost
+    zero = largest == 0
+    quats = quats / torch.where(zero, torch.ones_like(largest), largest)
     norm2 = (quats * quats).sum(-1, keepdim=True)
-    zero = norm2 == 0
     unit = quats / torch.where(zero, torch.ones_like(norm2), norm2).sqrt()
     identity = torch.zeros_like(quats)
     identity[..., 0] = 1.0

@@ -76,6 +76,8 @@ def decode_picture(name: str, data: bytes, width: int, height: int, where: str) 
     if name.endswith(".zst"):
         return _unzstd(data, width, height, where)
     try:
+        if name not in (*RGB, *ALPHA, *PARTS, *DEPTH):
+            raise ValueError(f"{name} is no picture of a sample")
         if name.endswith(".png"):
             image = decode_image(data, where)
         else:

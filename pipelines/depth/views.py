@@ -188,6 +188,8 @@ def head_box(views: Sequence[DepthView]) -> tuple[np.ndarray, np.ndarray]:
 
 def _meeting_point(views: Sequence[DepthView]) -> np.ndarray:
     """Find the point (3,) nearest to the rays through the mattes' centres."""
+    if len(views) < 2:
+        raise StageError(f"a surface needs two cameras with a matte, got {len(views)}")
     A, b, origins = np.zeros((3, 3)), np.zeros(3), []
     for view in views:
         y, x = np.nonzero(view.alpha > INSIDE)

@@ -112,5 +112,11 @@ def test_laplacian_gradient():
     assert gradcheck(lambda x: losses.laplacian_mm2(1e-3 * x, edges), (field,))
 
 
+def test_terms_of_nothing_are_zero():
+    none = torch.zeros(0, 3)
+    assert float(losses.scale_mm(none)) == float(losses.displacement_mm2(none)) == 0.0
+    assert float(losses.laplacian_mm2(none, torch.zeros(0, 2, dtype=torch.int64))) == 0.0
+
+
 def test_code_term_is_the_sum_of_squares():
     assert float(losses.codes(torch.tensor([3.0]), torch.tensor([0.0, 4.0]))) == 25

@@ -48,3 +48,10 @@ def test_no_reader_takes_half_a_picture(tmp_path):
             read()
     with pytest.raises(CaptureError, match="truncated"):
         read_picture(tmp_path, "half.jpg")
+
+
+@pytest.mark.parametrize("shape", [(2, 65_501, 3), (0, 4, 3)])
+def test_sides_that_jpeg_does_not_have_are_refused(shape, capfd):
+    with pytest.raises(FormatError, match="65500"):
+        encode_jpeg(np.zeros(shape, np.uint8))
+    assert capfd.readouterr().err == ""

@@ -88,6 +88,14 @@ def test_scaling_a_one_focal_model_keeps_it_right():
     )
 
 
+def test_rays_that_part_meet_nowhere():
+    left = cameras.pinhole_camera("l", np.diag([300.0, 300.0, 1.0]), 320, 240, np.eye(4))
+    pose = np.eye(4)
+    pose[0, 3] = -0.1
+    right = cameras.pinhole_camera("r", left.K, 320, 240, pose)
+    assert np.isnan(cameras.triangulate([left, right], np.array([[[-20.0, 0]], [[20.0, 0]]]))).all()
+
+
 def test_triangulate_recovers_points_and_says_nan_for_one_view():
     other_pose = transforms.look_at(
         np.array([0.8, 0.2, 0.6]), np.zeros(3), np.array([0.0, 1.0, 0.0])

@@ -86,6 +86,18 @@ def test_fits_refuse_what_has_no_answer():
         transforms.quat_to_matrix(np.zeros(4))
 
 
+@pytest.mark.parametrize("scale", [1e-160, 1e-22, 1.0, 1e22, 1e200])
+def test_quaternions_of_any_length_give_rotations(scale):
+    quat = np.array([1.0, 1.0, 0.5, 0.0])
+    expected = transforms.quat_to_matrix(quat)
+    np.testing.assert_allclose(transforms.quat_to_matrix(scale * quat), expected, atol=1e-15)
+    dtype = torch.float32 if 1e-40 < scale < 1e30 else torch.float64
+    given = torch.tensor(scale * quat, dtype=dtype, requires_grad=True)
+    R = torch_transforms.quat_to_matrix(given)
+    np.testing.assert_allclose(R.detach().numpy(), expected, atol=1e-6)
+    assert torch.isfinite(torch.autograd.grad(R[0, 1], given)[0]).all()
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_fits_refuse_points_that_are_not_finite(bad):
     points = np.eye(4, 3)

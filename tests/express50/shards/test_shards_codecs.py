@@ -74,6 +74,12 @@ def test_damaged_bytes_give_an_image_of_the_size_or_one_error(profile, data) -> 
         assert image.shape[:2] == (28, 40)
 
 
+def test_a_picture_of_an_unknown_name_is_refused_by_it() -> None:
+    png = encode_pictures(*pictures(), "lossless")["rgb.png"]
+    with pytest.raises(FormatError, match="rgb.webp"):
+        decode_picture("rgb.webp", png, 40, 28, "here")
+
+
 def test_what_would_grow_is_refused_before_it_does() -> None:
     rgb, alpha, depth, parts = pictures(300, 300)
     members = encode_pictures(rgb, alpha, depth, parts, "fast")
