@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.budget build/budget`` records twin captures, runs the chain for five budgets
 from a minute to an hour and with every preset, and measures each run against the truth. ``--quick``
-takes two people of two expressions at 256 px, one pilot for all runs, and three budgets along the
+takes one person of two expressions at 192 px, one pilot for all runs, and three budgets along the
 front, in processor time, which means something on a busy machine too. ``--captures`` takes footage
 without truth: errors are then differences from the dearest run, and promises cannot be checked.
 The last line printed is one JSON object.
@@ -33,7 +33,7 @@ from express50.runner.ledger import Ledger
 from express50.twin.truth import Truth
 
 TWIN = {"subjects": 3, "cameras": 8, "width": 320, "height": 320, "frames-per-expression": 6}
-QUICK = {"subjects": 2, "cameras": 6, "width": 256, "height": 256, "frames-per-expression": 6}
+QUICK = {"subjects": 1, "cameras": 6, "width": 192, "height": 192, "frames-per-expression": 6}
 BUDGETS = ("1m", "5m", "15m", "30m", "1h")
 TRUE = {
     "mesh": (accuracy.measure_track, "vertex_rmse_mm"),

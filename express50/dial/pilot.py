@@ -73,7 +73,8 @@ class Pilot:
 
     def trial(self, settings: Mapping[str, str], peaks: int, source: Trial | None) -> Trial:
         """Run one trial, or read it if it ran before."""
-        name = value_digest([dict(settings), peaks, self.subject])[:12]
+        key = key_of(self.stages, self.ladders, self.pool.threads)
+        name = value_digest([key, dict(settings), peaks, self.subject])[:12]
         root = pilot_dir(self.dataset) / name
         record = root / "trial.json"
         if record.is_file():
