@@ -72,7 +72,9 @@ def run_chain(args: argparse.Namespace) -> int:
         say_json({"run": vars(state), "stages": [summary.to_json() for summary in summaries]})
     else:
         say(*closing_lines(state, summaries))
-    return OK if state.finished and all(summary.ok for summary in summaries) else FAILED
+    dropped = args.strict and any(o.dropped for summary in summaries for o in summary.outcomes)
+    whole = state.finished and all(summary.ok for summary in summaries) and not dropped
+    return OK if whole else FAILED
 
 
 def run_tune(args: argparse.Namespace) -> int:

@@ -12,6 +12,7 @@ import jinja2
 import matplotlib as mpl
 from markupsafe import Markup
 
+from express50.console import format_seconds
 from express50.contract.layout import Dataset
 from express50.contract.stage import stages, typical_error
 from express50.errors import FormatError
@@ -285,7 +286,7 @@ def _front_view(table: dict) -> dict | None:
     stated = [result for result in results if points[-1]["errors"][result]["stated"]]
     usual = presets["standard"]["settings"]
     cells = [
-        [f"{p['seconds'] / 60:.2g} min", *(number(p["errors"][r]["value"]) for r in results),
+        [format_seconds(p["seconds"]), *(number(p["errors"][r]["value"]) for r in results),
          ", ".join(f"{n} {k}" for n, k in p["settings"].items() if k != usual[n]) or "standard"]
         for p in points
     ]  # fmt: skip

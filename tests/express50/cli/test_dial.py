@@ -1,0 +1,36 @@
+"""Budgets on the command line: wrong usage is one line, and a tuned dataset shows its front."""
+
+import pytest
+
+from express50.cli.main import main
+from express50.console import USAGE
+from express50.contract.layout import Dataset
+from express50.dataset.report import render_page
+from express50.dial.tune import tune
+from tests.express50.dial.toy_chain import captures_of, chain_of
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--budget", "2"], "expected a time such as 45m"),
+        (["--error", "0.5"], "expected such as 0.5mm"),
+        (["--budget", "1h", "--first", "align"], "leave --first and --last out"),
+        (["--budget", "1h", "--preset", "draft"], "settings are measured and chosen here"),
+        (["--budget", "1h", "--workers", "-1"], "--workers"),
+        (["--budget", "1h", "--set", "track.sampels=1"], "did you mean 'samples'"),
+    ],
+)
+def test_wrong_usage_is_one_line_and_starts_nothing(tmp_path, capsys, options, words):
+    assert main(["run", str(tmp_path / "data"), *options]) == USAGE
+    error = capsys.readouterr().err
+    assert words in error and error.count("\n") == 1
+    assert not (tmp_path / "data").exists()
+
+
+def test_the_report_shows_the_front(tmp_path):
+    captures = captures_of(tmp_path / "captures", subjects=1, expressions=2)
+    tune(chain_of(tmp_path / "data", captures))
+    page = render_page(Dataset(tmp_path / "data"))
+    assert "What time buys" in page and "value, mm" in page and "solve draft" in page
+    assert "nine times in ten" in page and "none does" not in page
