@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 
 from annotations.align.features import Features, watch
-from annotations.align.suggest import Reference, Suggestion, suggest_all
+from annotations.align.suggest import (
+    PLATEAU_SHARE,
+    STILL,
+    Reference,
+    Suggestion,
+    suggest_all,
+)
 from annotations.labels import (
     AUTOMATIC,
     Label,
@@ -25,7 +31,8 @@ from express50.capture.expressions import load_script
 from express50.capture.frames import read_proxy
 from express50.capture.index import Index, read_index
 from express50.contract.layout import Dataset
-from express50.contract.stage import Note, Result
+from express50.contract.stage import ExpectedError, Note, Result
+from express50.error_model import error_bounds
 from express50.errors import StageError
 from express50.files.atomic import write_json
 from express50.files.images import contact_sheet, write_image
@@ -55,7 +62,28 @@ def run(dataset: Dataset, item: str, out: Path, *, accept: float, match: bool) -
         "matched": sum(suggested.kind == "match" for suggested in found.values()),
         "confidence_median": round(float(np.median(sure)), 4) if sure else None,
     }
-    return Result(metrics, dropped)
+    taken = [s for e, s in found.items() if e in peaks and peaks[e].annotator == AUTOMATIC]
+    return Result(metrics, dropped, expected_error=expected_error(taken))
+
+
+def expected_error(taken: Sequence[Suggested]) -> ExpectedError | None:
+    """Say how many frames off suggestions probably are; None where people chose every peak."""
+    figures = [error_figures(suggested) for suggested in taken]
+    if not figures:
+        return None
+    joined = {name: np.array([row[name] for row in figures]) for name in figures[0]}
+    return error_bounds("align", joined).expected
+
+
+def error_figures(suggested: Suggested) -> dict[str, float]:
+    """Describe how well a peak is known: its width in frames, its height, and its confidence."""
+    activity = np.array(suggested.activity)
+    top = float(activity.max(initial=0.0))
+    return {
+        "width": float(max((activity >= PLATEAU_SHARE * top).sum(), 1)),
+        "flatness": STILL / max(top, 1e-3),
+        "doubt": 1.02 - suggested.confidence,
+    }
 
 
 def suggest_for(

@@ -43,6 +43,10 @@ class Track:
         t: (E, 3) metres.
         vertices: (E, V, 3) float32 metres, world.
         offsets: (V, 3) float32 metres, added to the rest shape; zeros where there are none.
+        sigma: (E, V) float32 metres, standard deviations by the fit's own covariance; NaN where
+            the file has none, as of a scan.
+        bound: (E, V) float32 metres: nine vertices in ten are nearer than this to the true ones;
+            NaN where the file has none.
     """
 
     head: str
@@ -57,6 +61,8 @@ class Track:
     t: np.ndarray
     vertices: np.ndarray
     offsets: np.ndarray
+    sigma: np.ndarray
+    bound: np.ndarray
 
     def row(self, expression: str) -> int:
         """Return the row of an expression.
@@ -104,6 +110,8 @@ class Registration:
         seen: (V,) bool, where the surface was found and trusted.
         residual: (V,) float32 metres, height of the surface over the mesh there, 0 elsewhere.
         sigma: (V,) float32 metres, standard deviation of the vertices along their normals.
+        bound: (V,) float32 metres: along their normals nine vertices in ten are nearer than this
+            to the true ones; NaN where the file has none, as of a scan.
     """
 
     track: str
@@ -112,6 +120,7 @@ class Registration:
     seen: np.ndarray
     residual: np.ndarray
     sigma: np.ndarray
+    bound: np.ndarray
 
 
 def existing_track(dataset: Dataset, subject: str) -> Path:
@@ -140,6 +149,8 @@ def read_track(path: Path) -> Track:
         count = vertices.shape[1] if vertices.ndim == 3 else None
         further = {"vertices": (names.size, count, 3), "offsets": (count, 3)}
         numbers = _checked(arrays, names, further)
+        for name in ("sigma", "bound"):
+            numbers[name] = _doubt(arrays, name, numbers["vertices"].shape[:2])
         if len(set(names.tolist())) != len(names):
             raise ValueError("an expression appears twice")
         return Track(head=str(arrays["head"]), expressions=tuple(names.tolist()), **numbers)
@@ -175,7 +186,24 @@ def read_registration(path: Path) -> Registration:
             check_finite(name, arrays[name])
         check_shape("seen", arrays["seen"], (count,))
         names = ("vertices", "offsets", "seen", "residual", "sigma")
-        return Registration(track=str(arrays["track"]), **{name: arrays[name] for name in names})
+        return Registration(
+            track=str(arrays["track"]),
+            **{name: arrays[name] for name in names},
+            bound=_doubt(arrays, "bound", (count,)),
+        )
+
+
+def _doubt(arrays: dict[str, np.ndarray], name: str, shape: tuple[int, ...]) -> np.ndarray:
+    """Return deviations or bounds of vertices; NaN where a file has none.
+
+    Raises:
+        ValueError: they have another shape, or are not finite.
+    """
+    if name not in arrays:
+        return np.full(shape, np.nan, np.float32)
+    check_shape(name, arrays[name], shape)
+    check_finite(name, arrays[name])
+    return arrays[name].astype(np.float32)
 
 
 def registration_of(path: Path, track: Track, digest: str) -> Registration | None:

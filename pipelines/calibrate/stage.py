@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 
 from express50.capture.index import Index, calibration_file, read_index
 from express50.contract.layout import Dataset
-from express50.contract.stage import Note, Result
+from express50.contract.stage import ExpectedError, Note, Result
+from express50.error_model import error_bounds
 from express50.errors import CalibrationError, CaptureError
 from express50.files.atomic import write_json
 from express50.files.calibration import read_cameras, write_cameras
@@ -43,7 +44,7 @@ from pipelines.calibrate.given_rig import (
     refine_by_footage,
 )
 from pipelines.calibrate.timing import CameraTiming
-from pipelines.calibrate.uncertainty import state_uncertainty
+from pipelines.calibrate.uncertainty import HeadError, state_uncertainty
 
 COLOUR_FRAMES = 12  # board images read per camera if only its colours are needed
 
@@ -65,6 +66,7 @@ class CalibratedRig:
     solution: BoardSolution | None = None
     dropped: tuple[Note, ...] = ()
     warnings: tuple[Note, ...] = ()
+    expected: ExpectedError | None = None
 
 
 def run(dataset: Dataset, item: str, config: CalibrateConfig, out: Path) -> Result:
@@ -125,7 +127,7 @@ def _write(rig: CalibratedRig, check: FootageCheck | None, out: Path) -> Result:
         "models": {name: rig.cameras[name].model for name in names},
         **figures,
     }
-    return Result(metrics, rig.dropped, (*rig.warnings, *moved))
+    return Result(metrics, rig.dropped, (*rig.warnings, *moved), rig.expected)
 
 
 def _rounded(value: float | None, digits: int) -> float | None:
@@ -230,7 +232,14 @@ def _from_board(index: Index, config: CalibrateConfig) -> CalibratedRig:
         solution=solution,
         dropped=_notes(solution.dropped),
         warnings=(*_notes(weak), *_notes(_out_of_step(solution.timing))),
+        expected=expected_error(uncertainty),
     )
+
+
+def expected_error(uncertainty: Mapping[str, HeadError]) -> ExpectedError | None:
+    """Say how far cameras probably are off in the head's place; None for a lone camera."""
+    stated = np.array([error.mm for error in uncertainty.values()])
+    return error_bounds("calibrate", {"stated_mm": stated}).expected
 
 
 def _out_of_step(timing: Mapping[str, CameraTiming]) -> dict[str, str]:

@@ -38,7 +38,7 @@ def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> Result:
 
 STAGE = Stage(
     name="depth",
-    version=9,
+    version=10,
     config=DepthConfig,
     presets=PRESETS,
     items=peak_items,

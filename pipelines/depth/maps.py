@@ -1,35 +1,36 @@
-"""Cast rays at the surface: depth, normals and confidence per camera, checked by its neighbours.
+"""Cast rays at the surface: depth, normals and error bounds per camera, checked by its neighbours.
 
-Confidence comes from photometric reprojection: each view is warped into its neighbours' pictures
-through its own depth map. Where the surface is right the colours agree up to gain, highlights and
-noise. On bare skin a small error proves little, a large one always shows (Seitz et al. 2006).
+Bounds come from what each pixel shows of its depth: how well patches agree there, slant, jumps and
+roughness of the surface, and photometric reprojection. Each view is warped into its neighbours'
+pictures through its own depth map. Where the surface is right the colours agree up to gain,
+highlights and noise. On bare skin a small error proves little, a large one always shows (Seitz et
+al. 2006). `express50.error_model` turns these figures into millimetres.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import open3d as o3d
 
+from express50.error_model import PEOPLE_DIFFER, Bounds, error_bounds
 from express50.geometry.cameras import Camera, rays
 from express50.geometry.raycast import barycentrics, camera_rays, mesh_scene
 from express50.geometry.sampling import bilinear
+from pipelines.depth.prior import TrackedSolid
 from pipelines.depth.surface import HeadSurface
 from pipelines.depth.views import INSIDE, project_fast, reduced
 
-STEEP = 0.25  # cosine between surface and ray below which confidence fades to 0
-BROKEN = 4.0  # pixels' widths between neighbours' depths at which confidence is halved
+SURE_MM = 2.0  # bound at which confidence is a half
 COMPARED_SIDE = 512  # longest side, pixels, at which views are compared through the depth
 NEIGHBOURS = 4  # views that each is compared with, those whose directions are closest
 CONSISTENT_STEPS = 10.0  # 8-bit steps up to which colours agree: noise and highlights take some
 DARK = 16.0  # 8-bit steps; darker pixels say nothing about gain
 FLAT = 4.0  # tangent of the angle between line of sight and normal from which colours smear
 HIDDEN_M = 0.004  # metres behind the neighbour's own depth at which a point counts as hidden
-DOUBT_STEPS = 5.0  # 8-bit steps of error by which confidence falls to 1/e
-UNSEEN_TRUST = 0.2  # what is left of confidence where no neighbour sees the point
 WINDOW = 5  # pixels, odd: colours around a wrong depth agree here and there by chance
 
 Pictures = list[tuple[Camera, np.ndarray, np.ndarray]]
@@ -40,16 +41,26 @@ Pictures = list[tuple[Camera, np.ndarray, np.ndarray]]
 class DepthMaps:
     """The maps (H, W) of the surface in one camera, `valid` where it lies inside the matte.
 
-    Depth is in metres, normals (H, W, 3) in camera axes, both 0 where not valid; confidence is in
-    [0, 1]. `covered` is the share of the matte with depth, `spill` that of the surface outside.
+    Depth is in metres, normals (H, W, 3) in camera axes, both 0 where not valid. `covered` is the
+    share of the matte with depth, `spill` that of the surface outside. `figures` describe how well
+    each of the N valid pixels is known, `bounds` are what they say.
     """
 
     depth: np.ndarray
     valid: np.ndarray
-    confidence: np.ndarray
     normals: np.ndarray
     covered: float
     spill: float
+    figures: Mapping[str, np.ndarray | float]
+    bounds: Bounds | None = None
+
+    @property
+    def confidence(self) -> np.ndarray:
+        """Return SURE_MM / (SURE_MM + bound), (H, W) float32 in [0, 1]; 0 where not valid."""
+        found = np.zeros(self.depth.shape, np.float32)
+        if self.bounds is not None:
+            found[self.valid] = SURE_MM / (SURE_MM + self.bounds.bound)
+        return found
 
 
 @dataclass(frozen=True)
@@ -91,14 +102,44 @@ class PhotoErrors:
 
 
 def surface_maps(
-    surface: HeadSurface, pictures: Pictures
+    surface: HeadSurface, pictures: Pictures, solid: TrackedSolid | None = None
 ) -> tuple[dict[str, DepthMaps], dict[str, PhotoErrors]]:
-    """Make every camera's maps of the surface and its neighbours' errors, by camera."""
+    """Make every camera's maps of the surface and its neighbours' errors, by camera.
+
+    What stands off the tracked head, `solid`, is hair or cloth, or wrong.
+    """
+    apart = None
+    if solid is not None:
+        query = o3d.core.Tensor(surface.vertices.astype(np.float32))
+        apart = 1e3 * solid.scene.compute_distance(query, nthreads=1).numpy()
     scene = mesh_scene(surface.vertices, surface.faces)
     photo = photo_errors([compared_view(scene, *row) for row in pictures])
+    middle = surface.vertices.mean(0)
+    pixels = [np.linalg.norm(c.center - middle) / c.K[0, 0] for c, _, _ in pictures]
+    common = {
+        "voxel_mm": surface.figures["voxel_mm"],
+        "pixel_mm": 1e3 * float(np.median(pixels)),
+        "views": float(len(pictures)),
+    }
+    known = np.concatenate([one.errors[np.isfinite(one.errors)] for one in photo])
+    common["photo_all"] = float(np.median(known)) if len(known) else np.inf
+    seen_maps = [cast_maps(surface, scene, c, alpha, apart) for c, _, alpha in pictures]
+    grains = [grain(rgb)[seen.valid] for (_, rgb, _), seen in zip(pictures, seen_maps, strict=True)]
+    every = np.concatenate(grains)
+    common["grain_all"] = float(np.median(every)) if len(every) else np.inf
     maps = {}
-    for (camera, _, alpha), errors in zip(pictures, photo, strict=True):
-        maps[camera.id] = doubted(cast_maps(surface, scene, camera, alpha), errors)
+    rows = zip(pictures, seen_maps, grains, photo, strict=True)
+    for (camera, _, _), seen, grained, errors in rows:
+        figures = {
+            **seen.figures,
+            **common,
+            "photo": smoothed_errors(errors, seen.valid, WINDOW),
+            "photo_wide": smoothed_errors(errors, seen.valid, 3 * WINDOW),
+            "grain": grained,
+        }
+        shared = 1e3 * PEOPLE_DIFFER * seen.depth[seen.valid] if len(pictures) == 1 else 0.0
+        bounds = error_bounds("depth", figures, shared)
+        maps[camera.id] = replace(seen, figures=figures, bounds=bounds)
     return maps, dict(zip(maps, photo, strict=True))
 
 
@@ -107,17 +148,25 @@ def cast_maps(
     scene: o3d.t.geometry.RaycastingScene,
     camera: Camera,
     alpha: np.ndarray,
+    apart_mm: np.ndarray | None = None,
 ) -> DepthMaps:
-    """Cast a camera's rays; depth is valid where they hit inside the matte (H, W)."""
+    """Cast a camera's rays; depth is valid where they hit inside the matte (H, W).
+
+    `apart_mm` (V,) are the vertices' distances to the tracked head.
+    """
     hits = scene.cast_rays(camera_rays(camera), nthreads=1)
     depth = hits["t_hit"].numpy()
     hit = np.isfinite(depth)
     faces = surface.faces[hits["primitive_ids"].numpy()[hit]]
     corners = barycentrics(hits, hit)
-    normals, confidence = np.zeros((*depth.shape, 3)), np.zeros(depth.shape)
+    normals, agreement = np.zeros((*depth.shape, 3)), np.zeros(depth.shape)
     normals[hit] = (surface.normals[faces] * corners[..., None]).sum(1)
-    confidence[hit] = (surface.confidence[faces] * corners).sum(1)
-    return make_maps(camera, alpha, depth, normals, confidence)
+    agreement[hit] = (surface.confidence[faces] * corners).sum(1)
+    maps = make_maps(camera, alpha, depth, normals, agreement)
+    apart = np.full(depth.shape, np.nan)
+    if apart_mm is not None:
+        apart[hit] = 1 + (apart_mm[faces] * corners).sum(1)
+    return replace(maps, figures={**maps.figures, "apart_mm": apart[maps.valid]})
 
 
 def make_maps(
@@ -125,11 +174,12 @@ def make_maps(
     alpha: np.ndarray,
     depth: np.ndarray,
     normals: np.ndarray,
-    confidence: np.ndarray,
+    agreement: np.ndarray,
 ) -> DepthMaps:
-    """Keep what is hit inside the matte (H, W); weaken confidence at slants and where depth jumps.
+    """Keep what is hit inside the matte (H, W), and describe how well it is known.
 
-    `depth` (H, W) is not finite where nothing is hit; `normals` (H, W, 3) are the world's.
+    `depth` (H, W) is not finite where nothing is hit; `normals` (H, W, 3) are the world's; the
+    patches' `agreement` (H, W) is in [0, 1].
     """
     hit = np.isfinite(depth) & (depth > 0)
     inside = alpha > INSIDE
@@ -138,17 +188,29 @@ def make_maps(
     _, way = rays(camera)
     cosine = -(normals * way).sum(-1) / np.linalg.norm(way, axis=-1)
     depth = np.where(valid, depth, 0).astype(np.float32)
-    whole = np.clip(cosine / STEEP, 0, 1) / (1 + jumps(camera, depth) / BROKEN)
-    confidence = np.where(valid, confidence * whole, 0.0)
-    picture = np.where(valid[..., None], normals @ camera.cam_from_world[:3, :3].T, 0.0)
+    normals = np.where(valid[..., None], normals, 0.0)
+    figures = {
+        "disagreement": 1.05 - np.clip(agreement, 0, 1),
+        "slant": 1 / np.clip(cosine, 0.05, 1),
+        "jump": np.minimum(jumps(camera, depth), 1e3),
+        "rough": roughness(normals.astype(np.float32)),
+        "soft": 1.05 - np.clip(alpha, 0, 1),
+    }
     return DepthMaps(
         depth=depth,
         valid=valid,
-        confidence=np.clip(confidence, 0, 1).astype(np.float32),
-        normals=picture.astype(np.float32),
+        normals=(normals @ camera.cam_from_world[:3, :3].T).astype(np.float32),
         covered=float(valid.sum() / max(int(inside.sum()), 1)),
         spill=float((hit & ~inside).sum() / max(int(hit.sum()), 1)),
+        figures={name: values[valid] for name, values in figures.items()},
     )
+
+
+def roughness(normals: np.ndarray) -> np.ndarray:
+    """Measure (H, W) how much unit normals (H, W, 3; 0: none) differ within a window: 0 to 1."""
+    count = cv2.blur((np.abs(normals).sum(-1) > 0).astype(np.float32), (WINDOW, WINDOW))
+    mean = np.linalg.norm(cv2.blur(normals, (WINDOW, WINDOW)), axis=-1)
+    return 1.001 - np.minimum(mean / np.maximum(count, 1e-6), 1)
 
 
 def jumps(camera: Camera, depth: np.ndarray) -> np.ndarray:
@@ -224,19 +286,27 @@ def _difference(colour: np.ndarray, points: np.ndarray, other: ComparedView) -> 
     return found
 
 
-def doubted(maps: DepthMaps, photo: PhotoErrors) -> DepthMaps:
-    """Lower the confidence where neighbours' colours contradict the depth.
+def grain(rgb: np.ndarray) -> np.ndarray:
+    """Measure (H, W) how much a picture (H, W, 3) uint8 varies within a window, over its light.
 
-    The root of the product keeps the differences of small values in 8 bits.
+    Hair does, whose strands no surface follows.
+    """
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    mean, square = (cv2.blur(values, (WINDOW, WINDOW)) for values in (grey, grey * grey))
+    return (1 + np.sqrt(np.maximum(square - mean * mean, 0))) / (DARK + mean)
+
+
+def smoothed_errors(photo: PhotoErrors, valid: np.ndarray, window: int) -> np.ndarray:
+    """Average a view's errors over a window at the N valid pixels (H, W): (N,) 8-bit steps.
+
+    NaN where no neighbour sees the window.
     """
     known = np.isfinite(photo.errors)
     total, count = (
-        cv2.blur(values.astype(np.float32), (WINDOW, WINDOW))
+        cv2.blur(values.astype(np.float32), (window, window))
         for values in (np.where(known, photo.errors, 0.0), known)
     )
-    compared = count > 0.5 / WINDOW**2
-    believed = np.exp(-total / np.maximum(count, 1e-6) / DOUBT_STEPS)
-    believed = np.where(compared, believed, UNSEEN_TRUST).astype(np.float32)
-    height, width = maps.confidence.shape
-    believed = cv2.resize(believed, (width, height), interpolation=cv2.INTER_LINEAR)
-    return replace(maps, confidence=np.sqrt(maps.confidence * believed))
+    mean = np.where(count > 0.5 / window**2, total / np.maximum(count, 1e-6), np.nan)
+    rows, columns = np.nonzero(valid)
+    height, width = mean.shape
+    return 0.5 + mean[rows * height // valid.shape[0], columns * width // valid.shape[1]]

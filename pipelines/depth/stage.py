@@ -12,6 +12,7 @@ from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
 from express50.dataset.depth_files import write_depth, write_normals
 from express50.dataset.tracks import read_track
+from express50.error_model import error_models, expect, size_sigma
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.images import contact_sheet, read_alpha, srgb_to_linear, write_image
 from express50.geometry import meshes
@@ -51,13 +52,17 @@ def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> Result:
         surface = tracked_surface(views[0], solid, *fineness)
     else:
         surface = reconstruct(views, solid, *fineness)
-    maps, photo = surface_maps(surface, pictures)
+    maps, photo = surface_maps(surface, pictures, solid)
     write_ply(out / "surface.ply", surface)
     write_glb(out / "surface.glb", surface)
     for camera_id, seen in maps.items():
         write_maps(out, camera_id, seen)
     write_picture(out, pictures, maps, photo)
-    return Result(figures_of(surface, maps, photo) | {"track": track}, dropped)
+    typical = np.concatenate([seen.bounds.typical for seen in maps.values() if seen.bounds])
+    shared = size_sigma([row[0] for row in pictures], surface.vertices)
+    expected = expect(error_models()["depth"], typical, float(np.median(shared)))
+    figures = figures_of(surface, maps, photo) | {"track": track}
+    return Result(figures, dropped, expected_error=expected)
 
 
 def read_views(
@@ -162,6 +167,8 @@ def figures_of(
     for name, view in maps.items():
         sure = float(view.confidence[view.valid].mean()) if view.valid.any() else 0.0
         row = {"coverage": view.covered, "spill": view.spill, "confidence": sure}
+        if view.bounds is not None and view.valid.any():
+            row["bound_mm_median"] = float(np.median(view.bounds.bound))
         row |= photo[name].figures()
         cameras[name] = {key: round(value, 4) for key, value in row.items()}
     rounded = {k: round(v, 5) if isinstance(v, float) else v for k, v in table.items()}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import numpy as np
 from express50.capture.frames import read_cameras_of, read_peak_frame, read_plate_image
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
+from express50.error_model import error_bounds, error_models, expect
 from express50.errors import CaptureError, NoFaceError, StageError
 from express50.files.images import shrink, tile_sheet, write_image
 from express50.geometry.cameras import Camera, pinhole, resized
@@ -21,6 +22,7 @@ from express50.geometry.sampling import undistorted_mask
 from pipelines.matte.config import NETWORKS, WITHOUT_PLATE, MatteConfig
 from pipelines.matte.consensus import Agreement, agree
 from pipelines.matte.cutout import CutView, cut_out, make_cut_view, soft_alpha
+from pipelines.matte.doubt import rim_figures
 from pipelines.matte.key import key_alpha
 from pipelines.matte.plates import LEAST_SHARE, exposed, exposure_gain, match_plate
 from pipelines.matte.visual_hull import (
@@ -96,7 +98,14 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
     }
     named = {note.what for note in found.warnings}
     odd = [note for note in matte_warnings(final) if note.what not in named]
-    return Result(figures, dropped, [*odd_plates, *found.warnings, *odd])
+    doubt = {}
+    for name, alpha in final.items():
+        own = mattes[name]
+        rim = rim_figures(alpha, own.rgb, own.plated, len(mattes))
+        doubt[name] = error_bounds("matte", rim)
+    figures["expected"] = {name: asdict(e) for name, d in doubt.items() if (e := d.expected)}
+    expected = expect(error_models()["matte"], np.concatenate([d.typical for d in doubt.values()]))
+    return Result(figures, dropped, [*odd_plates, *found.warnings, *odd], expected)
 
 
 def camera_mattes(

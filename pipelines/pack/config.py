@@ -21,7 +21,7 @@ class EncodeConfig:
     torso: Literal["remove", "keep"] = "remove"
     """Alpha without or with shoulders and clothes, where the regions stage separated them."""
     min_confidence: float = 0.0
-    """Depth pixels with less confidence count as not valid, 0 to 1."""
+    """Depth pixels with less confidence count as not valid, 0 to 1; 0.5 keeps bounds up to 2 mm."""
 
     def __post_init__(self) -> None:
         """Check ranges."""

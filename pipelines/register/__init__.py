@@ -16,11 +16,12 @@ class RegisterConfig:
 
 
 def inputs(dataset: Dataset, item: str, config: RegisterConfig) -> dict[str, Path | str]:
-    """List the track and the expression's surface."""
+    """List the cameras, the track and the expression's surface."""
     from express50.dataset.tracks import existing_track
 
     subject, expression = item.split("/")
     return {
+        "cameras": dataset.cameras_file(subject),
         "track": existing_track(dataset, subject),
         "surface": dataset.surface_file(subject, expression),
     }
@@ -35,13 +36,13 @@ def run(dataset: Dataset, item: str, config: RegisterConfig, out: Path) -> Resul
 
 STAGE = Stage(
     name="register",
-    version=1,
+    version=2,
     config=RegisterConfig,
     items=peak_items,
     inputs=inputs,
     run=run,
     help="lay the tracked mesh onto the reconstructed surface",
     purpose="Each vertex moves along its normal to the surface; hair and what no view shows are"
-    " left out. Every vertex gets a residual and a standard deviation.",
+    " left out. Every vertex gets a residual, a standard deviation and an error bound.",
     growth=Growth(items=("subjects", "expressions")),
 )

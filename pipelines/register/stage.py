@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from express50.capture.frames import read_cameras_of
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
 from express50.dataset.tracks import REGISTRATION_SCHEMA, Track, existing_track, read_track
+from express50.error_model import error_bounds, size_sigma
 from express50.errors import FormatError, StageError
 from express50.files.digests import file_sha256
 from express50.files.images import contact_sheet, write_image
+from express50.geometry.cameras import Camera
 from express50.geometry.meshes import read_surface
 from express50.geometry.transforms_torch import axis_angle_to_matrix
 from express50.head.load import load_head
 from express50.head.model import HeadModel, joint_angles, joint_transforms
 from express50.head.preview import render_preview
-from pipelines.register.lay import GivenSurface, LaidMesh, lay
+from pipelines.register.lay import GivenSurface, LaidMesh, lay, mesh_normals
 from pipelines.register.skin import skin_trust
 from pipelines.register.untangle import crossings
 from pipelines.track.sequence import write_npz
@@ -52,20 +56,45 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
         )
     trust = skin_trust(model, start, surface.vertices, surface.colors, surface.confidence)
     laid = lay(model, start, GivenSurface(surface.vertices, surface.faces, trust), DETAIL_M)
-    metrics = write_registration(out, path, track, row, laid)
+    cameras = list(read_cameras_of(dataset, subject).values())
+    shared = lone_sigma(laid, cameras, model)
+    doubt = error_bounds("register", error_figures(laid, track, row), shared)
+    metrics = write_registration(out, path, track, row, laid, bound=1e-3 * doubt.bound)
     warnings = []
     if metrics["seen_share"] < LEAST_SEEN:
         why = f"the surface was found at only {metrics['seen_share']:.0%} of the face's vertices"
         warnings.append(Note(expression, why))
-    return Result(metrics, (), warnings)
+    return Result(metrics, (), warnings, doubt.expected)
+
+
+def lone_sigma(laid: LaidMesh, cameras: Sequence[Camera], model: HeadModel) -> np.ndarray:
+    """Return `size_sigma` (V,) along the mesh's normals."""
+    along = size_sigma(cameras, laid.vertices)
+    ray = laid.vertices - cameras[0].center
+    cosine = (mesh_normals(laid.vertices, model.faces) * ray).sum(1) / np.linalg.norm(ray, axis=1)
+    return along * np.abs(cosine)
+
+
+def error_figures(laid: LaidMesh, track: Track, row: int) -> dict[str, np.ndarray | float]:
+    """Describe how well the vertices (V,) are known along their normals, for `error_bounds`."""
+    moved = np.linalg.norm(laid.vertices - track.vertices[row], axis=1)
+    return {
+        "laid_sigma_mm": 1e3 * laid.sigma,
+        "tracked_mm": 1e3 * track.bound[row],
+        "unseen": np.where(laid.seen, 1.0, 2.0),
+        "residual_mm": 0.05 + 1e3 * np.abs(laid.residual),
+        "moved_mm": 0.05 + 1e3 * moved,
+    }
 
 
 def write_registration(
-    out: Path, path: Path, track: Track, row: int, laid: LaidMesh, start_name: str = "tracked"
-) -> dict:
+    out: Path, path: Path, track: Track, row: int, laid: LaidMesh, start_name: str = "tracked",
+    bound: np.ndarray | None = None,
+) -> dict:  # fmt: skip
     """Write registration.npz and a picture of a track's row; returns the metrics.
 
-    `path` is the track's file; the picture calls the track's mesh `start_name`.
+    `path` is the track's file; the picture calls the track's mesh `start_name`. `bound` (V,) are
+    metres.
     """
     model, start = load_head(track.head), track.vertices[row].astype(np.float64)
     numbers = {
@@ -73,6 +102,7 @@ def write_registration(
         "offsets": rest_offsets(model, track, row, laid.vertices - start),
         "residual": laid.residual,
         "sigma": laid.sigma,
+        **({} if bound is None else {"bound": bound}),
     }
     arrays = {name: array.astype(np.float32) for name, array in numbers.items()}
     arrays |= {"schema": np.array(REGISTRATION_SCHEMA), "track": np.array(file_sha256(path))}

@@ -80,6 +80,35 @@ def fit(
     return state, least
 
 
+def vertex_sigma(
+    basis: Basis, targets: list[Target], state: State, free: tuple[str, ...] = ()
+) -> np.ndarray:
+    """Return standard deviations (E, V), metres, of all vertices under the fit's covariance.
+
+    They take residuals for independent and the terms' own deviations for true: they say where a
+    vertex is better known than another, and `express50.error_model` says how well.
+    """
+    shared = basis.shape_size + BIAS
+    precision, own = np.diag(_shared_weights(basis, len(targets), free)), []
+    for target, pose in zip(targets, state.poses, strict=True):
+        hessian, _ = _normal_equations(basis, _Expression.of(basis, target), pose, state)
+        inner = hessian[shared:, shared:]
+        inverse = np.linalg.inv(inner + 1e-9 * np.trace(inner) / len(inner) * np.eye(len(inner)))
+        follow = -inverse @ hessian[shared:, :shared]  # how its own unknowns follow the shared ones
+        precision += hessian[:shared, :shared] + hessian[:shared, shared:] @ follow
+        own.append((inverse, follow))
+    values, axes = np.linalg.eigh(precision)
+    root = axes / np.sqrt(np.maximum(values, 1e-9 * values[-1]))  # of the shared covariance
+    every, found = Points(basis, np.arange(len(basis.model.template))), []
+    for pose, (inverse, follow) in zip(state.poses, own, strict=True):
+        jacobian = every.linearise(np.r_[state.shape, pose.own], pose.rotation)[1]
+        slope = jacobian[..., basis.shape_size :]
+        along = slope @ (follow @ root) + jacobian[..., : basis.shape_size] @ root[:-BIAS]
+        alone = np.einsum("vij,jk,vik->v", slope, inverse, slope, optimize=True)
+        found.append(np.sqrt(np.maximum((along**2).sum((1, 2)) + alone, 0)))
+    return np.stack(found)
+
+
 def condensed(basis: Basis, target: Target, pose: Pose) -> Target:
     """Return a target whose evidence is a quadratic about a pose that was fitted to it.
 

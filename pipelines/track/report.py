@@ -256,3 +256,25 @@ def track_metrics(model: HeadModel, targets: list[Target], vertices: np.ndarray)
         "marked_views": marked,
         "head": model.name,
     }
+
+
+def error_figures(
+    sigma: np.ndarray,
+    vertices: np.ndarray,
+    cameras: Mapping[str, Camera],
+    marks_px: Mapping[str, float],
+    outline_views: int,
+) -> dict[str, np.ndarray | float]:
+    """Describe how well the vertices (V, 3) of an expression are known, for `error_bounds`.
+
+    `sigma` (V,) are metres; `marks_px` is the landmarks' RMS per camera.
+    """
+    away = [np.linalg.norm(c.center - vertices.mean(0)) / c.K[0, 0] for c in cameras.values()]
+    pixel = 1e3 * float(np.median(away))
+    return {
+        "sigma_mm": 1e3 * sigma,
+        "landmark_mm": pixel * _rms(marks_px.values()) if marks_px else math.inf,
+        "pixel_mm": pixel,
+        "views": float(max(len(marks_px), 1)),
+        "outline_views": 1.0 + outline_views,
+    }

@@ -166,12 +166,14 @@ def refine(
             moved, _ = fit(person, found, State(np.zeros(0), state.poses), ROUND_STEPS)
             state = replace(state, poses=moved.poses)
             continue
-        kinds = {type(term) for target in found for term in target.terms}
-        free = tuple(
-            name for kind, name in ((NormalTerm, OFF), (SlideTerm, ALONG)) if kind in kinds
-        )
-        state, _ = fit(basis, found, state, ROUND_STEPS, free)
+        state, _ = fit(basis, found, state, ROUND_STEPS, free_modes(found))
     return state, found
+
+
+def free_modes(targets: list[Target]) -> tuple[str, ...]:
+    """Name the offset modes that the targets' terms can determine."""
+    kinds = {type(term) for target in targets for term in target.terms}
+    return tuple(name for kind, name in ((NormalTerm, OFF), (SlideTerm, ALONG)) if kind in kinds)
 
 
 def doubted(model: HeadModel, sigma: np.ndarray, hidden: np.ndarray) -> np.ndarray:

@@ -13,9 +13,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from express50.capture.frames import read_cameras_of
 from express50.capture.index import read_index
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
+from express50.error_model import Bounds, error_bounds, error_models, expect, size_sigma
 from express50.errors import StageError
 from express50.files.digests import path_digest, value_digest
 from express50.head.load import load_head
@@ -24,7 +26,7 @@ from pipelines.track.appearance import write_texture
 from pipelines.track.basis import Basis, freeze_shape, make_basis, split_shape, with_modes
 from pipelines.track.config import TrackConfig
 from pipelines.track.eyes_and_jaw import lid_terms, measure_eyes
-from pipelines.track.fit import consistent_sigma, fit
+from pipelines.track.fit import consistent_sigma, fit, vertex_sigma
 from pipelines.track.observe import Observation
 from pipelines.track.read_inputs import (
     observe_peaks,
@@ -35,11 +37,13 @@ from pipelines.track.read_inputs import (
 )
 from pipelines.track.report import (
     draw_overlays,
+    error_figures,
     track_metrics,
     write_sheet,
 )
 from pipelines.track.schedule import (
     LANDMARK_STEPS,
+    free_modes,
     gather,
     make_schedule,
     refine,
@@ -96,11 +100,14 @@ def run(
     state, targets = refine(basis, targets, state, evidence, schedule)
     state = rounded(state, DECIMALS)
     meshes, turns = all_vertices(basis.model, state), rotations(state)
-    write_track(out / "track.npz", config.head, basis, targets, state, meshes)
+    metrics = track_metrics(basis.model, targets, meshes)
+    sigma = vertex_sigma(basis, targets, state, free_modes(targets))
+    bounds = stated_bounds(dataset, item, sigma, meshes, metrics)
+    doubt = {"sigma": sigma, "bound": 1e-3 * np.stack([one.bound for one in bounds])}
+    write_track(out / "track.npz", config.head, basis, targets, state, meshes, doubt)
     if config.texture_side:
         sides = (config.samples, config.texture_side)
         write_texture(out, basis.model, targets, meshes, pictures, *sides)
-    metrics = track_metrics(basis.model, targets, meshes)
     tiles = draw_overlays(dataset, item, out / "qc", basis.model, targets, meshes, turns)
     write_sheet(out / "qc", tiles, metrics["landmark_rms_px"])
     metrics["schedule"] = schedule_table(schedule)
@@ -122,7 +129,26 @@ def run(
             dataset.windows_dir(item), identity,
         )  # fmt: skip
         dropped += lost
-    return Result(metrics, dropped)
+    shared = size_sigma(list(read_cameras_of(dataset, item).values()), meshes.reshape(-1, 3))
+    typical = np.concatenate([one.typical for one in bounds])
+    expected = expect(error_models()["track"], typical, shared)
+    return Result(metrics, dropped, expected_error=expected)
+
+
+def stated_bounds(
+    dataset: Dataset, subject: str, sigma: np.ndarray, meshes: np.ndarray, metrics: dict
+) -> list[Bounds]:
+    """Bound the vertices' errors of every expression, millimetres, from sigma (E, V), metres."""
+    cameras, outlines = read_cameras_of(dataset, subject), metrics["outline_views"]
+    rows = zip(sigma, meshes, metrics["landmark_rms_px"].values(), strict=True)
+    return [
+        error_bounds(
+            "track",
+            error_figures(own, mesh, cameras, marks, outlines),
+            size_sigma(list(cameras.values()), mesh),
+        )
+        for own, mesh, marks in rows
+    ]
 
 
 def fit_landmarks(
@@ -170,8 +196,9 @@ def write_track(
     targets: list[Target],
     state: State,
     vertices: np.ndarray,
+    doubt: Mapping[str, np.ndarray] | None = None,
 ) -> None:
-    """Write track.npz (docs/FORMAT.md)."""
+    """Write track.npz (docs/FORMAT.md); `doubt` are the vertices' deviations and bounds (E, V)."""
     shape, offsets = split_shape(basis.model, state.shape)
     arrays = {
         "schema": np.array(SCHEMA),
@@ -182,7 +209,8 @@ def write_track(
         "offsets": offsets.astype(np.float32),
     }
     arrays |= pose_arrays(state.poses, basis.expression_size)
-    write_npz(path, arrays | {"vertices": vertices.astype(np.float32)})
+    further = {"vertices": vertices, **(doubt or {})}
+    write_npz(path, arrays | {name: array.astype(np.float32) for name, array in further.items()})
 
 
 @lru_cache(maxsize=2)

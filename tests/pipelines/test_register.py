@@ -13,6 +13,7 @@ from express50.contract.layout import Dataset
 from express50.dataset.export import Head, with_registered
 from express50.dataset.tracks import best_vertices, read_registration, read_track
 from express50.errors import FormatError, StageError
+from express50.files.calibration import write_cameras
 from express50.geometry.meshes import cotangent_laplacian, read_surface, write_ply
 from express50.geometry.raycast import mesh_scene
 from express50.geometry.transforms_torch import axis_angle_to_matrix
@@ -30,6 +31,7 @@ from pipelines.register.skin import skin_trust
 from pipelines.register.stage import rest_offsets
 from pipelines.register.untangle import crossing_pairs, untangled
 from tests.express50.dataset.tracked import track_arrays, write_track
+from tests.pipelines.board_rigs import make_rig
 
 DETAIL = 0.010
 
@@ -211,6 +213,8 @@ def dataset(tmp_path, model) -> Dataset:
     dataset.item_dir("track", "S001").mkdir(parents=True)
     arrays = track_arrays("procedural", offsets_mm=0.0)
     write_track(dataset.track_file("S001"), arrays)
+    dataset.cameras_file("S001").parent.mkdir(parents=True)
+    write_cameras(dataset.cameras_file("S001"), make_rig(2))
     path = dataset.surface_file("S001", "smile")
     path.parent.mkdir(parents=True)
     head = (arrays["vertices"][1] - arrays["t"][1]) @ arrays["R"][1]
@@ -245,6 +249,9 @@ def test_the_stage_writes_a_mesh_that_later_stages_take(dataset, tmp_path):
     assert np.array_equal(best, [track.vertices[0], found.vertices])
     assert np.abs(best[1] - track.vertices[1]).max() > 0.001
     assert found.seen.any() and np.isfinite(found.sigma).all()
+    assert np.isfinite(found.bound).all() and (found.bound > 0).all()
+    stated = result.expected_error
+    assert stated.unit == "mm" and 0 < stated.low <= stated.value <= stated.high
     head = Head(subject="S001", track=track, model=load_head("procedural"), albedo=None)
     exported = with_registered(dataset, head).track.vertices
     assert np.array_equal(exported, [track.vertices[0], found.vertices])

@@ -1,0 +1,261 @@
+"""Measure how often the bounds hold that stages state about their own errors.
+
+``python -m benchmarks.intervals [--work DIR] [--conditions ...] [--made]`` records test subjects of
+the digital twin under the conditions of ``benchmarks.intervals_rows``, runs the chain, and compares
+the stated bounds with the truth: ``coverage_percent`` of a stage and condition is the share of
+elements (pixels of depth, pixels about a matte's outline, vertices, cameras, peaks) whose error is
+within its bound, items weighted alike; 90 is meant. ``items_inside`` counts the items whose error
+lies in the interval of their ``expected_error``. ``depth.ause`` is the sparsification error of
+depth (0 is ideal, Ilg et al. 2018) over all pixels, ``_skin`` over those of bare skin, ``_before``
+with the confidence that former versions had. ``halves`` has no truth: captures of ``--foreign`` are
+run on either half of their cameras, and results must differ by no more than both bounds together.
+What is made is kept in DIR and taken up again; ``--made`` takes only that. ``--fit`` makes the same
+of other subjects, and writes ``express50/error_models.json`` from it; raise the versions of the
+stages then. The last line is one JSON object.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.intervals_collect import (
+    Sample,
+    half_shares,
+    peak_samples,
+    row_samples,
+    with_tracked,
+)
+from benchmarks.intervals_fit import ause, fit_model
+from benchmarks.intervals_rigs import rig_samples
+from benchmarks.intervals_rows import (
+    ALIGN_NOISE,
+    CONDITIONS,
+    make_halves,
+    make_peaks,
+    make_row,
+)
+from express50.contract.layout import Dataset
+from express50.contract.stage import Unit
+from express50.error_model import FILE, NOMINAL, ErrorModel, error_bounds, error_models, item_error
+from express50.files.atomic import dump_json
+from express50.twin.truth import Truth
+
+UNITS: dict[str, Unit] = {
+    "calibrate": "mm",
+    "align": "frames",
+    "matte": "alpha",
+    "track": "mm",
+    "depth": "mm",
+    "register": "mm",
+}
+FIT, TEST = (61, 62, 63, 64), (71, 72, 73, 74)  # subjects
+FIT_RIGS, TEST_RIGS = range(3), range(100, 103)  # seeds of simulated rigs
+FIT_PEAKS, TEST_PEAKS = ((81, 82), (83,)), ((91, 92), (93,))  # subjects per noise of ALIGN_NOISE
+HALVES_PEAKS = {"neutral": 2, "smile": 9}  # frames of the foreign captures
+Row = tuple[str, Sample]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Make the rows, and fit or measure."""
+    options = parse(arguments)
+    began = time.process_time()
+    rows = list(samples(options))
+    if options.fit:
+        write_models(rows)
+        return 0
+    figures = measure(rows)
+    figures |= {"halves": halves(options), "cpu_seconds": round(time.process_time() - began)}
+    print(json.dumps({"benchmark": "intervals"} | figures))
+    return 0
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Parse the command line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.intervals", description=__doc__)
+    parser.add_argument("--work", type=Path, default=Path("build/intervals"))
+    names = [one.name for one in CONDITIONS]
+    parser.add_argument("--conditions", nargs="*", choices=names, metavar="NAME",
+                        default=[one.name for one in CONDITIONS if not one.costly])  # fmt: skip
+    parser.add_argument(
+        "--subjects", nargs="*", type=int, help="numbers; default: those not fitted"
+    )
+    parser.add_argument("--made", action="store_true", help="only rows that are made already")
+    parser.add_argument("--fit", action="store_true", help="fit the constants, on other subjects")
+    parser.add_argument("--foreign", nargs="*", type=Path, default=[], help="captures, no truth")
+    options = parser.parse_args(arguments)
+    mine, others = (FIT, TEST) if options.fit else (TEST, FIT)
+    options.subjects = options.subjects or list(mine)
+    if set(options.subjects) & set(others):
+        parser.error(f"--subjects: {others} are the other side's; never fit and test on the same")
+    return options
+
+
+def samples(options: argparse.Namespace) -> Iterator[Row]:
+    """Yield condition and sample of every stage, from rows that are made where they are not."""
+    root = options.work
+    chosen = [one for one in CONDITIONS if one.name in options.conditions]
+    for number in options.subjects:
+        for condition in chosen:
+            subject = f"S{number:03d}"
+            dataset = Dataset(root / "rows" / condition.row(subject))
+            if options.made:
+                if not dataset.stage_dir("register").is_dir():
+                    continue
+                truth = Truth(root / "films" / condition.film(subject) / "truth")
+            else:
+                dataset, truth = make_row(condition, number, root)
+            print(f"{condition.name}, {subject}", file=sys.stderr, flush=True)
+            yield from ((condition.name, sample) for sample in row_samples(dataset, truth))
+    groups = FIT_PEAKS if options.fit else TEST_PEAKS
+    for (name, noise), numbers in zip(ALIGN_NOISE.items(), groups, strict=True):
+        folder = root / "peaks" / f"{noise}-{numbers[0]}"
+        if not options.made:
+            make_peaks(noise, numbers, root)
+        elif not (folder / "dataset" / "align").is_dir():
+            continue
+        dataset, truth = Dataset(folder / "dataset"), Truth(folder / "twin" / "truth")
+        yield from ((name, sample) for sample in peak_samples(dataset, truth))
+    yield from rig_samples(FIT_RIGS if options.fit else TEST_RIGS)
+
+
+def measure(rows: Sequence[Row]) -> dict:
+    """Return the coverage per stage and condition, and depth's sparsification error."""
+    models = error_models()
+    table: dict[str, dict[str, dict]] = {stage: {} for stage in UNITS}
+    for stage, conditions in table.items():
+        mine = [(name, sample) for name, sample in rows if sample.stage == stage]
+        for name in dict.fromkeys(name for name, _ in mine):
+            found = [with_tracked(s, models["track"]) for n, s in mine if n == name]
+            conditions[name] = coverage(found)
+    shares = [row["coverage_percent"] for rows_ in table.values() for row in rows_.values()]
+    depth = [sample for _, sample in rows if sample.stage == "depth"]
+    return {
+        "coverage_min_percent": min(shares, default=None),
+        "coverage_max_percent": max(shares, default=None),
+        "coverage_percent_by_stage": {
+            stage: mean([row["coverage_percent"] for row in conditions.values()])
+            for stage, conditions in table.items()
+        },
+        "items_inside_percent_by_stage": {
+            stage: round(
+                100
+                * sum(row["items_inside"] for row in conditions.values())
+                / max(sum(row["items"] for row in conditions.values()), 1),
+                1,
+            )
+            if conditions
+            else None
+            for stage, conditions in table.items()
+        },
+        **sparsification(depth),
+        "rows": table,
+        "not_run": [one.name for one in CONDITIONS if one.name not in {name for name, _ in rows}],
+        "not_measured": {
+            "focal lengths under 310 px": "a head does not fit the twin's picture",
+            "grmm": "it states no interval",
+        },
+    }
+
+
+def coverage(found: Sequence[Sample]) -> dict:
+    """Return how often the bounds of a condition's items held."""
+    shares, inside = [], 0
+    for sample in found:
+        bounds = error_bounds(sample.stage, sample.figures, sample.shared)
+        shares.append(float(np.mean(sample.errors <= bounds.bound)))
+        true, expected = item_error(sample.errors, UNITS[sample.stage]), bounds.expected
+        inside += expected is not None and expected.low <= true <= expected.high
+    return {
+        "coverage_percent": round(100 * float(np.mean(shares)), 1),
+        "items": len(found),
+        "items_inside": int(inside),
+        "error": mean([item_error(s.errors, UNITS[s.stage]) for s in found]),
+        "unit": UNITS[found[0].stage],
+    }
+
+
+def sparsification(depth: Sequence[Sample]) -> dict:
+    """Return the mean sparsification errors of depth's items."""
+    keys = ("depth.ause", "depth.ause_before", "depth.ause_skin", "depth.ause_skin_before")
+    rows = []
+    for sample in depth:
+        doubt = error_bounds("depth", sample.figures, sample.shared).bound
+        sides = [(sample.errors, doubt), (sample.errors, -sample.baseline)]
+        bare = sample.skin
+        rows.append([ause(*pair) for pair in sides])
+        rows[-1] += [
+            ause(errors[bare], key[bare]) if bare.any() else np.nan for errors, key in sides
+        ]
+    if not rows:
+        return dict.fromkeys(keys)
+    return {k: round(float(v), 3) for k, v in zip(keys, np.nanmean(rows, axis=0), strict=True)}
+
+
+def halves(options: argparse.Namespace) -> dict:
+    """Return how often results of two halves of the cameras agree within both bounds."""
+    found: dict[str, list[float]] = {}
+    for capture in options.foreign:
+        one, other = made = [
+            Dataset(options.work / "halves" / f"{capture.name}-{half}") for half in (0, 1)
+        ]
+        if not options.made:
+            one, other = make_halves(capture, HALVES_PEAKS, options.work)
+        if all(dataset.stage_dir("register").is_dir() for dataset in made):
+            for stage, share in half_shares(one, other):
+                found.setdefault(stage, []).append(share)
+    return {stage: round(100 * float(np.mean(rows)), 1) for stage, rows in found.items()}
+
+
+def write_models(rows: Sequence[Row]) -> None:
+    """Fit every stage's constants and write them; stages without samples keep theirs."""
+    former = json.loads(FILE.read_text())["stages"]
+    models: dict[str, ErrorModel] = {}
+    for stage, unit in UNITS.items():
+        mine = [sample for _, sample in rows if sample.stage == stage]
+        if stage == "register" and "track" in models:
+            mine = [with_tracked(sample, models["track"]) for sample in mine]
+        if mine:
+            models[stage] = fit_model(mine, unit)
+    fitted = {stage: _rounded(asdict(model)) for stage, model in models.items()}
+    content = {
+        "made_by": "python -m benchmarks.intervals --fit",
+        "nominal": NOMINAL,
+        "fitted_on": {
+            stage: {
+                "items": sum(sample.stage == stage for _, sample in rows),
+                "conditions": list(dict.fromkeys(n for n, s in rows if s.stage == stage)),
+                "subjects": sorted({s.item.split("/")[0] for _, s in rows if s.stage == stage})
+                if stage != "calibrate"
+                else f"simulated rigs, seeds {FIT_RIGS.start} to {FIT_RIGS.stop - 1}",
+            }
+            for stage in models
+        },
+        "stages": former | fitted,
+    }
+    FILE.write_bytes(dump_json(content))
+    error_models.cache_clear()
+    print(f"wrote {FILE.name}: {', '.join(models)}", file=sys.stderr)
+
+
+def _rounded(row: dict) -> dict:
+    return {
+        key: np.round(value, 4).tolist() if key not in ("unit", "features") else value
+        for key, value in row.items()
+    }
+
+
+def mean(values: Sequence[float]) -> float | None:
+    """Return the mean to four digits; None of nothing."""
+    return float(f"{np.mean(values):.4g}") if len(values) else None
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,165 @@
+"""Fit the constants of ``express50.error_model`` to samples whose errors are known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import stats
+
+from benchmarks.intervals_collect import Sample
+from express50.contract.stage import Unit
+from express50.error_model import NOMINAL, TINY, ErrorModel, error_bounds, item_error, scores_of
+
+KNOTS = 20
+LEAST_ELEMENTS = 40  # per knot
+FLOORS = {"mm": 0.02, "px": 0.002, "alpha": 0.002, "frames": 0.3, "dB": 0.1}
+LEAST = {"mm": 1e-4, "px": 1e-4, "alpha": 1e-4, "frames": 0.5, "dB": 1e-4}
+"""Bounds are no less: a peak lies somewhere within its frame."""
+ROW_LEVEL = 0.05  # share of a figure's variance within items under which it describes the item
+RIDGE = 0.003, 0.03  # of weights within and between items: variances of logarithms
+
+
+def fit_model(samples: Sequence[Sample], unit: Unit) -> ErrorModel:
+    """Fit weights by least squares of logarithms, then the table; every item counts alike.
+
+    Figures of elements are weighed by what they say within items, figures of whole items by what is
+    left between items: otherwise a few items would decide what a pixel's figure means.
+    """
+    samples = [s for s in samples if not s.shared.any()]  # what is shared is known, not fitted
+    names = tuple(samples[0].figures)
+    logs = [_logarithms(s, names) for s in samples]
+    known = np.concatenate(logs)
+    limits = np.stack([np.nanpercentile(known, q, axis=0) for q in (0.5, 99.5)], 1)
+    if len(names) == 1:
+        return _proportional(names, unit, samples)
+    # A figure that is not known counts as the worst met.
+    filled = [np.where(np.isfinite(x), np.clip(x, *limits.T), limits[:, 1]) for x in logs]
+    target = [np.log(s.errors + FLOORS[unit]) for s in samples]
+    weights = _weights(filled, target)
+    blank = np.zeros(1)
+    model = ErrorModel(unit, names, weights, limits, blank, blank, blank, (1, 1, 1))
+    score = np.concatenate([scores_of(model, s.figures) for s in samples])
+    share = np.concatenate([np.full(len(s.errors), 1 / len(s.errors)) for s in samples])
+    errors = np.maximum(np.concatenate([s.errors for s in samples]), LEAST[unit])
+    knots, typical, bound = _table(score, errors, share)
+    model = replace(model, scores=knots, typical=typical, bound=bound)
+    return replace(model, item=_item_ratios(model, samples))
+
+
+def _proportional(names: tuple[str, ...], unit: Unit, samples: Sequence[Sample]) -> ErrorModel:
+    """Fit errors that are proportional to the one figure: a stage's own deviation."""
+    ratios = np.concatenate([s.errors / s.figures[names[0]] for s in samples])
+    typical, bound = (np.log(np.quantile(ratios, [q])) for q in (0.5, NOMINAL))
+    wide = np.array([[np.log(TINY), -np.log(TINY)]])
+    model = ErrorModel(unit, names, np.ones(1), wide, np.zeros(1), typical, bound, (1, 1, 1))
+    return replace(model, item=_item_ratios(model, samples))
+
+
+def _logarithms(sample: Sample, names: Sequence[str]) -> np.ndarray:
+    """Return the logarithms (N, F) of a sample's figures; NaN where not finite."""
+    columns = np.stack([sample.figures[name] for name in names], 1)
+    return np.where(np.isfinite(columns), np.log(np.maximum(columns, TINY)), np.nan)
+
+
+def _weights(logs: Sequence[np.ndarray], target: Sequence[np.ndarray]) -> np.ndarray:
+    """Fit weights (F,) of figures (N, F) per item to the logarithms of errors (N,) per item."""
+    within = np.mean([x.var(0) for x in logs], axis=0)
+    means = np.stack([x.mean(0) for x in logs])
+    between = means.var(0)
+    own = within > ROW_LEVEL * (within + between) + 1e-9
+    rest = ~own & (between > 1e-9)
+    weights = np.zeros(len(within))
+    moved = [(x - x.mean(0))[:, own] for x in logs]
+    normal = np.mean([x.T @ x / len(x) for x in moved], axis=0) + RIDGE[0] * np.eye(own.sum())
+    right = [x.T @ (y - y.mean()) / len(x) for x, y in zip(moved, target, strict=True)]
+    weights[own] = np.linalg.solve(normal, np.mean(right, axis=0))
+    left = np.array([y.mean() for y in target]) - means @ weights
+    x = (means - means.mean(0))[:, rest]
+    normal = x.T @ x / len(x) + RIDGE[1] * np.eye(rest.sum())
+    weights[rest] = np.linalg.solve(normal, x.T @ (left - left.mean()) / len(x))
+    return weights
+
+
+def _table(
+    score: np.ndarray, errors: np.ndarray, share: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return knots of the score and the logarithms of median and bound there, both rising."""
+    order = np.argsort(score, kind="stable")
+    place = np.cumsum(share[order])
+    count = int(np.clip(len(score) // LEAST_ELEMENTS, 1, KNOTS))
+    bins = np.minimum((place / place[-1] * count).astype(int), count - 1)
+    rows = [
+        (
+            np.average(score[mine], weights=share[mine]),
+            _quantile(errors[mine], share[mine], 0.5),
+            _quantile(errors[mine], share[mine], NOMINAL),
+        )
+        for mine in (order[bins == k] for k in range(count))
+        if len(mine)
+    ]
+    knots, typical, bound = np.array(rows).T
+    kept = np.r_[True, np.diff(knots) > 1e-9]
+    typical, bound = (np.log(_rising(v[kept])) for v in (typical, bound))
+    return knots[kept], typical, bound
+
+
+def _rising(values: np.ndarray) -> np.ndarray:
+    """Return the nearest values that do not fall (pool adjacent violators)."""
+    blocks: list[tuple[float, int]] = []
+    for value in values:
+        blocks.append((float(value), 1))
+        while len(blocks) > 1 and blocks[-2][0] > blocks[-1][0]:
+            (a, n), (b, m) = blocks[-2:]
+            blocks[-2:] = [((a * n + b * m) / (n + m), n + m)]
+    return np.concatenate([np.full(count, value) for value, count in blocks])
+
+
+def _quantile(values: np.ndarray, weights: np.ndarray, level: float) -> float:
+    """Return a weighted quantile of values (N,)."""
+    order = np.argsort(values)
+    place = np.cumsum(weights[order]) / weights.sum()
+    row = min(int(np.searchsorted(place, level)), len(values) - 1)
+    return float(values[order[row]])
+
+
+def _item_ratios(model: ErrorModel, samples: Sequence[Sample]) -> tuple[float, float, float]:
+    """Return the ends and middle of items' errors over what their elements let expect.
+
+    People differ more than items of one person do, and few people were recorded: the ends are those
+    of Student's prediction interval for the logarithm of another person's item. With one person
+    they lie a factor of two away.
+    """
+    groups: dict[str, list[float]] = {}
+    for sample in samples:
+        typical = error_bounds("", sample.figures, 0.0, model).typical
+        ratio = item_error(sample.errors, model.unit) / item_error(typical, model.unit)
+        groups.setdefault(sample.item.split("/")[0], []).append(np.log(max(ratio, TINY)))
+    if model.unit == "frames":  # whole frames: most are 0
+        return 0.0, 0.0, 1.0
+    means = [float(np.mean(rows)) for rows in groups.values()]
+    within = float(np.mean([np.var(rows) for rows in groups.values()]))
+    count = len(means)
+    spread = np.log(2.0)
+    if count > 1:
+        between = float(np.var(means, ddof=1))
+        reach = float(stats.t.ppf((1 + NOMINAL) / 2, count - 1))
+        spread = reach * np.sqrt(between * (1 + 1 / count) + within)
+    middle = float(np.mean(means))
+    return tuple(float(np.exp(middle + way * spread)) for way in (-1, 0, 1))  # type: ignore[return-value]
+
+
+def ause(errors: np.ndarray, doubt: np.ndarray, steps: int = 50) -> float:
+    """Return the sparsification error of a doubt (N,) about errors (N,).
+
+    It is the area between the mean errors that are left as the most doubted elements are taken
+    away, and those left as the worst are, over the mean error (Ilg et al. 2018).
+    """
+    kept = np.maximum((np.linspace(1, 1 / steps, steps) * len(errors)).astype(int), 1)
+
+    def left(key: np.ndarray) -> np.ndarray:
+        total = np.cumsum(errors[np.argsort(key, kind="stable")])
+        return total[kept - 1] / kept
+
+    return float(np.mean(left(doubt) - left(errors)) / max(errors.mean(), 1e-12))

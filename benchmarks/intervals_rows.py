@@ -1,0 +1,204 @@
+"""Record a digital twin under a condition and run the chain up to registration on it.
+
+A condition is a row of ``CONDITIONS``: how many cameras, how many pixels, how far away, and what is
+wrong with the footage. Peaks are the truth's, as alignment has rows of its own. Captures without
+truth are run twice, on either half of their cameras.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from unittest import mock
+
+import cv2
+import numpy as np
+
+from annotations import align, observe
+from benchmarks.align import run as run_stage_or_stop
+from benchmarks.track import write_peaks
+from express50.contract.config import build_config
+from express50.contract.layout import Dataset
+from express50.files.calibration import read_cameras, write_cameras
+from express50.files.images import read_image, write_image
+from express50.geometry.transforms import axis_angle_to_matrix
+from express50.runner.runner import run_stage
+from express50.twin import rig
+from express50.twin.config import TwinConfig
+from express50.twin.record import record
+from express50.twin.truth import Truth
+from pipelines import calibrate, depth, frames, ingest, matte, register, track
+from pipelines.ingest import register as take_in
+
+EXPRESSIONS = ("neutral", "smile")
+SETTINGS: dict[str, dict[str, object]] = {  # sizes that fit a small machine, as in the demo
+    "track": {"patch_rounds": 4, "samples": 2500, "offset_modes": 80, "texture_side": 256},
+    "depth": {"voxel_mm": 2.8},
+}
+FRONT = {1: [4], 2: [3, 4], 4: [2, 3, 4, 5]}  # of eight cameras
+LIGHT = (0.75, 1.2)  # colour gains of a camera whose lamps moved after its plate was taken
+BLUR_PX = 1.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Condition:
+    """What is recorded, and what goes wrong.
+
+    Attributes:
+        name: of the row.
+        views: cameras that the stages see.
+        side: pixels of the pictures' sides.
+        distance: of the cameras, in the rig's usual one; the focal length grows with it.
+        noise: of the sensor, in that of a good studio camera.
+        harm: ``blur``, ``light``, ``turned`` or nothing.
+        head: model of the person.
+        costly: takes more than ten minutes of a core, and is run only if it is named.
+    """
+
+    name: str
+    views: int = 8
+    side: int = 256
+    distance: float = 1.0
+    noise: float = 1.0
+    harm: str = ""
+    head: str = "procedural"
+    costly: bool = False
+
+    def row(self, subject: str) -> str:
+        """Return the folder of a subject's row."""
+        return f"{self.name.replace(' ', '-')}-{subject}"
+
+    def film(self, subject: str) -> str:
+        """Return the folder of the recording, which rows share."""
+        rest = f"{self.distance}-{self.noise}-{Path(self.head).stem}"
+        return f"{max(8, self.views)}-{self.side}-{rest}-{subject}"
+
+
+CONDITIONS = (
+    Condition(name="8 views"),
+    Condition(name="4 views", views=4),
+    Condition(name="2 views", views=2),
+    Condition(name="1 view", views=1),
+    Condition(name="blur", harm="blur"),
+    Condition(name="wrong light", harm="light"),
+    Condition(name="a camera off by a degree", harm="turned"),
+    Condition(name="128 px", side=128),
+    Condition(name="noise", noise=6.0),
+    Condition(name="512 px", side=512),
+    # Nearer than this a head does not fit the picture: focal lengths of 20 px are n/a.
+    Condition(name="focal length 310 px", distance=0.5),
+    Condition(name="focal length 2,500 px", distance=4.0),
+    Condition(name="focal length 20,000 px", distance=32.0),
+    Condition(name="24 views", views=24),
+    Condition(name="1920 px", side=1920, costly=True),
+    Condition(name="3840 px", side=3840, costly=True),
+)
+
+
+def make_row(condition: Condition, number: int, root: Path) -> tuple[Dataset, Truth]:
+    """Record subject ``number`` and run the stages; what is there already is kept."""
+    subject = f"S{number:03d}"
+    config = TwinConfig(
+        subjects=1, first_subject=number, cameras=max(8, condition.views), width=condition.side,
+        height=condition.side, expressions=EXPRESSIONS, frames_per_expression=4, board_frames=0,
+        give_calibration=True, footage="png", seed=5, noise=condition.noise, head=condition.head,
+    )  # fmt: skip
+    film = root / "films" / condition.film(subject)
+    with mock.patch.object(rig, "RADIUS_M", rig.RADIUS_M * condition.distance):
+        record(config, film, workers=1)
+    truth = Truth(film / "truth")
+    dataset = Dataset(root / "rows" / condition.row(subject))
+    capture = dataset.root / "capture" / subject
+    if not capture.is_dir():
+        shutil.copytree(film / "captures" / subject, capture)
+        _harm(capture, condition)
+    run_chain(dataset, capture, truth.peaks(subject))
+    return dataset, truth
+
+
+def run_chain(dataset: Dataset, capture: Path, peaks: dict[str, int]) -> None:
+    """Run the stages from ingest to registration; a stage that fails ends the row there."""
+    take_in(dataset, [capture])
+    for stage in (ingest, calibrate, frames, matte, track, depth, register):
+        settings = build_config(stage.STAGE, SETTINGS.get(stage.STAGE.name, {}))
+        if stage is frames:
+            write_peaks(dataset, capture.name, peaks)
+        summary = run_stage(stage.STAGE, dataset, settings, workers=0, progress=False)
+        for line in (outcome.reason for outcome in summary.outcomes if outcome.reason):
+            print(f"{dataset.root.name}: {stage.STAGE.name}: {line}", file=sys.stderr)
+        if not summary.count("done") + summary.count("skipped"):
+            return
+
+
+def _harm(capture: Path, condition: Condition) -> None:
+    """Leave cameras out, and spoil pictures or calibration."""
+    names = sorted(path.name for path in (capture / "cameras").iterdir())
+    keep_cameras(capture, [names[k] for k in FRONT.get(condition.views, range(len(names)))])
+    if condition.harm == "turned":
+        cameras = read_cameras(capture / "calibration.json")
+        turn = np.eye(4)
+        turn[:3, :3] = axis_angle_to_matrix(np.array([0.0, np.radians(1.0), 0.0]))
+        one = cameras[names[3]]
+        cameras[names[3]] = replace(one, cam_from_world=turn @ one.cam_from_world)
+        write_cameras(capture / "calibration.json", cameras)
+    for k, folder in enumerate(sorted((capture / "cameras").iterdir())):
+        gain = np.random.default_rng([7, k]).uniform(*LIGHT, 3)
+        for path in sorted(folder.rglob("*.png")) if condition.harm in ("blur", "light") else ():
+            picture = read_image(path)
+            if condition.harm == "blur":
+                picture = cv2.GaussianBlur(picture, (0, 0), BLUR_PX)
+            else:
+                picture = np.clip(picture * gain, 0, 255).astype(np.uint8)
+            write_image(path, picture)
+
+
+def keep_cameras(capture: Path, kept: Sequence[str]) -> None:
+    """Take all other cameras out of a capture with given calibration."""
+    cameras = read_cameras(capture / "calibration.json")
+    for name in set(cameras) - set(kept):
+        shutil.rmtree(capture / "cameras" / name)
+        (capture / "plates" / f"{name}.png").unlink(missing_ok=True)
+    (capture / "calibration.json").unlink()
+    write_cameras(capture / "calibration.json", {name: cameras[name] for name in kept})
+
+
+def make_halves(source: Path, peaks: dict[str, int], root: Path) -> list[Dataset]:
+    """Run the chain on every other camera of a capture, and on the rest."""
+    made = []
+    for half in (0, 1):
+        dataset = Dataset(root / "halves" / f"{source.name}-{half}")
+        capture = dataset.root / "capture" / source.name
+        if not capture.is_dir():
+            shutil.copytree(source, capture)
+            for folder in (capture, *capture.rglob("*")):
+                folder.chmod(0o755 if folder.is_dir() else 0o644)
+            keep_cameras(capture, sorted(p.name for p in (capture / "cameras").iterdir())[half::2])
+        run_chain(dataset, capture, peaks)
+        made.append(dataset)
+    return made
+
+
+SCRIPT = (
+    "neutral", "smile", "jaw_open", "pucker", "brow_raise", "wink_left", "anger", "shout",
+    "surprise", "sadness", "smile_open", "laugh",
+)  # fmt: skip
+ALIGN_NOISE = {"1 view": 1.0, "noise": 6.0}
+
+
+def make_peaks(noise: float, numbers: Sequence[int], root: Path) -> None:
+    """Record subjects with one camera and suggest their peaks."""
+    folder = root / "peaks" / f"{noise}-{numbers[0]}"
+    config = TwinConfig(
+        subjects=len(numbers), first_subject=numbers[0], cameras=1, width=192, height=192,
+        expressions=SCRIPT, frames_per_expression=10, board_frames=0, give_calibration=True,
+        footage="jpg", plates=False, seed=17, noise=noise,
+    )  # fmt: skip
+    record(config, folder / "twin", workers=1)
+    dataset = Dataset(folder / "dataset")
+    take_in(dataset, sorted((folder / "twin" / "captures").iterdir()))
+    for stage in (ingest.STAGE, observe.STAGE):
+        run_stage_or_stop(stage, dataset, "standard")
+    run_stage_or_stop(align.STAGE, dataset, "standard", match=False)
