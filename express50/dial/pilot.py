@@ -79,19 +79,18 @@ class Pilot:
         record = root / "trial.json"
         if record.is_file():
             return trial_of(json.loads(record.read_text(encoding="utf-8")))
-        shutil.rmtree(root, ignore_errors=True)
-        if source is None:
+        if source is None:  # items of one that was stopped stand
             self._begin(root)
         else:
+            shutil.rmtree(root, ignore_errors=True)
             shutil.copytree(source.folder, root, copy_function=_link)
             (root / "trial.json").unlink()
         dataset = Dataset(root)
         costs, failed = dict(source.costs) if source else {}, {}
         for stage in self.stages:
+            config = self.ladders[stage.name][settings[stage.name]]
             try:
-                cost, why = self._run(
-                    stage, dataset, self.ladders[stage.name][settings[stage.name]]
-                )
+                cost, why = self._run(stage, dataset, config, anew=source is not None)
             except (ConfigError, DiskFullError):
                 raise
             except Express50Error as error:  # an earlier stage made nothing, perhaps
@@ -121,17 +120,25 @@ class Pilot:
     def _begin(self, root: Path) -> None:
         """Start a dataset with one capture, and the labels that people gave."""
         capture = self.dataset.captures()[self.subject]
+        if root.is_dir():
+            return
         root.mkdir(parents=True)
         write_json(root / "captures.json", {self.subject: str(capture.resolve())})
         if (self.dataset.root / "labels").is_dir():
             shutil.copytree(self.dataset.root / "labels", root / "labels")
 
-    def _run(self, stage: Stage, dataset: Dataset, config: Any) -> tuple[Cost | None, str]:
-        """Run a stage; returns what an item cost, if any was made, and why all failed."""
+    def _run(
+        self, stage: Stage, dataset: Dataset, config: Any, anew: bool
+    ) -> tuple[Cost | None, str]:
+        """Run a stage; returns what an item cost, if any was made, and why all failed.
+
+        Only items that are made in this run count, if ``anew``: others are of another trial.
+        """
         if not stage.items(dataset):
             return None, "an earlier stage made nothing for it"
         summary = run_stage(stage, dataset, config, pool=self.pool, progress=False, gate=self.clock)
-        made = {o.item for o in summary.outcomes if o.status == "done"}
+        counted = ("done",) if anew else ("done", "skipped")
+        made = {o.item for o in summary.outcomes if o.status in counted}
         failures = [o.reason for o in summary.outcomes if o.status == "failed"]
         with Ledger(dataset.ledger, read_only=True) as ledger:
             receipts = [r for i, r in ledger.read(stage.name).items() if i in made]
@@ -162,27 +169,25 @@ def pilot_dir(dataset: Dataset) -> Path:
     return dataset.staging_dir / "pilot"
 
 
-def keep_for_run(dataset: Dataset, trials: Sequence[Trial], settings: Mapping[str, str]) -> None:
+def keep_for_run(dataset: Dataset, settings: Mapping[str, str]) -> None:
     """Move what trials made at chosen settings to the store of replaced outputs.
 
     The run takes an output from there where it would make the same.
     """
-    for name, label in settings.items():
-        moved: set[str] = set()
-        for trial in trials:
-            if trial.settings[name] != label or not trial.folder:
-                continue
-            folder = Dataset(Path(trial.folder))
-            for subject in folder.subjects():
-                with suppress(FileNotFoundError):  # the peaks before they were cut
-                    whole_peaks(folder, subject).rename(folder.peaks_file(subject))
+    moved: set[tuple[str, str]] = set()
+    for record in sorted(pilot_dir(dataset).glob("*/trial.json")):
+        trial, folder = trial_of(json.loads(record.read_text("utf-8"))), Dataset(record.parent)
+        for subject in folder.subjects():
+            with suppress(FileNotFoundError):  # the peaks before they were cut
+                whole_peaks(folder, subject).rename(folder.peaks_file(subject))
+        for name in (n for n, label in settings.items() if trial.settings.get(n) == label):
             with Ledger(folder.ledger, read_only=True) as ledger:
                 receipts, made = ledger.read(name), ledger.made(name)
-            for item in made.keys() - moved:
+            for item in (i for i in made if (name, i) not in moved):
                 keep = keeping(dataset, replace(receipts[item], made=made[item]))
                 if keep is not None and folder.item_dir(name, item).is_dir():
                     keep(folder.item_dir(name, item))
-                    moved.add(item)
+                    moved.add((name, item))
 
 
 def _link(source: str, target: str) -> None:

@@ -12,6 +12,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from express50.console import count, format_seconds, format_table
 from express50.contract.config import config_toml
@@ -39,6 +40,7 @@ from express50.dial.pilot import (
     key_of,
     measure,
     pilot_dir,
+    stated_errors,
 )
 from express50.dial.results import RESULTS, ResultKind
 from express50.errors import ConfigError, FormatError, StageError
@@ -68,6 +70,7 @@ class RunState:
         promised: expected error of each result, as said before the start.
         seconds: expected then.
         changes: what was chosen anew later, and why.
+        stated: ``[value, low, high]`` of each result, as the stages state in the end.
         finished: whether nothing was left.
     """
 
@@ -77,9 +80,10 @@ class RunState:
     spent: float = 0.0
     settings: dict[str, str] = field(default_factory=dict)
     begun: list[str] = field(default_factory=list)
-    promised: dict[str, dict[str, float]] = field(default_factory=dict)
+    promised: dict[str, dict[str, Any]] = field(default_factory=dict)
     seconds: float = 0.0
     changes: list[str] = field(default_factory=list)
+    stated: dict[str, list[float]] = field(default_factory=dict)
     finished: bool = False
 
 
@@ -209,7 +213,7 @@ def run_within(
             state, settings=point.settings, seconds=clock.now() + point.seconds,
             promised={name: asdict(error) for name, error in point.errors.items()},
         )  # fmt: skip
-        keep_for_run(chain.dataset, measured.trials, point.settings)
+        keep_for_run(chain.dataset, point.settings)
         for line in choice_lines(load, point, budget, clock.now()):
             chain.tell(line)
     else:
@@ -228,7 +232,9 @@ def run_within(
         summaries.append(summary)
         ended(stage, summary)
     whole = len(summaries) == len(chain.stages) and not any(s.count("left") for s in summaries)
-    state = replace(state, finished=whole, spent=clock.now())
+    names = [stage.name for stage in chain.stages]
+    stated = stated_errors(chain.dataset, names, chain.kinds) if summaries else {}
+    state = replace(state, finished=whole, spent=clock.now(), stated=stated)
     keep(clock.now())
     if whole:
         shutil.rmtree(pilot_dir(chain.dataset), ignore_errors=True)
@@ -430,6 +436,9 @@ def closing_lines(state: RunState, summaries: Sequence[Summary]) -> Iterator[str
     """Yield how a run kept its word: time, errors that the stages state, and what is left."""
     whole = f" of {state.budget}" if state.budget else ""
     yield f"spent {format_seconds(state.spent)}{whole}, {format_seconds(state.seconds)} expected"
+    for name, (value, low, high) in state.stated.items():
+        unit, said = state.promised[name]["unit"], state.promised[name]["value"]
+        yield f"{name}: {value:.2g} {unit} ({low:.2g} to {high:.2g}), {said:.2g} promised"
     left = [f"{s.count('left')} of {s.stage}" for s in summaries if s.count("left")]
     if not state.finished:
         what = ", ".join(left) or "later stages"

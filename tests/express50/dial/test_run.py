@@ -102,6 +102,8 @@ def test_a_budget_below_the_cheapest_settings_says_what_the_least_is(tmp_path, c
     with pytest.raises(ConfigError, match=r"the cheapest settings need about .* give --budget"):
         go(tmp_path / "d", captures, "1s")
     assert not (tmp_path / "d" / "map").exists()
+    _, state = go(tmp_path / "d", captures, "5m")  # with what the pilot made
+    assert state.finished and state.stated["value"][0] == pytest.approx(error_of(state.settings))
 
 
 def test_a_goal_is_reached_in_the_least_time_or_refused(tmp_path, captures):
