@@ -128,7 +128,8 @@ def gather(
     bald = False
     if shown is not None:
         images = pictures[shown].images()
-        bald = bare_share(model, images, meshes[shown]) > BALD_SHARE
+        # One picture does not tell fair hair from skin.
+        bald = len(images) > 1 and bare_share(model, images, meshes[shown]) > BALD_SHARE
     uv_map = reading_map(model) if any(one.read_uv for one in schedule) else None
     fine_map = make_uv_map(model, FINE) if any(one.follow_skin for one in schedule) else None
     skin = skin_samples(model, samples)
