@@ -2,13 +2,13 @@
 
 ``python -m benchmarks.landmarks``. `real` needs ``--real DIR``: photographs with 68 points per face
 in dlib's XML (``*.xml``), cropped to 1.3 times the points' larger side about their mean before
-detecting; errors are mean distances over the root of the area of the points' box, in percent.
-`inner` leaves the jaw line out: where a face is turned, annotators mark the visible outline, and
-the detector the edge of the jaw itself, which may be hidden.
+detecting; errors are mean distances over the root of the area of the points' box, in percent. The
+points that count are those of the published mark-up, the outline in place of the jaw's landmarks.
+`inner` leaves the outline out.
 
 `rendered` shows heads that training never saw, of the built-in model and of that of ``--ict``, in
-percent of the square root of the area of the landmarks' box: landmarks and dense points, by the
-head's turn, and how far errors are from the stated scale (1.0: a Laplace distribution of that scale
+percent of the square root of the area of the landmarks' box: landmarks and outline, by the head's
+turn, and how far errors are from the stated scale (1.0: a Laplace distribution of that scale
 has such a mean). `seconds_per_view` is processor time of one core for views of 512 px. `before`
 says the same of the weights of ``--before``. The last line printed is one JSON object.
 """
@@ -29,9 +29,8 @@ import torch
 
 from express50.head.load import load_head
 from express50.landmarks import WEIGHTS
-from express50.landmarks.detector import Detection, detect, detect_many, find_dense
-from express50.landmarks.network import LandmarkNet, load_network
-from express50.landmarks.training.dense import Places, carry_places
+from express50.landmarks.detector import detect, detect_many
+from express50.landmarks.network import OUTLINE, LandmarkNet, load_network
 from express50.landmarks.training.random_heads import random_head
 from express50.landmarks.training.scene import HeadScene, TrainingView
 from express50.landmarks.training.views import make_backgrounds
@@ -48,7 +47,7 @@ VIEW, HEAD = 512, 320  # pixels of a view and of the head in it
 
 @dataclass(frozen=True)
 class Frame:
-    """A picture with true points (68 or 68 + D, 2), and the head's turn in degrees if known."""
+    """A picture with true points (68 or 68 + 17, 2), and the head's turn in degrees if known."""
 
     image: np.ndarray
     points: np.ndarray
@@ -67,10 +66,7 @@ def main(arguments: list[str] | None = None) -> int:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     real = list(read_faces(options.real)) if options.real else []
-    places = load_network().places()
-    rendered = {
-        spec: draw(spec, options.heads, places) for spec in ("procedural", options.ict) if spec
-    }
+    rendered = {spec: draw(spec, options.heads) for spec in ("procedural", options.ict) if spec}
     result = {"benchmark": "landmarks"} | measure(load_network(WEIGHTS), real, rendered)
     result["before"] = "n/a: --before names no weights"
     if options.before:
@@ -116,8 +112,12 @@ def _cropped(picture: np.ndarray, points: np.ndarray) -> Frame:
 def shares(found: np.ndarray, frame: Frame, first: int = 0) -> np.ndarray:
     """Return distances (N,) from the true points from `first` on, in percent of the face."""
     true = frame.points[first : first + len(found)]
-    size = np.sqrt(np.prod(np.ptp(frame.points[:68], axis=0)))
-    return 100 * np.linalg.norm(found - true, axis=1) / size
+    return 100 * np.linalg.norm(found - true, axis=1) / size_of(frame)
+
+
+def size_of(frame: Frame) -> float:
+    """Return the root of the area of the landmarks' box, pixels."""
+    return float(np.sqrt(np.prod(np.ptp(frame.points[:68], axis=0))))
 
 
 def on_real(net: LandmarkNet, frames: list[Frame]) -> dict:
@@ -125,7 +125,7 @@ def on_real(net: LandmarkNet, frames: list[Frame]) -> dict:
     errors, scores = [], []
     for frame in frames:
         face = detect(net, frame.image)
-        errors.append(shares(face.points, frame))
+        errors.append(shares(face.marks(), frame))
         scores.append(face.score)
     table = np.stack(errors)
     return {
@@ -137,14 +137,13 @@ def on_real(net: LandmarkNet, frames: list[Frame]) -> dict:
     }
 
 
-def draw(spec: str, heads: int, places: Places) -> list[Frame]:
+def draw(spec: str, heads: int) -> list[Frame]:
     """Draw frames of random heads of a model before random backgrounds, from all sides in turn."""
     model, rng = load_head(spec), np.random.default_rng([SEED, *spec.encode()[:1]])
-    places = carry_places(load_head("procedural"), places, model)
     backgrounds = make_backgrounds(20, rng)
     frames = []
     for _ in range(heads):
-        scene = HeadScene(model, random_head(model, rng), places)
+        scene = HeadScene(model, random_head(model, rng))
         for low, high in TURNS.values():
             yaw = float(rng.uniform(low, high) * rng.choice([-1, 1]))
             view = scene.render(rng, HEAD, np.radians(yaw))
@@ -164,32 +163,21 @@ def _framed(
 
 
 def on_rendered(net: LandmarkNet, frames: list[Frame]) -> dict:
-    """Return errors by turn of landmarks and dense points, and how well scales are stated."""
+    """Return errors by turn of landmarks and outline, and how well scales are stated."""
     result: dict = {}
     for name, (low, high) in TURNS.items():
-        marks, dense, said = [], [], []
+        marks, edges, said = [], [], []
         some = [frame for frame in frames if low <= frame.turn < high]
         for frame, face in zip(some, detect_many(net, [one.image for one in some]), strict=True):
             marks.append(shares(face.points, frame))
-            said.append(face.sigma / np.sqrt(np.prod(np.ptp(frame.points[:68], axis=0))))
-            if net.dense is not None:
-                dense.append(on_dense(net, frame, face))
+            said.append(face.sigma / size_of(frame))
+            edges.append(shares(face.marks()[:OUTLINE], frame, 68))
         result[name] = {
             "landmarks_percent": round(float(np.median(np.mean(marks, axis=1))), 2),
+            "outline_percent": round(float(np.median(np.mean(edges, axis=1))), 2),
             "stated": round(float(np.sum(marks) / (200 * np.sum(said))), 2),
         }
-        if dense:
-            table = np.stack(dense)
-            result[name]["dense_percent"] = round(float(np.median(table[:, 0].mean(1))), 2)
-            result[name]["dense_stated"] = round(float(table[:, 0].sum() / table[:, 1].sum()), 2)
     return result
-
-
-def on_dense(net: LandmarkNet, frame: Frame, face: Detection) -> np.ndarray:
-    """Return errors of the dense points and what is stated of them (2, D), percent of the face."""
-    found = find_dense(net, frame.image, face)
-    size = np.sqrt(np.prod(np.ptp(frame.points[:68], axis=0)))
-    return np.stack([shares(found.points, frame, 68), 200 * found.sigma / size])
 
 
 def seconds(net: LandmarkNet, images: list[np.ndarray]) -> dict[str, float]:
@@ -214,7 +202,7 @@ def write_sheet(path: Path, net: LandmarkNet, frames: list[Frame], side: int = 2
         tile = np.zeros((side, side, 3), np.uint8)
         part = cv2.resize(frame.image, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
         tile[: part.shape[0], : part.shape[1]] = part[:side, :side]
-        found = detect(net, frame.image).points
+        found = detect(net, frame.image).marks()
         for points, color in ((frame.points, (0, 255, 0)), (found, (255, 0, 0))):
             for x, y in points * scale:
                 cv2.circle(tile, (int(x), int(y)), 1, color, -1)

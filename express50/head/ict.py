@@ -44,6 +44,7 @@ RANGES = {
     "lower_teeth": (19247, 21451),
     "left_eyeball": (21451, 23021),
     "right_eyeball": (23021, 24591),
+    "eyelashes": (25351, 26719),
 }
 # Shells that only a game engine's transparent shaders can show: as opaque faces they hide the eyes.
 _HIDDEN_MATERIALS = ("M_EyeBlend", "M_EyeOcclusion", "M_LacrimalFluid")
@@ -355,6 +356,7 @@ def ict_regions(
         "upper_teeth": part["upper_teeth"],
         "lower_teeth": part["lower_teeth"],
         "tongue": _tongue(template, faces, uv_faces, part["gums_tongue"]),
+        "eyelashes": part["eyelashes"],
         "mouth_interior": part["mouth_socket"] | part["gums_tongue"],
         "boundary": skin & np.isin(number, edges[uses == 1]) & (y < np.quantile(y, 0.05)),
     }

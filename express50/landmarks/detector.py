@@ -6,7 +6,7 @@ the eyes. The last look is taken in several crops at once: where these do not ag
 face.
 Points are the projections of the 3D landmarks, also where the head hides them: views of several
 cameras can be triangulated. Points that the head or something before it hides come with a low
-confidence.
+confidence. Beside them is the outline of the face, as published marks have the points 0 to 16.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ import torch
 from express50.geometry.conventions import affine_to_opencv
 from express50.landmarks.network import (
     CROP,
+    EYE_CROP,
+    EYE_ZOOM,
+    LEFT_EYE,
     MIRROR,
-    POINTS,
     LandmarkNet,
-    Output,
     face_box,
-    mirrored,
 )
 
 # A point whose error scale is this share of the face box has half the confidence.
@@ -62,12 +62,20 @@ class Detection:
         score: in 0..1, how surely a face looks towards the camera: the network's probability,
             lowered where the points are vague or other crops give other points. Low for backs of
             heads and where no head is visible.
+        outline: (17, 2) pixels, the edge of the face from ear to ear; None where it is not known.
     """
 
     points: np.ndarray
     sigma: np.ndarray
     confidence: np.ndarray
     score: float
+    outline: np.ndarray | None = None
+
+    def marks(self) -> np.ndarray:
+        """Return points (68, 2) as published marks have them: 0 to 16 lie on the outline."""
+        if self.outline is None:
+            return self.points
+        return np.concatenate([self.outline, self.points[len(self.outline) :]])
 
 
 class Look(NamedTuple):
@@ -79,9 +87,10 @@ class Look(NamedTuple):
 
 @dataclass(frozen=True)
 class _Place:
-    """A face in an image: points (68, 2), sigma and seen (68,), score; see `Detection`."""
+    """A face in an image; see `Detection`."""
 
     points: np.ndarray
+    outline: np.ndarray
     sigma: np.ndarray
     seen: np.ndarray
     score: float
@@ -144,46 +153,14 @@ def detect_many(
                 best[one] = held = place
             if held.score >= FOUND_SCORE:
                 del left[one]
-    return [_detection(place) for place in best if place is not None]
+    found = [place for place in best if place is not None]
+    return [_detection(place) for place in _with_eyes(net, pyramids, found)]
 
 
 def _detection(place: _Place) -> Detection:
     relative = place.sigma / (HALF_CONFIDENCE_SHARE * max(face_box(place.points)[1], 1e-6))
     confidence = place.score * place.seen / (1.0 + relative**2)
-    return Detection(place.points, place.sigma, confidence, place.score)
-
-
-@dataclass(frozen=True)
-class DensePoints:
-    """Dense points of a face, those of `LandmarkNet.places`.
-
-    Attributes:
-        points: (D, 2) pixels, corner origin.
-        sigma: (D,) expected error in pixels (the scale of a Laplace distribution), large where
-            the head or something before it hides a point.
-    """
-
-    points: np.ndarray
-    sigma: np.ndarray
-
-
-def find_dense(net: LandmarkNet, image: np.ndarray, face: Detection) -> DensePoints:
-    """Find the dense points of a detected face, in the same crops as the last look at it."""
-    pyramid = make_pyramid(image)
-    windows = _last_windows(window_about(face.points))
-    output = _answer(net, [Look(pyramid, window) for window in windows], dense=True)
-    found = output.dense.double().numpy()
-    scales = output.dense_log_scale.double().exp().numpy()
-    partner = mirrored(found.shape[1])[POINTS:] - POINTS
-    points, sigmas = [], []
-    for window, places, scale in zip(windows, found, scales, strict=True):
-        determinant = np.linalg.det(window[:, :2])
-        order = partner if determinant < 0 else slice(None)
-        points.append((places @ window[:, :2].T + window[:, 2])[order])
-        sigmas.append((scale * np.sqrt(abs(determinant)))[order])
-    mean = np.mean(points, axis=0)
-    spread = np.linalg.norm(np.stack(points) - mean, axis=2).mean(0)
-    return DensePoints(mean, np.hypot(np.mean(sigmas, axis=0), spread))
+    return Detection(place.points, place.sigma, confidence, place.score, place.outline)
 
 
 def _searches(width: int, height: int, smallest: float) -> Iterator[list[np.ndarray]]:
@@ -258,6 +235,7 @@ def _agreed(place: _Place, looks: list[_Place]) -> _Place:
     spread = np.linalg.norm(points - mean, axis=2).mean(0)
     together = _Place(
         mean,
+        np.mean([look.outline for look in looks], axis=0),
         np.hypot(np.mean([look.sigma for look in looks], axis=0), spread),
         np.mean([look.seen for look in looks], axis=0),
         float(np.mean([look.score for look in looks])),
@@ -324,6 +302,38 @@ def window_about(points: np.ndarray) -> np.ndarray:
     return place_window(centre @ turn, max(side, 8.0), angle)
 
 
+def eye_window(points: np.ndarray, left: bool) -> np.ndarray:
+    """Place the crop of an eye of landmarks (68, 2): the subject's left, or mirrored the right."""
+    ids = LEFT_EYE if left else MIRROR[LEFT_EYE]
+    turn = EYE_ZOOM * window_about(points)[:, :2] @ np.diag([1.0 if left else -1.0, 1.0])
+    return place_crop(points[ids].mean(0), turn, EYE_CROP)
+
+
+def _with_eyes(
+    net: LandmarkNet, pyramids: list[list[np.ndarray]], places: list[_Place]
+) -> list[_Place]:
+    """Look at the eyes again; a point stays where that is less sure of it."""
+    if net.eyes is None:
+        return places
+    found = []
+    for pyramid, place in zip(pyramids, places, strict=True):
+        points, sigma = place.points.copy(), place.sigma.copy()
+        windows = [eye_window(place.points, left) for left in (True, False)]
+        crops = np.stack([sample_window(pyramid, window, EYE_CROP) for window in windows])
+        with torch.inference_mode():
+            answer = net.eyes(torch.from_numpy(crops).permute(0, 3, 1, 2).float() / 255.0)
+        eyes, scales = (part.double().numpy() for part in answer)
+        for ids, window, eye, scale in zip(
+            (LEFT_EYE, MIRROR[LEFT_EYE]), windows, eyes, np.exp(scales), strict=True
+        ):
+            scale = scale * np.sqrt(abs(np.linalg.det(window[:, :2])))
+            surer = scale < place.sigma[ids]
+            points[ids[surer]] = (eye @ window[:, :2].T + window[:, 2])[surer]
+            sigma[ids[surer]] = scale[surer]
+        found.append(replace(place, points=points, sigma=sigma))
+    return found
+
+
 def make_pyramid(image: np.ndarray) -> list[np.ndarray]:
     """Return the image and its halvings down to about the crop's size."""
     levels = [image]
@@ -334,14 +344,14 @@ def make_pyramid(image: np.ndarray) -> list[np.ndarray]:
     return levels
 
 
-def sample_window(pyramid: list[np.ndarray], window: np.ndarray) -> np.ndarray:
-    """Cut a crop (128, 128, 3) uint8 out of the level whose resolution fits the window."""
+def sample_window(pyramid: list[np.ndarray], window: np.ndarray, size: int = CROP) -> np.ndarray:
+    """Cut a crop (size, size, 3) uint8 out of the level whose resolution fits the window."""
     step = np.sqrt(abs(np.linalg.det(window[:, :2])))
     level = int(np.clip(np.floor(np.log2(max(step, 1e-6)) + 0.5), 0, len(pyramid) - 1))
     height, width = pyramid[0].shape[:2]
     shape = pyramid[level].shape
     scale = np.array([[shape[1] / width], [shape[0] / height]])
-    return cut_crop(pyramid[level], window * scale, CROP)
+    return cut_crop(pyramid[level], window * scale, size)
 
 
 def _run(net: LandmarkNet, looks: Sequence[Look]) -> list[_Place]:
@@ -349,37 +359,38 @@ def _run(net: LandmarkNet, looks: Sequence[Look]) -> list[_Place]:
     places = []
     for start in range(0, len(looks), BATCH):
         part = looks[start : start + BATCH]
-        output = _answer(net, part, dense=False)
+        crops = np.stack([sample_window(look.pyramid, look.window) for look in part])
+        # (N, H, W, 3) seen as (N, 3, H, W) lies in memory as channels-last already.
+        with torch.inference_mode():
+            output = net(torch.from_numpy(crops).permute(0, 3, 1, 2).float() / 255.0)
         scales = output.log_scale.double().exp().numpy()
         visible = torch.sigmoid(output.seen).double().numpy()
         scores = torch.sigmoid(output.logit).double().numpy()
-        found = output.points.double().numpy()
+        found, edges = output.points.double().numpy(), output.outline.double().numpy()
         places += [
             _placed(look.window, *row)
-            for look, *row in zip(part, found, scales, visible, scores, strict=True)
+            for look, *row in zip(part, found, edges, scales, visible, scores, strict=True)
         ]
     return places
 
 
-def _answer(net: LandmarkNet, looks: Sequence[Look], dense: bool) -> Output:
-    crops = np.stack([sample_window(look.pyramid, look.window) for look in looks])
-    # (N, H, W, 3) seen as (N, 3, H, W) lies in memory as channels-last already.
-    with torch.inference_mode():
-        images = torch.from_numpy(crops).permute(0, 3, 1, 2)
-        return net(images.float() / 255.0, dense=dense)
-
-
 def _placed(
-    window: np.ndarray, found: np.ndarray, sigma: np.ndarray, seen: np.ndarray, score: float
+    window: np.ndarray,
+    found: np.ndarray,
+    edge: np.ndarray,
+    sigma: np.ndarray,
+    seen: np.ndarray,
+    score: float,
 ) -> _Place:
     """Return what a crop showed in pixels of its image."""
-    points = found @ window[:, :2].T + window[:, 2]
+    points, outline = (part @ window[:, :2].T + window[:, 2] for part in (found, edge))
     determinant = np.linalg.det(window[:, :2])
     sigma = sigma * np.sqrt(abs(determinant))
     if determinant < 0:
         points, sigma, seen = points[MIRROR], sigma[MIRROR], seen[MIRROR]
+        outline = outline[::-1]
     vague = np.median(sigma) / (VAGUE_SHARE * max(face_box(points)[1], 1e-6))
-    return _Place(points, sigma, seen, float(score / (1.0 + vague**2)))
+    return _Place(points, outline, sigma, seen, float(score / (1.0 + vague**2)))
 
 
 def follow(net: LandmarkNet, image: np.ndarray, window: np.ndarray) -> Detection:
@@ -401,5 +412,6 @@ def follow(net: LandmarkNet, image: np.ndarray, window: np.ndarray) -> Detection
     high = np.clip(np.ceil(corners.max(1)) + 1, low + 1, size).astype(int)
     part = np.ascontiguousarray(image[low[1] : high[1], low[0] : high[0]])
     moved = window - np.column_stack([np.zeros((2, 2)), low])
-    place = _run(net, [Look(make_pyramid(part), moved)])[0]
-    return _detection(replace(place, points=place.points + low))
+    pyramid = make_pyramid(part)
+    place = _with_eyes(net, [pyramid], _run(net, [Look(pyramid, moved)]))[0]
+    return _detection(replace(place, points=place.points + low, outline=place.outline + low))

@@ -4,8 +4,14 @@ Points come from the expectation over softmax heat maps (integral regression, Su
 they are continuous and have gradients everywhere. A small perceptron that sees all of them at once
 then corrects what does not look like a face, as where a heat map was fooled by an occluder, and
 says of each point how far off it may be (the scale of a two-dimensional Laplace distribution) and
-whether it can be seen. Dense points, over face, ears and neck, are found in the same way on coarser
-heat maps, and corrected by a perceptron that sees them and the landmarks.
+whether it can be seen.
+
+The eyes are looked at once more, at twice the resolution: a small network of its own finds their
+six points each, as the first one hardly tells half shut lids from open ones.
+
+The landmarks are fixed places of a head. The outline, 17 points of the edge of the face that a
+picture shows, is what published marks have in place of the jaw line's. It is found in the same way
+and corrected by a perceptron that sees it and the landmarks.
 """
 
 from __future__ import annotations
@@ -26,7 +32,7 @@ from express50.geometry.conventions import cell_centres, corner_to_cell
 from express50.landmarks import WEIGHTS
 
 CROP = 128
-POINTS = 68
+POINTS, OUTLINE = 68, 17
 # Points may lie a little outside the crop: the grid of the heat maps is stretched about its middle.
 STRETCH = 1.15
 # Side of a crop over the longer side of the box of its landmarks.
@@ -37,16 +43,14 @@ MIRROR = np.array(
      45, 44, 43, 42, 47, 46, 39, 38, 37, 36, 41, 40,
      54, 53, 52, 51, 50, 49, 48, 59, 58, 57, 56, 55, 64, 63, 62, 61, 60, 67, 66, 65]
 )  # fmt: skip
+# The same of the landmarks and the outline.
+MIRROR_ALL = np.concatenate([MIRROR, POINTS + np.arange(OUTLINE)[::-1]])
+# An eye is seen in a crop of EYE_CROP pixels, each EYE_ZOOM of a pixel of the face's crop; the
+# subject's right eye is mirrored. Its points are the landmarks LEFT_EYE, or their partners.
+EYE_CROP, EYE_ZOOM = 48, 0.6
+LEFT_EYE = np.arange(42, 48)
 # Suffix of buffers that are not stored: batch normalisation counts its batches.
 COUNTERS = "num_batches_tracked"
-
-
-def mirrored(dense: int = 0) -> np.ndarray:
-    """Return the partner of each landmark and dense point in the mirror image (68 + dense,).
-
-    The first half of the dense points is on the subject's left, the other its mirror image.
-    """
-    return np.concatenate([MIRROR, POINTS + np.roll(np.arange(dense), dense // 2)])
 
 
 def face_box(points: np.ndarray) -> tuple[np.ndarray, float]:
@@ -64,9 +68,8 @@ class Output(NamedTuple):
         seen: (B, 68) logit of whether nothing hides the point.
         logit: (B,) logit of whether a face looks towards the camera.
         heat: (B, 68, H / 4, W / 4) heat maps before the softmax.
-        dense: (B, D, 2) dense points, crop pixels.
-        dense_log_scale: (B, D) as of the landmarks.
-        dense_heat: (B, D, H / 8, W / 8) heat maps before the softmax.
+        outline: (B, 17, 2) crop pixels; the landmarks 0 to 16 of a network that does not find it.
+        outline_log_scale, outline_heat: as of the landmarks.
     """
 
     points: torch.Tensor
@@ -74,9 +77,9 @@ class Output(NamedTuple):
     seen: torch.Tensor
     logit: torch.Tensor
     heat: torch.Tensor
-    dense: torch.Tensor
-    dense_log_scale: torch.Tensor
-    dense_heat: torch.Tensor
+    outline: torch.Tensor
+    outline_log_scale: torch.Tensor
+    outline_heat: torch.Tensor
 
 
 class Residual(nn.Module):
@@ -115,29 +118,23 @@ class ShapeHead(nn.Module):
         return points + 8.0 * out[:, :2].transpose(1, 2), log_scale.clamp(-2.0, 4.0), out[:, 3]
 
 
-class DenseHead(nn.Module):
-    """Finds dense points on the maps of a stage before the last; see `Output`.
+class OutlineHead(nn.Module):
+    """Finds the outline on the finest maps; see `Output`."""
 
-    Attributes:
-        faces: (D,) int32, of the built-in head; weights: (D, 3) barycentric: where the points are.
-    """
-
-    def __init__(self, dense: int, maps: int, features: int, width: int = 160) -> None:
+    def __init__(self, maps: int, features: int, width: int = 160) -> None:
         super().__init__()
-        self.register_buffer("faces", torch.zeros(dense, dtype=torch.int32))
-        self.register_buffer("weights", torch.zeros(dense, 3))
-        self.heat = nn.Conv2d(maps, dense, 1)
+        self.heat = nn.Conv2d(maps, OUTLINE, 3, 1, 1)
         self.look = nn.Linear(features, 64)
-        self.first = nn.Linear(3 * dense + 2 * POINTS + 64, width)
-        self.second = nn.Linear(width, 3 * dense)
-        self.spread = nn.Parameter(torch.zeros(dense))
+        self.first = nn.Linear(3 * OUTLINE + 2 * POINTS + 64, width)
+        self.second = nn.Linear(width, 3 * OUTLINE)
+        self.spread = nn.Parameter(torch.zeros(OUTLINE))
         nn.init.zeros_(self.second.weight)
         nn.init.zeros_(self.second.bias)
 
     def forward(
         self, maps: torch.Tensor, marks: torch.Tensor, features: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return points (B, D, 2), log scales (B, D) and heat maps (B, D, H, W)."""
+        """Return points (B, 17, 2), log scales (B, 17) and heat maps (B, 17, H, W)."""
         heat = self.heat(maps)
         points, variance = expectation(heat)
         spread = variance.clamp_min(1e-2).log()
@@ -150,18 +147,39 @@ class DenseHead(nn.Module):
         return points + 8.0 * out[:, :2].transpose(1, 2), log_scale, heat
 
 
+class EyeNet(nn.Module):
+    """Finds the points of the subject's left eye in crops (B, 3, 48, 48) in [0, 1]."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stem, self.block24 = _conv(3, 16, 5, 2), Residual(16)
+        self.down12, self.block12 = _conv(16, 32, 3, 2), Residual(32)
+        self.down6, self.block6 = _conv(32, 48, 3, 2), Residual(48)
+        self.first, self.second = nn.Linear(48 * 36, 64), nn.Linear(64, 3 * len(LEFT_EYE))
+
+    def forward(self, crops: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return points (B, 6, 2) in crop pixels and log scales (B, 6), as of the landmarks."""
+        x = functional.relu(self.stem(_normalised(crops)))
+        x = functional.relu(self.down12(self.block24(x)))
+        x = self.block6(functional.relu(self.down6(self.block12(x))))
+        out = self.second(functional.relu(self.first(x.flatten(1)))).view(-1, 3, len(LEFT_EYE))
+        points = 0.5 * EYE_CROP + 8.0 * out[:, :2].transpose(1, 2)
+        return points, (0.5 + out[:, 2]).clamp(-3.0, 4.0)
+
+
 class LandmarkNet(nn.Module):
     """Maps crops (B, 3, 128, 128) in [0, 1] to landmarks; see `Output`.
 
     Crops of half the size (64, 64) are understood as well; points are in pixels of 128 all the
     same. Training begins with them, for a quarter of the time.
 
-    A network for other pictures than of whole heads has no dense points.
+    A network for other pictures than of `whole` heads finds no outline and has no `eyes`.
     """
 
-    def __init__(self, dense: int = 0) -> None:
+    def __init__(self, whole: bool = False) -> None:
         super().__init__()
-        self.dense = DenseHead(dense, 64, 128) if dense else None
+        self.outline = OutlineHead(48, 128) if whole else None
+        self.eyes = EyeNet() if whole else None
         self.stem1, self.stem2 = _conv(3, 16, 5, 2), _conv(16, 32, 3, 2)
         self.block32 = Residual(32)
         self.down16, self.block16 = _conv(32, 64, 3, 2), Residual(64)
@@ -174,42 +192,34 @@ class LandmarkNet(nn.Module):
         self.shape = ShapeHead(128)
         self.face = nn.Linear(128, 1)
 
-    def forward(self, crops: torch.Tensor, dense: bool = True) -> Output:
-        """Run the network, without dense points if these are not wanted.
-
-        Exposure and contrast are normalised per crop.
-        """
+    def forward(self, crops: torch.Tensor) -> Output:
+        """Run the network; exposure and contrast are normalised per crop."""
         # Places need single precision, whatever training has the convolutions done in.
-        maps, finest, features = (part.float() for part in self.trunk(crops))
+        finest, features = (part.float() for part in self.trunk(crops))
         with torch.autocast("cpu", enabled=False):
             heat = self.heat(finest)
             points, log_scale, seen = self.shape(*expectation(heat), features)
-            none = points[:, :0]
-            over = none, none[..., 0], none[..., None]
-            if self.dense is not None and dense:
-                over = self.dense(maps, points, features)
-            return Output(points, log_scale, seen, self.face(features)[:, 0], heat, *over)
+            edge = points[:, :OUTLINE], log_scale[:, :OUTLINE], heat[:, :OUTLINE]
+            if self.outline is not None:
+                edge = self.outline(finest, points, features)
+            return Output(points, log_scale, seen, self.face(features)[:, 0], heat, *edge)
 
-    def places(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return where the dense points are: faces (D,) of the built-in head, weights (D, 3)."""
-        if self.dense is None:
-            return np.zeros(0, np.int64), np.zeros((0, 3))
-        faces, weights = self.dense.faces, self.dense.weights
-        return faces.numpy().astype(np.int64), weights.double().numpy()
-
-    def trunk(self, crops: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return maps (B, 64, H / 8, W / 8) and (B, 48, H / 4, W / 4), and features (B, 128)."""
-        mean = crops.mean((1, 2, 3), keepdim=True)
-        deviation = crops.std((1, 2, 3), keepdim=True) + 0.02
-        x = functional.relu(self.stem1((crops - mean) / deviation))
+    def trunk(self, crops: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return maps (B, 48, H / 4, W / 4) and features (B, 128)."""
+        x = functional.relu(self.stem1(_normalised(crops)))
         x32 = self.block32(functional.relu(self.stem2(x)))
         x16 = self.block16(functional.relu(self.down16(x32)))
         x8 = self.block8(functional.relu(self.down8(x16)))
         x4 = self.block4(functional.relu(self.down4(x8)))
         y = self.mix8(functional.relu(x8 + _twice(self.side4(x4))))
-        y16 = functional.relu(self.mix16(functional.relu(x16 + _twice(self.side8(y)))))
-        y = functional.relu(self.mix32(functional.relu(x32 + _twice(self.side16(y16)))))
-        return y16, y, x4.mean((2, 3))
+        y = functional.relu(self.mix16(functional.relu(x16 + _twice(self.side8(y)))))
+        y = functional.relu(self.mix32(functional.relu(x32 + _twice(self.side16(y)))))
+        return y, x4.mean((2, 3))
+
+
+def _normalised(crops: torch.Tensor) -> torch.Tensor:
+    mean = crops.mean((1, 2, 3), keepdim=True)
+    return (crops - mean) / (crops.std((1, 2, 3), keepdim=True) + 0.02)
 
 
 def _conv(inputs: int, outputs: int, size: int, stride: int = 1) -> nn.Sequential:
@@ -286,7 +296,7 @@ def trainable_network(path: Path = WEIGHTS) -> LandmarkNet:
     """
     names = [key for key in LandmarkNet().state_dict() if not key.endswith(COUNTERS)]
     arrays = read_arrays(path, FormatError, "landmark weights", names)
-    net = LandmarkNet(len(arrays.get("dense.faces", ())))
+    net = LandmarkNet("outline.spread" in arrays)
     names = [key for key in net.state_dict() if not key.endswith(COUNTERS)]
     try:
         state = {key: torch.from_numpy(arrays[key].astype(np.float32)) for key in names}

@@ -136,7 +136,7 @@ def write_panel(dataset: Dataset, subject: str, config: TrackConfig, path: Path)
     image = read_peak_frame(dataset, subject, track.expressions[0], camera_id)
     source = open_landmarks(dataset, subject, config.landmarks, config.search)
     seen = source(image, camera_id, int(track.frames[0]))
-    dots = [seen.face.points, seen.irises.centres[seen.irises.confidence > 0]]
+    dots = [seen.face.marks(), seen.irises.centres[seen.irises.confidence > 0]]
     column = draw_column(image, camera, model.to(dtype=torch.float64), mesh, dots, PANEL_TILE)
     head = (mesh - track.t[0]) @ track.R[0]
     turned = render_preview(model, head, yaw=PANEL_YAW, size=PANEL_TILE)

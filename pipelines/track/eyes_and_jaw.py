@@ -5,8 +5,7 @@ turns the gaze by five degrees in every expression alike, so the median offset o
 expressions is attributed to misplacement, and only the rest to gaze.
 
 **Lids**: an eye is shut if cameras find no iris that they find at other times. Contrast decides
-that over some twenty pixels, whereas the distance between the lids is one or two pixels of the
-landmark network's crop, which puts shut lids nearly as far apart as open ones. Half-shut eyes stay
+that over some twenty pixels, whereas the distance between the lids is a few. Half-shut eyes stay
 as seen.
 
 **Jaw line**: people, and networks trained on their marks, mark the visible edge of the cheek where

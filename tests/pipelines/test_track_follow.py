@@ -139,7 +139,7 @@ def test_a_face_that_jumps_thirty_pixels_is_found(shift: tuple[int, int]) -> Non
     for yaw in (0.0, 0.4, -0.5):
         view = HeadScene(model, random_head(model, rng)).render(rng, 208, yaw)
         image = on_canvas(view.rgba, 5, (150, 120))
-        true = view.points + (150, 120)
+        true = view.points[:68] + (150, 120)
         found = look(image, true - shift).face
         side = face_box(true)[1]
         assert found.score > 0.5

@@ -16,10 +16,15 @@ import torch
 
 from express50.capture.expressions import Expression, load_script
 from express50.head.model import HeadModel, landmarks, pose, vertex_normals
-from express50.landmarks.training.dense import Places, closest_places, place_points
+from express50.landmarks.training.places import Places, closest_places, place_points
 
 BROWS = slice(17, 27)
+# Metres that brows are lower than the head models' landmarks, outer ends and inner ends: about half
+# of what the published mean of the 68 marks on faces has (4 and 7 mm), and their spread.
+LOWER_M, BROW_SPREAD_M = (0.003, 0.005), 0.004
 SCRIPTED_SHARE = 0.6  # of the heads play entries of the script
+LASHES = "eyelashes"
+BLINKS = 0.22  # share of the heads that close an eye, or both
 Rng = np.random.Generator
 
 
@@ -70,9 +75,12 @@ class Canvas:
         return replace(self, rest=rest.astype(np.float32), region=region)
 
 
-def random_head(model: HeadModel, rng: Rng) -> RandomHead:
-    """Draw shape, expression, pose, smooth deformation, hair and colours."""
-    draw = random_parameters(model, rng)
+def random_head(model: HeadModel, rng: Rng, blinks: float = BLINKS) -> RandomHead:
+    """Draw shape, expression, pose, smooth deformation, hair and colours.
+
+    The share `blinks` of the heads close an eye or both; the lids then stop anywhere.
+    """
+    draw = random_parameters(model, rng, blinks)
     with torch.no_grad():
         vertices = pose(model, **draw)
     vertices = torch.from_numpy(deform(vertices[0].numpy(), rng))[None]
@@ -99,7 +107,8 @@ def _move_brows(model: HeadModel, canvas: Canvas, rng: Rng) -> tuple[Canvas, Pla
     outwards = np.sign(brows[:, 0])
     along = (np.abs(brows[:, 0]) - np.abs(brows[:, 0]).min()) / np.ptp(np.abs(brows[:, 0]))
     brows[:, 0] += outwards * (rng.normal() * 0.002 + along * rng.normal() * 0.003)
-    brows[:, 1] += rng.normal() * 0.003 + (along - 0.5) * rng.normal() * 0.003
+    brows[:, 1] -= LOWER_M[1] + along * (LOWER_M[0] - LOWER_M[1])
+    brows[:, 1] += (rng.normal() + (along - 0.5) * rng.normal()) * BROW_SPREAD_M
     brows[:, 1] += outwards * rng.normal() * 0.0007
     places = closest_places(model, brows)
     marks = canvas.marks.copy()
@@ -133,8 +142,8 @@ def paint(canvas: Canvas, rng: Rng) -> tuple[np.ndarray, np.ndarray | None]:
     rest, region, marks = canvas.rest, canvas.region, canvas.marks
     skin = _skin_color(rng)
     colors = np.tile(skin, (len(rest), 1))
-    # Anything in no region is a small part such as lashes: dark.
-    nothing = ~np.any(list(region.values()), axis=0)
+    # Lashes, and what is in no region, a small part behind the lids, are dark.
+    nothing = ~np.any([mask for name, mask in region.items() if name != LASHES], axis=0)
     for most, count, low, high in ((0.15, 12, 20.0, 150.0), (0.12, 24, 150.0, 900.0)):
         spots = most * rng.beta(1.0, 3.0) * waves(rest, rng, count, low, high)
         colors *= 1 + spots[:, None]
@@ -251,7 +260,9 @@ def _color_eyes_and_mouth(colors: np.ndarray, canvas: Canvas, rng: Rng) -> None:
     colors[region["teeth"]] = rng.uniform(0.5, 1.0) * np.array([1.0, 0.97, rng.uniform(0.8, 1.0)])
 
 
-def random_parameters(model: HeadModel, rng: Rng) -> dict[str, torch.Tensor]:
+def random_parameters(
+    model: HeadModel, rng: Rng, blinks: float = BLINKS
+) -> dict[str, torch.Tensor]:
     """Draw arguments for `express50.head.model.pose`, a batch of one."""
     shape = rng.normal(size=len(model.shape_names)) * rng.uniform(0.5, 1.4)
     jaw = rng.normal(size=3) * np.array([0.03, 0.03, 0.02])
@@ -273,7 +284,7 @@ def random_parameters(model: HeadModel, rng: Rng) -> dict[str, torch.Tensor]:
         active = rng.choice(count, size=rng.integers(0, min(9, count + 1)), replace=False)
         expression[active] = rng.beta(1.0, 1.2, size=active.size)
     if model.unit_expressions:
-        _close_eyes(expression, model, rng)
+        _close_eyes(expression, model, rng, blinks)
         expression = np.clip(expression, -1.0, 1.2)
     if rng.random() < 0.25:
         jaw[0] = rng.uniform(0.0, 0.65)  # up to a scream
@@ -296,13 +307,14 @@ def _lopsided(entry: Expression, model: HeadModel, rng: Rng) -> np.ndarray:
     return out
 
 
-def _close_eyes(expression: np.ndarray, model: HeadModel, rng: Rng) -> None:
+def _close_eyes(expression: np.ndarray, model: HeadModel, rng: Rng, share: float) -> None:
     """Blink in some draws, wink in others, in place."""
     kind = rng.random()
-    if kind > 0.22:
+    if kind > share:
         return
-    sides = "LR" if kind < 0.1 else "LR"[rng.integers(2)]
+    least = 0.6 if share == BLINKS else 0.0
+    sides = "LR" if kind < 0.45 * share else "LR"[rng.integers(2)]
     for side in sides:
         name = f"eyeBlink_{side}"
         if name in model.expression_names:
-            expression[model.expression_names.index(name)] = rng.uniform(0.6, 1.0)
+            expression[model.expression_names.index(name)] = rng.uniform(least, 1.0)

@@ -15,7 +15,8 @@ import open3d as o3d
 from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
 from express50.geometry.transforms import make_transform
 from express50.head.model import HeadModel
-from express50.landmarks.training.random_heads import Canvas, RandomHead, paint, waves
+from express50.landmarks.training.outline import face_front
+from express50.landmarks.training.random_heads import LASHES, Canvas, RandomHead, paint, waves
 
 FRAME_SIDE_M = 0.38
 # A landmark counts as seen if nothing lies further than this in front of it.
@@ -23,6 +24,7 @@ HIDING_M = 0.005
 # Rays per vertex that measure how open it lies to the light of the surroundings, and their length.
 OPEN_RAYS, OPEN_M = 4, 0.08
 GLASSES_SHARE, NATURAL_SHARE = 0.25, 0.75
+LASHES_SHARE = 0.3  # of the heads that have them: opaque ones are far heavier than people's
 RING = 24  # corners of a lens
 Rng = np.random.Generator
 
@@ -32,8 +34,8 @@ class TrainingView:
     """A rendered view."""
 
     rgba: np.ndarray  # (S, S, 4) uint8, black where empty
-    points: np.ndarray  # (68 + D, 2) float32 pixels, corner origin: landmarks, then dense points
-    visible: np.ndarray  # (68 + D,) bool, nothing of the head or its glasses is before the point
+    points: np.ndarray  # (68 + 17, 2) float32 pixels, corner origin: landmarks, then the outline
+    visible: np.ndarray  # (68,) bool, nothing of the head or its glasses is before the landmark
     facing: np.float32  # cosine between the ways that the face looks and to the camera
 
 
@@ -51,21 +53,15 @@ class _Hits:
 class HeadScene:
     """A random head in a ray caster, to be seen from many sides."""
 
-    def __init__(
-        self,
-        model: HeadModel,
-        head: RandomHead,
-        places: tuple[np.ndarray, np.ndarray] | None = None,
-    ) -> None:
-        """Compile a head; `places` are faces (D,) and weights (D, 3) of dense points on it."""
+    def __init__(self, model: HeadModel, head: RandomHead) -> None:
+        """Compile a head."""
+        self.front = face_front(model)
         self.faces = model.faces.numpy()
+        if LASHES in model.regions and head.look % 100 >= 100 * LASHES_SHARE:
+            self.faces = self.faces[~model.regions[LASHES].numpy()[self.faces].all(1)]
         self.head = head
         self.canvas = head.canvas
         self.scene = mesh_scene(head.vertices, self.faces)
-        self.points = head.landmarks
-        if places is not None:
-            dense = (head.skin[self.faces[places[0]]] * places[1][..., None]).sum(1)
-            self.points = np.concatenate([head.landmarks, dense])
         self.openness = self._measure_openness(np.random.default_rng(head.look))
 
     def _measure_openness(self, rng: Rng) -> np.ndarray:
@@ -78,10 +74,16 @@ class HeadScene:
             free += ~self.scene.test_occlusions(rays, 0.0, OPEN_M).numpy()
         return free / OPEN_RAYS
 
-    def render(self, rng: Rng, side: int, yaw: float) -> TrainingView:
-        """Render (side, side) pixels from a yaw in radians, 0 in front; the rest is random."""
+    def render(
+        self, rng: Rng, side: int, yaw: float, close: tuple[np.ndarray, float] | None = None
+    ) -> TrainingView:
+        """Render (side, side) pixels from a yaw in radians, 0 in front; the rest is random.
+
+        The whole head, or `close`, a point (3,) and how many metres about it.
+        """
         marks = self.head.landmarks
-        K, cam_from_world = _random_camera(marks, rng, side, yaw)
+        target, frame_m = close or (marks.mean(0) + np.array([0.0, 0.02, -0.06]), FRAME_SIDE_M)
+        K, cam_from_world = _random_camera(target, frame_m, rng, side, yaw)
         rays = o3d.t.geometry.RaycastingScene.create_rays_pinhole(
             intrinsic_matrix=o3d.core.Tensor(K),
             extrinsic_matrix=o3d.core.Tensor(cam_from_world),
@@ -90,16 +92,18 @@ class HeadScene:
         )
         rgba = self._shade(rays, rng)
         eye = -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
-        visible = self._seen(eye, self.points)
+        visible = self._seen(eye, marks)
         # Right eye to left eye is +x, brow to chin is -y: (-y) x (+x) = +z.
         forward = unit(np.cross(marks[8] - marks[27], marks[45] - marks[36]))
         facing = np.float32(forward @ unit(eye - marks[30]))
-        pixels = project(K, cam_from_world, self.points)
+        pixels = project(K, cam_from_world, marks)
         if rng.random() < GLASSES_SHARE and facing > -0.1:
             for outline in self._wear_glasses(rgba, eye, K @ cam_from_world[:3], rng):
                 ring = np.round(outline).astype(np.float32)
                 visible &= [cv2.pointPolygonTest(ring, tuple(xy), False) <= 0 for xy in pixels]
-        return TrainingView(rgba, pixels.astype(np.float32), visible, facing)
+        edge = self.front.outline(project(K, cam_from_world, self.head.skin), pixels)
+        points = np.concatenate([pixels, edge]).astype(np.float32)
+        return TrainingView(rgba, points, visible, facing)
 
     def _seen(self, eye: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Return which points (N, 3) the head does not hide from an eye (3,)."""
@@ -281,12 +285,12 @@ def _blend(rgba: np.ndarray, outline: np.ndarray, color: np.ndarray, strength: f
 
 
 def _random_camera(
-    points: np.ndarray, rng: Rng, side: int, yaw: float
+    target: np.ndarray, frame_m: float, rng: Rng, side: int, yaw: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw K (3,3) and cam_from_world (4,4) that frame the whole head, landmarks (68, 3) given."""
+    """Draw K (3,3) and cam_from_world (4,4) that show some metres about a target (3,)."""
     pitch = np.clip(rng.normal() * 0.28, -0.8, 0.8)
     forward = np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
-    target = points.mean(0) + np.array([0.0, 0.02, -0.06]) + rng.normal(size=3) * 0.008
+    target = target + rng.normal(size=3) * 0.02 * frame_m
     distance = np.exp(rng.uniform(np.log(0.45), np.log(2.0)))
     right = unit(np.cross(np.array([0.0, 1.0, 0.0]), forward))
     rotation = np.stack([right, -np.cross(forward, right), -forward])
@@ -294,5 +298,5 @@ def _random_camera(
     c, s = np.cos(roll), np.sin(roll)
     rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]) @ rotation
     cam_from_world = make_transform(rotation, -rotation @ (target + distance * forward))
-    focal = side * distance / FRAME_SIDE_M * rng.uniform(0.85, 1.15)
+    focal = side * distance / frame_m * rng.uniform(0.85, 1.15)
     return np.array([[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1.0]]), cam_from_world

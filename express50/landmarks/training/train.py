@@ -4,17 +4,16 @@
 
 Trains on renders of random heads only: the procedural head and, where a path is given,
 ICT-FaceKit; the shipped file used both, in several runs that each went on from the one before
-(`--start`; docs/LOG.md). No photograph of a person is used. The result depends on the arguments
-alone, up to how the machine rounds. A run that was interrupted goes on from its last state, which
-is kept in DIR, to the same result.
+(`--start`; docs/LOG.md), the outline's part and the eyes' in the last, with all else held. No
+photograph of a person is used. The result depends on the arguments alone, up to how the machine
+rounds. A run that was interrupted goes on from its last state, which is kept in DIR, to the same
+result.
 """
 
 from __future__ import annotations
 
 import argparse
 import hashlib
-import time
-from collections.abc import Callable
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
@@ -24,14 +23,12 @@ import torch
 from torch.nn import functional
 
 from express50.contract.config import field_documents
-from express50.errors import TrainError
-from express50.files.arrays import read_weights
 from express50.head.load import load_head
 from express50.head.model import HeadModel
+from express50.landmarks import WEIGHTS
 from express50.landmarks.network import (
     CROP,
     POINTS,
-    WEIGHTS,
     LandmarkNet,
     Output,
     heat_loss,
@@ -39,7 +36,8 @@ from express50.landmarks.network import (
     save_network,
     trainable_network,
 )
-from express50.landmarks.training.dense import Places, carry_places, choose_places
+from express50.landmarks.training.descent import descend
+from express50.landmarks.training.eyes import train_eyes
 from express50.landmarks.training.scene import TrainingView
 from express50.landmarks.training.views import (
     FILE_VIEWS,
@@ -51,10 +49,6 @@ from express50.landmarks.training.views import (
 
 BATCH = 32
 RATE, RATE_ON = 2e-3, 1e-3  # from nothing, from given weights
-WARM_UP = 100
-# The rate stays high until this share of the run, then falls in a straight line.
-HIGH_SHARE = 0.65
-KEEP_EVERY = 100
 FIRST_FILES = 6
 STEPS_PER_FILE = 300
 HELD_OUT = 0
@@ -71,8 +65,6 @@ class TrainingPlan:
     "Of these, the first that are at half resolution."
     files: int = 30
     "Files of views per head model."
-    dense: int = 256
-    "Dense points, an even number, with those low on the neck, which are left out."
     seed: int = 0
     "Of everything random."
 
@@ -95,29 +87,21 @@ def main(arguments: list[str] | None = None) -> int:
     cv2.setNumThreads(1)
     models = [load_head(spec) for spec in ("procedural", options.ict) if spec]
     plan = TrainingPlan(**{name: getattr(options, name) for name in words})
-    save_network(train(models, plan, options.views, options.start), options.out)
+    net = train(models, plan, options.views, options.start)
+    net.eyes = train_eyes(models, options.views, plan.seed)
+    save_network(net, options.out)
     net = load_network(options.out)
-    for model, places in zip(models, places_of(models, plan.dense), strict=True):
-        views = open_views(options.views, model, HELD_OUT, plan.seed, places)
+    for model in models:
+        views = open_views(options.views, model, HELD_OUT, plan.seed)
         print(f"{model.name}: held-out heads {validate(net, views, plan.seed)}")
     return 0
 
 
-def places_of(models: list[HeadModel], dense: int) -> list[Places]:
-    """Return the places of the dense points on each model: chosen on the last, the most human."""
-    chosen = choose_places(models[-1], dense)
-    return [carry_places(models[-1], chosen, model) for model in models]
-
-
-def start_network(start: Path | None, places: Places) -> LandmarkNet:
+def start_network(start: Path | None) -> LandmarkNet:
     """Return a network to train, with what given weights hold of it."""
-    net = LandmarkNet(len(places[0]))
-    state = net.state_dict()
-    given = {} if start is None else trainable_network(start).state_dict()
-    # Weights of another number of dense points lack all that depends on it.
-    state |= {key: value for key, value in given.items() if value.shape == state[key].shape}
-    state["dense.faces"], state["dense.weights"] = (torch.from_numpy(part) for part in places)
-    net.load_state_dict(state)
+    net = LandmarkNet(whole=True)
+    if start is not None:
+        net.load_state_dict(trainable_network(start).state_dict(), strict=False)
     return net.train().to(memory_format=torch.channels_last)
 
 
@@ -127,8 +111,7 @@ def train(
     """Train on views of the head models; views and the run's state are kept in a folder."""
     torch.manual_seed(plan.seed)
     backgrounds = make_backgrounds(400, np.random.default_rng([plan.seed, 1]))
-    places = places_of(models, plan.dense)
-    net = start_network(start, places[0])
+    net = start_network(start)
     begun = hashlib.sha256(start.read_bytes()).hexdigest()[:8] if start else "anew"
     name = "-".join([*(m.name for m in models), *(str(value) for value in astuple(plan)), begun])
     sets: list[list[TrainingView]] = []
@@ -139,7 +122,7 @@ def train(
         while len(sets) < len(models) * files:
             number = HELD_OUT + 1 + len(sets) // len(models)
             which = len(sets) % len(models)
-            sets.append(open_views(folder, models[which], number, plan.seed, places[which]))
+            sets.append(open_views(folder, models[which], number, plan.seed))
         # Seeded by the step, so that a run taken up again draws what it would have drawn.
         rng = np.random.default_rng([plan.seed, 2, step])
         small = step < plan.small_steps or step % SMALL_EVERY == 0
@@ -155,53 +138,9 @@ def train(
     return descend(net, plan.steps, rate, folder / f"training-{name}.pt", loss_at)
 
 
-def descend(
-    net: LandmarkNet, steps: int, rate: float, state: Path, loss_at: Callable[[int], torch.Tensor]
-) -> LandmarkNet:
-    """Minimise the loss of every step; an interrupted run goes on from its `state`, a file."""
-    optimiser = torch.optim.AdamW(net.parameters(), lr=rate, weight_decay=1e-3)
-    first = take_up(state, net, optimiser)
-    began, losses = time.monotonic(), []
-    for step in range(first, steps):
-        fall = (steps - step) / (steps * (1.0 - HIGH_SHARE))
-        optimiser.param_groups[0]["lr"] = rate * min(1.0, (step + 1) / WARM_UP, max(fall, 0.01))
-        loss = loss_at(step)
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(net.parameters(), 5.0)
-        optimiser.step()
-        losses.append(loss.item())
-        if (step + 1) % KEEP_EVERY == 0:
-            seconds = (time.monotonic() - began) / (step + 1 - first)
-            recent = np.mean(losses[-KEEP_EVERY:])
-            print(f"step {step + 1}: loss {recent:.3f}, {seconds:.2f} s", flush=True)
-            keep_state(state, net, optimiser, step + 1)
-    return net.eval()
-
-
-def keep_state(
-    path: Path, net: torch.nn.Module, optimiser: torch.optim.Optimizer, step: int
-) -> None:
-    """Write a run's state, from which `take_up` goes on."""
-    part = path.with_suffix(".part")
-    torch.save({"net": net.state_dict(), "optimiser": optimiser.state_dict(), "step": step}, part)
-    part.replace(path)
-
-
-def take_up(path: Path, net: torch.nn.Module, optimiser: torch.optim.Optimizer) -> int:
-    """Read a state that `keep_state` wrote, if there is one; the step to go on with."""
-    if not path.exists():
-        return 0
-    state = read_weights(path, TrainError, str(path), "a state of training", "delete it")
-    net.load_state_dict(state["net"])
-    optimiser.load_state_dict(state["optimiser"])
-    print(f"going on from step {state['step']} ({path}; delete it to begin anew)")
-    return state["step"]
-
-
 @dataclass(frozen=True)
 class LandmarkBatch:
-    """Stacked crops: images (B, 3, H, W) in [0, 1], points (B, 68 + D, 2), the rest (B[, 68])."""
+    """Stacked crops: images (B, 3, H, W) in [0, 1], points (B, 68 + 17, 2), the rest (B[, 68])."""
 
     images: torch.Tensor
     points: torch.Tensor
@@ -248,13 +187,12 @@ def crop_loss(net: LandmarkNet, crops: list[TrainingCrop]) -> torch.Tensor:
     batch = crop_batch(crops)
     with torch.autocast("cpu", torch.bfloat16):
         output = net(batch.images)
-    visible, marks = batch.visible[:, :POINTS], batch.points[:, :POINTS]
-    dense = batch.points[:, POINTS:]
-    seen = functional.binary_cross_entropy_with_logits(output.seen, visible, reduction="none")
+    marks, outline = batch.points[:, :POINTS], batch.points[:, POINTS:]
+    seen = functional.binary_cross_entropy_with_logits(output.seen, batch.visible, reduction="none")
     share = batch.weight / batch.weight.sum().clamp_min(1.0)
     points = (point_loss(output, marks)[0] + 0.5 * seen).mean(1) * share
-    over = output.dense, output.dense_log_scale, output.dense_heat
-    points = points + 0.5 * place_loss(*over, dense)[0].mean(1) * share
+    edge = output.outline, output.outline_log_scale, output.outline_heat
+    points = points + 0.5 * place_loss(*edge, outline)[0].mean(1) * share
     return points.sum() + functional.binary_cross_entropy_with_logits(output.logit, batch.score)
 
 
@@ -271,7 +209,7 @@ def validate(net: LandmarkNet, views: list[TrainingView], seed: int) -> str:
         error = (output.points - batch.points[:, :POINTS]).norm(dim=-1).mean(1)
         errors.append(torch.where(batch.weight > 0, error, torch.nan))
         full = batch.weight >= 1.0
-        seen.append(((output.seen > 0) == (batch.visible[:, :POINTS] > 0.5))[full].float().mean(1))
+        seen.append(((output.seen > 0) == (batch.visible > 0.5))[full].float().mean(1))
         clear = (batch.score <= 0) | (batch.score >= 1)
         right.append(((output.logit > 0) == (batch.score > 0.5))[clear].float())
     error, facing = torch.cat(errors), torch.from_numpy(np.stack([view.facing for view in views]))

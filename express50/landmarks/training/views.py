@@ -1,7 +1,6 @@
 """Cut training crops of rendered heads on random backgrounds, spoiled as cameras do.
 
-A file of views is made once; it depends on the seed, the head model, its number and the dense
-points alone.
+A file of views is made once; it depends on the seed, the head model and its number alone.
 """
 
 from __future__ import annotations
@@ -18,8 +17,7 @@ import numpy as np
 
 from express50.geometry.conventions import affine_to_opencv
 from express50.head.model import HeadModel
-from express50.landmarks.network import CROP, CROP_MARGIN, POINTS, face_box, mirrored
-from express50.landmarks.training.dense import Places
+from express50.landmarks.network import CROP, CROP_MARGIN, MIRROR, MIRROR_ALL, POINTS, face_box
 from express50.landmarks.training.random_heads import random_head
 from express50.landmarks.training.scene import HeadScene, TrainingView
 
@@ -39,28 +37,22 @@ def draw_yaws(rng: np.random.Generator) -> np.ndarray:
     return np.append(front, rng.uniform(FACE_YAW, 2 * np.pi - FACE_YAW))
 
 
-def draw_views(
-    model: HeadModel, count: int, rng: np.random.Generator, places: Places | None = None
-) -> list[TrainingView]:
-    """Render `count` views of random heads, with dense points at places of the model."""
+def draw_views(model: HeadModel, count: int, rng: np.random.Generator) -> list[TrainingView]:
+    """Render `count` views of random heads."""
     views: list[TrainingView] = []
     while len(views) < count:
-        scene = HeadScene(model, random_head(model, rng), places)
+        scene = HeadScene(model, random_head(model, rng))
         yaws = draw_yaws(rng)[: count - len(views)]
         views += [scene.render(rng, SIDE, float(yaw)) for yaw in yaws]
     return views
 
 
-def open_views(
-    folder: Path, model: HeadModel, number: int, seed: int, places: Places
-) -> list[TrainingView]:
+def open_views(folder: Path, model: HeadModel, number: int, seed: int) -> list[TrainingView]:
     """Read one file of `FILE_VIEWS` views, which is rendered if it is not there yet."""
     rng = np.random.default_rng([seed, number, *model.name.encode()])
-    # Other heads or other dense points make other files.
-    made_of = b"".join(np.ascontiguousarray(part).tobytes() for part in (model.template, *places))
-    digest = hashlib.sha256(made_of).hexdigest()[:8]
+    digest = hashlib.sha256(model.template.numpy().tobytes()).hexdigest()[:8]
     path = folder / f"{model.name}-{digest}-{seed}-{number:03d}.npz"
-    return made_once(path, TrainingView, lambda: draw_views(model, FILE_VIEWS, rng, places))
+    return made_once(path, TrainingView, lambda: draw_views(model, FILE_VIEWS, rng))
 
 
 def made_once(path: Path, kind: type[Record], make: Callable[[], list[Record]]) -> list[Record]:
@@ -84,10 +76,8 @@ class TrainingCrop:
     """A training crop."""
 
     image: np.ndarray  # (size, size, 3) uint8
-    points: np.ndarray  # (68 + D, 2) pixels of a crop of `CROP` pixels, whatever the image's size
-    visible: (
-        np.ndarray
-    )  # (68 + D,) float32, 1 where neither the head nor anything else hides the point
+    points: np.ndarray  # (68 + 17, 2) pixels of a crop of `CROP` pixels, whatever the image's size
+    visible: np.ndarray  # (68,) float32, 1 where neither the head nor anything else hides the point
     score: float  # target of the face score
     weight: float  # how much the points count; 0 for backs of heads
 
@@ -115,18 +105,17 @@ def random_crop(
     points = points @ matrix[:, :2].T + matrix[:, 2]
     visible = view.visible
     if np.linalg.det(matrix[:, :2]) < 0:
-        partner = mirrored(len(points) - POINTS)
-        points, visible = points[partner], visible[partner]
+        points, visible = points[MIRROR_ALL], visible[MIRROR]
     pool = backgrounds[rng.integers(len(backgrounds))]
     x, y = rng.integers(0, CROP, 2)
     image = pool[y : y + CROP, x : x + CROP].copy()
     if size != CROP:
         image = cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA)
-    if not empty:
-        _shoulders(image, points * (size / CROP), rng)
-        image = _composite(view.rgba, matrix * (size / CROP), image)
-    covered = np.zeros(image.shape[:2], np.uint8)
     scaled = points[:POINTS] * (size / CROP)
+    if not empty:
+        _shoulders(image, scaled, rng)
+        image = composite(view.rgba, matrix * (size / CROP), image)
+    covered = np.zeros(image.shape[:2], np.uint8)
     if rng.random() < 0.25:
         _hair_locks(image, covered, scaled, rng)
     if rng.random() < 0.1:
@@ -137,14 +126,14 @@ def random_crop(
     facing = float(view.facing)
     score = 0.0 if empty else float(np.clip((facing + 0.15) / 0.3, 0.0, 1.0))
     weight = 0.0 if empty else float(np.clip((facing + 0.3) / 0.4, 0.0, 1.0))
-    column, row = np.floor(points * (size / CROP)).astype(int).T
+    column, row = np.floor(scaled).astype(int).T
     shown = (column >= 0) & (row >= 0) & (column < size) & (row < size)
     shown[shown] = covered[row[shown], column[shown]] == 0
     visible = (visible & shown).astype(np.float32)
-    return TrainingCrop(_spoil(image, rng), points.astype(np.float32), visible, score, weight)
+    return TrainingCrop(spoil(image, rng), points.astype(np.float32), visible, score, weight)
 
 
-def _composite(rgba: np.ndarray, matrix: np.ndarray, background: np.ndarray) -> np.ndarray:
+def composite(rgba: np.ndarray, matrix: np.ndarray, background: np.ndarray) -> np.ndarray:
     """Warp a view (black where empty) into the crop over a background; uint8."""
     scale = float(np.sqrt(abs(np.linalg.det(matrix[:, :2]))))
     if scale < 0.8:
@@ -234,7 +223,7 @@ def _whole(values: np.ndarray) -> tuple[int, int]:
     return int(values[0]), int(values[1])
 
 
-def _spoil(image: np.ndarray, rng: Rng) -> np.ndarray:
+def spoil(image: np.ndarray, rng: Rng) -> np.ndarray:
     """Apply gain, white balance, gamma, haze, blur, low resolution, noise and JPEG; uint8 out."""
     ramp = np.arange(256)[:, None] / 255.0
     curve = (ramp * rng.uniform(0.8, 1.25, 3)) ** rng.uniform(0.65, 1.5) * rng.uniform(0.6, 1.3)

@@ -1,0 +1,62 @@
+"""Minimise a loss, step by step, so that an interrupted run goes on to the same result."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+
+from express50.errors import TrainError
+from express50.files.arrays import read_weights
+
+WARM_UP = 100
+# The rate stays high until this share of the run, then falls in a straight line.
+HIGH_SHARE = 0.65
+KEEP_EVERY = 100
+Net = TypeVar("Net", bound=torch.nn.Module)
+
+
+def descend(
+    net: Net, steps: int, rate: float, state: Path, loss_at: Callable[[int], torch.Tensor]
+) -> Net:
+    """Minimise the loss of every step; an interrupted run goes on from its `state`, a file."""
+    optimiser = torch.optim.AdamW(net.parameters(), lr=rate, weight_decay=1e-3)
+    first = take_up(state, net, optimiser)
+    began, losses = time.monotonic(), []
+    for step in range(first, steps):
+        fall = (steps - step) / (steps * (1.0 - HIGH_SHARE))
+        optimiser.param_groups[0]["lr"] = rate * min(1.0, (step + 1) / WARM_UP, max(fall, 0.01))
+        loss = loss_at(step)
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(net.parameters(), 5.0)
+        optimiser.step()
+        losses.append(loss.item())
+        if (step + 1) % KEEP_EVERY == 0:
+            seconds = (time.monotonic() - began) / (step + 1 - first)
+            recent = np.mean(losses[-KEEP_EVERY:])
+            print(f"step {step + 1}: loss {recent:.3f}, {seconds:.2f} s", flush=True)
+            keep_state(state, net, optimiser, step + 1)
+    return net.eval()
+
+
+def keep_state(path: Path, net: Net, optimiser: torch.optim.Optimizer, step: int) -> None:
+    """Write a run's state, from which `take_up` goes on."""
+    part = path.with_suffix(".part")
+    torch.save({"net": net.state_dict(), "optimiser": optimiser.state_dict(), "step": step}, part)
+    part.replace(path)
+
+
+def take_up(path: Path, net: Net, optimiser: torch.optim.Optimizer) -> int:
+    """Read a state that `keep_state` wrote, if there is one; the step to go on with."""
+    if not path.exists():
+        return 0
+    state = read_weights(path, TrainError, str(path), "a state of training", "delete it")
+    net.load_state_dict(state["net"])
+    optimiser.load_state_dict(state["optimiser"])
+    print(f"going on from step {state['step']} ({path}; delete it to begin anew)")
+    return state["step"]

@@ -1,0 +1,103 @@
+"""Find the visible outline of a face, points 0 to 16 as the published mark-up of 68 has them.
+
+People who mark photographs (Multi-PIE, 300-W) put these points on the edge of the face that they
+see, whatever the skin there: from before the ear at the height of the eyes (0 and 16) down to the
+lowest edge of the chin (8), evenly spaced. The jaw's landmarks of a head model are fixed places.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from express50.geometry.conventions import corner_to_cell
+from express50.head.load import load_head
+from express50.head.model import HeadModel, landmarks
+from express50.landmarks.training.places import closest_places, laid_on
+
+EYE_BAND_M, CHIN_BAND_M = 0.005, 0.004  # about the height of the eye corners; about the middle
+MASK_SIDE, MASK_SHARE = 512, 0.9  # pixels of the face's mask, and the face's share of them
+SMOOTHING = 6  # pixels of the mask: models mark out the face triangle by triangle
+HALF = 8  # steps from an ear to the chin
+
+
+class FaceFront:
+    """The part of a head model whose edge is marked: the face down to the jaw's lower edge."""
+
+    def __init__(self, model: HeadModel) -> None:
+        """Find the part; where it ends is said by the built-in head."""
+        builtin = load_head("procedural")
+        region = {name: mask.numpy() for name, mask in builtin.regions.items()}
+        front = region["face"] & ~region["nose"] & ~region["lips"]
+        rest = model.template.double().numpy()
+        marks = landmarks(model, model.template[None])[0].double().numpy()
+        if model.name != builtin.name:
+            faces, weights = closest_places(builtin, laid_on(model, builtin, rest))
+            inside = (front[builtin.faces.numpy()[faces]] * weights).sum(1) > 0.5
+            front = inside & model.regions["face"].numpy()
+        all_faces = model.faces.numpy()
+        self.faces = all_faces[front[all_faces].all(1)]
+        ids = np.unique(self.faces)
+        level = np.abs(rest[ids, 1] - marks[[36, 45], 1].mean()) < EYE_BAND_M
+        self.right, self.left = (ids[level & (sign * rest[ids, 0] > 0)] for sign in (-1, 1))
+        low = (np.abs(rest[ids, 0]) < CHIN_BAND_M) & (rest[ids, 1] < marks[57, 1])
+        self.chin = ids[low]
+
+    def outline(self, pixels: np.ndarray, marks: np.ndarray) -> np.ndarray:
+        """Return points 0 to 16 (17, 2) of a view.
+
+        Args:
+            pixels: (V, 2) where the view shows the head's vertices.
+            marks: (68, 2) where it shows the landmarks.
+        """
+        down = marks[8] - marks[27]
+        across = np.array([down[1], -down[0]])  # towards the subject's left
+        ends = (
+            self.right[np.argmin(pixels[self.right] @ across)],
+            self.chin[np.argmax(pixels[self.chin] @ down)],
+            self.left[np.argmax(pixels[self.left] @ across)],
+        )
+        edge = self._edge(pixels)
+        first, middle, last = (
+            int(np.linalg.norm(edge - pixels[one], axis=1).argmin()) for one in ends
+        )
+        edge = np.roll(edge, -first, axis=0)
+        middle, last = (middle - first) % len(edge), (last - first) % len(edge)
+        if middle > last:  # the way over the chin is the other one
+            edge = np.roll(edge[::-1], 1, axis=0)
+            middle, last = len(edge) - middle, len(edge) - last
+        halves = _spaced(edge[: middle + 1]), _spaced(edge[middle : last + 1])
+        return np.concatenate([halves[0], halves[1][1:]])
+
+    def _edge(self, pixels: np.ndarray) -> np.ndarray:
+        """Return the outer edge (n, 2) of the front in a view, smoothed."""
+        used = pixels[np.unique(self.faces)]
+        low, size = used.min(0), float(np.ptp(used, axis=0).max())
+        scale = MASK_SHARE * MASK_SIDE / max(size, 1e-6)
+        shift = 0.5 * (1 - MASK_SHARE) * MASK_SIDE
+        mask = np.zeros((MASK_SIDE, MASK_SIDE), np.uint8)
+        corners = corner_to_cell((pixels - low) * scale + shift)
+        for triangle in np.round(corners[self.faces] * 16).astype(np.int32):
+            cv2.fillConvexPoly(mask, triangle, 255, shift=4)
+        mask = cv2.GaussianBlur(mask, (0, 0), SMOOTHING)
+        found, _ = cv2.findContours(
+            (mask > 127).view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+        )
+        edge = max(found, key=len)[:, 0].astype(np.float64)
+        return (edge + 0.5 - shift) / scale + low
+
+
+@lru_cache(maxsize=4)
+def face_front(model: HeadModel) -> FaceFront:
+    """Return the marked part of a head model."""
+    return FaceFront(model)
+
+
+def _spaced(line: np.ndarray) -> np.ndarray:
+    """Return HALF + 1 points at even distances along a line (n, 2), its ends included."""
+    steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    way = np.concatenate([[0.0], np.cumsum(steps)])
+    even = np.linspace(0.0, way[-1], HALF + 1)
+    return np.stack([np.interp(even, way, line[:, axis]) for axis in (0, 1)], axis=1)
