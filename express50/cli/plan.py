@@ -27,6 +27,7 @@ from express50.dial.laws import MeasuredSize, forecast
 from express50.errors import ConfigError, StageError
 from express50.files.digests import files_of, text_digest
 from express50.runner.ledger import Ledger
+from express50.runner.replaced import size_of
 
 SIZES = ("subjects", "expressions", "cameras", "frames_per_expression")
 # Campaigns of the papers: EXPRESS-50, and RenderMe-360 as it was used beside it (280 of its people,
@@ -117,9 +118,10 @@ def run_plan(args: argparse.Namespace) -> int:
     target = target_of(args.target, sizes, footage)
     rows = estimate(known, target, measured, args.workers)
     total = totals(rows)
-    data = {"target": vars(target), "measured": [vars(f) for f, _ in measured]}
+    data: dict[str, Any] = {"target": vars(target), "measured": [vars(f) for f, _ in measured]}
     data["workers"] = args.workers
-    data |= {"stages": [vars(row) for row in rows], "total": total}
+    replaced = size_of(dataset.replaced_dir)[1]
+    data |= {"stages": [vars(row) for row in rows], "total": total, "replaced": replaced}
     columns = ["stage", "items", "s per item", "core hours", f"days on {args.workers}", "disk"]
     columns += ["peak memory", "preset", "sizes", "times what was measured"]
     hours = _hours(total["core_hours"], total["core_hours_low"], total["core_hours_high"])
@@ -134,8 +136,8 @@ def run_plan(args: argparse.Namespace) -> int:
         "not grow, which --also DATASET of another size would tell",
         "s per item: of one core; stages one after the other, no item split over workers",
         "peak memory: as measured; more footage may need more",
-        "disk: without outputs that were replaced; stages keep two of each item while there are 2 "
-        "GB left, and 'express50 prune' deletes them",
+        f"disk: without outputs that were replaced, {decimal(replaced)} of them here; stages keep "
+        "two per item while there are 2 GB left, and 'express50 prune' deletes them",
     ]
     if total["not_measured"]:
         lines.append(f"the sum lacks {', '.join(total['not_measured'])}")

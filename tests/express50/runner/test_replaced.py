@@ -10,6 +10,7 @@ from unittest.mock import Mock
 import pytest
 
 from express50.cli.main import main
+from express50.dataset.audit import audit
 from express50.runner import replaced
 from express50.runner.ledger import Ledger
 from express50.runner.runner import run_stage
@@ -149,6 +150,17 @@ def test_a_full_disk_takes_the_store_before_it_stops_a_run(tmp_path):
     stage = dataclasses.replace(toy.STAGE, run=full_once)
     summary = run_stage(stage, dataset, toy.ToyConfig(word="c"), workers=0, progress=False)
     assert summary.ok and tries == ["a", "z_full", "z_full"]
+
+
+def test_check_says_what_is_kept_and_finds_nothing_wrong_with_it(dataset):
+    run_toy(dataset, word="b")
+    for deep in (False, True):
+        result = audit(dataset, [toy.STAGE], deep=deep)
+        assert result.findings == []
+        (note,) = result.notes
+        assert note.startswith(".replaced: 0.4 MB (10 files) of outputs that others replaced")
+    audit(dataset, [toy.STAGE], fix=True)
+    assert kept(dataset) == ["S001+b", "a"]
 
 
 def test_prune_empties_the_store_and_says_what_it_freed(dataset, capsys):
