@@ -16,7 +16,7 @@ from rich.filesize import decimal
 from express50.console import count
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
-from express50.errors import Express50Error, FormatError, NotReadyError, StageError
+from express50.errors import Express50Error, FormatError, StageError
 from express50.files.atomic import LEAST_FREE
 from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger
@@ -32,7 +32,7 @@ def problems(
     """Yield, one line each, what would stop stages with these configurations; nothing is written.
 
     Memory and disk space are judged by the receipts of items that were made in this dataset; the
-    space for some of the items is left to `check_expected_space`.
+    space for some of the items is left to `expected_shortage`.
     """
     chosen = [stage for stage, _ in work]
     yield from _folder_problems(dataset, chosen)
@@ -118,15 +118,12 @@ def expected_bytes(
     return (stage, new, sum(sizes) / len(sizes)) if new and sizes else None
 
 
-def check_expected_space(dataset: Dataset, ledger: Ledger, stage: str, items: list[str]) -> None:
-    """Refuse to begin a stage whose outputs will not fit, as far as its items were measured.
-
-    Raises:
-        NotReadyError: they will not.
-    """
-    if need := expected_bytes(ledger, stage, items):
-        for problem in _space_problems(dataset, [need]):
-            raise NotReadyError(problem)
+def expected_shortage(
+    dataset: Dataset, ledger: Ledger, stage: str, items: Iterable[str]
+) -> str | None:
+    """Say that outputs of a stage's items will not fit, as far as some were measured; else None."""
+    need = expected_bytes(ledger, stage, items)
+    return next(_space_problems(dataset, [need]), None) if need else None
 
 
 def _space_problems(dataset: Dataset, needs: Sequence[tuple[str, int, float]]) -> Iterator[str]:

@@ -12,17 +12,18 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
+from express50.console import log as write
 from express50.contract.config import config_toml
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Stage
-from express50.errors import ConfigError, StageError, nearest
+from express50.errors import ConfigError, NotReadyError, StageError, nearest
 from express50.files.atomic import check_space, write_bytes
 from express50.files.digests import file_version, path_digest
 from express50.runner.executor import Pool
 from express50.runner.imported import import_trouble
 from express50.runner.ledger import Ledger, Made, Receipt
 from express50.runner.outdated import why_outdated
-from express50.runner.preflight import check_expected_space
+from express50.runner.preflight import expected_shortage
 from express50.runner.progress import RunLog, showing
 from express50.runner.publish import (
     clean_leftovers,
@@ -195,7 +196,8 @@ def run_stage(
             ledger.forget(stage.name, gone)
         with RunLog(dataset.ledger, stage.name, len(chosen)) as log:
             threads = workers_pool.threads
-            check_expected_space(dataset, ledger, stage.name, chosen)
+            if shortage := expected_shortage(dataset, ledger, stage.name, chosen):
+                raise NotReadyError(shortage)
             work = _sort_items(stage, dataset, config, chosen, ledger, threads)
             outcomes = _run_items(stage, dataset, work, ledger, workers_pool, progress, log, gate)
     missing = set(chosen) - set(outcomes)
@@ -372,6 +374,10 @@ def _run_items(
             ended.append(receipt)
             if len(ended) == ALIKE < len(work.tasks):
                 _refuse_alike(stage, ended, work.former)
+                # Of a stage that was never run nothing was known before.
+                items = [*outcomes, *(task.item for task in work.tasks)]
+                if shortage := expected_shortage(dataset, ledger, stage.name, items):
+                    write(f"{stage.name}: warning: {shortage}")
 
         for receipt in work.unreadable:
             settle(receipt)

@@ -172,3 +172,16 @@ def test_a_port_that_answers_otherwise_is_no_scheduler(dataset, monkeypatch):
         (line,) = found(dataset, scheduler=f"tcp://127.0.0.1:{server.getsockname()[1]}")
         server.shutdown(socket.SHUT_RDWR)
     assert "cannot connect" in line
+
+
+def test_a_stage_that_was_never_run_warns_after_some_items(tmp_path, monkeypatch, capsys):
+    dataset = make_dataset(tmp_path / "data", list("abcdefgh"))
+    usage = SimpleNamespace(total=1e12, free=100e6 + 800e3)
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage)
+    assert run_toy(dataset).ok
+    words = "toy: warning: {}: about 960.2 kB are needed, most of it by toy (5 items of 192.0 kB)"
+    assert words.format(dataset.root) in capsys.readouterr().err
+    usage.free += 1e6
+    dataset = make_dataset(tmp_path / "other", list("abcdefgh"))
+    assert run_toy(dataset).ok
+    assert "warning" not in capsys.readouterr().err
