@@ -3,11 +3,11 @@
 ``python -m benchmarks.faults --hours 1`` runs one case after the other until the time is over. A
 case makes a dataset, runs a stage of slow items on it, hurts it, and runs it again until it is
 whole; then every byte is compared with what it must be, and `express50.dataset.audit` must find no
-fault. Every third case kills a real stage, or a training, on a small recording. Each case has a
-number that is the seed of all that is random in it: ``--seed N`` runs one again. With ``--folder``
-a stopped storm goes on. `seconds_lost_per_kill` is work that was begun and not published; starting
-again, up to the first item, is in `restart_seconds_median`. The last line printed is one JSON
-object.
+fault. In a longer storm every third case kills a real stage, or a training, on a small recording,
+which takes some minutes to make. Each case has a number, which is the seed of all that is random in
+it: ``--seed N`` runs one again. With ``--folder`` a stopped storm goes on. `seconds_lost_per_kill`
+is work that was begun and not published; starting again, up to the first item, is in
+`restart_seconds_median`. The last line printed is one JSON object.
 """
 
 from __future__ import annotations
@@ -42,13 +42,15 @@ ITEMS, KILLS = 14, 3  # of one case
 SMALL_DISK = 112  # MB; a run counts a disk with less than 100 MB left as full
 CHAIN = (
     "ingest", "calibrate", "observe", "align", "frames", "matte", "track", "depth", "register",
-    "regions", "pack", "train",
+    "regions", "encode", "pack", "train",
 )  # fmt: skip
 RECORDING = (
     "--subjects=2", "--cameras=5", "--give-calibration", "--width=160", "--height=160",
     "--frames-per-expression=4", "--expressions=neutral,smile", "--seed=3",
 )  # fmt: skip
-SETTINGS = ("--preset", "draft", "--set", "pack.size=64", "--set", 'pack.test_subjects=["S002"]')
+SIZE = ("--set", "encode.size=64")
+SETTINGS = {"encode": SIZE, "pack": (*SIZE, "--set", 'pack.test_subjects=["S002"]')}
+RECORDING_SECONDS = 600.0  # a storm that is shorter leaves the real stages out
 ITERATIONS = 12
 
 
@@ -93,11 +95,12 @@ def storm(folder: Path, seed: int | None, until: float) -> dict:
     log = folder / "cases.jsonl"
     rows = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
     done = {row["seed"] for row in rows}
+    short = until - time.monotonic() < RECORDING_SECONDS
     for number in itertools.count() if seed is None else [seed]:
-        if seed is None and (number in done or time.monotonic() > until):
-            if number not in done:
-                break
+        if seed is None and (number in done or (short and kind_of(number) == "stage")):
             continue
+        if seed is None and time.monotonic() > until:
+            break
         row = run_case(folder, number)
         rows = [one for one in rows if one["seed"] != number] + [row]
         with log.open("a") as file:
@@ -105,9 +108,14 @@ def storm(folder: Path, seed: int | None, until: float) -> dict:
     return figures([row for row in rows if seed in (None, row["seed"])])
 
 
+def kind_of(number: int) -> str:
+    """Return what a case does."""
+    return ORDER[number % len(ORDER)]
+
+
 def run_case(folder: Path, number: int) -> dict:
     """Run one case; what is wrong with it is printed with its seed."""
-    kind = ORDER[number % len(ORDER)]
+    kind = kind_of(number)
     scratch, error = folder / f"case{number}", ""
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()
@@ -329,16 +337,18 @@ def kill_stage(case: Case) -> None:
     stage = CHAIN[(rounds * ORDER.count("stage") + ORDER[:place].count("stage")) % len(CHAIN)]
     data = case.scratch / "data"
     shutil.copytree(calm / "data", data)
-    target = data / "grmm" if stage == "train" else data / stage
-    shutil.rmtree(target)
-    command = chain_command(stage, data, "--workers=2")
-    process = launch(command)
+    command = chain_command(stage, data)
     spent = json.loads((calm / "seconds.json").read_text())[stage]
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(case.rng.uniform(0.5, 1.0) * spent)
-    if process.poll() is None:
-        case.faults[f"kill of {stage}"] += 1
-    finish(process)
+    for share in (1.0, 0.5, 0.25):  # until it is killed before its end
+        shutil.rmtree(data / ("grmm" if stage == "train" else stage), ignore_errors=True)
+        process = launch(command)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(case.rng.uniform(0.4, 0.9) * share * spent)
+        killed = process.poll() is None
+        finish(process)
+        if killed:
+            case.faults[f"kill of {stage}"] += 1
+            break
     names = contents(calm / "data", stage)
     for name, there in contents(data, stage).items():
         case.wrong += there != names.get(name) and stage != "train"
@@ -508,8 +518,8 @@ def calm_chain(folder: Path) -> Path:
     captures = sorted(str(path) for path in (folder / "captures").iterdir())
     seconds = {}
     for stage in CHAIN:
-        command = chain_command(stage, folder / "data", "--workers=2")
-        command += captures if stage == "ingest" else []
+        given = captures if stage == "ingest" else []
+        command = chain_command(stage, folder / "data", *given)
         began = time.monotonic()
         subprocess.run(command, env=environment(), capture_output=True, check=True)
         seconds[stage] = time.monotonic() - began
@@ -517,14 +527,15 @@ def calm_chain(folder: Path) -> Path:
     return folder
 
 
-def chain_command(stage: str, data: Path, *options: str) -> list[str]:
+def chain_command(stage: str, data: Path, *captures: str) -> list[str]:
     """Return the command of a stage, or of a training."""
     if stage == "train":
         train = [f"train.iterations={ITERATIONS}", "train.save_seconds=0.5"]
         return [sys.executable, "-m", "grmm", "train", str(data / "pack/shards"),
                 str(data / "grmm"), "--preset=demo",
                 *(word for one in train for word in ("--set", one))]  # fmt: skip
-    return [sys.executable, "-m", "express50", stage, str(data), *SETTINGS, *options]
+    words = (stage, str(data), *captures, "--preset", "draft", "--workers", "2")
+    return [sys.executable, "-m", "express50", *words, *SETTINGS.get(stage, ())]
 
 
 def contents(data: Path, stage: str) -> dict[str, bytes]:
