@@ -101,7 +101,7 @@ def show_status(args: argparse.Namespace) -> int:
             ]
             for s in table
         }
-        answer(args, rows, *_lines(table), *_outdated_lines(dataset, why))
+        answer(args, rows, *_lines(table), *_outdated_lines(why))
     return FAILED if any(row.failed for row in table) else OK
 
 
@@ -167,17 +167,14 @@ def _lines(table: list[StageStatus]) -> Iterator[str]:
             yield f"failed {receipt.stage} {receipt.item}: {receipt.reason}"
 
 
-def _outdated_lines(dataset: Dataset, why: Mapping[tuple[str, str], str]) -> Iterator[str]:
+def _outdated_lines(why: Mapping[tuple[str, str], str]) -> Iterator[str]:
     groups: dict[tuple[str, str], list[str]] = {}
     for (stage, item), words in why.items():
         groups.setdefault((stage, words), []).append(item)
     for (stage, words), items in groups.items():
         yield f"outdated {stage} {few(items, 2)}: {words}"
     if groups:
-        yield (
-            f"a run with the settings of the last one ({dataset.root}/config) makes these again; "
-            "one with those that they were made with keeps them"
-        )
+        yield "the next run makes these again; where only settings changed, the former keep them"
 
 
 def read_status(

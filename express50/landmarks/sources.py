@@ -22,12 +22,11 @@ from express50.files.arrays import DAMAGE, read_arrays
 from express50.files.text import read_json
 from express50.geometry.cameras import Camera, normalised
 from express50.geometry.conventions import cell_to_corner
-from express50.landmarks import WEIGHTS
+from express50.landmarks import source_files
 from express50.landmarks.detector import SMALLEST, Detection, cut_crop, detect, place_crop
 from express50.landmarks.eyes_and_lips import Irises, find_irises, open_lips
 from express50.landmarks.network import load_network
 
-EMBEDDED, FAN = "embedded", "fan:"
 SCHEMA = "express50.landmarks/1"
 NAMES = ("schema", "cameras", "frames", "points")
 POINTS, IRISES = 68, 2
@@ -46,15 +45,6 @@ class Marked:
 
 
 Source = Callable[[np.ndarray, str, int], Marked]
-
-
-def source_files(landmarks: str) -> dict[str, Path]:
-    """Return the files that a source reads, by name: a stage's output depends on them."""
-    if landmarks == EMBEDDED:
-        return {"weights": WEIGHTS}
-    if landmarks.startswith(FAN):
-        return {"weights": WEIGHTS, "fan": Path(landmarks.removeprefix(FAN)).expanduser()}
-    return {"landmarks": Path(landmarks).expanduser()}
 
 
 def _existing_files(landmarks: str) -> dict[str, Path]:

@@ -33,8 +33,9 @@ def showing(stage: str, total: int, enabled: bool) -> Iterator[Callable[[Receipt
     task, settled = bar.add_task(stage, total=total), itertools.count(1)
 
     def show(receipt: Receipt) -> None:
-        line = f"{receipt.stage} {next(settled)}/{total} {receipt.item} {receipt.status}"
-        line += f" {receipt.seconds:.1f} s" + (f": {receipt.reason}" if receipt.reason else "")
+        how = f"{receipt.status} {receipt.seconds:.1f} s" if receipt.attempts else "restored"
+        line = f"{receipt.stage} {next(settled)}/{total} {receipt.item} {how}"
+        line += f": {receipt.reason}" if receipt.reason else ""
         bar.advance(task)
         if enabled and not in_terminal:
             log(line)

@@ -13,7 +13,7 @@ from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.contract.layout import Dataset
 from express50.errors import CaptureError, StageError
 from express50.geometry.cameras import Camera, project_pinhole
-from express50.landmarks.sources import EMBEDDED
+from express50.landmarks import EMBEDDED
 from pipelines.imports.places import PeakFrame
 from pipelines.track.observe import Observation, agree
 from pipelines.track.read_inputs import MIN_LANDMARKS, face_views, open_landmarks

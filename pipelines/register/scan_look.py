@@ -18,7 +18,8 @@ from express50.files.images import linear_to_srgb
 from express50.geometry.cameras import Camera, pinhole_camera, rays
 from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
 from express50.geometry.transforms import look_at, rigid_fit
-from express50.landmarks.sources import EMBEDDED, Source, open_source
+from express50.landmarks import EMBEDDED
+from express50.landmarks.sources import Source, open_source
 from pipelines.register.lay import mesh_normals
 from pipelines.register.scan_landmarks import GIVEN_M, check_face
 from pipelines.register.scan_mesh import Scan

@@ -34,7 +34,7 @@ def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path |
 
 
 def _setting_files(config: TrackConfig) -> dict[str, Path]:
-    from express50.landmarks.sources import source_files
+    from express50.landmarks import source_files
 
     found = source_files(config.landmarks)
     if config.head != "procedural":
@@ -50,13 +50,16 @@ def _setting_files(config: TrackConfig) -> dict[str, Path]:
 
 def try_files(config: TrackConfig) -> None:
     """Read the head model and the landmarks."""
-    from express50.head.load import load_head
-    from express50.landmarks.sources import EMBEDDED, try_source
+    from express50.landmarks import EMBEDDED
 
     _setting_files(config)
     if config.head != "procedural":
+        from express50.head.load import load_head
+
         load_head(config.head)
     if config.landmarks != EMBEDDED:
+        from express50.landmarks.sources import try_source  # torch takes seconds to import
+
         try_source(config.landmarks)
 
 

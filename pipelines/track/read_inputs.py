@@ -15,10 +15,11 @@ from express50.contract.stage import Note
 from express50.errors import CaptureError
 from express50.files.images import read_alpha
 from express50.geometry.cameras import Camera, project_pinhole
+from express50.landmarks import EMBEDDED
 from express50.landmarks.detector import follow, window_about
 from express50.landmarks.eyes_and_lips import find_irises, open_lips
 from express50.landmarks.network import face_box, load_network
-from express50.landmarks.sources import EMBEDDED, Marked, Source, open_source
+from express50.landmarks.sources import Marked, Source, open_source
 from pipelines.track.eyes_and_jaw import shut_lids
 from pipelines.track.observe import LandmarkView, Observation, agree
 from pipelines.track.outline import signed_distance

@@ -61,12 +61,13 @@ def test_an_input_that_is_as_before_brings_its_output_back(dataset):
     assert [o.restored for o in run_toy(dataset).outcomes] == [False, True]
 
 
-def test_items_that_come_back_to_the_list_are_restored(dataset):
+def test_items_that_come_back_to_the_list_are_restored(dataset, capsys):
     (dataset.root / "in" / "a.txt").rename(dataset.root / "a.txt")
     run_toy(dataset)
     assert not dataset.item_dir("toy", "a").exists() and kept(dataset) == ["a"]
     (dataset.root / "a.txt").rename(dataset.root / "in" / "a.txt")
-    back = run_toy(dataset)
+    back = run_stage(toy.STAGE, dataset, toy.ToyConfig(), workers=0)
+    assert "toy 1/1 a restored\n" in capsys.readouterr().err
     assert [o.restored for o in back.outcomes] == [False, True]
     assert "  restored 1: same as before" in list(back.lines())
 
