@@ -10,6 +10,7 @@ import torch
 from express50.geometry.sampling import smoothstep
 from express50.geometry.transforms import rigid_fit
 from express50.head.model import HeadModel, landmarks, pose
+from express50.twin.alive import own_offsets
 from express50.twin.hair import HairMesh, grow_hair, join_hair
 from express50.twin.subjects import TwinPerformance, TwinSubject
 from express50.twin.surface import (
@@ -172,6 +173,9 @@ def head_vertices(
     model: HeadModel, subject: TwinSubject, play: TwinPerformance, frame: int
 ) -> np.ndarray:
     """Return vertices (V, 3) of the posed head model in the world, metres."""
+    offsets = subject.offsets
+    if subject.own is not None:
+        offsets = offsets + own_offsets(model, subject.own, play.expression[frame])
 
     def row(array: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.asarray(array, dtype=np.float32))[None]
@@ -184,7 +188,7 @@ def head_vertices(
             neck=row(play.neck[frame]),
             jaw=row(play.jaw[frame]),
             eyes=row(play.eyes[frame]),
-            offsets=row(subject.offsets),
+            offsets=row(offsets),
         )
     return posed[0].double().numpy() @ play.R[frame].T + play.t[frame]
 

@@ -48,6 +48,8 @@ class TwinConfig:
     "Give subjects hair strands."
     wear: tuple[str, ...] = ()
     "What every subject wears or holds: glasses, hand, beard, moustache, fringe, microphone, mask."
+    personal: float = 0.0
+    "Movements, wrinkles and reddening of each person's own that no head model has; 1 is lively."
     noise: float = 1.0
     "Sensor noise relative to a good studio camera; 0 is none."
 
@@ -56,7 +58,7 @@ class TwinConfig:
             "subjects": (1, 10_000), "first_subject": (0, 99_999), "cameras": (1, 200),
             "width": (32, 16_384), "height": (32, 16_384), "frames_per_expression": (4, 10_000),
             "fps": (1, 1000), "crf": (0, 51), "board_frames": (0, 1000), "noise": (0, 100),
-            "seed": (0, 2**63 - 1),
+            "seed": (0, 2**63 - 1), "personal": (0, 2),
         }  # fmt: skip
         for name, (low, high) in limits.items():
             value = getattr(self, name)

@@ -12,6 +12,7 @@ import numpy as np
 
 from express50.geometry.sampling import smoothstep
 from express50.head.model import HeadModel
+from express50.twin.alive import LivingSkin
 from express50.twin.body import Body, Posed, model_materials
 from express50.twin.skin import SkinTexture, sample_skin
 from express50.twin.surface import (
@@ -107,10 +108,17 @@ class LitScene:
     attributes: np.ndarray
     posed: Posed
     iris_lattice: np.ndarray
+    living: LivingSkin | None
 
 
 def build_scene(
-    body: Body, texture: SkinTexture, eyes: TwinEyes, lighting: Lighting, posed: Posed, seed: int
+    body: Body,
+    texture: SkinTexture,
+    eyes: TwinEyes,
+    lighting: Lighting,
+    posed: Posed,
+    seed: int,
+    living: LivingSkin | None = None,
 ) -> LitScene:
     """Compile one frame: Embree scene, then light at every vertex."""
     caster = Caster(posed.vertices, body.faces)
@@ -135,7 +143,7 @@ def build_scene(
     attributes[solid, 9:] = reach[:, 1:]
     return LitScene(
         caster=caster, body=body, texture=texture, eyes=eyes, lighting=lighting,
-        attributes=attributes, posed=posed,
+        attributes=attributes, posed=posed, living=living,
         iris_lattice=make_lattice(np.random.default_rng([seed, body.subject.number, 10])),
     )  # fmt: skip
 
@@ -282,6 +290,8 @@ def _surface(
     """Return albedo (N, 3), strength and sharpness of the highlight at places on the mean head."""
     if kind == Material.SKIN:
         texel = sample_skin(scene.texture, place)
+        if scene.living is not None:
+            texel[:, :3] *= scene.living.factor(place)
         return texel[:, :3], 0.045 * texel[:, 3:], 22.0
     if kind == Material.EYE:
         return _eye_albedo(scene, place), 0.16, 240.0

@@ -15,6 +15,7 @@ from express50.files.images import encode_png
 from express50.files.video import ImageFootage, VideoFootage
 from express50.geometry.cameras import Camera
 from express50.head.load import load_head
+from express50.twin.alive import LivingSkin, living_skin
 from express50.twin.board import board_poses, render_board, studio_bands
 from express50.twin.body import Body, build_body, pose_body, with_hand
 from express50.twin.config import TwinConfig
@@ -37,7 +38,7 @@ def cast_subject(config: TwinConfig, subject_id: str) -> tuple[Body, TwinPerform
     """Make a subject's body and its performance."""
     # The number in the id, such as S001, seeds everything about the subject.
     model, number = _head(config.head), int(subject_id.removeprefix("S"))
-    subject = make_subject(model, subject_id, number, config.seed)
+    subject = make_subject(model, subject_id, number, config.seed, config.personal)
     # Strands follow the pixels: thin enough to be finer than one, not finer than can be seen.
     detail = float(np.clip(min(config.width, config.height) / 512, 0.6, 3.0))
     body = build_body(model, subject, config.seed, detail if config.hair else 0.0, config.wear)
@@ -95,7 +96,8 @@ def film_subject(
             stack.enter_context(films[-1])
         for frame in range(play.frames):
             posed = pose_body(body, play, frame)
-            scene = build_scene(body, texture, eyes, lighting, posed, seed)
+            living = skin_of(config, body, play, frame)
+            scene = build_scene(body, texture, eyes, lighting, posed, seed, living)
             hull = hull_of(posed.vertices)
             for view, film in zip(views, films, strict=True):
                 picture = render_view(scene, view, hull)
@@ -110,6 +112,14 @@ def film_subject(
             plate = np.concatenate([plate for _, plate in view.bands()])
             image = expose(view.sensor, plate, chance, config.noise)
             write_png(capture / "plates" / f"{view.camera.id}.png", image)
+
+
+def skin_of(config: TwinConfig, body: Body, play: TwinPerformance, frame: int) -> LivingSkin | None:
+    """Return how the skin looks in a frame; None where `twin.personal` is 0."""
+    if not config.personal:
+        return None
+    who = body.subject.number, config.seed, body.subject.look.age
+    return living_skin(body.model, *who, config.personal, play.expression[frame])
 
 
 def render_view(scene: LitScene, view: StudioView, hull: np.ndarray) -> np.ndarray:

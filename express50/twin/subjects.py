@@ -16,6 +16,7 @@ from express50.errors import HeadModelError
 from express50.geometry.sampling import smoothstep
 from express50.geometry.transforms import axis_angle_to_matrix, matrix_to_axis_angle
 from express50.head.model import HeadModel
+from express50.twin.alive import own_motion
 from express50.twin.rig import TARGET
 from express50.twin.surface import fractal, make_lattice
 
@@ -68,10 +69,13 @@ class TwinSubject:
     shape: np.ndarray  # (S,) coefficients
     offsets: np.ndarray  # (V, 3) metres, added at rest, orthogonal to the model's shape space
     look: PersonLook
+    own: np.ndarray | None = None  # (V, 3, 3) of `alive.own_motion`
 
 
-def make_subject(model: HeadModel, subject_id: str, number: int, seed: int) -> TwinSubject:
-    """Draw one subject; it depends on the seed and the subject's number only."""
+def make_subject(
+    model: HeadModel, subject_id: str, number: int, seed: int, personal: float = 0.0
+) -> TwinSubject:
+    """Draw one subject; it depends on the seed, the subject's number and `twin.personal` only."""
     rng = np.random.default_rng([seed, number, 1])
     shape = np.clip(rng.standard_normal(len(model.shape_names)), -2.5, 2.5)
     rng = np.random.default_rng([seed, number, 2])
@@ -90,7 +94,14 @@ def make_subject(model: HeadModel, subject_id: str, number: int, seed: int) -> T
     rms = np.sqrt((np.linalg.norm(field, axis=1)[weight > 0.5] ** 2).mean())
     offsets = (field * (OFFSET_RMS_M / rms)).astype(np.float32)
     look = _make_look(np.random.default_rng([seed, number, 3]), number)
-    return TwinSubject(id=subject_id, number=number, shape=shape, offsets=offsets, look=look)
+    own = None
+    if personal:
+        # The inside of the mouth goes with the lips, or it would come through them.
+        moved = np.where(model.regions["mouth_interior"].numpy(), 1.0, weight)
+        own = own_motion(model, number, seed, personal) * moved[:, None, None].astype(np.float32)
+    return TwinSubject(
+        id=subject_id, number=number, shape=shape, offsets=offsets, look=look, own=own
+    )
 
 
 def soft_mask(model: HeadModel) -> np.ndarray:

@@ -48,6 +48,8 @@ def write_truth(
     (folder / "peaks.json").write_text(json.dumps(play.peaks, indent=1) + "\n")
     np.savez_compressed(folder / "frames.npz", **{name: getattr(play, name) for name in _PLAY})
     extras = body.extras
+    if subject.own is not None:
+        np.savez_compressed(folder / "own.npz", own=subject.own)
     np.savez_compressed(
         folder / "body.npz",
         shape=subject.shape, offsets=subject.offsets, scalp=body.scalp, centre=body.centre,
@@ -185,11 +187,15 @@ class Truth:
         )
         with np.load(folder / "body.npz", allow_pickle=False) as stored:
             data = dict(stored)
+        own = None
+        if (folder / "own.npz").is_file():
+            with np.load(folder / "own.npz", allow_pickle=False) as stored:
+                own = stored["own"]
         look: dict[str, Any] = about["look"]
         look |= {name: np.array(value) for name, value in look.items() if isinstance(value, list)}
         person = TwinSubject(
             id=about["id"], number=about["number"], shape=data["shape"], offsets=data["offsets"],
-            look=PersonLook(**look),
+            look=PersonLook(**look), own=own,
         )  # fmt: skip
         # What only colours need is left empty.
         blank = np.zeros_like(data["hair_vertices"])
