@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.budget build/budget`` records twin captures, runs the chain for five budgets
 from a minute to an hour and with every preset, and measures each run against the truth. ``--quick``
-takes one person of two expressions at 192 px, one pilot for all runs, and three budgets along the
+takes one person of two expressions, one pilot for all runs, and three budgets along the
 front, in processor time, which means something on a busy machine too. ``--captures`` takes footage
 without truth: errors are then differences from the dearest run, and promises cannot be checked.
 The last line printed is one JSON object.
@@ -22,8 +22,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks import accuracy
 from benchmarks.demo import EXPRESSIONS, record_twin
+from benchmarks.intervals_collect import peak_samples, row_samples
 from express50.contract.config import PRESETS
 from express50.contract.layout import Dataset
 from express50.contract.stage import stages
@@ -33,13 +33,15 @@ from express50.runner.ledger import Ledger
 from express50.twin.truth import Truth
 
 TWIN = {"subjects": 3, "cameras": 8, "width": 320, "height": 320, "frames-per-expression": 6}
-QUICK = {"subjects": 1, "cameras": 6, "width": 192, "height": 192, "frames-per-expression": 6}
+QUICK = {"subjects": 1, "cameras": 8, "width": 320, "height": 320, "frames-per-expression": 6}
 BUDGETS = ("1m", "5m", "15m", "30m", "1h")
-TRUE = {
-    "mesh": (accuracy.measure_track, "vertex_rmse_mm"),
-    "depth": (accuracy.measure_depth, "abs_error_mm_median"),
-    "mattes": (accuracy.measure_matte, "mae"),
-    "peaks": (accuracy.measure_align, "peak_error_frames_mean"),
+# Stages whose samples hold the true errors of each result, as the stage states its own.
+MAKERS = {
+    "register": "mesh",
+    "track": "track",
+    "depth": "depth",
+    "matte": "mattes",
+    "align": "peaks",
 }
 
 
@@ -143,13 +145,20 @@ def measure_all(out: Path, runs: Sequence[Run], truth: Truth | None) -> None:
     for run in runs:
         dataset = Dataset(out / run.name)
         if truth is not None:
-            run.errors = {
-                name: float(measure(dataset, truth)[key]) for name, (measure, key) in TRUE.items()
-            }
+            run.errors = true_errors(dataset, truth)
         elif dataset.root != best.root:
             rows = [differences(dataset, best, s, RESULTS) for s in dataset.subjects()]
             names = rows[0].keys()
             run.errors = {name: float(np.mean([row[name] for row in rows])) for name in names}
+
+
+def true_errors(dataset: Dataset, truth: Truth) -> dict[str, float]:
+    """Return the typical error of each result's items, in the measure that its stage states."""
+    rows: dict[str, list[float]] = {}
+    for sample in (*row_samples(dataset, truth), *peak_samples(dataset, truth)):
+        typical = np.mean if sample.stage == "matte" else np.median
+        rows.setdefault(MAKERS[sample.stage], []).append(float(typical(sample.errors)))
+    return {name: float(np.median(values)) for name, values in rows.items()}
 
 
 def figures(runs: Sequence[Run], grid: Sequence[Run], true: bool) -> dict:
@@ -157,7 +166,7 @@ def figures(runs: Sequence[Run], grid: Sequence[Run], true: bool) -> dict:
     everyone = [*runs, *grid]
     scale = {
         name: max(float(np.median([r.errors[name] for r in everyone if name in r.errors])), 1e-9)
-        for name in TRUE
+        for name in MAKERS.values()
         if any(name in r.errors for r in everyone)
     }
 

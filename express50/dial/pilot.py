@@ -229,6 +229,12 @@ def stated_errors(
     return found
 
 
+def last_maker(names: Sequence[str], kinds: Sequence[ResultKind]) -> int:
+    """Return the number of the last stage that makes a measured result; -1 where none does."""
+    makers = [name for kind in kinds for name in kind.made_by(names)]
+    return max((list(names).index(name) for name in makers), default=-1)
+
+
 def tradable(
     names: Sequence[str], ladders: Mapping[str, Ladder], kinds: Sequence[ResultKind]
 ) -> list[str]:
@@ -236,28 +242,50 @@ def tradable(
 
     What a later stage's settings do cannot be measured here, so it keeps its standard one.
     """
-    makers = [name for kind in kinds for name in kind.made_by(names)]
-    last = max((list(names).index(name) for name in makers), default=-1)
+    last = last_maker(names, kinds)
     return [name for name in names[: last + 1] if len(ladders[name]) > 1]
+
+
+def broken_stage(pilot: Pilot, trial: Trial) -> str:
+    """Return the first stage that made nothing, if a measured result needs it; else nothing."""
+    names = [stage.name for stage in pilot.stages]
+    last = last_maker(names, pilot.kinds)
+    return next((name for name in names[: last + 1] if name in trial.failed), "")
+
+
+def _base(pilot: Pilot, settings: dict[str, str], choices: Sequence[str]) -> Trial:
+    """Run the first trial; a stage that makes nothing at its cheapest setting is set higher."""
+    while True:
+        base = pilot.trial(settings, PEAKS, None)
+        broken = broken_stage(pilot, base)
+        ladder = list(pilot.ladders.get(broken, ()))
+        if broken not in choices or settings[broken] == ladder[-1] or pilot.clock.closed():
+            return base
+        settings |= {broken: ladder[ladder.index(settings[broken]) + 1]}
+        pilot.tell(f"{broken} made nothing at its cheapest; trying {settings[broken]}")
 
 
 def measure(pilot: Pilot, allowance: float) -> PilotFigures:
     """Run trials, the cheapest first, as far as the allowance of time goes.
 
-    The first one, at the cheapest settings, always runs to its end or to that of the budget.
+    The first one, at the cheapest settings, always runs to its end or to that of the budget. Where
+    a stage makes nothing whatever its settings, it stays the only one.
     """
     names = [stage.name for stage in pilot.stages]
     choices = tradable(names, pilot.ladders, pilot.kinds)
     cheapest = {n: next(iter(pilot.ladders[n])) if n in choices else standard_of(pilot.ladders[n])
                 for n in names}  # fmt: skip
     pilot.tell(f"measuring on {PEAKS} expressions of one subject; every stage at its cheapest")
-    base = pilot.trial(cheapest, PEAKS, None)
+    base = _base(pilot, cheapest, choices)
+    cheapest = base.settings
     began, trials = pilot.clock.now(), [base]
     untried: dict[str, list[str]] = {}
     key = key_of(pilot.stages, pilot.ladders, pilot.pool.threads)
-    if pilot.clock.closed():
+    if pilot.clock.closed() or broken_stage(pilot, base):
         return PilotFigures(key=key, trials=trials, losses={})
-    steps = [(name, label) for name in choices for label in list(pilot.ladders[name])[1:]]
+    ladders = {name: list(pilot.ladders[name]) for name in choices}
+    higher = {n: ladder[ladder.index(cheapest[n]) + 1 :] for n, ladder in ladders.items()}
+    steps = [(name, label) for name, labels in higher.items() for label in labels]
     steps.sort(key=lambda step: _guess(base, names, step[0]))
     grown: dict[str, float] = {}
     if base.footage.expressions > 1 and _guess(base, names, names[0]) < allowance:

@@ -7,20 +7,23 @@ stage that makes it, so that nothing here knows a stage by name.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from express50.capture.frames import read_cameras_of
 from express50.contract.layout import Dataset
 from express50.dataset.depth_files import depth_file, read_depth
-from express50.dataset.tracks import best_vertices, read_track
-from express50.errors import FormatError
+from express50.dataset.tracks import read_registration, read_track
+from express50.errors import Express50Error, FormatError
 from express50.files.images import read_image
 from express50.files.text import read_json_table
 from express50.geometry.transforms import rigid_fit
 
+RIM = 0.008  # share of a picture's longer side: how wide the band about an outline is
 COMPARED = 4  # cameras of an expression; more change the mean by less than expressions do
 
 
@@ -31,7 +34,7 @@ class ResultKind:
     Attributes:
         name: for people.
         unit: of its error.
-        places: paths of it; of a subject's expression and camera. The last one made counts.
+        places: paths of it; of a subject's expression and camera. Of several, the last one counts.
         apart: how far the results of a subject in two datasets differ, of each of the expressions.
     """
 
@@ -54,8 +57,9 @@ def whole_peaks(dataset: Dataset, subject: str) -> Path:
 
 
 def _peak_frames(dataset: Dataset, subject: str) -> dict[str, int]:
-    whole, path = whole_peaks(dataset, subject), dataset.peaks_file(subject)
-    rows = read_json_table(whole if whole.is_file() else path, FormatError)
+    paths = whole_peaks(dataset, subject), dataset.peaks_file(subject)
+    path = next((path for path in paths if path.is_file()), None)
+    rows = read_json_table(path, FormatError) if path else {}
     return {name: int(row["frame"]) for name, row in rows.items()}
 
 
@@ -72,9 +76,9 @@ def differences(
     found = {}
     for kind in kinds:
         names = sorted(one.keys() & two.keys()) if kind.apart is _frames_apart else same
-        values = list(kind.apart(a, b, subject, names))
-        if values:
-            found[kind.name] = float(np.mean(values))
+        with suppress(Express50Error):  # a stage before it made nothing
+            if values := list(kind.apart(a, b, subject, names)):
+                found[kind.name] = float(np.mean(values))
     return found
 
 
@@ -84,32 +88,50 @@ def _frames_apart(a: Dataset, b: Dataset, subject: str, names: Sequence[str]) ->
 
 
 def _mattes_apart(a: Dataset, b: Dataset, subject: str, names: Sequence[str]) -> list[float]:
+    """Compare pixels about either outline, as the error of a matte is stated."""
     cameras = list(read_cameras_of(a, subject))
     found = []
     for name in names:
         pairs = [[d.matte_file(subject, name, c) for d in (a, b)] for c in cameras]
         there = [pair for pair in pairs if all(path.is_file() for path in pair)]
         for pair in there[:COMPARED]:
-            one, two = (read_image(path).astype(np.float32) / 255 for path in pair)
+            one, two = (read_image(path) for path in pair)
             if one.shape == two.shape:
-                found.append(float(np.abs(one - two).mean()))
+                reach = np.ones([2 * max(1, round(RIM * max(one.shape))) + 1] * 2, np.uint8)
+                highest = cv2.dilate(np.maximum(one, two), reach)
+                rim = (highest > 12) & (cv2.erode(np.minimum(one, two), reach) < 243)
+                apart = np.abs(one[rim].astype(np.float32) - two[rim]) / 255
+                found.append(float(apart.mean()) if rim.any() else 0.0)
     return found
 
 
-def _meshes_apart(a: Dataset, b: Dataset, subject: str, names: Sequence[str]) -> list[float]:
-    """Compare vertices after one rigid motion: solved rigs have worlds of their own."""
-    if not all(dataset.track_file(subject).is_file() for dataset in (a, b)):
+def _tracks_apart(a: Dataset, b: Dataset, subject: str, names: Sequence[str]) -> list[float]:
+    paths = [dataset.track_file(subject) for dataset in (a, b)]
+    if not all(path.is_file() for path in paths):
         return []
-    tracks = [read_track(dataset.track_file(subject)) for dataset in (a, b)]
-    meshes = [best_vertices(d, subject, t) for d, t in zip((a, b), tracks, strict=True)]
+    tracks = [read_track(path) for path in paths]
     same = [name for name in names if all(name in track.expressions for track in tracks)]
-    if not same or meshes[0].shape[1:] != meshes[1].shape[1:]:
+    return _medians_apart([[t.vertices[t.row(name)] for name in same] for t in tracks])
+
+
+def _meshes_apart(a: Dataset, b: Dataset, subject: str, names: Sequence[str]) -> list[float]:
+    files = [[d.registration_file(subject, name) for d in (a, b)] for name in names]
+    there = [pair for pair in files if all(path.is_file() for path in pair)]
+    both = [[read_registration(path).vertices for path in pair] for pair in there]
+    return _medians_apart([[pair[k] for pair in both] for k in (0, 1)])
+
+
+def _medians_apart(meshes: Sequence[Sequence[np.ndarray]]) -> list[float]:
+    """Return the median distance of vertices of E pairs of meshes (V, 3), millimetres.
+
+    One rigid motion is taken out before: solved rigs have worlds of their own.
+    """
+    if not meshes[0] or meshes[0][0].shape != meshes[1][0].shape:
         return []
-    rows = [[track.row(name) for name in same] for track in tracks]
-    one, two = (m[r].reshape(-1, 3).astype(float) for m, r in zip(meshes, rows, strict=True))
+    one, two = (np.concatenate(list(some)).astype(np.float64) for some in meshes)
     R, t = rigid_fit(one, two)
-    squares = ((one @ R.T + t - two) ** 2).sum(axis=1).reshape(len(same), -1)
-    return list(1000 * np.sqrt(squares.mean(axis=1)))
+    apart = np.linalg.norm(one @ R.T + t - two, axis=1).reshape(len(meshes[0]), -1)
+    return list(1000 * np.median(apart, axis=1))
 
 
 def _depths_apart(a: Dataset, b: Dataset, subject: str, names: Sequence[str]) -> list[float]:
@@ -126,12 +148,8 @@ def _depths_apart(a: Dataset, b: Dataset, subject: str, names: Sequence[str]) ->
 
 
 RESULTS = (
-    ResultKind(
-        "mesh",
-        "mm",
-        (lambda d, s, e, c: d.track_file(s), lambda d, s, e, c: d.registration_file(s, e)),
-        _meshes_apart,
-    ),
+    ResultKind("mesh", "mm", (lambda d, s, e, c: d.registration_file(s, e),), _meshes_apart),
+    ResultKind("track", "mm", (lambda d, s, e, c: d.track_file(s),), _tracks_apart),
     ResultKind("depth", "mm", (lambda d, s, e, c: d.surface_file(s, e),), _depths_apart),
     ResultKind("mattes", "alpha", (Dataset.matte_file,), _mattes_apart),
     ResultKind("peaks", "frames", (lambda d, s, e, c: d.peaks_file(s),), _frames_apart),

@@ -36,6 +36,7 @@ from express50.dial.footage import Footage, footage_of
 from express50.dial.pilot import (
     Ladder,
     Pilot,
+    broken_stage,
     keep_for_run,
     key_of,
     measure,
@@ -124,19 +125,23 @@ class Chain:
         subjects = [s for s in self.dataset.captures() if not exclusion_reason(self.dataset, s)]
         if not subjects:
             raise StageError(f"{self.dataset.root}: no capture is registered; name a CAPTURE")
-        first, reason = self.stages[0].name, ""
+        reason = ""
         for subject in subjects[:PILOTS]:
             pilot = Pilot(
                 self.dataset, subject, self.stages, self.ladders, self.pool, clock, self.tell,
                 self.kinds,
             )  # fmt: skip
             found = measure(pilot, allowance)
-            reason = found.trials[0].failed.get(first, "")
-            if not reason:
+            broken = broken_stage(pilot, found.trials[0])
+            reason = f"{broken}: {found.trials[0].failed[broken]}" if broken else ""
+            if not reason or clock.closed():
                 break
             self.tell(f"{subject} cannot be measured: {reason}")
         if found is None or reason:
-            raise StageError(f"{self.dataset.root}: nothing could be measured: {reason}")
+            raise StageError(
+                f"{self.dataset.root}: no subject could be measured: {reason}; correct that, or "
+                "run without --budget to see what each stage says"
+            )
         if not clock.closed():  # folders of trials go; no figure names a person
             trials = [replace(trial, folder="") for trial in found.trials]
             write_json(path, asdict(replace(found, trials=trials)))

@@ -12,7 +12,7 @@ from express50.dial.figures import dial_dir
 from express50.dial.pilot import pilot_dir
 from express50.dial.run import closing_lines, run_within
 from express50.dial.tune import tune
-from express50.errors import ConfigError
+from express50.errors import ConfigError, StageError
 from express50.runner.runner import run_stage
 from tests.express50.dial.toy_chain import (
     FAILS,
@@ -191,6 +191,17 @@ def test_a_setting_that_fails_in_the_pilot_is_not_chosen(tmp_path, captures, mon
     monkeypatch.setenv(FAILS, "solve 16")
     _, state = go(tmp_path / "e", captures, "5m")
     assert state.finished and state.settings["solve"] == "standard"
+
+
+def test_a_stage_that_fails_at_every_setting_is_named_and_nothing_else_is_tried(
+    tmp_path, captures, monkeypatch
+):
+    monkeypatch.setenv(FAILS, "solve")
+    said = []
+    with pytest.raises(StageError, match=r"no subject could be measured: solve: .* lead nowhere"):
+        go(tmp_path / "d", captures, "5m", said=said)
+    assert sum("cannot be measured" in line for line in said) == 3
+    assert not any(line.startswith("measuring map") for line in said)
 
 
 def test_core_hours_count_processor_time_alone(tmp_path, captures):
