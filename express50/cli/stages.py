@@ -105,7 +105,7 @@ def run_all(args: argparse.Namespace) -> int:
 def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None) -> int:
     from express50.runner.executor import Pool
     from express50.runner.preflight import problems
-    from express50.runner.runner import run_stage
+    from express50.runner.runner import Summary, run_stage
     from express50.runner.threads import cap_threads
 
     check_workers(args)
@@ -122,7 +122,7 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
             address = "tcp://ADDRESS-OF-THE-RUN"
             say(job_script(job, address, "express50-N", args.threads, logs).rstrip())
         return OK
-    summaries = []
+    summaries: list[Summary] = []
     with (
         stdout_to_stderr() if args.json else nullcontext(),
         Pool(args.workers, args.scheduler, args.threads, slurm) as pool,
@@ -135,6 +135,10 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
             return USAGE
         for stage, config in work:
             items = _items(stage, dataset, args, pattern)
+            failed = [summary.stage for summary in summaries if not summary.ok]
+            if failed and not (stage.items(dataset) if items is None else items):
+                log(f"express50: {stage.name} has nothing to do, as {failed[-1]} failed; see above")
+                break
             summaries.append(run_stage(stage, dataset, config, items, pool=pool))
             if not args.json:
                 say_account(stage, dataset, summaries[-1])

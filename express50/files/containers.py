@@ -56,14 +56,18 @@ def inside(root: Path, name: str) -> Path:
     """Return the path of a name relative to a folder.
 
     Raises:
-        CaptureError: it is absolute or leads out of the folder.
+        CaptureError: it is absolute, leads out of the folder, or is a link to itself.
     """
     pure = PurePosixPath(name)
     path = root / name
     out = pure.is_absolute() or ".." in pure.parts or not name.isprintable()
     if any(len(part.encode(errors="replace")) > NAME_LIMIT for part in pure.parts):
         raise CaptureError(f"{root}: {name[:40]!r}... is longer than a name may be")
-    if out or not path.resolve().is_relative_to(root.resolve()):
+    try:
+        out = out or not path.resolve().is_relative_to(root.resolve())
+    except RuntimeError:  # what pathlib raises of links in a circle
+        raise CaptureError(f"{root}: {name!r} is a link to itself; copy the file there") from None
+    if out:
         raise CaptureError(f"{root}: {name!r} leads out of it; expected a name inside it")
     return path
 

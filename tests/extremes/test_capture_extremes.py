@@ -101,6 +101,12 @@ def test_a_link_out_of_the_folder_is_no_way_out(tmp_path):
         read_picture(folder, "a.png")
 
 
+def test_a_link_to_itself_is_named(tmp_path):
+    (tmp_path / "a.png").symlink_to("a.png")
+    with pytest.raises(CaptureError, match="'a.png'"):
+        read_picture(tmp_path, "a.png")
+
+
 def test_transforms_with_paths_out_of_the_folder(tmp_path):
     path = layouts.write_transforms(tmp_path)
     table = json.loads((path / "transforms.json").read_text())

@@ -155,6 +155,14 @@ def test_errors_are_one_line_with_their_exit_code(run, data, capture, arguments,
     assert "Traceback" not in err
 
 
+def test_a_chain_that_cannot_go_on_ends_with_the_cause(run, data, tmp_path):
+    make_capture(tmp_path / "S002", subject="S002", cameras=1)
+    (tmp_path / "S002" / "cues.csv").write_text("expression_id\n")
+    code, _, err = run("run", data, tmp_path / "S002", "--workers", "0")
+    assert code == 1
+    assert "calibrate has nothing to do, as ingest failed" in err.splitlines()[-1]
+
+
 def test_a_dataset_in_the_place_of_a_capture_is_refused(run, data, capture):
     assert run("ingest", data, capture)[0] == 0
     code, _, err = run("ingest", data.parent / "new", data)
