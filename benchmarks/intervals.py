@@ -157,7 +157,11 @@ def measure(rows: Sequence[Row]) -> dict:
         },
         **sparsification(depth),
         "rows": table,
-        "not_run": [one.name for one in CONDITIONS if one.name not in {name for name, _ in rows}],
+        "not_run_through_the_chain": [
+            one.name
+            for one in CONDITIONS
+            if one.name not in {name for name, sample in rows if sample.stage == "matte"}
+        ],
         "not_measured": {
             "focal lengths under 310 px": "a head does not fit the twin's picture",
             "grmm": "it states no interval",
@@ -219,9 +223,9 @@ def write_models(rows: Sequence[Row]) -> None:
     former = json.loads(FILE.read_text())["stages"]
     models: dict[str, ErrorModel] = {}
     for stage, unit in UNITS.items():
-        mine = [sample for _, sample in rows if sample.stage == stage]
+        mine = [(name, sample) for name, sample in rows if sample.stage == stage]
         if stage == "register" and "track" in models:
-            mine = [with_tracked(sample, models["track"]) for sample in mine]
+            mine = [(name, with_tracked(sample, models["track"])) for name, sample in mine]
         if mine:
             models[stage] = fit_model(mine, unit)
     fitted = {stage: _rounded(asdict(model)) for stage, model in models.items()}

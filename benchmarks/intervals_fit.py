@@ -18,16 +18,35 @@ FLOORS = {"mm": 0.02, "px": 0.002, "alpha": 0.002, "frames": 0.3, "dB": 0.1}
 LEAST = {"mm": 1e-4, "px": 1e-4, "alpha": 1e-4, "frames": 0.5, "dB": 1e-4}
 """Bounds are no less: a peak lies somewhere within its frame."""
 ROW_LEVEL = 0.05  # share of a figure's variance within items under which it describes the item
+NORMAL = 1.645  # standard deviations to either side that hold nine in ten
 RIDGE = 0.003, 0.03  # of weights within and between items: variances of logarithms
 
 
-def fit_model(samples: Sequence[Sample], unit: Unit) -> ErrorModel:
+def fit_model(rows: Sequence[tuple[str, Sample]], unit: Unit) -> ErrorModel:
     """Fit weights by least squares of logarithms, then the table; every item counts alike.
 
     Figures of elements are weighed by what they say within items, figures of whole items by what is
-    left between items: otherwise a few items would decide what a pixel's figure means.
+    left between items: otherwise a few items would decide what a pixel's figure means. The items'
+    intervals come from items of conditions that their model did not see. `rows` name the condition
+    of each sample.
     """
-    samples = [s for s in samples if not s.shared.any()]  # what is shared is known, not fitted
+    rows = [(name, s) for name, s in rows if not s.shared.any()]  # that is known, not fitted
+    names = list(dict.fromkeys(name for name, _ in rows))
+    model = _fit([sample for _, sample in rows], unit)
+    ratios: dict[str, list[float]] = {}
+    for name in names:
+        others = [sample for other, sample in rows if other != name]
+        unseen = _fit(others, unit) if others else model
+        for sample in (sample for other, sample in rows if other == name):
+            typical = error_bounds("", sample.figures, 0.0, unseen).typical
+            ratio = item_error(sample.errors, unit) / item_error(typical, unit)
+            person = sample.item.split("/")[0]
+            ratios.setdefault(person, []).append(float(np.log(max(ratio, TINY))))
+    return replace(model, item=_item_ratios(ratios, unit))
+
+
+def _fit(samples: Sequence[Sample], unit: Unit) -> ErrorModel:
+    """Fit all but the items' intervals."""
     names = tuple(samples[0].figures)
     logs = [_logarithms(s, names) for s in samples]
     known = np.concatenate(logs)
@@ -44,8 +63,7 @@ def fit_model(samples: Sequence[Sample], unit: Unit) -> ErrorModel:
     share = np.concatenate([np.full(len(s.errors), 1 / len(s.errors)) for s in samples])
     errors = np.maximum(np.concatenate([s.errors for s in samples]), LEAST[unit])
     knots, typical, bound = _table(score, errors, share)
-    model = replace(model, scores=knots, typical=typical, bound=bound)
-    return replace(model, item=_item_ratios(model, samples))
+    return replace(model, scores=knots, typical=typical, bound=bound)
 
 
 def _proportional(names: tuple[str, ...], unit: Unit, samples: Sequence[Sample]) -> ErrorModel:
@@ -53,8 +71,7 @@ def _proportional(names: tuple[str, ...], unit: Unit, samples: Sequence[Sample])
     ratios = np.concatenate([s.errors / s.figures[names[0]] for s in samples])
     typical, bound = (np.log(np.quantile(ratios, [q])) for q in (0.5, NOMINAL))
     wide = np.array([[np.log(TINY), -np.log(TINY)]])
-    model = ErrorModel(unit, names, np.ones(1), wide, np.zeros(1), typical, bound, (1, 1, 1))
-    return replace(model, item=_item_ratios(model, samples))
+    return ErrorModel(unit, names, np.ones(1), wide, np.zeros(1), typical, bound, (1, 1, 1))
 
 
 def _logarithms(sample: Sample, names: Sequence[str]) -> np.ndarray:
@@ -124,30 +141,28 @@ def _quantile(values: np.ndarray, weights: np.ndarray, level: float) -> float:
     return float(values[order[row]])
 
 
-def _item_ratios(model: ErrorModel, samples: Sequence[Sample]) -> tuple[float, float, float]:
+def _item_ratios(ratios: dict[str, list[float]], unit: Unit) -> tuple[float, float, float]:
     """Return the ends and middle of items' errors over what their elements let expect.
 
-    People differ more than items of one person do, and few people were recorded: the ends are those
-    of Student's prediction interval for the logarithm of another person's item. With one person
-    they lie a factor of two away.
+    `ratios` are their logarithms by person. People differ more than items of one person do, and few
+    people were recorded: the ends are those of Student's prediction interval for another person's
+    item. With one person they lie a factor of two further away.
     """
-    groups: dict[str, list[float]] = {}
-    for sample in samples:
-        typical = error_bounds("", sample.figures, 0.0, model).typical
-        ratio = item_error(sample.errors, model.unit) / item_error(typical, model.unit)
-        groups.setdefault(sample.item.split("/")[0], []).append(np.log(max(ratio, TINY)))
-    if model.unit == "frames":  # whole frames: most are 0
+    if unit == "frames":  # whole frames: most are 0
         return 0.0, 0.0, 1.0
-    means = [float(np.mean(rows)) for rows in groups.values()]
-    within = float(np.mean([np.var(rows) for rows in groups.values()]))
-    count = len(means)
-    spread = np.log(2.0)
+    means = [float(np.mean(rows)) for rows in ratios.values()]
+    several = [float(np.var(rows)) for rows in ratios.values() if len(rows) > 1]
+    within = sum(several) / max(len(several), 1)
+    count, spread = len(means), np.log(2.0) + NORMAL * np.sqrt(within)
     if count > 1:
         between = float(np.var(means, ddof=1))
         reach = float(stats.t.ppf((1 + NOMINAL) / 2, count - 1))
-        spread = reach * np.sqrt(between * (1 + 1 / count) + within)
-    middle = float(np.mean(means))
-    return tuple(float(np.exp(middle + way * spread)) for way in (-1, 0, 1))  # type: ignore[return-value]
+        spread = float(
+            np.hypot(reach * np.sqrt(between * (1 + 1 / count)), NORMAL * np.sqrt(within))
+        )
+    middle = float(np.median([value for rows in ratios.values() for value in rows]))
+    low, value, high = (float(np.exp(middle + way * spread)) for way in (-1, 0, 1))
+    return low, value, high
 
 
 def ause(errors: np.ndarray, doubt: np.ndarray, steps: int = 50) -> float:

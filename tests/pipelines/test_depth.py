@@ -11,7 +11,7 @@ from express50.errors import StageError
 from express50.geometry.cameras import rays
 from express50.geometry.raycast import mesh_scene
 from pipelines.depth.blocks import build
-from pipelines.depth.maps import cast_maps
+from pipelines.depth.maps import cast_maps, surface_maps
 from pipelines.depth.prior import boundary_loops, close_mesh, matte_agreement
 from pipelines.depth.reconstruct import reconstruct
 from pipelines.depth.stage import write_ply
@@ -184,10 +184,10 @@ def test_two_runs_give_the_same_surface(surface, views):
 
 
 def test_confidence_separates_good_depth_from_bad(surface, shots):
-    scene = mesh_scene(surface.vertices, surface.faces)
+    maps, _ = surface_maps(surface, [shot[:3] for shot in shots])
     sure, unsure = [], []
-    for camera, _, alpha, true in shots:
-        view = cast_maps(surface, scene, camera, alpha)
+    for camera, _, _, true in shots:
+        view = maps[camera.id]
         error = np.abs(view.depth - true)
         both = view.valid & (true > 0)
         cut = np.median(view.confidence[both])

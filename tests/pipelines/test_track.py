@@ -339,10 +339,13 @@ def test_stage_writes_the_contracted_file(tracked_dataset, tmp_path: Path) -> No
         ).numpy()  # fmt: skip
         world = np.einsum("eij,evj->evi", track["R"], posed) + track["t"][:, None]
         np.testing.assert_allclose(track["vertices"], world, atol=1e-6)
+        for doubt in (track["sigma"], track["bound"]):
+            assert np.isfinite(doubt).all() and (doubt > 0).all()
     assert shapes == {
         "schema": (), "head": (), "expressions": (2,), "frames": (2,), "shape": (5,),
         "expression": (2, 4), "neck": (2, 3), "jaw": (2, 3), "eyes": (2, 6), "R": (2, 3, 3),
         "t": (2, 3), "vertices": (2, 90, 3), "offsets": (90, 3),
+        "sigma": (2, 90), "bound": (2, 90),
     }  # fmt: skip
 
 
