@@ -142,8 +142,7 @@ def measure(dataset_root: Path, truth_root: Path, item: str, name: str) -> dict 
     sure = None
     if name in PRESETS:
         found["raycast"] = both_ways(surface, [camera for camera, _, _ in pictures[::8]])
-        maps, _ = surface_maps(surface, pictures)
-        sure = {name: view.confidence for name, view in maps.items()}
+        sure = {name: view.confidence for name, view, _ in surface_maps(surface, pictures)}
     return found | score(mesh, truth, subject, frame, pictures, sure)
 
 

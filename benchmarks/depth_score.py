@@ -49,7 +49,7 @@ def compare(
     seen = transform_camera(camera, motion)
     true_depth, true_valid = truth.render_depth(subject, frame, seen)
     depth, normals = cast(mesh, camera)
-    both = np.isfinite(depth) & (alpha > 0.5) & true_valid
+    both = np.isfinite(depth) & (alpha > 127) & true_valid
     errors = 1e3 * np.abs(np.where(both, depth, 0) - true_depth)
     skin = both & truth.skin(subject, frame, seen)
     head = truth.vertices(subject, frame), truth.head_model(subject).faces.numpy()

@@ -167,13 +167,11 @@ def _depth(peak: _Peak) -> Iterator[Sample]:
         mesh = track.vertices[track.row(peak.expression)].astype(np.float64)
         solid = close_mesh(mesh, load_head(track.head).faces.numpy())
     pictures = [
-        (peak.cameras[n], peak.frame_of(n), peak.alpha(n).astype(np.float32) / 255)
-        for n in surface.figures["cameras"]
+        (peak.cameras[n], peak.frame_of(n), peak.alpha(n)) for n in surface.figures["cameras"]
     ]
-    maps, _ = surface_maps(surface, pictures, solid)
     parts, errors, shared, old, skin = [], [], [], [], []
     lone = PEOPLE_DIFFER if len(pictures) == 1 else 0.0
-    for name, view in maps.items():
+    for name, view, _ in surface_maps(surface, pictures, solid):
         place = peak.subject, peak.frame, peak.true_camera(name)
         true, there = peak.truth.render_depth(*place)
         both = there[view.valid]

@@ -76,11 +76,13 @@ def write_normals(path: Path, normals: np.ndarray, valid: np.ndarray) -> None:
     Raises:
         ValueError: a valid normal is not finite or not of unit length.
     """
-    length = np.linalg.norm(normals[valid], axis=-1)
+    known = normals[valid]
+    length = np.linalg.norm(known, axis=-1)
     if length.size and not np.abs(length - 1).max() < 1e-3:  # NaN fails as well
         raise ValueError(f"{path.name}: valid normals must be finite and of unit length")
-    code = np.rint(np.where(valid[..., None], normals, -1) * NORMAL_STEPS) + NORMAL_STEPS + 1
-    write_image(path, np.where(valid[..., None], np.clip(code, 1, 255), 0).astype(np.uint8))
+    code = np.zeros(normals.shape, np.uint8)
+    code[valid] = np.clip(np.rint(known * NORMAL_STEPS) + NORMAL_STEPS + 1, 1, 255)
+    write_image(path, code)
 
 
 def read_normals(path: Path) -> tuple[np.ndarray, np.ndarray]:

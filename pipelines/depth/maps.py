@@ -9,7 +9,7 @@ al. 2006). `express50.error_model` turns these figures into millimetres.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -17,7 +17,7 @@ import numpy as np
 import open3d as o3d
 
 from express50.error_model import PEOPLE_DIFFER, Bounds, error_bounds
-from express50.geometry.cameras import Camera, rays
+from express50.geometry.cameras import Camera, crop_camera, rays
 from express50.geometry.raycast import barycentrics, camera_rays, mesh_scene
 from express50.geometry.sampling import bilinear
 from pipelines.depth.prior import TrackedSolid
@@ -33,8 +33,10 @@ FLAT = 4.0  # tangent of the angle between line of sight and normal from which c
 HIDDEN_M = 0.004  # metres behind the neighbour's own depth at which a point counts as hidden
 WINDOW = 5  # pixels, odd: colours around a wrong depth agree here and there by chance
 
+GRAINS = 7  # of so many pixels one is taken for the typical grain of all views
+
 Pictures = list[tuple[Camera, np.ndarray, np.ndarray]]
-"""Cameras with their full-size frames (H, W, 3) uint8 and mattes (H, W) float32."""
+"""Cameras with their full-size frames (H, W, 3) and mattes (H, W), uint8."""
 
 
 @dataclass(frozen=True)
@@ -103,44 +105,80 @@ class PhotoErrors:
 
 def surface_maps(
     surface: HeadSurface, pictures: Pictures, solid: TrackedSolid | None = None
-) -> tuple[dict[str, DepthMaps], dict[str, PhotoErrors]]:
-    """Make every camera's maps of the surface and its neighbours' errors, by camera.
+) -> Iterator[tuple[str, DepthMaps, PhotoErrors]]:
+    """Yield camera id, maps of the surface and neighbours' errors of one camera after the other.
 
-    What stands off the tracked head, `solid`, is hair or cloth, or wrong.
+    What stands off the tracked head, `solid`, is hair or cloth, or wrong. All cameras' maps
+    together would take gigabytes.
     """
     apart = None
     if solid is not None:
         query = o3d.core.Tensor(surface.vertices.astype(np.float32))
         apart = 1e3 * solid.scene.compute_distance(query, nthreads=1).numpy()
     scene = mesh_scene(surface.vertices, surface.faces)
-    photo = photo_errors([compared_view(scene, *row) for row in pictures])
-    middle = surface.vertices.mean(0)
-    pixels = [np.linalg.norm(c.center - middle) / c.K[0, 0] for c, _, _ in pictures]
-    common = {
-        "voxel_mm": surface.figures["voxel_mm"],
-        "pixel_mm": 1e3 * float(np.median(pixels)),
-        "views": float(len(pictures)),
-    }
-    known = np.concatenate([one.errors[np.isfinite(one.errors)] for one in photo])
-    common["photo_all"] = float(np.median(known)) if len(known) else np.inf
-    seen_maps = [cast_maps(surface, scene, c, alpha, apart) for c, _, alpha in pictures]
-    grains = [grain(rgb)[seen.valid] for (_, rgb, _), seen in zip(pictures, seen_maps, strict=True)]
-    every = np.concatenate(grains)
-    common["grain_all"] = float(np.median(every)) if len(every) else np.inf
-    maps = {}
-    rows = zip(pictures, seen_maps, grains, photo, strict=True)
-    for (camera, _, _), seen, grained, errors in rows:
+    shots = [compared_view(scene, c, rgb, a.astype(np.float32) / 255) for c, rgb, a in pictures]
+    photo = photo_errors(shots)
+    common = common_figures(surface, pictures, photo)
+    for (camera, rgb, alpha), errors in zip(pictures, photo, strict=True):
+        seen = cast_window(surface, scene, camera, alpha, apart)
         figures = {
             **seen.figures,
             **common,
             "photo": smoothed_errors(errors, seen.valid, WINDOW),
             "photo_wide": smoothed_errors(errors, seen.valid, 3 * WINDOW),
-            "grain": grained,
+            "grain": grain(rgb)[seen.valid],
         }
         shared = 1e3 * PEOPLE_DIFFER * seen.depth[seen.valid] if len(pictures) == 1 else 0.0
         bounds = error_bounds("depth", figures, shared)
-        maps[camera.id] = replace(seen, figures=figures, bounds=bounds)
-    return maps, dict(zip(maps, photo, strict=True))
+        yield camera.id, replace(seen, figures=figures, bounds=bounds), errors
+
+
+def common_figures(
+    surface: HeadSurface, pictures: Pictures, photo: Sequence[PhotoErrors]
+) -> dict[str, float]:
+    """Return the figures that all pixels of an item share."""
+    middle = surface.vertices.mean(0)
+    pixels = [np.linalg.norm(c.center - middle) / c.K[0, 0] for c, _, _ in pictures]
+    known = np.concatenate([one.errors[np.isfinite(one.errors)] for one in photo])
+    grains = [grain(rgb)[alpha > 255 * INSIDE][::GRAINS] for _, rgb, alpha in pictures]
+    every = np.concatenate(grains)
+    return {
+        "voxel_mm": surface.figures["voxel_mm"],
+        "pixel_mm": 1e3 * float(np.median(pixels)),
+        "views": float(len(pictures)),
+        "photo_all": float(np.median(known)) if len(known) else np.inf,
+        "grain_all": float(np.median(every)) if len(every) else np.inf,
+    }
+
+
+def cast_window(
+    surface: HeadSurface,
+    scene: o3d.t.geometry.RaycastingScene,
+    camera: Camera,
+    alpha: np.ndarray,
+    apart_mm: np.ndarray | None,
+) -> DepthMaps:
+    """Cast rays only where the surface projects to; the maps are of the whole frame (H, W) uint8.
+
+    A head fills a third of a frame.
+    """
+    pixels, depth = project_fast(camera, surface.vertices)
+    low, high = np.zeros(2, int), np.array([camera.width, camera.height])
+    if (depth > 0).all():  # two pixels more for what looks at neighbours
+        low = np.clip(np.floor(pixels.min(0)).astype(int) - 2, low, high - 1)
+        high = np.clip(np.ceil(pixels.max(0)).astype(int) + 2, low + 1, high)
+    window = np.s_[low[1] : high[1], low[0] : high[0]]
+    part = crop_camera(camera, *low.tolist(), *(high - low).tolist())
+    seen = cast_maps(surface, scene, part, alpha[window].astype(np.float32) / 255, apart_mm)
+
+    def whole(values: np.ndarray) -> np.ndarray:
+        found = np.zeros((*alpha.shape, *values.shape[2:]), values.dtype)
+        found[window] = values
+        return found
+
+    covered = float(seen.valid.sum() / max(int((alpha > 255 * INSIDE).sum()), 1))
+    maps = (whole(seen.depth), whole(seen.valid), whole(seen.normals))
+    return DepthMaps(*maps, covered, seen.spill, seen.figures)
 
 
 def cast_maps(

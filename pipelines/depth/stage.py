@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,7 @@ from express50.dataset.depth_files import write_depth, write_normals
 from express50.dataset.tracks import read_track
 from express50.error_model import error_models, expect, size_sigma
 from express50.errors import CaptureError, FormatError, StageError
-from express50.files.images import contact_sheet, read_alpha, srgb_to_linear, write_image
+from express50.files.images import contact_sheet, read_alpha, shrink, srgb_to_linear, write_image
 from express50.geometry import meshes
 from express50.head.load import load_head
 from pipelines.depth.config import DepthConfig
@@ -27,6 +28,7 @@ from pipelines.depth.views import DepthView, make_view, without_contradiction
 ERROR_STEPS = 30.0  # 8-bit steps at the bright end of the error maps
 BLANK = 24  # grey of unknown pixels
 SHOWN = 4  # cameras in the contact sheet
+TILE = 240  # pixels of a picture in it
 AGREEMENT = 0.85  # share of the tracked mesh that must lie in the mattes for it to be used
 
 
@@ -52,17 +54,39 @@ def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> Result:
         surface = tracked_surface(views[0], solid, *fineness)
     else:
         surface = reconstruct(views, solid, *fineness)
-    maps, photo = surface_maps(surface, pictures, solid)
     write_ply(out / "surface.ply", surface)
     write_glb(out / "surface.glb", surface)
-    for camera_id, seen in maps.items():
-        write_maps(out, camera_id, seen)
-    write_picture(out, pictures, maps, photo)
-    typical = np.concatenate([seen.bounds.typical for seen in maps.values() if seen.bounds])
+    rows, photo, typical = write_views(out, surface, pictures, solid)
     shared = size_sigma([row[0] for row in pictures], surface.vertices)
     expected = expect(error_models()["depth"], typical, float(np.median(shared)))
-    figures = figures_of(surface, maps, photo) | {"track": track}
+    figures = figures_of(surface, rows, photo) | {"track": track}
     return Result(figures, dropped, expected_error=expected)
+
+
+def write_views(
+    out: Path, surface: HeadSurface, pictures: Pictures, solid: TrackedSolid | None
+) -> tuple[dict[str, dict], list[PhotoErrors], np.ndarray]:
+    """Write every camera's maps and a contact sheet of evenly chosen cameras.
+
+    Returns each camera's figures, its photometric errors, and the typical errors of all pixels.
+    """
+    chosen = np.unique(np.linspace(0, len(pictures) - 1, SHOWN).round().astype(int))
+    rows, photo, typical, columns = {}, [], [], []
+    views = surface_maps(surface, pictures, solid)
+    for number, (camera_id, seen, errors) in enumerate(views):
+        write_maps(out, camera_id, seen)
+        rows[camera_id] = view_figures(seen, errors)
+        photo.append(errors)
+        if seen.bounds is not None:
+            typical.append(seen.bounds.typical.astype(np.float32))
+        if number in chosen:
+            columns.append(view_panels(pictures[number][1], seen, errors.errors))
+    labels = ["frame", "depth", "normals", "confidence", f"photo error, 0 to {ERROR_STEPS:g}/255"]
+    (out / "qc").mkdir(exist_ok=True)
+    table = [list(row) for row in zip(*columns, strict=True)]
+    sheet = contact_sheet(table, labels, tile=(TILE, TILE))
+    write_image(out / "qc" / "surface.jpg", sheet, quality=90)
+    return rows, photo, np.concatenate(typical)
 
 
 def read_views(
@@ -78,9 +102,9 @@ def read_views(
         try:
             if not path.is_file():
                 raise StageError("it has no matte")
-            alpha = read_alpha(path).astype(np.float32) / 255
+            alpha = read_alpha(path)
             rgb = read_peak_frame(dataset, subject, expression, camera_id)
-            views.append(make_view(camera, rgb, alpha, image_side))
+            views.append(make_view(camera, rgb, alpha.astype(np.float32) / 255, image_side))
             pictures.append((camera, rgb, alpha))
         except (CaptureError, FormatError, StageError) as error:
             dropped.append(Note(camera_id, str(error)))
@@ -127,7 +151,8 @@ def write_maps(out: Path, camera_id: str, maps: DepthMaps) -> None:
         raise StageError(f"{camera_id}: {error}") from None
     confidence = np.rint(maps.confidence * 255).astype(np.uint8)
     write_image(out / f"{camera_id}_confidence.png", confidence)
-    known = maps.valid & (np.linalg.norm(maps.normals, axis=-1) > 0.5)
+    known = maps.valid.copy()
+    known[known] = np.linalg.norm(maps.normals[known], axis=-1) > 0.5
     write_normals(out / f"{camera_id}_normals.png", maps.normals, known)
 
 
@@ -150,55 +175,51 @@ def write_glb(path: Path, surface: HeadSurface) -> None:
     meshes.write_glb(path, "surface", vertices, surface.faces, normals=normals, colours=colours)
 
 
-def figures_of(
-    surface: HeadSurface, maps: dict[str, DepthMaps], photo: dict[str, PhotoErrors]
-) -> dict:
+def figures_of(surface: HeadSurface, rows: dict[str, dict], photo: Sequence[PhotoErrors]) -> dict:
     """Collect the item's metrics, rounded so that they do not depend on the last bit."""
-    errors = np.concatenate([one.errors[np.isfinite(one.errors)] for one in photo.values()])
-    compared = float(np.mean([one.compared for one in photo.values()]))
+    errors = np.concatenate([one.errors[np.isfinite(one.errors)] for one in photo])
+    compared = float(np.mean([one.compared for one in photo]))
+    covered = [row["coverage"] for row in rows.values()]
     table = surface.figures | PhotoErrors(errors, compared).figures() | {
-        "coverage": float(np.mean([view.covered for view in maps.values()])),
-        "coverage_worst": min(view.covered for view in maps.values()),
-        "spill": float(np.mean([view.spill for view in maps.values()])),
+        "coverage": float(np.mean(covered)),
+        "coverage_worst": min(covered),
+        "spill": float(np.mean([row["spill"] for row in rows.values()])),
         "voxel_share": surface.figures["voxels_allocated"] / surface.figures["voxels_dense"],
-        "views": len(maps),
+        "views": len(rows),
     }  # fmt: skip
-    cameras = {}
-    for name, view in maps.items():
-        sure = float(view.confidence[view.valid].mean()) if view.valid.any() else 0.0
-        row = {"coverage": view.covered, "spill": view.spill, "confidence": sure}
-        if view.bounds is not None and view.valid.any():
-            row["bound_mm_median"] = float(np.median(view.bounds.bound))
-        row |= photo[name].figures()
-        cameras[name] = {key: round(value, 4) for key, value in row.items()}
+    cameras = {name: {k: round(v, 4) for k, v in row.items()} for name, row in rows.items()}
     rounded = {k: round(v, 5) if isinstance(v, float) else v for k, v in table.items()}
     return rounded | {"cameras": cameras}
 
 
-def write_picture(
-    out: Path, pictures: Pictures, maps: dict[str, DepthMaps], photo: dict[str, PhotoErrors]
-) -> None:
-    """Write a contact sheet of evenly chosen cameras: frame, depth, normals, confidence, errors."""
-    chosen = np.unique(np.linspace(0, len(pictures) - 1, SHOWN).round().astype(int))
-    rows: list[list[np.ndarray]] = [[], [], [], [], []]
-    for camera, rgb, _ in (pictures[k] for k in chosen):
-        view, errors = maps[camera.id], photo[camera.id].errors
-        near = np.zeros_like(view.depth)
-        if view.valid.any():
-            low, high = np.percentile(view.depth[view.valid], [1, 99])
-            near = (high - view.depth) / max(high - low, 1e-6)
-        known = np.isfinite(errors)
-        share = np.where(known, errors, 0) / ERROR_STEPS
-        normal = (view.normals * [1, -1, -1] + 1) * 127.5
-        rows[0].append(rgb)
-        rows[1].append(_coloured(near, view.valid, cv2.COLORMAP_VIRIDIS))
-        rows[2].append(np.where(view.valid[..., None], normal, BLANK).astype(np.uint8))
-        rows[3].append((view.confidence * 255).astype(np.uint8))
-        rows[4].append(_coloured(share, known, cv2.COLORMAP_INFERNO))
-    labels = ["frame", "depth", "normals", "confidence", f"photo error, 0 to {ERROR_STEPS:g}/255"]
-    (out / "qc").mkdir(exist_ok=True)
-    sheet = contact_sheet(rows, labels, tile=(240, 240))
-    write_image(out / "qc" / "surface.jpg", sheet, quality=90)
+def view_figures(view: DepthMaps, photo: PhotoErrors) -> dict[str, float]:
+    """Summarise one camera's maps for the metrics."""
+    sure = float(view.confidence[view.valid].mean()) if view.valid.any() else 0.0
+    row = {"coverage": view.covered, "spill": view.spill, "confidence": sure}
+    if view.bounds is not None and view.valid.any():
+        row["bound_mm_median"] = float(np.median(view.bounds.bound))
+    return row | photo.figures()
+
+
+def view_panels(rgb: np.ndarray, view: DepthMaps, errors: np.ndarray) -> list[np.ndarray]:
+    """Draw frame, depth, normals, confidence and photometric errors (h, w) of a camera."""
+    step = max(1, max(rgb.shape[:2]) // (2 * TILE))  # of pixels: the sheet shows no more
+    depth, valid, normals, sure = (
+        values[::step, ::step] for values in (view.depth, view.valid, view.normals, view.confidence)
+    )
+    near = np.zeros_like(depth)
+    if valid.any():
+        low, high = np.percentile(depth[valid], [1, 99])
+        near = (high - depth) / max(high - low, 1e-6)
+    known = np.isfinite(errors)
+    normal = (normals * [1, -1, -1] + 1) * 127.5
+    return [
+        shrink(rgb, 2 * TILE),
+        _coloured(near, valid, cv2.COLORMAP_VIRIDIS),
+        np.where(valid[..., None], normal, BLANK).astype(np.uint8),
+        (sure * 255).astype(np.uint8),
+        _coloured(np.where(known, errors, 0) / ERROR_STEPS, known, cv2.COLORMAP_INFERNO),
+    ]
 
 
 def _coloured(values: np.ndarray, known: np.ndarray, colours: int) -> np.ndarray:

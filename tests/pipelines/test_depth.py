@@ -184,10 +184,10 @@ def test_two_runs_give_the_same_surface(surface, views):
 
 
 def test_confidence_separates_good_depth_from_bad(surface, shots):
-    maps, _ = surface_maps(surface, [shot[:3] for shot in shots])
+    pictures = [(c, rgb, np.rint(alpha * 255).astype(np.uint8)) for c, rgb, alpha, _ in shots]
+    views = surface_maps(surface, pictures)
     sure, unsure = [], []
-    for camera, _, _, true in shots:
-        view = maps[camera.id]
+    for (_, view, _), (*_, true) in zip(views, shots, strict=True):
         error = np.abs(view.depth - true)
         both = view.valid & (true > 0)
         cut = np.median(view.confidence[both])
