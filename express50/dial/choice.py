@@ -188,7 +188,7 @@ def expected_errors(load: Workload, lost: Mapping[str, float]) -> dict[str, Expe
 
 def front(load: Workload) -> list[Point]:
     """Return the choices that no other beats in time and error, the quickest first."""
-    scale = _scales(load)
+    scale = scales(load)
     states: list[tuple[dict[str, str], dict[str, float], dict[str, float], bool]]
     states = [({}, {}, dict.fromkeys(scale, 0.0), True)]
     for stage in load.stages:
@@ -213,7 +213,7 @@ def front(load: Workload) -> list[Point]:
     return kept_points
 
 
-def _scales(load: Workload) -> dict[str, float]:
+def scales(load: Workload) -> dict[str, float]:
     """Return what a result's error is counted in: what the dearest settings leave, or differences.
 
     Results that no setting changes are left out.

@@ -29,6 +29,7 @@ from express50.dial.choice import (
     goal_result,
     item_seconds,
     labels_of,
+    scales,
     stage_seconds,
 )
 from express50.dial.figures import PilotFigures, dial_dir, read_measured
@@ -377,8 +378,19 @@ def _run_one(
 def error_text(name: str, error: Expected) -> str:
     """Write an expected error for people."""
     if not error.stated:
-        return f"{name} {error.value:.2g} {error.unit} from the dearest settings (none states more)"
+        return f"{name} {error.value:.2g} {error.unit}"
     return f"{name} {error.value:.2g} {error.unit} ({error.low:.2g} to {error.high:.2g})"
+
+
+def expected_lines(point: Point) -> Iterator[str]:
+    """Yield the errors to expect: those that stages state, and mere differences."""
+    texts = {name: error_text(name, error) for name, error in point.errors.items()}
+    stated = [text for name, text in texts.items() if point.errors[name].stated]
+    others = [text for name, text in texts.items() if not point.errors[name].stated]
+    if stated:
+        yield f"expected error: {', '.join(stated)}"
+    if others:
+        yield f"no error is stated; apart from the dearest settings by: {', '.join(others)}"
 
 
 def choice_lines(
@@ -388,8 +400,7 @@ def choice_lines(
     kind = "core time" if load.cores else count(load.width, "worker")
     whole = f"budget {budget.text}" if budget else "no budget"
     yield f"{whole}, {kind}: {format_seconds(spent)} spent on measuring"
-    errors = ", ".join(error_text(name, error) for name, error in point.errors.items())
-    yield f"expected: {errors or 'no stage states its error'}"
+    yield from expected_lines(point)
     yield f"done in {format_seconds(spent + point.seconds)}, measuring included"
     rows = []
     for stage in load.stages:
@@ -412,27 +423,27 @@ def _why(load: Workload, stage: Stage, point: Point) -> str:
         why = next((t.failed[name] for t in load.measured.trials if name in t.failed), "no time")
         return f"not measured: {why}"
     here, tried = ladder.index(label), labels_of(load, name)
-    words = []
+    words, untried = [], [other for other in ladder if other not in tried]
     for other in (*reversed(ladder[:here]), *ladder[here + 1 :]):
-        if other not in tried:
-            words.append(f"{other}: not tried")
-            continue
-        seconds = stage_seconds(load, stage, other) - stage_seconds(load, stage, label)
-        time = f"{format_seconds(abs(seconds))} {'more' if seconds > 0 else 'less'}"
-        words.append(f"{other}: {time}, {_change(load, name, label, other, point)}")
+        if other in tried:
+            seconds = stage_seconds(load, stage, other) - stage_seconds(load, stage, label)
+            time = f"{format_seconds(abs(seconds))} {'more' if seconds > 0 else 'less'}"
+            words.append(f"{other}: {time}, {_change(load, name, label, other, point)}")
+    if untried:
+        words.append(f"{', '.join(untried)}: not tried")
     return "; ".join(words)
 
 
 def _change(load: Workload, name: str, label: str, other: str, point: Point) -> str:
     """Say how another setting of a stage changes the result that it changes most."""
-    losses = load.measured.losses[name]
-    best, words = 0.0, "same errors"
+    losses, sizes = load.measured.losses[name], scales(load)
+    most, words = 0.005, "same errors"
     for result, error in point.errors.items():
         squares = [losses.get(one, {}).get(result, 0.0) ** 2 for one in (label, other)]
         changed = math.sqrt(max(0.0, error.value**2 - squares[0] + squares[1]))
-        share = abs(changed - error.value) / max(error.value, changed, 1e-12)
-        if share > max(best, 0.005):
-            best = share
+        share = abs(changed - error.value) / sizes.get(result, math.inf)
+        if share > most:
+            most = share
             words = f"{result} {changed - error.value:+.2g} {error.unit}"
     return words
 

@@ -55,7 +55,7 @@ def test_much_time_buys_the_dearest_settings_and_the_promise_is_the_error(tmp_pa
     promised = state.promised["value"]
     assert promised["value"] == pytest.approx(error_of(state.settings), rel=0.05)
     assert promised["low"] < error_of(state.settings) < promised["high"]
-    assert any("expected: value 0.5" in line for line in said)
+    assert any("expected error: value 0.5" in line for line in said)
     assert any("draft:" in line and "less, value +" in line for line in said)
     assert not pilot_dir(Dataset(tmp_path / "d")).exists()
     for path in dial_dir(Dataset(tmp_path / "d")).iterdir():  # figures name nobody
