@@ -19,9 +19,6 @@ from express50.head.model import HeadModel, landmarks, pose, vertex_normals
 from express50.landmarks.training.places import Places, closest_places, place_points
 
 BROWS = slice(17, 27)
-# Metres that brows are lower than the head models' landmarks, outer ends and inner ends: about half
-# of what the published mean of the 68 marks on faces has (4 and 7 mm), and their spread.
-LOWER_M, BROW_SPREAD_M = (0.003, 0.005), 0.004
 SCRIPTED_SHARE = 0.6  # of the heads play entries of the script
 LASHES = "eyelashes"
 BLINKS = 0.22  # share of the heads that close an eye, or both
@@ -107,8 +104,7 @@ def _move_brows(model: HeadModel, canvas: Canvas, rng: Rng) -> tuple[Canvas, Pla
     outwards = np.sign(brows[:, 0])
     along = (np.abs(brows[:, 0]) - np.abs(brows[:, 0]).min()) / np.ptp(np.abs(brows[:, 0]))
     brows[:, 0] += outwards * (rng.normal() * 0.002 + along * rng.normal() * 0.003)
-    brows[:, 1] -= LOWER_M[1] + along * (LOWER_M[0] - LOWER_M[1])
-    brows[:, 1] += (rng.normal() + (along - 0.5) * rng.normal()) * BROW_SPREAD_M
+    brows[:, 1] += rng.normal() * 0.003 + (along - 0.5) * rng.normal() * 0.003
     brows[:, 1] += outwards * rng.normal() * 0.0007
     places = closest_places(model, brows)
     marks = canvas.marks.copy()
