@@ -23,7 +23,6 @@ from express50.contract.layout import Dataset
 from express50.contract.stage import Stage, stages
 from express50.dial.figures import dial_dir, read_measured
 from express50.dial.footage import Footage, footage_of
-from express50.dial.laws import MeasuredSize, forecast
 from express50.errors import ConfigError, StageError
 from express50.files.digests import files_of, text_digest
 from express50.runner.ledger import Ledger
@@ -259,6 +258,8 @@ def estimate(
 
     Workers are processes of one core each. Only datasets of the first one's preset count.
     """
+    from express50.dial.laws import MeasuredSize, forecast  # NumPy would slow every command
+
     rows = []
     for stage in known:
         growth = stage.growth
