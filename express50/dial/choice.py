@@ -166,7 +166,7 @@ def rest_of(load: Workload, result: str) -> tuple[float, float, float] | None:
             losses[name].get(trial.settings[name], {}).get(result, 0.0) ** 2 for name in losses
         )
         rests.append(max(value**2 - lost, (LEAST_REST * value) ** 2))
-        ratios.append((low / max(value, 1e-12), high / max(value, 1e-12)))
+        ratios.append((low / value, high / value) if value else (1.0, 1.0))
     if not rests:
         return None
     return median(rests), median(r[0] for r in ratios), median(r[1] for r in ratios)
@@ -179,7 +179,13 @@ def expected_errors(load: Workload, lost: Mapping[str, float]) -> dict[str, Expe
         rest = rest_of(load, kind.name)
         if rest is not None:
             value = math.sqrt(rest[0] + lost.get(kind.name, 0.0))
-            found[kind.name] = Expected(value, value * rest[1], value * rest[2], kind.unit, True)
+            low, high = (value * ratio for ratio in rest[1:])
+            if not rest[0]:  # of an error of 0 the interval is as wide as it is stated
+                stated = [
+                    t.errors[kind.name] for t in load.measured.trials if kind.name in t.errors
+                ]
+                low, high = min(e[1] for e in stated), max(e[2] for e in stated)
+            found[kind.name] = Expected(value, min(low, value), max(high, value), kind.unit, True)
         elif kind.name in lost:
             value = math.sqrt(lost[kind.name])
             found[kind.name] = Expected(value, value, value, kind.unit, False)
