@@ -270,9 +270,10 @@ def _make_track(
     frames = np.array([peak.frame for peak in peaks], np.int64)
     moving = max(step.dynamic_mm for step in steps.values())
     why = f"displacements of single time steps, up to {moving:.2f} mm, are left out"
+    unknown = np.full(stacked["vertices"].shape[:2], np.nan, np.float32)  # to other tools
     return Track(
         head=head, expressions=tuple(peak.expression for peak in peaks), frames=frames,
-        shape=shape, offsets=offsets.astype(np.float32), **stacked,
+        sigma=unknown, bound=unknown, shape=shape, offsets=offsets.astype(np.float32), **stacked,
     ), [Note("dynamic_offset", why)] if moving > 0 else []  # fmt: skip
 
 
