@@ -109,6 +109,7 @@ def _build(
             pose = given.cam_from_world @ np.linalg.inv(root)
             made_rig.add_sensor(camera.sensor_id, _rigid(pose))
     reconstruction.add_rig(made_rig)
+    often = np.bincount(corners.corner, minlength=len(points)) > 1  # COLMAP refuses the others
     for corner, point in enumerate(points):
         reconstruction.add_point3D_with_id(corner + 1, pycolmap.Point3D(xyz=point))
     for i, frame in enumerate(frames):
@@ -130,8 +131,9 @@ def _build(
         for image, seen in images:
             reconstruction.add_image(image)
             for k, corner in enumerate(seen):
-                element = pycolmap.TrackElement(image.image_id, k)
-                reconstruction.add_observation(int(corner) + 1, element)
+                if often[corner]:
+                    element = pycolmap.TrackElement(image.image_id, k)
+                    reconstruction.add_observation(int(corner) + 1, element)
         reconstruction.register_frame(i + 1)
     return reconstruction, names, frames
 

@@ -33,6 +33,16 @@ def solved(rig, boards, noise: float):
     return solve_rig(observe(rig, boards, noise), POINTS, sizes_of(rig), rounds=2)
 
 
+def test_a_corner_that_was_seen_once_does_no_harm() -> None:
+    rig = make_rig(3, span_deg=80)
+    corners = observe(rig, board_motion(15, 1, span_deg=80), 0.05)
+    keep = corners.corner != 40
+    keep[np.flatnonzero(~keep)[0]] = True
+    solution = solve_rig(corners.select(keep), POINTS, sizes_of(rig), rounds=2)
+    rotation, _, error = rig_errors(solution.cameras, rig)
+    assert len(solution.cameras) == 3 and rotation < 0.1 and error < 0.3
+
+
 @pytest.mark.parametrize(
     ("focal", "size", "distance"),
     [(20.0, (32, 24), 0.7), (900.0, (640, 480), 1.1), (20_000.0, (4096, 3072), 3.0)],
