@@ -9,7 +9,12 @@ import numpy as np
 from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import FLIP_YZ
-from express50.geometry.transforms import invert_transform, make_transform, rigid_fit
+from express50.geometry.transforms import (
+    invert_transform,
+    make_transform,
+    matrix_to_axis_angle,
+    rigid_fit,
+)
 
 SHARE = 0.01  # of a focal length, an image's side or the rig's size that may differ
 TURN_DEG = 1.0
@@ -83,13 +88,9 @@ def _check_intrinsics(theirs: Camera, ours: Camera, where: str) -> None:
         )
 
 
-def _centres(poses: list[np.ndarray]) -> np.ndarray:
-    return np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in poses])
-
-
 def _size(poses: list[np.ndarray]) -> float:
     """Return the root mean square distance of cameras from their middle; 1 m of a single one."""
-    centres = _centres(poses)
+    centres = np.stack([invert_transform(pose)[:3, 3] for pose in poses])
     spread = float(np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()))
     return spread if len(poses) > 1 else 1.0
 
@@ -109,17 +110,14 @@ def _fit(
     theirs: list[np.ndarray], ours: list[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fit the motion (4, 4) that moves poses onto others; per camera degrees and metres left."""
-    motions = [invert_transform(b) @ a for a, b in zip(theirs, ours, strict=True)]
-    # Three far points per camera fix its turn as well as its place.
+    # Three points a metre ahead of a camera's centre fix its turn as well as its place.
     arms = np.vstack([np.zeros((1, 3)), np.eye(3)])
-    source = np.concatenate([_in_world(pose, arms) for pose in theirs])
-    target = np.concatenate([_in_world(pose, arms) for pose in ours])
+    source, target = (
+        np.concatenate([(arms - pose[:3, 3]) @ pose[:3, :3] for pose in poses])
+        for poses in (theirs, ours)
+    )
     R, t = rigid_fit(source, target)
-    turns = [np.clip((np.trace(R.T @ m[:3, :3]) - 1) / 2, -1, 1) for m in motions]
-    shift = np.linalg.norm(_centres(theirs) @ R.T + t - _centres(ours), axis=1)
-    return make_transform(R, t), np.degrees(np.arccos(turns)), shift
-
-
-def _in_world(cam_from_world: np.ndarray, points: np.ndarray) -> np.ndarray:
-    R, t = cam_from_world[:3, :3], cam_from_world[:3, 3]
-    return (points - t) @ R
+    shift = np.linalg.norm(source @ R.T + t - target, axis=1)[:: len(arms)]
+    turns = [b[:3, :3] @ R @ a[:3, :3].T for a, b in zip(theirs, ours, strict=True)]
+    degrees = np.degrees([np.linalg.norm(matrix_to_axis_angle(turn)) for turn in turns])
+    return make_transform(R, t), degrees, shift

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,9 @@ from express50.console import FAILED, OK, add_command, answer
 from express50.contract.layout import Dataset, existing_dataset, included_subjects
 from express50.contract.stage import Note, Result, stages
 from express50.dataset.depth_files import write_depth
-from express50.dataset.tracks import SCHEMA
 from express50.errors import ConfigError, StageError
 from express50.files.images import read_alpha, write_image
-from express50.geometry.cameras import pinhole
+from express50.geometry.cameras import Camera, pinhole
 from express50.head.load import load_head
 from express50.head.model import landmarks
 from express50.runner.imported import publish_import, remove_imports
@@ -53,7 +53,6 @@ WORDS = {
     "matte": "masks or opacities",
     "depth": "depth maps: 16-bit PNG, EXR or .npy",
 }
-NO_FACE = "the footage shows no face that two cameras agree on; it was not compared to one"
 PATTERN = (
     "path with {subject}, {expression}, {camera}, {frame} (decode index) or {clip_frame} (counted"
     " from the cue's start) in it, such as 'masks/{subject}/{camera}/{frame:06d}.png'"
@@ -84,7 +83,7 @@ def add_commands(subparsers: Any) -> None:
         add("--distorted", action="store_true", help=words)
         if action == "depth":
             words = "of the values: m, cm, mm, or metres per step, such as 0.0001"
-            add("--unit", required=True, help=words)
+            add("--unit", required=True, type=_metres, dest="metres", help=words)
             add("--ray", action="store_true", help="they are lengths of rays, not camera z")
     words = "give imported items up, so that their stage makes them"
     parser = add_command(actions, "remove", run_remove, words)
@@ -104,19 +103,18 @@ def run_remove(args: argparse.Namespace) -> int:
 def run_import(args: argparse.Namespace) -> int:
     """Import every item of the chosen subjects; one that is wrong is named, the others go on."""
     dataset, stage = existing_dataset(args.dataset.resolve()), stages()[args.action]
-    subjects, writers = _subjects(dataset, args), _PLANS[args.action]
-    metres = _metres(args.unit) if args.action == "depth" else 1.0
-    rows = []
+    subjects, rows = _subjects(dataset, args), []
     with stage_lock(dataset, stage.name), Ledger(dataset.ledger) as ledger:
         clean_leftovers(dataset, stage.name)
         for subject in subjects:
             peaks = peak_frames(dataset, subject)
-            for item, write in writers(dataset, subject, peaks, args, metres).items():
+            for item, write in _PLANS[args.action](dataset, subject, peaks, args).items():
                 receipt = publish_import(dataset, stage, item, write, ledger)
-                metrics = receipt.metrics.get("imported", {})
-                warnings = receipt.metrics.get("warnings", [])
-                rows.append({"item": item, "reason": receipt.reason, "warnings": warnings}
-                            | {"checks": metrics})  # fmt: skip
+                found = receipt.metrics
+                rows.append({
+                    "item": item, "reason": receipt.reason,
+                    "warnings": found.get("warnings", []), "checks": found.get("imported", {}),
+                })  # fmt: skip
     failed = [row for row in rows if row["reason"]]
     lines = [f"import {stage.name}: read {len(rows)} = {len(rows) - len(failed)} done"
              f" + {len(failed)} failed"]  # fmt: skip
@@ -148,56 +146,76 @@ def _metres(unit: str) -> float:
     except ValueError:
         metres = 0.0
     if not 0 < metres < np.inf:
-        raise ConfigError(f"--unit {unit!r}: expected m, cm, mm, or metres per step above 0")
+        raise argparse.ArgumentTypeError(
+            f"{unit!r}, expected m, cm, mm, or metres per step above 0"
+        )
     return metres
 
 
 def _plan_tracks(
-    dataset: Dataset, subject: str, peaks: list[PeakFrame], args: argparse.Namespace, _: float
+    dataset: Dataset, subject: str, peaks: list[PeakFrame], args: argparse.Namespace
 ) -> dict[str, Write]:
     head = args.head if args.head == "procedural" else str(Path(args.head).expanduser().resolve())
     source = TrackSource(pattern=args.pattern, head=head, axes=args.axes, cameras=args.cameras)
-    return {subject: partial(_write_track, dataset, subject, peaks, source, args.trust)}
+
+    def write(out: Path) -> Result:
+        arrays, notes = read_foreign_track(dataset, subject, peaks, source)
+        checks = _check_track(dataset, subject, peaks, arrays, args.trust, notes)
+        write_npz(out / "track.npz", arrays)
+        return Result({"imported": checks}, (), notes)
+
+    return {subject: write}
 
 
-def _write_track(
-    dataset: Dataset,
-    subject: str,
-    peaks: list[PeakFrame],
-    source: TrackSource,
-    trust: bool,
-    out: Path,
-) -> Result:
-    track, notes = read_foreign_track(dataset, subject, peaks, source)
-    model = load_head(track.head)
-    marks = landmarks(model, torch.from_numpy(track.vertices.astype(np.float32))).numpy()
-    cameras = read_cameras_of(dataset, subject)
-    errors: dict[str, float | None] = {}
-    for mesh in track.vertices:
+def _check_track(
+    dataset: Dataset, subject: str, peaks: list[PeakFrame], arrays: Mapping[str, np.ndarray],
+    trust: bool, notes: list[Note],
+) -> dict[str, object]:  # fmt: skip
+    cameras, vertices = read_cameras_of(dataset, subject), arrays["vertices"]
+    marks = landmarks(load_head(str(arrays["head"])), torch.from_numpy(vertices)).double().numpy()
+    for mesh in vertices:
         check_in_view(cameras, mesh, subject)
-    for peak, points in zip(peaks, marks.astype(np.float64), strict=True):
-        found = observe_peak(dataset, subject, peak)
-        where = f"{subject}/{peak.expression}"
+    errors: dict[str, float | None] = {}
+    for peak, points in zip(peaks, marks, strict=True):
+        found = observe_peak(dataset, subject, peak, notes)
         with trusting(trust, notes):
+            where = f"{subject}/{peak.expression}"
             errors[peak.expression] = check_landmarks(found, points, where)
-        if found is None:
-            notes.append(Note(peak.expression, NO_FACE))
-    names = ("shape", "expression", "neck", "jaw", "eyes", "R", "t", "frames", "vertices",
-             "offsets")  # fmt: skip
-    arrays = {name: getattr(track, name) for name in names}
-    texts = {"schema": SCHEMA, "head": track.head, "expressions": track.expressions}
-    write_npz(out / "track.npz", arrays | {k: np.array(v) for k, v in texts.items()})
-    checks = {"landmarks_off_of_face": errors, "expressions": len(peaks)}
-    return Result({"imported": checks}, (), notes)
+    return {"landmarks_off_of_face": errors, "expressions": len(peaks)}
+
+
+@dataclass(frozen=True)
+class PeakPictures:
+    """Holds the pictures of one peak frame: cameras as recorded, and a file of each."""
+
+    dataset: Dataset
+    subject: str
+    peak: PeakFrame
+    cameras: dict[str, Camera]
+    files: dict[str, Path]
+    args: argparse.Namespace
+
+    @property
+    def item(self) -> str:
+        """Return the name of the item."""
+        return f"{self.subject}/{self.peak.expression}"
+
+    def undistorted(self) -> dict[str, Camera]:
+        """Return the cameras of what is imported."""
+        return {name: pinhole(camera) for name, camera in self.cameras.items()}
+
+    def footage(self) -> dict[str, np.ndarray]:
+        """Read what the cameras recorded, undistorted."""
+        expression = self.peak.expression
+        return {n: read_peak_frame(self.dataset, self.subject, expression, n) for n in self.cameras}
 
 
 def _plan_pictures(
-    write: Callable[..., Result],
+    write: Callable[[PeakPictures, Path], Result],
     dataset: Dataset,
     subject: str,
     peaks: list[PeakFrame],
     args: argparse.Namespace,
-    metres: float,
 ) -> dict[str, Write]:
     """Plan one item per expression.
 
@@ -205,81 +223,52 @@ def _plan_pictures(
         StageError: files are missing; nothing is imported.
     """
     cameras = read_cameras_of(dataset, subject, undistorted=False)
-    plan: dict[str, Write] = {}
-    missing: list[Path] = []
+    every = []
     for peak in peaks:
         files = {name: fill(args.pattern, subject, peak, name) for name in cameras}
-        missing += [path for path in files.values() if not path.is_file()]
-        known = partial(write, dataset, subject, peak, files, args, metres)
-        plan[f"{subject}/{peak.expression}"] = known
+        every.append(PeakPictures(dataset, subject, peak, cameras, files, args))
+    missing = [path for one in every for path in one.files.values() if not path.is_file()]
     if missing:
         more = f" and {len(missing) - 3} more" if missing[3:] else ""
         raise StageError(
             f"{subject}: {len(missing)} of {len(cameras) * len(peaks)} files are missing:"
             f" {', '.join(map(str, missing[:3]))}{more}; every camera of every peak frame needs one"
         )
-    return plan
+    return {one.item: partial(write, one) for one in every}
 
 
-def _write_masks(
-    dataset: Dataset,
-    subject: str,
-    peak: PeakFrame,
-    files: dict[str, Path],
-    args: argparse.Namespace,
-    _: float,
-    out: Path,
-) -> Result:
-    cameras = read_cameras_of(dataset, subject, undistorted=False)
-    masks = {n: read_mask(path, cameras[n], args.distorted) for n, path in files.items()}
-    flat = {name: pinhole(camera) for name, camera in cameras.items()}
-    where = f"{subject}/{peak.expression}"
-    check_masks(flat, masks, where)
-    found, notes = observe_peak(dataset, subject, peak), list[Note]()
-    checks: dict[str, object] = {"cameras": len(masks)}
-    pictures = {n: read_peak_frame(dataset, subject, peak.expression, n) for n in masks}
-    with trusting(args.trust, notes):
-        check_masks_show_face(found, masks, where)
-        checks["edge_contrast"] = check_outlines(pictures, masks, where)
-    if found is None:
-        notes.append(Note(peak.expression, NO_FACE))
+def _write_masks(given: PeakPictures, out: Path) -> Result:
+    distorted = given.args.distorted
+    masks = {n: read_mask(path, given.cameras[n], distorted) for n, path in given.files.items()}
+    check_masks(given.undistorted(), masks, given.item)
+    notes, checks = list[Note](), dict[str, object](cameras=len(masks))
+    found = observe_peak(given.dataset, given.subject, given.peak, notes)
+    with trusting(given.args.trust, notes):
+        check_masks_show_face(found, masks, given.item)
+        checks["edge_contrast"] = check_outlines(given.footage(), masks, given.item)
     for name, alpha in masks.items():
         write_image(out / f"{name}.png", alpha)
     return Result({"imported": checks}, (), notes)
 
 
-def _write_depths(
-    dataset: Dataset,
-    subject: str,
-    peak: PeakFrame,
-    files: dict[str, Path],
-    args: argparse.Namespace,
-    metres: float,
-    out: Path,
-) -> Result:
-    cameras = read_cameras_of(dataset, subject, undistorted=False)
-    depths = {}
-    for name, path in files.items():
-        depth = read_foreign_depth(path, cameras[name], metres, args.ray, args.distorted)
-        matte = dataset.matte_file(subject, peak.expression, name)
+def _write_depths(given: PeakPictures, out: Path) -> Result:
+    cameras, depths, args = given.undistorted(), {}, given.args
+    for name, path in given.files.items():
+        depth = read_foreign_depth(path, given.cameras[name], args.metres, args.ray, args.distorted)
+        matte = given.dataset.matte_file(given.subject, given.peak.expression, name)
         # Depth of the set would become part of the head.
         depths[name] = depth * (read_alpha(matte) > 127) if matte.is_file() else depth
-    flat = {name: pinhole(camera) for name, camera in cameras.items()}
-    where = f"{subject}/{peak.expression}"
-    found, notes = observe_peak(dataset, subject, peak), list[Note]()
-    checks: dict[str, object] = {}
+    notes, checks = list[Note](), dict[str, object]()
+    found = observe_peak(given.dataset, given.subject, given.peak, notes)
     with trusting(args.trust, notes):
-        checks["off_the_face_m"] = check_face_depth(found, flat, depths, where)
-        checks["views_agree"] = check_depths(flat, depths, where)
-    if found is None:
-        notes.append(Note(peak.expression, NO_FACE))
+        checks["off_the_face_m"] = check_face_depth(found, cameras, depths, given.item)
+        checks["views_agree"] = check_depths(cameras, depths, given.item)
     for name, depth in depths.items():
         known = depth > 0
         write_depth(out, name, depth, known)
         write_image(out / f"{name}_confidence.png", np.where(known, 255, 0).astype(np.uint8))
-    pictures = {n: read_peak_frame(dataset, subject, peak.expression, n) for n in depths}
-    checks["surface_vertices"] = write_fused(out / "surface.ply", flat, depths, pictures)
-    return Result({"imported": checks}, (), notes)
+    count = write_fused(out / "surface.ply", cameras, depths, given.footage())
+    return Result({"imported": checks | {"surface_vertices": count}}, (), notes)
 
 
 @contextmanager

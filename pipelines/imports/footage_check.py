@@ -11,12 +11,14 @@ import numpy as np
 
 from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.contract.layout import Dataset
+from express50.contract.stage import Note
 from express50.errors import CaptureError, StageError
-from express50.geometry.cameras import Camera, project_pinhole
+from express50.geometry.cameras import Camera, inside_frame, project_pinhole
 from express50.landmarks import EMBEDDED
+from pipelines.imports.pictures import look_up
 from pipelines.imports.places import PeakFrame
-from pipelines.track.observe import Observation, agree
-from pipelines.track.read_inputs import MIN_LANDMARKS, face_views, open_landmarks
+from pipelines.track.observe import Observation
+from pipelines.track.read_inputs import agreed, face_views, open_landmarks
 
 # Of a face's height. Tracks of the twin are 0.012 to 0.017 off the landmarks that are found, those
 # of another person in the same place 0.04 to 0.15.
@@ -28,19 +30,21 @@ LEAST_MARKS = 8
 # Depth of the twin is 0.003 m off the landmarks that are triangulated, that of others 0.01 to 0.02.
 DEPTH_OFF_M = 0.008
 SEARCH = 0.25  # smallest window searched for a face, as in tracking
+NO_FACE = "the footage shows no face that two cameras agree on; it was not compared to one"
 INNER = slice(17, 68)  # landmarks that are not on the jaw's outline
 
 
-def observe_peak(dataset: Dataset, subject: str, peak: PeakFrame) -> Observation | None:
-    """Find the face of a peak frame in the footage; None where the cameras agree on none."""
+def observe_peak(
+    dataset: Dataset, subject: str, peak: PeakFrame, notes: list[Note]
+) -> Observation | None:
+    """Find the face of a peak frame in the footage; None, and a note, where cameras see none."""
     source = open_landmarks(dataset, subject, EMBEDDED, SEARCH)
-    read = partial(read_peak_frame, dataset, subject, peak.expression)
-    views = []
+    read, views = partial(read_peak_frame, dataset, subject, peak.expression), []
     with suppress(CaptureError):
         views = face_views(read, read_cameras_of(dataset, subject), peak.frame, source)
-    found = agree(peak.expression, peak.frame, views)[0] if views else None
-    if found is None or found.inliers.sum(1).max(initial=0) < MIN_LANDMARKS:
-        return None
+    found = agreed(peak.expression, peak.frame, views)
+    if found is None:
+        notes.append(Note(peak.expression, NO_FACE))
     return found
 
 
@@ -50,11 +54,8 @@ def check_in_view(cameras: Mapping[str, Camera], vertices: np.ndarray, where: st
     Raises:
         StageError: it is so.
     """
-    middle, seen = vertices.mean(0, dtype=np.float64)[None], 0
-    for camera in cameras.values():
-        pixels, ahead = project_pinhole(camera, middle)
-        inside = (pixels >= 0).all() and (pixels < (camera.width, camera.height)).all()
-        seen += bool(ahead[0] > 0 and inside)
+    middle = vertices.mean(0, dtype=np.float64)[None]
+    seen = sum(bool(inside_frame(camera, middle)[1]) for camera in cameras.values())
     if 2 * seen <= len(cameras):
         raise StageError(
             f"{where}: {seen} of {len(cameras)} cameras have the head in their picture: the track"
@@ -63,29 +64,26 @@ def check_in_view(cameras: Mapping[str, Camera], vertices: np.ndarray, where: st
         )
 
 
-def landmark_error(observation: Observation, marks: np.ndarray) -> float:
-    """Return the median distance of landmarks (68, 3), world, over the height of the face seen."""
-    errors = []
-    for view, agreed in zip(observation.views, observation.inliers, strict=True):
-        used = agreed[INNER]
-        if used.sum() < LEAST_MARKS:
-            continue
-        pixels, ahead = project_pinhole(view.camera, marks[INNER])
-        away = np.linalg.norm(pixels - view.points[INNER], axis=1)
-        away[(ahead <= 0) | ~np.isfinite(away)] = np.inf
-        errors.append(np.median(away[used]) / max(float(np.ptp(view.points[:, 1])), 1.0))
-    return float(np.median(errors)) if errors else 0.0
-
-
 def check_landmarks(observation: Observation | None, marks: np.ndarray, where: str) -> float | None:
-    """Return how far a track's landmarks (68, 3) are off those seen; None where none are.
+    """Return how far landmarks (68, 3), world, are off those seen; None where none are.
+
+    It is the median of their distances over the height of the face.
 
     Raises:
         StageError: it is not this face in this frame.
     """
-    if observation is None:
+    errors = []
+    pairs = () if observation is None else zip(observation.views, observation.inliers, strict=True)
+    for view, inliers in pairs:
+        used = inliers[INNER]
+        if used.sum() >= LEAST_MARKS:
+            pixels, ahead = project_pinhole(view.camera, marks[INNER])
+            away = np.linalg.norm(pixels - view.points[INNER], axis=1)
+            away[(ahead <= 0) | ~np.isfinite(away)] = np.inf
+            errors.append(np.median(away[used]) / max(float(np.ptp(view.points[:, 1])), 1.0))
+    if not errors:
         return None
-    error = landmark_error(observation, marks)
+    error = float(np.median(errors))
     if error > LEAST_OFF:
         raise StageError(
             f"{where}: its landmarks are {100 * min(error, 99):.0f} % of the face's height off"
@@ -105,9 +103,9 @@ def check_masks_show_face(
     """
     shares, covers = [], []
     pairs = () if observation is None else zip(observation.views, observation.inliers, strict=True)
-    for view, agreed in pairs:
+    for view, inliers in pairs:
         alpha = masks[view.camera_id]
-        pixels = view.points[INNER][agreed[INNER]].astype(int)
+        pixels = view.points[INNER][inliers[INNER]].astype(int)
         pixels = pixels[((pixels >= 0) & (pixels < alpha.shape[::-1])).all(1)]
         if len(pixels) >= LEAST_MARKS:
             shares.append((alpha[pixels[:, 1], pixels[:, 0]] > 127).mean())
@@ -175,22 +173,12 @@ def check_face_depth(
     """
     if observation is None:
         return None
-    off: list[float] = []
-    ratios: list[float] = []
-    for view in observation.views:
-        if view.camera_id not in depths:
-            continue
-        depth = depths[view.camera_id]
-        pixels, z = project_pinhole(cameras[view.camera_id], observation.points[INNER])
-        known = np.isfinite(pixels).all(1) & (z > 0)
-        x, y = np.where(known[:, None], pixels, 0).astype(int).T
-        known &= (x >= 0) & (y >= 0) & (x < depth.shape[1]) & (y < depth.shape[0])
-        found = depth[y[known], x[known]]
-        off += np.abs(found - z[known])[found > 0].tolist()
-        ratios += (z[known][found > 0] / found[found > 0]).tolist()
-    if len(off) < LEAST_MARKS:
+    names = [view.camera_id for view in observation.views]
+    pairs = [look_up(cameras[n], depths[n], observation.points[INNER]) for n in names]
+    found, z = np.hstack([np.stack(pair)[:, pair[0] > 0] for pair in pairs])
+    if len(found) < LEAST_MARKS:
         return None
-    middle, ratio = float(np.median(off)), float(np.median(ratios))
+    middle, ratio = float(np.median(np.abs(found - z))), float(np.median(z / found))
     if not 0.8 < ratio < 1.25:
         raise StageError(
             f"{where}: the face that the footage shows is {ratio:.3g} times as far away as it says:"

@@ -9,9 +9,10 @@ import numpy as np
 import open3d as o3d
 
 from express50.errors import StageError
-from express50.geometry.cameras import Camera, project_pinhole
+from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_to_opencv
 from express50.geometry.meshes import write_ply
+from pipelines.imports.pictures import look_up
 
 LEAST_VOXEL_M, VOXEL_PX = 0.0015, 1.4  # as depth's own
 TRUNCATION = 4.0  # voxels
@@ -75,11 +76,8 @@ def _seen(
     """Count the views that show each vertex (N,), and average their colours (N, 3) uint8."""
     count, total = np.zeros(len(vertices)), np.zeros((len(vertices), 3))
     for name, depth in depths.items():
-        pixels, z = project_pinhole(cameras[name], vertices)
-        height, width = depth.shape
-        inside = (z > 0) & (pixels >= 0).all(1) & (pixels < (width, height)).all(1)
-        x, y = np.where(inside[:, None], pixels, 0).astype(int).T
-        shown = inside & (np.abs(depth[y, x] - z) < near)
+        found, z = look_up(cameras[name], depth, vertices)
+        shown = (found > 0) & (np.abs(found - z) < near)
         count += shown
-        total[shown] += pictures[name][y[shown], x[shown]]
+        total[shown] += look_up(cameras[name], pictures[name], vertices[shown])[0]
     return count, np.rint(total / np.maximum(count, 1)[:, None]).astype(np.uint8)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -24,8 +23,6 @@ LEAST_COSINE = 0.5  # between the directions of two views that are compared
 FINE_M, FINER_SHARE = 0.003, 0.1  # what another measure must gain closely, to be the right one
 FACTORS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-Change = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Make depth of sampled depth and of the lengths of its rays at camera z 1."""
 
 
 def read_mask(path: Path, camera: Camera, distorted: bool) -> np.ndarray:
@@ -153,39 +150,29 @@ def check_depths(
     Raises:
         StageError: too few do, or many more would by another unit or measure, which it names.
     """
-    share = agreement(cameras, depths, _as_it_is)
+    share = agreement(cameras, depths)
     if share is None:
         return None
     best, words = share, "its cameras, subject or frame are others"
     if share < AGREE_SHARE:
         for factor in FACTORS:
-            other = agreement(cameras, depths, partial(_times, factor))
-            if other is not None and other > max(best, AGREE_SHARE):
+            other = agreement(cameras, {n: factor * depth for n, depth in depths.items()}) or 0.0
+            if other > max(best, AGREE_SHARE):
                 best, words = other, f"its unit is {factor:g} times as large as the one given"
         raise StageError(
             f"{where}: views agree on {share:.0%} of what they share, expected {AGREE_SHARE:.0%}:"
             f" {words}"
         )
-    closely = agreement(cameras, depths, _as_it_is, FINE_M) or 0.0
+    closely = agreement(cameras, depths, FINE_M) or 0.0
     for change, words in ((np.divide, "give --ray"), (np.multiply, "leave --ray out")):
-        if (agreement(cameras, depths, change, FINE_M) or 0.0) > closely + FINER_SHARE:
+        changed = {n: change(depth, ray_lengths(cameras[n])) for n, depth in depths.items()}
+        if (agreement(cameras, changed, FINE_M) or 0.0) > closely + FINER_SHARE:
             raise StageError(f"{where}: views agree better if lengths of rays are meant; {words}")
     return round(share, 4)
 
 
-def _times(factor: float, depth: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    return factor * depth
-
-
-def _as_it_is(depth: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    return depth
-
-
 def agreement(
-    cameras: Mapping[str, Camera],
-    depths: Mapping[str, np.ndarray],
-    change: Change,
-    near: float = NEAR_M,
+    cameras: Mapping[str, Camera], depths: Mapping[str, np.ndarray], near: float = NEAR_M
 ) -> float | None:
     """Return the share of pixels whose surface point other views know at the same place.
 
@@ -197,17 +184,26 @@ def agreement(
         camera, (y, x) = cameras[name], np.nonzero(depth)
         chosen = np.unique(np.linspace(0, len(y) - 1, min(SAMPLES, len(y))).astype(int))
         y, x = y[chosen], x[chosen]
-        z = change(depth[y, x], ray_lengths(camera)[y, x])
-        points = unproject(camera, cell_to_corner(np.stack([x, y], 1).astype(float)), z)
+        corners = cell_to_corner(np.stack([x, y], 1).astype(float))
+        points = unproject(camera, corners, depth[y, x])
         for other, there in depths.items():
             facing = cameras[other].cam_from_world[2, :3] @ camera.cam_from_world[2, :3]
-            if other == name or facing < LEAST_COSINE or not len(points):
-                continue
-            pixels, ahead = project_pinhole(cameras[other], points)
-            size = (cameras[other].width, cameras[other].height)
-            inside = (ahead > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)
-            column, row = pixels[inside].astype(int).T
-            found = change(there[row, column], ray_lengths(cameras[other])[row, column])
-            total += len(points)
-            same += int((np.abs(found - ahead[inside]) < near).sum())
+            if other != name and facing >= LEAST_COSINE:
+                found, z = look_up(cameras[other], there, points)
+                total += len(points)
+                same += int(((found > 0) & (np.abs(found - z) < near)).sum())
     return same / total if total else None
+
+
+def look_up(camera: Camera, image: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pixels (N[, C]) of an image that show world points (N, 3); their depth (N,).
+
+    The camera is undistorted. Pixels outside the image are 0.
+    """
+    pixels, depth = project_pinhole(camera, points)
+    size = (camera.width, camera.height)
+    inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)
+    column, row = np.where(inside[:, None], pixels, 0).astype(int).T
+    found = image[row, column]
+    found[~inside] = 0
+    return found, depth

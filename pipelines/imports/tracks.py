@@ -1,4 +1,4 @@
-"""Read tracks of VHAP and GaussianAvatars, FLAME's parameters by time step, as a `Track`.
+"""Read tracks of VHAP and GaussianAvatars, FLAME's parameters by time step, as track.npz.
 
 Read are a folder with ``transforms.json`` and the files of parameters that it names, and VHAP's own
 ``tracked_flame_params_N.npz``. FLAME turns a head about its root joint J, we about the origin:
@@ -18,7 +18,7 @@ import torch
 from express50.capture.frames import read_cameras_of
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note
-from express50.dataset.tracks import Track
+from express50.dataset.tracks import SCHEMA
 from express50.errors import CalibrationError, ConfigError, FormatError, StageError
 from express50.files.arrays import read_arrays
 from express50.files.text import read_json_table
@@ -75,11 +75,16 @@ class TrackSource:
     axes: str = "opengl"
     cameras: Path | None = None
 
+    @property
+    def in_clip(self) -> bool:
+        """Return whether each expression has a track of its own, its frames counted from 0."""
+        return "{expression}" in self.pattern
+
 
 def read_foreign_track(
     dataset: Dataset, subject: str, peaks: list[PeakFrame], source: TrackSource
-) -> tuple[Track, list[Note]]:
-    """Read a subject's track in its peak frames, and what is doubtful about it.
+) -> tuple[dict[str, np.ndarray], list[Note]]:
+    """Read a subject's arrays of track.npz in its peak frames, and what is doubtful about them.
 
     Raises:
         ConfigError: the source is of no known kind.
@@ -88,30 +93,23 @@ def read_foreign_track(
         FormatError: parameters are damaged, or do not fit the head model.
     """
     ours = read_cameras_of(dataset, subject)
-    rig = None if source.cameras is None else read_rig(source.cameras, None, None, 1.0)
     steps: dict[str, FlameStep] = {}
-    if "{expression}" in source.pattern:
+    if source.in_clip:
         for peak in peaks:
             path = fill(source.pattern, subject, peak)
-            steps |= _read_steps(path, subject, [peak], ours, source.axes, rig, in_clip=True)
+            steps |= _read_steps(path, subject, [peak], ours, source)
     else:
-        path = fill(source.pattern, subject)
-        steps = _read_steps(path, subject, peaks, ours, source.axes, rig, in_clip=False)
+        steps = _read_steps(fill(source.pattern, subject), subject, peaks, ours, source)
     return _make_track(source.head, peaks, steps)
 
 
 def _read_steps(
-    path: Path,
-    subject: str,
-    peaks: list[PeakFrame],
-    ours: Mapping[str, Camera],
-    axes: str,
-    rig: Mapping[str, Camera] | None,
-    in_clip: bool,
-) -> dict[str, FlameStep]:
+    path: Path, subject: str, peaks: list[PeakFrame], ours: Mapping[str, Camera],
+    source: TrackSource,
+) -> dict[str, FlameStep]:  # fmt: skip
     """Read the time steps of peaks, by expression."""
     if is_transforms(path):
-        return _steps_of_transforms(path, subject, peaks, ours, axes, in_clip)
+        return _steps_of_transforms(path, subject, peaks, ours, source)
     if path.is_dir():
         # VHAP writes one per epoch; the last is the best.
         files = sorted(path.glob("tracked_flame_params*.npz"), key=lambda p: (len(p.name), p.name))
@@ -122,17 +120,13 @@ def _read_steps(
         path = files[-1]
     if path.suffix != ".npz":
         raise ConfigError(f"{path}: no such file; expected a folder or {WHAT} (.npz)")
-    return _steps_of_npz(path, peaks, ours, rig, in_clip)
+    return _steps_of_npz(path, peaks, ours, source)
 
 
 def _steps_of_transforms(
-    path: Path,
-    subject: str,
-    peaks: list[PeakFrame],
-    ours: Mapping[str, Camera],
-    axes: str,
-    in_clip: bool,
-) -> dict[str, FlameStep]:
+    path: Path, subject: str, peaks: list[PeakFrame], ours: Mapping[str, Camera],
+    source: TrackSource,
+) -> dict[str, FlameStep]:  # fmt: skip
     file = path / "transforms.json" if path.is_dir() else path
     folder, frames = file.parent, read_json_table(file, FormatError)["frames"]
     other = folder / "export.json"
@@ -143,10 +137,10 @@ def _steps_of_transforms(
     for number, row in enumerate(frames):
         where = f"{file}: frame {number}"
         name = str(row.get("camera_id", row.get("camera_index", "")))
-        cameras.setdefault(name, _camera_of(where, name, row, axes))
+        cameras.setdefault(name, _camera_of(where, name, row, source.axes))
         rows.setdefault(str(row.get("timestep_id", row.get("timestep_index", number))), row)
     motion = aligning_transform(cameras, ours, str(file))
-    chosen = _choose(list(rows), peaks, in_clip, str(file))
+    chosen = _choose(list(rows), peaks, source.in_clip, str(file))
     steps = {}
     for expression, key in chosen.items():
         row = rows[key]
@@ -177,22 +171,21 @@ def _camera_of(where: str, name: str, row: dict, axes: str) -> Camera:
 
 
 def _steps_of_npz(
-    path: Path,
-    peaks: list[PeakFrame],
-    ours: Mapping[str, Camera],
-    rig: Mapping[str, Camera] | None,
-    in_clip: bool,
+    path: Path, peaks: list[PeakFrame], ours: Mapping[str, Camera], source: TrackSource
 ) -> dict[str, FlameStep]:
     arrays = read_arrays(path, FormatError, WHAT, ROWS)
-    if "focal_length" in arrays and rig is None:
+    if "focal_length" in arrays and source.cameras is None:
         raise CalibrationError(
             f"{path}: was tracked without calibrated cameras (it has a focal_length); track it with"
             " those of the dataset, or import the folder that its export wrote"
         )
-    motion = np.eye(4) if rig is None else aligning_transform(rig, ours, str(path))
+    motion = np.eye(4)
+    if source.cameras is not None:
+        rig = read_rig(source.cameras, None, None, 1.0)
+        motion = aligning_transform(rig, ours, str(path))
     count = len(arrays["translation"])
     names = [str(n) for n in np.ravel(arrays.get("timestep_id", np.arange(count)))]
-    chosen = _choose(names[:count], peaks, in_clip, str(path))
+    chosen = _choose(names[:count], peaks, source.in_clip, str(path))
     return {e: _step(path, arrays, names.index(key), motion) for e, key in chosen.items()}
 
 
@@ -251,7 +244,7 @@ def _step(path: Path, arrays: Mapping[str, np.ndarray], row: int, motion: np.nda
 
 def _make_track(
     head: str, peaks: list[PeakFrame], steps: Mapping[str, FlameStep]
-) -> tuple[Track, list[Note]]:
+) -> tuple[dict[str, np.ndarray], list[Note]]:
     model = load_head(head).to(dtype=torch.float64)
     first = steps[peaks[0].expression]
     for name, value in first.shared.items():
@@ -266,15 +259,16 @@ def _make_track(
     shape = _fitted(first.shared["shape"], model.shape_dirs.shape[2], "shape", first.where)
     offsets = _offsets(first, model)
     rows = [_posed(steps[peak.expression], model, shape, offsets) for peak in peaks]
-    stacked = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-    frames = np.array([peak.frame for peak in peaks], np.int64)
+    track = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+    track |= {
+        "schema": np.array(SCHEMA), "head": np.array(head),
+        "expressions": np.array([peak.expression for peak in peaks]),
+        "frames": np.array([peak.frame for peak in peaks], np.int64),
+        "shape": shape, "offsets": offsets.astype(np.float32),
+    }  # fmt: skip
     moving = max(step.dynamic_mm for step in steps.values())
     why = f"displacements of single time steps, up to {moving:.2f} mm, are left out"
-    unknown = np.full(stacked["vertices"].shape[:2], np.nan, np.float32)  # to other tools
-    return Track(
-        head=head, expressions=tuple(peak.expression for peak in peaks), frames=frames,
-        sigma=unknown, bound=unknown, shape=shape, offsets=offsets.astype(np.float32), **stacked,
-    ), [Note("dynamic_offset", why)] if moving > 0 else []  # fmt: skip
+    return track, [Note("dynamic_offset", why)] if moving > 0 else []
 
 
 def _fitted(values: np.ndarray, count: int, name: str, where: str) -> np.ndarray:

@@ -149,14 +149,14 @@ def _look(
     found = None
     for place in places:
         if follow is not None and found is None and np.isfinite(place).all():
-            found = _agreed(cue, frame, _followed(read, cameras, follow, place))
+            found = agreed(cue, frame, _followed(read, cameras, follow, place))
     if found is None:
-        found = _agreed(cue, frame, face_views(read, cameras, frame, source))
+        found = agreed(cue, frame, face_views(read, cameras, frame, source))
     # A clip may be one long blink: the peaks show what open eyes look like.
     return None if found is None else shut_lids([found], peaks)[0]
 
 
-def _agreed(cue: str, frame: int, views: list[LandmarkView]) -> Observation | None:
+def agreed(cue: str, frame: int, views: list[LandmarkView]) -> Observation | None:
     """Return what the views agree on; None if that is no face."""
     observation = agree(cue, frame, views)[0] if views else None
     if observation is None or observation.inliers.sum(1).max() < MIN_LANDMARKS:
