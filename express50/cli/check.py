@@ -22,11 +22,11 @@ def add_commands(subparsers: Any) -> None:
         "check",
         run_check,
         "audit a dataset against its ledger, and fix it",
-        description="Compares every output with what was published (present, size, and SHA-256 "
-        "where the time of change is another; --deep reads every byte), with the inputs and "
-        "settings that are there now, looks for unfinished and unaccounted outputs, labels of "
-        "frames that do not exist, captures that are gone, and traces of withdrawn people. Exit "
-        "code 0 when nothing wrong is left, 1 otherwise.",
+        description="Compares every output with what was published (presence and size; SHA-256 if\n"
+        "the modification time differs; --deep reads every byte) and with the present\n"
+        "inputs and settings. Looks for unfinished and unknown outputs, labels of frames\n"
+        "that do not exist, missing captures, and traces of withdrawn people.\n"
+        "Exit code 0 if no problem is left, 1 otherwise.",
         example="express50 check DATASET --fix && express50 run DATASET",
     )
     check.add_argument("--deep", action="store_true", help="read every byte of every output")
@@ -40,10 +40,10 @@ def add_commands(subparsers: Any) -> None:
         "prune",
         run_prune,
         "delete outputs that were replaced or set aside",
-        description="Stages keep the two outputs that each item had before its present one, as "
-        "long as the disk has 2 GB left: going back to their settings or inputs is then a rename. "
-        "This command deletes these and what was set aside because it was wrong. Nothing that any "
-        "command reads is lost.",
+        description="Stages keep the last two replaced outputs of each item while the disk has 2 "
+        "GB left, so that going back to old settings or inputs takes no work. This command deletes "
+        "them, and outputs that were set aside because they were wrong. The present outputs "
+        "stay.",
     )
     subject = subparsers.add_parser("subject", help="withdraw a person from a dataset")
     withdraw = add_command(
@@ -51,10 +51,11 @@ def add_commands(subparsers: Any) -> None:
         "withdraw",
         run_withdraw,
         "remove all that the dataset holds of a subject",
-        description="Removes a subject's index, derived files, labels, receipts, the packed shards "
-        "and whatever of others names the person, takes codes and frames out of checkpoints, notes "
-        "in withdrawn.json when that was, then searches all that is left for the subject's id. "
-        "Lists only, without --yes. 'express50 check' proves it at any later time.",
+        description="Removes a subject's index, derived files, labels and receipts, the packed\n"
+        "shards, and everything else that names the person. Takes codes and frames out\n"
+        "of checkpoints, notes the time in withdrawn.json, then searches the rest for\n"
+        "the subject's id. Without --yes it only lists. 'express50 check' proves the\n"
+        "removal at any later time.",
         example="express50 subject withdraw DATASET S001 --yes",
     )
     withdraw.add_argument("subject", metavar="SUBJECT")

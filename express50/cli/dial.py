@@ -35,14 +35,17 @@ from express50.errors import ConfigError
 def add_commands(subparsers: Any) -> None:
     """Add ``tune``, and ``--budget`` and ``--error`` to ``run``."""
     run = subparsers.choices["run"]
-    words = "choose the settings for this time: 45m, 2h, 1h30m; 40ch are core hours"
+    words = "choose the settings that fit in this time: 45m, 2h, 1h30m; 40ch means core hours"
     run.add_argument("--budget", metavar="TIME", help=words)
     words = "choose the quickest settings with this expected error, such as 0.5mm"
     run.add_argument("--error", metavar="ERROR", help=words)
     run.set_defaults(handler=run_chain)
-    words = "measure what time buys on this dataset: error of the whole chain against time"
+    words = "measure the error of the whole chain against its time on this dataset"
     parser = add_command(
-        subparsers, "tune", run_tune, words, description=words,
+        subparsers, "tune", run_tune, words,
+        description="Tries every setting of every stage on a few expressions of one subject,\n"
+        "prints the choices that no other beats in both time and error, and writes\n"
+        "DATASET/dial/front.csv. Later 'run --budget' and 'plan' use the measurements.",
         example="express50 tune DATASET && express50 report DATASET",
     )  # fmt: skip
     add_run_options(parser, captures=True)

@@ -17,8 +17,9 @@ OWN = (stages, dial, status, shards, check, plan, export, twin)
 DESCRIPTION = "From raw multi-view head footage to packed, annotated shards."
 EPILOG = """example:
   express50 run DATASET CAPTURE... --preset draft
-exit codes: 0 all done, 1 some item failed, 2 wrong usage or configuration, or something that a
-run needs is not there and nothing was started"""
+  express50 run DATASET CAPTURE... --budget 2h
+exit codes: 0 all done; 1 an item failed or a budget ended; 2 wrong usage or configuration, or
+something that a run needs is missing (nothing was started)"""
 
 
 def build_parser(command: str | None = None) -> argparse.ArgumentParser:

@@ -75,10 +75,11 @@ def add_commands(subparsers: Any) -> None:
         subparsers,
         "plan",
         run_plan,
-        "what a campaign costs, from measured datasets",
-        description="Scales what every stage of a dataset took to the size of a campaign. Every "
-        "figure is from receipts or from 'express50 tune' on this machine; what was not run is "
-        "n/a. A second dataset with other cameras or sizes tells what does not grow.",
+        "estimate what a campaign costs, from measured datasets",
+        description="Scales the time and disk space that every stage took on a dataset to the\n"
+        "size of a campaign. Every figure comes from receipts or from 'express50 tune' on this\n"
+        "machine; stages that were not run are n/a. A second dataset of another size\n"
+        "(--also) separates the costs that grow with the footage from the others.",
         example="express50 plan DATASET --also OTHER --target express-50 --workers 32",
     )
     words = "another measured dataset, of another size (repeatable)"
@@ -86,11 +87,14 @@ def add_commands(subparsers: Any) -> None:
         "--also", type=Path, action="append", default=[], metavar="DATASET", help=words
     )
     parser.add_argument("--target", choices=list(TARGETS), help="a named campaign")
+    words = "of the campaign (default: as in --target, else as measured)"
     for name in SIZES:
         flag = f"--{name.replace('_', '-')}"
-        parser.add_argument(flag, type=int, metavar="N", help="of the target; else as measured")
-    parser.add_argument("--size", metavar="WxH", help="pixels of the target's cameras")
-    parser.add_argument("--workers", type=int, default=1, metavar="N", help="cores (default 1)")
+        parser.add_argument(flag, type=int, metavar="N", help=words)
+    parser.add_argument("--size", metavar="WxH", help="pixels of the campaign's cameras")
+    parser.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="cores that work (default 1)"
+    )
 
 
 def run_plan(args: argparse.Namespace) -> int:
@@ -105,7 +109,7 @@ def run_plan(args: argparse.Namespace) -> int:
             width, height = (int(part) for part in args.size.lower().split("x"))
         except ValueError:
             raise ConfigError(
-                f"--size {args.size!r}: expected WIDTHxHEIGHT, as 3840x2160"
+                f"--size {args.size!r}: expected WIDTHxHEIGHT, such as 3840x2160"
             ) from None
         sizes["pixels"] = width * height
     dataset = Dataset(args.dataset)

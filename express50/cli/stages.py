@@ -20,22 +20,26 @@ def add_commands(subparsers: Any) -> None:
     for stage in stages().values():
         parser = add_command(
             subparsers, stage.name, run_one, stage.help, description=stage.help,
-            epilog=f"options of the stage: express50 config {stage.name}",
+            epilog=f"settings of the stage: express50 config {stage.name}",
         )  # fmt: skip
         add_run_options(parser, captures=stage.prepare is not None)
         parser.add_argument("--items", metavar="GLOB", help="only items that match, such as 'S00*'")
         parser.set_defaults(stage=stage.name)
     words, names = "run all stages in order", list(stages())
     parser = add_command(
-        subparsers, "run", run_all, words, description=words,
-        epilog="options of a stage: express50 config STAGE",
+        subparsers, "run", run_all, words,
+        description="Runs all stages in order and skips items that are up to date. With --budget\n"
+        "or --error it first measures a few expressions, then chooses the settings of\n"
+        "every stage.",
+        example="express50 run DATASET CAPTURE... --budget 2h\n"
+        "settings of a stage: express50 config STAGE",
     )  # fmt: skip
     add_run_options(parser, captures=True)
-    parser.add_argument("--first", metavar="STAGE", choices=names, help="start here")
-    parser.add_argument("--last", metavar="STAGE", choices=names, help="end here")
+    parser.add_argument("--first", metavar="STAGE", choices=names, help="first stage to run")
+    parser.add_argument("--last", metavar="STAGE", choices=names, help="last stage to run")
     words = "print the configuration of stages as TOML"
     parser = add_command(subparsers, "config", show_config, words, dataset=False, json=False)
-    parser.add_argument("stage", nargs="*", metavar="STAGE", help="all by default")
+    parser.add_argument("stage", nargs="*", metavar="STAGE", help="stages to print; all by default")
     add_config_options(parser)
 
 
@@ -52,7 +56,7 @@ def add_run_options(parser: argparse.ArgumentParser, captures: bool) -> None:
             help="folders of raw captures",
         )
     add_config_options(parser)
-    words = "local processes; 0 runs in this one"
+    words = "local worker processes (default 2); 0 works in this process"
     add("--workers", type=int, default=2, metavar="N", help=words)
     add("--scheduler", metavar="ADDRESS", help="dask scheduler, tcp://host:port")
     words = "run in SLURM jobs: partition=P,time=4:00:00,memory=16G,cores=4,jobs=8 or jobs.toml"
@@ -61,7 +65,7 @@ def add_run_options(parser: argparse.ArgumentParser, captures: bool) -> None:
     add("--print-job", action="store_true", help=words)
     words = "threads an item may use (default 1)"
     add("--threads", type=int, default=1, metavar="N", help=words)
-    words = "exit code 1 also where a part of an item was dropped, such as a camera"
+    words = "exit code 1 also if a part of an item was dropped, such as a camera"
     add("--strict", action="store_true", help=words)
 
 
@@ -69,9 +73,15 @@ def add_config_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that make up a configuration."""
     words = f"{', '.join(PRESETS)} (default standard)"
     parser.add_argument("--preset", metavar="P", help=words)
-    parser.add_argument("--config", type=Path, metavar="FILE", help="TOML, one table per stage")
     parser.add_argument(
-        "--set", action="append", default=[], metavar="STAGE.KEY=VALUE", help="set one value"
+        "--config", type=Path, metavar="FILE", help="TOML file of settings, one table per stage"
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="STAGE.KEY=VALUE",
+        help="change one setting; may be repeated",
     )
 
 

@@ -74,12 +74,22 @@ class StageStatus:
 
 def add_commands(subparsers: Any) -> None:
     """Add ``status``."""
-    words = "what is done, what failed, time and memory"
-    parser = add_command(subparsers, "status", show_status, words, json=False)
+    words = "show what is done, failed or outdated, expected errors, time and memory"
+    parser = add_command(
+        subparsers,
+        "status",
+        show_status,
+        words,
+        json=False,
+        description="Shows per stage the items that are done, failed, running or missing, time,"
+        " memory and the expected error; then what is outdated, and why. Exit code 1 if an item"
+        " failed.",
+    )
+    page = "write an HTML page, and update it while a stage runs"
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--json", action="store_true", help="print receipts as JSON")
-    how.add_argument("--page", type=Path, metavar="FILE", help="HTML page, kept up while a run is")
-    how.add_argument("--serve", type=int, metavar="PORT", help="the page on this machine, at PORT")
+    how.add_argument("--page", type=Path, metavar="FILE", help=page)
+    how.add_argument("--serve", type=int, metavar="PORT", help="serve the page on this machine")
 
 
 def show_status(args: argparse.Namespace) -> int:

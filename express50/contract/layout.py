@@ -17,7 +17,7 @@ def footage_root(capture: Path) -> Path:
     may be that one file, which says where a read-only dataset lies and how to take it.
 
     Raises:
-        CaptureError: capture.toml is not TOML, or its source is no existing path.
+        CaptureError: capture.toml is not TOML, or its source does not exist.
     """
     source = footage_source(Path(capture))
     return source.parent if source.is_file() else source
@@ -27,7 +27,7 @@ def footage_source(capture: Path) -> Path:
     """Return what ``source`` in capture.toml names; the capture itself where it names nothing.
 
     Raises:
-        CaptureError: capture.toml is not TOML, or its source is no existing path.
+        CaptureError: capture.toml is not TOML, or its source does not exist.
     """
     path = capture / "capture.toml"
     if not path.is_file():

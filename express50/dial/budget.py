@@ -44,7 +44,7 @@ def parse_budget(text: str) -> Budget:
     """Read a budget: ``90s``, ``45m``, ``2h``, ``1h30m``, ``1d``; ``40ch`` are core hours.
 
     Raises:
-        ConfigError: the text is no such time, or is 0.
+        ConfigError: the text is not such a time, or is 0.
     """
     parts = PART.findall(text)
     seconds = sum(float(number) * SECONDS[unit] for number, unit in parts)
@@ -61,12 +61,14 @@ def parse_goal(text: str) -> Goal:
     """Read a goal: ``0.5mm``, ``0.004alpha``.
 
     Raises:
-        ConfigError: the text is no number with a unit.
+        ConfigError: the text is not a number with a unit.
     """
     found = re.fullmatch(r"(\d*\.?\d+)\s*([A-Za-z]+)", text)
     if found is None or found[2] not in get_args(Unit) or not float(found[1]) > 0:
         units = ", ".join(get_args(Unit))
-        raise ConfigError(f"--error {text!r}: expected such as 0.5mm; units: {units}")
+        raise ConfigError(
+            f"--error {text!r}: expected a number and a unit, such as 0.5mm; units: {units}"
+        )
     return Goal(text, float(found[1]), found[2])
 
 

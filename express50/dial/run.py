@@ -281,7 +281,7 @@ def _first_choice(load: Workload, clock: Clock, goal: Goal | None) -> Point:
             need = format_seconds(clock.now() + reaching[0].seconds)
             how = f"takes about {need}, which is more than --budget"
         else:
-            how = f"the dearest settings give {error_text(name, points[-1].errors[name])}"
+            how = f"the most expensive settings give {error_text(name, points[-1].errors[name])}"
         raise ConfigError(f"--error {goal.text}: {how}")
     return point
 
@@ -297,7 +297,7 @@ def budget_text(seconds: float, cores: bool) -> str:
 
 @dataclass
 class _Speed:
-    """How long stages took against what was expected; believed after so many seconds."""
+    """How long stages took, compared with what was expected; used after ``believed`` seconds."""
 
     believed: float
     real: float = 0.0
@@ -353,7 +353,7 @@ def _run_one(
     speed: _Speed,
     cores: bool,
 ) -> Summary | None:
-    """Run a stage as far as the budget goes; None where it has nothing to work on."""
+    """Run a stage until the budget ends; None if it has nothing to work on."""
     load = chain.workload(measured, cores, {})
     label = state.settings[stage.name]
     config = chain.ladders[stage.name][label]
@@ -390,7 +390,8 @@ def expected_lines(point: Point) -> Iterator[str]:
     if stated:
         yield f"expected error: {', '.join(stated)}"
     if others:
-        yield f"no error is stated; apart from the dearest settings by: {', '.join(others)}"
+        words = "no stage states these errors; difference from the most expensive settings"
+        yield f"{words}: {', '.join(others)}"
 
 
 def choice_lines(
@@ -449,7 +450,7 @@ def _change(load: Workload, name: str, label: str, other: str, point: Point) -> 
 
 
 def closing_lines(state: RunState, summaries: Sequence[Summary]) -> Iterator[str]:
-    """Yield how a run kept its word: time, errors that the stages state, and what is left."""
+    """Yield time spent, the errors that the stages state, and what is left."""
     whole = f" of {state.budget}" if state.budget else ""
     yield f"spent {format_seconds(state.spent)}{whole}, {format_seconds(state.seconds)} expected"
     for name, (value, low, high) in state.stated.items():
@@ -458,4 +459,4 @@ def closing_lines(state: RunState, summaries: Sequence[Summary]) -> Iterator[str
     left = [f"{s.count('left')} of {s.stage}" for s in summaries if s.count("left")]
     if not state.finished:
         what = ", ".join(left) or "later stages"
-        yield f"the time is over; left: {what}; a larger --budget goes on from here"
+        yield f"the time is over; left: {what}; a larger --budget continues from here"

@@ -77,7 +77,7 @@ def decode_picture(name: str, data: bytes, width: int, height: int, where: str) 
         return _unzstd(data, width, height, where)
     try:
         if name not in (*RGB, *ALPHA, *PARTS, *DEPTH):
-            raise ValueError(f"{name} is no picture of a sample")
+            raise ValueError(f"{name} is not a picture of a sample")
         if name.endswith(".png"):
             image = decode_image(data, where)
         else:

@@ -71,29 +71,29 @@ OPTIONS: dict[str, dict[str, Any]] = {
     # Training
     "--preset": {
         "default": "paper",
-        "help": f"{', '.join(PRESETS)} (paper), or {commands.AUTO}: what suits the machine and the"
+        "help": f"{', '.join(PRESETS)} (paper), or {commands.AUTO}: chosen for the machine and the"
         " --budget",
     },
-    "--config": {"type": Path, "help": "TOML file over the preset"},
+    "--config": {"type": Path, "help": "TOML file; replaces values of the preset"},
     "--set": REPEATED | {
         "metavar": "TABLE.KEY=VALUE",
-        "help": "one value over everything else, for example train.lr=1e-3; repeatable",
+        "help": "set one value, such as train.lr=1e-3; overrides preset and file; repeatable",
     },
-    "--also": REPEATED | {"type": Path, "metavar": "SHARDS", "help": "mix in; repeatable"},
+    "--also": REPEATED | {"type": Path, "metavar": "SHARDS", "help": "more shards; repeatable"},
     "--seconds": {"type": parse_seconds, "help": "stop after this long: 240, 4m, 2h"},
     "--holdout-cameras": {"default": "", "help": "camera ids to test on: cam02,cam05"},
     "--holdout-expressions": {
-        "default": "", "metavar": "SUBJECT/EXPRESSION,..", "help": "to test on",
+        "default": "", "metavar": "SUBJECT/EXPRESSION,..", "help": "expressions to test on",
     },
-    "--paper-diff": FLAG | {"help": "print deviations from the paper's letter instead"},
-    "--anew": FLAG | {"help": "start over, though OUT has a checkpoint"},
+    "--paper-diff": FLAG | {"help": "print differences from the paper instead"},
+    "--anew": FLAG | {"help": "start over even if OUT has a checkpoint"},
     # Measuring
     "--alexnet": {"default": "", "help": "torchvision's alexnet state dict, for LPIPS"},
     "--inception": {"default": "", "help": "Inception as TorchScript, for FID"},
     "--subjects": {"default": "*", "help": f"{PATTERNS}: S001,S002"},
     "--expressions": {"default": "*", "help": PATTERNS},
     "--cameras": {"default": "*", "help": f"{PATTERNS}: cam02,cam05"},
-    "--images": {"type": at_least(0), "default": 0, "help": "at most so many, 0 = all"},
+    "--images": {"type": at_least(0), "default": 0, "help": "at most this many, 0 = all"},
     "--heldout": FLAG | {"help": "leave out what training saw"},
     "--save": {"type": Path, "metavar": "FOLDER", "help": "write pictures for 'score'"},
     "--fit-subjects": {"default": "", "help": "default: all not trained"},
@@ -102,7 +102,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--fit-budget": {"type": parse_seconds, "help": "time for a fit: 60s, 5m"},
     "--background": {"type": float, "default": 0.0, "help": "grey, 0 to 1"},
     "--partial": FLAG | {"help": "score the pictures that exist"},
-    "--seeds": {"type": at_least(1), "default": 1, "help": "train rows so often (1)"},
+    "--seeds": {"type": at_least(1), "default": 1, "help": "train each row this many times (1)"},
     "--test": REPEATED | {"type": Path, "metavar": "SHARDS", "help": "fit their people only"},
     "--rows": {"default": "", "help": "full,no_residuals,..; default: all"},
     "--json": FLAG | {"help": "print the result as JSON"},
@@ -177,13 +177,13 @@ COMMANDS = {
         handler=commands.train,
         options=f"shards out {TRAINING} --anew --json",
         help="train on packed shards",
-        example="grmm train data/pack/shards run --preset demo --seconds 240; the same again goes "
-        "on from run/checkpoint.pt",
+        example="grmm train data/pack/shards run --preset demo --budget 4m; the same command again "
+        "continues from run/checkpoint.pt",
         changes={
             "out": {"help": "folder for checkpoint.pt, metrics.json, preview/"},
             "--preset": {
                 "default": commands.AUTO,
-                "help": f"{', '.join(PRESETS)}, or {commands.AUTO}: what suits the machine and the"
+                "help": f"{', '.join(PRESETS)}, or {commands.AUTO}: chosen for the machine and the"
                 " --budget (auto)",
             },
         },

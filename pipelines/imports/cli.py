@@ -58,6 +58,11 @@ PATTERN = (
     " from the cue's start) in it, such as 'masks/{subject}/{camera}/{frame:06d}.png'"
 )
 
+TRACKS = (
+    "folder or file of the tracks; may hold {subject} and {expression}, such as"
+    " 'vhap/{subject}_{expression}'"
+)
+
 
 def add_commands(subparsers: Any) -> None:
     """Add ``import track``, ``matte``, ``depth`` and ``remove``."""
@@ -68,27 +73,41 @@ def add_commands(subparsers: Any) -> None:
     for action, what in WORDS.items():
         parser = add_command(actions, action, run_import, f"take in {what}")
         add = parser.add_argument
-        add("pattern", metavar="PATH", help=PATTERN)
-        add("--subject", action="append", metavar="ID", help="may be repeated [all included]")
-        words = "only warn where it does not fit what the footage shows"
+        add("pattern", metavar="PATH", help=TRACKS if action == "track" else PATTERN)
+        add(
+            "--subject",
+            action="append",
+            metavar="ID",
+            help="subject to import; may be repeated [all included]",
+        )
+        words = "only warn if the import contradicts the footage"
         add("--trust", action="store_true", help=words)
         if action == "track":
-            add("--head", required=True, metavar="MODEL", help="FLAME's .pkl that was tracked with")
-            words = "of the camera matrices in transforms.json [opengl]"
+            add(
+                "--head",
+                required=True,
+                metavar="MODEL",
+                help="the FLAME .pkl that the track was made with",
+            )
+            words = "camera axes of the matrices in transforms.json [opengl]"
             add("--axes", choices=("opengl", "opencv"), default="opengl", help=words)
-            words = "calibration that tracked_flame_params_N.npz was tracked with, if another"
+            words = (
+                "calibration that tracked_flame_params_N.npz was made with, if not the dataset's"
+            )
             add("--cameras", type=Path, metavar="FILE", help=words)
             continue
         words = "the pictures are of the footage as recorded: undistort them"
         add("--distorted", action="store_true", help=words)
         if action == "depth":
-            words = "of the values: m, cm, mm, or metres per step, such as 0.0001"
+            words = "unit of the values: m, cm, mm, or metres per step, such as 0.0001"
             add("--unit", required=True, type=_metres, dest="metres", help=words)
-            add("--ray", action="store_true", help="they are lengths of rays, not camera z")
-    words = "give imported items up, so that their stage makes them"
+            add("--ray", action="store_true", help="values are lengths of rays, not camera z")
+    words = "remove imported items, so that their stage makes them"
     parser = add_command(actions, "remove", run_remove, words)
     parser.add_argument("stage", choices=tuple(WORDS))
-    parser.add_argument("--items", default="*", metavar="GLOB", help="such as 'S001*' [all]")
+    parser.add_argument(
+        "--items", default="*", metavar="GLOB", help="only items that match, such as 'S001*' [all]"
+    )
 
 
 def run_remove(args: argparse.Namespace) -> int:

@@ -14,4 +14,4 @@ def add_commands(subparsers: Any) -> None:
     add(subparsers)
 
 
-COMMAND = Command("track the face of a bare photograph or video", add_commands)
+COMMAND = Command("track the face in a single photograph or video", add_commands)

@@ -37,7 +37,7 @@ PHOTO_SETTINGS = (
     "matte.method=grabcut",
 )  # fmt: skip
 PANEL_TILE, PANEL_YAW = 512, 60.0  # pixels; degrees
-WORDS = "track the face of a bare photograph or video, without calibration"
+WORDS = "track the face in a single photograph or video, without calibration"
 
 
 def add_commands(subparsers: Any) -> None:
@@ -48,12 +48,12 @@ def add_commands(subparsers: Any) -> None:
     )  # fmt: skip
     parser.add_argument("picture", type=Path, metavar="PICTURE", help="image or video file")
     parser.add_argument("out", type=Path, metavar="OUT", help="dataset folder to make or extend")
-    parser.add_argument("--subject", metavar="ID", help="subject id (the file's name)")
+    parser.add_argument("--subject", metavar="ID", help="subject id [the file's name]")
     lens = parser.add_mutually_exclusive_group()
     lens.add_argument("--focal-px", type=float, metavar="F", help="focal length, pixels")
     lens.add_argument(
         "--film-mm", type=float, default=50.0, metavar="MM",
-        help="focal length on 35 mm film to assume where EXIF has none [50]",
+        help="focal length on 35 mm film to assume if EXIF has none [50]",
     )  # fmt: skip
     parser.add_argument(
         "--windows", type=int, default=8, metavar="N",
@@ -62,11 +62,11 @@ def add_commands(subparsers: Any) -> None:
     parser.add_argument(
         "--matte",
         action="store_true",
-        help="matte too, and fit outlines; by colours about the face, or by a network of yours:"
+        help="also make a matte and fit outlines; by colours around the face, or by your network:"
         " --set matte.method=salient --set matte.weights=FILE",
     )
     add_config_options(parser)
-    parser.add_argument("--json", action="store_true", help="print the account as JSON")
+    parser.add_argument("--json", action="store_true", help="print as JSON")
     parser.set_defaults(handler=run_photo)
 
 

@@ -110,7 +110,7 @@ def test_a_goal_is_reached_in_the_least_time_or_refused(tmp_path, captures):
     _, state = go(tmp_path / "d", captures, goal="0.8mm")
     assert error_of(state.settings) <= 0.8
     assert state.settings["solve"] == "standard" and state.settings["map"] == "standard"
-    with pytest.raises(ConfigError, match=r"--error 0\.1mm: the dearest settings give value 0\.5"):
+    with pytest.raises(ConfigError, match=r"0\.1mm: the most expensive settings give value 0\.5"):
         go(tmp_path / "d", captures, goal="0.1mm")
     with pytest.raises(ConfigError, match="no stage states its error in px"):
         go(tmp_path / "d", captures, goal="1px")
