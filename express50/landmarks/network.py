@@ -10,8 +10,9 @@ The eyes are looked at once more, at twice the resolution: a small network of it
 six points each, as the first one hardly tells half shut lids from open ones.
 
 The landmarks are fixed places of a head. The outline, 17 points of the edge of the face that a
-picture shows, is what published marks have in place of the jaw line's. It is found in the same way
-and corrected by a perceptron that sees it and the landmarks.
+picture shows, is what published marks have in place of the jaw line's. The dense points, found on
+coarser maps, are fixed places spread over face, ears, neck and the front of the scalp. Both kinds
+are found in the same way and corrected by a perceptron that sees them and the landmarks.
 """
 
 from __future__ import annotations
@@ -43,14 +44,22 @@ MIRROR = np.array(
      45, 44, 43, 42, 47, 46, 39, 38, 37, 36, 41, 40,
      54, 53, 52, 51, 50, 49, 48, 59, 58, 57, 56, 55, 64, 63, 62, 61, 60, 67, 66, 65]
 )  # fmt: skip
-# The same of the landmarks and the outline.
-MIRROR_ALL = np.concatenate([MIRROR, POINTS + np.arange(OUTLINE)[::-1]])
 # An eye is seen in a crop of EYE_CROP pixels, each EYE_ZOOM of a pixel of the face's crop; the
 # subject's right eye is mirrored. Its points are the landmarks LEFT_EYE, or their partners.
 EYE_CROP, EYE_ZOOM = 48, 0.6
 LEFT_EYE = np.arange(42, 48)
 # Suffix of buffers that are not stored: batch normalisation counts its batches.
 COUNTERS = "num_batches_tracked"
+
+
+def mirrored(dense: int) -> np.ndarray:
+    """Return the partners (68 + 17 + dense,) of landmarks, outline and dense points in a mirror.
+
+    The first half of the dense points is on the subject's left, the other its mirror image.
+    """
+    first = POINTS + OUTLINE
+    outline, others = np.arange(POINTS, first)[::-1], np.arange(first, first + dense)
+    return np.concatenate([MIRROR, outline, np.roll(others, dense // 2)])
 
 
 def face_box(points: np.ndarray) -> tuple[np.ndarray, float]:
@@ -70,6 +79,8 @@ class Output(NamedTuple):
         heat: (B, 68, H / 4, W / 4) heat maps before the softmax.
         outline: (B, 17, 2) crop pixels; the landmarks 0 to 16 of a network that does not find it.
         outline_log_scale, outline_heat: as of the landmarks.
+        dense: points (B, D, 2), log scales (B, D) and heat maps (B, D, H / 8, W / 8) of the dense
+            points, as of the landmarks; None where these are not asked for.
     """
 
     points: torch.Tensor
@@ -80,6 +91,7 @@ class Output(NamedTuple):
     outline: torch.Tensor
     outline_log_scale: torch.Tensor
     outline_heat: torch.Tensor
+    dense: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None
 
 
 class Residual(nn.Module):
@@ -118,23 +130,23 @@ class ShapeHead(nn.Module):
         return points + 8.0 * out[:, :2].transpose(1, 2), log_scale.clamp(-2.0, 4.0), out[:, 3]
 
 
-class OutlineHead(nn.Module):
-    """Finds the outline on the finest maps; see `Output`."""
+class MorePoints(nn.Module):
+    """Finds more points on maps of the trunk, by convolutions of `size`; see `Output`."""
 
-    def __init__(self, maps: int, features: int, width: int = 160) -> None:
+    def __init__(self, count: int, maps: int, features: int, size: int, width: int = 160) -> None:
         super().__init__()
-        self.heat = nn.Conv2d(maps, OUTLINE, 3, 1, 1)
+        self.heat = nn.Conv2d(maps, count, size, 1, size // 2)
         self.look = nn.Linear(features, 64)
-        self.first = nn.Linear(3 * OUTLINE + 2 * POINTS + 64, width)
-        self.second = nn.Linear(width, 3 * OUTLINE)
-        self.spread = nn.Parameter(torch.zeros(OUTLINE))
+        self.first = nn.Linear(3 * count + 2 * POINTS + 64, width)
+        self.second = nn.Linear(width, 3 * count)
+        self.spread = nn.Parameter(torch.zeros(count))
         nn.init.zeros_(self.second.weight)
         nn.init.zeros_(self.second.bias)
 
     def forward(
         self, maps: torch.Tensor, marks: torch.Tensor, features: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return points (B, 17, 2), log scales (B, 17) and heat maps (B, 17, H, W)."""
+        """Return points (B, N, 2), log scales (B, N) and heat maps (B, N, H, W)."""
         heat = self.heat(maps)
         points, variance = expectation(heat)
         spread = variance.clamp_min(1e-2).log()
@@ -145,6 +157,19 @@ class OutlineHead(nn.Module):
         out = self.second(hidden).view(-1, 3, heat.shape[1])
         log_scale = (1.0 + out[:, 2] + self.spread * spread).clamp(-2.0, 4.0)
         return points + 8.0 * out[:, :2].transpose(1, 2), log_scale, heat
+
+
+class DensePart(MorePoints):
+    """Finds the dense points.
+
+    Attributes:
+        faces: (D,) int32, of the built-in head; weights: (D, 3) barycentric: where the points are.
+    """
+
+    def __init__(self, count: int, maps: int, features: int) -> None:
+        super().__init__(count, maps, features, 1)
+        self.register_buffer("faces", torch.zeros(count, dtype=torch.int32))
+        self.register_buffer("weights", torch.zeros(count, 3))
 
 
 class EyeNet(nn.Module):
@@ -173,12 +198,14 @@ class LandmarkNet(nn.Module):
     Crops of half the size (64, 64) are understood as well; points are in pixels of 128 all the
     same. Training begins with them, for a quarter of the time.
 
-    A network for other pictures than of `whole` heads finds no outline and has no `eyes`.
+    A network for other pictures than of `whole` heads finds no outline and has no `eyes`; one of
+    no `dense` points finds none.
     """
 
-    def __init__(self, whole: bool = False) -> None:
+    def __init__(self, whole: bool = False, dense: int = 0) -> None:
         super().__init__()
-        self.outline = OutlineHead(48, 128) if whole else None
+        self.outline = MorePoints(OUTLINE, 48, 128, 3) if whole else None
+        self.dense = DensePart(dense, 64, 128) if dense else None
         self.eyes = EyeNet() if whole else None
         self.stem1, self.stem2 = _conv(3, 16, 5, 2), _conv(16, 32, 3, 2)
         self.block32 = Residual(32)
@@ -192,29 +219,39 @@ class LandmarkNet(nn.Module):
         self.shape = ShapeHead(128)
         self.face = nn.Linear(128, 1)
 
-    def forward(self, crops: torch.Tensor) -> Output:
-        """Run the network; exposure and contrast are normalised per crop."""
+    def forward(self, crops: torch.Tensor, dense: bool = False) -> Output:
+        """Run the network, with dense points if wanted; exposure and contrast are normalised."""
         # Places need single precision, whatever training has the convolutions done in.
-        finest, features = (part.float() for part in self.trunk(crops))
+        maps, finest, features = (part.float() for part in self.trunk(crops))
         with torch.autocast("cpu", enabled=False):
             heat = self.heat(finest)
             points, log_scale, seen = self.shape(*expectation(heat), features)
             edge = points[:, :OUTLINE], log_scale[:, :OUTLINE], heat[:, :OUTLINE]
             if self.outline is not None:
                 edge = self.outline(finest, points, features)
-            return Output(points, log_scale, seen, self.face(features)[:, 0], heat, *edge)
+            over = None
+            if self.dense is not None and dense:
+                over = self.dense(maps, points, features)
+            return Output(points, log_scale, seen, self.face(features)[:, 0], heat, *edge, over)
 
-    def trunk(self, crops: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return maps (B, 48, H / 4, W / 4) and features (B, 128)."""
+    def places(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return where the dense points are: faces (D,) of the built-in head, weights (D, 3)."""
+        if self.dense is None:
+            return np.zeros(0, np.int64), np.zeros((0, 3))
+        faces, weights = self.dense.faces, self.dense.weights
+        return faces.numpy().astype(np.int64), weights.double().numpy()
+
+    def trunk(self, crops: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return maps (B, 64, H / 8, W / 8) and (B, 48, H / 4, W / 4), and features (B, 128)."""
         x = functional.relu(self.stem1(_normalised(crops)))
         x32 = self.block32(functional.relu(self.stem2(x)))
         x16 = self.block16(functional.relu(self.down16(x32)))
         x8 = self.block8(functional.relu(self.down8(x16)))
         x4 = self.block4(functional.relu(self.down4(x8)))
         y = self.mix8(functional.relu(x8 + _twice(self.side4(x4))))
-        y = functional.relu(self.mix16(functional.relu(x16 + _twice(self.side8(y)))))
-        y = functional.relu(self.mix32(functional.relu(x32 + _twice(self.side16(y)))))
-        return y, x4.mean((2, 3))
+        y16 = functional.relu(self.mix16(functional.relu(x16 + _twice(self.side8(y)))))
+        y = functional.relu(self.mix32(functional.relu(x32 + _twice(self.side16(y16)))))
+        return y16, y, x4.mean((2, 3))
 
 
 def _normalised(crops: torch.Tensor) -> torch.Tensor:
@@ -296,7 +333,7 @@ def trainable_network(path: Path = WEIGHTS) -> LandmarkNet:
     """
     names = [key for key in LandmarkNet().state_dict() if not key.endswith(COUNTERS)]
     arrays = read_arrays(path, FormatError, "landmark weights", names)
-    net = LandmarkNet("outline.spread" in arrays)
+    net = LandmarkNet("outline.spread" in arrays, len(arrays.get("dense.faces", ())))
     names = [key for key in net.state_dict() if not key.endswith(COUNTERS)]
     try:
         state = {key: torch.from_numpy(arrays[key].astype(np.float32)) for key in names}

@@ -1,6 +1,7 @@
 """Cut training crops of rendered heads on random backgrounds, spoiled as cameras do.
 
-A file of views is made once; it depends on the seed, the head model and its number alone.
+A file of views is made once; it depends on the seed, the head model, its number and the dense
+points alone.
 """
 
 from __future__ import annotations
@@ -17,7 +18,16 @@ import numpy as np
 
 from express50.geometry.conventions import affine_to_opencv
 from express50.head.model import HeadModel
-from express50.landmarks.network import CROP, CROP_MARGIN, MIRROR, MIRROR_ALL, POINTS, face_box
+from express50.landmarks.network import (
+    CROP,
+    CROP_MARGIN,
+    MIRROR,
+    OUTLINE,
+    POINTS,
+    face_box,
+    mirrored,
+)
+from express50.landmarks.training.places import Places
 from express50.landmarks.training.random_heads import random_head
 from express50.landmarks.training.scene import HeadScene, TrainingView
 
@@ -37,22 +47,28 @@ def draw_yaws(rng: np.random.Generator) -> np.ndarray:
     return np.append(front, rng.uniform(FACE_YAW, 2 * np.pi - FACE_YAW))
 
 
-def draw_views(model: HeadModel, count: int, rng: np.random.Generator) -> list[TrainingView]:
-    """Render `count` views of random heads."""
+def draw_views(
+    model: HeadModel, count: int, rng: np.random.Generator, places: Places | None = None
+) -> list[TrainingView]:
+    """Render `count` views of random heads, with dense points at places of the model."""
     views: list[TrainingView] = []
     while len(views) < count:
-        scene = HeadScene(model, random_head(model, rng))
+        scene = HeadScene(model, random_head(model, rng), places)
         yaws = draw_yaws(rng)[: count - len(views)]
         views += [scene.render(rng, SIDE, float(yaw)) for yaw in yaws]
     return views
 
 
-def open_views(folder: Path, model: HeadModel, number: int, seed: int) -> list[TrainingView]:
+def open_views(
+    folder: Path, model: HeadModel, number: int, seed: int, places: Places
+) -> list[TrainingView]:
     """Read one file of `FILE_VIEWS` views, which is rendered if it is not there yet."""
     rng = np.random.default_rng([seed, number, *model.name.encode()])
-    digest = hashlib.sha256(model.template.numpy().tobytes()).hexdigest()[:8]
+    # Other heads or other dense points make other files.
+    made_of = b"".join(np.ascontiguousarray(part).tobytes() for part in (model.template, *places))
+    digest = hashlib.sha256(made_of).hexdigest()[:8]
     path = folder / f"{model.name}-{digest}-{seed}-{number:03d}.npz"
-    return made_once(path, TrainingView, lambda: draw_views(model, FILE_VIEWS, rng))
+    return made_once(path, TrainingView, lambda: draw_views(model, FILE_VIEWS, rng, places))
 
 
 def made_once(path: Path, kind: type[Record], make: Callable[[], list[Record]]) -> list[Record]:
@@ -76,7 +92,8 @@ class TrainingCrop:
     """A training crop."""
 
     image: np.ndarray  # (size, size, 3) uint8
-    points: np.ndarray  # (68 + 17, 2) pixels of a crop of `CROP` pixels, whatever the image's size
+    # (68 + 17 + D, 2) pixels of a crop of `CROP` pixels, whatever the image's size
+    points: np.ndarray
     visible: np.ndarray  # (68,) float32, 1 where neither the head nor anything else hides the point
     score: float  # target of the face score
     weight: float  # how much the points count; 0 for backs of heads
@@ -105,7 +122,8 @@ def random_crop(
     points = points @ matrix[:, :2].T + matrix[:, 2]
     visible = view.visible
     if np.linalg.det(matrix[:, :2]) < 0:
-        points, visible = points[MIRROR_ALL], visible[MIRROR]
+        partner = mirrored(len(points) - POINTS - OUTLINE)
+        points, visible = points[partner], visible[MIRROR]
     pool = backgrounds[rng.integers(len(backgrounds))]
     x, y = rng.integers(0, CROP, 2)
     image = pool[y : y + CROP, x : x + CROP].copy()
