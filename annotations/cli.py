@@ -75,7 +75,11 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
 
     _add_labelling_verbs(add)
     _add_reviewing_verbs(add)
-    parser = add("reference", run_reference, "say or choose whom the others are matched to")
+    parser = add(
+        "reference",
+        run_reference,
+        "print or choose the reference person, to whom the others are matched",
+    )
     parser.add_argument("subject", nargs="?", metavar="SUBJECT", help="new reference")
     words = "label by RenderMe-360's rule: the last frame of a clip is its peak"
     add("rule", run_rule, words, "subjects").add_argument(
@@ -88,7 +92,7 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument("subject", metavar="SUBJECT")
     for parser in (
         add("export", run_export, "write every event as .csv or .json", "subjects"),
-        add("import", run_import, "take events of a .csv or .json in, once each"),
+        add("import", run_import, "add events from a .csv or .json, each only once"),
     ):
         parser.add_argument("file", type=Path, metavar="FILE")
 
@@ -106,8 +110,13 @@ def _add_labelling_verbs(add: Callable[..., argparse.ArgumentParser]) -> None:
         help="block characters, or sixels for terminals that draw them (xterm -ti vt340, foot,"
         " WezTerm, iTerm2) [%(default)s]",
     )  # fmt: skip
-    add("suggest", run_suggest, "what align suggests, doubtful first", "subjects")
-    words = "what you still have to label, in the best order"
+    add(
+        "suggest",
+        run_suggest,
+        "list the frames that align suggests, doubtful ones first",
+        "subjects",
+    )
+    words = "list what you still have to label, in the best order"
     parser = add("next", run_next, words, "subjects", "annotator")
     parser.add_argument("--order", choices=ORDERS, default=ORDERS[0], help="default: %(default)s")
     parser.add_argument("--count", type=int, default=10, metavar="N", help="at most so many [10]")
@@ -118,7 +127,7 @@ def _add_labelling_verbs(add: Callable[..., argparse.ArgumentParser]) -> None:
     parser.add_argument("--last", type=int, metavar="FRAME", help="last frame of its plateau")
     parser = add("flag", run_flag, "say that an expression has no peak", "clip", "annotator")
     parser.add_argument("reason", metavar="REASON", help=", ".join(FLAG_REASONS) + ", ...")
-    words = "take your last event on an expression back"
+    words = "undo your last event on an expression"
     add("undo", run_undo, words, "clip", "annotator")
     add("labels", run_labels, "every label in force", "subjects")
 
@@ -138,8 +147,8 @@ def _add_reviewing_verbs(add: Callable[..., argparse.ArgumentParser]) -> None:
         help="verdict: a frame, the annotator who is right, or the reason for a flag: "
         f"{', '.join(FLAG_REASONS)}, or flag:REASON",
     )  # fmt: skip
-    add("coverage", run_coverage, "subjects against expressions, with the gaps")
-    add("status", run_status, "how far each subject is, and what labels cost")
+    add("coverage", run_coverage, "print a table of subjects and expressions, with the gaps")
+    add("status", run_status, "show how far each subject is, and what labels cost")
     words = "write a contact sheet of all labels, or of a subject or expression, as one HTML file"
     parser = add("sheet", run_sheet, words, "subjects")
     parser.add_argument("file", type=Path, metavar="OUT.html")

@@ -100,7 +100,7 @@ def add_commands(subparsers: Any) -> None:
         add("--distorted", action="store_true", help=words)
         if action == "depth":
             words = "unit of the values: m, cm, mm, or metres per step, such as 0.0001"
-            add("--unit", required=True, type=_metres, dest="metres", help=words)
+            add("--unit", required=True, type=_metres, dest="metres", metavar="UNIT", help=words)
             add("--ray", action="store_true", help="values are lengths of rays, not camera z")
     words = "remove imported items, so that their stage makes them"
     parser = add_command(actions, "remove", run_remove, words)
