@@ -94,7 +94,7 @@ def run_tune(args: argparse.Namespace) -> int:
 @contextmanager
 def _chain(args: argparse.Namespace) -> Iterator[Any]:
     """Open the chain of a dataset with all settings of its stages; None where it cannot run."""
-    from express50.dial.run import Chain
+    from express50.dial.pilot import Chain
     from express50.runner.executor import Pool
     from express50.runner.preflight import problems
     from express50.runner.threads import cap_threads

@@ -18,7 +18,7 @@ from typing import Any
 from rich.filesize import decimal
 
 from express50.console import add_command, answer, count, format_table, stdout_to_stderr
-from express50.contract.config import PRESETS, config_toml, resolve_config
+from express50.contract.config import PRESETS, made_with, resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage, stages
 from express50.dial.figures import dial_dir, read_measured
@@ -223,12 +223,10 @@ def measure(dataset: Dataset, known: Sequence[Stage]) -> dict[str, Measured]:
 
 def preset_of(dataset: Dataset, stage: Stage) -> str:
     """Return the preset whose values a stage last ran with, or ``own`` and a digest of these."""
+    presets = {preset: resolve_config(stage, preset) for preset in ("standard", *PRESETS)}
     path = dataset.config_file(stage.name)
     text = path.read_text(encoding="utf-8") if path.is_file() else ""
-    for preset in ("standard", *PRESETS):
-        if config_toml(stage.name, resolve_config(stage, preset)) == text:
-            return preset
-    return f"own {text_digest(text)[:6]}"
+    return made_with(path, stage, presets) or f"own {text_digest(text)[:6]}"
 
 
 def target_of(name: str | None, sizes: Mapping[str, float], measured: Footage) -> Footage:

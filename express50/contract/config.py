@@ -195,6 +195,12 @@ def config_toml(name: str, config: Any) -> str:
     return "\n".join(lines) + "\n"
 
 
+def made_with(path: Path, stage: Stage, known: Mapping[str, Any]) -> str | None:
+    """Return the name of the configuration that a file of a stage holds; None of another one."""
+    text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+    return next((k for k, c in known.items() if config_toml(stage.name, c) == text), None)
+
+
 def field_documents(config: type) -> dict[str, str]:
     """Return documentation strings that stand under the fields of a config dataclass."""
     try:

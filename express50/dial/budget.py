@@ -86,7 +86,7 @@ class Clock:
 
     budget: Budget | None
     spent: float = 0.0
-    keep: Callable[[float], None] = lambda spent: None
+    keep: Callable[[], None] = lambda: None
     item: float = 0.0
     early: float = 0.0
     core: float = 0.0
@@ -94,10 +94,14 @@ class Clock:
     _kept: float = 0.0
     _closed: bool = False
 
+    @property
+    def cores(self) -> bool:
+        """Return whether processor seconds count."""
+        return self.budget is not None and self.budget.cores
+
     def now(self) -> float:
         """Return what was spent up to now."""
-        cores = self.budget is not None and self.budget.cores
-        return self.spent + (self.core if cores else time.monotonic() - self.began)
+        return self.spent + (self.core if self.cores else time.monotonic() - self.began)
 
     def left(self) -> float:
         """Return what may still be spent."""
@@ -112,7 +116,7 @@ class Clock:
         self.core += receipt.core_seconds if receipt.attempts else 0.0
         if time.monotonic() - self._kept > 2.0:
             self._kept = time.monotonic()
-            self.keep(self.now())
+            self.keep()
 
     def closed(self) -> bool:
         """Return whether a further item would probably end after the budget."""

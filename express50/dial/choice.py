@@ -11,11 +11,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import median
+from typing import NamedTuple
 
 from express50.contract.stage import Stage
 from express50.dial.budget import Goal
 from express50.dial.figures import Cost, PilotFigures, Trial
 from express50.dial.footage import Footage
+from express50.dial.laws import MeasuredSize, typical_seconds
 from express50.dial.pilot import Ladder, standard_of
 from express50.dial.results import RESULTS, ResultKind
 from express50.errors import ConfigError
@@ -120,24 +122,20 @@ def item_seconds(load: Workload, stage: Stage, label: str) -> tuple[int, float]:
     if stage.name in first.costs and first is not trial:  # a trial makes only what changes
         share = first.costs[stage.name].items / max(first.footage.work(per), 1e-9)
     count = max(1, round(share * load.footage.work(per)))
-    ratio = load.footage.work(stage.growth.time) / trial.footage.work(stage.growth.time)
-    growing = growing_share(load.measured, stage)
-    seconds = cost.core_seconds if load.cores else cost.seconds
-    return count, seconds * (1 - growing + growing * ratio)
+    samples = sizes_of(load.measured, stage)
+    work = [footage.work(stage.growth.time) for footage in (load.footage, trial.footage)]
+    grown = typical_seconds(samples, work[0]) / typical_seconds(samples, work[1])
+    return count, (cost.core_seconds if load.cores else cost.seconds) * grown
 
 
-def growing_share(measured: PilotFigures, stage: Stage) -> float:
-    """Return the share of an item's time that grows with its footage, from trials of two sizes."""
+def sizes_of(measured: PilotFigures, stage: Stage) -> list[MeasuredSize]:
+    """Return what an item of a stage cost on the footage of both sizes that the pilot tried."""
     base, *others = measured.trials
-    small = next((t for t in others if t.footage.expressions < base.footage.expressions), None)
-    if small is None or not {stage.name} <= base.costs.keys() & small.costs.keys():
-        return 1.0
-    work = [t.footage.work(stage.growth.time) for t in (small, base)]
-    if work[0] >= work[1]:
-        return 1.0
-    few, many = (t.costs[stage.name].core_seconds for t in (small, base))
-    slope = (many - few) / (work[1] - work[0])
-    return min(1.0, max(0.0, slope * work[1] / max(many, 1e-9)))
+    small = [t for t in others if t.footage.expressions < base.footage.expressions]
+    return [
+        MeasuredSize(t.footage.work(stage.growth.time), [t.costs[stage.name].core_seconds])
+        for t in (base, *small[:1]) if stage.name in t.costs
+    ] or [MeasuredSize(base.footage.work(stage.growth.time), [1.0])]  # fmt: skip
 
 
 def stage_seconds(load: Workload, stage: Stage, label: str, left: float = 1.0) -> float:
@@ -192,25 +190,32 @@ def expected_errors(load: Workload, lost: Mapping[str, float]) -> dict[str, Expe
     return found
 
 
+class _State(NamedTuple):
+    """Settings of the first stages, seconds by stage, squares by result, whether all is made."""
+
+    settings: dict[str, str]
+    each: dict[str, float]
+    lost: dict[str, float]
+    kept: bool
+
+
 def front(load: Workload) -> list[Point]:
     """Return the choices that no other beats in time and error, the quickest first."""
     scale = scales(load)
-    states: list[tuple[dict[str, str], dict[str, float], dict[str, float], bool]]
-    states = [({}, {}, dict.fromkeys(scale, 0.0), True)]
+    states = [_State({}, {}, dict.fromkeys(scale, 0.0), True)]
     for stage in load.stages:
-        grown = []
-        for settings, each, lost, same in states:
-            for label in labels_of(load, stage.name):
-                there, share = load.done.get(stage.name, ("", 0.0))
-                kept = same and label == there
-                seconds = stage_seconds(load, stage, label, 1.0 - share if kept else 1.0)
-                more = load.measured.losses.get(stage.name, {}).get(label, {})
-                squares = {r: lost[r] + more.get(r, 0.0) ** 2 for r in lost}
-                grown.append(
-                    ({**settings, stage.name: label}, {**each, stage.name: seconds}, squares, kept)
-                )
+        there, share = load.done.get(stage.name, ("", 0.0))
+        losses, grown = load.measured.losses.get(stage.name, {}), []
+        for label in labels_of(load, stage.name):
+            whole, rest = (stage_seconds(load, stage, label, part) for part in (1.0, 1.0 - share))
+            more = losses.get(label, {})
+            for state in states:
+                kept = state.kept and label == there
+                lost = {r: value + more.get(r, 0.0) ** 2 for r, value in state.lost.items()}
+                each = {**state.each, stage.name: rest if kept else whole}
+                grown.append(_State({**state.settings, stage.name: label}, each, lost, kept))
         states = _best(grown, scale)
-    points = [_point(load, scale, *state[:3]) for state in states]
+    points = [_point(load, scale, state) for state in states]
     points.sort(key=lambda p: (p.seconds, p.worse))
     kept_points: list[Point] = []
     for point in points:
@@ -237,17 +242,13 @@ def scales(load: Workload) -> dict[str, float]:
     return found
 
 
-def _worse(scale: Mapping[str, float], errors: Mapping[str, Expected]) -> float:
-    return sum(errors[name].value / size for name, size in scale.items())
-
-
-def _best(states: list, scale: Mapping[str, float]) -> list:
+def _best(states: list[_State], scale: Mapping[str, float]) -> list[_State]:
     """Drop partial choices that another one beats in time and in every result."""
-    states.sort(key=lambda s: (sum(s[1].values()), sum(s[2][r] / scale[r] ** 2 for r in scale)))
-    kept: list = []
+    states.sort(key=lambda s: (sum(s.each.values()), sum(s.lost[r] / scale[r] ** 2 for r in scale)))
+    kept: list[_State] = []
     for state in states:
         beaten = any(
-            (other[3] or not state[3]) and all(other[2][r] <= state[2][r] for r in scale)
+            (other.kept or not state.kept) and all(other.lost[r] <= state.lost[r] for r in scale)
             for other in kept
         )
         if not beaten:
@@ -255,15 +256,10 @@ def _best(states: list, scale: Mapping[str, float]) -> list:
     return kept[:STATES]
 
 
-def _point(
-    load: Workload,
-    scale: Mapping[str, float],
-    settings: dict[str, str],
-    each: dict[str, float],
-    lost: Mapping[str, float],
-) -> Point:
-    errors = expected_errors(load, lost)
-    return Point(settings, sum(each.values()), each, _worse(scale, errors), errors)
+def _point(load: Workload, scale: Mapping[str, float], state: _State) -> Point:
+    errors = expected_errors(load, state.lost)
+    worse = sum(errors[name].value / size for name, size in scale.items())
+    return Point(state.settings, sum(state.each.values()), state.each, worse, errors)
 
 
 def point_of(load: Workload, settings: Mapping[str, str]) -> Point:

@@ -38,44 +38,59 @@ STEEPER = 3.0  # a setting that was not tried may cost so many times the one bel
 Ladder = Mapping[str, Any]  # configurations of a stage by the name of the setting, cheapest first
 
 
-def key_of(known: Sequence[Stage], ladders: Mapping[str, Ladder], threads: int) -> str:
-    """Return a digest of everything that measured figures depend on but the footage."""
-    steps = {
-        stage.name: [stage.version, {k: vars(c) for k, c in ladders[stage.name].items()}]
-        for stage in known
-    }
-    return value_digest([steps, os.cpu_count(), threads])[:16]
+@dataclass
+class Chain:
+    """The stages of a dataset with their settings, and the workers that run them.
+
+    Attributes:
+        stages: in order.
+        dataset: the dataset.
+        ladders: settings of each stage.
+        pool: workers.
+        tell: takes lines for people.
+        kinds: results that are measured.
+    """
+
+    stages: Sequence[Stage]
+    dataset: Dataset
+    ladders: Mapping[str, Ladder]
+    pool: Pool
+    tell: Callable[[str], None]
+    kinds: Sequence[ResultKind] = RESULTS
+
+    @property
+    def names(self) -> list[str]:
+        """Return the names of the stages."""
+        return [stage.name for stage in self.stages]
+
+    def key(self) -> str:
+        """Return a digest of everything that measured figures depend on but the footage."""
+        steps = {
+            stage.name: [stage.version, {k: vars(c) for k, c in self.ladders[stage.name].items()}]
+            for stage in self.stages
+        }
+        return value_digest([steps, os.cpu_count(), self.pool.threads])[:16]
+
+    def measurable(self) -> list[str]:
+        """Return the names of the stages up to the last one that makes a measured result."""
+        names = self.names
+        makers = [name for kind in self.kinds for name in kind.made_by(names)]
+        return names[: max(map(names.index, makers), default=-1) + 1]
 
 
 @dataclass
 class Pilot:
-    """Runs trials.
+    """Runs trials of a chain on one subject's footage; the clock counts and stops them."""
 
-    Attributes:
-        dataset: the dataset to measure.
-        subject: whose footage the trials use.
-        stages: in order.
-        ladders: settings of each stage.
-        pool: workers.
-        clock: counts what trials spend, and stops them.
-        tell: takes a line for people.
-        kinds: results that are compared.
-    """
-
-    dataset: Dataset
+    chain: Chain
     subject: str
-    stages: Sequence[Stage]
-    ladders: Mapping[str, Ladder]
-    pool: Pool
     clock: Clock
-    tell: Callable[[str], None]
-    kinds: Sequence[ResultKind] = RESULTS
 
     def trial(self, settings: Mapping[str, str], peaks: int, source: Trial | None) -> Trial:
         """Run one trial, or read it if it ran before."""
-        key = key_of(self.stages, self.ladders, self.pool.threads)
-        name = value_digest([key, dict(settings), peaks, self.subject])[:12]
-        root = pilot_dir(self.dataset) / name
+        chain = self.chain
+        name = value_digest([chain.key(), dict(settings), peaks, self.subject])[:12]
+        root = pilot_dir(chain.dataset) / name
         record = root / "trial.json"
         if record.is_file():
             return trial_of(json.loads(record.read_text(encoding="utf-8")))
@@ -87,8 +102,8 @@ class Pilot:
             (root / "trial.json").unlink()
         dataset = Dataset(root)
         costs, failed = dict(source.costs) if source else {}, {}
-        for stage in self.stages:
-            config = self.ladders[stage.name][settings[stage.name]]
+        for stage in chain.stages:
+            config = chain.ladders[stage.name][settings[stage.name]]
             try:
                 cost, why = self._run(stage, dataset, config, anew=source is not None)
             except (ConfigError, DiskFullError):
@@ -103,13 +118,12 @@ class Pilot:
         count = len(_rows(dataset.peaks_file(self.subject)))
         whole = footage_of(dataset)
         footage = replace(whole, expressions=float(max(1, count)))
-        errors = stated_errors(dataset, [stage.name for stage in self.stages], self.kinds)
         done = Trial(
             settings=dict(settings),
             footage=footage,
             scripted=whole.expressions,
             costs=costs,
-            errors=errors,
+            errors=stated_errors(chain, dataset),
             failed=failed,
             folder=str(root),
         )
@@ -119,13 +133,15 @@ class Pilot:
 
     def _begin(self, root: Path) -> None:
         """Start a dataset with one capture, and the labels that people gave."""
-        capture = self.dataset.captures()[self.subject]
+        given = self.chain.dataset
         if root.is_dir():
             return
         root.mkdir(parents=True)
-        write_json(root / "captures.json", {self.subject: str(capture.resolve())})
-        if (self.dataset.root / "labels").is_dir():
-            shutil.copytree(self.dataset.root / "labels", root / "labels")
+        write_json(
+            root / "captures.json", {self.subject: str(given.captures()[self.subject].resolve())}
+        )
+        if (given.root / "labels").is_dir():
+            shutil.copytree(given.root / "labels", root / "labels")
 
     def _run(
         self, stage: Stage, dataset: Dataset, config: Any, anew: bool
@@ -136,7 +152,8 @@ class Pilot:
         """
         if not stage.items(dataset):
             return None, "an earlier stage made nothing for it"
-        summary = run_stage(stage, dataset, config, pool=self.pool, progress=False, gate=self.clock)
+        pool = self.chain.pool
+        summary = run_stage(stage, dataset, config, pool=pool, progress=False, gate=self.clock)
         counted = ("done",) if anew else ("done", "skipped")
         made = {o.item for o in summary.outcomes if o.status in counted}
         failures = [o.reason for o in summary.outcomes if o.status == "failed"]
@@ -145,7 +162,7 @@ class Pilot:
         why = failures[0] if len(failures) == len(summary.outcomes) else ""
         if not receipts:
             return None, why
-        width = min(self.pool.width(), len(receipts))
+        width = min(pool.width(), len(receipts))
         extra = max(0.0, summary.seconds - sum(r.seconds for r in receipts) / width)
         return cost_of(dataset, stage.name, receipts, extra), why
 
@@ -215,54 +232,41 @@ def _cut_peaks(dataset: Dataset, subject: str, count: int) -> None:
         write_json(path, {name: rows[name] for name in rows if name in kept})
 
 
-def stated_errors(
-    dataset: Dataset, names: Sequence[str], kinds: Sequence[ResultKind]
-) -> dict[str, list[float]]:
+def stated_errors(chain: Chain, dataset: Dataset) -> dict[str, list[float]]:
     """Return what stages state about the error of each result: value, low and high."""
     found = {}
     with Ledger(dataset.ledger, read_only=True) as ledger:
-        for kind in kinds:
-            for name in kind.made_by(names):
+        for kind in chain.kinds:
+            for name in kind.made_by(chain.names):
                 error = typical_error(r.metrics for r in ledger.read(name).values())
                 if error is not None and error.unit == kind.unit and kind.name not in found:
                     found[kind.name] = [error.value, error.low, error.high]
     return found
 
 
-def last_maker(names: Sequence[str], kinds: Sequence[ResultKind]) -> int:
-    """Return the number of the last stage that makes a measured result; -1 where none does."""
-    makers = [name for kind in kinds for name in kind.made_by(names)]
-    return max((list(names).index(name) for name in makers), default=-1)
-
-
-def tradable(
-    names: Sequence[str], ladders: Mapping[str, Ladder], kinds: Sequence[ResultKind]
-) -> list[str]:
+def tradable(chain: Chain) -> list[str]:
     """List the stages that have a choice and stand before the last measured result.
 
     What a later stage's settings do cannot be measured here, so it keeps its standard one.
     """
-    last = last_maker(names, kinds)
-    return [name for name in names[: last + 1] if len(ladders[name]) > 1]
+    return [name for name in chain.measurable() if len(chain.ladders[name]) > 1]
 
 
-def broken_stage(pilot: Pilot, trial: Trial) -> str:
+def broken_stage(chain: Chain, trial: Trial) -> str:
     """Return the first stage that made nothing, if a measured result needs it; else nothing."""
-    names = [stage.name for stage in pilot.stages]
-    last = last_maker(names, pilot.kinds)
-    return next((name for name in names[: last + 1] if name in trial.failed), "")
+    return next((name for name in chain.measurable() if name in trial.failed), "")
 
 
 def _base(pilot: Pilot, settings: dict[str, str], choices: Sequence[str]) -> Trial:
     """Run the first trial; a stage that makes nothing at its cheapest setting is set higher."""
     while True:
         base = pilot.trial(settings, PEAKS, None)
-        broken = broken_stage(pilot, base)
-        ladder = list(pilot.ladders.get(broken, ()))
+        broken = broken_stage(pilot.chain, base)
+        ladder = list(pilot.chain.ladders.get(broken, ()))
         if broken not in choices or settings[broken] == ladder[-1] or pilot.clock.closed():
             return base
         settings |= {broken: ladder[ladder.index(settings[broken]) + 1]}
-        pilot.tell(f"{broken} made nothing at its cheapest; trying {settings[broken]}")
+        pilot.chain.tell(f"{broken} made nothing at its cheapest; trying {settings[broken]}")
 
 
 def measure(pilot: Pilot, allowance: float) -> PilotFigures:
@@ -271,19 +275,18 @@ def measure(pilot: Pilot, allowance: float) -> PilotFigures:
     The first one, at the cheapest settings, always runs to its end or to that of the budget. Where
     a stage makes nothing whatever its settings, it stays the only one.
     """
-    names = [stage.name for stage in pilot.stages]
-    choices = tradable(names, pilot.ladders, pilot.kinds)
-    cheapest = {n: next(iter(pilot.ladders[n])) if n in choices else standard_of(pilot.ladders[n])
+    chain, names = pilot.chain, pilot.chain.names
+    choices = tradable(chain)
+    cheapest = {n: next(iter(chain.ladders[n])) if n in choices else standard_of(chain.ladders[n])
                 for n in names}  # fmt: skip
-    pilot.tell(f"measuring on {PEAKS} expressions of one subject; every stage at its cheapest")
+    chain.tell(f"measuring on {PEAKS} expressions of one subject; every stage at its cheapest")
     base = _base(pilot, cheapest, choices)
     cheapest = base.settings
     began, trials = pilot.clock.now(), [base]
     untried: dict[str, list[str]] = {}
-    key = key_of(pilot.stages, pilot.ladders, pilot.pool.threads)
-    if pilot.clock.closed() or broken_stage(pilot, base):
-        return PilotFigures(key=key, trials=trials, losses={})
-    ladders = {name: list(pilot.ladders[name]) for name in choices}
+    if pilot.clock.closed() or broken_stage(chain, base):
+        return PilotFigures(key=chain.key(), trials=trials, losses={})
+    ladders = {name: list(chain.ladders[name]) for name in choices}
     higher = {n: ladder[ladder.index(cheapest[n]) + 1 :] for n, ladder in ladders.items()}
     steps = [(name, label) for name, labels in higher.items() for label in labels]
     steps.sort(key=lambda step: _guess(base, names, step[0]))
@@ -296,7 +299,7 @@ def measure(pilot: Pilot, allowance: float) -> PilotFigures:
         if pilot.clock.now() - began + expected > allowance:
             untried.setdefault(name, []).append(label)
             continue
-        pilot.tell(f"measuring {name} {label}")
+        chain.tell(f"measuring {name} {label}")
         trial = pilot.trial(cheapest | {name: label}, PEAKS, base)
         if pilot.clock.closed():
             untried.setdefault(name, []).append(label)
@@ -306,7 +309,7 @@ def measure(pilot: Pilot, allowance: float) -> PilotFigures:
             ratio = trial.costs[name].core_seconds / max(base.costs[name].core_seconds, 1e-9)
             grown[name] = STEEPER * max(1.0, ratio)
     losses = {name: _losses(pilot, trials, cheapest, name) for name in choices}
-    return PilotFigures(key=key, trials=trials, losses=losses, untried=untried)
+    return PilotFigures(key=chain.key(), trials=trials, losses=losses, untried=untried)
 
 
 def standard_of(ladder: Ladder) -> str:
@@ -329,14 +332,14 @@ def _losses(
     full = [t for t in trials if t.footage.expressions == trials[0].footage.expressions]
     tried = {
         label: next((t for t in full if t.settings == {**cheapest, name: label}), None)
-        for label in pilot.ladders[name]
+        for label in pilot.chain.ladders[name]
     }
     good = {label: t for label, t in tried.items() if t is not None and name not in t.failed}
     if not good:
         return {}
     best = Dataset(Path(list(good.values())[-1].folder))
-    found = {}
-    for label, trial in good.items():
-        other = Dataset(Path(trial.folder))
-        found[label] = differences(other, best, pilot.subject, pilot.kinds) if other != best else {}
-    return found
+    others = {label: Dataset(Path(trial.folder)) for label, trial in good.items()}
+    return {
+        label: differences(other, best, pilot.subject, pilot.chain.kinds) if other != best else {}
+        for label, other in others.items()
+    }

@@ -11,11 +11,10 @@ import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 from express50.console import count, format_seconds, format_table
-from express50.contract.config import config_toml
+from express50.contract.config import made_with
 from express50.contract.layout import Dataset, exclusion_reason
 from express50.contract.stage import Stage
 from express50.dial.budget import Budget, Clock, Goal
@@ -32,23 +31,20 @@ from express50.dial.choice import (
     scales,
     stage_seconds,
 )
-from express50.dial.figures import PilotFigures, dial_dir, read_measured
+from express50.dial.figures import PilotFigures, Trial, dial_dir, read_measured
 from express50.dial.footage import Footage, footage_of
 from express50.dial.pilot import (
-    Ladder,
+    Chain,
     Pilot,
     broken_stage,
     keep_for_run,
-    key_of,
     measure,
     pilot_dir,
     stated_errors,
 )
-from express50.dial.results import RESULTS, ResultKind
 from express50.errors import ConfigError, FormatError, StageError
 from express50.files.atomic import write_json
 from express50.files.text import read_json_table
-from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger
 from express50.runner.runner import Summary, run_stage
 
@@ -89,95 +85,105 @@ class RunState:
     finished: bool = False
 
 
+def measured_figures(chain: Chain, clock: Clock, allowance: float) -> PilotFigures:
+    """Read what was measured of a chain's dataset, or measure it.
+
+    Raises:
+        StageError: there is no footage that can be measured.
+    """
+    root, path = chain.dataset.root, dial_dir(chain.dataset) / "measured.json"
+    found = read_measured(path, chain.key())
+    if found is not None and (allowance < math.inf or not found.untried):
+        return found
+    subjects = [s for s in chain.dataset.captures() if not exclusion_reason(chain.dataset, s)]
+    if not subjects:
+        raise StageError(f"{root}: no capture is registered; name a CAPTURE")
+    reason = ""
+    for subject in subjects[:PILOTS]:
+        found = measure(Pilot(chain, subject, clock), allowance)
+        broken = broken_stage(chain, found.trials[0])
+        reason = f"{broken}: {found.trials[0].failed[broken]}" if broken else ""
+        if not reason or clock.closed():
+            break
+        chain.tell(f"{subject} cannot be measured: {reason}")
+    if found is None or reason:
+        raise StageError(
+            f"{root}: no subject could be measured: {reason}; correct that, or run without --budget"
+            " to see what each stage says"
+        )
+    if not clock.closed():  # folders of trials go; no figure names a person
+        trials = [replace(trial, folder="") for trial in found.trials]
+        write_json(path, asdict(replace(found, trials=trials)))
+    return found
+
+
+def workload(
+    chain: Chain, measured: PilotFigures, cores: bool, begun: Mapping[str, str]
+) -> Workload:
+    """Describe what is left to make."""
+    load = Workload(
+        stages=chain.stages, ladders=chain.ladders, measured=measured,
+        footage=_whole_footage(chain.dataset, measured.trials[0]), width=chain.pool.width(),
+        cores=cores, fixed=begun, kinds=chain.kinds,
+    )  # fmt: skip
+    return replace(load, done={s.name: _done(chain.dataset, load, s) for s in chain.stages})
+
+
+def _whole_footage(dataset: Dataset, seen: Trial) -> Footage:
+    """Return the size of all footage: as ingested, or like the pilot's for every capture."""
+    captures = len(dataset.captures())
+    if 0 < len(dataset.subjects()) >= captures:
+        return footage_of(dataset)
+    return replace(seen.footage, subjects=float(captures), expressions=seen.scripted)
+
+
+def _done(dataset: Dataset, load: Workload, stage: Stage) -> tuple[str, float]:
+    """Return the setting that a stage's folder was made with, and the share that is there."""
+    label = made_with(dataset.config_file(stage.name), stage, load.ladders[stage.name])
+    if label is None or not dataset.ledger.is_file():
+        return "", 0.0
+    with Ledger(dataset.ledger, read_only=True) as ledger:
+        done = sum(r.status == "done" for r in ledger.read(stage.name).values())
+    return label, min(1.0, done / item_seconds(load, stage, label)[0])
+
+
 @dataclass
-class Chain:
-    """The stages of a dataset with their settings, and the workers that run them.
+class _Run:
+    """A run as it goes on.
 
     Attributes:
-        stages: in order.
-        dataset: the dataset.
-        ladders: settings of each stage.
-        pool: workers.
-        tell: takes lines for people.
-        kinds: results that are measured.
+        chain, clock: as given.
+        state: as stored.
+        measured: of the pilot.
+        wanted: name of the result that has a goal, and the goal.
+        real, expected: seconds that stages took so far, and that were expected of them.
     """
 
-    stages: Sequence[Stage]
-    dataset: Dataset
-    ladders: Mapping[str, Ladder]
-    pool: Pool
-    tell: Callable[[str], None]
-    kinds: Sequence[ResultKind] = RESULTS
+    chain: Chain
+    clock: Clock
+    state: RunState
+    measured: PilotFigures = field(init=False)
+    wanted: tuple[str, float] | None = None
+    real: float = 0.0
+    expected: float = 0.0
 
-    def key(self) -> str:
-        """Return the digest of what measured figures depend on."""
-        return key_of(self.stages, self.ladders, self.pool.threads)
+    def keep(self, **changes: Any) -> None:
+        """Change the state, and store it with what is spent."""
+        self.state = replace(self.state, **changes)
+        path = dial_dir(self.chain.dataset) / "run.json"
+        write_json(path, asdict(replace(self.state, spent=self.clock.now())))
 
-    def measured(self, clock: Clock, allowance: float) -> PilotFigures:
-        """Read what was measured of this dataset, or measure it.
+    def workload(self) -> Workload:
+        """Describe what is left to make; stages that have begun keep their setting."""
+        begun = {name: self.state.settings[name] for name in self.state.begun}
+        return workload(self.chain, self.measured, self.clock.cores, begun)
 
-        Raises:
-            StageError: there is no footage that can be measured.
-        """
-        path = dial_dir(self.dataset) / "measured.json"
-        found = read_measured(path, self.key())
-        if found is not None and (allowance < math.inf or not found.untried):
-            return found
-        subjects = [s for s in self.dataset.captures() if not exclusion_reason(self.dataset, s)]
-        if not subjects:
-            raise StageError(f"{self.dataset.root}: no capture is registered; name a CAPTURE")
-        reason = ""
-        for subject in subjects[:PILOTS]:
-            pilot = Pilot(
-                self.dataset, subject, self.stages, self.ladders, self.pool, clock, self.tell,
-                self.kinds,
-            )  # fmt: skip
-            found = measure(pilot, allowance)
-            broken = broken_stage(pilot, found.trials[0])
-            reason = f"{broken}: {found.trials[0].failed[broken]}" if broken else ""
-            if not reason or clock.closed():
-                break
-            self.tell(f"{subject} cannot be measured: {reason}")
-        if found is None or reason:
-            raise StageError(
-                f"{self.dataset.root}: no subject could be measured: {reason}; correct that, or "
-                "run without --budget to see what each stage says"
-            )
-        if not clock.closed():  # folders of trials go; no figure names a person
-            trials = [replace(trial, folder="") for trial in found.trials]
-            write_json(path, asdict(replace(found, trials=trials)))
-        return found
-
-    def workload(self, measured: PilotFigures, cores: bool, begun: Mapping[str, str]) -> Workload:
-        """Describe what is left to make."""
-        footage = self.footage(measured)
-        load = Workload(
-            stages=self.stages, ladders=self.ladders, measured=measured, footage=footage,
-            width=self.pool.width(), cores=cores, fixed=begun, kinds=self.kinds,
-        )  # fmt: skip
-        return replace(load, done={stage.name: self._done(load, stage) for stage in self.stages})
-
-    def footage(self, measured: PilotFigures) -> Footage:
-        """Return the size of all footage: as ingested, or like the pilot's for every capture."""
-        captures = len(self.dataset.captures())
-        if 0 < len(self.dataset.subjects()) >= captures:
-            return footage_of(self.dataset)
-        seen = measured.trials[0].footage
-        scripted = measured.trials[0].scripted
-        return replace(seen, subjects=float(captures), expressions=scripted)
-
-    def _done(self, load: Workload, stage: Stage) -> tuple[str, float]:
-        """Return the setting that a stage's folder was made with, and the share that is there."""
-        path = self.dataset.config_file(stage.name)
-        if not path.is_file() or not self.dataset.ledger.is_file():
-            return "", 0.0
-        text = path.read_text(encoding="utf-8", errors="replace")
-        for label, config in self.ladders[stage.name].items():
-            if config_toml(stage.name, config) == text:
-                with Ledger(self.dataset.ledger, read_only=True) as ledger:
-                    done = sum(r.status == "done" for r in ledger.read(stage.name).values())
-                return label, min(1.0, done / item_seconds(load, stage, label)[0])
-        return "", 0.0
+    def slowness(self) -> float:
+        """Return how much longer stages took than expected; 1 while too little was seen."""
+        believed = max(1.0, BELIEVED * (self.state.seconds - self.state.spent))
+        if self.expected < believed:
+            return 1.0
+        return min(4.0, max(0.5, self.real / self.expected))
 
 
 def run_within(
@@ -199,57 +205,53 @@ def run_within(
             goal; the sentence says what would.
         StageError: nothing can be measured.
     """
-    path = dial_dir(chain.dataset) / "run.json"
-    state = _resumed(path, chain.key(), budget, goal)
+    state = _resumed(chain, budget, goal)
     clock = Clock(budget, spent=state.spent)
-
-    def keep(spent: float) -> None:
-        write_json(path, asdict(replace(state, spent=spent)))
-
-    clock.keep = keep
-    allowance = PILOT_SHARE * budget.seconds if budget else math.inf
-    measured = chain.measured(clock, allowance)
-    cores = budget is not None and budget.cores
-    begun = {name: state.settings[name] for name in state.begun}
-    load = chain.workload(measured, cores, begun)
-    wanted = (goal_result(load, goal), goal.value) if goal is not None else None
+    run = _Run(chain, clock, state)
+    clock.keep = run.keep
+    run.measured = measured_figures(
+        chain, clock, PILOT_SHARE * budget.seconds if budget else math.inf
+    )
+    load = run.workload()
+    run.wanted = None if goal is None else (goal_result(load, goal), goal.value)
     if not state.settings:
-        point = _first_choice(load, clock, goal)
-        state = replace(
-            state, settings=point.settings, seconds=clock.now() + point.seconds,
-            promised={name: asdict(error) for name, error in point.errors.items()},
-        )  # fmt: skip
-        keep_for_run(chain.dataset, point.settings)
-        for line in choice_lines(load, point, budget, clock.now()):
-            chain.tell(line)
-    else:
-        chain.tell(
-            f"going on: {format_seconds(clock.now())} of the budget are spent; settings as chosen"
+        point = _first_choice(run, load, goal)
+        promised = {name: asdict(error) for name, error in point.errors.items()}
+        run.state = replace(
+            state, settings=point.settings, seconds=clock.now() + point.seconds, promised=promised
         )
-    keep(clock.now())
+        keep_for_run(chain.dataset, point.settings)
+        lines = choice_lines(load, point, budget, clock.now())
+    else:
+        spent = format_seconds(clock.now())
+        lines = iter([f"going on: {spent} of the budget are spent; settings as chosen"])
+    for line in lines:
+        chain.tell(line)
+    run.keep()
     summaries = []
-    speed = _Speed(believed=max(1.0, BELIEVED * (state.seconds - state.spent)))
     for stage in chain.stages:
-        state = _choose_rest(chain, measured, clock, state, stage, speed, wanted, cores)
-        keep(clock.now())
-        summary = _run_one(chain, measured, clock, state, stage, speed, cores)
+        if stage.name not in run.state.begun:
+            _choose_rest(run, stage)
+        summary = _run_one(run, stage)
         if summary is None:
             break
         summaries.append(summary)
         ended(stage, summary)
     whole = len(summaries) == len(chain.stages) and not any(s.count("left") for s in summaries)
-    names = [stage.name for stage in chain.stages]
-    stated = stated_errors(chain.dataset, names, chain.kinds) if summaries else {}
-    state = replace(state, finished=whole, spent=clock.now(), stated=stated)
-    keep(clock.now())
+    stated = stated_errors(chain, chain.dataset) if summaries else {}
+    run.state = replace(run.state, spent=clock.now())
+    run.keep(finished=whole, stated=stated)
     if whole:
         shutil.rmtree(pilot_dir(chain.dataset), ignore_errors=True)
-    return summaries, state
+    return summaries, run.state
 
 
-def _resumed(path: Path, key: str, budget: Budget | None, goal: Goal | None) -> RunState:
+def _resumed(chain: Chain, budget: Budget | None, goal: Goal | None) -> RunState:
     """Read the run that is to go on, or begin one: another budget or goal is another run."""
-    fresh = RunState(key=key, budget=budget.text if budget else "", goal=goal.text if goal else "")
+    fresh = RunState(
+        key=chain.key(), budget=budget.text if budget else "", goal=goal.text if goal else ""
+    )
+    path = dial_dir(chain.dataset) / "run.json"
     if not path.is_file():
         return fresh
     try:
@@ -260,9 +262,8 @@ def _resumed(path: Path, key: str, budget: Budget | None, goal: Goal | None) -> 
     return state if same else fresh
 
 
-def _first_choice(load: Workload, clock: Clock, goal: Goal | None) -> Point:
-    wanted = (goal_result(load, goal), goal.value) if goal is not None else None
-    points = front(load)
+def _first_choice(run: _Run, load: Workload, goal: Goal | None) -> Point:
+    clock, wanted, points = run.clock, run.wanted, front(load)
     left = clock.left()
     if clock.closed() or points[0].seconds > left:
         least = clock.now() + points[0].seconds
@@ -295,83 +296,45 @@ def budget_text(seconds: float, cores: bool) -> str:
     return f"{math.ceil(seconds / 60)}m" if seconds < 36000 else f"{math.ceil(seconds / 3600)}h"
 
 
-@dataclass
-class _Speed:
-    """How long stages took, compared with what was expected; used after ``believed`` seconds."""
-
-    believed: float
-    real: float = 0.0
-    expected: float = 0.0
-
-    def ratio(self) -> float:
-        """Return the ratio, 1 while too little was seen."""
-        if self.expected < self.believed:
-            return 1.0
-        return min(4.0, max(0.5, self.real / self.expected))
-
-
-def _choose_rest(
-    chain: Chain,
-    measured: PilotFigures,
-    clock: Clock,
-    state: RunState,
-    stage: Stage,
-    speed: _Speed,
-    wanted: tuple[str, float] | None,
-    cores: bool,
-) -> RunState:
-    """Choose the settings of this and later stages anew where the time left asks for it."""
-    if stage.name in state.begun:
-        return state
-    begun = {name: state.settings[name] for name in state.begun}
-    points = front(chain.workload(measured, cores, begun))
-    left = clock.left() / speed.ratio()
+def _choose_rest(run: _Run, stage: Stage) -> None:
+    """Begin a stage; choose its and later settings anew where the time left asks for it."""
+    state, points = run.state, front(run.workload())
+    left = run.clock.left() / run.slowness()
     now = next((p for p in points if p.settings == state.settings), None)
-    better = choose(points, left * SAFETY, wanted)
+    better = choose(points, left * SAFETY, run.wanted)
     late = now is None or now.seconds > left
+    begun = [*state.begun, stage.name]
     changed = [n for n, label in better.settings.items() if label != state.settings[n]]
     if not changed or not (late or better.worse < (now.worse if now else math.inf)):
-        return replace(state, begun=[*state.begun, stage.name])
+        run.keep(begun=begun)
+        return
     why = "behind" if late else "ahead of"
     moves = ", ".join(f"{n} {state.settings[n]} -> {better.settings[n]}" for n in changed)
-    line = f"{why} time at {format_seconds(clock.now())}: {moves}"
-    chain.tell(line)
-    return replace(
-        state,
-        settings=better.settings,
-        begun=[*state.begun, stage.name],
-        changes=[*state.changes, line],
-    )
+    line = f"{why} time at {format_seconds(run.clock.now())}: {moves}"
+    run.chain.tell(line)
+    run.keep(settings=better.settings, begun=begun, changes=[*state.changes, line])
 
 
-def _run_one(
-    chain: Chain,
-    measured: PilotFigures,
-    clock: Clock,
-    state: RunState,
-    stage: Stage,
-    speed: _Speed,
-    cores: bool,
-) -> Summary | None:
+def _run_one(run: _Run, stage: Stage) -> Summary | None:
     """Run a stage until the budget ends; None if it has nothing to work on."""
-    load = chain.workload(measured, cores, {})
-    label = state.settings[stage.name]
-    config = chain.ladders[stage.name][label]
+    chain, clock, label = run.chain, run.clock, run.state.settings[stage.name]
+    load = workload(chain, run.measured, clock.cores, {})
     items, item = item_seconds(load, stage, label)
-    later = list(chain.stages)[list(chain.stages).index(stage) + 1 :]
     rest = sum(
         min(stage_seconds(load, other, one) for one in labels_of(load, other.name))
-        for other in later
+        for other in chain.stages[chain.names.index(stage.name) + 1 :]
     )
-    clock.expect(item * speed.ratio(), rest * speed.ratio() if clock.budget else 0.0)
+    slow = run.slowness()
+    clock.expect(item * slow, rest * slow if clock.budget else 0.0)
     before = clock.now()
     if not stage.items(chain.dataset):  # an earlier stage made nothing
         return None
+    config = chain.ladders[stage.name][label]
     summary = run_stage(stage, chain.dataset, config, pool=chain.pool, gate=clock)
     made = sum(o.status == "done" and not o.restored for o in summary.outcomes)
     if made:
-        speed.real += clock.now() - before
-        speed.expected += stage_seconds(load, stage, label, min(1.0, made / items))
+        run.real += clock.now() - before
+        run.expected += stage_seconds(load, stage, label, min(1.0, made / items))
     return summary
 
 

@@ -15,8 +15,8 @@ from express50.contract.config import PRESETS
 from express50.dial.budget import Clock
 from express50.dial.choice import Point, Workload, front, labels_of, point_of
 from express50.dial.figures import dial_dir
-from express50.dial.pilot import pilot_dir, standard_of
-from express50.dial.run import Chain, error_text
+from express50.dial.pilot import Chain, pilot_dir, standard_of
+from express50.dial.run import error_text, measured_figures, workload
 from express50.files.atomic import write_bytes, write_json
 
 
@@ -28,9 +28,8 @@ def tune(chain: Chain) -> tuple[dict[str, Any], list[str]]:
     Raises:
         StageError: there is no footage that can be measured.
     """
-    clock = Clock(None)
-    measured = chain.measured(clock, math.inf)
-    load = replace(chain.workload(measured, False, {}), done={})
+    measured = measured_figures(chain, Clock(None), math.inf)
+    load = replace(workload(chain, measured, False, {}), done={})
     points = front(load)
     presets = {preset: point_of(load, preset_settings(load, preset)) for preset in PRESETS}
     table = {

@@ -18,8 +18,8 @@ from express50.capture.index import peak_items, read_index
 from express50.contract.config import distinct_settings, resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import ExpectedError, Growth, Result, Stage
+from express50.dial.pilot import Chain
 from express50.dial.results import ResultKind
-from express50.dial.run import Chain
 from express50.errors import StageError
 from express50.runner.executor import Pool
 from pipelines import ingest
