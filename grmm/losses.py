@@ -41,7 +41,13 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
 
 
 def ssim_map(a: Tensor, b: Tensor) -> Tensor:
-    """Compute the SSIM per window (C, H - 10, W - 10); see `ssim`."""
+    """Compute the SSIM per window (C, H - 10, W - 10); see `ssim`.
+
+    Raises:
+        ValueError: the images are empty.
+    """
+    if not a.numel():
+        raise ValueError(f"image has shape {tuple(a.shape)}, expected at least one pixel")
     dtype = a.dtype if a.dtype in (torch.float32, torch.float64) else torch.float32
     a, b = a.to(dtype), b.to(dtype)
     stack = torch.cat([a, b, a * a, b * b, a * b])[None]  # (1, 5 C, H, W)
@@ -75,6 +81,8 @@ def reconstruction(
     image: Tensor, target: Tensor, config: LossConfig, perceptual: Perceptual | None = None
 ) -> Tensor:
     """Compute L_rec of (3, H, W): weighted L1, 1 - SSIM and, with VGG16, perceptual distance."""
+    if not image.numel():
+        return image.sum()
     loss = L1 * (image - target).abs().mean()
     if config.ssim > 0:
         loss = loss + config.ssim * (1 - ssim(image, target))

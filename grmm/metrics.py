@@ -42,8 +42,14 @@ def rmse(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 
 
 def _mse(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+    _check_same(image, target)
     squared = (image.clamp(0, 1).double() - target.double()).square()
     return (squared if mask is None else squared[:, mask]).mean()
+
+
+def _check_same(image: Tensor, target: Tensor) -> None:
+    if image.shape != target.shape:
+        raise ValueError(f"target has shape {tuple(target.shape)}, expected {tuple(image.shape)}")
 
 
 def ssim_score(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
@@ -51,6 +57,7 @@ def ssim_score(image: Tensor, target: Tensor, mask: Tensor | None = None) -> flo
 
     Windows that reach over the border are left out. NaN where no window fits or is selected.
     """
+    _check_same(image, target)
     if min(image.shape[1:]) < SSIM_WINDOW:
         return math.nan
     values, reach = ssim_map(image.clamp(0, 1).float(), target.float()), SSIM_WINDOW // 2

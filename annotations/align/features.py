@@ -23,6 +23,7 @@ from annotations.observe.stage import (
 )
 from express50.capture.expressions import Expression
 from express50.capture.index import Index
+from express50.geometry.shapes import check_finite
 
 LIDS = np.array([37, 38, 40, 41, 43, 44, 46, 47])
 _GROUPS = {
@@ -91,7 +92,13 @@ def measure(observations: FaceObservations, windows: dict[str, np.ndarray]) -> F
         observations: of one subject.
         windows: rows of ``observations`` by expression, see `Features`; none is empty. Without
             the neutral expression the windows' first frames are taken for rest.
+
+    Raises:
+        ValueError: there is no window, one is empty, or a landmark in one is not finite.
     """
+    if not windows or not all(map(len, windows.values())):
+        raise ValueError(f"windows are {sorted(windows)}, expected one or more, none of them empty")
+    check_finite("landmarks", observations.points[:, np.concatenate([*windows.values()])])
     ends = np.concatenate([rows[[0, -1]] for rows in windows.values()])
     rest = windows.get(NEUTRAL, ends[::2])
     values, owner, camera = [], [], []

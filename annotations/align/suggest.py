@@ -25,6 +25,7 @@ OTHER_SIDE = 0.05  # of the apex: what being on the other side of it counts
 PLATEAU_SHARE = 0.95  # of the apex: frames that are equal to it within noise
 AGREE_FRAMES = 1
 STILL = 1.0  # in units of one feature's noise: a face that does less does not move
+LARGEST_FEATURE = 1e100  # in units of its noise; the square of more may not be finite
 _DRAWS = 24  # random halves of the features that a suggestion is repeated with
 
 
@@ -179,8 +180,11 @@ def suggest_rest(values: np.ndarray, groups: np.ndarray, typical: float) -> Sugg
 
 
 def _check(values: np.ndarray) -> None:
-    if values.size == 0 or not np.isfinite(values).all():
-        raise ValueError(f"features are {values.shape}, expected a frame or more, all finite")
+    if values.size == 0 or not np.abs(values).max() < LARGEST_FEATURE:
+        raise ValueError(
+            f"features are {values.shape}, expected a frame or more, all finite and below"
+            f" {LARGEST_FEATURE:g}"
+        )
 
 
 def _halves(groups: np.ndarray) -> Iterator[np.ndarray]:

@@ -14,6 +14,7 @@ from express50.files.atomic import write_bytes
 from express50.files.text import read_json
 from express50.geometry.cameras import MODELS, Camera
 from express50.geometry.shapes import PIXEL_LIMIT
+from express50.geometry.transforms import is_rigid
 
 CAMERA_ID = re.compile(r"\w[\w.+-]{0,119}")
 LARGEST = 1e12  # of a parameter or a pose, pixels or metres
@@ -58,7 +59,7 @@ def _parse_camera(path: str, camera_id: str, row: object) -> Camera:
     params = _numbers(where, "params", row["params"], (len(MODELS[model]),))
     pose = _numbers(where, "world_to_camera", row["world_to_camera"], (4, 4))
     R = pose[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-4 or np.linalg.det(R) < 0:
+    if not is_rigid(pose):
         raise CalibrationError(
             f"{where}: world_to_camera has no rotation (R R^T differs from 1 by"
             f" {np.abs(R @ R.T - np.eye(3)).max():.2g}, det {np.linalg.det(R):.3f});"

@@ -22,7 +22,7 @@ from express50.geometry.shapes import PIXEL_LIMIT
 CUT = "truncated: a JPEG without its end; copy it again"
 DEPTH_UNIT_M = 5e-5  # one step of a 16-bit depth map; 3.28 m at most, 0.025 mm rounding
 DEPTH_LIMIT_M = DEPTH_UNIT_M * 65535
-JPEG_SIDE = 65500  # pixels; longer sides the encoder refuses
+JPEG_SIDE, PNG_SIDE = 65500, 1_000_000  # pixels; longer sides the encoders refuse
 # Orientation -> quarter turns counter-clockwise after an optional left-right flip (EXIF 2.3).
 TURNS = {1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (1, True), 6: (3, False),
          7: (3, True), 8: (1, False)}  # fmt: skip
@@ -164,18 +164,35 @@ def encode_jpeg(image: np.ndarray, quality: int = 95) -> bytes:
     Raises:
         FormatError: a side is empty, or longer than the format allows.
     """
+    _check_sides("JPEG", image, JPEG_SIDE)
     flags = [cv2.IMWRITE_JPEG_QUALITY, quality]
     if quality >= 95:
         flags += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
-    if max(image.shape[:2]) > JPEG_SIDE or 0 in image.shape:
-        size = f"{image.shape[1]}x{image.shape[0]} pixels"
-        raise FormatError(f"JPEG: {size}, expected sides of 1 to {JPEG_SIDE}; take PNG, or less")
     return cv2.imencode(".jpg", _swap(image), flags)[1].tobytes()
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """Encode a grey or RGB uint8 or uint16 image as PNG."""
+    """Encode a grey or RGB uint8 or uint16 image as PNG.
+
+    Raises:
+        FormatError: a side is empty, or longer than OpenCV writes.
+    """
+    _check_sides("PNG", image, PNG_SIDE)
     return cv2.imencode(".png", _swap(image), [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes()
+
+
+def _check_sides(kind: str, image: np.ndarray, longest: int) -> None:
+    if max(image.shape[:2]) > longest or 0 in image.shape:
+        size = f"{image.shape[1]}x{image.shape[0]} pixels"
+        less = "; take PNG, or less" if kind == "JPEG" else ""
+        raise FormatError(f"{kind}: {size}, expected sides of 1 to {longest}{less}")
+
+
+def has_alpha(path: Path) -> bool:
+    """Say whether a file is a PNG whose header names an alpha channel."""
+    with path.open("rb") as file:
+        head = file.read(26)
+    return head.startswith(b"\x89PNG") and head[25:] in (b"\x04", b"\x06")  # grey or RGB, alpha
 
 
 def decode_image(data: bytes, name: str = "image") -> np.ndarray:
@@ -311,7 +328,14 @@ def scaled_levels(gain: np.ndarray) -> np.ndarray:
 
 
 def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Resize (H, W[, C]); averages areas when shrinking, interpolates when growing."""
+    """Resize (H, W[, C]); averages areas when shrinking, interpolates when growing.
+
+    Raises:
+        ValueError: the image is empty, or would be.
+    """
+    if 0 in image.shape or min(width, height) < 1:
+        had = f"{image.shape[1]}x{image.shape[0]}"
+        raise ValueError(f"resize of {had} to {width}x{height} pixels, expected 1x1 or more")
     shrinking = width <= image.shape[1] and height <= image.shape[0]
     mode = cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR
     return cv2.resize(np.ascontiguousarray(image), (width, height), interpolation=mode)

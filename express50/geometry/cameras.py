@@ -94,13 +94,27 @@ def pinhole(camera: Camera) -> Camera:
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:
-    """Return the camera of the image resized to (width, height)."""
+    """Return the camera of the image resized to (width, height).
+
+    Raises:
+        ValueError: the image is empty, before or after.
+    """
+    if min(camera.width, camera.height) < 1:
+        raise ValueError(
+            f"{camera.id}: image is {camera.width}x{camera.height}, expected at least 1x1"
+        )
     return scale_camera(camera, width / camera.width, height / camera.height)
 
 
 def scale_camera(camera: Camera, sx: float, sy: float) -> Camera:
-    """Return the camera of the image scaled by (sx, sy); with a corner origin K scales as it is."""
+    """Return the camera of the image scaled by (sx, sy); with a corner origin K scales as it is.
+
+    Raises:
+        ValueError: no pixel would be left.
+    """
     width, height = round(camera.width * sx), round(camera.height * sy)
+    if min(width, height) < 1:
+        raise ValueError(f"{camera.id}: scaled to {width}x{height}, expected at least 1x1")
     K = np.diag([sx, sy, 1.0]) @ camera.K
     return replace(_with_K(camera, K), width=width, height=height)
 

@@ -11,9 +11,18 @@ from scipy.spatial.transform import Rotation
 
 from express50.geometry.shapes import check_shape
 
+LARGEST_ANGLE = 1e15  # radians; from here on float64 counts angles in steps of 0.1 and more
+
 
 def axis_angle_to_matrix(axis_angle: np.ndarray) -> np.ndarray:
-    """Return rotation matrices (..., 3, 3) of axis-angle vectors (..., 3), radians."""
+    """Return rotation matrices (..., 3, 3) of axis-angle vectors (..., 3), radians.
+
+    Raises:
+        ValueError: an angle is infinite, or so large that float64 cannot hold its part of a turn.
+    """
+    largest = np.abs(axis_angle).max(initial=0.0)
+    if largest > LARGEST_ANGLE:
+        raise ValueError(f"axis-angle holds {largest:.3g}, expected at most {LARGEST_ANGLE:g} rad")
     return Rotation.from_rotvec(axis_angle).as_matrix()
 
 
@@ -58,6 +67,13 @@ def invert_transform(T: np.ndarray) -> np.ndarray:
     """Return the inverse (4, 4) of a rigid transform (4, 4)."""
     R, t = T[:3, :3], T[:3, 3]
     return make_transform(R.T, -R.T @ t)
+
+
+def is_rigid(T: np.ndarray) -> bool:
+    """Say whether a transform (4, 4) is finite and turns without scaling, shearing or mirroring."""
+    R = T[:3, :3]
+    turns = np.isfinite(T).all() and np.abs(R @ R.T - np.eye(3)).max() <= 1e-4
+    return bool(turns and np.linalg.det(R) > 0)
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:

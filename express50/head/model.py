@@ -207,12 +207,22 @@ def rest_vertices(
             raise ValueError(
                 f"{name} has shape {tuple(value.shape)}, expected (B, at most {count})"
             )
+    if shape.shape[0] != expression.shape[0] and 1 not in (shape.shape[0], expression.shape[0]):
+        raise ValueError(
+            f"expression has {expression.shape[0]} rows, expected {shape.shape[0]} as shape has"
+        )
     rest = (
         model.template
         + torch.einsum("vcs,bs->bvc", model.shape_dirs[..., : shape.shape[1]], shape)
         + torch.einsum("vcx,bx->bvc", model.expression_dirs[..., : expression.shape[1]], expression)
     )
-    return rest if offsets is None else rest + offsets
+    if offsets is None:
+        return rest
+    if offsets.shape not in (rest.shape, (1, *rest.shape[1:])):
+        raise ValueError(
+            f"offsets has shape {tuple(offsets.shape)}, expected {tuple(rest.shape)} or (1, ...)"
+        )
+    return rest + offsets
 
 
 def joint_angles(

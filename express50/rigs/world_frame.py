@@ -23,7 +23,7 @@ import numpy as np
 from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera, transform_camera
 from express50.geometry.conventions import FLIP_YZ
-from express50.geometry.transforms import make_transform
+from express50.geometry.transforms import is_rigid, make_transform
 
 # Below this the mean viewing side of a rig is noise: the cameras stand all round.
 CLEAR_SIDE = 0.15
@@ -68,6 +68,12 @@ def depths_behind(cameras: Mapping[str, Camera]) -> dict[str, float]:
 
 def check_meeting(cameras: Mapping[str, Camera], where: str) -> None:
     """Raise CalibrationError unless the point the cameras look at is in front of each of them."""
+    for name, camera in cameras.items():
+        if not is_rigid(camera.cam_from_world):
+            raise CalibrationError(
+                f"{where}: the pose of {name} is not a rotation and a translation; expected finite"
+                " numbers and det 1: calibrate again"
+            )
     problem = _describe_behind(depths_behind(cameras))
     if problem:
         raise CalibrationError(

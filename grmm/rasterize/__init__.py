@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from express50 import native
+from express50.geometry.shapes import PIXEL_LIMIT
 from grmm.rasterize.projection import (
     NotFiniteTensorError,
     Pinhole,
@@ -136,6 +137,10 @@ def _check(splats: Splats, camera: Pinhole, background: Tensor | None) -> None:
     K = _check_values(tensors)
     if camera.width < 1 or camera.height < 1:
         raise ValueError(f"image size is {camera.width} x {camera.height}, expected at least 1 x 1")
+    if camera.width * camera.height > PIXEL_LIMIT:
+        raise ValueError(
+            f"image size is {camera.width} x {camera.height}, expected at most {PIXEL_LIMIT} pixels"
+        )
     (fx, skew, _), (below, fy, _), bottom = K
     if fx <= 0 or fy <= 0 or skew != 0 or below != 0 or bottom != [0.0, 0.0, 1.0]:
         raise ValueError(

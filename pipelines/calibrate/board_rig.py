@@ -10,6 +10,7 @@ import numpy as np
 
 from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera
+from express50.geometry.shapes import check_finite
 from express50.rigs.world_frame import canonical_from_rig, move_cameras
 from pipelines.calibrate.board import BoardCorners, even
 from pipelines.calibrate.board_adjust import BoardRig, adjust_board_rig, corner_errors
@@ -77,7 +78,9 @@ def solve_rig(
 
     Raises:
         CalibrationError: no camera can be calibrated; the message lists the reasons.
+        ValueError: a corner is not finite.
     """
+    check_finite("pixels of board corners", corners.pixels)
     dropped: dict[str, str] = {}
     lens = "RADIAL" if model == AUTO else model
     lone, views = _single_cameras(corners, points, sizes, lens, dropped)

@@ -16,6 +16,7 @@ from express50.files.images import resize_area, shrink
 from express50.geometry.cameras import Camera, project, resized
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.sampling import bilinear
+from express50.geometry.transforms import is_rigid
 
 INSIDE = 0.5  # alpha at a silhouette
 EMPTY = 0.002  # share of the image below which a matte holds no head
@@ -154,8 +155,14 @@ def head_box(views: Sequence[DepthView]) -> tuple[np.ndarray, np.ndarray]:
     """Find the corners (3,), (3,) of the box around the visual hull, metres.
 
     Raises:
-        StageError: the silhouettes have no common volume.
+        StageError: the silhouettes have no common volume, or a camera's pose is not rigid.
     """
+    for view in views:
+        if not is_rigid(view.camera.cam_from_world):
+            raise StageError(
+                f"camera {view.camera.id}: its pose is not a rotation and a translation; expected"
+                " finite numbers and det 1: check the calibration"
+            )
     center, reach = _meeting_point(views), []
     for view in views:
         pixel, depth = project(view.camera, center[None])
