@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from express50.cli.main import main
-from express50.errors import FormatError
+from express50.errors import FormatError, UnknownNameError
 from express50.shards.reader import ShardReader
 from express50.shards.writer import ShardWriter, copy_samples, verify, write_manifest
 from tests.express50.shards.test_shards import make_sample, write
@@ -40,7 +40,7 @@ def test_parts_are_chosen_by_ids(tmp_path: Path) -> None:
     assert count == 2 and set(content(tmp_path / "some")) == {
         "S002_neutral_cam00", "S002_neutral_cam02",
     }  # fmt: skip
-    with pytest.raises(FormatError, match="S009"):
+    with pytest.raises(UnknownNameError, match="S009"):
         ShardReader(whole).select(["S009"])
 
 
