@@ -165,9 +165,7 @@ def _metres(unit: str) -> float:
     except ValueError:
         metres = 0.0
     if not 0 < metres < np.inf:
-        raise argparse.ArgumentTypeError(
-            f"{unit!r}, expected m, cm, mm, or metres per step above 0"
-        )
+        raise ConfigError(f"--unit {unit!r}: expected m, cm, mm, or metres per step above 0")
     return metres
 
 
