@@ -95,6 +95,8 @@ class RemoteWorkers:
         """
         from distributed import Client
 
+        # It logs a lost scheduler with tracebacks; the pool says it in one line.
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
         try:
             _knock(address)
             client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
