@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -109,8 +110,9 @@ def write_video(
     b_frames: int = 2,
     options: dict[str, str] | None = None,
     container_options: dict[str, str] | None = None,
+    ticks: list[int] | None = None,
 ) -> None:
-    """H.264 with B-frames, as cameras write it."""
+    """H.264 with B-frames, as cameras write it; ``ticks`` are time stamps in 96ths of a second."""
     with av.open(str(path), "w", options=container_options or {}) as container:
         stream = container.add_stream(codec, rate=24)
         stream.height, stream.width = images[0].shape[:2]
@@ -118,9 +120,14 @@ def write_video(
         stream.codec_context.gop_size = gop
         stream.codec_context.max_b_frames = b_frames
         stream.codec_context.thread_count = 1
+        if ticks is not None:
+            stream.codec_context.time_base = Fraction(1, 96)
         stream.options = {"crf": "12"} | (options or {})
-        for image in images:
-            for packet in stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")):
+        for number, image in enumerate(images):
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+            if ticks is not None:
+                frame.pts, frame.time_base = ticks[number], Fraction(1, 96)
+            for packet in stream.encode(frame):
                 container.mux(packet)
         for packet in stream.encode():
             container.mux(packet)

@@ -10,6 +10,7 @@ import csv
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from express50.capture.index import Cue
 from express50.errors import CalibrationError, CaptureError
@@ -19,6 +20,14 @@ from express50.geometry.cameras import Camera
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
+# Windows keeps these names for devices, with any letter case.
+RESERVED = {
+    "CON",
+    "PRN",
+    "AUX",
+    "NUL",
+    *(f"{port}{n}" for port in ("COM", "LPT") for n in range(1, 10)),
+}
 CUE_COLUMNS = ("expression_id", "start_frame", "end_frame")
 
 
@@ -160,10 +169,29 @@ def check_identity(path: Path, subject: object, fps: object) -> None:
             f"{path}: subject is {subject!r:.130}, expected at most 120 letters, digits, '_'"
             " and '-', such as 'S001'"
         )
+    if subject.upper() in RESERVED:
+        raise CaptureError(
+            f"{path}: subject is {subject!r}, a name that Windows keeps for a device; expected"
+            " another, such as 'S001'"
+        )
     if isinstance(fps, bool) or not isinstance(fps, int | float):
         raise CaptureError(f"{path}: fps is {fps!r}, expected a number such as 24")
     if not (math.isfinite(fps) and 0 < fps <= 10_000):
         raise CaptureError(f"{path}: fps is {fps!r}, expected more than 0 and at most 10000")
+
+
+def check_focals(path: Path, given: Any) -> None:
+    """Refuse ``focal_px`` of capture.toml unless it is positive, a number or a table by camera.
+
+    Raises:
+        CalibrationError: a value is not a positive number.
+    """
+    for name, value in (given if isinstance(given, dict) else {"all cameras": given}).items():
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not (number and 0 < float(value) < math.inf):
+            raise CalibrationError(
+                f"{path}: focal_px of {name} is {value!r}, expected a positive number of pixels"
+            )
 
 
 def plain(value: object) -> object:

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from express50.capture.frames import FrameReader
 from express50.capture.index import Cue, Index
-from express50.capture.raw import RawCamera, read_capture
+from express50.capture.raw import RawCamera, check_focals, read_capture
 from express50.errors import CalibrationError, CaptureError, FormatError
 from express50.files.containers import read_picture
 from express50.files.images import read_exif
@@ -179,18 +179,12 @@ def known_focals(index: Index) -> dict[str, float]:
         CalibrationError: `focal_px` is not a positive number.
     """
     given = index.meta.get("focal_px", {})
+    check_focals(index.capture / "capture.toml", given)
     table = given if isinstance(given, dict) else dict.fromkeys(index.cameras, given)
     found = {}
     for name, source in index.cameras.items():
         if name in table:
-            value = table[name]
-            usable = isinstance(value, int | float) and not isinstance(value, bool)
-            if not (usable and math.isfinite(value) and value > 0):
-                raise CalibrationError(
-                    f"{index.capture / 'capture.toml'}: focal_px of {name} is {value!r}, expected a"
-                    " positive number of pixels"
-                )
-            found[name] = float(value)
+            found[name] = float(table[name])
         elif source.kind == "frames":
             try:
                 film_mm = read_exif(index.capture / source.source / source.names[0])[1]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import json
 import tarfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,10 +19,13 @@ from express50.errors import CaptureError
 from express50.files.atomic import dump_json
 from express50.files.containers import WITHIN, inside, read_picture
 from express50.files.digests import file_sha256, text_digest
-from express50.files.images import encode_jpeg, shrink, upright
-from express50.files.video import iterate_video
+from express50.files.images import encode_jpeg, has_alpha, shrink, upright
+from express50.files.video import iterate_video, video_fps
 from pipelines.ingest.config import IngestConfig
 from pipelines.ingest.quality import Seen, edge_width, light_cells, movement, small_grey
+
+FPS_SLACK = 0.02  # of the rate: less than from 24 to 25 frames per second
+UNEVEN = 0.1  # share of the steps that differ; a lost frame now and then is counted as a gap
 
 
 def scan_camera(
@@ -131,11 +135,56 @@ def time_gaps(pts: tuple[int, ...], clips: tuple[int, ...] = ()) -> int:
 
     Steps from one clip to the next do not count.
     """
+    steps = _steps(pts, clips)
+    return int((steps > 1.5 * np.median(steps)).sum()) if steps.size else 0
+
+
+def _steps(pts: tuple[int, ...], clips: tuple[int, ...]) -> np.ndarray:
     steps = np.diff(np.array(pts, dtype=np.int64))
     within = np.ones(len(steps), dtype=bool)
     within[np.cumsum(clips[:-1], dtype=np.int64) - 1] = False
-    steps = steps[within]
-    return int((steps > 1.5 * np.median(steps)).sum()) if steps.size else 0
+    return steps[within]
+
+
+def odd_footage(raw: RawCapture, cameras: Mapping[str, CameraSource]) -> dict[str, str]:
+    """Return what is odd about rate, time stamps and channels of the cameras, by camera."""
+    found = {}
+    for name, source in cameras.items():
+        words = []
+        if source.kind == "frames":
+            if _first_has_alpha(raw.cameras[name]):
+                words.append("has an alpha channel, which is left out: a later stage makes mattes")
+        else:
+            words += [w for w in (_rate(raw, raw.cameras[name]), _uneven(source)) if w]
+        if words:
+            found[f"camera {name}"] = "; ".join(words)
+    return found
+
+
+def _first_has_alpha(camera: RawCamera) -> bool:
+    path = camera.path / camera.names[0]
+    return path.is_file() and has_alpha(path)  # else a member of a container
+
+
+def _rate(raw: RawCapture, camera: RawCamera) -> str:
+    path: Path = inside(camera.path, camera.names[0]) if camera.names else camera.path
+    with suppress(CaptureError):  # a container without a rate
+        fps = video_fps(path)
+        if abs(fps - raw.fps) > FPS_SLACK * raw.fps:
+            return f"is a video at {fps:.4g} fps, the capture says {raw.fps:.4g}; correct fps there"
+    return ""
+
+
+def _uneven(source: CameraSource) -> str:
+    steps = _steps(source.pts, source.clips)
+    if not steps.size:
+        return ""
+    usual = np.median(steps)
+    # A step is a whole number of ticks, so that one tick more or less may be rounding.
+    share = float((np.abs(steps - usual) > np.maximum(1, 0.2 * usual)).mean())
+    if share <= UNEVEN:
+        return ""
+    return f"has a variable frame rate ({share:.0%} of its steps); record at a constant rate"
 
 
 def source_sha256(camera: RawCamera) -> str:

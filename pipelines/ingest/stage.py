@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ import numpy as np
 from express50.capture.demographics import public_meta
 from express50.capture.frames import decode_proxy
 from express50.capture.index import TRANSLATED, CameraSource, Cue, Index, index_to_json
-from express50.capture.raw import RawCapture, check_calibrated_sizes
+from express50.capture.raw import RawCapture, check_calibrated_sizes, check_focals
 from express50.capture.readers.read import OURS, read_any, subject_of, watched
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
@@ -32,7 +33,7 @@ from express50.geometry.cameras import Camera
 from express50.rigs.camera_builder import at_size
 from pipelines.ingest.config import IngestConfig
 from pipelines.ingest.quality import Seen, check_quality
-from pipelines.ingest.scan import remove_proxies, scan_camera, time_gaps, trimmed
+from pipelines.ingest.scan import odd_footage, remove_proxies, scan_camera, time_gaps, trimmed
 
 QC_CAMERAS, QC_COLUMNS = 24, 6
 FILE_ENDINGS = ("head", "confidence", "normals")  # later stages write <camera>_<ending>.png
@@ -43,7 +44,7 @@ def register(dataset: Dataset, captures: list[Path]) -> list[str]:
 
     Raises:
         CaptureError: a folder is not a capture, two captures claim one subject, or the subject
-            was withdrawn.
+            was withdrawn, or differs from another by letter case alone.
     """
     table = {subject: str(path) for subject, path in dataset.captures().items()}
     added: dict[str, str] = {}
@@ -59,6 +60,12 @@ def register(dataset: Dataset, captures: list[Path]) -> list[str]:
                 f"{root}: subject {subject} is also that of {added[subject]}; "
                 "give each capture its own subject id (subject in capture.toml)"
             )
+        for other in table.keys() | added.keys():
+            if subject not in table and other != subject and other.lower() == subject.lower():
+                raise CaptureError(
+                    f"{root}: subject {subject} differs from {other} by letter case alone, and many"
+                    " disks take both for one; give it another id (subject in capture.toml)"
+                )
         added[subject] = str(root)
     if not added.items() <= table.items():
         write_json(dataset.captures_file, table | added)
@@ -95,6 +102,7 @@ def run(dataset: Dataset, item: str, config: IngestConfig, out: Path) -> Result:
             f"{raw.root / 'capture.toml'}: subject is {raw.subject!r}, registered as {item!r}; "
             "ingest the capture again"
         )
+    check_focals(raw.root / "capture.toml", raw.meta.get("focal_px", {}))
     (out / "proxies").mkdir()
     cameras, seen, dropped = _scan(raw, out / "proxies", config)
     calibration = _calibration(raw, cameras)
@@ -116,10 +124,12 @@ def run(dataset: Dataset, item: str, config: IngestConfig, out: Path) -> Result:
     digests = {name: camera.sha256 for name, camera in cameras.items()}
     clips = next(iter(cameras.values())).clips or (index.frames,)
     figures, warnings = check_quality({n: seen[n] for n in cameras}, digests, clips, config)
+    for name, why in odd_footage(raw, cameras).items():
+        warnings[name] = "; ".join([why, *filter(None, [warnings.get(name)])])
     write_json(out / "checks.json", figures)
     lost = {f"camera {k}": why for k, why in sorted(dropped.items())}
     lost |= {f"expression {k}": why for k, why in sorted(beyond.items())} | outside | raw.skipped
-    return metrics(raw, index, usual, lost, raw.warnings | warnings)
+    return metrics(raw, index, usual, lost, raw.warnings | odd_cues(cues) | warnings)
 
 
 def _scan(
@@ -214,6 +224,18 @@ def split_cues(cues: tuple[Cue, ...], frames: int) -> tuple[tuple[Cue, ...], dic
         if cue.end_frame >= frames
     }
     return tuple(cue for cue in cues if cue.expression_id not in outside), outside
+
+
+def odd_cues(cues: tuple[Cue, ...]) -> dict[str, str]:
+    """Return which expressions share frames with one before them, by expression."""
+    found = {}
+    for a, b in combinations(cues, 2):
+        first, last = max(a.start_frame, b.start_frame), min(a.end_frame, b.end_frame)
+        if first <= last:
+            found[f"expression {b.expression_id}"] = (
+                f"its cue shares frames {first} to {last} with {a.expression_id}; correct cues.csv"
+            )
+    return found
 
 
 def short_cameras(cameras: dict[str, CameraSource], cues: tuple[Cue, ...]) -> dict[str, str]:

@@ -209,9 +209,8 @@ def test_one_image_a_camera_without_faces_is_refused_by_the_stage(tmp_path, caps
         write_image(root / "cameras" / name / "frames" / "000000.jpg", image)
     (root / "capture.toml").write_text('subject = "S001"\nfps = 1\nfocal_px = -3\n')
     dataset = Dataset(tmp_path / "data")
-    assert main(["ingest", str(dataset.root), str(root), "--workers", "0"]) == 0
-    assert main(["calibrate", str(dataset.root), "--workers", "0"]) == 1
-    assert "focal_px of a is -3, expected a positive" in capsys.readouterr().out
+    assert main(["ingest", str(dataset.root), str(root), "--workers", "0"]) == 1
+    assert "focal_px of all cameras is -3, expected a positive" in capsys.readouterr().out
     (root / "capture.toml").write_text('subject = "S001"\nfps = 1\n')
     assert main(["ingest", str(dataset.root), str(root), "--workers", "0"]) == 0
     assert main(["calibrate", str(dataset.root), "--workers", "0"]) == 1

@@ -13,11 +13,12 @@ from express50.contract.layout import Dataset
 from express50.contract.stage import Note
 from express50.errors import CaptureError, ConfigError, StageError
 from express50.files.images import read_image
+from express50.files.video import iterate_video
 from express50.runner.runner import run_stage
 from pipelines import ingest
 from pipelines.ingest.scan import time_gaps
 from pipelines.ingest.stage import usual_count
-from tests.synth import make_capture, noise_video_images, write_video
+from tests.synth import make_capture, noise_video_images, write_frames, write_video
 
 
 def run(dataset, **values):
@@ -234,3 +235,49 @@ def test_real_size_captures(shared, tmp_path):
     assert run(dataset).ok
     assert metrics(dataset, "H900")["frames"] == 8 * 48
     assert metrics(dataset, "H900")["dropped"] == []
+
+
+def test_footage_unlike_what_is_said_of_it_is_a_warning(tmp_path):
+    root = tmp_path / "S001"
+    make_capture(root, cameras=3, frames=24, video=True)
+    clear, uneven = (root / "cameras" / name / "video.mp4" for name in ("cam01", "cam02"))
+    images = [image for _, image in iterate_video(clear)]
+    ticks = [4 * n + (n % 3 == 0) * 2 for n in range(24)]
+    write_video(uneven, images, b_frames=0, ticks=ticks)
+    clear.unlink()
+    write_frames(clear.parent / "frames", [np.dstack([i, i[..., :1]]) for i in images])
+    (root / "capture.toml").write_text('subject = "S001"\nfps = 12\n')
+    (root / "cues.csv").write_text(
+        "expression_id,start_frame,end_frame\nneutral,0,11\nsmile,8,23\n"
+    )
+    dataset = Dataset(tmp_path / "data")
+    ingest.register(dataset, [root])
+    assert run(dataset).ok
+    said = {row["what"]: row["why"] for row in metrics(dataset)["warnings"]}
+    assert "is a video at 24 fps, the capture says 12" in said["camera cam00"]
+    assert "variable" not in said["camera cam00"]
+    assert "has an alpha channel, which is left out" in said["camera cam01"]
+    assert "has a variable frame rate" in said["camera cam02"]
+    assert "shares frames 8 to 11 with neutral" in said["expression smile"]
+
+
+@pytest.mark.parametrize("focal", ["-1", "true", "{cam00 = 0}"])
+def test_a_focal_length_that_is_none_fails_at_once(dataset, focal):
+    toml = dataset.captures()["S001"] / "capture.toml"
+    toml.write_text(f'subject = "S001"\nfps = 24\nfocal_px = {focal}\n')
+    (outcome,) = run(dataset).outcomes
+    assert "capture.toml: focal_px of" in outcome.reason
+
+
+@pytest.mark.parametrize("subject", ["CON", "nul", "Com7"])
+def test_subjects_named_like_a_device_are_refused(tmp_path, subject):
+    make_capture(tmp_path / "a", subject=subject, cameras=1)
+    with pytest.raises(CaptureError, match="a name that Windows keeps for a device"):
+        ingest.register(Dataset(tmp_path / "data"), [tmp_path / "a"])
+
+
+def test_subjects_that_differ_by_case_alone_are_refused(dataset, tmp_path):
+    make_capture(tmp_path / "small", subject="s001", cameras=1)
+    with pytest.raises(CaptureError, match="s001 differs from S001 by letter case alone"):
+        ingest.register(dataset, [tmp_path / "small"])
+    ingest.register(dataset, [tmp_path / "S001"])
