@@ -55,7 +55,8 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
 def matrix_to_quat(R: Tensor) -> Tensor:
     """Return unit quaternions (..., 4), wxyz with w >= 0, of rotation matrices (..., 3, 3).
 
-    Takes the best conditioned of four branches (Shepperd 1978).
+    Takes the best conditioned of four branches (Shepperd 1978). The NumPy twin refuses reflections;
+    here they are not looked for, because each training step would wait for the GPU.
     """
     m = R
     d0, d1, d2 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
