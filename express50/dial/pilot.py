@@ -34,6 +34,7 @@ from express50.runner.replaced import keeping
 from express50.runner.runner import run_stage
 
 PEAKS = 3  # expressions of a trial
+SPARE_SHARE = 0.5  # of the time that the cheapest settings would leave over, for trials
 STEEPER = 3.0  # a setting that was not tried may cost so many times the one below it
 Ladder = Mapping[str, Any]  # configurations of a stage by the name of the setting, cheapest first
 
@@ -282,6 +283,7 @@ def measure(pilot: Pilot, allowance: float) -> PilotFigures:
     chain.tell(f"measuring on {PEAKS} expressions of one subject; every stage at its cheapest")
     base = _base(pilot, cheapest, choices)
     cheapest = base.settings
+    allowance = max(allowance, SPARE_SHARE * spare_seconds(pilot, base))
     began, trials = pilot.clock.now(), [base]
     untried: dict[str, list[str]] = {}
     if pilot.clock.closed() or broken_stage(chain, base):
@@ -310,6 +312,20 @@ def measure(pilot: Pilot, allowance: float) -> PilotFigures:
             grown[name] = STEEPER * max(1.0, ratio)
     losses = {name: _losses(pilot, trials, cheapest, name) for name in choices}
     return PilotFigures(key=chain.key(), trials=trials, losses=losses, untried=untried)
+
+
+def spare_seconds(pilot: Pilot, base: Trial) -> float:
+    """Guess the seconds of the budget that a run at the cheapest settings would leave over.
+
+    On a small dataset a tenth of the budget may pay for no trial at all; then nothing better than
+    the cheapest settings would be known, and most of the time would stay unused.
+    """
+    clock, chain = pilot.clock, pilot.chain
+    cores = clock.budget is not None and clock.budget.cores
+    each = (cost.items * (cost.core_seconds if cores else cost.seconds / chain.pool.width())
+            for cost in base.costs.values())  # fmt: skip
+    size = len(chain.dataset.captures()) * base.scripted / base.footage.expressions
+    return clock.left() - sum(each) * size
 
 
 def standard_of(ladder: Ladder) -> str:

@@ -268,9 +268,10 @@ def _first_choice(run: _Run, load: Workload, goal: Goal | None) -> Point:
     if clock.closed() or points[0].seconds > left:
         least = clock.now() + points[0].seconds
         words = "core time" if load.cores else f"with {count(load.width, 'worker')}"
+        known = "more than" if clock.closed() else "about"  # measuring did not end
         raise ConfigError(
             f"--budget {clock.budget.text if clock.budget else ''}: the cheapest settings need "
-            f"about {format_seconds(least)} {words}, {format_seconds(clock.now())} of them for "
+            f"{known} {format_seconds(least)} {words}, {format_seconds(clock.now())} of them for "
             f"measuring, which is kept; give --budget {budget_text(1.1 * least, load.cores)} or"
             " more"
         )
