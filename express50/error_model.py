@@ -86,7 +86,7 @@ def error_bounds(
     """Return the bounds of N elements from their figures, each (N,) or one for all.
 
     `shared` are standard deviations of a further error that all elements have in common, such as
-    that of a lone camera's distance. `expected` is None where there is no element.
+    that of a lone camera's distance. `expected` is None if N is 0.
     """
     model = model or error_models()[stage]
     score = scores_of(model, figures)

@@ -94,7 +94,7 @@ def measure(observations: FaceObservations, windows: dict[str, np.ndarray]) -> F
             the neutral expression the windows' first frames are taken for rest.
 
     Raises:
-        ValueError: there is no window, one is empty, or a landmark in one is not finite.
+        ValueError: no window is given, a window is empty, or a landmark is not finite.
     """
     if not windows or not all(map(len, windows.values())):
         raise ValueError(f"windows are {sorted(windows)}, expected one or more, none of them empty")

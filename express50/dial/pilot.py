@@ -321,8 +321,7 @@ def spare_seconds(pilot: Pilot, base: Trial) -> float:
     the cheapest settings would be known, and most of the time would stay unused.
     """
     clock, chain = pilot.clock, pilot.chain
-    cores = clock.budget is not None and clock.budget.cores
-    each = (cost.items * (cost.core_seconds if cores else cost.seconds / chain.pool.width())
+    each = (cost.items * (cost.core_seconds if clock.cores else cost.seconds / chain.pool.width())
             for cost in base.costs.values())  # fmt: skip
     size = len(chain.dataset.captures()) * base.scripted / base.footage.expressions
     return clock.left() - sum(each) * size

@@ -89,7 +89,7 @@ def measured_figures(chain: Chain, clock: Clock, allowance: float) -> PilotFigur
     """Read what was measured of a chain's dataset, or measure it.
 
     Raises:
-        StageError: there is no footage that can be measured.
+        StageError: no footage can be measured.
     """
     root, path = chain.dataset.root, dial_dir(chain.dataset) / "measured.json"
     found = read_measured(path, chain.key())

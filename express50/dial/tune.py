@@ -26,7 +26,7 @@ def tune(chain: Chain) -> tuple[dict[str, Any], list[str]]:
     Returns the table and lines for people.
 
     Raises:
-        StageError: there is no footage that can be measured.
+        StageError: no footage can be measured.
     """
     measured = measured_figures(chain, Clock(None), math.inf)
     load = replace(workload(chain, measured, False, {}), done={})

@@ -358,7 +358,7 @@ def missed(
 
 
 def _depth(mask: np.ndarray) -> np.ndarray:
-    """Return the distance (h, w) of a mask's pixels to its edge; the image's border is no edge."""
+    """Return the distance (h, w) of a mask's pixels to its edge; the image's border is not one."""
     if mask.all():
         return np.full(mask.shape, float(max(mask.shape)), np.float32)
     return cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
