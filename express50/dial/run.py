@@ -85,15 +85,20 @@ class RunState:
     finished: bool = False
 
 
-def measured_figures(chain: Chain, clock: Clock, allowance: float) -> PilotFigures:
+def measured_figures(
+    chain: Chain, clock: Clock, allowance: float, chosen: bool = False
+) -> PilotFigures:
     """Read what was measured of a chain's dataset, or measure it.
+
+    Settings that there was no time to try are tried by the next run, unless its settings are
+    ``chosen`` already. Trials that are still there are not run again.
 
     Raises:
         StageError: no footage can be measured.
     """
     root, path = chain.dataset.root, dial_dir(chain.dataset) / "measured.json"
     found = read_measured(path, chain.key())
-    if found is not None and (allowance < math.inf or not found.untried):
+    if found is not None and (chosen or not found.untried):
         return found
     subjects = [s for s in chain.dataset.captures() if not exclusion_reason(chain.dataset, s)]
     if not subjects:
@@ -209,9 +214,8 @@ def run_within(
     clock = Clock(budget, spent=state.spent)
     run = _Run(chain, clock, state)
     clock.keep = run.keep
-    run.measured = measured_figures(
-        chain, clock, PILOT_SHARE * budget.seconds if budget else math.inf
-    )
+    allowance = PILOT_SHARE * budget.seconds if budget else math.inf
+    run.measured = measured_figures(chain, clock, allowance, chosen=bool(state.settings))
     load = run.workload()
     run.wanted = None if goal is None else (goal_result(load, goal), goal.value)
     if not state.settings:

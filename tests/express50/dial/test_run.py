@@ -148,6 +148,16 @@ def test_outputs_of_the_pilot_are_not_made_twice(tmp_path, captures):
     assert restored["ingest"] == 1 and restored["align"] == 1
 
 
+def test_a_larger_budget_tries_what_a_small_one_had_no_time_for(tmp_path, captures, monkeypatch):
+    monkeypatch.setattr("express50.dial.run.PILOT_SHARE", 0.0)
+    monkeypatch.setattr("express50.dial.pilot.SPARE_SHARE", 0.0)
+    _, cheap = go(tmp_path / "d", captures, "5m")
+    assert cheap.settings["map"] == "draft"
+    monkeypatch.undo()
+    _, state = go(tmp_path / "d", captures, "6m")
+    assert state.settings["map"] == "reference"
+
+
 def test_a_slower_machine_than_measured_gets_cheaper_settings(tmp_path, captures, monkeypatch):
     monkeypatch.setenv(PAUSE, "0.01")
     tune(chain_of(tmp_path / "d", captures))
