@@ -69,7 +69,7 @@ def run_verify(args: argparse.Namespace) -> int:
     from express50.shards.writer import verify
 
     faults = verify(args.directory)
-    verdict = f"{args.directory}: {count(len(faults), 'fault')}" if faults else "all is well"
+    verdict = f"{args.directory}: {count(len(faults), 'fault') if faults else 'no faults'}"
     answer(args, {"directory": str(args.directory), "faults": faults}, *faults, verdict)
     return FAILED if faults else OK
 

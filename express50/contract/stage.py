@@ -72,7 +72,8 @@ class ExpectedError:
 
     def __str__(self) -> str:
         """Format for people: ``0.31 mm (0.22 to 0.5)``."""
-        return f"{self.value:.2g} {self.unit} ({self.low:.2g} to {self.high:.2g})"
+        unit = "alpha at the outline" if self.unit == "alpha" else self.unit
+        return f"{self.value:.2g} {unit} ({self.low:.2g} to {self.high:.2g})"
 
 
 def typical_error(metrics: Iterable[Mapping[str, Any]]) -> ExpectedError | None:

@@ -90,8 +90,9 @@ def record_command(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({"captures": str(args.out / "captures"), "recorded": recorded}))
     else:
-        new = count(len(recorded), "subject")
-        print(f"{new} recorded in {args.out / 'captures'}; the rest was there")
+        kept = args.subjects - len(recorded)
+        rest = f"; {kept} recorded before" if kept else ""
+        print(f"{count(len(recorded), 'subject')} recorded in {args.out / 'captures'}{rest}")
     return 0
 
 
