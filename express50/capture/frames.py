@@ -66,9 +66,11 @@ class FrameReader:
             )
         orientation, expected = self.source.orientation, self.source.dhash[frame]
         if self.source.kind == "frames":
-            image = read_picture(self.path, self.source.names[frame], orientation)
+            name = self.source.names[frame]
+            file, image = f"{self.path}/{name}", read_picture(self.path, name, orientation)
         else:
             video, number = self._video_of(frame)
+            file = str(video.path)
             image = upright(video.read(number), orientation)
             if dhash(image) != expected:
                 # A decoder may conceal a missing reference after a seek; from the start it cannot.
@@ -76,7 +78,7 @@ class FrameReader:
                 image = upright(video.read(number), orientation)
         if (found := dhash(image)) != expected:
             raise CaptureError(
-                f"{self._file(frame)}: frame {frame} has hash {found}, the index says {expected}; "
+                f"{file}: frame {frame} has hash {found}, the index says {expected}; "
                 "the footage changed since it was ingested, run 'express50 ingest' again"
             )
         return corrected(image, self.source)
@@ -93,14 +95,6 @@ class FrameReader:
             self._video = VideoReader(path, self.source.pts[first:last])
             self._clip = clip
         return self._video, frame - first
-
-    def _file(self, frame: int) -> str:
-        """Name the file that holds a frame, for messages."""
-        if self.source.kind == "video":
-            return str(self.path)
-        if self.source.kind == "frames":
-            return f"{self.path}/{self.source.names[frame]}"
-        return f"{self.path}/{self.source.names[self._clip]}"
 
     def close(self) -> None:
         """Close the video, if there is one."""

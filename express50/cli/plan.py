@@ -21,8 +21,7 @@ from express50.console import add_command, answer, count, format_table, stdout_t
 from express50.contract.config import PRESETS, made_with, resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage, stages
-from express50.dial.figures import dial_dir, read_measured
-from express50.dial.footage import Footage, footage_of
+from express50.dial.figures import Footage, dial_dir, footage_of, read_measured
 from express50.errors import ConfigError, StageError
 from express50.files.digests import files_of, text_digest
 from express50.runner.ledger import Ledger

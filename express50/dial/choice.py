@@ -15,8 +15,7 @@ from typing import NamedTuple
 
 from express50.contract.stage import Stage
 from express50.dial.budget import Goal
-from express50.dial.figures import Cost, PilotFigures, Trial
-from express50.dial.footage import Footage
+from express50.dial.figures import Cost, Footage, PilotFigures, Trial
 from express50.dial.laws import MeasuredSize, typical_seconds
 from express50.dial.pilot import Ladder, standard_of
 from express50.dial.results import RESULTS, ResultKind
@@ -215,7 +214,11 @@ def front(load: Workload) -> list[Point]:
                 each = {**state.each, stage.name: rest if kept else whole}
                 grown.append(_State({**state.settings, stage.name: label}, each, lost, kept))
         states = _best(grown, scale)
-    points = [_point(load, scale, state) for state in states]
+    points = []
+    for state in states:
+        errors, seconds = expected_errors(load, state.lost), sum(state.each.values())
+        worse = sum(errors[name].value / size for name, size in scale.items())
+        points.append(Point(state.settings, seconds, state.each, worse, errors))
     points.sort(key=lambda p: (p.seconds, p.worse))
     kept_points: list[Point] = []
     for point in points:
@@ -254,12 +257,6 @@ def _best(states: list[_State], scale: Mapping[str, float]) -> list[_State]:
         if not beaten:
             kept.append(state)
     return kept[:STATES]
-
-
-def _point(load: Workload, scale: Mapping[str, float], state: _State) -> Point:
-    errors = expected_errors(load, state.lost)
-    worse = sum(errors[name].value / size for name, size in scale.items())
-    return Point(state.settings, sum(state.each.values()), state.each, worse, errors)
 
 
 def point_of(load: Workload, settings: Mapping[str, str]) -> Point:

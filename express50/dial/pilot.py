@@ -21,8 +21,7 @@ from express50.capture.index import read_index
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage, typical_error
 from express50.dial.budget import Clock
-from express50.dial.figures import Cost, PilotFigures, Trial, trial_of
-from express50.dial.footage import footage_of
+from express50.dial.figures import Cost, PilotFigures, Trial, footage_of, trial_of
 from express50.dial.results import RESULTS, ResultKind, differences, whole_peaks
 from express50.errors import ConfigError, DiskFullError, Express50Error, FormatError
 from express50.files.atomic import write_json

@@ -31,8 +31,7 @@ from express50.dial.choice import (
     scales,
     stage_seconds,
 )
-from express50.dial.figures import PilotFigures, Trial, dial_dir, read_measured
-from express50.dial.footage import Footage, footage_of
+from express50.dial.figures import PilotFigures, dial_dir, footage_of, read_measured
 from express50.dial.pilot import (
     Chain,
     Pilot,
@@ -126,20 +125,15 @@ def workload(
     chain: Chain, measured: PilotFigures, cores: bool, begun: Mapping[str, str]
 ) -> Workload:
     """Describe what is left to make."""
+    seen, captures = measured.trials[0], len(chain.dataset.captures())
+    footage = replace(seen.footage, subjects=float(captures), expressions=seen.scripted)
+    if 0 < len(chain.dataset.subjects()) >= captures:
+        footage = footage_of(chain.dataset)
     load = Workload(
-        stages=chain.stages, ladders=chain.ladders, measured=measured,
-        footage=_whole_footage(chain.dataset, measured.trials[0]), width=chain.pool.width(),
-        cores=cores, fixed=begun, kinds=chain.kinds,
+        stages=chain.stages, ladders=chain.ladders, measured=measured, footage=footage,
+        width=chain.pool.width(), cores=cores, fixed=begun, kinds=chain.kinds,
     )  # fmt: skip
     return replace(load, done={s.name: _done(chain.dataset, load, s) for s in chain.stages})
-
-
-def _whole_footage(dataset: Dataset, seen: Trial) -> Footage:
-    """Return the size of all footage: as ingested, or like the pilot's for every capture."""
-    captures = len(dataset.captures())
-    if 0 < len(dataset.subjects()) >= captures:
-        return footage_of(dataset)
-    return replace(seen.footage, subjects=float(captures), expressions=seen.scripted)
 
 
 def _done(dataset: Dataset, load: Workload, stage: Stage) -> tuple[str, float]:

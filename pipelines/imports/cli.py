@@ -35,13 +35,13 @@ from pipelines.imports.footage_check import (
     check_outlines,
     observe_peak,
 )
-from pipelines.imports.fusion import write_fused
 from pipelines.imports.pictures import (
     UNITS,
     check_depths,
     check_masks,
     read_foreign_depth,
     read_mask,
+    write_fused,
 )
 from pipelines.imports.places import PeakFrame, check_pattern, fill, peak_frames
 from pipelines.imports.tracks import TrackSource, read_foreign_track

@@ -1,4 +1,4 @@
-"""Read the masks and depth maps of other tools, and check them against cameras and footage."""
+"""Read the masks and depth maps of other tools, check them against cameras, and fuse depth."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import open3d as o3d
 
 from express50.errors import FormatError, StageError
 from express50.files.arrays import read_npy
 from express50.files.images import read_image
 from express50.geometry.cameras import Camera, pinhole, project_pinhole, triangulate, unproject
-from express50.geometry.conventions import cell_centres, cell_to_corner
+from express50.geometry.conventions import K_to_opencv, cell_centres, cell_to_corner
+from express50.geometry.meshes import write_ply
 from express50.geometry.sampling import undistort_image, undistort_maps
 
 SAMPLES = 1500  # pixels per view that are compared to the other views
@@ -22,6 +24,10 @@ AGREE_SHARE = 0.4  # of the pixels that two views know, which must be the same s
 LEAST_COSINE = 0.5  # between the directions of two views that are compared
 FINE_M, FINER_SHARE = 0.003, 0.1  # what another measure must gain closely, to be the right one
 FACTORS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
+LEAST_VOXEL_M, VOXEL_PX = 0.0015, 1.4  # as depth's own
+TRUNCATION = 4.0  # voxels
+FARTHEST_M = 1e3
+SURE = 3.0  # views of a point for full confidence
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
@@ -207,3 +213,66 @@ def look_up(camera: Camera, image: np.ndarray, points: np.ndarray) -> tuple[np.n
     found = image[row, column]
     found[~inside] = 0
     return found, depth
+
+
+def write_fused(
+    path: Path,
+    cameras: Mapping[str, Camera],
+    depths: Mapping[str, np.ndarray],
+    pictures: Mapping[str, np.ndarray],
+) -> int:
+    """Write the fused surface of depths (H, W), metres, with colours; returns its vertices.
+
+    Source: Curless and Levoy 1996, through Open3D.
+
+    Raises:
+        StageError: the maps hold no surface.
+    """
+    steps = [
+        float(np.median(depth[depth > 0])) / cameras[name].K[0, 0]
+        for name, depth in depths.items()
+        if depth.any()
+    ]
+    if not steps:
+        raise StageError(f"{path.name}: no depth map knows any pixel")
+    voxel = max(LEAST_VOXEL_M, VOXEL_PX * float(np.median(steps)))
+    centre = np.mean([camera.center for camera in cameras.values()], axis=0)
+    volume = o3d.t.geometry.VoxelBlockGrid(
+        ("tsdf", "weight"), (o3d.core.float32, o3d.core.float32), ((1,), (1,)),
+        voxel_size=voxel, block_resolution=16, block_count=20_000,
+    )  # fmt: skip
+    for name, depth in depths.items():
+        image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth[..., None])))
+        near = cameras[name].cam_from_world.copy()
+        near[:3, 3] += near[:3, :3] @ centre  # Open3D's world is in single precision
+        pose = o3d.core.Tensor(K_to_opencv(cameras[name].K)), o3d.core.Tensor(near)
+        blocks = volume.compute_unique_block_coordinates(image, *pose, 1.0, FARTHEST_M, TRUNCATION)
+        volume.integrate(blocks, image, *pose, 1.0, FARTHEST_M, TRUNCATION)
+    mesh = volume.extract_triangle_mesh(weight_threshold=1.0)
+    if not len(mesh.vertex.positions):
+        raise StageError(f"{path.name}: the depth maps hold no surface")
+    mesh.compute_vertex_normals()
+    vertices = mesh.vertex.positions.numpy().astype(np.float64) + centre
+    seen, colours = _seen(vertices, cameras, depths, pictures, TRUNCATION * voxel)
+    columns = {f"n{axis}": mesh.vertex.normals.numpy()[:, k] for k, axis in enumerate("xyz")}
+    columns |= {c: colours[:, k] for k, c in enumerate(("red", "green", "blue"))}
+    columns["confidence"] = np.minimum(seen / SURE, 1.0).astype(np.float32)
+    write_ply(path, vertices, mesh.triangle.indices.numpy(), columns)
+    return len(vertices)
+
+
+def _seen(
+    vertices: np.ndarray,
+    cameras: Mapping[str, Camera],
+    depths: Mapping[str, np.ndarray],
+    pictures: Mapping[str, np.ndarray],
+    near: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Count the views that show each vertex (N,), and average their colours (N, 3) uint8."""
+    count, total = np.zeros(len(vertices)), np.zeros((len(vertices), 3))
+    for name, depth in depths.items():
+        found, z = look_up(cameras[name], depth, vertices)
+        shown = (found > 0) & (np.abs(found - z) < near)
+        count += shown
+        total[shown] += look_up(cameras[name], pictures[name], vertices[shown])[0]
+    return count, np.rint(total / np.maximum(count, 1)[:, None]).astype(np.uint8)

@@ -9,11 +9,10 @@ import torch
 
 from express50.errors import ConfigError
 from express50.head.load import load_head
-from grmm.arkit import arkit_controls, arkit_targets
 from grmm.checkpoint import Gallery, Loaded
 from grmm.data import Tracked
 from grmm.edit import HeadCodes
-from grmm.export import mesh_glb
+from grmm.export import arkit_controls, arkit_targets, mesh_glb
 from grmm.model import GRMM
 from tests.grmm.synthetic import tiny_config
 

@@ -20,7 +20,7 @@ from grmm.checkpoint import load_checkpoint
 from grmm.edit import trained_head
 from grmm.metrics import psnr_db
 from grmm.model import GRMM
-from grmm.player import export_player
+from grmm.player import export_player, player_page, stored
 from grmm.player.distillation import (
     AvatarPose,
     all_gaussians,
@@ -32,7 +32,6 @@ from grmm.player.distillation import (
     posed,
     sampled_poses,
 )
-from grmm.player.page import player_page, stored
 from grmm.train import train
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 

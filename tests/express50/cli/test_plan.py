@@ -17,7 +17,7 @@ from express50.cli.plan import (
 )
 from express50.contract.layout import Dataset
 from express50.contract.stage import stages
-from express50.dial.footage import Footage, footage_of
+from express50.dial.figures import Footage, footage_of
 from express50.dial.laws import MeasuredSize, forecast
 from express50.dial.tune import tune
 from express50.errors import ConfigError
