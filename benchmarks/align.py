@@ -230,8 +230,8 @@ def as_markdown(figures: dict) -> list[str]:
     """Return the acceptance table as a section of docs/TRADEOFFS.md."""
     lines = [
         f"Made by `python -m benchmarks.align --doc docs/TRADEOFFS.md` on {figures['subjects']}"
-        f" synthetic subjects, {figures['labels']} clips; all but the reference's are counted."
-        " `align.accept` takes suggestions at least so sure without a person.",
+        f" synthetic subjects, {figures['labels']} clips; the reference's clips are not counted."
+        " Suggestions whose confidence reaches `align.accept` are accepted without a person.",
         "",
     ]
     head = ["accept", "labels by hand", "mean error of the others, frames", "within one frame"]

@@ -86,9 +86,10 @@ def as_markdown(rows: list[dict], item: str) -> list[str]:
     """Format the section of the document."""
     lines = [
         f"Made by `python -m benchmarks.depth --sweep` on {item} of a synthetic capture: one"
-        " setting at a time around `standard`. Views, pixels (of the longest side) and voxel are"
-        " those that were used, where the footage has less or is too coarse for more. Seconds of"
-        " one core; errors in all cameras of the rig, those left out too.",
+        " setting at a time differs from `standard`. The columns views, pixels (of the longest"
+        " side) and voxel show what was used: the footage may have fewer views, or be too coarse"
+        " for smaller voxels. Seconds are of one core; errors are over all cameras of the rig,"
+        " including those left out.",
         "",
     ]
     head = ("setting", "value", "views", "pixels", "voxel mm", "seconds", "median mm", "95 % mm",

@@ -44,9 +44,9 @@ SETTINGS: dict[str, tuple[Changes, int]] = {  # name -> changes of tables, pixel
     "no refinement": ({"model": {"refine_widths": []}}, 1),
     "n_g 256, no refinement": ({"model": {"n_g": 256, "refine_widths": []}}, 1),
     "refinement at half": ({"model": {"refine_unshuffle": 2}}, 1),
-    "half the pixels a side": ({}, 2),
+    "half the pixels per side": ({}, 2),
 }
-HEADING = "Knobs of GRMM"
+HEADING = "Settings of GRMM"
 
 
 class Smaller:
@@ -141,10 +141,10 @@ def as_markdown(rows: list[dict], people: int, cameras: int, size: int) -> list[
     """Return the section's lines."""
     text = (
         f"Made by `python -m benchmarks.grmm_trade`: {people} people, {cameras} cameras of {size} "
-        "px, two more held out. One thing is changed at a time from `--preset demo`. A budget is "
-        "processor seconds of one core, from the first image read; dB are over all pixels but the "
-        "torso, and over the head's alone. A picture is decoded, drawn, refined and compared. One "
-        "run a row: a tenth of a dB says nothing."
+        "px, two more held out. One setting at a time differs from `--preset demo`. A budget is "
+        "processor seconds of one core, counted from the first image read. PSNR is over all pixels "
+        "but the torso, and over the head alone. Seconds per picture cover decoding, drawing, "
+        "refining and comparing it. Each row is one run, so a tenth of a dB means nothing."
     )
     head = ["setting", "budget s", "steps", "PSNR dB", "head dB", "SSIM", "seconds per picture"]
     lines = [

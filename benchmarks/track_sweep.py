@@ -25,7 +25,7 @@ from express50.files.text import markdown_table
 from express50.twin.truth import Truth
 from pipelines.track import STAGE
 
-SECTION = "Knobs of tracking"
+SECTION = "Settings of tracking"
 EXPRESSIONS = ("neutral", "jaw_open", "smile")
 VIEWS = (2, 4, 8)
 KNOBS: tuple[tuple[str, dict[str, object]], ...] = (
@@ -109,9 +109,9 @@ def as_markdown(rows: list[dict], cameras: int) -> list[str]:
     """Return the section's lines."""
     text = (
         f"Made by `python -m benchmarks.track_sweep`: one twin subject, {len(EXPRESSIONS)}"
-        f" expressions, {cameras} cameras. One thing is changed at a time from `standard`; errors"
-        " are root mean squares against the truth, seconds are processor seconds per frame. One"
-        " head: differences under 0.1 mm are not to be trusted."
+        f" expressions, {cameras} cameras. One setting at a time differs from `standard`. Errors"
+        " are root mean squares against ground truth, seconds are processor seconds per frame. All"
+        " rows are of one head, so differences under 0.1 mm mean nothing."
     )
     head = ["setting", "face mm", "head mm", "jaw degrees", "outline IoU", "seconds"]
     lines = [

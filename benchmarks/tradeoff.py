@@ -157,7 +157,7 @@ def plot(rows: list[dict], path: Path) -> None:
         axes.plot(
             [r["seconds_per_item"] for r in own], [r["error"] for r in own], "o-", color="#2457a6"
         )
-        # Each label stands a line above the one before: presets of equal cost share a place.
+        # Each label is one line above the one before, as presets of equal cost share a place.
         for line, r in enumerate(own):
             axes.annotate(
                 r["preset"], (r["seconds_per_item"], r["error"]), (4, 4 + 9 * line),
@@ -177,10 +177,10 @@ def as_markdown(rows: list[dict]) -> list[str]:
     front = pareto(rows)
     lines = [
         "Made by `make tradeoff` on the demo's synthetic captures (4 subjects, 8 cameras, 320 px),"
-        " one process, against ground truth. Seconds are processor seconds, starting the command"
-        " included; an item of `matte` is a peak with all its cameras. A star marks a preset that"
-        " no other preset of the stage beats in both. `express50 tune` measures the whole chain on"
-        " your own footage, without truth.",
+        " one process, against ground truth. Seconds are processor seconds, including the start of"
+        " the command; an item of `matte` is one peak frame with all its cameras. A star marks a"
+        " preset that no other preset of its stage beats in both time and error. `express50 tune`"
+        " measures the whole chain on your own footage, without ground truth.",
         "",
     ]
     lines += markdown_table(
