@@ -93,6 +93,7 @@ def measured_figures(
     ``chosen`` already. Trials that are still there are not run again.
 
     Raises:
+        ConfigError: the budget ended before any footage was ingested.
         StageError: no footage can be measured.
     """
     root, path = chain.dataset.root, dial_dir(chain.dataset) / "measured.json"
@@ -104,13 +105,21 @@ def measured_figures(
         raise StageError(f"{root}: no capture is registered; name a CAPTURE")
     reason = ""
     for subject in subjects[:PILOTS]:
-        found = measure(Pilot(chain, subject, clock), allowance)
+        try:
+            found = measure(Pilot(chain, subject, clock), allowance)
+        except StageError as error:
+            if clock.budget is None or not clock.closed():
+                raise
+            raise ConfigError(
+                f"--budget {clock.budget.text}: it ended before the footage of {subject} was"
+                " ingested; give more"
+            ) from error
         broken = broken_stage(chain, found.trials[0])
         reason = f"{broken}: {found.trials[0].failed[broken]}" if broken else ""
         if not reason or clock.closed():
             break
         chain.tell(f"{subject} cannot be measured: {reason}")
-    if found is None or reason:
+    if found is None or (reason and not clock.closed()):  # a stage without time makes nothing
         raise StageError(
             f"{root}: no subject could be measured: {reason}; correct that, or run without --budget"
             " to see what each stage says"

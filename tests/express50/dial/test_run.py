@@ -106,6 +106,12 @@ def test_a_budget_below_the_cheapest_settings_says_what_the_least_is(tmp_path, c
     assert state.finished and state.stated["value"][0] == pytest.approx(error_of(state.settings))
 
 
+@pytest.mark.parametrize("budget", ["0.001s", "0.2s"])  # ends in ingest; on a slow machine, later
+def test_a_budget_that_ends_while_measuring_is_called_too_small(tmp_path, captures, budget):
+    with pytest.raises(ConfigError, match=rf"--budget {budget}: .*give "):
+        go(tmp_path / "d", captures, budget)
+
+
 def test_a_goal_is_reached_in_the_least_time_or_refused(tmp_path, captures):
     _, state = go(tmp_path / "d", captures, goal="0.8mm")
     assert error_of(state.settings) <= 0.8
