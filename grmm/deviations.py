@@ -62,7 +62,7 @@ ALWAYS = (
         paper="depth by ProbeSDF",
         ours="a level set moved to where the views agree (pipelines/depth)",
         reason="volume rendering gained nothing for a minute more per frame",
-        effect="median 0.293 mm with volume rendering and without (docs/LOG.md, What went)",
+        effect="median 0.293 mm with volume rendering and without (docs/LOG.md, What was removed)",
     ),
     Deviation(
         paper="mattes by RMBG-2.0 and BackgroundMattingV2, torso by Sapiens",
