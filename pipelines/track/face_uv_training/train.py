@@ -1,9 +1,9 @@
 """Train the face UV network: `python -m pipelines.track.face_uv_training.train --cases DIR`.
 
-Goes on from the landmark network's weights or from those given by `--start`, on painted heads only:
-the procedural one and, where a path is given, ICT-FaceKit (how the shipped file was made:
-docs/LOG.md, 2026-11-22). The result depends on the arguments alone, up to how the machine rounds.
-A run that was interrupted goes on from its last state, which is kept in DIR.
+Starts from the landmark network's weights, or from those given by `--start`, and sees painted heads
+only: the procedural one and, if a path is given, ICT-FaceKit. How the shipped file was made is in
+`git show c44aa77:docs/LOG.md`, 2026-11-22. The result depends on the arguments alone, up to how the
+machine rounds. An interrupted run continues from its last state, which is kept in DIR.
 """
 
 from __future__ import annotations
