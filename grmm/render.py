@@ -77,19 +77,19 @@ def orbit(view: PinholeView, degrees: float, centre: Tensor, pitch: float = 0.0)
     axis (positive: seen from above).
     """
     pivot = centre.to(view.cam_from_head.device, torch.float64)
-    turn = _rotation(math.radians(degrees), 0, 2, pivot)
+    turn = _rotation(math.radians(degrees), 0, pivot)
     camera = view.cam_from_head.double() @ turn
     if pitch:
         seen = camera[:3, :3] @ pivot + camera[:3, 3]
-        camera = _rotation(math.radians(-pitch), 1, 2, seen) @ camera
+        camera = _rotation(math.radians(-pitch), 1, seen) @ camera
     return replace(view, cam_from_head=camera)
 
 
-def _rotation(angle: float, first: int, second: int, pivot: Tensor) -> Tensor:
-    """Return (4, 4) rotation by radians from axis ``second`` to ``first``, about a point (3,)."""
+def _rotation(angle: float, axis: int, pivot: Tensor) -> Tensor:
+    """Return (4, 4) rotation by radians from axis z to ``axis``, about a point (3,)."""
     turn = torch.eye(4, dtype=torch.float64, device=pivot.device)
-    turn[first, first] = turn[second, second] = math.cos(angle)
-    turn[first, second], turn[second, first] = math.sin(angle), -math.sin(angle)
+    turn[axis, axis] = turn[2, 2] = math.cos(angle)
+    turn[axis, 2], turn[2, axis] = math.sin(angle), -math.sin(angle)
     turn[:3, 3] = pivot - turn[:3, :3] @ pivot
     return turn
 

@@ -19,6 +19,7 @@ IMAGES_PER_SUBJECT = 96  # more hardly change the mean texture
 FACING = 0.25  # cosine of normal and view below which a texel is seen too obliquely
 OCCLUSION_M = 0.012  # a texel this far behind the rendered surface is hidden; hair is this thick
 ALIKE_COLOUR, ALIKE_M = 0.08, 0.04  # how far texels may differ and still change alike
+SAMPLES = 1024  # of seen texels, from which the changes of the others are predicted
 LOGIT_LIMIT = 0.01  # colours are kept this far from 0 and 1 before the logit
 
 
@@ -108,20 +109,18 @@ def _seen_colours(model: GRMM, gaussians: Gaussians, item: Item) -> tuple[Tensor
     return sampled[:, :3], seen * facing.square()
 
 
-def spread_change(
-    change: Tensor, weight: Tensor, colours: Tensor, means: Tensor, samples: int = 1024
-) -> Tensor:
+def spread_change(change: Tensor, weight: Tensor, colours: Tensor, means: Tensor) -> Tensor:
     """Predict the change of every texel (N, 3) from the changes of seen texels.
 
     A kernel regression on colour before the change and on place, with the head's left and right
-    folded together; at most ``samples`` seen texels, evenly taken, speak for all. ``change`` (N, 3)
-    counts where ``weight`` (N,) is positive; ``colours`` (N, 3) in [0, 1] are those before it, and
-    ``means`` (N, 3) the places in head space, metres.
+    folded together, from at most SAMPLES evenly chosen seen texels. ``change`` (N, 3) counts where
+    ``weight`` (N,) is positive; ``colours`` (N, 3) in [0, 1] are those before it, and ``means``
+    (N, 3) the places in head space, metres.
     """
     seen = torch.nonzero(weight > 0.25 * weight.max())[:, 0] if bool((weight > 0).any()) else []
     if not len(seen):
         return torch.zeros_like(change)
-    seen = seen[:: max(1, len(seen) // samples)]
+    seen = seen[:: max(1, len(seen) // SAMPLES)]
     folded = torch.cat([means[:, :1].abs(), means[:, 1:]], 1)
     traits = torch.cat([colours / ALIKE_COLOUR, folded / ALIKE_M], 1)
     affinity = -0.5 * torch.cdist(traits, traits[seen]).square()

@@ -70,18 +70,17 @@ class PicturePane(Widget):
         That cache rewrites the style of every segment, which costs more than all the rest: a
         picture has thousands, and no border or padding that it would be needed for.
         """
-        return [line.crop(crop.x, crop.right) for line in self._draw()[crop.y : crop.bottom]]
-
-    def _draw(self) -> list[Strip]:
         if self.look is None:
-            return self._written(self._words)
-        # Below a dialog characters stand in: Textual tints them, and pixels would lie on top.
-        painter = self._painter if self.screen.is_active else self._blocks
-        shot = shot_of(self.look, painter.shape(self.size))
-        try:
-            return painter.strips(shot, self.size, self._read)
-        except AnnotationError as error:
-            return self._written(str(error))
+            lines = self._written(self._words)
+        else:
+            # Below a dialog characters are shown: Textual tints them, pixels would lie on top.
+            painter = self._painter if self.screen.is_active else self._blocks
+            shot = shot_of(self.look, painter.shape(self.size))
+            try:
+                lines = painter.strips(shot, self.size, self._read)
+            except AnnotationError as error:
+                lines = self._written(str(error))
+        return [line.crop(crop.x, crop.right) for line in lines[crop.y : crop.bottom]]
 
     def _read(self, crop: FrameCrop) -> np.ndarray:
         picture = self._cache.get(crop)

@@ -33,7 +33,7 @@ def resolve_config(
     Args:
         stage: the stage.
         preset: ``draft``, ``standard`` or ``reference``.
-        file: TOML file with one table a stage; tables of other stages are left alone.
+        file: TOML file with one table per stage; tables of other stages are left alone.
         assignments: ``stage.key=value`` strings; those of other known stages are left alone.
         known_stages: names that a table may carry beside this stage's own.
 
@@ -93,7 +93,7 @@ def known_assignments(
     """Split ``table.key=value`` strings as `parse_assignment` does.
 
     Raises:
-        ConfigError: an unknown table, or a text that has not that form.
+        ConfigError: a table is unknown, or a text does not have that form.
     """
     found = [(text, *parse_assignment(text)) for text in texts]
     for text, table, _, _ in found:
@@ -137,7 +137,7 @@ def parse_assignment(text: str) -> tuple[str, str, object]:
     """Split ``stage.key=value``; the value is TOML, a bare word is a string.
 
     Raises:
-        ConfigError: the text has not that form.
+        ConfigError: the text does not have that form.
     """
     name, equals, raw = text.partition("=")
     table, dot, key = name.strip().partition(".")
@@ -174,15 +174,13 @@ def _coerce(name: str, value: object, kind: Any) -> object:
     raise ConfigError(f"{name}: got {value!r} ({type(value).__name__}), expected {kind.__name__}")
 
 
-def config_values(config: Any) -> dict[str, object]:
-    """Return field values of a config dataclass, in order."""
-    return {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
-
-
 def config_texts(config: Any) -> dict[str, str]:
     """Return field values of a config dataclass, in order, as TOML has them."""
     # A number, text, list or truth is written in TOML as in JSON.
-    return {k: json.dumps(v, ensure_ascii=False) for k, v in config_values(config).items()}
+    return {
+        field.name: json.dumps(getattr(config, field.name), ensure_ascii=False)
+        for field in dataclasses.fields(config)
+    }
 
 
 def config_toml(name: str, config: Any) -> str:

@@ -121,6 +121,11 @@ def no_files(config: Any) -> None:
     """Try nothing: no setting names a file."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class NoSettings:
+    """The configuration of a stage that has nothing to set."""
+
+
 @dataclass(frozen=True)
 class Growth:
     """Sizes of the footage that a stage's cost is proportional to, for ``express50 plan``.

@@ -65,20 +65,6 @@ class LocalWorkers:
         self._cluster.close(timeout=10)
 
 
-def _knock(address: str) -> None:
-    """Open a connection and close it: dask itself tries for half a minute where nobody answers.
-
-    Raises:
-        ValueError: the address has no port.
-        OSError: nobody answers.
-    """
-    parts = urlsplit(address if "://" in address else f"tcp://{address}")
-    if parts.hostname is None or parts.port is None:
-        raise ValueError("it has no port")
-    if parts.scheme in ("tcp", "tls"):
-        socket.create_connection((parts.hostname, parts.port), KNOCK_SECONDS).close()
-
-
 class RemoteWorkers:
     """Workers of a scheduler that somebody else runs."""
 
@@ -98,7 +84,12 @@ class RemoteWorkers:
         # It logs a lost scheduler with tracebacks; the pool says it in one line.
         logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
         try:
-            _knock(address)
+            parts = urlsplit(address if "://" in address else f"tcp://{address}")
+            if parts.hostname is None or parts.port is None:
+                raise ValueError("it has no port")
+            # If nobody answers, dask itself would try for half a minute.
+            if parts.scheme in ("tcp", "tls"):
+                socket.create_connection((parts.hostname, parts.port), KNOCK_SECONDS).close()
             client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
             has_workers = bool(client.nthreads())
         except (OSError, TimeoutError, ValueError, MemoryError) as error:  # of another server, too

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from express50.capture.index import read_peaks
 from express50.contract.layout import Dataset
-from express50.contract.stage import Result, Stage
+from express50.contract.stage import NoSettings, Result, Stage
 from express50.errors import Express50Error
 from express50.files.digests import path_digest, value_digest
 from express50.runner.ledger import IMPORTED, Ledger, Made, Receipt
@@ -23,11 +23,6 @@ from express50.runner.worker import Task, run_task
 
 Digest = Callable[[Path], str]
 AGAIN = "import it again, or give it up with 'express50 import remove'"
-
-
-@dataclass(frozen=True)
-class NoSettings:
-    """Nothing to set: no stage's settings concern an import."""
 
 
 def import_inputs(dataset: Dataset, item: str, digest: Digest = path_digest) -> dict[str, str]:
@@ -59,7 +54,7 @@ def publish_import(
     # Each import is another one: what replaced outputs hold of a former one must not come back.
     fingerprint = IMPORTED + value_digest([inputs, time.time_ns()])
     with run_folder(dataset, stage.name) as folder:
-        settings = NoSettings()
+        settings = NoSettings()  # no stage's settings concern an import
         receipt = run_task(
             Task(writer, dataset, item, settings, fingerprint, inputs, 1, former, folder)
         )

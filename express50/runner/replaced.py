@@ -7,7 +7,6 @@ gives way where a disk has little space.
 
 from __future__ import annotations
 
-import functools
 import shutil
 import time
 from collections.abc import Callable
@@ -33,27 +32,27 @@ Keep = Callable[[Path], None]
 def keeping(dataset: Dataset, former: Receipt | None) -> Keep | None:
     """Return a function that moves the folder of a replaced output into the store.
 
-    It moves nothing where there is little space; whatever else goes wrong costs the entry alone.
-    None for an output whose receipt is not known.
+    It moves nothing if there is little space; any other trouble only costs the entry. None for an
+    output whose receipt is not known.
     """
     if former is None or former.made is None:
         return None
-    return functools.partial(_keep, dataset, former)
-
-
-def _keep(dataset: Dataset, former: Receipt, folder: Path) -> None:
     entry = _entry(dataset, former.stage, former.item, former.fingerprint)
-    with suppress(OSError, DiskFullError):  # others may empty the store meanwhile
-        if make_room(dataset):
-            return
-        write_json(folder / RECEIPT, asdict(former))
-        shutil.rmtree(entry, ignore_errors=True)
-        entry.parent.mkdir(parents=True, exist_ok=True)
-        folder.rename(entry)
-        # The receipt's file was the last change in each.
-        newest_first = sorted(entry.parent.iterdir(), key=lambda p: -p.stat().st_mtime_ns)
-        for old in newest_first[GENERATIONS:]:
-            shutil.rmtree(old, ignore_errors=True)
+
+    def keep(folder: Path) -> None:
+        with suppress(OSError, DiskFullError):  # others may empty the store meanwhile
+            if make_room(dataset):
+                return
+            write_json(folder / RECEIPT, asdict(former))
+            shutil.rmtree(entry, ignore_errors=True)
+            entry.parent.mkdir(parents=True, exist_ok=True)
+            folder.rename(entry)
+            # The receipt's file was the last change in each.
+            newest_first = sorted(entry.parent.iterdir(), key=lambda p: -p.stat().st_mtime_ns)
+            for old in newest_first[GENERATIONS:]:
+                shutil.rmtree(old, ignore_errors=True)
+
+    return keep
 
 
 def restore(

@@ -129,10 +129,8 @@ class Person:
     def pose(self, tracked: Tracked, expression: str | None = None) -> AvatarPose:
         """Return the pose of tracked parameters, with a training expression's code if named."""
         weights = [float(name == expression) for name in self.expressions]
-        return AvatarPose(parameters=self._row(tracked), weights=self.own.new_tensor(weights))
-
-    def _row(self, tracked: Tracked) -> Tensor:
-        return _parameters(tracked, len(self.own) - 12).to(self.own)
+        parameters = _parameters(tracked, len(self.own) - 12).to(self.own)
+        return AvatarPose(parameters=parameters, weights=self.own.new_tensor(weights))
 
 
 def person_of(loaded: Loaded, head: HeadCodes, subject: str) -> Person:

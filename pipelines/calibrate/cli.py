@@ -77,21 +77,17 @@ def run_check(args: argparse.Namespace) -> int:
     verdict = judge(cameras)
     footage = None
     if args.footage is not None and not verdict.problem:
-        footage = _look_at_footage(args, cameras)
+        # Imported here: the other commands need neither torch nor OpenCV's features.
+        from pipelines.calibrate.footage import find_points, read_raw_footage
+        from pipelines.calibrate.given_rig import check_footage
+
+        if args.frames < 1:
+            raise ConfigError(f"--frames is {args.frames}, expected 1 or more")
+        seen = find_points(read_raw_footage(args.footage, cameras, args.frames))
+        shown = {name for points in seen.values() for name in points.features}
+        footage = check_footage({n: c for n, c in cameras.items() if n in shown}, seen)
     _report(args, cameras, verdict, None, footage)
     return FAILED if verdict.problem or (footage and footage.moved) else OK
-
-
-def _look_at_footage(args: argparse.Namespace, cameras: Mapping[str, Camera]) -> FootageCheck:
-    # Imported here: the other commands need neither torch nor OpenCV's features.
-    from pipelines.calibrate.footage import find_points, read_raw_footage
-    from pipelines.calibrate.given_rig import check_footage
-
-    if args.frames < 1:
-        raise ConfigError(f"--frames is {args.frames}, expected 1 or more")
-    seen = find_points(read_raw_footage(args.footage, cameras, args.frames))
-    shown = {name for points in seen.values() for name in points.features}
-    return check_footage({n: c for n, c in cameras.items() if n in shown}, seen)
 
 
 def _read(args: argparse.Namespace) -> dict[str, Camera]:

@@ -202,7 +202,8 @@ def _adjust(
             break
         wider, wide = with_features(fit.cameras | more, BANDS[:1])
         expected = _expected(wide, wider, seen, priors)
-        loose = {n for n in more if not expected.get(n, np.inf) < _most(start[n])}
+        most = {n: LOOSE * float(np.hypot(start[n].width, start[n].height)) for n in more}
+        loose = {n for n in more if not expected.get(n, np.inf) < most[n]}
         refused |= loose
         if set(more) - loose:
             held = {n: c for n, c in wide.cameras.items() if n not in loose}
@@ -219,10 +220,6 @@ def _expected(
     found = footage_uncertainty(fit, tracks, priors, FEATURE_SCALES[-1], middle, radius)
     # Errors that stay the same in every frame set do not average out: all sets count as one.
     return {name: px * len(seen) ** 0.5 for name, px in found.items()}
-
-
-def _most(camera: Camera) -> float:
-    return LOOSE * float(np.hypot(camera.width, camera.height))
 
 
 def _landmark_points(

@@ -7,17 +7,11 @@ subject are one more item.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from express50.capture.index import peak_items, read_index, read_peak_rows
 from express50.contract.layout import PLATES, Dataset
-from express50.contract.stage import Growth, Result, Stage
-
-
-@dataclass(frozen=True, kw_only=True)
-class FramesConfig:
-    """Nothing to set."""
+from express50.contract.stage import Growth, NoSettings, Result, Stage
 
 
 def items(dataset: Dataset) -> list[str]:
@@ -32,7 +26,7 @@ def items(dataset: Dataset) -> list[str]:
     return peaks + [f"{s}/{PLATES}" for s in subjects if read_index(dataset, s).plates]
 
 
-def inputs(dataset: Dataset, item: str, config: FramesConfig) -> dict[str, Path | str]:
+def inputs(dataset: Dataset, item: str, config: NoSettings) -> dict[str, Path | str]:
     """Name the index, the cameras, and the peak or the plates; the index holds footage hashes."""
     subject, expression = item.split("/")
     found: dict[str, Path | str] = {
@@ -46,7 +40,7 @@ def inputs(dataset: Dataset, item: str, config: FramesConfig) -> dict[str, Path 
     return found | {"peak": repr(read_peak_rows(dataset, subject)[expression])}
 
 
-def run(dataset: Dataset, item: str, config: FramesConfig, out: Path) -> Result:
+def run(dataset: Dataset, item: str, config: NoSettings, out: Path) -> Result:
     """Write one file per camera, and a contact sheet."""
     from pipelines.frames.stage import run as work
 
@@ -56,7 +50,7 @@ def run(dataset: Dataset, item: str, config: FramesConfig, out: Path) -> Result:
 STAGE = Stage(
     name="frames",
     version=2,
-    config=FramesConfig,
+    config=NoSettings,
     items=items,
     inputs=inputs,
     run=run,

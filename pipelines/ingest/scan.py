@@ -152,18 +152,14 @@ def odd_footage(raw: RawCapture, cameras: Mapping[str, CameraSource]) -> dict[st
     for name, source in cameras.items():
         words = []
         if source.kind == "frames":
-            if _first_has_alpha(raw.cameras[name]):
+            path = raw.cameras[name].path / raw.cameras[name].names[0]
+            if path.is_file() and has_alpha(path):  # no file: a member of a container
                 words.append("has an alpha channel, which is left out: a later stage makes mattes")
         else:
             words += [w for w in (_rate(raw, raw.cameras[name]), _uneven(source)) if w]
         if words:
             found[f"camera {name}"] = "; ".join(words)
     return found
-
-
-def _first_has_alpha(camera: RawCamera) -> bool:
-    path = camera.path / camera.names[0]
-    return path.is_file() and has_alpha(path)  # else a member of a container
 
 
 def _rate(raw: RawCapture, camera: RawCamera) -> str:

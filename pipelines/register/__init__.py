@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from express50.capture.index import peak_items
 from express50.contract.layout import Dataset
-from express50.contract.stage import Growth, Result, Stage
+from express50.contract.stage import Growth, NoSettings, Result, Stage
 
 
-@dataclass(frozen=True, kw_only=True)
-class RegisterConfig:
-    """Nothing to set."""
-
-
-def inputs(dataset: Dataset, item: str, config: RegisterConfig) -> dict[str, Path | str]:
+def inputs(dataset: Dataset, item: str, config: NoSettings) -> dict[str, Path | str]:
     """List the cameras, the track and the expression's surface."""
     from express50.dataset.tracks import existing_track
 
@@ -27,7 +21,7 @@ def inputs(dataset: Dataset, item: str, config: RegisterConfig) -> dict[str, Pat
     }
 
 
-def run(dataset: Dataset, item: str, config: RegisterConfig, out: Path) -> Result:
+def run(dataset: Dataset, item: str, config: NoSettings, out: Path) -> Result:
     """Register one expression."""
     from pipelines.register.stage import run as work
 
@@ -37,7 +31,7 @@ def run(dataset: Dataset, item: str, config: RegisterConfig, out: Path) -> Resul
 STAGE = Stage(
     name="register",
     version=2,
-    config=RegisterConfig,
+    config=NoSettings,
     items=peak_items,
     inputs=inputs,
     run=run,

@@ -21,12 +21,12 @@ from pipelines.register.lay import (
     folded,
     lay,
     mesh_normals,
+    skin_trust,
     trusted_vertices,
 )
 from pipelines.register.scan_landmarks import GIVEN_M, check_face
 from pipelines.register.scan_look import look
 from pipelines.register.scan_mesh import Scan
-from pipelines.register.skin import skin_trust
 from pipelines.track.basis import OFF, Basis, make_basis
 from pipelines.track.fit import fit
 from pipelines.track.observe import JAW_LINE_WEIGHT

@@ -22,8 +22,7 @@ from express50.geometry.transforms_torch import axis_angle_to_matrix
 from express50.head.load import load_head
 from express50.head.model import HeadModel, joint_angles, joint_transforms
 from express50.head.preview import render_preview
-from pipelines.register.lay import GivenSurface, LaidMesh, lay, mesh_normals
-from pipelines.register.skin import skin_trust
+from pipelines.register.lay import GivenSurface, LaidMesh, lay, mesh_normals, skin_trust
 from pipelines.register.untangle import crossings
 from pipelines.track.sequence import write_npz
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from express50.contract.layout import Dataset
+from express50.contract.stage import NoSettings
 from express50.dataset.export import Head, with_registered
 from express50.dataset.tracks import best_vertices, read_registration, read_track
 from express50.errors import FormatError, StageError
@@ -19,15 +20,15 @@ from express50.geometry.raycast import mesh_scene
 from express50.geometry.transforms_torch import axis_angle_to_matrix
 from express50.head.load import load_head
 from express50.head.model import joint_angles, pose, rest_vertices, skin
-from pipelines.register import STAGE, RegisterConfig
+from pipelines.register import STAGE
 from pipelines.register.lay import (
     GivenSurface,
     Plate,
     SurfaceSearch,
     lay,
     mesh_normals,
+    skin_trust,
 )
-from pipelines.register.skin import skin_trust
 from pipelines.register.stage import rest_offsets
 from pipelines.register.untangle import crossing_pairs, untangled
 from tests.express50.dataset.tracked import track_arrays, write_track
@@ -236,7 +237,7 @@ def test_the_stage_writes_a_mesh_that_later_stages_take(dataset, tmp_path):
     out.mkdir()
     track = read_track(dataset.track_file("S001"))
     assert np.array_equal(best_vertices(dataset, "S001", track), track.vertices)
-    result = STAGE.run(dataset, "S001/smile", RegisterConfig(), out)
+    result = STAGE.run(dataset, "S001/smile", NoSettings(), out)
     assert result.metrics["seen_share"] > 0.5 and not result.warnings
     assert result.metrics["residual_mm_median"] < 0.05
     assert result.metrics["moved_mm_p95"] > 0.1
@@ -262,7 +263,7 @@ def test_the_stage_writes_a_mesh_that_later_stages_take(dataset, tmp_path):
 
 def test_what_is_missing_or_damaged_is_one_clear_error(dataset, tmp_path):
     with pytest.raises(StageError):  # no surface
-        STAGE.run(dataset, "S001/neutral", RegisterConfig(), tmp_path)
+        STAGE.run(dataset, "S001/neutral", NoSettings(), tmp_path)
     path = dataset.surface_file("S001", "smile")
     whole = path.read_bytes()
     for damaged in (

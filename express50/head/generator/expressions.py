@@ -143,7 +143,7 @@ def expression_directions(
     and jaw move by the mean's own shape. `jaw` (V,) separates the lips; `hinge` (3,) is the jaw's
     joint in the mean.
     """
-    scopes = scope_weights(mesh, regions, jaw)
+    scopes = scope_weights(regions, jaw)
     result: dict[str, Array] = {}
     for name, pulls in PAIRED.items():
         motion = part_lips(mesh, settle_eyes(mesh, displacement(mesh, pulls, scopes)))

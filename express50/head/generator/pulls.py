@@ -43,7 +43,7 @@ def displacement(mesh: WholeMesh, pulls: tuple[Pull, ...], scopes: dict[str, Arr
     return total
 
 
-def scope_weights(mesh: WholeMesh, regions: dict[str, Array], jaw: Array) -> dict[str, Array]:
+def scope_weights(regions: dict[str, Array], jaw: Array) -> dict[str, Array]:
     """Return vertex weights (V,) of each scope. `jaw` separates the lower lip from the upper."""
     hard = regions["teeth"] | regions["gums"] | regions["tongue"]
     balls = regions["left_eyeball"] | regions["right_eyeball"]
