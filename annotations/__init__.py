@@ -1,4 +1,4 @@
-"""This package labels peak expressions: labels, suggestions, and the terminal annotator."""
+"""Label peak expressions: labels, suggestions, and the terminal annotator."""
 
 from __future__ import annotations
 

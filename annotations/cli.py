@@ -92,7 +92,7 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument("subject", metavar="SUBJECT")
     for parser in (
         add("export", run_export, "write every event as .csv or .json", "subjects"),
-        add("import", run_import, "add events from a .csv or .json, each only once"),
+        add("import", run_import, "add events from a .csv or .json; known ones are skipped"),
     ):
         parser.add_argument("file", type=Path, metavar="FILE")
 
@@ -119,7 +119,7 @@ def _add_labelling_verbs(add: Callable[..., argparse.ArgumentParser]) -> None:
     words = "list what you still have to label, in the best order"
     parser = add("next", run_next, words, "subjects", "annotator")
     parser.add_argument("--order", choices=ORDERS, default=ORDERS[0], help="default: %(default)s")
-    parser.add_argument("--count", type=int, default=10, metavar="N", help="at most so many [10]")
+    parser.add_argument("--count", type=int, default=10, metavar="N", help="at most this many [10]")
     parser = add("mark", run_mark, "mark the peak frame of an expression", "clip", "annotator")
     parser.add_argument("frame", type=int, metavar="FRAME", help="0-based decode index")
     parser.add_argument("--camera", help="camera it was judged in (default: the suggestion's)")
@@ -197,7 +197,7 @@ def chosen_subjects(dataset: Dataset, wanted: list[str] | None) -> list[str] | N
 
 
 def run_ui(args: argparse.Namespace) -> int:
-    """Open the annotator; the exit code is 0 also when work is left."""
+    """Open the annotator; the exit code is 0 even if work is left."""
     from annotations.ui.app import AnnotateApp
     from annotations.ui.frames import FaceFinder
     from annotations.ui.images import cell_size
@@ -363,7 +363,7 @@ def run_agree(args: argparse.Namespace) -> int:
 
 
 def run_review(args: argparse.Namespace) -> int:
-    """Print the queue, or settle one of it."""
+    """Print the disagreements, or settle one."""
     if args.settle:
         subject, expression, verdict = args.settle
         index = read_index(args.dataset, subject)

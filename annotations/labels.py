@@ -68,7 +68,7 @@ class Label:
     reason: str | None = None
 
 
-# What a field may be; a whole number does for one with a fraction.
+# Types of the fields; a whole number may stand for one with a fraction.
 KINDS = {
     name: int | float if kind is float else kind | int if kind == float | None else kind
     for name, kind in get_type_hints(Label).items()
@@ -152,7 +152,7 @@ def find_cue(index: Index, expression: str) -> Cue:
 
 
 def shows_labelled_frame(index: Index, label: Label) -> bool:
-    """Return whether the footage still holds the very frame that was labelled."""
+    """Return whether the footage still holds the frame that was labelled."""
     source, frame = index.cameras.get(label.camera or ""), label.frame or 0
     return source is not None and 0 <= frame < source.frames and source.dhash[frame] == label.dhash
 

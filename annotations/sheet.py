@@ -204,7 +204,7 @@ QUALITY = 82
 
 @dataclass(frozen=True)
 class Pictures:
-    """A tile's picture and the frames around it, side by side, as data addresses; "" for none.
+    """A tile's picture and the frames around it, side by side, as data URLs; "" for none.
 
     Attributes:
         face: the frame.

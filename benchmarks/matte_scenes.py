@@ -15,7 +15,7 @@ import numpy as np
 
 from express50.files.images import linear_to_srgb, srgb_to_linear
 
-FINE = 8  # samples a pixel and axis
+FINE = 8  # samples per pixel and axis
 SHADES = 24  # of hair
 READ, SHOT = 0.0016, 0.006  # deviation of dark pixels and at full light, linear light
 LENS = 0.5  # pixels

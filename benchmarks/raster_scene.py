@@ -22,8 +22,8 @@ from grmm.rasterize.projection import (
 def head(n: int, size: int, channels: int) -> dict[str, Tensor]:
     """Return N flat splats on an ellipsoid as large as a head, 1 m in front of the camera, float64.
 
-    They lie row by row on an equal-area map, as GRMM's lie on its UV map, and cover a third of
-    the picture with 14 to 16 blended splats a pixel of it on average.
+    They lie row by row on an equal-area map, as GRMM's lie on its UV map, and cover a third of the
+    picture with 14 to 16 blended splats per pixel on average.
     """
     side = math.isqrt(n)
     if side * side != n:

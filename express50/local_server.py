@@ -1,4 +1,4 @@
-"""Serve pages to the browser of this machine, and to nobody else.
+"""Serve pages to browsers on this machine only.
 
 Every address begins with a random token, so that neither another user of the machine nor a web page
 can guess it. Requests that name another host (DNS rebinding) or come from another site's page are
@@ -39,7 +39,7 @@ NOT_FOUND = Reply(HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
 Get = Callable[[str], Reply]
 """The address after the token, without its slash, to its reply."""
 Post = Callable[[str, str, Callable[[int], bytes | None]], Reply]
-"""The address, the media type, and a function that reads a body of at most so many bytes."""
+"""The address, the media type, and a function that reads a body up to a number of bytes."""
 
 
 @dataclass(frozen=True)

@@ -179,7 +179,7 @@ class Item:
 
 
 class Cache(Generic[Key, Value]):
-    """Keeps what was made last, up to so many bytes; the newest entry always stays."""
+    """Keeps the newest results, up to a number of bytes; the last one always stays."""
 
     def __init__(self, limit: int, size: Callable[[Value], int]) -> None:
         """Hold entries whose ``size``, bytes, adds up to at most ``limit``."""

@@ -18,7 +18,7 @@ from grmm.config import ModelConfig
 
 SLOPE = 0.2  # of every leaky ReLU, as RGCA's
 DISPLACEMENT_M = 1e-2  # per unit of network output: displacements are centimetres (G5, G8)
-VIEW_CHANNELS = 8  # the view direction is lifted to so many before it joins the seed (RGCA; G7)
+VIEW_CHANNELS = 8  # channels of the view direction before it joins the seed (RGCA; G7)
 FEATURE_STD = 0.3  # of features before training
 CODE_STD = 0.01  # of codes before training (DeepSDF; G13)
 EMPTY_RANGE_M = 1e-6  # a depth range thinner than a micrometre carries no shape
@@ -30,7 +30,7 @@ class Networks(nn.Module):
     def __init__(
         self, config: ModelConfig, head: HeadModel, subjects: int, expressions: int
     ) -> None:
-        """Build for a head model and so many rows of the code tables."""
+        """Build for a head model and the number of rows of the code tables."""
         super().__init__()
         self.config = config
         self.z_id = nn.Parameter(CODE_STD * torch.randn(subjects, config.z_id))

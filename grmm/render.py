@@ -34,7 +34,7 @@ from grmm.head_crop import draw_window
 from grmm.model import PinholeView
 from grmm.networks import normalise_depth
 
-VIDEO_RATE = 24  # frames a second, as the rig's
+VIDEO_RATE = 24  # frames per second, as the rig's
 YAWS, PITCHES = (-60, -30, 0, 30, 60), (20, 0, -20)  # degrees of the sheet of novel views
 Sheet = tuple[list[list[np.ndarray]], list[str]]
 COLUMNS = "footage, refined, drawn, depth, error times four"  # of comparison sheets

@@ -2,7 +2,7 @@
 
 Every feature is counted in its own noise, which is measured from the footage itself. What a face
 does at rest (fidgets, sway, the detector's drift) is shrunk, so that the curve of an expression
-rises for what the expression does and for nothing else.
+rises only with the expression.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _CONTROL_GROUPS = {
     "nostril": ("nose",),
     "cheek": ("mouth",),
 }
-CELLS = 24  # the aligned face is compared in so many cells per side
+CELLS = 24  # cells per side in which the aligned face is compared
 CELL_REACH = 0.12  # of the face's side: a cell further from every landmark shows no face
 LOOK_WEIGHT = 0.5  # of a cell against a landmark's coordinate: there are more of them
 BYSTANDER = 0.3  # weight of features the script does not name: people move more than they should
@@ -176,7 +176,8 @@ def in_noise(values: np.ndarray, windows: dict[str, np.ndarray]) -> np.ndarray:
     """Divide features (F, N) by their noise, which second differences in time show.
 
     Motion is smooth from frame to frame, so that what remains of a second difference is noise, with
-    six times its variance. Half of every scale is the median feature's: none is divided by nothing.
+    six times its variance. Half of every scale is the median feature's, so that nothing is divided
+    by zero.
     """
     bends = [np.diff(values[rows], n=2, axis=0) for rows in windows.values() if len(rows) > 2]
     if not bends:

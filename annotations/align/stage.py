@@ -127,7 +127,7 @@ def suggest_for(
 def accept_sure(
     dataset: Dataset, index: Index, found: Mapping[str, Suggested], threshold: float
 ) -> dict[str, Label]:
-    """Append an automatic mark for each sure suggestion that is news; return the labels in force.
+    """Append an automatic mark for each new sure suggestion; return the labels in force.
 
     Automatic marks that no suggestion supports any more are undone. A rerun appends nothing.
     """

@@ -17,9 +17,9 @@ from express50.capture.expressions import Expression
 
 CANDIDATES, CANDIDATE_GAP = 5, 3
 NEAR_FRAMES = 2.0  # an event's direction is learnt from frames about its apex (sigma)
-OVERRULE = 2.0  # the clip's strongest event yields to one so many times more like the reference's,
+OVERRULE = 2.0  # the clip's strongest event yields to one this much more like the reference's,
 OVERRULE_COSINE = 0.3  # if that goes the reference's way at all: two of noise are both unlike it
-DISPUTED = 0.6  # confidence counts so much where the strongest event is not the likest
+DISPUTED = 0.6  # times the confidence, where the strongest event is not the likest one
 APEX_LEVEL = 0.9  # a canonical frame at this share of its apex or more is an apex
 OTHER_SIDE = 0.05  # of the apex: what being on the other side of it counts
 PLATEAU_SHARE = 0.95  # of the apex: frames that are equal to it within noise
@@ -256,7 +256,7 @@ def share_of_apex(event: Event) -> np.ndarray:
 
 
 def _slope(share: np.ndarray, apex: int, side: int) -> np.ndarray:
-    """List rows from the apex to one side for as long as the movement falls, but for a tremble."""
+    """List rows from the apex to one side while the movement falls, small trembles aside."""
     rows = [apex]
     while 0 <= rows[-1] + side < len(share) and share[rows[-1] + side] <= share[rows[-1]] + 0.05:
         rows.append(rows[-1] + side)

@@ -1,1 +1,1 @@
-"""This room holds the terminal annotator: state, frames, pictures and the Textual app."""
+"""The terminal annotator: state, frames, pictures and the Textual app."""

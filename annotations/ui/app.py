@@ -109,7 +109,7 @@ class Desk(Screen[None]):
         self.app.call_from_thread(self.draw)
 
     def on_resize(self) -> None:
-        """Give the strip what the height allows, then draw all anew."""
+        """Give the strip what the height allows, then draw everything again."""
         height = self.app.size.height
         rows = next((rows for below, rows in _STRIP_ROWS if height < below), _TALLEST_STRIP)
         self.query_one(CurveStrip).styles.height = rows
@@ -279,7 +279,7 @@ class Desk(Screen[None]):
         self.draw()
 
     def action_blink(self) -> None:
-        """Show frame and reference in turns in one place, or stop."""
+        """Alternate frame and reference in one place, or stop."""
         self.player.blink()
         self.draw()
 
@@ -392,7 +392,7 @@ class Player:
         self.plays = True
 
     def blink(self) -> None:
-        """Show the reference in the frame's place and back, in turns; or stop."""
+        """Alternate frame and reference in the frame's place, or stop."""
         if self.stop():
             return
 

@@ -44,7 +44,7 @@ _SPLITS = np.array(
 _GLYPHS = np.array(list("▀▌▚▘▝▖▗"))
 # A quadrant must be this much better than the plain half block, so that flat areas stay calm.
 _QUADRANT_GAIN = 1.02
-_STEP = 8  # colours are kept in steps of 8: fewer styles, fewer bytes over ssh
+_STEP = 8  # colours are rounded to steps of 8: fewer styles, fewer bytes over ssh
 _BAND = 6
 
 
@@ -87,7 +87,7 @@ class Painter:
         self.strips = lru_cache(maxsize=KEPT)(lambda crop, pane, read: self.paint(pane, read(crop)))
 
     def shape(self, pane: Size) -> PaneShape:
-        """Return the picture's shape in a pane of so many cells: four pixels per cell."""
+        """Return the picture's shape in a pane of this size in cells: four pixels per cell."""
         return PaneShape(max(1, pane.width), max(1, pane.height), 2, 2)
 
     def paint(self, pane: Size, picture: np.ndarray) -> list[Strip]:

@@ -38,7 +38,7 @@ Line = list[Cell]
 
 
 def frame_cells(frames: int, width: int) -> tuple[int, int]:
-    """Return the cells per frame and the frames per cell of a window in so many cells."""
+    """Return the cells per frame and the frames per cell of a window in ``width`` cells."""
     if frames <= width:
         return min(WIDEST, width // frames), 1
     return 1, -(-frames // width)

@@ -1,1 +1,1 @@
-"""This room reads raw captures: their frames, index and expressions."""
+"""Read raw captures: their frames, index and expressions."""

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 AGE_BANDS = ((0, 17), (18, 29), (30, 44), (45, 59), (60, 200))
-# Of fewer people a count says who: one of two subjects is the woman, or the one aged 71.
+# A count of fewer people identifies them: of two subjects, one is the woman or the one aged 71.
 LEAST_PEOPLE = 5
 OTHERS = "others or not given"
 PUBLIC_KEYS = frozenset(
@@ -29,10 +29,10 @@ def public_meta(meta: Mapping) -> dict:
 
 
 def shown_counts(counts: Mapping[str, int]) -> dict[str, int]:
-    """Keep counts of LEAST_PEOPLE or more; smaller groups are counted among the others.
+    """Keep counts of at least LEAST_PEOPLE; smaller groups are counted among the others.
 
-    The smallest groups join the others until these are enough too: a single small one could be
-    inferred from the total. Empty where there are too few people at all, or only one group.
+    The smallest groups join the others until these are large enough too, as a single small group
+    could be inferred from the total. Empty if there are too few people, or only one group.
     """
     left = sorted((n, name) for name, n in counts.items() if name != "not given")
     others = counts.get("not given", 0)

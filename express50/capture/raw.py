@@ -181,7 +181,7 @@ def check_identity(path: Path, subject: object, fps: object) -> None:
 
 
 def check_focals(path: Path, given: Any) -> None:
-    """Refuse ``focal_px`` of capture.toml unless it is positive, a number or a table by camera.
+    """Refuse ``focal_px`` of capture.toml unless it is positive, a number or a table per camera.
 
     Raises:
         CalibrationError: a value is not a positive number.

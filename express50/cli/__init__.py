@@ -1,1 +1,1 @@
-"""This room holds the express50 command line."""
+"""The express50 command line."""

@@ -24,7 +24,7 @@ from express50.runner.ledger import COLUMNS, Ledger, Receipt, Run
 from express50.runner.outdated import few, outdated
 
 PAGE_SECONDS = 3.0  # between two pages while a run goes on
-SILENT_SECONDS = 15.0  # a run that shows no sign for so long was killed
+SILENT_SECONDS = 15.0  # a run without a sign of life for this long was killed
 RECENT = 50  # items whose rate counts for the time left
 FAILED_SHOWN = 200
 SLOWEST_SHOWN = 10
@@ -209,7 +209,7 @@ def _stage(name: str, table: dict[str, Receipt], run: Run | None, now: float) ->
         running = {k: t for k, t in began.items() if k not in table or table[k].time < t}
         open_items = max(0, run.items - run.current - len(settled))
         rate = _rate(settled, run.begun, now if alive else run.ended or run.seen)
-        # Items that wait to be made anew have their former receipts still.
+        # Items that wait to be made again still have their former receipts.
         older = sum(r.status == "done" and r.time < run.begun for r in receipts)
         former = min(open_items, max(0, older - run.current))
     if alive:
@@ -234,7 +234,7 @@ def _stage(name: str, table: dict[str, Receipt], run: Run | None, now: float) ->
 
 
 def _rate(ends: list[float], begun: float, now: float) -> float:
-    """Return items per second over the last ones, up to now: it sinks while nothing ends."""
+    """Return items per second over the last ones, up to now: it falls while nothing ends."""
     recent = sorted(ends)[-RECENT - 1 :]
     if len(recent) <= RECENT:  # the start of the run counts as an end
         recent = [begun, *recent]

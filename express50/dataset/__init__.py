@@ -1,1 +1,1 @@
-"""This room works on finished datasets: tracks, audit, report, export, withdrawal."""
+"""Work on finished datasets: tracks, audit, report, export, withdrawal."""

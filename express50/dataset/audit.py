@@ -38,7 +38,7 @@ LabelProblems = Callable[[Dataset, list[str]], Iterable[Any]]
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """Says what is wrong, where, and how to fix it.
+    """A fault: what is wrong, where, and how to fix it.
 
     Attributes:
         kind: one word for programs, such as ``missing`` or ``changed``.
@@ -210,7 +210,7 @@ def _person_findings(dataset: Dataset, checkpoints: Sequence[Path]) -> Iterator[
 
 
 class _StageAudit:
-    """Passes over the stages once; state: which subjects were found broken on the way."""
+    """Audits the stages once, and keeps which subjects were found broken on the way."""
 
     def __init__(
         self,
@@ -232,7 +232,7 @@ class _StageAudit:
         self.digest = published_digest(dataset, self.made, sha256)
 
     def run(self) -> None:
-        """Audit each stage; what an earlier one lacks is not held against a later one."""
+        """Audit each stage; faults of an earlier stage are not reported again for a later one."""
         for stage in self.stages:
             if not self.fix and is_running(self.dataset, stage.name):
                 self._note(stage, "runs now; its items were not looked at")
@@ -265,7 +265,8 @@ class _StageAudit:
             self._judge(stage, sound)
         failed = {item for item, receipt in receipts.items() if receipt.status == "failed"}
         to_do = (known or set()) - receipts.keys() - wrong
-        # None of these has an output: what was made of a former one is right once it is back.
+        # None of these has an output; outputs made from an earlier one are valid again once it is
+        # back.
         self.broken |= {item.split("/")[0] for item in wrong | failed | to_do}
         if to_do and receipts:
             words = f"{len(to_do)} of {count(len(known or ()), 'item')} to do"

@@ -117,7 +117,7 @@ def read_tracked(dataset: Dataset, subject: str, expressions: Sequence[str]) -> 
 
 
 def with_registered(dataset: Dataset, head: Head) -> Head:
-    """Put the meshes on the reconstructed surface, where they are, in the place of tracked ones.
+    """Replace tracked meshes by registered ones where these exist.
 
     Raises:
         FormatError: one is damaged, or of another track.

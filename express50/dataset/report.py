@@ -274,7 +274,7 @@ def _front_view(table: dict) -> dict | None:
         for line, (name, point) in enumerate(presets.items()):
             place = point["seconds"] / 60, point["errors"][result]["value"]
             axes.plot(*place, "s", color="#b3541e", ms=4)
-            # A line apart: presets of one stage's difference share a place.
+            # One line apart: presets that differ in one stage share a place.
             axes.annotate(name, place, (5, 5 + 9 * line), textcoords="offset points", fontsize=7)
         error = rows[-1][1]
         axes.set_title(f"{result}, {error['unit']}", fontsize=9)

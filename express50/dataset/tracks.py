@@ -221,7 +221,7 @@ def registration_of(path: Path, track: Track, digest: str) -> Registration | Non
 
 
 def best_vertices(dataset: Dataset, subject: str, track: Track) -> np.ndarray:
-    """Return the vertices (E, V, 3) float32 of a subject's track, registered ones where they are.
+    """Return the vertices (E, V, 3) float32 of a subject's track, registered where possible.
 
     Raises:
         FormatError: a registration is damaged, or of another track.

@@ -1,8 +1,8 @@
 """Choose settings: predict time and errors of the whole chain from a pilot, and find the front.
 
-What a stage's cheaper setting does to a result is independent of what the others do: squares of
-differences add up, over what the dearest settings leave. That rest is what stages state of their
-own errors; where none does, only the differences are known.
+A cheaper setting of one stage is assumed to change a result independently of the other stages:
+squared differences add up, on top of the error that remains at the dearest settings. That remainder
+comes from the errors that stages state; where no stage states one, only the differences are known.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Workload:
         ladders: settings of each stage.
         measured: of the pilot.
         footage: of all that is to be made.
-        width: items that are worked at at once.
+        width: items that are worked on at once.
         cores: whether seconds of all cores count.
         fixed: settings of stages that have begun.
         kinds: results of the chain.

@@ -34,7 +34,7 @@ from express50.runner.runner import run_stage
 
 PEAKS = 3  # expressions of a trial
 SPARE_SHARE = 0.5  # of the time that the cheapest settings would leave over, for trials
-STEEPER = 3.0  # a setting that was not tried may cost so many times the one below it
+STEEPER = 3.0  # a setting that was not tried may cost this many times the one below it
 Ladder = Mapping[str, Any]  # configurations of a stage by the name of the setting, cheapest first
 
 
@@ -94,7 +94,7 @@ class Pilot:
         record = root / "trial.json"
         if record.is_file():
             return trial_of(json.loads(record.read_text(encoding="utf-8")))
-        if source is None:  # items of one that was stopped stand
+        if source is None:  # items of a trial that was stopped are kept
             self._begin(root)
         else:
             shutil.rmtree(root, ignore_errors=True)

@@ -44,7 +44,7 @@ class ResultKind:
     apart: Callable[[Dataset, Dataset, str, Sequence[str]], Iterable[float]]
 
     def made_by(self, names: Iterable[str]) -> list[str]:
-        """Return the stages of an ordered list that make it, the last first."""
+        """Return the stages of an ordered list that make the result, the last first."""
         any_one = Dataset(Path("dataset"))
         paths = [place(any_one, "s", "e", "c") for place in self.places]
         makers = {path.relative_to(any_one.root).parts[0] for path in paths}

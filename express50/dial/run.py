@@ -1,8 +1,8 @@
 """Run the whole chain within a budget: measure, choose, say what to expect, keep to it.
 
-What is chosen and what is spent stands in ``dial/run.json``. A run that is stopped goes on with the
-same choices within the same budget. Before each stage the rest is chosen anew with the speed seen
-so far; a stage that has begun keeps its setting.
+``dial/run.json`` holds what was chosen and what was spent. A run that was stopped continues with
+the same choices within the same budget. Before each stage the remaining settings are chosen again
+with the speed seen so far; a stage that has begun keeps its setting.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from express50.runner.runner import Summary, run_stage
 PILOT_SHARE = 0.1  # of the budget, for trials that are not what the run makes anyway
 SAFETY = 0.95  # of the time left is planned with: what items take varies
 BELIEVED = 0.1  # of the expected time must have passed before its speed changes choices
-PILOTS = 3  # subjects whose footage is tried, where that of the first is bad
+PILOTS = 3  # subjects whose footage is tried if the first one's is bad
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +66,7 @@ class RunState:
         begun: stages that have begun, which keep their setting.
         promised: expected error of each result, as said before the start.
         seconds: expected then.
-        changes: what was chosen anew later, and why.
+        changes: what was chosen again later, and why.
         stated: ``[value, low, high]`` of each result, as the stages state in the end.
         finished: whether nothing was left.
     """
@@ -254,7 +254,7 @@ def run_within(
 
 
 def _resumed(chain: Chain, budget: Budget | None, goal: Goal | None) -> RunState:
-    """Read the run that is to go on, or begin one: another budget or goal is another run."""
+    """Read the run to continue, or begin a new one if budget or goal differ."""
     fresh = RunState(
         key=chain.key(), budget=budget.text if budget else "", goal=goal.text if goal else ""
     )
@@ -305,7 +305,7 @@ def budget_text(seconds: float, cores: bool) -> str:
 
 
 def _choose_rest(run: _Run, stage: Stage) -> None:
-    """Begin a stage; choose its and later settings anew where the time left asks for it."""
+    """Begin a stage; choose its and later settings again if the time left requires it."""
     state, points = run.state, front(run.workload())
     left = run.clock.left() / run.slowness()
     now = next((p for p in points if p.settings == state.settings), None)

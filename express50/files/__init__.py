@@ -1,1 +1,1 @@
-"""This room reads and writes files: text, arrays, pictures, video, checkpoints."""
+"""Read and write files: text, arrays, pictures, video, checkpoints."""

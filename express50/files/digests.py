@@ -18,7 +18,7 @@ def cached_by_file(size: int) -> Callable[[Callable[..., T]], Callable[..., T]]:
     """Cache the last `size` results of a function of a path until the file there changes.
 
     The function's first argument is a path, or has a method `__fspath__`; all arguments are
-    hashable. A file counts as changed when its size, time of change or inode is another.
+    hashable. A file counts as changed when its size, time of change or inode differs.
 
     Raises:
         OSError: when the function is called and the path cannot be examined.
@@ -42,7 +42,7 @@ FileVersion = tuple[int, int, int]
 
 
 def file_version(path: Path) -> FileVersion:
-    """Return size, time of change (ns) and inode: another version has other bytes."""
+    """Return size, time of change (ns) and inode: they change whenever the bytes do."""
     stat = Path(path).stat()
     return stat.st_size, stat.st_mtime_ns, stat.st_ino
 

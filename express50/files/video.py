@@ -23,7 +23,7 @@ from express50.geometry.shapes import PIXEL_LIMIT
 # Frames before the wanted one at which a seek aims. An H.264 or H.265 picture may be displayed
 # up to 16 pictures away from its place in the stream, so a nearer key frame may lie behind it.
 REORDER = 16
-# Containers that are read. FFmpeg goes by content: a playlist named video.mp4 would make it read
+# Containers that are read. FFmpeg judges by content: a playlist named video.mp4 would make it read
 # other files.
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 BOXES = 1_000_000  # of one file; a fragment of a second has two
@@ -254,9 +254,9 @@ _BT709 = 1
 class VideoFootage:
     """Writes ``video.mp4``: H.264, 4:4:4, BT.709.
 
-    One thread, no B-frames and no lookahead, as the same pictures would give other bytes from run
-    to run: libx264 reads stale memory there. It placed B-frames in six ways in 40 runs of one
-    thread, and without them weighted predictions in two ways in 3,000 runs.
+    One thread, no B-frames and no lookahead, as otherwise the same pictures give different bytes
+    from run to run: libx264 reads stale memory there. It placed B-frames in six ways in 40 runs of
+    one thread, and without them weighted predictions in two ways in 3,000 runs.
     """
 
     def __init__(self, folder: Path, width: int, height: int, fps: float, crf: int) -> None:

@@ -1,1 +1,1 @@
-"""This room holds cameras, rigid transforms and conversions between conventions."""
+"""Cameras, rigid transforms and conversions between conventions."""

@@ -1,1 +1,1 @@
-"""This room loads head models: one type for FLAME, ICT-FaceKit and the built-in head."""
+"""Load head models: one type for FLAME, ICT-FaceKit and the built-in head."""

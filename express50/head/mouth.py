@@ -244,7 +244,7 @@ def _extended(directions: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
     return torch.cat([directions, torch.einsum("nv,vck->nck", weights, directions)])
 
 
-GRID = 512  # cells a side of the search
+GRID = 512  # cells per side of the search
 GUTTER = 3  # cells kept free around a chart, so that neighbours do not bleed into each other
 SHRINK, LEAST = 0.9, 0.15  # of the wanted size: factor between tries, and the smallest accepted
 

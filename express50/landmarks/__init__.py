@@ -1,4 +1,4 @@
-"""This room finds 68 landmarks: network, detection in frames, synthetic training."""
+"""Find 68 landmarks: network, detection in frames, synthetic training."""
 
 from __future__ import annotations
 

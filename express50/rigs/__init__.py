@@ -1,1 +1,1 @@
-"""This room reads cameras that other tools calibrated, and checks any rig."""
+"""Read cameras that other tools calibrated, and check any rig."""

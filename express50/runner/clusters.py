@@ -15,8 +15,8 @@ from urllib.parse import urlsplit
 from express50.errors import StageError
 from express50.runner.threads import thread_environment
 
-GPU = "GPU"  # name of the resource, of which a worker offers 1 for the device that it sees
-GPU_SECONDS = 60.0  # a GPU worker that died may take so long to come back
+GPU = "GPU"  # name of the resource; a worker offers 1 for the device that it sees
+GPU_SECONDS = 60.0  # a GPU worker that died may need this long to come back
 CONNECT_SECONDS = 20.0
 KNOCK_SECONDS = 3.0
 

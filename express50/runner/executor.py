@@ -41,7 +41,7 @@ class Pool:
         """Choose the workers; nothing is started yet.
 
         These are local processes (with 0, and for 1 item, this one), or those of a dask scheduler
-        at an address, or SLURM jobs by stage. An item may use so many ``threads``.
+        at an address, or SLURM jobs by stage. An item may use ``threads`` threads.
         """
         self.workers = workers
         self.scheduler = scheduler
@@ -65,7 +65,7 @@ class Pool:
             self._workers = RemoteWorkers.reach(self.scheduler)
 
     def check_gpu(self, stage: str) -> None:
-        """See that a stage that needs a GPU gets one.
+        """Check that a stage that needs a GPU gets one.
 
         Raises:
             StageError: it does not.
@@ -86,10 +86,10 @@ class Pool:
     ) -> None:
         """Run tasks of one stage and configuration; hand each receipt to ``settle`` as it comes.
 
-        ``begin`` is called as a task is handed to a worker; none is once ``closed`` says so. A task
-        whose worker died is tried again when nothing else runs, so that neighbours that died with
-        it are not blamed, and is set aside when that fails too. SLURM jobs do not share memory but
-        a time limit, so there all of those are tried again together.
+        ``begin`` is called when a task is handed to a worker; once ``closed`` returns True, no
+        further task is. A task whose worker died is tried again when nothing else runs, so that
+        neighbours that died with it are not blamed, and is set aside when that fails too. SLURM
+        jobs share a time limit but no memory, so there all such tasks are tried again together.
 
         Raises:
             StageError: the scheduler cannot be reached or went away, or offers no GPU that the
@@ -178,7 +178,7 @@ class Pool:
         return killed
 
     def _workers_for(self, task: Task) -> LocalWorkers | RemoteWorkers:
-        """Return the workers for a task's stage; those of the stage before where they fit."""
+        """Return the workers for a task's stage; the previous stage's if they fit."""
         job = self.slurm[task.stage.name] if self.slurm else None
         if isinstance(self._workers, SlurmWorkers) and self._workers.job != job:
             self.close()
@@ -197,7 +197,7 @@ class Pool:
         self._workers = None
 
     def width(self) -> int:
-        """Return how many items may be worked at at once.
+        """Return how many items can be worked on at once.
 
         Raises:
             StageError: the scheduler cannot be reached.

@@ -44,14 +44,14 @@ def publish_import(
 ) -> Receipt:
     """Publish an item that ``write`` writes into an empty folder; the caller holds the stage.
 
-    A receipt with a reason was not published, and what was there stands.
+    An item whose receipt has a reason was not published; the previous output stays.
     """
     inputs = import_inputs(dataset, item)
     former = ledger.read(stage.name).get(item)
     if former is not None:
         former = replace(former, made=ledger.made(stage.name).get(item))
     writer = replace(stage, run=lambda *given: write(given[-1]), needs_gpu=lambda config: False)
-    # Each import is another one: what replaced outputs hold of a former one must not come back.
+    # Every import counts as new: a replaced output of an earlier import must not come back.
     fingerprint = IMPORTED + value_digest([inputs, time.time_ns()])
     with run_folder(dataset, stage.name) as folder:
         settings = NoSettings()  # no stage's settings concern an import
@@ -68,7 +68,7 @@ def publish_import(
 
 
 def remove_imports(dataset: Dataset, stage: str, pattern: Callable[[str], bool]) -> list[str]:
-    """Set aside a stage's imported items whose id fits, so that the stage makes them; list them."""
+    """Set aside a stage's imported items whose id matches, so that it makes them; list them."""
     with Ledger(dataset.ledger) as ledger:
         found = ledger.read(stage).items()
         chosen = [item for item, receipt in found if receipt.imported and pattern(item)]

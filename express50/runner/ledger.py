@@ -31,7 +31,7 @@ class FileMark:
 
 @dataclass(frozen=True)
 class Made:
-    """Says what an item was made from and with, and the files that it consists of.
+    """The inputs and settings that an item was made from, and its files.
 
     Attributes:
         inputs: their digests.
@@ -46,7 +46,7 @@ class Made:
     version: int = 0
 
 
-IMPORTED = "imported "  # begins the fingerprint of what no stage made
+IMPORTED = "imported "  # begins the fingerprint of imported items
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,8 +58,9 @@ class Receipt:
         item: item id.
         fingerprint: digest of stage version, config and inputs.
         status: ``done``, or ``failed`` where nothing is published.
-        reason: one line if the last attempt failed, else empty. What a former one published may
-            still stand: then the status stays ``done``, and all but this and the time are of it.
+        reason: one line if the last attempt failed, else empty. The output of an earlier attempt
+            may still be valid: then the status stays ``done``, and all fields but this and the time
+            describe that attempt.
         metrics: what the stage returned.
         seconds: wall time of the attempt.
         core_seconds: processor time of the attempt; 0 in receipts of older versions.
@@ -97,7 +98,7 @@ class Run:
         items: number of items to bring up to date.
         current: number of those that already were.
         begun: when it began.
-        seen: when it last gave a sign of life.
+        seen: when it was last known to be alive.
         ended: when it ended; 0 if it did not.
         running: start time of each item in work.
     """

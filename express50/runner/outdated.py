@@ -64,12 +64,12 @@ def outdated(
     """Yield stage, item and reason of each output that the next run would make again.
 
     The settings are those of each stage's last run. Outputs whose inputs cannot be read are left
-    out: `express50 check` finds these. Of what stages published, the ledger's digests are taken.
+    out: `express50 check` finds these. For published files the ledger's digests are used.
     """
     made = {stage.name: ledger.made(stage.name) for stage in stages}
     digest = published_digest(dataset, made, ledger.sha256)
     for stage in stages:
-        with suppress(ConfigError):  # of settings that are no more; the next run says so
+        with suppress(ConfigError):  # a setting no longer exists; the next run says so
             path = dataset.config_file(stage.name)
             config = resolve_config(stage, "standard", path, (), [s.name for s in stages])
             for item, receipt in ledger.read(stage.name).items():
@@ -86,8 +86,8 @@ def published_digest(
 ) -> Callable[[Path], str]:
     """Return a function that digests paths as `path_digest` does, with files as published.
 
-    A damaged file is made again to the same bytes, and does not make wrong what was made of the
-    good one. Paths that no stage published count as they are.
+    A damaged file will be made again with the same bytes, so that outputs made from the good one
+    stay valid. Paths that no stage published are digested as they are now.
     """
     known: dict[Path, str] = {}
     below: dict[Path, list[Path]] = {}

@@ -1,4 +1,4 @@
-"""Ask before the work whether files, folders, memory, space, GPU and scheduler are there."""
+"""Check before a run that files, folders, memory, space, GPU and scheduler are available."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger
 from express50.runner.replaced import size_of
 
-WORKER_SHARE = 0.9 * 0.95  # of memory: what workers get, and where dask ends one
+WORKER_SHARE = 0.9 * 0.95  # share of the memory that workers get, and at which dask stops one
 CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")  # of containers and jobs
 
 
@@ -43,7 +43,7 @@ def problems(
             yield str(error)
     yield from _worker_problems(work, pool)
     needs = []
-    with suppress(FormatError):  # a damaged ledger: the first stage says so
+    with suppress(FormatError):  # a damaged ledger: the first stage reports it
         if dataset.ledger.is_file():
             with Ledger(dataset.ledger, read_only=True) as ledger:
                 yield from _memory_problems(ledger, chosen, pool)
@@ -52,7 +52,7 @@ def problems(
 
 
 def _folder_problems(dataset: Dataset, stages: Iterable[Stage]) -> Iterator[str]:
-    """Write a file without a name into each folder that the stages write to."""
+    """Find folders that the stages write to and that cannot be written to."""
     inside = [dataset.stage_dir(stage.name) for stage in stages]
     inside += [dataset.staging_dir, dataset.config_file("").parent]
     for folder in [_existing(dataset.root), *(one for one in inside if one.exists())]:
@@ -100,7 +100,7 @@ def _need(dataset: Dataset, ledger: Ledger, stage: Stage) -> tuple[str, int, flo
     """Return a stage's name, items to do that have no output yet, and bytes of an item."""
     try:
         items = stage.items(dataset)
-    except Express50Error:  # what names them is damaged: the stage says so
+    except Express50Error:  # the list of items is damaged: the stage reports it
         return None
     return expected_bytes(ledger, stage.name, items)
 
@@ -131,7 +131,7 @@ def _space_problems(dataset: Dataset, needs: Sequence[tuple[str, int, float]]) -
     if not usage.total:  # some network drives do not report their size
         return
     need = sum(new * size for _, new, size in needs)
-    # What was replaced gives way.
+    # Replaced outputs are deleted when space is needed.
     room = usage.free - LEAST_FREE + size_of(dataset.replaced_dir)[1]
     if room < 0:
         yield (
@@ -148,6 +148,6 @@ def _space_problems(dataset: Dataset, needs: Sequence[tuple[str, int, float]]) -
 
 
 def _existing(path: Path) -> Path:
-    """Return a path, or the nearest folder above it that is there."""
+    """Return a path, or the nearest folder above it that exists."""
     path = path.resolve()
     return next(one for one in (path, *path.parents) if one.exists())

@@ -42,7 +42,7 @@ from express50.runner.worker import (
 )
 
 WARNINGS = 12  # lines; more of them would hide the account
-ALIKE = 3  # so many first items that fail for one reason show a wrong setting
+ALIKE = 3  # if this many first items fail for the same reason, a setting is wrong
 KEPT = "imported; the stage does not make it"
 
 
@@ -163,7 +163,7 @@ def run_stage(
         stage: the stage.
         dataset: the dataset.
         config: instance of ``stage.config``.
-        items: ids to run; all by default, and then outputs of items that are no more are set
+        items: ids to run. By default all are run, and outputs of items that no longer exist are set
             aside.
         workers: local processes; 0 runs in this one.
         scheduler: address of a dask scheduler to use in place of local processes.
@@ -211,7 +211,7 @@ def run_stage(
 
 @dataclass(frozen=True)
 class _Work:
-    """The items of a stage by what is to do with them.
+    """The items of a stage by what is to be done with them.
 
     Attributes:
         former: receipts of former runs.
@@ -219,7 +219,7 @@ class _Work:
         unreadable: receipts of items whose inputs cannot be read.
         tasks: items to run.
         again: why items are run that a former run had made.
-        stands: items whose former output is right until a new one is whole.
+        stands: items whose former output stays valid until a new one is complete.
     """
 
     former: Mapping[str, Receipt]
@@ -374,7 +374,7 @@ def _run_items(
             ended.append(receipt)
             if len(ended) == ALIKE < len(work.tasks):
                 _refuse_alike(stage, ended, work.former)
-                # Of a stage that was never run nothing was known before.
+                # Nothing was known before of a stage that was never run.
                 items = [*outcomes, *(task.item for task in work.tasks)]
                 if shortage := expected_shortage(dataset, ledger, stage.name, items):
                     write(f"{stage.name}: warning: {shortage}")
@@ -423,7 +423,7 @@ def _retire(dataset: Dataset, ledger: Ledger, stage: str, item: str) -> None:
     if not dataset.item_dir(stage, item).exists():
         return
     receipt, made = ledger.read(stage).get(item), ledger.made(stage).get(item)
-    # The store may be emptied, and nobody makes an import again.
+    # The store may be emptied, and an import cannot be made again.
     former = None
     if receipt is not None and not receipt.imported:
         former = replace(receipt, made=made)

@@ -75,7 +75,7 @@ class SlurmJob:
                 raise ValueError(f"{text!r} has a line break")
 
     def processes(self, threads: int) -> int:
-        """Return the number of workers of a job, each with so many threads."""
+        """Return the number of workers of a job, each with ``threads`` threads."""
         return 1 if self.gpus else max(1, self.cores // threads)
 
 
@@ -138,7 +138,7 @@ def check_slurm(submit: bool = True) -> None:
 def job_script(job: SlurmJob, address: str, name: str, threads: int, logs: Path) -> str:
     """Write the script of one job, whose workers have a name and report to a scheduler's address.
 
-    An item may use so many ``threads``; the job's output goes to the folder ``logs``.
+    An item may use ``threads`` threads; the job's output goes to the folder ``logs``.
     """
     from dask_jobqueue.slurm import SLURMJob
 
@@ -202,7 +202,7 @@ class SlurmWorkers(RemoteWorkers):
         return super().slots(stage, gpu)
 
     def keep(self, tasks: int) -> None:
-        """Bring the jobs up to what so many unfinished tasks need; looks at the queue seldom.
+        """Submit the jobs that this many unfinished tasks need; looks at the queue seldom.
 
         Raises:
             StageError: ``sbatch`` refuses and no job is left, or job after job ends at once.

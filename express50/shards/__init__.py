@@ -1,1 +1,1 @@
-"""This room reads, writes and edits packed shards."""
+"""Read, write and edit packed shards."""

@@ -97,7 +97,7 @@ def export_player(
     views: HeadViews | None = None,
     clips: Sequence | None = None,
 ) -> PlayerReport:
-    """Write the page; footage of the subject in ``views``, if given, tells the loss.
+    """Write the page; the loss is measured on footage of the subject in ``views``, if given.
 
     Raises:
         ConfigError: the clips were tracked with another head model.

@@ -30,9 +30,9 @@ BEHIND = 1e4  # residual of a point behind its camera, in sigmas
 class RigPriors:
     """Standard deviations of the unknowns about their expected values: 0 holds, inf frees them.
 
-    `focal` and `focal_spread` (against the mean of pictures as large) are shares of the focal
-    length, `centre` is a share of the image's diagonal. `bend` is the first radial term's effect at
-    the image's corner, as a share of half the diagonal.
+    `focal` and `focal_spread` (against the mean of pictures of the same size) are shares of the
+    focal length, `centre` is a share of the image's diagonal. `bend` is the first radial term's
+    effect at the image's corner, as a share of half the diagonal.
     """
 
     turn_rad: float = np.inf
@@ -263,7 +263,7 @@ def _information(
 
 
 def _ties(rig: list[Camera], priors: RigPriors) -> np.ndarray:
-    """Return the information (C, C) that ties log focal lengths to those of pictures as large."""
+    """Return the information (C, C) that ties log focal lengths of pictures of one size."""
     sizes = np.array([(camera.width, camera.height) for camera in rig])
     alike = (sizes[:, None] == sizes).all(2)
     ties = np.eye(len(rig)) - alike / alike.sum(1)
@@ -337,8 +337,8 @@ def eliminate(
     """Eliminate what observations share in groups: points, or the board's poses.
 
     `errors` (N, 2) are weighted and derived by the unknowns of the observation's camera (N, 2, K)
-    and group (N, 2, M); `camera` and `group` (N,) number these. `damping` adds so many times the
-    groups' diagonal.
+    and group (N, 2, M); `camera` and `group` (N,) number these. `damping` times the groups'
+    diagonal is added.
     """
     total, each, size = int(group.max(initial=-1)) + 1, by_camera.shape[2], by_group.shape[2]
     V = _sum_by(by_group.transpose(0, 2, 1) @ by_group, group, total)

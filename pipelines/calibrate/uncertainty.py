@@ -2,9 +2,9 @@
 
 The covariance of all cameras follows from the derivatives of the corners' errors, boards' poses
 eliminated. It is carried over to points in the head's place, after worlds are laid on each other by
-these points, as nothing else matters further on. It takes corners' errors for independent and the
-lens model for true. So it grows where corners of one image are off together, and where rigs of two
-halves of the board images differ by more than it lets expect.
+these points, as nothing else matters further on. It assumes that the corners' errors are
+independent and that the lens model is true. Therefore it is enlarged where corners of one image are
+off together, and where rigs of two halves of the board images differ by more than it predicts.
 After mrcal's projection uncertainty (Kogan, https://mrcal.secretsauce.net/uncertainty.html).
 """
 
@@ -52,9 +52,9 @@ class HeadError:
 def state_uncertainty(solution: BoardSolution, points: np.ndarray) -> dict[str, HeadError]:
     """Estimate each camera's error in the head's place; empty for a lone camera.
 
-    `points` (P, 3) are corners on the board. Where halves of the board images differ by more than
-    the covariance lets expect, its variance is multiplied by the mean of 1 and the square of by how
-    much more.
+    `points` (P, 3) are corners on the board. Where rigs of two halves of the board images differ by
+    more than the covariance predicts, the variance is multiplied by the mean of 1 and the squared
+    ratio.
     """
     names = sorted(solution.cameras)
     if len(names) < 2:

@@ -234,7 +234,7 @@ def write_fused(
         if depth.any()
     ]
     if not steps:
-        raise StageError(f"{path.name}: no depth map knows any pixel")
+        raise StageError(f"{path.name}: no depth map has a known pixel")
     voxel = max(LEAST_VOXEL_M, VOXEL_PX * float(np.median(steps)))
     centre = np.mean([camera.center for camera in cameras.values()], axis=0)
     volume = o3d.t.geometry.VoxelBlockGrid(

@@ -1,7 +1,7 @@
 """Read tracks of VHAP and GaussianAvatars, FLAME's parameters by time step, as track.npz.
 
-Read are a folder with ``transforms.json`` and the files of parameters that it names, and VHAP's own
-``tracked_flame_params_N.npz``. FLAME turns a head about its root joint J, we about the origin:
+The source is a folder with ``transforms.json`` and the parameter files that it names, or VHAP's
+own ``tracked_flame_params_N.npz``. FLAME turns a head about its root joint J, we about the origin:
 world = R (x - J) + J + T, so that t = T - R J + J.
 """
 

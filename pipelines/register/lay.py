@@ -29,7 +29,7 @@ from pipelines.track.basis import in_regions, movable_vertices
 # that the mesh follows, in multiples of the last. Broad differences are taken first.
 ROUNDS = ((0.010, 2.0), (0.008, 1.25), (0.006, 1.0), (0.004, 1.0), (0.003, 1.0), (0.002, 1.0))
 AGREE = 0.6  # least cosine between the normals of mesh and surface
-OUTLIER = 0.3  # of the reach: a height so far from the plate is believed by a quarter
+OUTLIER = 0.3  # share of the reach: a height this far from the plate gets a quarter of the weight
 BELIEF_STEPS = 2
 NOISE_M = 0.0003  # standard deviation of a height that is fully trusted
 # Heights err together, as neighbouring patches of a surface do: set on three synthetic people so
@@ -52,7 +52,7 @@ LEAST = 100  # vertices of bare skin, to know its colour
 SPREADS = (0.05, 0.05, 0.2)  # least standard deviations: red and blue over green, brightness; logs
 ODD = 3.0  # standard deviations at which a colour is half believed
 SURE = (0.5, 1.0)  # confidence, over that of bare skin: of nothing and of full trust
-AROUND_M, NEIGHBOURS, EVERY = 0.008, 12, 14  # hair's rim is hair: trust what has trusted neighbours
+AROUND_M, NEIGHBOURS, EVERY = 0.008, 12, 14  # hair's rim is hair: neighbours must be trusted too
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ def skin_trust(
     odd[np.r_[in_regions(model, ("lips",)), False][owner]] = 0.0
     sure = confidence / max(float(np.median(confidence[reference])), 1e-6)
     trust = np.clip((sure - SURE[0]) / (SURE[1] - SURE[0]), 0.0, 1.0) / (1.0 + (odd / ODD) ** 4)
-    # What lies among untrusted vertices is not trusted either; some of those nearby will do.
+    # A vertex among untrusted ones is not trusted either; a sample of its neighbours is enough.
     some = np.arange(0, len(vertices), EVERY)
     distance, nearest = cKDTree(vertices[some]).query(vertices, min(NEIGHBOURS, len(some)))
     near = distance < AROUND_M

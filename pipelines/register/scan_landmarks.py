@@ -58,7 +58,7 @@ def read_landmarks(path: Path) -> np.ndarray:
                 words = f"point {name or place} is {xyz}, expected 3 finite numbers"
                 raise ValueError(words + "; name the points and leave out what is not known")
             if np.isfinite(points[place]).all():
-                raise ValueError(f"point {name} is there twice")
+                raise ValueError(f"point {name} appears twice")
             points[place] = xyz
     except (ValueError, ArithmeticError, TypeError, LookupError, ElementTree.ParseError) as error:
         raise FormatError(

@@ -54,7 +54,7 @@ class Layout:
     read: Callable[[Path, Selection], RawCapture]
 
 
-# In order: a layout that another could be mistaken for stands behind it.
+# The order matters: a layout that could be mistaken for another comes after it.
 LAYOUTS = (
     Layout(
         "renderme360", "<actor>_<performance>_raw.smc",
@@ -158,7 +158,7 @@ def read_any(path: Path) -> RawCapture:
     raw = layout.read(source, parse_selection(meta, path / "capture.toml"))
     subject, fps = meta.get("subject") or raw.subject, meta.get("fps", raw.fps)
     check_identity(path / "capture.toml", subject, fps)
-    # Where the footage lies is this machine's matter, not the dataset's.
+    # The footage's place belongs to this machine, not to the dataset.
     given = {key: value for key, value in meta.items() if key != "source"}
     described = {"subject": subject, "fps": float(fps), "layout": layout.name}
     doubled = sorted({clip for clip in raw.clips if raw.clips.count(clip) > 1})

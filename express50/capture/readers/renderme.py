@@ -205,7 +205,7 @@ def _frames(performance: Performance, selection: Selection) -> tuple[dict[str, l
 
 
 def _person(performance: Performance) -> dict[str, object]:
-    """Read age and gender, which dataset cards count; the rest about the body stays where it is."""
+    """Read age and gender, which dataset cards count; the rest about the body is not read."""
     file = open_hdf5(performance.raw)
     age, gender = attribute(file, "age", ()), attribute(file, "gender", "").tolist()
     person: dict[str, object] = {}

@@ -1,1 +1,1 @@
-"""This room makes the built-in head; only its stored arrays are read at run time."""
+"""Make the built-in head; only its stored arrays are read at run time."""

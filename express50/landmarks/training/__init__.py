@@ -1,1 +1,1 @@
-"""This room trains the landmark network on rendered heads."""
+"""Train the landmark network on rendered heads."""

@@ -1,1 +1,1 @@
-"""This room trains the network that reads face UV maps; nothing outside imports it."""
+"""Train the network that reads face UV maps; nothing outside imports it."""

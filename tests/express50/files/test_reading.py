@@ -16,7 +16,7 @@ from express50.files.text import parse_json, read_json, read_json_table, read_te
     [
         ('{"a": 1,\n"b": NaN}', "line 2 holds NaN, which is NaN or infinite"),
         ('{"a": 1,\n\n"b": -1e999}', "line 3 holds -1e999, which"),
-        ('{"a": 1, "a": 2}', "the key 'a' is there twice"),
+        ('{"a": 1, "a": 2}', "the key 'a' appears twice"),
         ("[" * 100_000, "nested too deeply"),
         ("9" * 5000, "not JSON"),
         ("", "not JSON"),
