@@ -60,11 +60,9 @@ def resolve_config(
 
 
 def distinct_settings(stage: Stage, resolve: Callable[[Stage, str], Any]) -> dict[str, Any]:
-    """Return the configurations of a stage's presets by name; one that is standard's is that.
+    """Return a stage's configurations by preset, without those that equal standard's.
 
-    Args:
-        stage: the stage.
-        resolve: ``resolve(stage, preset)`` builds a configuration.
+    ``resolve(stage, preset)`` builds one.
     """
     standard = resolve(stage, "standard")
     found = {preset: resolve(stage, preset) for preset in PRESETS}

@@ -54,8 +54,7 @@ class Receipt:
     """The state of one item: what is published, and how its last attempt ended.
 
     Attributes:
-        stage: stage name.
-        item: item id.
+        stage, item: name and id.
         fingerprint: digest of stage version, config and inputs.
         status: ``done``, or ``failed`` where nothing is published.
         reason: one line if the last attempt failed, else empty. The output of an earlier attempt

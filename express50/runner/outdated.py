@@ -22,13 +22,9 @@ NAMED = 3  # inputs or settings that are named
 
 
 def why_outdated(stage: Stage, config: Any, made: Made, inputs: Mapping[str, str]) -> str:
-    """Say what differs between what an output was made from and with, and what is there now.
+    """Say how what an output was made from differs from the present stage, settings and inputs.
 
-    Args:
-        stage: the stage as it is now.
-        config: its present settings.
-        made: inputs, settings and version of the output.
-        inputs: digests of the present inputs by name.
+    ``inputs`` are digests of the present inputs by name.
     """
     words = []
     if changed := differing(made.inputs, inputs):

@@ -65,16 +65,11 @@ def restore(
 ) -> Receipt | None:
     """Publish an output of the store again, if it has this fingerprint and all of its bytes.
 
-    Args:
-        folder: the run's.
-        dataset: the dataset.
-        stage: stage name.
-        item: item id.
-        fingerprint: of what is asked for.
-        former: receipt of the published output, which goes into the store in exchange.
+    It is published through the run's ``folder``. The published output, whose receipt is ``former``,
+    goes into the store in exchange.
 
     Returns:
-        The receipt, with 0 attempts as nothing was made; None where the store has no such output.
+        The receipt, with 0 attempts as nothing was made; None if the store has no such output.
         A damaged one is deleted.
     """
     entry = _entry(dataset, stage, item, fingerprint)

@@ -158,14 +158,9 @@ def _check_values(tensors: dict[str, Tensor]) -> list[list[float]]:
     values = torch.cat([torch.stack(ends), tensors["K"].detach().double().flatten()]).tolist()
     for name, low, high in zip(parts, values[::2], values[1::2], strict=False):
         if not (low > -LIMIT and high < LIMIT):
-            _refuse(name, tensors[name])
+            bad = ~(tensors[name].detach().abs() < LIMIT)
+            raise NotFiniteTensorError(
+                f"{name} has {int(bad.sum())} values that are not finite or over {LIMIT:g}, the"
+                f" first at {tuple(bad.nonzero()[0].tolist())}; expected finite numbers"
+            )
     return [values[-9:-6], values[-6:-3], values[-3:]]
-
-
-def _refuse(name: str, tensor: Tensor) -> None:
-    bad = ~(tensor.detach().abs() < LIMIT)
-    first = tuple(bad.nonzero()[0].tolist())
-    raise NotFiniteTensorError(
-        f"{name} has {int(bad.sum())} values that are not finite or over {LIMIT:g}, the first at"
-        f" {first}; expected finite numbers"
-    )

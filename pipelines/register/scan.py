@@ -1,6 +1,8 @@
-"""Register a given scan: fit a head model to it, and lay the mesh onto it.
+"""Register a given scan: find its face, fit a head model to it, and lay the mesh onto it.
 
-Neither a pose nor landmarks nor a texture is needed (`scan_look`).
+Neither a pose nor landmarks nor a texture is needed. The scan is drawn from all sides, the landmark
+detector finds the face in these pictures, and the cameras that drew them triangulate it. Landmarks
+that are given replace the detector's, and say where to look.
 """
 
 from __future__ import annotations
@@ -8,12 +10,18 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import open3d as o3d
 import torch
 
 from express50.errors import StageError
 from express50.files.images import linear_to_srgb
+from express50.geometry.cameras import Camera, pinhole_camera, rays
+from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
+from express50.geometry.transforms import look_at, rigid_fit
 from express50.head.load import load_head
 from express50.head.model import HeadModel, landmarks
+from express50.landmarks import EMBEDDED
+from express50.landmarks.sources import Source, open_source
 from pipelines.register.lay import (
     GivenSurface,
     LaidMesh,
@@ -25,18 +33,29 @@ from pipelines.register.lay import (
     trusted_vertices,
 )
 from pipelines.register.scan_landmarks import GIVEN_M, check_face
-from pipelines.register.scan_look import look
 from pipelines.register.scan_mesh import Scan
 from pipelines.track.basis import OFF, Basis, make_basis
 from pipelines.track.fit import fit
-from pipelines.track.observe import JAW_LINE_WEIGHT
+from pipelines.track.observe import JAW_LINE_WEIGHT, LandmarkView, Observation, agree
 from pipelines.track.stage import fit_landmarks
-from pipelines.track.state import State, Target, all_vertices
+from pipelines.track.state import INNER, MIN_TRIANGULATED, State, Target, all_vertices
 from pipelines.track.terms import MeshPlaces, NormalTerm, PointTerm, landmark_anchors
 
 REACHES = (0.015, 0.010, 0.006, 0.004)  # of the search, per round of the fit of parameters; metres
 ROUND_STEPS, SIGMA_M = 4, 0.0012
 DETAIL_M = 0.008  # wavelength of the finest detail that is followed: scans have few errors
+SIDE, AWAY_M, SPAN_M = 400, 1.2, 0.34  # of the pictures: pixels, distance, what is seen across
+YAWS, PITCHES = (-50.0, -25.0, 0.0, 25.0, 50.0), (-15.0, 15.0)
+LEAST_SCORE = 0.2
+CHIN, NOSE_BRIDGE = 8, 27
+HALF_HEAD_M = 0.06
+OFF_SCAN_M = 0.02  # given landmarks lie nearer, on hair or at the rim of a hole too
+INWARDS = (
+    "its triangles face inwards: it is inside out, or mirrored; flip its triangles, or mirror it"
+    " back"
+)
+Frame = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Middle of a face, its way up and its way ahead, each (3,)."""
 
 
 @dataclass(frozen=True)
@@ -102,3 +121,156 @@ def surface_term(
     goals = mesh[ids] + height[ids, None] * normals[ids]
     sigma = SIGMA_M / np.sqrt(trust[ids])
     return NormalTerm(MeshPlaces.of_vertices(ids), goals, normals[ids], sigma, 0.5 * reach)
+
+
+def look(scan: Scan, template: np.ndarray, given: np.ndarray) -> Observation:
+    """Find the landmarks of a scan's face in pictures of it.
+
+    Landmarks (68, 3) of a head model's template say how a face is made; given ones (68, 3), NaN
+    where there is none, replace those that are found.
+
+    Raises:
+        StageError: no picture shows a face, or given landmarks are not of this scan.
+    """
+    source, painter, known = open_source(EMBEDDED, {}), ScanPainter(scan), np.isfinite(given[:, 0])
+    if known.any():
+        painter.check_near(given)
+        check_face(given, template, "the given landmarks")
+    frame = place_face(given, template) if known.any() else find_face(source, painter)
+    if painter.picture(place_camera(frame[0], frame[2], frame[1], SPAN_M))[1] > 0.5:
+        raise StageError(INWARDS)
+    views = look_around(source, painter, *frame)
+    if len(views) >= 2:
+        found = agree("scan", 0, views)[0]
+    elif known[INNER].sum() >= MIN_TRIANGULATED:
+        nothing = np.full((68, 3), np.nan), np.full((68, 3, 3), np.nan)
+        found = Observation("scan", 0, (), np.zeros((0, 68), bool), *nothing)
+    else:
+        raise StageError(
+            "fewer than two sides of the scan show a face; is most of it missing? Then give at"
+            f" least {MIN_TRIANGULATED} landmarks between brows and mouth"
+        )
+    return replace(
+        found,
+        points=np.where(known[:, None], given, found.points),
+        covariance=np.where(known[:, None, None], GIVEN_M**2 * np.eye(3), found.covariance),
+        inliers=found.inliers & ~known,
+    )
+
+
+def find_face(source: Source, painter: ScanPainter) -> Frame:
+    """Find a face in pictures from all sides.
+
+    Raises:
+        StageError: no picture shows a face.
+    """
+    low, high = painter.scan.vertices.min(0), painter.scan.vertices.max(0)
+    middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
+    best, found, turned = None, -1.0, []
+    for way in np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), -1).reshape(-1, 3):
+        if np.abs(way).sum() in (1.0, 3.0):  # the axes and the diagonals
+            camera = place_camera(middle, way, np.eye(3)[np.abs(way).argmin()], 0.8 * size)
+            picture, inwards = painter.picture(camera)
+            turned.append(inwards)
+            face = source(picture, camera.id, 0).face
+            if inwards < 0.5 and face.score > found:  # not a mask from behind
+                best, found = (camera, face), face.score
+    if best is None or found < LEAST_SCORE:
+        unseen = "no side of the scan shows a face; is it a head, its triangles facing out?"
+        raise StageError(INWARDS if np.mean(turned) > 0.5 else unseen)
+    # The way that the face looks is known to 45 degrees, its top by the landmarks.
+    camera, face = best
+    axes = camera.cam_from_world[:3, :3]
+    rise = face.points[NOSE_BRIDGE] - face.points[CHIN]
+    return painter.middle_of(camera, face.points), rise @ axes[:2] / np.linalg.norm(rise), -axes[2]
+
+
+def place_face(given: np.ndarray, template: np.ndarray) -> Frame:
+    """Find a face by given landmarks (68, 3), NaN where there is none."""
+    known = np.isfinite(given).all(1)
+    turn, shift = rigid_fit(template[known], given[known])
+    return turn @ (template.mean(0) - [0.0, 0.0, HALF_HEAD_M]) + shift, turn[:, 1], turn[:, 2]
+
+
+def look_around(
+    source: Source, painter: ScanPainter, middle: np.ndarray, up: np.ndarray, ahead: np.ndarray
+) -> list[LandmarkView]:
+    """Draw a scan from ways around that in which its face looks; return the views that show it."""
+    right = np.cross(up, ahead)
+    views: list[LandmarkView] = []
+    for yaw in np.radians(YAWS):
+        for pitch in np.radians(PITCHES):
+            flat = ahead * np.cos(yaw) + right * np.sin(yaw)
+            way = flat * np.cos(pitch) + up * np.sin(pitch)
+            camera = place_camera(middle, way, up, SPAN_M, f"view{len(views):02d}")
+            face = source(painter.picture(camera)[0], camera.id, 0).face
+            if face.score >= LEAST_SCORE:
+                views.append(LandmarkView(camera.id, camera, face.points, face.sigma, face.score))
+    return views
+
+
+def place_camera(
+    middle: np.ndarray, way: np.ndarray, up: np.ndarray, span: float, name: str = "view"
+) -> Camera:
+    """Place a camera that looks at `middle` (3,) from `way` (3,) and sees `span` metres across."""
+    away = max(AWAY_M, 2.0 * span)
+    focal = SIDE * away / span
+    K = np.array([[focal, 0, SIDE / 2], [0, focal, SIDE / 2], [0, 0, 1.0]])
+    pose = look_at(middle + away * way / np.linalg.norm(way), middle, up)
+    return pinhole_camera(name, K, SIDE, SIDE, pose)
+
+
+class ScanPainter:
+    """Draws a scan by ray casting, lit from beside the camera; the ray tree is built once.
+
+    Triangles are lit on both sides, as a scan may have some that are turned.
+    """
+
+    def __init__(self, scan: Scan) -> None:
+        self.scan, self.centre = scan, scan.vertices.mean(0)
+        self.scene = mesh_scene(scan.vertices - self.centre, scan.faces)
+        self.normals = mesh_normals(scan.vertices, torch.from_numpy(scan.faces))
+
+    def picture(self, camera: Camera) -> tuple[np.ndarray, float]:
+        """Draw a picture (H, W, 3) uint8 sRGB; return it and the share of it that faces away."""
+        origin, directions = rays(camera)
+        hit = self.scene.cast_rays(join_rays(origin - self.centre, directions))
+        seen = np.isfinite(hit["t_hit"].numpy())
+        away = (hit["primitive_normals"].numpy()[seen] * directions[seen]).sum(1) > 0
+        corners = self.scan.faces[hit["primitive_ids"].numpy()[seen].astype(np.int64)]
+        weights = barycentrics(hit, seen)[..., None]
+        normals = (self.normals[corners] * weights).sum(1)
+        normals *= -np.sign((normals * directions[seen]).sum(1, keepdims=True))
+        right, down, ahead = camera.cam_from_world[:3, :3]
+        light = 0.3 * right - 0.5 * down - ahead
+        shade = 0.25 + 0.75 * np.clip(normals @ light / np.linalg.norm(light), 0, 1)
+        image = np.full((*seen.shape, 3), 0.05)
+        image[seen] = (self.scan.colors[corners] * weights).sum(1) * shade[:, None]
+        shown = np.rint(255 * linear_to_srgb(np.clip(image, 0, 1))).astype(np.uint8)
+        return shown, float(away.mean()) if seen.any() else 0.0
+
+    def check_near(self, given: np.ndarray) -> None:
+        """Refuse landmarks (68, 3), NaN where unknown, that are far off the scan.
+
+        Raises:
+            StageError: they are.
+        """
+        known = np.flatnonzero(np.isfinite(given).all(1))
+        at = o3d.core.Tensor((given[known] - self.centre).astype(np.float32))
+        away = self.scene.compute_distance(at).numpy()
+        if (away > OFF_SCAN_M).any():
+            raise StageError(
+                f"the given landmarks: {(away > OFF_SCAN_M).sum()} of {len(known)} are off the scan"
+                f", point {known[away.argmax()]} by {1e3 * away.max():.0f} mm, expected at most"
+                f" {1e3 * OFF_SCAN_M:.0f}; give them in the unit and axes of the scan's file"
+            )
+
+    def middle_of(self, camera: Camera, points: np.ndarray) -> np.ndarray:
+        """Return the middle (3,) of the scan's places at pixels (N, 2), half a head behind."""
+        origin, directions = rays(camera)
+        column, row = np.clip(points, 0, SIDE - 1).astype(np.int64).T
+        hit = self.scene.cast_rays(join_rays(origin - self.centre, directions[row, column]))
+        depth = hit["t_hit"].numpy()
+        near = np.median(depth[np.isfinite(depth)]) if np.isfinite(depth).any() else AWAY_M
+        ahead = camera.cam_from_world[2, :3]
+        return (origin + near * directions[row, column]).mean(0) + HALF_HEAD_M * ahead

@@ -21,9 +21,8 @@ from express50.files.text import ID, read_json_table, read_text
 from express50.geometry.raycast import mesh_scene
 from express50.head.load import load_head
 from express50.head.model import landmarks
-from pipelines.register.scan import FittedScan, fit_scan
+from pipelines.register.scan import PITCHES, YAWS, FittedScan, fit_scan
 from pipelines.register.scan_landmarks import landmarks_beside, read_landmarks
-from pipelines.register.scan_look import PITCHES, YAWS
 from pipelines.register.scan_mesh import KINDS, UNITS, Scan, read_scan
 from pipelines.register.stage import LEAST_SEEN, write_registration
 from pipelines.track.stage import write_track

@@ -13,8 +13,8 @@ from express50.errors import FormatError, StageError
 from express50.geometry.transforms import axis_angle_to_matrix
 from express50.head.load import load_builtin
 from express50.head.model import landmarks, pose
+from pipelines.register.scan import look
 from pipelines.register.scan_landmarks import check_face
-from pipelines.register.scan_look import look
 from pipelines.register.scan_mesh import GREY, UNITS, Scan, read_scan
 
 NONE = np.full((68, 3), np.nan)
