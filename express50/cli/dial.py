@@ -35,9 +35,10 @@ from express50.errors import ConfigError
 def add_commands(subparsers: Any) -> None:
     """Add ``tune``, and ``--budget`` and ``--error`` to ``run``."""
     run = subparsers.choices["run"]
-    words = "choose the settings that fit in this time: 45m, 2h, 1h30m; 40ch means core hours"
+    words = "choose the settings that fit in this time: 45m, 2h, 1h30m; 40ch means core hours; "
+    words += "without --preset and --print-job"
     run.add_argument("--budget", metavar="TIME", help=words)
-    words = "choose the quickest settings with this expected error, such as 0.5mm"
+    words = "choose the quickest settings with this expected error, such as 0.5mm; likewise"
     run.add_argument("--error", metavar="ERROR", help=words)
     run.set_defaults(handler=run_chain)
     words = "measure the error of the whole chain against its time on this dataset"
@@ -48,7 +49,7 @@ def add_commands(subparsers: Any) -> None:
         "DATASET/dial/front.csv. Later 'run --budget' and 'plan' use the measurements.",
         example="express50 tune DATASET && express50 report DATASET",
     )  # fmt: skip
-    add_run_options(parser, captures=True)
+    add_run_options(parser, captures=True, preset=False)
 
 
 def run_chain(args: argparse.Namespace) -> int:

@@ -264,7 +264,7 @@ def estimate(
     rows = []
     for stage in known:
         growth = stage.growth
-        items = max(1, round(target.work(growth.items)))
+        items = max(1, round(target.items(growth)))
         runs = [(footage, table[stage.name]) for footage, table in measured if stage.name in table]
         if not runs:
             rows.append(Row(stage=stage.name, items=items, why="was not run"))

@@ -43,8 +43,11 @@ def add_commands(subparsers: Any) -> None:
     add_config_options(parser)
 
 
-def add_run_options(parser: argparse.ArgumentParser, captures: bool) -> None:
-    """Add the options that say with what and where stages run."""
+def add_run_options(parser: argparse.ArgumentParser, captures: bool, preset: bool = True) -> None:
+    """Add the options that say with what and where stages run.
+
+    Without ``preset``, the command chooses settings itself and has no option that needs them.
+    """
     add = parser.add_argument
     if captures:
         add(
@@ -55,24 +58,28 @@ def add_run_options(parser: argparse.ArgumentParser, captures: bool) -> None:
             metavar="CAPTURE",
             help="folders of raw captures",
         )
-    add_config_options(parser)
+    add_config_options(parser, preset)
     words = "local worker processes (default 2); 0 works in this process"
     add("--workers", type=int, default=2, metavar="N", help=words)
     add("--scheduler", metavar="ADDRESS", help="dask scheduler, tcp://host:port")
     words = "run in SLURM jobs: partition=P,time=4:00:00,memory=16G,cores=4,jobs=8 or jobs.toml"
     add("--slurm", metavar="JOBS", help=words)
-    words = "print the script of a SLURM job, and run nothing"
-    add("--print-job", action="store_true", help=words)
+    parser.set_defaults(print_job=False)
+    if preset:
+        words = "print the script of a SLURM job, and run nothing"
+        add("--print-job", action="store_true", help=words)
     words = "threads an item may use (default 1)"
     add("--threads", type=int, default=1, metavar="N", help=words)
     words = "exit code 1 also if a part of an item was dropped, such as a camera"
     add("--strict", action="store_true", help=words)
 
 
-def add_config_options(parser: argparse.ArgumentParser) -> None:
+def add_config_options(parser: argparse.ArgumentParser, preset: bool = True) -> None:
     """Add the options that make up a configuration."""
-    words = f"{', '.join(PRESETS)} (default standard)"
-    parser.add_argument("--preset", metavar="P", help=words)
+    parser.set_defaults(preset=None)
+    if preset:
+        words = f"{', '.join(PRESETS)} (default standard)"
+        parser.add_argument("--preset", metavar="P", help=words)
     parser.add_argument(
         "--config", type=Path, metavar="FILE", help="TOML file of settings, one table per stage"
     )

@@ -137,11 +137,13 @@ class Growth:
         items: number of items.
         time: seconds per item.
         disk: bytes per item.
+        more: number of further items, such as one of plates per subject; none by default.
     """
 
     items: tuple[str, ...] = ("subjects",)
     time: tuple[str, ...] = ()
     disk: tuple[str, ...] = ()
+    more: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -112,15 +112,14 @@ def item_seconds(load: Workload, stage: Stage, label: str) -> tuple[int, float]:
     found = cost_at(load, stage.name, label) or cost_at(
         load, stage.name, load.measured.trials[0].settings[stage.name]
     )
-    per = stage.growth.items
     if found is None:
-        return max(1, round(load.footage.work(per))), 0.0
+        return max(1, round(load.footage.items(stage.growth))), 0.0
     cost, trial = found
-    share = cost.items / max(trial.footage.work(per), 1e-9)
+    share = cost.items / max(trial.footage.items(stage.growth), 1e-9)
     first = load.measured.trials[0]
     if stage.name in first.costs and first is not trial:  # a trial makes only what changes
-        share = first.costs[stage.name].items / max(first.footage.work(per), 1e-9)
-    count = max(1, round(share * load.footage.work(per)))
+        share = first.costs[stage.name].items / max(first.footage.items(stage.growth), 1e-9)
+    count = max(1, round(share * load.footage.items(stage.growth)))
     samples = sizes_of(load.measured, stage)
     work = [footage.work(stage.growth.time) for footage in (load.footage, trial.footage)]
     grown = typical_seconds(samples, work[0]) / typical_seconds(samples, work[1])

@@ -10,6 +10,7 @@ from typing import Any
 
 from express50.capture.index import read_index
 from express50.contract.layout import Dataset
+from express50.contract.stage import Growth
 from express50.errors import FormatError, StageError
 from express50.files.text import read_json_table
 
@@ -27,6 +28,10 @@ class Footage:
     def work(self, factors: Sequence[str]) -> float:
         """Multiply some of its sizes."""
         return math.prod(getattr(self, name) for name in factors)
+
+    def items(self, growth: Growth) -> float:
+        """Return how many items of a stage it gives."""
+        return self.work(growth.items) + (self.work(growth.more) if growth.more else 0.0)
 
 
 def footage_of(dataset: Dataset) -> Footage:

@@ -290,13 +290,13 @@ def measure(pilot: Pilot, allowance: float) -> PilotFigures:
     ladders = {name: list(chain.ladders[name]) for name in choices}
     higher = {n: ladder[ladder.index(cheapest[n]) + 1 :] for n, ladder in ladders.items()}
     steps = [(name, label) for name, labels in higher.items() for label in labels]
-    steps.sort(key=lambda step: _guess(base, names, step[0]))
+    steps.sort(key=lambda step: trial_seconds(pilot, base, step[0]))
     grown: dict[str, float] = {}
-    if base.footage.expressions > 1 and _guess(base, names, names[0]) < allowance:
+    if base.footage.expressions > 1 and trial_seconds(pilot, base, names[0]) < allowance:
         trials.append(pilot.trial(cheapest, 1, base))
     for name, label in steps:
         factor = grown.get(name, STEEPER)
-        expected = _guess(base, names, name, factor)
+        expected = trial_seconds(pilot, base, name, factor)
         if pilot.clock.now() - began + expected > allowance:
             untried.setdefault(name, []).append(label)
             continue
@@ -319,11 +319,17 @@ def spare_seconds(pilot: Pilot, base: Trial) -> float:
     On a small dataset a tenth of the budget may pay for no trial at all; then nothing better than
     the cheapest settings would be known, and most of the time would stay unused.
     """
-    clock, chain = pilot.clock, pilot.chain
-    each = (cost.items * (cost.core_seconds if clock.cores else cost.seconds / chain.pool.width())
-            for cost in base.costs.values())  # fmt: skip
-    size = len(chain.dataset.captures()) * base.scripted / base.footage.expressions
-    return clock.left() - sum(each) * size
+    size = len(pilot.chain.dataset.captures()) * base.scripted / base.footage.expressions
+    width = pilot.chain.pool.width()
+    each = (
+        _charged(pilot, cost) / (1 if pilot.clock.cores else width) for cost in base.costs.values()
+    )
+    return pilot.clock.left() - sum(each) * size
+
+
+def _charged(pilot: Pilot, cost: Cost) -> float:
+    """Return what a stage's items take of the budget, one after the other."""
+    return cost.items * (cost.core_seconds if pilot.clock.cores else cost.seconds)
 
 
 def standard_of(ladder: Ladder) -> str:
@@ -331,12 +337,11 @@ def standard_of(ladder: Ladder) -> str:
     return "standard" if "standard" in ladder else next(iter(ladder))
 
 
-def _guess(base: Trial, names: Sequence[str], name: str, factor: float = 1.0) -> float:
+def trial_seconds(pilot: Pilot, base: Trial, name: str, factor: float = 1.0) -> float:
     """Guess the seconds of a trial that changes a stage: it, and all that follows."""
-    later = names[names.index(name) :]
-    known = [(n, base.costs[n]) for n in later if n in base.costs]
-    each = (cost.seconds * cost.items * (factor if n == name else 1.0) for n, cost in known)
-    return sum(each)
+    names = pilot.chain.names
+    later = [n for n in names[names.index(name) :] if n in base.costs]
+    return sum(_charged(pilot, base.costs[n]) * (factor if n == name else 1.0) for n in later)
 
 
 def _losses(

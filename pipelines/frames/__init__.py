@@ -58,6 +58,9 @@ STAGE = Stage(
     purpose="Peak frames and clean plates as every later stage reads them: undistorted to the"
     " calibrated pinhole camera, colour-corrected, lossless.",
     growth=Growth(
-        items=("subjects", "expressions"), time=("views", "pixels"), disk=("views", "pixels")
-    ),
+        items=("subjects", "expressions"),
+        time=("views", "pixels"),
+        disk=("views", "pixels"),
+        more=("subjects",),
+    ),  # fmt: skip
 )

@@ -28,6 +28,14 @@ def test_wrong_usage_is_one_line_and_starts_nothing(tmp_path, capsys, options, w
     assert not (tmp_path / "data").exists()
 
 
+def test_tune_has_no_option_that_needs_chosen_settings(capsys):
+    assert main(["tune", "--help"]) == 0
+    said = capsys.readouterr().out
+    assert "--set" in said and "--preset" not in said and "--print-job" not in said
+    for option in (["--preset", "draft"], ["--print-job"]):
+        assert main(["tune", "DATA", *option]) == USAGE
+
+
 def test_the_report_shows_the_front(tmp_path):
     captures = captures_of(tmp_path / "captures", subjects=1, expressions=2)
     tune(chain_of(tmp_path / "data", captures))

@@ -45,6 +45,11 @@ def test_express_50_is_scaled_linearly_from_one_dataset():
     assert row.memory == 1e9  # the part that does not grow is unknown: no guess is printed
 
 
+def test_plates_are_an_item_per_subject_not_per_expression():
+    (row,) = estimate([stages()["frames"]], SMALL, [(SMALL, {"frames": cost(2.0)})], workers=1)
+    assert row.items == 2 * 6 + 2
+
+
 def test_one_item_is_not_split_over_workers():
     (row,) = estimate([stages()["pack"]], SMALL, [(SMALL, {"pack": cost(86400.0)})], workers=32)
     assert row.items == 1 and row.days == pytest.approx(1.0)

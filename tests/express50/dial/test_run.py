@@ -7,9 +7,9 @@ import shutil
 import pytest
 
 from express50.contract.layout import Dataset
-from express50.dial.budget import parse_budget, parse_goal
-from express50.dial.figures import dial_dir
-from express50.dial.pilot import pilot_dir
+from express50.dial.budget import Clock, parse_budget, parse_goal
+from express50.dial.figures import Cost, Footage, Trial, dial_dir
+from express50.dial.pilot import Pilot, pilot_dir, spare_seconds, trial_seconds
 from express50.dial.run import closing_lines, run_within
 from express50.dial.tune import tune
 from express50.errors import ConfigError, StageError
@@ -96,6 +96,21 @@ def test_a_tight_budget_takes_the_best_that_fits(tmp_path, captures, monkeypatch
     assert state.promised["value"]["value"] <= middle["errors"]["value"]["value"]
     assert state.promised["value"]["value"] > table["front"][-1]["errors"]["value"]["value"]
     assert state.finished and state.spent <= parse_budget(budget).seconds * 1.1
+
+
+def test_trials_of_a_core_hour_budget_are_guessed_in_core_hours(tmp_path, captures):
+    chain = chain_of(tmp_path / "d", captures)  # three subjects of four expressions
+    cost = Cost(seconds=50.0, core_seconds=2.0, bytes=1.0, memory=1.0, items=3)
+    footage = Footage(subjects=1, expressions=3, views=2, pixels=2304, frames=16)
+    base = Trial(
+        settings={}, footage=footage, scripted=4, costs={"solve": cost, "map": cost}, errors={},
+        failed={}, folder="",
+    )  # fmt: skip
+    cores, clock = (Pilot(chain, "S0", Clock(parse_budget(text))) for text in ("1ch", "1h"))
+    assert trial_seconds(cores, base, "solve", 3.0) == 3 * 2 * 3 + 3 * 2
+    assert trial_seconds(clock, base, "solve", 3.0) == 3 * 50 * 3 + 3 * 50
+    assert spare_seconds(cores, base) == pytest.approx(3600 - 2 * 3 * 2 * 3 * 4 / 3)
+    assert spare_seconds(clock, base) == pytest.approx(3600 - 2 * 3 * 50 * 3 * 4 / 3, abs=5)
 
 
 def test_a_budget_below_the_cheapest_settings_says_what_the_least_is(tmp_path, captures):
