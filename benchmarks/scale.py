@@ -16,16 +16,16 @@ import multiprocessing
 import resource
 import shutil
 import sys
-import time
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 from benchmarks.accuracy import measure_dataset
 from benchmarks.demo import record_twin
-from express50.contract.config import build_config
+from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import stages
 from express50.runner.runner import run_stage
+from express50.runner.worker import core_seconds
 
 PRESETS = ("draft", "standard")
 EXPRESSIONS = ("neutral",)
@@ -34,15 +34,14 @@ EXPRESSIONS = ("neutral",)
 def run_alone(name: str, root: Path, preset: str) -> dict[str, float]:
     """Run a stage in this process; returns its core seconds and the process's peak memory."""
     stage = stages()[name]
-    start = time.process_time()
     summary = run_stage(
-        stage, Dataset(root), build_config(stage, stage.presets[preset]), workers=0, progress=False
+        stage, Dataset(root), resolve_config(stage, preset), workers=0, progress=False
     )
     failed = [outcome.reason for outcome in summary.outcomes if outcome.reason]
     if failed:
         raise RuntimeError(f"{name}: {failed[0]}")
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    return {"core_seconds": round(time.process_time() - start, 2), "gib": round(peak, 2)}
+    return {"core_seconds": round(core_seconds(), 2), "gib": round(peak, 2)}
 
 
 def measure_preset(captures: list[Path], truth: Path, root: Path, preset: str) -> dict:
