@@ -3,9 +3,12 @@
 ``python -m benchmarks.scale OUT`` records one moment (one expression of one person) with 24 cameras
 of 3840 x 2160, without a board, and runs every stage with each preset, every stage in a process of
 its own. ``--cameras`` and ``--size`` make smaller ones; the footage is recorded anew if they
-change. What a stage does once per subject counts in full, as if the subject had one expression. The
-last line printed is one JSON object: ``<preset>.core_seconds_per_moment``,
-``<preset>.peak_memory_gib``, both also by stage, and the errors against the truth.
+change. What a stage does once per subject counts in full, as if the subject had one expression.
+``--smaller`` names sizes at which the same is run; from their receipts `express50.cli.plan`
+predicts the large one. The last line printed is one JSON object: ``<preset>``'s
+``core_seconds_per_moment`` and ``peak_memory_gib``, both also by stage, the errors against the
+truth, those at the smaller sizes, and ``plan_core_seconds``, ``plan_off_percent``: prediction
+against what the items took.
 """
 
 from __future__ import annotations
@@ -21,14 +24,27 @@ from pathlib import Path
 
 from benchmarks.accuracy import measure_dataset
 from benchmarks.demo import record_twin
+from express50.cli.plan import estimate, measure, measure_sizes
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import stages
+from express50.dial.footage import footage_of
 from express50.runner.runner import run_stage
 from express50.runner.worker import core_seconds
 
 PRESETS = ("draft", "standard")
 EXPRESSIONS = ("neutral",)
+SMALLER = "8x320x320,24x910x512"  # the demo's cameras; all cameras at 512 px
+
+
+def record(out: Path, cameras: int, width: int, height: int) -> tuple[list[Path], Path]:
+    """Record one moment unless it is there; returns captures and truth."""
+    twin = {
+        "subjects": 1, "cameras": cameras, "width": width, "height": height,
+        "frames-per-expression": 4, "board-frames": 0,
+    }  # fmt: skip
+    record_twin(out, 2, twin, EXPRESSIONS, ("--give-calibration",))
+    return sorted((out / "captures").iterdir()), out / "truth"
 
 
 def run_alone(name: str, root: Path, preset: str) -> dict[str, float]:
@@ -63,25 +79,47 @@ def measure_preset(captures: list[Path], truth: Path, root: Path, preset: str) -
     }
 
 
+def compare_plan(large: Dataset, smaller: list[Dataset]) -> dict:
+    """Predict the processor seconds of a dataset's items from smaller ones, and compare."""
+    known = list(stages().values())
+    sizes = [pair for dataset in smaller for pair in measure_sizes(dataset, known)]
+    rows = estimate(known, footage_of(large), sizes, 1)
+    said = {row.stage: row.items * (row.seconds or 0.0) for row in rows}
+    took = {name: sum(cost.seconds) for name, cost in measure(large, known).items()}
+    total = sum(took.values())
+    return {
+        "items_core_seconds": round(total, 1),
+        "plan_core_seconds": round(sum(said.values()), 1),
+        "plan_off_percent": round(100 * (sum(said.values()) / total - 1), 1),
+        "plan_by_stage": {name: [round(said[name], 1), round(took[name], 1)] for name in took},
+    }
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Record, measure and print."""
     parser = argparse.ArgumentParser(prog="benchmarks.scale", description=__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--cameras", type=int, default=24)
     parser.add_argument("--size", default="3840x2160", help="WIDTHxHEIGHT")
+    parser.add_argument("--smaller", default=SMALLER, help="CAMERASxWIDTHxHEIGHT,...; may be empty")
     parser.add_argument("--presets", default=",".join(PRESETS))
     args = parser.parse_args(arguments)
-    width, height = map(int, args.size.split("x"))
-    twin = {
-        "subjects": 1, "cameras": args.cameras, "width": width, "height": height,
-        "frames-per-expression": 4, "board-frames": 0,
-    }  # fmt: skip
-    record_twin(args.out / "twin", 2, twin, EXPRESSIONS, ("--give-calibration",))
-    captures = sorted((args.out / "twin" / "captures").iterdir())
-    found = {
-        preset: measure_preset(captures, args.out / "twin" / "truth", args.out / preset, preset)
-        for preset in args.presets.split(",")
-    }
+    sizes = [f"{args.cameras}x{args.size}", *filter(None, args.smaller.split(","))]
+    roots = [args.out if k == 0 else args.out / text for k, text in enumerate(sizes)]
+    footage = [
+        record(root / "twin", *map(int, text.split("x")))
+        for root, text in zip(roots, sizes, strict=True)
+    ]
+    found: dict[str, dict] = {}
+    for preset in args.presets.split(","):
+        rows = [
+            measure_preset(*paths, root / preset, preset)
+            for root, paths in zip(roots, footage, strict=True)
+        ]
+        found[preset] = rows[0]
+        if smaller := [Dataset(root / preset) for root in roots[1:]]:
+            found[preset] |= compare_plan(Dataset(roots[0] / preset), smaller)
+            found[preset]["smaller"] = dict(zip(sizes[1:], rows[1:], strict=True))
     print(json.dumps({"cameras": args.cameras, "size": args.size} | found))
     return 0
 

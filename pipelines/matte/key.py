@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.files.images import edge_distance, resize_area
+from express50.files.images import LIGHT_OF_LEVEL, edge_distance, resize_area
 from pipelines.matte.config import MatteConfig
 from pipelines.matte.plates import (
     PlateModel,
@@ -36,7 +36,7 @@ HIGH = 6.0  # deviations of noise that prove foreground; weaker pixels must touc
 FIRM = 0.5  # share of the local foreground's difference that may belong to the solid inside
 CORE = 0.018  # radius of the disc that must fit inside a part of the subject for it to be solid
 FILL = 0.012  # spots and gaps in the solid subject are filled this far from its edge
-_LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)
+_LUMA = np.array([[0.299, 0.587, 0.114]], dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def alpha_of(
     alpha = np.zeros(valid.shape, np.float32)
     length = max(valid.shape)
     image = frame.astype(np.float32)
-    difference = plate_difference(image, model, config.shadow, length)
+    dark, difference = plate_difference(image, model, config.shadow, length)
     difference[~valid] = 0.0
     region = subject_region(difference)
     if not region.any():
@@ -87,44 +87,46 @@ def alpha_of(
         max(0, y - margin) : y + height + margin, max(0, x - margin) : x + width + margin
     ]
     part = PlateModel(model.plate[window], model.sigma[window], model.whiten)
-    image, difference, region = image[window], difference[window], region[window]
+    frame, image, dark = frame[window], image[window], dark[window]
+    difference, region = difference[window], region[window]
     support = find_support(difference > 2 * LOW, region, length)
     if support.core.any():
         firm = firm_pixels(image, difference, support.core, part, length)
         support = find_support(firm, region, length)
-    alpha[window] = _opacity(image, difference, support, part, length, config)
+    alpha[window] = _opacity(frame, difference, dark, support, part, length)
     alpha[~valid] = 0.0
     return alpha
 
 
 def _opacity(
-    image: np.ndarray,
+    frame: np.ndarray,
     difference: np.ndarray,
+    dark: np.ndarray,
     support: Support,
     model: PlateModel,
     length: int,
-    config: MatteConfig,
 ) -> np.ndarray:
-    """Solve alpha (H, W) float32: 1 deep in the core and 0 off the support."""
+    """Solve alpha (H, W) float32: 1 deep in the core and 0 off the support.
+
+    `dark` (H, W) is the broad shadow's factor on the plate's values, 0 where there is none.
+    """
     core = support.core
     alpha = core.astype(np.float32)
     # Between strands the solid looks closed from a distance; near its edge it is measured.
-    todo = support.near | (core & ~eroded(core, _pixels(FILL, length)))
+    todo = support.near | (core & ~eroded_about(core, _pixels(FILL, length)))
     if not todo.any():
         return alpha
     weight = _rim(core, length).astype(np.float32)
     if not core.any():
         strong = difference >= np.percentile(difference[difference > 0], 98)
         weight = (strong & support.near).astype(np.float32)
-    light = to_light(image)
-    reach = REACH * length
-    mean, covariance = local_colours(light, weight, todo, reach, SPREAD)
-    plate = model.plate
-    if config.shadow > 0:
-        clear = ~(core | support.near)
-        plate = plate * shade_of_plate(image, model, clear, config.shadow, length)[..., None]
-    noise = light_noise(plate[todo], model.sigma[todo], model.whiten)
-    behind = to_light(plate[todo])
+    light = cv2.LUT(frame, LIGHT_OF_LEVEL)
+    mean, covariance = local_colours(light, weight, todo, REACH * length, SPREAD)
+    plate = model.plate[todo]
+    if dark.any():
+        plate = plate * shade_of_plate(dark, ~(core | support.near), length)[todo][:, None]
+    noise = light_noise(plate, model.sigma[todo], model.whiten)
+    behind = to_light(plate)
     value, deviation, at_zero = solve_opacity(light[todo], behind, mean, covariance, noise)
     # In the core what is not surely open is solid, off it what is not surely subject is plate.
     solid = 1 - shrunk(1 - value, SURE * deviation)
@@ -144,7 +146,29 @@ def eroded(mask: np.ndarray, radius: float) -> np.ndarray:
     """
     if mask.all():
         return mask > 0
+    if radius <= 2:  # a disc of few pixels is quicker laid down than measured
+        side = np.arange(-radius, radius + 1)
+        disc = (side[:, None] ** 2 + side**2 <= radius**2).astype(np.uint8)
+        return cv2.erode(mask.astype(np.uint8), disc) > 0
     return edge_distance(mask) > radius
+
+
+def eroded_about(mask: np.ndarray, radius: int) -> np.ndarray:
+    """Return `eroded` of a mask, of a radius that is right to a tenth if it is 32 pixels or more.
+
+    Such discs are laid down at a reduced size.
+    """
+    step = radius // 16
+    if step < 2:
+        return eroded(mask, radius)
+    height, width = mask.shape
+    padding = (0, -height % step, 0, -width % step)
+    whole = cv2.copyMakeBorder(mask.astype(np.uint8), *padding, cv2.BORDER_REPLICATE)
+    rows, columns = (n // step for n in whole.shape)
+    blocks = cv2.erode(whole, np.ones((step, step), np.uint8), anchor=(0, 0))[::step, ::step]
+    small = eroded(blocks, radius / step).astype(np.uint8)
+    large = cv2.resize(small, (columns * step, rows * step), interpolation=cv2.INTER_NEAREST)
+    return large[:height, :width] > 0
 
 
 def dilated(mask: np.ndarray, radius: float) -> np.ndarray:
@@ -165,41 +189,34 @@ def _length(error: np.ndarray, model: PlateModel) -> np.ndarray:
 
 def plate_difference(
     image: np.ndarray, model: PlateModel, shadow: float, length: int
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """Measure the difference (H, W) of an image (H, W, 3) from the plate, in noise deviations.
 
     Where a whole neighbourhood is the plate darkened (no more than by `shadow`), the difference
     is taken from the darkened plate. A dark strand darkens too, but not a whole neighbourhood.
+    Also returns the darkening's factor (H, W) on sRGB values there, 0 elsewhere.
     """
-    difference = _length(image - model.plate, model)
+    off = image - model.plate
+    difference = _length(off, model)
     if shadow <= 0:
-        return difference
-    _, broad, shaded = _darkened(image, model, shadow, length)
-    return np.where(broad, np.minimum(difference, shaded), difference)
+        return np.zeros_like(difference), difference
+    # Darkening linear light by s darkens sRGB values by about s^(1/2.2).
+    lumas = [cv2.transform(values, _LUMA) for values in (image, model.plate)]
+    dark = np.clip(lumas[0] / np.maximum(lumas[1], 1.0), (1 - shadow) ** (1 / 2.2), 1.0)
+    off += model.plate * (1 - dark)[..., None]
+    shaded = _length(off, model)
+    # Opened by a disc wider than strands and soft edges: what is left is broad.
+    alike, radius = shaded < 3.0, _pixels(0.01, length)
+    broad = alike & ~eroded_about(~eroded_about(alike, radius), radius)
+    return dark * broad, np.where(broad, np.minimum(difference, shaded), difference)
 
 
-def shade_of_plate(
-    image: np.ndarray, model: PlateModel, clear: np.ndarray, shadow: float, length: int
-) -> np.ndarray:
-    """Measure the shadow's factor (H, W) on the plate's sRGB values, where `clear` (H, W)."""
-    dark, broad, _ = _darkened(image, model, shadow, length)
-    weight = (broad & clear).astype(np.float32)
+def shade_of_plate(dark: np.ndarray, clear: np.ndarray, length: int) -> np.ndarray:
+    """Measure the shadow's factor (H, W) on the plate, seen as `dark` where `clear` (H, W)."""
+    weight = ((dark > 0) & clear).astype(np.float32)
     reach = REACH * length
     # Where no plate is in reach a shadow cannot be measured; assume none.
     return (blurred(dark * weight, reach) + 1e-3) / (blurred(weight, reach) + 1e-3)
-
-
-def _darkened(
-    image: np.ndarray, model: PlateModel, shadow: float, length: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the darkening (H, W) where only it changes the plate, and the difference left."""
-    # Darkening linear light by s darkens sRGB values by about s^(1/2.2).
-    dark = np.clip(
-        (image @ _LUMA) / np.maximum(model.plate @ _LUMA, 1.0), (1 - shadow) ** (1 / 2.2), 1.0
-    )
-    shaded = _length(image - model.plate * dark[..., None], model)
-    # Opened by a disc wider than strands and soft edges: what is left is broad.
-    return dark, opened(shaded < 3.0, _pixels(0.01, length)), shaded
 
 
 def subject_region(difference: np.ndarray) -> np.ndarray:
@@ -231,7 +248,7 @@ def find_support(firm: np.ndarray, region: np.ndarray, length: int) -> Support:
     pad = 4 * radius + edge + 2
     solid = cv2.copyMakeBorder(solid, pad, pad, pad, pad, cv2.BORDER_REPLICATE)
     thick = opened(solid, _pixels(0.006, length))
-    closed = eroded(dilated(thick, 2 * edge), 2 * edge)
+    closed = thick | eroded_about(~eroded_about(~thick, 2 * edge), 2 * edge)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(
         (~closed).astype(np.uint8), connectivity=4
     )
@@ -239,7 +256,7 @@ def find_support(firm: np.ndarray, region: np.ndarray, length: int) -> Support:
     fill[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = False
     fill[0] = False  # the closed part itself
     hull = closed | fill[labels]
-    core = opened((solid > 0) | eroded(hull, 2 * edge), radius)
+    core = opened((solid > 0) | eroded_about(hull, 2 * edge), radius)
     # The outermost pixels of the solid are mixed with plate by lens and sampling.
     core = eroded(core, 2 if length >= 256 else 1)[pad:-pad, pad:-pad]
     return Support(core, dilated(region, 1) & ~core)
@@ -272,19 +289,24 @@ def firm_pixels(
 def subject_colour(image: np.ndarray, core: np.ndarray, length: int) -> np.ndarray:
     """Return the subject's colour (H, W, 3) nearby: of the core's rim, in the nearest reach."""
     weight = _rim(core, length).astype(np.float32)
-    total = np.zeros_like(image)
-    weights = np.full(core.shape, 1e-12, np.float32)
-    colours = image * weight[..., None]
+    factor = max(1, int(REACH * length / 3))  # a blur this wide has no detail
+    height, width = core.shape
+    size = max(1, width // factor), max(1, height // factor)
+    colours, weight = (
+        cv2.resize(values, size, interpolation=cv2.INTER_AREA)
+        for values in (image * weight[..., None], weight)
+    )
+    total, weights = np.zeros_like(colours), np.full_like(weight, 1e-12)
     for octave in range(4):
-        reach = REACH * length * 2**octave
-        share = np.float32(1e-2**octave)
+        reach, share = REACH * length * 2**octave / factor, np.float32(1e-2**octave)
         total += share * blurred(colours, reach)
         weights += share * blurred(weight, reach)
-    return total / weights[..., None]
+    own = total / weights[..., None]
+    return cv2.resize(own, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
 def _rim(core: np.ndarray, length: int) -> np.ndarray:
     """Return pixels (H, W) of core near its edge, but for those that may be mixed with plate."""
     inner = eroded(core, 2)
     inner = inner if inner.any() else core
-    return inner & ~eroded(inner, 2 * _pixels(REACH, length))
+    return inner & ~eroded_about(inner, 2 * _pixels(REACH, length))

@@ -217,22 +217,26 @@ def fit_plate(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> PlateM
     The noise is measured on the frame (H, W, 3) uint8 where `valid` (H, W); with too little plate
     in view it is NOISE_FLOOR everywhere.
     """
-    base, shown = plate.astype(np.float32), exposed(plate, exposure_gain(frame, plate))
-    # Length of the gradient, 8-bit steps per pixel.
-    slope = np.hypot(*(cv2.Sobel(base, cv2.CV_32F, x, 1 - x) / 8.0 for x in (1, 0)))
+    shown = exposed(plate, exposure_gain(frame, plate))
+    # The gradient, eighths of an 8-bit step per pixel.
+    slopes = [cv2.Sobel(plate, cv2.CV_16S, x, 1 - x) for x in (1, 0)]
     step = max(1, round(np.sqrt(valid.size / 4e5)))
     window = np.s_[step // 2 :: step, step // 2 :: step]
-    error = (frame.astype(np.float32) - shown)[window][valid[window]]
+    error = (frame[window].astype(np.float32) - shown[window])[valid[window]]
     quiet = np.abs(error).max(axis=1) < MOST_NOISE
     if quiet.sum() < max(LEAST_PLATE * len(error), 100):
-        return PlateModel(shown, np.full_like(base, NOISE_FLOOR), np.eye(3, dtype=np.float32))
-    error, level, contrast = (
-        error[quiet], base[window][valid[window]][quiet], slope[window][valid[window]][quiet]
-    )  # fmt: skip
-    table = _noise_table(error, level)
-    by_level = _look_up(table, level)
+        return PlateModel(shown, np.full_like(shown, NOISE_FLOOR), np.eye(3, dtype=np.float32))
+    error, level, x, y = (
+        image[quiet] for image in (error, *(i[window][valid[window]] for i in (plate, *slopes)))
+    )
+    contrast = np.hypot(x, y, dtype=np.float32) / 8
+    table = _by_level(_noise_table(error, level.astype(np.float32)))
+    by_level = table[level, np.arange(3)]
     share = _contrast_share(error, by_level, contrast)
-    sigma = np.sqrt(_look_up(table, base) ** 2 + (share * slope) ** 2).astype(np.float32)
+    sigma = cv2.LUT(plate, table[None] ** 2)
+    for slope in slopes if share > 0 else ():
+        cv2.accumulateSquare(slope * np.float32(share / 8), sigma)
+    sigma = cv2.sqrt(sigma)
     scaled = error / np.sqrt(by_level**2 + (share * contrast) ** 2)
     inside = scaled[np.abs(scaled).max(axis=1) < 4.0]
     covariance = inside.T @ inside / max(len(inside), 1)
@@ -272,12 +276,11 @@ def _robust_deviation(size: np.ndarray) -> float:
     return deviation
 
 
-def _look_up(table: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """Return the deviation of each channel at plate values (..., 3)."""
+def _by_level(table: np.ndarray) -> np.ndarray:
+    """Return the deviation (256, 3) float32 of each channel at every plate value."""
     steps = np.arange(256)
-    fine = np.stack([np.interp(steps, LEVELS, table[:, c]) for c in range(3)], axis=1)
-    index = np.clip(level + 0.5, 0, 255).astype(np.uint8)
-    return np.stack([fine[index[..., c], c] for c in range(3)], axis=-1).astype(np.float32)
+    fine = [np.interp(steps, LEVELS, table[:, c]) for c in range(3)]
+    return np.stack(fine, axis=1).astype(np.float32)
 
 
 def _contrast_share(error: np.ndarray, by_level: np.ndarray, contrast: np.ndarray) -> float:
@@ -381,8 +384,25 @@ def solve_opacity(
 
 
 def _precision(covariance: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``C^-1 r`` (N, 3) and ``r' C^-1 r`` (N,), the weights and precision on r."""
-    direction = np.linalg.solve(covariance, reach[..., None].astype(np.float64))[..., 0]
+    """Return ``C^-1 r`` (N, 3) and ``r' C^-1 r`` (N,), the weights and precision on r.
+
+    By cofactors, in a quarter of a general solver's time.
+    """
+    a, b, c, d, e, f = (covariance[:, i, j] for i, j in _PAIRS)
+    x, y, z = reach.T.astype(np.float64)
+    cofactors = (
+        d * f - e * e,
+        c * e - b * f,
+        b * e - c * d,
+        a * f - c * c,
+        b * c - a * e,
+        a * d - b * b,
+    )
+    p, q, r, s, t, u = cofactors
+    weights = np.stack(
+        [p * x + q * y + r * z, q * x + s * y + t * z, r * x + t * y + u * z], axis=1
+    )
+    direction = weights / (a * p + b * q + c * r)[:, None]
     return direction, np.einsum("ni,ni->n", reach, direction)
 
 

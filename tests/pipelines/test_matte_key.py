@@ -12,7 +12,13 @@ from benchmarks.matte_scenes import make_scene as hair_before
 from express50.errors import ConfigError
 from express50.files.images import linear_to_srgb, srgb_to_linear
 from pipelines.matte.config import MatteConfig
-from pipelines.matte.key import dilated, eroded, key_alpha, plate_difference
+from pipelines.matte.key import (
+    dilated,
+    eroded,
+    eroded_about,
+    key_alpha,
+    plate_difference,
+)
 from pipelines.matte.learned import MattingLaplacian
 from pipelines.matte.plates import (
     LEAST_SHARE,
@@ -97,7 +103,7 @@ def test_the_difference_of_mere_noise_is_one() -> None:
     )
     model = fit_plate(plate, frame, np.ones(plate.shape[:2], bool))
     assert np.median(model.sigma) == pytest.approx(3 * np.sqrt(2), rel=0.1)
-    difference = plate_difference(frame.astype(np.float32), model, 0.0, 200)
+    _, difference = plate_difference(frame.astype(np.float32), model, 0.0, 200)
     assert np.sqrt(np.mean(difference**2)) == pytest.approx(1.0, abs=0.1)
 
 
@@ -176,6 +182,15 @@ def test_discs_by_distance_are_the_morphology() -> None:
     assert np.array_equal(eroded(mask, 3), cv2.erode(mask.astype(np.uint8), disc) > 0)
     assert np.array_equal(dilated(mask, 3), cv2.dilate(mask.astype(np.uint8), disc) > 0)
     assert eroded(np.ones((5, 5), bool), 3).all() and not dilated(np.zeros((5, 5), bool), 3).any()
+
+
+def test_wide_discs_are_laid_down_at_a_reduced_size() -> None:
+    y, x = np.mgrid[:301, :407]
+    mask = (np.hypot(x - 150, y - 140) < 120.3) | (x > 330)
+    about = eroded_about(mask, 64)
+    assert not (about & ~eroded(mask, 64 - 6)).any() and not (eroded(mask, 64 + 6) & ~about).any()
+    assert np.array_equal(eroded_about(mask, 31), eroded(mask, 31))
+    assert about[:, -1].all()  # the image's border counts as inside
 
 
 def test_half_scale_is_coarser_but_near() -> None:
