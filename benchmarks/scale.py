@@ -28,7 +28,7 @@ from express50.cli.plan import estimate, measure, measure_sizes
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import stages
-from express50.dial.footage import footage_of
+from express50.dial.figures import footage_of
 from express50.runner.runner import run_stage
 from express50.runner.worker import core_seconds
 
