@@ -78,7 +78,7 @@ class Smaller:
             alpha=area(sample.alpha),
             depth=depth,
             parts=None if sample.parts is None else sample.parts[:height:by, :width:by].copy(),
-            K=np.diag([1 / by, 1 / by, 1.0]) @ sample.K,
+            place=self.place(index),
         )
 
     def place(self, index: int) -> Place:

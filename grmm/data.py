@@ -96,9 +96,7 @@ class Sample:
         image: (H, W, 3) uint8 sRGB.
         alpha: (H, W) uint8.
         depth: (H, W) float32 camera z, metres; 0 where unknown. None: no depth.
-        K: (3, 3) pixels, corner origin.
-        cam_from_world: (4, 4).
-        tracked: head-model parameters.
+        place: camera and head.
         parts: (H, W) uint8 of segmentation_labels.LABELS. None: the shards have none.
         bare: True where alpha and depth leave the torso out already.
     """
@@ -106,22 +104,9 @@ class Sample:
     image: np.ndarray
     alpha: np.ndarray
     depth: np.ndarray | None
-    K: np.ndarray
-    cam_from_world: np.ndarray
-    tracked: Tracked
+    place: Place
     parts: np.ndarray | None = None
     bare: bool = False
-
-    @property
-    def place(self) -> Place:
-        """Return what remains without the pictures."""
-        height, width = self.alpha.shape
-        return Place(
-            K=self.K,
-            cam_from_world=self.cam_from_world,
-            tracked=self.tracked,
-            size=(height, width),
-        )
 
     @property
     def nbytes(self) -> int:
@@ -294,7 +279,7 @@ class HeadViews:
                     f"{where}: {name} is {array.shape}, expected the image's size {size}; pack the "
                     "dataset again"
                 )
-        check_tracked(where, sample.tracked, self.head)
+        check_tracked(where, sample.place.tracked, self.head)
         return sample
 
     def _where(self, index: int) -> str:

@@ -62,16 +62,13 @@ class ShardSource:
             FormatError: it is damaged, or was tracked with another head model than the first.
         """
         sample = self.reader.sample(index)
-        place = self._place(index, sample["meta"])
         rows, columns, _ = seen_window(sample["meta"], sample["key"])
         return Sample(
             image=sample["rgb"][rows, columns],
             alpha=np.rint(sample["alpha"] * 255).astype(np.uint8)[rows, columns],
             depth=sample["depth"][rows, columns] if sample["valid"].any() else None,
-            K=place.K,
-            cam_from_world=place.cam_from_world,
+            place=self._place(index, sample["meta"]),
             parts=None if sample["parts"] is None else sample["parts"][rows, columns],
-            tracked=place.tracked,
             bare=sample["meta"].get("torso") == "removed",
         )
 

@@ -63,6 +63,11 @@ def make_transform(R: np.ndarray, t: np.ndarray) -> np.ndarray:
     return T
 
 
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Scale vectors (..., 3) to length 1; zero stays zero."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
+
+
 def invert_transform(T: np.ndarray) -> np.ndarray:
     """Return the inverse (4, 4) of a rigid transform (4, 4)."""
     R, t = T[:3, :3], T[:3, 3]

@@ -145,7 +145,7 @@ def _loss(person: Person, avatar: Avatar, subject: str, views: HeadViews) -> dic
     full, ours = [], []
     for index in chosen:
         item = views.item(index)
-        pose = person.pose(views.sample(index).tracked, keys[index].expression)
+        pose = person.pose(views.place(index).tracked, keys[index].expression)
         picture = drawn(avatar, pose, item.view, views.background).colors.permute(2, 0, 1)
         ours.append(psnr_db(picture, item.target))
         full.append(psnr_db(full_picture(person, pose, item.view), item.target))

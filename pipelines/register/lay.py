@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 from express50.files.images import srgb_to_linear
 from express50.geometry.meshes import cotangent_laplacian
 from express50.geometry.raycast import join_rays, mesh_scene
+from express50.geometry.transforms import unit
 from express50.head.model import HeadModel, vertex_normals
 from pipelines.register.untangle import untangled
 from pipelines.track.basis import in_regions, movable_vertices
@@ -120,7 +121,7 @@ class SurfaceSearch:
         self.surface = surface
         self.scene = mesh_scene(surface.vertices - self.centre, surface.faces)
         a, b, c = ((surface.vertices - self.centre)[surface.faces[:, k]] for k in range(3))
-        self.normals = _unit(np.cross(b - a, c - a))
+        self.normals = unit(np.cross(b - a, c - a))
 
     def heights(
         self, places: np.ndarray, normals: np.ndarray, reach: float
@@ -202,7 +203,7 @@ def smoothed(
     Stiffness (V, V) and mass (V,) are those of `cotangent_laplacian`.
     """
     spread = sparse.diags(mass) + (wavelength / (2 * np.pi)) ** 2 * stiffness
-    return _unit(splu(spread.tocsc()).solve(mass[:, None] * normals))
+    return unit(splu(spread.tocsc()).solve(mass[:, None] * normals))
 
 
 def skin_trust(
@@ -242,7 +243,3 @@ def _oddness(colors: np.ndarray, reference: np.ndarray) -> np.ndarray:
     middle = np.median(axes[reference], axis=0)
     spread = 1.4826 * np.median(np.abs(axes[reference] - middle), axis=0)
     return np.linalg.norm((axes - middle) / np.maximum(spread, SPREADS), axis=1)
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)

@@ -17,7 +17,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
 from express50.geometry.meshes import cotangent_laplacian
-from express50.geometry.transforms import rigid_fit
+from express50.geometry.transforms import rigid_fit, unit
 from express50.head.model import HeadModel
 from pipelines.track.basis import in_regions
 
@@ -158,9 +158,9 @@ class Skin:
         """
         corners = mesh[self.faces[pairs]]  # (P, 2, 3, 3)
         edges = corners[:, :, 1:] - corners[:, :, :1]
-        normals = _unit(np.cross(edges[:, :, 0], edges[:, :, 1]))
-        way = _unit(np.subtract(*self.rest[self.faces[pairs]].mean(2).transpose(1, 0, 2)))
-        inwards = _unit(normals[:, 1] - normals[:, 0])
+        normals = unit(np.cross(edges[:, :, 0], edges[:, :, 1]))
+        way = unit(np.subtract(*self.rest[self.faces[pairs]].mean(2).transpose(1, 0, 2)))
+        inwards = unit(normals[:, 1] - normals[:, 0])
         facing = (normals[:, 0] * normals[:, 1]).sum(1) < OPPOSED
         facing &= (inwards * way).sum(1) > AGREE
         way = np.where(facing[:, None] & (step < BACK_STEPS), inwards, way)
@@ -178,7 +178,3 @@ class Skin:
         some = (moves != 0) & self.free[ids]
         ways = np.broadcast_to(way[:, None, None], corners.shape).reshape(-1, 3)
         return Pushes(ids[some], ways[some], moves[some])
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)

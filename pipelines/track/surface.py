@@ -13,6 +13,7 @@ from express50.files.images import LIGHT_OF_LEVEL, resize_area
 from express50.geometry.cameras import Camera, crop_camera, inside_frame, project_pinhole, resized
 from express50.geometry.raycast import mesh_scene
 from express50.geometry.sampling import bilinear_slope
+from express50.geometry.transforms import unit
 from express50.head.model import HeadModel
 from pipelines.track.basis import in_regions
 from pipelines.track.terms import MeshPlaces
@@ -177,8 +178,7 @@ def flat_barycentrics(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
 def sample_normals(samples: MeshPlaces, vertices: np.ndarray) -> np.ndarray:
     """Return unit normals (S, 3) of the samples' faces on vertices (V, 3)."""
     a, b, c = (vertices[samples.vertices[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    return unit(np.cross(b - a, c - a))
 
 
 class Visibility:

@@ -18,10 +18,11 @@ TINY = [
 def packed(source, index):
     """One sample as the pack stage encodes it."""
     key, sample = source.keys[index], source.read(index)
-    track = {k: np.asarray(v).tolist() for k, v in vars(sample.tracked).items()}
+    place = sample.place
+    track = {k: np.asarray(v).tolist() for k, v in vars(place.tracked).items()}
     meta = {
         "subject": key.subject, "expression": key.expression, "camera": key.camera,
-        "K": sample.K.tolist(), "cam_from_world": sample.cam_from_world.tolist(),
+        "K": place.K.tolist(), "cam_from_world": place.cam_from_world.tolist(),
         "width": source.size, "height": source.size, "depth_scale_m": 5e-5,
         "head": "ellipsoid", "track": track,
     }  # fmt: skip

@@ -96,9 +96,8 @@ class EllipsoidSource:
             R=turn,
             t=self.offset,
         )
-        return Sample(
-            image=image, alpha=alpha, depth=depth, K=K, cam_from_world=camera, tracked=tracked
-        )
+        place = Place(K=K, cam_from_world=camera, tracked=tracked, size=(size, size))
+        return Sample(image=image, alpha=alpha, depth=depth, place=place)
 
     def place(self, index: int) -> Place:
         return self.read(index).place

@@ -75,13 +75,15 @@ def test_sizes_that_differ_are_named():
 
 
 def test_parameters_of_another_head_model_are_named(source):
-    other = Changed(tracked=replace(source.read(0).tracked, expression=np.zeros(9)))
+    place = source.place(0)
+    tracked = replace(place.tracked, expression=np.zeros(9))
+    other = Changed(place=replace(place, tracked=tracked))
     with pytest.raises(FormatError, match="9 expression"):
         HeadViews(other, ellipsoid_head()).item(0)
 
 
 def test_fewer_coefficients_are_padded(source):
-    tracked = replace(source.read(0).tracked, expression=np.ones(1), shape=np.zeros(1))
+    tracked = replace(source.place(0).tracked, expression=np.ones(1), shape=np.zeros(1))
     state = pose_state(ellipsoid_head(), tracked)
     assert state.expression.tolist() == [1, 0, 0, 0]
 

@@ -111,8 +111,9 @@ def test_convention_camera_in_head_space(views):
     """K E [R t]: a head point seen through the view is the world point seen by the camera."""
     sample, view = views.sample(1), views.item(1).view
     point = np.array([0.01, 0.02, 0.09])
-    world = sample.tracked.R @ point + sample.tracked.t
-    expected = sample.cam_from_world[:3, :3] @ world + sample.cam_from_world[:3, 3]
+    place = sample.place
+    world = place.tracked.R @ point + place.tracked.t
+    expected = place.cam_from_world[:3, :3] @ world + place.cam_from_world[:3, 3]
     got = view.cam_from_head[:3, :3].numpy() @ point + view.cam_from_head[:3, 3].numpy()
     np.testing.assert_allclose(got, expected, atol=1e-12)
     centre = -view.cam_from_head[:3, :3].T @ view.cam_from_head[:3, 3]
