@@ -88,7 +88,7 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
     parser = add("exclude", run_exclusion, "leave a subject out, with the reason", "annotator")
     parser.add_argument("subject", metavar="SUBJECT")
     parser.add_argument("reason", metavar="REASON", help="heavy makeup, large glasses, ...")
-    parser = add("include", run_exclusion, "take an excluded subject back in", "annotator")
+    parser = add("include", run_exclusion, "include an excluded subject again", "annotator")
     parser.add_argument("subject", metavar="SUBJECT")
     for parser in (
         add("export", run_export, "write every event as .csv or .json", "subjects"),

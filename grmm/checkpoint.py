@@ -217,7 +217,7 @@ def _current_settings(path: Path, tables: dict[str, dict[str, Any]]) -> dict[str
             if gone[key] not in (ANY, values[key]):
                 raise FormatError(
                     f"{path}: was trained with {table}.{key} = {values[key]!r}, expected "
-                    f"{gone[key]!r}: the setting is gone. Train again, or use commit c44aa77"
+                    f"{gone[key]!r}: this setting was removed. Train again, or use commit c44aa77"
                 )
         kept = {key: value for key, value in values.items() if key not in gone}
         current[table] = UNSAID.get(table, {}) | kept

@@ -64,7 +64,7 @@ def trained_head(loaded: Loaded, subject: str, expression: str) -> HeadCodes:
     """Return a training subject with a training expression, by transfer if it never showed it.
 
     Raises:
-        ConfigError: the checkpoint knows no such subject or expression.
+        ConfigError: the checkpoint has no such subject or expression.
     """
     model, frames = loaded.model, loaded.gallery.frames
     _known("subject", subject, model.subjects)
@@ -283,7 +283,7 @@ def _entry(text: str, count: int, name: str, what: str, names: Sequence[str] = (
 def _known(what: str, name: str, known: Sequence[str]) -> None:
     if name not in known:
         raise ConfigError(
-            f"the checkpoint knows no {what} {name}{nearest(name, known)}; it has "
+            f"the checkpoint has no {what} {name}{nearest(name, known)}; it has "
             f"{', '.join(list(known)[:12])}"
         )
 

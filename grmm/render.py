@@ -119,7 +119,7 @@ def camera_of(loaded: Loaded, name: str | None, size: int = 0) -> PinholeView:
     """
     cameras = loaded.gallery.cameras
     if name is not None and name not in cameras:
-        raise ConfigError(f"the checkpoint knows no camera {name}; it has {', '.join(cameras)}")
+        raise ConfigError(f"the checkpoint has no camera {name}; it has {', '.join(cameras)}")
     view = frontal(loaded) if name is None else cameras[name]
     return resized(view, size) if size else view
 

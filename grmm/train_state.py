@@ -250,7 +250,7 @@ def restore(state: TrainState, path: Path, config: Config, device: torch.device)
     if changed:
         raise ConfigError(
             f"{path}: cannot resume, these differ: {'; '.join(changed)}. "
-            "Go on with the same, train into another folder, or start over with --anew"
+            "Keep these settings, train into another folder, or start over with --anew"
         )
     state.model.load_state_dict(loaded.model.state_dict())
     state.optimizer.load_state_dict(loaded.optimizer)

@@ -320,20 +320,20 @@ class Desk(Screen[None]):
         self.say(done + words.saved(label))
 
     def action_undo(self) -> None:
-        """Take the last decision back and show its task."""
+        """Undo the last decision and show its task."""
         try:
             task = self.session.undo()
         except (Express50Error, OSError) as error:
             self.say(f"not undone: {error}", theme.RED)
             return
         if task is None:
-            self.say("nothing of yours to take back here", theme.ACCENT)
+            self.say("you have nothing to undo here", theme.ACCENT)
             return
         self.open_task()
         self.say(f"taken back: {task.subject} {task.expression}")
 
     def action_task(self, by: int) -> None:
-        """Open a neighbouring task."""
+        """Open the next or previous task."""
         if self.session.move(by) or not self.session.tasks:
             self.open_task()
         else:

@@ -86,8 +86,8 @@ def _load(dataset: Dataset, scene: TaskScene, annotator: str) -> TaskScene:
     mine = labels_of(labels, annotator).get(task.expression)
     in_force = current_labels(labels).get(task.expression)
     notes += [
-        f"{label.annotator}'s frame {label.frame} of {label.camera} is another picture in today's "
-        "footage: look again and mark anew"
+        f"{label.annotator}'s frame {label.frame} of {label.camera} shows another picture in the "
+        "present footage: look and mark again"
         for label in (mine, in_force)
         if label is not None and label.frame is not None and not shows_labelled_frame(index, label)
     ]

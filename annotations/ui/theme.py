@@ -121,7 +121,7 @@ DECIDE = (
     KeyAction("left_square_bracket", "[", "move('set_plateau', 0)", "the plateau begins here"),
     KeyAction("right_square_bracket", "]", "move('set_plateau', 1)", "the plateau ends here"),
     KeyAction("f", "f", "ask_flag", "flag: no usable peak, with a reason"),
-    KeyAction("u", "u", "undo", "take the last decision back"),
+    KeyAction("u", "u", "undo", "undo the last decision"),
     KeyAction("n", "n", "task(1)", "next task, this one stays open"),
     KeyAction("p", "p", "task(-1)", "previous task"),
 )

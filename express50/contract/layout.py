@@ -37,7 +37,7 @@ def footage_source(capture: Path) -> Path:
         return capture
     if not isinstance(source, str) or not (capture / source).exists():
         raise CaptureError(
-            f"{path}: source is {source!r}, expected a file or folder that is there; correct it"
+            f"{path}: source is {source!r}, expected an existing file or folder; correct it"
         )
     return (capture / source).resolve()
 

@@ -386,7 +386,7 @@ class _StageAudit:
             elif self._waits(item):
                 self._note(stage, f"{item} cannot be judged before what it reads is made again")
             else:
-                what = f"made from another {few(changed)} than is there now"
+                what = f"made from another {few(changed)} than the present one"
                 self._settle(name, Fault(item, "outdated", what), True)
         for reason, items in unreadable.items():
             if not all(self._waits(item) for item in items):

@@ -22,7 +22,7 @@ from express50.files.images import (
 )
 
 NORMAL_STEPS = 127  # of a component from 0 to 1
-FARTHEST_M = 1e4  # no rig is so large: its unit is wrong
+FARTHEST_M = 1e4  # no rig is this large: its unit is wrong
 
 
 def depth_file(folder: Path, camera_id: str) -> Path | None:

@@ -188,7 +188,7 @@ def _withdrawals(dataset: Dataset) -> list:
     path = withdrawn_file(dataset)
     if not path.is_file():
         return []
-    fix = "restore it: it says who must not be taken in again"
+    fix = "restore it: it lists people who must not be added again"
     rows = read_json(path, FormatError, fix)
     if not isinstance(rows, list) or not all(isinstance(_digest(row), str) for row in rows):
         raise FormatError(f"{path}: expected a list of digests; {fix}")

@@ -262,9 +262,9 @@ def _resumed(chain: Chain, budget: Budget | None, goal: Goal | None) -> RunState
     if not path.is_file():
         return fresh
     try:
-        state = RunState(**read_json_table(path, FormatError, "delete it to choose anew"))
+        state = RunState(**read_json_table(path, FormatError, "delete it to choose again"))
     except TypeError as error:
-        raise FormatError(f"{path}: not a run ({error}); delete it to choose anew") from error
+        raise FormatError(f"{path}: not a run ({error}); delete it to choose again") from error
     same = (state.key, state.budget, state.goal) == (fresh.key, fresh.budget, fresh.goal)
     return state if same else fresh
 

@@ -107,7 +107,7 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
 
 
 def scale_camera(camera: Camera, sx: float, sy: float) -> Camera:
-    """Return the camera of the image scaled by (sx, sy); with a corner origin K scales as it is.
+    """Return the camera of the image scaled by (sx, sy); with a corner origin K just scales.
 
     Raises:
         ValueError: no pixel would be left.

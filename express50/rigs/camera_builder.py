@@ -76,7 +76,7 @@ def at_size(camera: Camera, size: tuple[int, int]) -> Camera:
     """Return the camera with K scaled to the footage's size (width, height).
 
     Raises:
-        CalibrationError: the aspect ratio is another, so that a crop and not a scale is missing.
+        CalibrationError: the aspect ratio differs: the images are cropped, not scaled.
     """
     sx, sy = size[0] / camera.width, size[1] / camera.height
     if abs(sx / sy - 1) > 0.01:

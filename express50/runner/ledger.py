@@ -382,7 +382,7 @@ class Ledger:
             database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
 
     def sha256(self, path: Path) -> str:
-        """Return the SHA-256 of a file; it is read again only when its size or time changed."""
+        """Return the SHA-256 of a file, which is read again only if its size or time changed."""
         stat = path.stat()
         key = (str(path), stat.st_size, stat.st_mtime_ns, stat.st_ino)
         with self._damage():

@@ -50,7 +50,7 @@ def few(names: Sequence[str], count: int = 3) -> str:
 
 
 def differing(one: Mapping[str, str], other: Mapping[str, str]) -> list[str]:
-    """List the keys under which two tables have other values, or one has none."""
+    """List the keys whose values differ between two tables, or that one of them lacks."""
     return [n for n in sorted(one.keys() | other.keys()) if one.get(n) != other.get(n)]
 
 

@@ -121,7 +121,7 @@ def expected_bytes(
 def expected_shortage(
     dataset: Dataset, ledger: Ledger, stage: str, items: Iterable[str]
 ) -> str | None:
-    """Say that outputs of a stage's items will not fit, as far as some were measured; else None."""
+    """Say that a stage's outputs will not fit, judged by those measured; None if they will."""
     need = expected_bytes(ledger, stage, items)
     return next(_space_problems(dataset, [need]), None) if need else None
 

@@ -29,7 +29,7 @@ from express50.runner.threads import thread_environment
 
 QUEUE_SECONDS = 10.0  # between two looks at the queue
 SILENT_JOBS = 3  # jobs in a row that end before their worker is seen, until the run gives up
-ALONE_SECONDS = 60  # a worker that cannot reach its scheduler for so long ends its job
+ALONE_SECONDS = 60  # a worker that cannot reach its scheduler for this long ends its job
 
 TIME = re.compile(r"\d+(:\d\d){0,2}|\d+-\d+(:\d\d){0,2}")
 MEMORY = re.compile(r"(\d+)([MGT])(i?B)?")

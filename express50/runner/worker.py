@@ -24,7 +24,7 @@ from express50.runner.publish import publishing
 from express50.runner.replaced import empty, keeping, restore
 from express50.runner.threads import cap_threads
 
-BATCH_SECONDS = 0.2  # a batch begins no further item after so long
+BATCH_SECONDS = 0.2  # a batch begins no further item after this long
 
 
 @dataclass(frozen=True)

@@ -72,6 +72,6 @@ class TwinConfig:
             raise ConfigError(f"twin.footage is {self.footage!r}, expected video, png or jpg")
         if self.footage == "video" and (self.width % 2 or self.height % 2):
             raise ConfigError(
-                f"twin: video frames are {self.width}x{self.height}, H.264 wants even sizes;"
+                f"twin: video frames are {self.width}x{self.height}, H.264 needs even sizes;"
                 " change the size or record frames"
             )

@@ -121,8 +121,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--size": {
         "type": at_least(0, 8192), "default": 0, "help": "longer side in pixels, 0 = as trained",
     },
-    "--yaw": {"type": float, "default": 0.0, "help": "degrees the camera goes round"},
-    "--pitch": {"type": float, "default": 0.0, "help": "degrees the camera goes up"},
+    "--yaw": {"type": float, "default": 0.0, "help": "degrees the camera moves around the head"},
+    "--pitch": {"type": float, "default": 0.0, "help": "degrees the camera moves up"},
     "--turntable": FLAG | {"help": "turntable.mp4"},
     "--degrees": {"type": float, "default": 360.0, "help": "how far the turntable goes"},
     "--frames": {"type": at_least(1), "default": 72, "help": "frames of a video"},

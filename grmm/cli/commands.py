@@ -109,8 +109,8 @@ def fit(args: argparse.Namespace) -> int:
     loaded = _load(args.checkpoint, [*args.set, *_metric_settings(args)], args.seconds)
     if not loaded.loop and len(loaded.model.subjects) == 1:
         log(
-            f"{args.checkpoint} is a fit of {loaded.model.subjects[0]}: it knows how one person "
-            "looks; people are fitted from what 'grmm train' wrote"
+            f"{args.checkpoint} is a fit of {loaded.model.subjects[0]}: it knows one person only; "
+            "fit people from a checkpoint of 'grmm train'"
         )
     views = loaded.views(ShardSource(args.shards, "*"))
     given = select(views.keys, args.subject, args.expression, args.cameras)

@@ -185,8 +185,8 @@ def check_given(cameras: dict[str, Camera], sizes: dict[str, tuple[int, int]], w
     """
     if not cameras:
         raise CalibrationError(
-            f"{where}: holds none of the footage's cameras ({', '.join(sorted(sizes))}); name them "
-            "as the folders in cameras/"
+            f"{where}: holds none of the footage's cameras ({', '.join(sorted(sizes))}); use the "
+            "names of the folders in cameras/"
         )
     for name, camera in cameras.items():
         if (camera.width, camera.height) != tuple(sizes[name]):

@@ -14,4 +14,4 @@ def add_commands(subparsers: Any) -> None:
     add(subparsers)
 
 
-COMMAND = Command("take in tracks, mattes or depth that other tools made", add_commands)
+COMMAND = Command("import tracks, mattes or depth that other tools made", add_commands)

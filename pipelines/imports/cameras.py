@@ -44,7 +44,7 @@ def aligning_transform(
     if not shared:
         raise CalibrationError(
             f"{where}: its cameras are {', '.join(list(theirs)[:4])}, the dataset's"
-            f" {', '.join(list(ours)[:4])}: none is the same; is it of another capture?"
+            f" {', '.join(list(ours)[:4])}: none match; is it of another capture?"
         )
     for name in shared:
         _check_intrinsics(theirs[name], ours[name], f"{where}: camera {name}")

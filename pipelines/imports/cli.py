@@ -66,7 +66,7 @@ TRACKS = (
 
 def add_commands(subparsers: Any) -> None:
     """Add ``import track``, ``matte``, ``depth`` and ``remove``."""
-    words = "take in tracks, mattes or depth that other tools made"
+    words = "import tracks, mattes or depth that other tools made"
     actions = subparsers.add_parser("import", help=words).add_subparsers(
         dest="action", metavar="ACTION", required=True
     )
@@ -115,7 +115,7 @@ def run_remove(args: argparse.Namespace) -> int:
     dataset = existing_dataset(args.dataset)
     with stage_lock(dataset, args.stage):
         gone = remove_imports(dataset, args.stage, lambda i: fnmatch.fnmatchcase(i, args.items))
-    line = f"{args.stage}: {len(gone)} imported items given up; express50 {args.stage} makes them"
+    line = f"{args.stage}: {len(gone)} imported items removed; express50 {args.stage} makes them"
     return answer(args, {"stage": args.stage, "removed": gone}, line)
 
 

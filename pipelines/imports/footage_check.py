@@ -181,8 +181,8 @@ def check_face_depth(
     middle, ratio = float(np.median(np.abs(found - z))), float(np.median(z / found))
     if not 0.8 < ratio < 1.25:
         raise StageError(
-            f"{where}: the face that the footage shows is {ratio:.3g} times as far away as it says:"
-            f" its unit is {ratio:.3g} times the one given"
+            f"{where}: the face in the footage is {ratio:.3g} times as far away as this depth"
+            f" says: its unit is {ratio:.3g} times the one given"
         )
     if middle > DEPTH_OFF_M:
         raise StageError(

@@ -159,7 +159,7 @@ def check_depths(
     share = agreement(cameras, depths)
     if share is None:
         return None
-    best, words = share, "its cameras, subject or frame are others"
+    best, words = share, "its cameras, subject or frame differ"
     if share < AGREE_SHARE:
         for factor in FACTORS:
             other = agreement(cameras, {n: factor * depth for n, depth in depths.items()}) or 0.0
@@ -173,7 +173,7 @@ def check_depths(
     for change, words in ((np.divide, "give --ray"), (np.multiply, "leave --ray out")):
         changed = {n: change(depth, ray_lengths(cameras[n])) for n, depth in depths.items()}
         if (agreement(cameras, changed, FINE_M) or 0.0) > closely + FINER_SHARE:
-            raise StageError(f"{where}: views agree better if lengths of rays are meant; {words}")
+            raise StageError(f"{where}: views agree better otherwise; {words}")
     return round(share, 4)
 
 

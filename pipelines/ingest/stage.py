@@ -44,7 +44,7 @@ def register(dataset: Dataset, captures: list[Path]) -> list[str]:
 
     Raises:
         CaptureError: a folder is not a capture, two captures claim one subject, or the subject
-            was withdrawn, or differs from another by letter case alone.
+            was withdrawn, or differs from another only in letter case.
     """
     table = {subject: str(path) for subject, path in dataset.captures().items()}
     added: dict[str, str] = {}
@@ -63,8 +63,8 @@ def register(dataset: Dataset, captures: list[Path]) -> list[str]:
         for other in table.keys() | added.keys():
             if subject not in table and other != subject and other.lower() == subject.lower():
                 raise CaptureError(
-                    f"{root}: subject {subject} differs from {other} by letter case alone, and many"
-                    " disks take both for one; give it another id (subject in capture.toml)"
+                    f"{root}: subject {subject} differs from {other} only in letter case, which"
+                    " many disks ignore; give it another id (subject in capture.toml)"
                 )
         added[subject] = str(root)
     if not added.items() <= table.items():

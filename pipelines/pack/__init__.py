@@ -19,7 +19,7 @@ def included(dataset: Dataset) -> list[str]:
 
 
 def encode_inputs(dataset: Dataset, item: str, config: EncodeConfig) -> dict[str, Path | str]:
-    """Name the outputs of every earlier stage for the subject, as far as they exist."""
+    """Name the existing outputs of every earlier stage for the subject."""
     stages = ("frames", "matte", "depth", "register", "regions")
     parts = {stage: dataset.item_dir(stage, item) for stage in stages} | {
         "calibrate": dataset.cameras_file(item),

@@ -114,7 +114,7 @@ def write_card(
 
 
 def people_lines(people: Sequence[Mapping]) -> list[str]:
-    """Count gender and age of the subjects in tables, as far as enough captures state them."""
+    """Count gender and age of the subjects in tables, if enough captures state them."""
     lines = []
     if genders := shown_counts(gender_counts(people)):
         lines += _count_table("gender", genders)

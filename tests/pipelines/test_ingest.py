@@ -278,6 +278,6 @@ def test_subjects_named_like_a_device_are_refused(tmp_path, subject):
 
 def test_subjects_that_differ_by_case_alone_are_refused(dataset, tmp_path):
     make_capture(tmp_path / "small", subject="s001", cameras=1)
-    with pytest.raises(CaptureError, match="s001 differs from S001 by letter case alone"):
+    with pytest.raises(CaptureError, match="s001 differs from S001 only in letter case"):
         ingest.register(dataset, [tmp_path / "small"])
     ingest.register(dataset, [tmp_path / "S001"])

@@ -127,7 +127,7 @@ def _read_posed(
     pictures: Mapping[str, Mapping[Moment, str]],
     selection: Selection,
 ) -> RawCapture:
-    """Read the pictures that are there, by moment, by camera."""
+    """Read the existing pictures, by moment, by camera."""
     ids = _camera_ids(root, calibration, str)
     check_selection(selection, [MOMENT], sorted(calibration))
     there = {

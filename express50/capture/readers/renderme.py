@@ -124,7 +124,9 @@ def read(path: Path, selection: Selection) -> RawCapture:
     pictures: dict[str, dict[Moment, str]] = {}
     for part, performance in known.items():
         if not selection.has_sequence(part, "*" if path.is_file() else USUAL):
-            skipped[f"sequence {part}"] = "no scripted expression; name it in sequences to take it"
+            skipped[f"sequence {part}"] = (
+                "not a scripted expression; name it in sequences to take it"
+            )
             continue
         try:
             frames, lengths[part] = _frames(performance, selection)
@@ -234,8 +236,8 @@ def _calibration(
         ]
         if moved:
             warnings[f"calibration of {performance.part}"] = (
-                f"{', '.join(moved[:4])} stand elsewhere than in the first performance, whose "
-                "cameras are taken for all"
+                f"{', '.join(moved[:4])} have moved since the first performance, whose cameras are "
+                "used for all"
             )
     if not first:
         warnings["calibration"] = "no anno file was found; the cameras are solved from the footage"

@@ -115,7 +115,7 @@ def test_undo_reopens_the_task_with_a_message(suggested, make_app):
     assert app.session.task.expression == "neutral"
     assert current_labels(labels(suggested)) == {}
     fresh = make_app(suggested, "bob")
-    assert "nothing of yours" in drive(fresh, "u", check=lambda app: line(app, "message"))
+    assert "nothing to undo" in drive(fresh, "u", check=lambda app: line(app, "message"))
 
 
 def test_next_and_previous_leave_tasks_open(suggested, make_app):
