@@ -187,11 +187,7 @@ def person(text: str) -> str:
 
 
 def chosen_subjects(dataset: Dataset, wanted: list[str] | None) -> list[str] | None:
-    """Check the subjects asked for; None for all.
-
-    Raises:
-        AnnotationError: one is not ingested.
-    """
+    """Return the subjects asked for, None for all; AnnotationError if one is not ingested."""
     check_known(str(dataset.root), "subject", wanted or (), dataset.subjects())
     return wanted
 
@@ -228,11 +224,7 @@ def run_ui(args: argparse.Namespace) -> int:
 
 
 def _check_terminal() -> None:
-    """Refuse terminals that the annotator cannot draw on.
-
-    Raises:
-        AnnotationError: there is none, it cannot place text, or its texts are not in Unicode.
-    """
+    """Raise AnnotationError unless there is a terminal that can place text, in Unicode."""
     without = "use 'express50 annotate mark' here"
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise AnnotationError(f"the annotator needs a terminal; {without}")

@@ -141,11 +141,7 @@ def make_event(index: Index, expression: str, action: str, annotator: str) -> La
 
 
 def find_cue(index: Index, expression: str) -> Cue:
-    """Find the cue window of an expression.
-
-    Raises:
-        UnknownNameError: it is not in the cues.
-    """
+    """Find the cue window of an expression; UnknownNameError if it is not in the cues."""
     cues = {cue.expression_id: cue for cue in index.cues}
     check_known(index.subject, "expression", [expression], cues)
     return cues[expression]

@@ -107,11 +107,7 @@ def reference_subject(dataset: Dataset) -> str:
 
 
 def choose_reference(dataset: Dataset, subject: str) -> None:
-    """Make a subject the reference.
-
-    Raises:
-        AnnotationError: it is not ingested, or excluded.
-    """
+    """Make a subject the reference; AnnotationError if it is not ingested, or excluded."""
     check_known(str(dataset.root), "included subject", [subject], included_subjects(dataset))
     write_json(reference_file(dataset), {"subject": subject})
 

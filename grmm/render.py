@@ -280,11 +280,7 @@ def check_clips(loaded: Loaded, clips: Sequence) -> None:
 
 
 def read_clips(path: Path, cue: str | None = None) -> Sequence:
-    """Read tracked clips, all of them or the one of a cue.
-
-    Raises:
-        ConfigError: no clip has this cue.
-    """
+    """Read tracked clips, all of them or the one of a cue; ConfigError if no clip has this cue."""
     clips = read_sequence(path)
     if cue is None:
         return clips

@@ -181,11 +181,7 @@ def check_identity(path: Path, subject: object, fps: object) -> None:
 
 
 def check_focals(path: Path, given: Any) -> None:
-    """Refuse ``focal_px`` of capture.toml unless it is positive, a number or a table per camera.
-
-    Raises:
-        CalibrationError: a value is not a positive number.
-    """
+    """Raise CalibrationError unless ``focal_px`` is positive: a number, or a table per camera."""
     for name, value in (given if isinstance(given, dict) else {"all cameras": given}).items():
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not (number and 0 < float(value) < math.inf):

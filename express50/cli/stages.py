@@ -168,11 +168,7 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
 
 
 def refuse_swapped(dataset: Dataset, captures: Sequence[Path], command: str) -> None:
-    """Refuse a capture in the place of the dataset, and the other way round.
-
-    Raises:
-        ConfigError: something is in the other's place.
-    """
+    """Raise ConfigError if a capture is in the place of the dataset, or the other way round."""
     from express50.capture.readers.read import is_capture
 
     root = dataset.root
@@ -198,11 +194,7 @@ def say_account(stage: Stage, dataset: Dataset, summary: Any) -> None:
 
 
 def check_workers(args: argparse.Namespace) -> None:
-    """Check the numbers of workers and threads.
-
-    Raises:
-        ConfigError: there are too few.
-    """
+    """Raise ConfigError if there are too few workers or threads."""
     if args.workers < 0:
         raise ConfigError(f"--workers {args.workers}: expected 0 or more")
     if args.threads < 1:

@@ -189,11 +189,7 @@ class Dataset:
 
 
 def existing_dataset(path: Path) -> Dataset:
-    """Open the dataset of a folder that has a ledger.
-
-    Raises:
-        ConfigError: it has none.
-    """
+    """Open the dataset of a folder that has a ledger; ConfigError if it has none."""
     dataset = Dataset(path)
     if not dataset.ledger.is_file():
         raise ConfigError(

@@ -65,11 +65,7 @@ class Track:
     bound: np.ndarray
 
     def row(self, expression: str) -> int:
-        """Return the row of an expression.
-
-        Raises:
-            StageError: it is not tracked.
-        """
+        """Return the row of an expression; StageError if it is not tracked."""
         if expression not in self.expressions:
             raise StageError(f"{expression}: it is not tracked; see the metrics of track")
         return self.expressions.index(expression)
@@ -124,11 +120,7 @@ class Registration:
 
 
 def existing_track(dataset: Dataset, subject: str) -> Path:
-    """Return the path of the subject's track.
-
-    Raises:
-        StageError: it is missing.
-    """
+    """Return the path of the subject's track; StageError if it is missing."""
     path = dataset.track_file(subject)
     if not path.is_file():
         raise StageError(f"subject {subject!r} is not tracked; run 'express50 track'")

@@ -35,11 +35,7 @@ class Footage:
 
 
 def footage_of(dataset: Dataset) -> Footage:
-    """Average the size of a dataset's footage.
-
-    Raises:
-        StageError: nothing is ingested.
-    """
+    """Average the size of a dataset's footage; StageError if nothing is ingested."""
     indices = [read_index(dataset, subject) for subject in dataset.subjects()]
     if not indices:
         raise StageError(f"{dataset.root}: nothing is ingested, so nothing was measured")

@@ -61,11 +61,7 @@ def write_json(path: Path, value: object) -> None:
 
 
 def check_space(folder: Path) -> None:
-    """Refuse to go on where the disk of an existing folder is nearly full.
-
-    Raises:
-        DiskFullError: less than `LEAST_FREE` is left.
-    """
+    """Raise DiskFullError if the disk of an existing folder has less than `LEAST_FREE` left."""
     usage = shutil.disk_usage(folder)
     if usage.total and usage.free < LEAST_FREE:  # some network drives do not report their size
         raise _full(folder, f"{usage.free / 1e6:.0f} MB are left, expected {LEAST_FREE / 1e6:.0f}")

@@ -210,11 +210,7 @@ def child(file: h5py.File, name: str) -> Any:
 
 
 def members(group: h5py.Group) -> list[str]:
-    """List the names in a group of an HDF5 file.
-
-    Raises:
-        CaptureError: the file is damaged.
-    """
+    """List the names in a group of an HDF5 file; CaptureError if the file is damaged."""
     with _damage_is_one_error(DAMAGE, f"{group.file.filename}: a group is damaged"):
         return [str(name) for name in group]
 

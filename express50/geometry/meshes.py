@@ -80,11 +80,7 @@ def read_surface(path: Path) -> Surface:
 
 
 def check_faces(faces: np.ndarray, count: int) -> None:
-    """Refuse faces (F, 3) that name vertices which a mesh of `count` vertices does not have.
-
-    Raises:
-        ValueError: there are such.
-    """
+    """Raise ValueError if faces (F, 3) name vertices beyond a mesh's `count`."""
     if len(faces) and (faces.min() < 0 or faces.max() >= count):
         raise ValueError(f"triangles name vertices {faces.min()} to {faces.max()} of {count}")
 

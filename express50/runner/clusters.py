@@ -74,11 +74,7 @@ class RemoteWorkers:
 
     @classmethod
     def reach(cls, address: str) -> RemoteWorkers:
-        """Connect to a scheduler that runs.
-
-        Raises:
-            StageError: there is none.
-        """
+        """Connect to a scheduler that runs; StageError if there is none."""
         from distributed import Client
 
         # It logs a lost scheduler with tracebacks; the pool says it in one line.

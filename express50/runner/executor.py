@@ -56,20 +56,12 @@ class Pool:
         self.close()
 
     def reach(self) -> None:
-        """Connect to the scheduler where one was given.
-
-        Raises:
-            StageError: it cannot be reached.
-        """
+        """Connect to the scheduler where one was given; StageError if it cannot be reached."""
         if self.scheduler is not None and self._workers is None:
             self._workers = RemoteWorkers.reach(self.scheduler)
 
     def check_gpu(self, stage: str) -> None:
-        """Check that a stage that needs a GPU gets one.
-
-        Raises:
-            StageError: it does not.
-        """
+        """Raise StageError unless a stage that needs a GPU gets one."""
         if self.slurm is not None:
             check_job_gpu(self.slurm[stage], stage)
         elif self._workers is not None:

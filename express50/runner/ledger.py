@@ -222,11 +222,7 @@ class Ledger:
                 raise
 
     def check_whole(self) -> None:
-        """Read every page.
-
-        Raises:
-            FormatError: one is damaged.
-        """
+        """Read every page; FormatError if one is damaged."""
         with self._damage():
             verdict = self._database.execute("PRAGMA quick_check(1)").fetchone()[0]
             if verdict != "ok":

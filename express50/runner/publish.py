@@ -154,11 +154,7 @@ def _locked(file: IO[str], kind: int = fcntl.LOCK_EX) -> bool:
 
 @contextmanager
 def hold_stages(dataset: Dataset, names: Iterable[str]) -> Iterator[None]:
-    """Hold several stages, so that none of them runs meanwhile.
-
-    Raises:
-        StageError: one of them runs.
-    """
+    """Hold several stages, so that none of them can start; StageError if one runs."""
     with ExitStack() as stack:
         for name in names:
             stack.enter_context(stage_lock(dataset, name))

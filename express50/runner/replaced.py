@@ -89,11 +89,7 @@ def restore(
 
 
 def _whole_receipt(entry: Path) -> Receipt:
-    """Read an entry's receipt and compare all of its files with it.
-
-    Raises:
-        FormatError: they differ.
-    """
+    """Read an entry's receipt and compare all of its files with it; FormatError if they differ."""
     row = read_json_table(entry / RECEIPT, FormatError)
     made = row.pop("made")
     marks = {name: FileMark(**mark) for name, mark in made.pop("files").items()}

@@ -130,11 +130,7 @@ class Summary:
 
 
 def select_items(stage: Stage, dataset: Dataset, pattern: str) -> list[str]:
-    """Return the items of a stage whose id matches a shell pattern.
-
-    Raises:
-        ConfigError: none does.
-    """
+    """Return the items of a stage that match a shell pattern; ConfigError if there are none."""
     known = stage.items(dataset)
     chosen = [item for item in known if fnmatch.fnmatchcase(item, pattern)]
     if not chosen:

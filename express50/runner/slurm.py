@@ -118,11 +118,7 @@ def read_slurm(text: str, stages: Iterable[str]) -> dict[str, SlurmJob]:
 
 
 def check_slurm(submit: bool = True) -> None:
-    """Check that jobs can be written, and submitted from here.
-
-    Raises:
-        StageError: dask-jobqueue or sbatch are not there.
-    """
+    """Raise StageError unless jobs can be written and submitted from here."""
     if find_spec("dask_jobqueue") is None:
         raise StageError(
             "--slurm needs dask-jobqueue, which is not installed; run "
@@ -173,11 +169,7 @@ def job_script(job: SlurmJob, address: str, name: str, threads: int, logs: Path)
 
 
 def check_job_gpu(job: SlurmJob, stage: str) -> None:
-    """Refuse jobs without a GPU for a stage that needs one.
-
-    Raises:
-        StageError: the jobs have none.
-    """
+    """Raise StageError if a stage that needs a GPU would run in jobs without one."""
     if not job.gpus:
         raise no_gpu(stage, f"--slurm asks for none; add gpus=1, or a table [{stage}] with it")
 

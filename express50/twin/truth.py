@@ -66,11 +66,7 @@ class Truth:
     """Reads what :func:`write_truth` wrote; everything is in the true world, metres."""
 
     def __init__(self, root: Path) -> None:
-        """Open ``OUT/truth`` of a recording.
-
-        Raises:
-            CaptureError: the folder holds no truth.
-        """
+        """Open ``OUT/truth`` of a recording; CaptureError if the folder holds no truth."""
         self.root = Path(root)
         if not self.subjects():
             raise CaptureError(

@@ -143,11 +143,7 @@ def method_of(study: dict, participant: int, example: int, side: str) -> str:
 
 
 def read_study(out: Path) -> dict:
-    """Read the study that `make_study` wrote.
-
-    Raises:
-        FormatError: there is none.
-    """
+    """Read the study that `make_study` wrote; FormatError if there is none."""
     path = out / "study.json"
     if not path.exists():
         raise FormatError(f"{path}: no such study; 'grmm study make' writes one")

@@ -178,11 +178,7 @@ def sizes_of(index: Index) -> dict[str, tuple[int, int]]:
 
 
 def check_given(cameras: dict[str, Camera], sizes: dict[str, tuple[int, int]], where: str) -> None:
-    """Check that given cameras have the footage's sizes and look at one place.
-
-    Raises:
-        CalibrationError: they do not, or there is none.
-    """
+    """Raise CalibrationError unless cameras have the footage's sizes and look at one place."""
     if not cameras:
         raise CalibrationError(
             f"{where}: holds none of the footage's cameras ({', '.join(sorted(sizes))}); use the "

@@ -234,11 +234,7 @@ def _plan_pictures(
     peaks: list[PeakFrame],
     args: argparse.Namespace,
 ) -> dict[str, Write]:
-    """Plan one item per expression.
-
-    Raises:
-        StageError: files are missing; nothing is imported.
-    """
+    """Plan one item per expression; StageError, and no item, if files are missing."""
     cameras = read_cameras_of(dataset, subject, undistorted=False)
     every = []
     for peak in peaks:

@@ -49,11 +49,7 @@ def observe_peak(
 
 
 def check_in_view(cameras: Mapping[str, Camera], vertices: np.ndarray, where: str) -> None:
-    """Refuse a mesh (V, 3), world, whose middle at most half of the cameras have in the picture.
-
-    Raises:
-        StageError: it is so.
-    """
+    """Raise StageError if at most half of the cameras see the middle of a mesh (V, 3), world."""
     middle = vertices.mean(0, dtype=np.float64)[None]
     seen = sum(bool(inside_frame(camera, middle)[1]) for camera in cameras.values())
     if 2 * seen <= len(cameras):
@@ -96,11 +92,7 @@ def check_landmarks(observation: Observation | None, marks: np.ndarray, where: s
 def check_masks_show_face(
     observation: Observation | None, masks: Mapping[str, np.ndarray], where: str
 ) -> None:
-    """Refuse masks (H, W) uint8 by camera that leave out the face which their cameras show.
-
-    Raises:
-        StageError: most of them do.
-    """
+    """Raise StageError if masks (H, W) uint8 by camera leave out the face that cameras see."""
     shares, covers = [], []
     pairs = () if observation is None else zip(observation.views, observation.inliers, strict=True)
     for view, inliers in pairs:

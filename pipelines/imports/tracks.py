@@ -216,11 +216,7 @@ def _choose(keys: list[str], peaks: list[PeakFrame], in_clip: bool, where: str) 
 
 
 def _step(path: Path, arrays: Mapping[str, np.ndarray], row: int, motion: np.ndarray) -> FlameStep:
-    """Take one row of arrays.
-
-    Raises:
-        FormatError: one is missing, of another shape, or not finite.
-    """
+    """Take one row of arrays; FormatError if one is missing, of another shape, or not finite."""
     where = f"{path}: row {row}"
     if missing := [name for name in (*ROWS, "shape") if name not in arrays]:
         raise FormatError(f"{where}: has no {', '.join(missing)}; expected {WHAT}")

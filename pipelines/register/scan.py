@@ -159,11 +159,7 @@ def look(scan: Scan, template: np.ndarray, given: np.ndarray) -> Observation:
 
 
 def find_face(source: Source, painter: ScanPainter) -> Frame:
-    """Find a face in pictures from all sides.
-
-    Raises:
-        StageError: no picture shows a face.
-    """
+    """Find a face in pictures from all sides; StageError if no picture shows a face."""
     low, high = painter.scan.vertices.min(0), painter.scan.vertices.max(0)
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
     best, found, turned = None, -1.0, []
@@ -250,11 +246,7 @@ class ScanPainter:
         return shown, float(away.mean()) if seen.any() else 0.0
 
     def check_near(self, given: np.ndarray) -> None:
-        """Refuse landmarks (68, 3), NaN where unknown, that are far off the scan.
-
-        Raises:
-            StageError: they are.
-        """
+        """Raise StageError if landmarks (68, 3), NaN where unknown, are far off the scan."""
         known = np.flatnonzero(np.isfinite(given).all(1))
         at = o3d.core.Tensor((given[known] - self.centre).astype(np.float32))
         away = self.scene.compute_distance(at).numpy()

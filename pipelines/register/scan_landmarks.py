@@ -32,11 +32,7 @@ _FIX = "docs/FORMAT.md, section Scans, has the layouts"
 
 
 def landmarks_beside(scan: Path) -> Path | None:
-    """Return the file of landmarks beside a scan, if there is one.
-
-    Raises:
-        FormatError: there are two.
-    """
+    """Return the file of landmarks beside a scan, if there is one; FormatError if there are two."""
     names = [scan.stem + mark + kind for mark in BESIDE for kind in KINDS]
     found = [path for name in names if (path := scan.with_name(name)).is_file()]
     if len(found) > 1:

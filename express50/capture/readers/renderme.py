@@ -49,11 +49,7 @@ def fits(path: Path) -> bool:
 
 
 def subject_of(path: Path) -> str:
-    """Return the actor's number.
-
-    Raises:
-        CaptureError: the folder holds several actors.
-    """
+    """Return the actor's number; CaptureError if the folder holds several actors."""
     actors = sorted({_parts(file)[0] for file in _files(path)})
     if len(actors) != 1:
         raise CaptureError(
