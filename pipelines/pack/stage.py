@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -123,9 +123,13 @@ def pack(dataset: Dataset, config: PackConfig, out: Path) -> Result:
     write_json(out / "splits.json", splits | {"chosen_by": how})
     reader = ShardReader(out)
     totals = _totals(out, reader, accounts)
-    left_out = dropped + [note for account in accounts.values() for note in _left_out(account)]
+    rows = [row for account in accounts.values() for row in account["dropped"]]
+    left_out = dropped + [Note(row["what"], row["why"]) for row in rows]
     people = read_people(dataset, sorted(accounts))
-    card = write_card(splits, list(_card_rows(reader)), left_out, _statistics(totals), people)
+    # Of a large dataset whole metas would fill the memory.
+    metas = (reader.meta(number) for number in range(len(reader)))
+    shown = [{key: meta[key] for key in ON_CARD} for meta in metas]
+    card = write_card(splits, shown, left_out, _statistics(totals), people)
     (out / "card.md").write_text(card, encoding="utf-8")
     by_split = {name: sum(entry.split == name for entry in reader.entries) for name in splits}
     coverage = _write_contact_sheet(out, reader)
@@ -147,10 +151,6 @@ def _read_accounts(dataset: Dataset) -> tuple[dict[str, dict], list[Note]]:
         else:
             accounts[name] = read_json_table(metrics, FormatError)
     return accounts, dropped
-
-
-def _left_out(account: Mapping[str, Any]) -> list[Note]:
-    return [Note(row["what"], row["why"]) for row in account["dropped"]]
 
 
 def _totals(out: Path, reader: ShardReader, accounts: Mapping[str, dict]) -> dict[str, Any]:
@@ -189,13 +189,6 @@ def _statistics(totals: Mapping[str, Any]) -> dict[str, str]:
         "registered mesh": f"{totals['registered']} of {kept} samples",
         "shards": f"{totals['shards']}, {totals['bytes'] / 1e6:.1f} MB",
     }
-
-
-def _card_rows(reader: ShardReader) -> Iterator[dict]:
-    """Yield what the card counts; whole metas of a large dataset would fill the memory."""
-    for number in range(len(reader)):
-        meta = reader.meta(number)
-        yield {key: meta[key] for key in ON_CARD}
 
 
 def _write_contact_sheet(out: Path, reader: ShardReader) -> float:
