@@ -120,7 +120,7 @@ def true_mesh_rows(
     for name, camera in true_world_cameras(dataset, truth, subject).items():
         rgb, alpha = read_pair(dataset, item, camera)
         depth = read_depth_of(dataset, item, camera)
-        small = label_view(head, camera, rgb, alpha, depth, False).labels
+        small = label_view(head, camera, rgb, alpha, depth, False, STAGE.config().image_side).labels
         shown = np.where(alpha > 0.5, small, 0)
         labels_of, alpha_of = true[name]
         rows.append(view_row(labels_of, alpha_of, head_alpha(alpha, small), shown))

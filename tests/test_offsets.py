@@ -21,7 +21,7 @@ from grmm.edit import interpolate_tracked, transfer
 from grmm.model import GRMM
 from grmm.shard_source import ShardSource
 from pipelines.depth import STAGE as DEPTH
-from pipelines.depth.config import DepthConfig
+from pipelines.depth import DepthConfig
 from pipelines.pack import ENCODE
 from pipelines.pack import STAGE as PACK
 from pipelines.pack.config import EncodeConfig, PackConfig

@@ -18,7 +18,6 @@ from express50.errors import CaptureError, FormatError, StageError
 from express50.files.images import contact_sheet, read_alpha, shrink, srgb_to_linear, write_image
 from express50.geometry import meshes
 from express50.head.load import load_head
-from pipelines.depth.config import DepthConfig
 from pipelines.depth.maps import DepthMaps, PhotoErrors, Pictures, surface_maps
 from pipelines.depth.prior import TrackedSolid, close_mesh, matte_agreement
 from pipelines.depth.reconstruct import reconstruct, tracked_surface
@@ -32,11 +31,12 @@ TILE = 240  # pixels of a picture in it
 AGREEMENT = 0.85  # share of the tracked mesh that must lie in the mattes for it to be used
 
 
-def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> Result:
+def run(
+    dataset: Dataset, item: str, out: Path, *, side: int, fineness: tuple[float, float, float]
+) -> Result:
     """Write every camera's maps, the coloured surface and a contact sheet."""
     cv2.setNumThreads(1)  # the runner counts one core per item
-    fineness = config.voxel_mm, config.voxel_px, config.noise
-    views, pictures, dropped = read_views(dataset, item, config.image_side)
+    views, pictures, dropped = read_views(dataset, item, side)
     one_camera = len(views) == 1 and not dropped  # a photograph, or a video of one camera
     if len(views) < 2 and not one_camera:
         why = "; ".join(f"{note.what}: {note.why}" for note in dropped)

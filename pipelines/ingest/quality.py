@@ -19,7 +19,6 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from express50.files.images import shrink, srgb_to_linear
-from pipelines.ingest.config import IngestConfig
 
 SIDE = 96  # longer side, pixels, of the images in which movement is measured
 FEWEST_CAMERAS, FEWEST_FRAMES = 3, 24
@@ -66,7 +65,8 @@ def check_quality(
     seen: Mapping[str, Seen],
     digests: Mapping[str, str],
     clips: Sequence[int],
-    config: IngestConfig,
+    sync_frames: int,
+    blur_ratio: float,
 ) -> tuple[dict, dict[str, str]]:
     """Return the figures for ``checks.json`` and the warnings by camera.
 
@@ -74,12 +74,10 @@ def check_quality(
     """
     count = min(sum(clips), *(len(s.moves) for s in seen.values()))
     moves = {name: s.moves[:count] for name, s in seen.items()}
-    steps, unjudged = (
-        find_steps(moves, clips, config.sync_frames) if config.sync_frames else ({}, {})
-    )
+    steps, unjudged = find_steps(moves, clips, sync_frames) if sync_frames else ({}, {})
     stuck = find_repeats(moves)
     drifts = {name: measure_drift(s.cells.astype("float32")) for name, s in seen.items()}
-    widths, blurred = judge_focus({n: s.widths for n, s in seen.items()}, config.blur_ratio)
+    widths, blurred = judge_focus({n: s.widths for n, s in seen.items()}, blur_ratio)
     first: dict[str, str] = {}
     warnings = {}
     for name in sorted(seen):

@@ -21,7 +21,6 @@ from express50.files.containers import WITHIN, inside, read_picture
 from express50.files.digests import file_sha256, text_digest
 from express50.files.images import encode_jpeg, has_alpha, shrink, upright
 from express50.files.video import iterate_video, video_fps
-from pipelines.ingest.config import IngestConfig
 from pipelines.ingest.quality import Seen, edge_width, light_cells, movement, small_grey
 
 FPS_SLACK = 0.02  # of the rate: less than from 24 to 25 frames per second
@@ -29,9 +28,11 @@ UNEVEN = 0.1  # share of the steps that differ; a lost frame now and then is cou
 
 
 def scan_camera(
-    raw: RawCapture, camera: RawCamera, folder: Path, config: IngestConfig
+    raw: RawCapture, camera: RawCamera, folder: Path, proxy: tuple[int, int], focus_every: int
 ) -> tuple[CameraSource, Seen]:
     """Decode one camera and write its proxies; return its frames' identity and measurements.
+
+    ``proxy`` is the longer side and the JPEG quality of proxies.
 
     Raises:
         CaptureError: the footage is truncated, damaged or changes its size.
@@ -56,14 +57,14 @@ def scan_camera(
             clips[clip] += 1
             pts.append(stamp)
             hashes.append(dhash(image))
-            small = shrink(image, config.proxy_long_side)
-            proxies.add(encode_jpeg(corrected(small, camera), config.proxy_quality))
+            small = shrink(image, proxy[0])
+            proxies.add(encode_jpeg(corrected(small, camera), proxy[1]))
             grey = small_grey(small)
             moves.append(movement(before, grey))
             before = grey
             cells.append(light_cells(small).astype(np.float16))
-            every = config.focus_every
-            if every and (len(pts) - 1) % every == 0 and (width := edge_width(image)) is not None:
+            looked_at = focus_every and (len(pts) - 1) % focus_every == 0
+            if looked_at and (width := edge_width(image)) is not None:
                 widths.append((len(pts) - 1, width))
     if size is None:
         raise CaptureError(f"{camera.path}: has no frames; record or copy it again")

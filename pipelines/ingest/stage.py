@@ -31,7 +31,6 @@ from express50.files.digests import stat_digest, text_digest
 from express50.files.images import contact_sheet, write_image
 from express50.geometry.cameras import Camera
 from express50.rigs.camera_builder import at_size
-from pipelines.ingest.config import IngestConfig
 from pipelines.ingest.quality import Seen, check_quality
 from pipelines.ingest.scan import odd_footage, remove_proxies, scan_camera, time_gaps, trimmed
 
@@ -72,7 +71,7 @@ def register(dataset: Dataset, captures: list[Path]) -> list[str]:
     return list(added)
 
 
-def inputs(dataset: Dataset, item: str, config: IngestConfig) -> dict[str, Path | str]:
+def inputs(dataset: Dataset, item: str) -> dict[str, Path | str]:
     """Name the capture by names, sizes and times of its files: hashing terabytes takes hours."""
     first, *others = watched(_capture_of(dataset, item))
     found: dict[str, Path | str] = {"capture": stat_digest(first)}
@@ -94,8 +93,20 @@ def _capture_of(dataset: Dataset, item: str) -> Path:
     return captures[item]
 
 
-def run(dataset: Dataset, item: str, config: IngestConfig, out: Path) -> Result:
-    """Index one capture; an unusable camera is dropped with its reason."""
+def run(
+    dataset: Dataset,
+    item: str,
+    out: Path,
+    *,
+    proxy: tuple[int, int],
+    sync_frames: int,
+    focus_every: int,
+    blur_ratio: float,
+) -> Result:
+    """Index one capture; an unusable camera is dropped with its reason.
+
+    ``proxy`` is the longer side and the JPEG quality of proxies.
+    """
     raw = read_any(_capture_of(dataset, item))
     if raw.subject != item:
         raise CaptureError(
@@ -104,7 +115,7 @@ def run(dataset: Dataset, item: str, config: IngestConfig, out: Path) -> Result:
         )
     check_focals(raw.root / "capture.toml", raw.meta.get("focal_px", {}))
     (out / "proxies").mkdir()
-    cameras, seen, dropped = _scan(raw, out / "proxies", config)
+    cameras, seen, dropped = _scan(raw, out / "proxies", proxy, focus_every)
     calibration = _calibration(raw, cameras)
     raw, outside = _with_cues(raw, cameras, seen, dropped, out / "proxies")
     usual = usual_count([camera.frames for camera in cameras.values()])
@@ -123,7 +134,8 @@ def run(dataset: Dataset, item: str, config: IngestConfig, out: Path) -> Result:
     write_contact_sheet(index, out)
     digests = {name: camera.sha256 for name, camera in cameras.items()}
     clips = next(iter(cameras.values())).clips or (index.frames,)
-    figures, warnings = check_quality({n: seen[n] for n in cameras}, digests, clips, config)
+    kept = {name: seen[name] for name in cameras}
+    figures, warnings = check_quality(kept, digests, clips, sync_frames, blur_ratio)
     for name, why in odd_footage(raw, cameras).items():
         warnings[name] = "; ".join([why, *filter(None, [warnings.get(name)])])
     write_json(out / "checks.json", figures)
@@ -133,7 +145,7 @@ def run(dataset: Dataset, item: str, config: IngestConfig, out: Path) -> Result:
 
 
 def _scan(
-    raw: RawCapture, folder: Path, config: IngestConfig
+    raw: RawCapture, folder: Path, proxy: tuple[int, int], focus_every: int
 ) -> tuple[dict[str, CameraSource], dict[str, Seen], dict[str, str]]:
     """Scan all cameras; return them, their measurements, and why the others are dropped.
 
@@ -144,7 +156,7 @@ def _scan(
     cameras, seen = {}, {}
     for name, camera in raw.cameras.items():
         try:
-            cameras[name], seen[name] = scan_camera(raw, camera, folder, config)
+            cameras[name], seen[name] = scan_camera(raw, camera, folder, proxy, focus_every)
         except CaptureError as error:
             dropped[name] = str(error)
             remove_proxies(folder, name)

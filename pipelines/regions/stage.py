@@ -20,7 +20,6 @@ from express50.files.images import contact_sheet, fit_into, read_alpha, shrink, 
 from express50.geometry.cameras import Camera, resized
 from express50.head.load import load_head
 from pipelines.regions.colour import SKIN, Scalp, by_colour, decide, face_colours, scalp_votes
-from pipelines.regions.config import RegionsConfig
 from pipelines.regions.geometry import (
     HAIR,
     SCALP,
@@ -51,15 +50,23 @@ class ViewLabels:
     mesh: np.ndarray
 
 
-def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> Result:
+def run(
+    dataset: Dataset,
+    item: str,
+    out: Path,
+    *,
+    side: int,
+    use_depth: bool,
+    scalp_is: str,
+    weights: str,
+) -> Result:
     """Write labels and the head's matte for each camera, and a contact sheet."""
     cv2.setNumThreads(1)  # the runner counts one core per item
-    side, use_depth, weights = config.image_side, config.depth, config.segmentation
     subject, expression = item.split("/")
     head = read_head(dataset, subject, expression)
     scalp, skin, frames = study_person(dataset, item, head)
-    if config.scalp != "auto":
-        scalp = replace(scalp, is_skin=config.scalp == "skin")
+    if scalp_is != "auto":
+        scalp = replace(scalp, is_skin=scalp_is == "skin")
     figures, rows = {}, {}
     dropped = []
     for name, camera in read_cameras_of(dataset, subject).items():
@@ -177,7 +184,7 @@ def label_view(
     alpha: np.ndarray,
     depth: np.ndarray | None,
     bare: bool,
-    side: int = RegionsConfig.image_side,
+    side: int,
     skin_colours: np.ndarray | None = None,
 ) -> ViewLabels:
     """Label one camera at the working size.

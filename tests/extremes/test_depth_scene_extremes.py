@@ -12,8 +12,7 @@ from express50.files.images import write_image
 from express50.geometry.cameras import pinhole_camera, rays
 from express50.geometry.raycast import mesh_scene
 from express50.geometry.transforms import axis_angle_to_matrix
-from pipelines.depth import STAGE
-from pipelines.depth.config import DepthConfig
+from pipelines.depth import STAGE, DepthConfig
 from pipelines.depth.maps import cast_maps, compared_view, photo_errors
 from pipelines.depth.reconstruct import reconstruct
 from pipelines.depth.views import make_view, without_contradiction

@@ -13,8 +13,7 @@ from express50.errors import FormatError, StageError
 from express50.files.images import write_image
 from express50.geometry.cameras import pinhole_camera, resized, transform_camera
 from express50.geometry.transforms import look_at, make_transform
-from pipelines.regions import STAGE
-from pipelines.regions.config import RegionsConfig
+from pipelines.regions import STAGE, RegionsConfig
 from pipelines.regions.geometry import SCALP, head_alpha, make_head, place, see
 from pipelines.regions.stage import label_shares, label_view, mesh_fit, subject_box, view_warning
 from tests.pipelines.bump_dataset import make_dataset
@@ -27,7 +26,7 @@ CONFIG = RegionsConfig()
 def labels_of(camera, alpha, depth=None, head=SCENE.head) -> np.ndarray:
     """Labels of a view on a grey frame."""
     rgb = np.full((camera.height, camera.width, 3), 128, np.uint8)
-    return label_view(head, camera, rgb, np.float32(alpha), depth, False).labels
+    return label_view(head, camera, rgb, np.float32(alpha), depth, False, CONFIG.image_side).labels
 
 
 def turned_away(distance: float = 1.0):

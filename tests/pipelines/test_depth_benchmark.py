@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.depth_score import of_surest, summary
 from benchmarks.depth_sweep import AXES
-from pipelines.depth.config import DepthConfig
+from pipelines.depth import DepthConfig
 
 
 def test_every_setting_of_the_sweep_exists():

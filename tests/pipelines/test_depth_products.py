@@ -16,8 +16,7 @@ from express50.geometry.raycast import mesh_scene
 from express50.geometry.transforms import make_transform
 from express50.head.load import load_head
 from express50.runner.runner import run_stage
-from pipelines.depth import STAGE
-from pipelines.depth.config import DepthConfig
+from pipelines.depth import STAGE, DepthConfig
 from pipelines.depth.maps import PhotoErrors, compared_view, photo_errors
 from pipelines.pack import ENCODE
 from pipelines.pack.config import EncodeConfig

@@ -23,7 +23,7 @@ from express50.geometry.transforms import look_at
 from express50.shards.reader import ShardReader
 from express50.shards.writer import verify
 from pipelines.depth import STAGE as DEPTH
-from pipelines.depth.config import DepthConfig
+from pipelines.depth import DepthConfig
 from pipelines.pack import ENCODE
 from pipelines.pack import STAGE as PACK
 from pipelines.pack.card import people_lines, split_subjects

@@ -15,9 +15,8 @@ from express50.errors import ConfigError, StageError
 from express50.files.images import read_image, write_image
 from express50.head.load import load_head
 from express50.head.model import pose
-from pipelines.regions import STAGE
+from pipelines.regions import STAGE, RegionsConfig
 from pipelines.regions.colour import decide, face_colours, scalp_votes
-from pipelines.regions.config import RegionsConfig
 from pipelines.regions.geometry import (
     SCALP,
     before_face,
@@ -32,10 +31,13 @@ from tests.pipelines.bump_dataset import make_dataset, published
 from tests.pipelines.region_scenes import COLOURS, RegionScene, camera_at, make_scene, tracked
 from tests.pipelines.stand_ins import Thirds, torchscript
 
+SIDE = RegionsConfig.image_side
+
 
 def labels_of(scene: RegionScene, bare: bool = False) -> np.ndarray:
     """Labels of a scene's one view."""
-    return label_view(scene.head, scene.camera, scene.rgb, scene.alpha, scene.depth, bare).labels
+    pictures = scene.rgb, scene.alpha, scene.depth
+    return label_view(scene.head, scene.camera, *pictures, bare, SIDE).labels
 
 
 def by_geometry(scene: RegionScene, depth: np.ndarray | None = None) -> np.ndarray:
@@ -164,7 +166,7 @@ def test_from_behind_the_skin_is_that_of_the_face() -> None:
     share = []
     for skin in (colours, None):
         labels = label_view(
-            back.head, back.camera, hair, back.alpha, back.depth, False, skin_colours=skin
+            back.head, back.camera, hair, back.alpha, back.depth, False, SIDE, skin
         ).labels
         share.append(label_mask(labels, "hair")[neck].mean())
     assert share[0] > share[1] + 0.3
@@ -181,7 +183,7 @@ def test_a_head_model_without_regions_lists_what_it_lacks() -> None:
     scene = make_scene(0)
     head = make_head(scene.head.vertices, np.eye(3), bare)
     assert head.end is None
-    labels = label_view(head, scene.camera, scene.rgb, scene.alpha, scene.depth, False)
+    labels = label_view(head, scene.camera, scene.rgb, scene.alpha, scene.depth, False, SIDE)
     assert not label_mask(labels.labels, "torso", "eyes", "neck").any()
     assert np.array_equal(head_alpha(scene.alpha, labels.labels), scene.alpha)
 
