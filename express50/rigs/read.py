@@ -18,7 +18,6 @@ from express50.files.text import read_json, read_yaml, reason
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_from_opencv
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
-from express50.rigs.calibrators import read_calibration_toml, read_kalibr, read_qualisys
 from express50.rigs.camera_builder import (
     at_size,
     camera_from_K,
@@ -28,7 +27,14 @@ from express50.rigs.camera_builder import (
     in_metres,
 )
 from express50.rigs.colmap import is_colmap, read_colmap_images
-from express50.rigs.photogrammetry import read_metashape, read_reality_capture, read_vggt
+from express50.rigs.other_tools import (
+    read_calibration_toml,
+    read_kalibr,
+    read_metashape,
+    read_qualisys,
+    read_reality_capture,
+    read_vggt,
+)
 from express50.rigs.public_captures import read_nersemble, read_renderme
 from express50.rigs.transforms_json import is_transforms, read_transforms
 
