@@ -158,11 +158,25 @@ def _parameters(tracked: Tracked, count: int) -> Tensor:
 
 @torch.no_grad()
 def distil(person: Person) -> Avatar:
-    """Distil a person, in twenty seconds at the demo's size, and leave out what never shows."""
+    """Distil a person, in twenty seconds at the demo's size, and leave out what never shows.
+
+    A picture is linear in the colours: its derivative by them says how many pixels each fills.
+    """
     generator = torch.Generator().manual_seed(2)
     poses = sampled_poses(person, PICTURES, generator)
     views = sampled_views(person.loaded, PICTURES, generator)
-    return _pruned(all_gaussians(person), poses, views)
+    avatar = all_gaussians(person)
+    most = torch.zeros_like(avatar.opacities)
+    for pose, view in zip(poses, views, strict=True):
+        colours = torch.full_like(avatar.colours, 0.5)
+        colours[1:] = 0
+        grey = replace(avatar, colours=colours.requires_grad_())
+        with torch.enable_grad():
+            drawn(grey, pose, view).colors[..., 0].sum().backward()
+        assert colours.grad is not None
+        most = torch.maximum(most, colours.grad[0, :, 0])
+    least = max(FAINT_PX, float(most.topk(min(MOST, len(most))).values[-1]))
+    return avatar.kept(most >= least)
 
 
 @torch.no_grad()
@@ -393,24 +407,6 @@ def drawn(avatar: Avatar, pose: AvatarPose, view: PinholeView, grey: float = 0.0
         means, quats, scales, avatar.opacities, colours.clamp(0, 1), view.K, view.cam_from_head,
         view.width, view.height, background=behind,
     )  # fmt: skip
-
-
-def _pruned(avatar: Avatar, poses: list[AvatarPose], views: list[PinholeView]) -> Avatar:
-    """Leave out Gaussians that no sampled picture shows.
-
-    A picture is linear in the colours: its derivative by them says how many pixels each fills.
-    """
-    most = torch.zeros_like(avatar.opacities)
-    for pose, view in zip(poses, views, strict=True):
-        colours = torch.full_like(avatar.colours, 0.5)
-        colours[1:] = 0
-        grey = replace(avatar, colours=colours.requires_grad_())
-        with torch.enable_grad():
-            drawn(grey, pose, view).colors[..., 0].sum().backward()
-        assert colours.grad is not None
-        most = torch.maximum(most, colours.grad[0, :, 0])
-    least = max(FAINT_PX, float(most.topk(min(MOST, len(most))).values[-1]))
-    return avatar.kept(most >= least)
 
 
 def full_picture(person: Person, pose: AvatarPose, view: PinholeView) -> Tensor:

@@ -95,25 +95,15 @@ class Points:
     def __call__(self, parameters: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
         """Evaluate world positions (M, 3) for parameters (D,) about the rotation (3, 3)."""
         linear, pose = parameters[:-POSE_SIZE], parameters[-POSE_SIZE:]
-        return self._posed(self._rest(linear), self._joints(linear), pose, rotation)
+        rest, joints = self._rest(linear)[None], self._joints(linear)[None]
+        posed = skin(rest, joints, _joint_rotations(pose)[None], self.skinning, self.pose_dirs)[0]
+        return posed @ (axis_angle_to_matrix(pose[12:15]) @ rotation).T + pose[15:]
 
     def _rest(self, linear: torch.Tensor) -> torch.Tensor:
         return self.template + self.directions @ linear
 
     def _joints(self, linear: torch.Tensor) -> torch.Tensor:
         return self.basis.joints + self.basis.joint_directions @ linear
-
-    def _posed(
-        self, rest: torch.Tensor, joints: torch.Tensor, pose: torch.Tensor, rotation: torch.Tensor
-    ) -> torch.Tensor:
-        posed = skin(
-            rest[None],
-            joints[None],
-            _joint_rotations(pose)[None],
-            self.skinning,
-            self.pose_dirs,
-        )[0]
-        return posed @ (axis_angle_to_matrix(pose[12:15]) @ rotation).T + pose[15:]
 
     def evaluate(self, parameters: np.ndarray, rotation: np.ndarray) -> np.ndarray:
         """Evaluate positions (M, 3)."""
