@@ -71,8 +71,10 @@ def check_whole(path: Path) -> None:
 
 def _open(path: Path) -> tuple[av.container.InputContainer, av.VideoStream]:
     limits = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file"}
+    # To open a file FFmpeg decodes a picture, 0.26 core seconds at 4K; the header says enough.
+    unseen = {"skip_frame": "all"}
     try:
-        container = av.open(str(path), container_options=limits)
+        container = av.open(str(path), container_options=limits, options=unseen)
     except DAMAGE as error:
         raise CaptureError(
             f"{path}: cannot be opened as a video ({reason(error)}); copy or encode it again"

@@ -271,10 +271,15 @@ def rays(camera: Camera, stride: int = 1) -> tuple[np.ndarray, np.ndarray]:
 
     Directions have camera z 1, so that ``origin + depth * direction`` is the point at a depth.
     """
-    x, y = np.meshgrid(cell_centres(camera.width)[::stride], cell_centres(camera.height)[::stride])
-    pixels = np.stack([x.ravel(), y.ravel()], axis=1)
-    ahead = unproject(camera, pixels, np.ones(len(pixels)))
-    return camera.center, (ahead - camera.center).reshape(*x.shape, 3)
+    x, y = cell_centres(camera.width)[::stride], cell_centres(camera.height)[::stride]
+    K, R = camera.K, camera.cam_from_world[:3, :3]
+    if camera.dist.any():
+        pixels = np.stack([part.ravel() for part in np.meshgrid(x, y)], axis=1)
+        way = normalised(camera, pixels) @ R[:2] + R[2]
+        return camera.center, way.reshape(len(y), len(x), 3)
+    # Without distortion a direction is a part of its column and a part of its row.
+    across, down = ((x - K[0, 2]) / K[0, 0])[:, None] * R[0], ((y - K[1, 2]) / K[1, 1])[:, None]
+    return camera.center, across + (down * R[1] + R[2])[:, None]
 
 
 def triangulate(

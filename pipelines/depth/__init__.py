@@ -72,7 +72,7 @@ def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> Result:
 
 STAGE = Stage(
     name="depth",
-    version=10,
+    version=11,
     config=DepthConfig,
     presets=PRESETS,
     items=peak_items,

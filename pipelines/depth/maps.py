@@ -126,7 +126,7 @@ def surface_maps(
             **common,
             "photo": smoothed_errors(errors, seen.valid, WINDOW),
             "photo_wide": smoothed_errors(errors, seen.valid, 3 * WINDOW),
-            "grain": grain(rgb)[seen.valid],
+            "grain": grain(rgb, seen.valid),
         }
         shared = 1e3 * PEOPLE_DIFFER * seen.depth[seen.valid] if len(pictures) == 1 else 0.0
         bounds = error_bounds("depth", figures, shared)
@@ -140,7 +140,7 @@ def common_figures(
     middle = surface.vertices.mean(0)
     pixels = [np.linalg.norm(c.center - middle) / c.K[0, 0] for c, _, _ in pictures]
     known = np.concatenate([one.errors[np.isfinite(one.errors)] for one in photo])
-    grains = [grain(rgb)[alpha > 255 * INSIDE][::GRAINS] for _, rgb, alpha in pictures]
+    grains = [grain(rgb, alpha > 255 * INSIDE)[::GRAINS] for _, rgb, alpha in pictures]
     every = np.concatenate(grains)
     return {
         "voxel_mm": surface.figures["voxel_mm"],
@@ -197,13 +197,17 @@ def cast_maps(
     hit = np.isfinite(depth)
     faces = surface.faces[hits["primitive_ids"].numpy()[hit]]
     corners = barycentrics(hits, hit)
-    normals, agreement = np.zeros((*depth.shape, 3)), np.zeros(depth.shape)
-    normals[hit] = (surface.normals[faces] * corners[..., None]).sum(1)
-    agreement[hit] = (surface.confidence[faces] * corners).sum(1)
-    maps = make_maps(camera, alpha, depth, normals, agreement)
-    apart = np.full(depth.shape, np.nan)
-    if apart_mm is not None:
-        apart[hit] = 1 + (apart_mm[faces] * corners).sum(1)
+
+    def mixed(values: np.ndarray, beyond: float = 0.0) -> np.ndarray:
+        found = np.full((*depth.shape, *values.shape[1:]), beyond, np.float32)
+        found[hit] = np.einsum("nk,nk...->n...", corners, values.astype(np.float32)[faces])
+        return found
+
+    maps = make_maps(camera, alpha, depth, mixed(surface.normals), mixed(surface.confidence))
+    if apart_mm is None:
+        apart = np.full(depth.shape, np.nan)
+    else:
+        apart = mixed(1 + apart_mm, np.nan)
     return replace(maps, figures={**maps.figures, "apart_mm": apart[maps.valid]})
 
 
@@ -222,25 +226,27 @@ def make_maps(
     hit = np.isfinite(depth) & (depth > 0)
     inside = alpha > INSIDE
     valid = hit & inside
-    normals = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
-    _, way = rays(camera)
-    cosine = -(normals * way).sum(-1) / np.linalg.norm(way, axis=-1)
+    known = normals[valid]
+    known = known / np.maximum(np.sqrt(np.einsum("ni,ni->n", known, known)), 1e-9)[:, None]
+    way = rays(camera)[1][valid]
+    length = np.sqrt(np.einsum("ni,ni->n", way, way))
+    cosine = -np.einsum("ni,ni->n", known, way) / length
     depth = np.where(valid, depth, 0).astype(np.float32)
-    normals = np.where(valid[..., None], normals, 0.0)
-    figures = {
-        "disagreement": 1.05 - np.clip(agreement, 0, 1),
-        "slant": 1 / np.clip(cosine, 0.05, 1),
-        "jump": np.minimum(jumps(camera, depth), 1e3),
-        "rough": roughness(normals.astype(np.float32)),
-        "soft": 1.05 - np.clip(alpha, 0, 1),
-    }
+    turned = np.zeros((*depth.shape, 3), np.float32)
+    turned[valid] = known @ camera.cam_from_world[:3, :3].T
     return DepthMaps(
         depth=depth,
         valid=valid,
-        normals=(normals @ camera.cam_from_world[:3, :3].T).astype(np.float32),
+        normals=turned,
         covered=float(valid.sum() / max(int(inside.sum()), 1)),
         spill=float((hit & ~inside).sum() / max(int(hit.sum()), 1)),
-        figures={name: values[valid] for name, values in figures.items()},
+        figures={
+            "disagreement": 1.05 - np.clip(agreement[valid], 0, 1),
+            "slant": 1 / np.clip(cosine, 0.05, 1),
+            "jump": np.minimum(jumps(camera, depth)[valid], 1e3),
+            "rough": roughness(turned)[valid],
+            "soft": 1.05 - np.clip(alpha[valid], 0, 1),
+        },
     )
 
 
@@ -324,13 +330,16 @@ def _difference(colour: np.ndarray, points: np.ndarray, other: ComparedView) -> 
     return found
 
 
-def grain(rgb: np.ndarray) -> np.ndarray:
-    """Measure (H, W) how much a picture (H, W, 3) uint8 varies within a window, over its light.
+def grain(rgb: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Measure how much a picture (H, W, 3) uint8 varies around the N pixels of a mask: (N,).
 
-    Hair does, whose strands no surface follows.
+    It is the deviation within a window over the light. Hair varies, whose strands no surface
+    follows.
     """
-    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    mean, square = (cv2.blur(values, (WINDOW, WINDOW)) for values in (grey, grey * grey))
+    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    box = np.s_[max(0, y - WINDOW) : y + height + WINDOW, max(0, x - WINDOW) : x + width + WINDOW]
+    grey = cv2.cvtColor(np.ascontiguousarray(rgb[box]), cv2.COLOR_RGB2GRAY).astype(np.float32)
+    mean, square = (cv2.blur(values, (WINDOW, WINDOW))[mask[box]] for values in (grey, grey * grey))
     return (1 + np.sqrt(np.maximum(square - mean * mean, 0))) / (DARK + mean)
 
 

@@ -5,15 +5,16 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from pipelines.matte.key import dilated
+
 RIM = 0.008  # share of the longer side: so far from the outline a matte can be wrong by a part
 WINDOW = 5  # pixels, odd
 
 
 def rim_of(alpha: np.ndarray) -> np.ndarray:
     """Return the pixels (H, W) bool about the outline of an alpha (H, W) uint8."""
-    reach = 2 * max(1, round(RIM * max(alpha.shape))) + 1
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
-    return (cv2.dilate(alpha, disc) > 12) & (cv2.erode(alpha, disc) < 243)
+    reach = max(1, round(RIM * max(alpha.shape)))
+    return dilated(alpha > 12, reach) & dilated(alpha < 243, reach)
 
 
 def rim_figures(

@@ -8,6 +8,7 @@ opaque as a dark one. Measured against plain keys and textbook matting in benchm
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -37,6 +38,10 @@ FIRM = 0.5  # share of the local foreground's difference that may belong to the 
 CORE = 0.018  # radius of the disc that must fit inside a part of the subject for it to be solid
 FILL = 0.012  # spots and gaps in the solid subject are filled this far from its edge
 _LUMA = np.array([[0.299, 0.587, 0.114]], dtype=np.float32)
+
+
+Erode = Callable[[np.ndarray, int], np.ndarray]
+"""`eroded` or `eroded_about`."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +94,8 @@ def alpha_of(
     part = PlateModel(model.plate[window], model.sigma[window], model.whiten)
     frame, image, dark = frame[window], image[window], dark[window]
     difference, region = difference[window], region[window]
-    support = find_support(difference > 2 * LOW, region, length)
+    # The first solid only gives the colours nearby.
+    support = find_support(difference > 2 * LOW, region, length, eroded_about)
     if support.core.any():
         firm = firm_pixels(image, difference, support.core, part, length)
         support = find_support(firm, region, length)
@@ -176,9 +182,9 @@ def dilated(mask: np.ndarray, radius: float) -> np.ndarray:
     return ~eroded(mask == 0, radius)
 
 
-def opened(mask: np.ndarray, radius: float) -> np.ndarray:
+def opened(mask: np.ndarray, radius: int, erode: Erode = eroded) -> np.ndarray:
     """Keep of a mask (H, W) what discs of a radius cover that lie wholly inside it."""
-    return dilated(eroded(mask, radius), radius)
+    return (mask > 0) & ~erode(~erode(mask, radius), radius)
 
 
 def _length(error: np.ndarray, model: PlateModel) -> np.ndarray:
@@ -206,8 +212,7 @@ def plate_difference(
     off += model.plate * (1 - dark)[..., None]
     shaded = _length(off, model)
     # Opened by a disc wider than strands and soft edges: what is left is broad.
-    alike, radius = shaded < 3.0, _pixels(0.01, length)
-    broad = alike & ~eroded_about(~eroded_about(alike, radius), radius)
+    broad = opened(shaded < 3.0, _pixels(0.01, length), eroded_about)
     return dark * broad, np.where(broad, np.minimum(difference, shaded), difference)
 
 
@@ -236,7 +241,9 @@ def subject_region(difference: np.ndarray) -> np.ndarray:
     return (sure & (area >= least))[labels]
 
 
-def find_support(firm: np.ndarray, region: np.ndarray, length: int) -> Support:
+def find_support(
+    firm: np.ndarray, region: np.ndarray, length: int, erode: Erode = eroded
+) -> Support:
     """Split the region (H, W) into the solid inside and the rest, where alpha is to be measured.
 
     `firm` (H, W) marks pixels that look opaque one by one; where they leave no gap that a strand
@@ -247,7 +254,7 @@ def find_support(firm: np.ndarray, region: np.ndarray, length: int) -> Support:
     # The image's border cuts the subject off; it goes on behind it.
     pad = 4 * radius + edge + 2
     solid = cv2.copyMakeBorder(solid, pad, pad, pad, pad, cv2.BORDER_REPLICATE)
-    thick = opened(solid, _pixels(0.006, length))
+    thick = opened(solid, _pixels(0.006, length), erode)
     closed = thick | eroded_about(~eroded_about(~thick, 2 * edge), 2 * edge)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(
         (~closed).astype(np.uint8), connectivity=4
@@ -256,7 +263,7 @@ def find_support(firm: np.ndarray, region: np.ndarray, length: int) -> Support:
     fill[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = False
     fill[0] = False  # the closed part itself
     hull = closed | fill[labels]
-    core = opened((solid > 0) | eroded_about(hull, 2 * edge), radius)
+    core = opened((solid > 0) | eroded_about(hull, 2 * edge), radius, erode)
     # The outermost pixels of the solid are mixed with plate by lens and sampling.
     core = eroded(core, 2 if length >= 256 else 1)[pad:-pad, pad:-pad]
     return Support(core, dilated(region, 1) & ~core)

@@ -291,7 +291,12 @@ def picture_row(image: np.ndarray, labels: np.ndarray, alpha: np.ndarray) -> lis
 
     They show the window of the subject only.
     """
-    box = subject_box(labels)
+    rows, columns = subject_box(labels)
+    size = [
+        len(range(*part.indices(n))) for part, n in zip((rows, columns), labels.shape, strict=False)
+    ]
+    step = max(1, min(size) // max(TILE))  # of pixels: tiles show no more
+    box = slice(rows.start, rows.stop, step), slice(columns.start, columns.stop, step)
     image, labels, alpha = image[box], labels[box], alpha[box]
     painted = 0.35 * image + 0.65 * COLOURS[labels]
     painted = np.where((labels > 0)[..., None], painted, 0.4 * image).astype(np.uint8)

@@ -101,7 +101,9 @@ def test_errors_that_nobody_sees_are_unknown_and_single_ones_are_averaged():
 def test_hair_has_grain_and_rough_normals_and_a_wall_has_not():
     rng = np.random.default_rng(0)
     strands = rng.integers(0, 255, (SIDE, SIDE, 3), np.uint8)
-    assert grain(strands).mean() > 5 * grain(np.full_like(strands, 128)).mean()
+    everywhere = np.ones(strands.shape[:2], bool)
+    flat = grain(np.full_like(strands, 128), everywhere)
+    assert grain(strands, everywhere).mean() > 5 * flat.mean()
     normals = rng.normal(size=(SIDE, SIDE, 3)).astype(np.float32)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     plane = np.broadcast_to(np.float32([0, 0, -1]), normals.shape)

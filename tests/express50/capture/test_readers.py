@@ -94,7 +94,7 @@ def test_renderme_key_frames_and_what_is_left_out(tmp_path):
     lost = notes_of(dataset, subject)
     assert "e10 119" in lost["camera cam03"]
     assert "num_frame is 13" in lost["sequence e2"]
-    assert "no scripted expression" in lost["sequence s1_all"]
+    assert "not a scripted expression" in lost["sequence s1_all"]
     assert_rig(dataset, subject, {k: c for k, c in rig(names).items() if k != "cam03"})
 
 
