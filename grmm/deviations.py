@@ -49,30 +49,30 @@ ALWAYS = (
     ),
     Deviation(
         paper="perceptual loss with VGG, weight 0.04",
-        ours="the same with the user's weights (loss.vgg16); off without, and said",
-        reason="we ship no weights of others (G14)",
+        ours="the same with the user's weights (loss.vgg16); off without them, with a note",
+        reason="we ship no third-party weights (G14)",
     ),
     Deviation(
         paper="tracking by VHAP, 68 FAN landmarks",
-        ours="our own tracker; FAN's weights are the user's",
+        ours="our own tracker; users may bring FAN's weights",
         reason="VHAP's licence (CONTRIBUTING.md)",
         effect="face 1.39 mm from the truth on the twin (docs/LOG.md); VHAP was not run",
     ),
     Deviation(
         paper="depth by ProbeSDF",
         ours="a level set moved to where the views agree (pipelines/depth)",
-        reason="volume rendering gained nothing for a minute more per frame",
+        reason="volume rendering took a minute more per frame and gained nothing",
         effect="median 0.293 mm with volume rendering and without (docs/LOG.md, What was removed)",
     ),
     Deviation(
         paper="mattes by RMBG-2.0 and BackgroundMattingV2, torso by Sapiens",
-        ours="keys, cut-outs and parts of our own; these networks with the user's weights",
-        reason="we ship no weights of others",
+        ours="our own keys, cut-outs and part labels; these networks with the user's weights",
+        reason="we ship no third-party weights",
     ),
     Deviation(
         paper="L2 of depth, no unit",
-        ours="squared decimetres, over pixels that both cover, 2 px inside their border",
-        reason="metres vanish beside colours, millimetres dominate (G11)",
+        ours="squared decimetres, over pixels that both cover and 2 px inside their border",
+        reason="in metres the term would vanish beside colours, in millimetres dominate (G11)",
     ),
     Deviation(
         paper="locality: neck and jaw by SLERP",
@@ -84,8 +84,8 @@ ALWAYS = (
 # By setting: why a preset has another value than ``paper``, and its effect.
 REASONS: dict[str, tuple[str, str]] = {
     "data.skip_hidden_neck": (
-        "every view sees another end of the neck above the collar; as background they contradict"
-        " each other",
+        "the neck ends elsewhere in every view, above the collar; as background the views"
+        " contradict each other",
         "neck of held-out views 20.6 to 25.2 dB, within 3 px of the collar 14.3 to 19.8, skin +0.05"
         " (120 steps of demo, 96 texels)",
     ),
@@ -94,16 +94,16 @@ REASONS: dict[str, tuple[str, str]] = {
         NOT_MEASURED,
     ),
     "train.warm_start": (
-        "projection gives at once the colours that the first thousands of steps would find",
+        "projecting the footage gives at once the colours that the first thousands of steps find",
         "+0.27 dB, on training views +1.2 (400 steps of demo, 27.60 to 27.88)",
     ),
     "loss.laplacian": (
-        "the Laplacian of the mesh costs the head's own curvature; the displacement is kept small"
-        " instead",
+        "the Laplacian of the mesh penalises the head's own curvature; the displacement is kept"
+        " small instead",
         "both terms instead of the Laplacian of the mesh: +0.25 dB (400 steps of demo)",
     ),
     "loss.displacement": (
-        "where the footage has no say, the decoded mesh drifts off the tracked surface",
+        "where the footage gives no evidence, the decoded mesh drifts off the tracked surface",
         "displacement 1.36 and 2.02 mm become 0.07 and 0.08; +0.12 and +0.21 dB, at ten times the"
         " weight +0.14 and +0.17 (700 steps, two seeds)",
     ),
