@@ -77,6 +77,8 @@ def measure_align(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
         for expression, frame in read_peaks(dataset, subject).items()
         if expression != NEUTRAL
     ]
+    if not errors:
+        return {"labels": 0}
     return {
         "peak_error_frames_median": float(np.median(errors)),
         "peak_error_frames_mean": round(float(np.mean(errors)), 3),

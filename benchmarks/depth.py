@@ -141,7 +141,7 @@ def measure(dataset_root: Path, truth_root: Path, item: str, name: str) -> dict 
     found["gib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     sure = None
     if name in PRESETS:
-        found["raycast"] = both_ways(surface, [camera for camera, _, _ in pictures[::8]])
+        found["raycast"] = both_ways(surface, [picture.camera for picture in pictures[::8]])
         sure = {name: view.confidence for name, view, _ in surface_maps(surface, pictures)}
     return found | score(mesh, truth, subject, frame, pictures, sure)
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import open3d as o3d
 
 from express50.geometry.cameras import Camera, transform_camera
 from express50.geometry.raycast import camera_rays, mesh_scene
 from express50.twin.truth import Truth, align_worlds
-from pipelines.depth.maps import Pictures
+from pipelines.depth.maps import Picture
 
 SUREST = (0.98, 0.96, 0.9, 0.7)  # shares of the pixels, the most confident ones
 
@@ -20,19 +22,19 @@ def score(
     truth: Truth,
     subject: str,
     frame: int,
-    pictures: Pictures,
+    pictures: Sequence[Picture],
     sure: dict[str, np.ndarray] | None = None,
 ) -> dict:
     """Gather errors over all pictures, and the confidence of the same pixels.
 
     ``sure`` holds maps of confidence (H, W) by camera, if there are any.
     """
-    cameras = {camera.id: camera for camera, _, _ in pictures}
+    cameras = {camera.id: camera for camera in (picture.camera for picture in pictures)}
     motion = align_worlds(cameras, truth.cameras(subject))
     none = np.zeros(0)
     rows = [
         compare(mesh, truth, subject, frame, camera, motion, alpha, (sure or {}).get(camera.id))
-        for camera, _, alpha in pictures
+        for camera, (_, alpha) in ((picture.camera, picture.read()) for picture in pictures)
     ]
     found: dict = {
         key: np.concatenate([row.get(key, none) for row in rows])

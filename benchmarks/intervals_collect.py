@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -27,7 +28,7 @@ from express50.geometry.cameras import Camera, transform_camera
 from express50.geometry.meshes import read_surface
 from express50.head.load import load_head
 from express50.twin.truth import Truth, align_worlds
-from pipelines.depth.maps import surface_maps
+from pipelines.depth.maps import picture_of, surface_maps
 from pipelines.depth.prior import close_mesh
 from pipelines.depth.surface import HeadSurface
 from pipelines.matte.config import MatteConfig
@@ -166,9 +167,11 @@ def _depth(peak: _Peak) -> Iterator[Sample]:
         track = read_track(peak.dataset.track_file(peak.subject))
         mesh = track.vertices[track.row(peak.expression)].astype(np.float64)
         solid = close_mesh(mesh, load_head(track.head).faces.numpy())
-    pictures = [
-        (peak.cameras[n], peak.frame_of(n), peak.alpha(n)) for n in surface.figures["cameras"]
-    ]
+    reads = {
+        n: partial(lambda n: (peak.frame_of(n), peak.alpha(n)), n)
+        for n in surface.figures["cameras"]
+    }
+    pictures = [picture_of(peak.cameras[n], *read(), read) for n, read in reads.items()]
     parts, errors, shared, old, skin = [], [], [], [], []
     lone = PEOPLE_DIFFER if len(pictures) == 1 else 0.0
     for name, view, _ in surface_maps(surface, pictures, solid):

@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import resource
 import shutil
 import sys
 from concurrent.futures import ProcessPoolExecutor
@@ -30,7 +29,7 @@ from express50.contract.layout import Dataset
 from express50.contract.stage import stages
 from express50.dial.figures import footage_of
 from express50.runner.runner import run_stage
-from express50.runner.worker import core_seconds
+from express50.runner.worker import core_seconds, peak_memory, reset_peak_memory
 
 PRESETS = ("draft", "standard")
 EXPRESSIONS = ("neutral",)
@@ -50,14 +49,14 @@ def record(out: Path, cameras: int, width: int, height: int) -> tuple[list[Path]
 def run_alone(name: str, root: Path, preset: str) -> dict[str, float]:
     """Run a stage in this process; returns its core seconds and the process's peak memory."""
     stage = stages()[name]
+    reset_peak_memory()
     summary = run_stage(
         stage, Dataset(root), resolve_config(stage, preset), workers=0, progress=False
     )
     failed = [outcome.reason for outcome in summary.outcomes if outcome.reason]
     if failed:
         raise RuntimeError(f"{name}: {failed[0]}")
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    return {"core_seconds": round(core_seconds(), 2), "gib": round(peak, 2)}
+    return {"core_seconds": round(core_seconds(), 2), "gib": round(peak_memory() / 2**30, 2)}
 
 
 def measure_preset(captures: list[Path], truth: Path, root: Path, preset: str) -> dict:

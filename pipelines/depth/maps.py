@@ -9,7 +9,7 @@ al. 2006). `express50.error_model` turns these figures into millimetres.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -35,8 +35,31 @@ WINDOW = 5  # pixels, odd: colours around a wrong depth agree here and there by 
 
 GRAINS = 7  # of so many pixels one is taken for the typical grain of all views
 
-Pictures = list[tuple[Camera, np.ndarray, np.ndarray]]
-"""Cameras with their full-size frames (H, W, 3) and mattes (H, W), uint8."""
+
+@dataclass(frozen=True)
+class Picture:
+    """One camera's picture, at full size only when it is read: all would take a gigabyte.
+
+    Attributes:
+        camera: pinhole, of the full size.
+        small: camera, frame (h, w, 3) and matte (h, w), uint8, as they are compared.
+        grains: (N,) `grain` at some pixels of the matte.
+        read: returns frame (H, W, 3) and matte (H, W), uint8.
+    """
+
+    camera: Camera
+    small: tuple[Camera, np.ndarray, np.ndarray]
+    grains: np.ndarray
+    read: Callable[[], tuple[np.ndarray, np.ndarray]]
+
+
+def picture_of(
+    camera: Camera, rgb: np.ndarray, alpha: np.ndarray,
+    read: Callable[[], tuple[np.ndarray, np.ndarray]],
+) -> Picture:  # fmt: skip
+    """Describe a frame (H, W, 3) and a matte (H, W), uint8, that `read` returns again."""
+    grains = grain(rgb, alpha > 255 * INSIDE)[::GRAINS]
+    return Picture(camera, reduced(camera, rgb, alpha, COMPARED_SIDE), grains, read)
 
 
 @dataclass(frozen=True)
@@ -104,7 +127,7 @@ class PhotoErrors:
 
 
 def surface_maps(
-    surface: HeadSurface, pictures: Pictures, solid: TrackedSolid | None = None
+    surface: HeadSurface, pictures: Sequence[Picture], solid: TrackedSolid | None = None
 ) -> Iterator[tuple[str, DepthMaps, PhotoErrors]]:
     """Yield camera id, maps of the surface and neighbours' errors of one camera after the other.
 
@@ -116,10 +139,14 @@ def surface_maps(
         query = o3d.core.Tensor(surface.vertices.astype(np.float32))
         apart = 1e3 * solid.scene.compute_distance(query, nthreads=1).numpy()
     scene = mesh_scene(surface.vertices, surface.faces)
-    shots = [compared_view(scene, c, rgb, a.astype(np.float32) / 255) for c, rgb, a in pictures]
+    shots = [
+        compared_view(scene, camera, rgb, alpha.astype(np.float32) / 255)
+        for camera, rgb, alpha in (picture.small for picture in pictures)
+    ]
     photo = photo_errors(shots)
     common = common_figures(surface, pictures, photo)
-    for (camera, rgb, alpha), errors in zip(pictures, photo, strict=True):
+    for picture, errors in zip(pictures, photo, strict=True):
+        camera, (rgb, alpha) = picture.camera, picture.read()
         seen = cast_window(surface, scene, camera, alpha, apart)
         figures = {
             **seen.figures,
@@ -134,14 +161,14 @@ def surface_maps(
 
 
 def common_figures(
-    surface: HeadSurface, pictures: Pictures, photo: Sequence[PhotoErrors]
+    surface: HeadSurface, pictures: Sequence[Picture], photo: Sequence[PhotoErrors]
 ) -> dict[str, float]:
     """Return the figures that all pixels of an item share."""
     middle = surface.vertices.mean(0)
-    pixels = [np.linalg.norm(c.center - middle) / c.K[0, 0] for c, _, _ in pictures]
+    cameras = [picture.camera for picture in pictures]
+    pixels = [np.linalg.norm(c.center - middle) / c.K[0, 0] for c in cameras]
     known = np.concatenate([one.errors[np.isfinite(one.errors)] for one in photo])
-    grains = [grain(rgb, alpha > 255 * INSIDE)[::GRAINS] for _, rgb, alpha in pictures]
-    every = np.concatenate(grains)
+    every = np.concatenate([picture.grains for picture in pictures])
     return {
         "voxel_mm": surface.figures["voxel_mm"],
         "pixel_mm": 1e3 * float(np.median(pixels)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -18,7 +19,7 @@ from express50.errors import CaptureError, FormatError, StageError
 from express50.files.images import contact_sheet, read_alpha, shrink, srgb_to_linear, write_image
 from express50.geometry import meshes
 from express50.head.load import load_head
-from pipelines.depth.maps import DepthMaps, PhotoErrors, Pictures, surface_maps
+from pipelines.depth.maps import DepthMaps, PhotoErrors, Picture, picture_of, surface_maps
 from pipelines.depth.prior import TrackedSolid, close_mesh, matte_agreement
 from pipelines.depth.reconstruct import reconstruct, tracked_surface
 from pipelines.depth.surface import HeadSurface
@@ -28,6 +29,7 @@ ERROR_STEPS = 30.0  # 8-bit steps at the bright end of the error maps
 BLANK = 24  # grey of unknown pixels
 SHOWN = 4  # cameras in the contact sheet
 TILE = 240  # pixels of a picture in it
+EXPECTING = 8  # of so many pixels one is asked what error to expect
 AGREEMENT = 0.85  # share of the tracked mesh that must lie in the mattes for it to be used
 
 
@@ -57,14 +59,14 @@ def run(
     write_ply(out / "surface.ply", surface)
     write_glb(out / "surface.glb", surface)
     rows, photo, typical = write_views(out, surface, pictures, solid)
-    shared = size_sigma([row[0] for row in pictures], surface.vertices)
+    shared = size_sigma([picture.camera for picture in pictures], surface.vertices)
     expected = expect(error_models()["depth"], typical, float(np.median(shared)))
     figures = figures_of(surface, rows, photo) | {"track": track}
     return Result(figures, dropped, expected_error=expected)
 
 
 def write_views(
-    out: Path, surface: HeadSurface, pictures: Pictures, solid: TrackedSolid | None
+    out: Path, surface: HeadSurface, pictures: Sequence[Picture], solid: TrackedSolid | None
 ) -> tuple[dict[str, dict], list[PhotoErrors], np.ndarray]:
     """Write every camera's maps and a contact sheet of evenly chosen cameras.
 
@@ -78,9 +80,9 @@ def write_views(
         rows[camera_id] = view_figures(seen, errors)
         photo.append(errors)
         if seen.bounds is not None:
-            typical.append(seen.bounds.typical.astype(np.float32))
+            typical.append(seen.bounds.typical[::EXPECTING].astype(np.float32))
         if number in chosen:
-            columns.append(view_panels(pictures[number][1], seen, errors.errors))
+            columns.append(view_panels(pictures[number].small[1], seen, errors.errors))
     labels = ["frame", "depth", "normals", "confidence", f"photo error, 0 to {ERROR_STEPS:g}/255"]
     (out / "qc").mkdir(exist_ok=True)
     table = [list(row) for row in zip(*columns, strict=True)]
@@ -91,27 +93,31 @@ def write_views(
 
 def read_views(
     dataset: Dataset, item: str, image_side: int
-) -> tuple[list[DepthView], Pictures, list[Note]]:
-    """Read the usable views, their full-size pictures, and the cameras that are left out."""
-    subject, expression = item.split("/")
+) -> tuple[list[DepthView], list[Picture], list[Note]]:
+    """Read the usable views, describe their pictures, and name the cameras that are left out."""
     views: list[DepthView] = []
-    pictures: Pictures = []
+    pictures: list[Picture] = []
     dropped = []
-    for camera_id, camera in read_cameras_of(dataset, subject).items():
-        path = dataset.matte_file(subject, expression, camera_id)
+    for camera_id, camera in read_cameras_of(dataset, item.split("/")[0]).items():
+        read = partial(_read_pair, dataset, item, camera_id)
         try:
-            if not path.is_file():
-                raise StageError("it has no matte")
-            alpha = read_alpha(path)
-            rgb = read_peak_frame(dataset, subject, expression, camera_id)
+            rgb, alpha = read()
             views.append(make_view(camera, rgb, alpha.astype(np.float32) / 255, image_side))
-            pictures.append((camera, rgb, alpha))
+            pictures.append(picture_of(camera, rgb, alpha, read))
         except (CaptureError, FormatError, StageError) as error:
             dropped.append(Note(camera_id, str(error)))
     views, contradicting = without_contradiction(views)
     gone = {note.what for note in contradicting}
-    pictures = [row for row in pictures if row[0].id not in gone]
+    pictures = [picture for picture in pictures if picture.camera.id not in gone]
     return views, pictures, sorted([*dropped, *contradicting], key=lambda note: note.what)
+
+
+def _read_pair(dataset: Dataset, item: str, camera_id: str) -> tuple[np.ndarray, np.ndarray]:
+    subject, expression = item.split("/")
+    path = dataset.matte_file(subject, expression, camera_id)
+    if not path.is_file():
+        raise StageError("it has no matte")
+    return read_peak_frame(dataset, subject, expression, camera_id), read_alpha(path)
 
 
 def read_tracked(
@@ -203,7 +209,7 @@ def view_figures(view: DepthMaps, photo: PhotoErrors) -> dict[str, float]:
 
 def view_panels(rgb: np.ndarray, view: DepthMaps, errors: np.ndarray) -> list[np.ndarray]:
     """Draw frame, depth, normals, confidence and photometric errors (h, w) of a camera."""
-    step = max(1, max(rgb.shape[:2]) // (2 * TILE))  # of pixels: the sheet shows no more
+    step = max(1, max(view.depth.shape) // (2 * TILE))  # of pixels: the sheet shows no more
     depth, valid, normals, sure = (
         values[::step, ::step] for values in (view.depth, view.valid, view.normals, view.confidence)
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from express50.errors import StageError
 from express50.geometry.cameras import rays
 from express50.geometry.raycast import mesh_scene
 from pipelines.depth.blocks import build
-from pipelines.depth.maps import cast_maps, surface_maps
+from pipelines.depth.maps import cast_maps, picture_of, surface_maps
 from pipelines.depth.prior import boundary_loops, close_mesh, matte_agreement
 from pipelines.depth.reconstruct import reconstruct
 from pipelines.depth.stage import write_ply
@@ -184,7 +185,11 @@ def test_two_runs_give_the_same_surface(surface, views):
 
 
 def test_confidence_separates_good_depth_from_bad(surface, shots):
-    pictures = [(c, rgb, np.rint(alpha * 255).astype(np.uint8)) for c, rgb, alpha, _ in shots]
+    mattes = [np.rint(alpha * 255).astype(np.uint8) for _, _, alpha, _ in shots]
+    pictures = [
+        picture_of(camera, rgb, matte, partial(tuple, (rgb, matte)))
+        for (camera, rgb, _, _), matte in zip(shots, mattes, strict=True)
+    ]
     views = surface_maps(surface, pictures)
     sure, unsure = [], []
     for (_, view, _), (*_, true) in zip(views, shots, strict=True):
