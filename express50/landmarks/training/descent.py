@@ -23,8 +23,12 @@ Net = TypeVar("Net", bound=torch.nn.Module)
 def descend(
     net: Net, steps: int, rate: float, state: Path, loss_at: Callable[[int], torch.Tensor]
 ) -> Net:
-    """Minimise the loss of every step; an interrupted run goes on from its `state`, a file."""
-    optimiser = torch.optim.AdamW(net.parameters(), lr=rate, weight_decay=1e-3)
+    """Minimise the loss of every step; an interrupted run goes on from its `state`, a file.
+
+    Parameters that require no gradient stay as they are.
+    """
+    trained = [part for part in net.parameters() if part.requires_grad]
+    optimiser = torch.optim.AdamW(trained, lr=rate, weight_decay=1e-3)
     first = take_up(state, net, optimiser)
     began, losses = time.monotonic(), []
     for step in range(first, steps):
@@ -33,7 +37,7 @@ def descend(
         loss = loss_at(step)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(net.parameters(), 5.0)
+        torch.nn.utils.clip_grad_norm_(trained, 5.0)
         optimiser.step()
         losses.append(loss.item())
         if (step + 1) % KEEP_EVERY == 0:

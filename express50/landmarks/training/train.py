@@ -4,16 +4,17 @@
 
 Trains on renders of random heads only: the procedural head and, where a path is given,
 ICT-FaceKit; the shipped file used both, in several runs that each went on from the one before
-(`--start`; docs/LOG.md), the outline's part and the eyes' in the last, with all else held. No
-photograph of a person is used. The result depends on the arguments alone, up to how the machine
-rounds. A run that was interrupted goes on from its last state, which is kept in DIR, to the same
-result.
+(`--start`). docs/LOG.md has their commands. `--parts` trains these parts of given weights alone:
+all else, batch normalisations included, is held as it is. No photograph of a person is used. The
+result depends on the arguments alone, up to how the machine rounds. A run that was interrupted goes
+on from its last state, which is kept in DIR, to the same result.
 """
 
 from __future__ import annotations
 
 import argparse
 import hashlib
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
@@ -55,6 +56,8 @@ RATE, RATE_ON = 2e-3, 1e-3  # from nothing, from given weights
 FIRST_FILES = 6
 STEPS_PER_FILE = 300
 HELD_OUT = 0
+# Of the network: those that find points and faces, the eyes' own, and what these (not eyes) share.
+PARTS = ("trunk", "heat", "shape", "face", "outline", "dense", "eyes")
 SMALL_EVERY = 4  # after the small steps one in so many stays small, so that blurred faces are kept
 
 
@@ -85,15 +88,21 @@ def main(arguments: list[str] | None = None) -> int:
     for name, value in vars(TrainingPlan()).items():
         flag = f"--{name.replace('_', '-')}"
         parser.add_argument(flag, type=int, default=value, help=words[name])
-    parser.add_argument("--start", type=Path, help="weights whose landmarks to go on from")
+    parser.add_argument("--start", type=Path, help="weights to go on from")
+    parser.add_argument(
+        "--parts", nargs="+", choices=PARTS, default=PARTS, help="what to train; all by default"
+    )
     parser.add_argument("--out", type=Path, default=WEIGHTS)
     options = parser.parse_args(arguments)
+    if options.start is None and set(options.parts) != set(PARTS):
+        parser.error("--parts needs --start: weights that have the other parts")
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     models = [load_head(spec) for spec in ("procedural", options.ict) if spec]
     plan = TrainingPlan(**{name: getattr(options, name) for name in words})
-    net = train(models, plan, options.views, options.start)
-    net.eyes = train_eyes(models, options.views, plan.seed)
+    net = train(models, plan, options.views, options.start, options.parts)
+    if "eyes" in options.parts:
+        net.eyes = train_eyes(models, options.views, plan.seed)
     save_network(net, options.out)
     net = load_network(options.out)
     for model, places in zip(models, places_of(models, plan.dense), strict=True):
@@ -108,28 +117,38 @@ def places_of(models: list[HeadModel], dense: int) -> list[Places]:
     return [carry_places(models[-1], chosen, model) for model in models]
 
 
-def start_network(start: Path | None, places: Places) -> LandmarkNet:
-    """Return a network to train, with what given weights hold of it."""
+def start_network(start: Path | None, places: Places, parts: Sequence[str] = PARTS) -> LandmarkNet:
+    """Return a network with what given weights hold of it, ready to train some of its parts."""
     net = LandmarkNet(whole=True, dense=len(places[0]))
     state = net.state_dict()
     given = {} if start is None else trainable_network(start).state_dict()
     # Weights of another number of dense points lack all that depends on it.
     state |= {key: value for key, value in given.items() if value.shape == state[key].shape}
-    state["dense.faces"], state["dense.weights"] = (torch.from_numpy(part) for part in places)
+    if "dense" in parts:
+        state["dense.faces"], state["dense.weights"] = (torch.from_numpy(part) for part in places)
     net.load_state_dict(state)
-    return net.train().to(memory_format=torch.channels_last)
+    for name, module in net.named_children():
+        part = name if name in PARTS else "trunk"
+        module.train(part in parts).requires_grad_(part in parts)
+    return net.to(memory_format=torch.channels_last)
 
 
 def train(
-    models: list[HeadModel], plan: TrainingPlan, folder: Path, start: Path | None = None
+    models: list[HeadModel],
+    plan: TrainingPlan,
+    folder: Path,
+    start: Path | None = None,
+    parts: Sequence[str] = PARTS,
 ) -> LandmarkNet:
     """Train on views of the head models; views and the run's state are kept in a folder."""
     torch.manual_seed(plan.seed)
     backgrounds = make_backgrounds(400, np.random.default_rng([plan.seed, 1]))
     places = places_of(models, plan.dense)
-    net = start_network(start, places[0])
+    net = start_network(start, places[0], parts)
     begun = hashlib.sha256(start.read_bytes()).hexdigest()[:8] if start else "anew"
-    name = "-".join([*(m.name for m in models), *(str(value) for value in astuple(plan)), begun])
+    chosen = [] if set(parts) == set(PARTS) else sorted(parts)
+    values = (str(value) for value in astuple(plan))
+    name = "-".join([*(m.name for m in models), *values, begun, *chosen])
     sets: list[list[TrainingView]] = []
 
     def loss_at(step: int) -> torch.Tensor:
@@ -150,8 +169,8 @@ def train(
         ]
         return crop_loss(net, crops)
 
-    rate = RATE_ON if start else RATE
-    return descend(net, plan.steps, rate, folder / f"training-{name}.pt", loss_at)
+    rate, steps = RATE_ON if start else RATE, plan.steps if set(parts) != {"eyes"} else 0
+    return descend(net, steps, rate, folder / f"training-{name}.pt", loss_at)
 
 
 @dataclass(frozen=True)
