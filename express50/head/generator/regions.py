@@ -61,7 +61,8 @@ def region_masks(mesh: WholeMesh) -> dict[str, Array]:
 # Subject's left side, from the chin (8) to the ear (16), mm; put on the skin before use.
 _JAW = np.array([(0, -95, 86), (16, -94, 79), (31, -87, 62), (44, -77, 44), (53, -64, 28),
                  (61, -46, 16), (67, -26, 10), (70, -6, 9), (71, 14, 8)], float)  # fmt: skip
-_BROW = np.array([(9, 36), (19, 41.5), (30, 43), (41, 41), (51, 34.5)], float)
+# On people, where published marks have it by eyes and nose (docs/LOG.md).
+_BROW = np.array([(10, 32), (19.5, 36.5), (29.5, 38.5), (41, 37), (52.5, 31.5)], float)
 _BRIDGE = np.array([(0, 24), (0, 13), (0, 1), (0, -13)], float)
 _NOSTRILS = np.array([(0, -28.5), (6.5, -27.5), (13, -25)], float)
 
@@ -82,13 +83,14 @@ def embed_landmarks(mesh: WholeMesh) -> tuple[Array, Array]:
     ):
         points[first : first + 6] = mesh.vertices[mesh.tag("lid0", side)[list(order)]]
     for first, tag, loop in (
-        (48, "lip3", (-16, -7, -2, 0, 2, 7, 16, 25, 30, 32, -30, -25)),
-        (60, "lip0", (-16, -6, 0, 6, 16, 26, 32, -26)),
+        (48, "lip3", (-16, -7, -2, 0, 2, 7, 16, 25, 30.5, 32, -30.5, -25)),
+        (60, "lip0", (-16, -4, 0, 4, 16, 28, 32, -28)),
     ):
         # Positions along the loop from the upper to the lower middle; negative on the right.
         row = mesh.vertices[mesh.tag(tag, "left")]
-        sign = np.where(np.array(loop) < 0, -1.0, 1.0)[:, None]
-        points[first : first + len(loop)] = row[np.abs(loop)] * np.where([1, 0, 0], sign, 1.0)
+        for k, place in enumerate(loop, first):
+            points[k] = [np.interp(abs(place), np.arange(len(row)), axis) for axis in row.T]
+            points[k, 0] *= np.sign(place)
     skin = np.flatnonzero(mesh.face_chart == "skin")
     corners = mesh.vertices[mesh.faces[skin]]
     faces, bary = np.zeros(68, np.int64), np.zeros((68, 3))

@@ -104,7 +104,7 @@ def _move_brows(model: HeadModel, canvas: Canvas, rng: Rng) -> tuple[Canvas, Pla
     outwards = np.sign(brows[:, 0])
     along = (np.abs(brows[:, 0]) - np.abs(brows[:, 0]).min()) / np.ptp(np.abs(brows[:, 0]))
     brows[:, 0] += outwards * (rng.normal() * 0.002 + along * rng.normal() * 0.003)
-    brows[:, 1] += rng.normal() * 0.003 + (along - 0.5) * rng.normal() * 0.003
+    brows[:, 1] += rng.normal() * 0.004 + (along - 0.5) * rng.normal() * 0.004
     brows[:, 1] += outwards * rng.normal() * 0.0007
     places = closest_places(model, brows)
     marks = canvas.marks.copy()
@@ -176,20 +176,26 @@ def _tint_features(colors: np.ndarray, canvas: Canvas, tone: np.ndarray, rng: Rn
     lips = region["lips"].astype(float) * rng.uniform(0.0, 0.9)
     colors[:] = _mix(colors, colors * rng.uniform([0.7, 0.3, 0.3], [1.2, 0.9, 0.9]), lips)
     brow_color = rng.uniform(0.0, 0.5) * np.array([1.0, rng.uniform(0.5, 1), rng.uniform(0.3, 1)])
-    brow_color = np.minimum(brow_color, rng.uniform(0.1, 0.8) * tone)
+    brow_color = np.minimum(brow_color, rng.uniform(0.1, 0.7) * tone)
     skin = np.flatnonzero(region["face"])
     width = rng.uniform(0.0035, 0.0075)  # the line runs a little below the skin
-    strength = rng.choice([0.0, rng.uniform(0.3, 1.0)], p=[0.05, 0.95])
-    for line in (marks[17:22], marks[22:27]):
-        # Distance of each place to the polyline.
+    taper = rng.uniform(0.0, 0.6)
+    strength = rng.choice([0.0, rng.uniform(0.45, 1.0)], p=[0.05, 0.95])
+    for line in (marks[17:22], marks[26:21:-1]):
+        # Distance of each place to the polyline, from the outer end on: hairs end at the marks.
+        line = line.copy()
+        for end, beside in ((0, 1), (-1, -2)):
+            inwards = line[beside] - line[end]
+            line[end] += inwards * min(0.5, 0.6 * width / np.linalg.norm(inwards))
         start, along = line[:-1], np.diff(line, axis=0)
         relative = rest[skin][:, None] - start[None]
         share = (relative * along).sum(2) / np.maximum((along**2).sum(1), 1e-12)
-        off = relative - np.clip(share, 0, 1)[..., None] * along
-        near = np.linalg.norm(off, axis=2).min(1)
+        off = np.linalg.norm(relative - np.clip(share, 0, 1)[..., None] * along, axis=2)
+        place = (np.abs(rest[skin, 0]) - abs(line[-1, 0])) / abs(line[0, 0] - line[-1, 0])
         ragged = 1 + 0.4 * waves(rest[skin], rng, 8, 300.0, 1500.0)
+        ragged *= 1 - taper * np.clip(place, 0.0, 1.0)
         hairs = np.clip(1 + rng.uniform(0, 0.7) * waves(rest[skin], rng, 12, 1e3, 4e3), 0.0, 1.0)
-        inside = np.clip((near - width * ragged) / 0.001, -30.0, 30.0)
+        inside = np.clip((off.min(1) - width * ragged) / 0.001, -30.0, 30.0)
         amount = strength * hairs / (1 + np.exp(inside))
         colors[skin] = _mix(colors[skin], brow_color, amount)
     for side in ("left", "right"):

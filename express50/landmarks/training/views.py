@@ -64,8 +64,9 @@ def open_views(
 ) -> list[TrainingView]:
     """Read one file of `FILE_VIEWS` views, which is rendered if it is not there yet."""
     rng = np.random.default_rng([seed, number, *model.name.encode()])
-    # Other heads or other dense points make other files.
-    made_of = b"".join(np.ascontiguousarray(part).tobytes() for part in (model.template, *places))
+    # Other heads, landmarks or dense points make other files.
+    parts = (model.template, model.landmark_faces, model.landmark_bary, *places)
+    made_of = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
     digest = hashlib.sha256(made_of).hexdigest()[:8]
     path = folder / f"{model.name}-{digest}-{seed}-{number:03d}.npz"
     return made_once(path, TrainingView, lambda: draw_views(model, FILE_VIEWS, rng, places))
