@@ -18,9 +18,9 @@ from express50.geometry.transforms import (
 
 SHARE = 0.01  # of a focal length, an image's side or the rig's size that may differ
 TURN_DEG = 1.0
-SAME = 1e-7  # metres and parts of 1: what is nearer to the identity is rounding
+SAME = 1e-7  # metres and parts of 1; a motion closer to the identity is rounding
 
-# What a matrix of a pose may be in the place of what it should be.
+# Common mistakes in pose matrices: the advice, and the change that would make them fit.
 _MISREADINGS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "its matrices have OpenCV's axes; give --axes opencv": lambda pose: FLIP_YZ @ pose,
     "its matrices are world to camera, expected camera to world": (
@@ -77,8 +77,8 @@ def _check_intrinsics(theirs: Camera, ours: Camera, where: str) -> None:
     middle = [(size, scale * padded), (centre, scale * padded / 2)]
     square = abs(theirs.K[1, 1] / theirs.K[0, 0] / (ours.K[1, 1] / ours.K[0, 0]) - 1) <= SHARE
     # Canvases are whole and even numbers of pixels.
-    room = SHARE * size.max() + 4
-    fits = any(all(np.abs(a - b).max() <= room for a, b in pairs) for pairs in (plain, middle))
+    slack = SHARE * size.max() + 4
+    fits = any(all(np.abs(a - b).max() <= slack for a, b in pairs) for pairs in (plain, middle))
     if not fits or not (square or np.abs(centre - size / 2).max() < 1e-6):
         raise CalibrationError(
             f"{where}: focal length {theirs.K[0, 0]:.1f} px in {theirs.width}x{theirs.height}"

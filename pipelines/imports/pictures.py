@@ -173,7 +173,9 @@ def check_depths(
     for change, words in ((np.divide, "give --ray"), (np.multiply, "leave --ray out")):
         changed = {n: change(depth, ray_lengths(cameras[n])) for n, depth in depths.items()}
         if (agreement(cameras, changed, FINE_M) or 0.0) > closely + FINER_SHARE:
-            raise StageError(f"{where}: views agree better otherwise; {words}")
+            raise StageError(
+                f"{where}: views agree better with depth measured the other way; {words}"
+            )
     return round(share, 4)
 
 
