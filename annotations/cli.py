@@ -60,7 +60,7 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
         parser.add_argument("--json", action="store_true", help="print JSON")
         if "subjects" in shared:
             parser.add_argument(
-                "--subject", action="append", metavar="ID", help="only this; repeatable"
+                "--subject", action="append", metavar="ID", help="only this one; may be repeated"
             )
         if "clip" in shared:
             parser.add_argument("subject", metavar="SUBJECT")
@@ -68,7 +68,7 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
         if "annotator" in shared:
             parser.add_argument(
                 "--annotator", type=person, default=getpass.getuser(), metavar="NAME",
-                help="you by default",
+                help="annotator's name (default: your login)",
             )  # fmt: skip
         parser.set_defaults(handler=handler)
         return parser
@@ -78,14 +78,19 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
     parser = add(
         "reference",
         run_reference,
-        "print or choose the reference person, to whom the others are matched",
+        "print or choose the reference person, whose frames all others are matched to",
     )
     parser.add_argument("subject", nargs="?", metavar="SUBJECT", help="new reference")
     words = "label by RenderMe-360's rule: the last frame of a clip is its peak"
     add("rule", run_rule, words, "subjects").add_argument(
-        "--expression", action="append", metavar="ID", help="repeatable; e0 to e11 by default"
+        "--expression",
+        action="append",
+        metavar="ID",
+        help="only this one; may be repeated (default: e0 to e11)",
     )
-    parser = add("exclude", run_exclusion, "leave a subject out, with the reason", "annotator")
+    parser = add(
+        "exclude", run_exclusion, "leave a subject out, and record the reason", "annotator"
+    )
     parser.add_argument("subject", metavar="SUBJECT")
     parser.add_argument("reason", metavar="REASON", help="heavy makeup, large glasses, ...")
     parser = add("include", run_exclusion, "include an excluded subject again", "annotator")
@@ -101,7 +106,9 @@ def _add_labelling_verbs(add: Callable[..., argparse.ArgumentParser]) -> None:
     parser = add("ui", run_ui, "label peak frames in the terminal", "annotator")
     parser.add_argument("--subjects", metavar="GLOB", help="only these subjects")
     parser.add_argument("--expressions", metavar="GLOB", help="only these expressions")
-    parser.add_argument("--order", choices=ORDERS, default="doubt", help="what comes first")
+    parser.add_argument(
+        "--order", choices=ORDERS, default="doubt", help="order of the tasks [%(default)s]"
+    )
     parser.add_argument(
         "--blind", action="store_true", help="hide suggestions and others' marks until you decide"
     )
@@ -129,30 +136,40 @@ def _add_labelling_verbs(add: Callable[..., argparse.ArgumentParser]) -> None:
     parser.add_argument("reason", metavar="REASON", help=", ".join(FLAG_REASONS) + ", ...")
     words = "undo your last event on an expression"
     add("undo", run_undo, words, "clip", "annotator")
-    add("labels", run_labels, "every label in force", "subjects")
+    add("labels", run_labels, "list every label in force", "subjects")
 
 
 def _add_reviewing_verbs(add: Callable[..., argparse.ArgumentParser]) -> None:
     words = "check labels against the footage and each other; exit code 1 when one is wrong"
     add("validate", run_validate, words, "subjects")
-    words = "how well annotators agree, overall, by expression and by pair"
+    words = "show how well annotators agree: overall, by expression and by pair"
     add("agree", run_agree, words, "subjects")
     parser = add("review", run_review, "list disagreements, or settle one", "subjects", "annotator")
     parser.add_argument(
-        "--beyond", type=int, default=2, metavar="FRAMES", help="marks so close agree [2]"
+        "--beyond",
+        type=int,
+        default=2,
+        metavar="FRAMES",
+        help="marks at most this far apart agree [2]",
     )
-    parser.add_argument("--all", action="store_true", help="also settled ones")
+    parser.add_argument("--all", action="store_true", help="list settled ones too")
     parser.add_argument(
         "--settle", nargs=3, metavar=("SUBJECT", "EXPRESSION", "VERDICT"),
-        help="verdict: a frame, the annotator who is right, or the reason for a flag: "
+        help="VERDICT is a frame, the annotator who is right, or the reason for a flag: "
         f"{', '.join(FLAG_REASONS)}, or flag:REASON",
     )  # fmt: skip
-    add("coverage", run_coverage, "print a table of subjects and expressions, with the gaps")
-    add("status", run_status, "show how far each subject is, and what labels cost")
+    add(
+        "coverage",
+        run_coverage,
+        "print a table of subjects and expressions that shows what is missing",
+    )
+    add("status", run_status, "show how many labels each subject has, and the time they took")
     words = "write a contact sheet of all labels, or of a subject or expression, as one HTML file"
     parser = add("sheet", run_sheet, words, "subjects")
     parser.add_argument("file", type=Path, metavar="OUT.html")
-    parser.add_argument("--expression", action="append", metavar="ID", help="only this; repeatable")
+    parser.add_argument(
+        "--expression", action="append", metavar="ID", help="only this one; may be repeated"
+    )
     parser.add_argument("--camera", metavar="ID", help="show this camera (default: the label's)")
     parser.add_argument(
         "--around", type=int, metavar="N",

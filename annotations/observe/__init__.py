@@ -62,7 +62,7 @@ STAGE = Stage(
     items=Dataset.subjects,
     inputs=inputs,
     run=run,
-    help="watch the face through every cue window (align runs it first)",
+    help="find the face in every frame of the cue windows (align runs this first)",
     purpose="The cameras that watch the face through the cue windows.",
     growth=Growth(items=("subjects",), time=("frames",), disk=("frames",)),
 )

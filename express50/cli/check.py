@@ -21,7 +21,7 @@ def add_commands(subparsers: Any) -> None:
         subparsers,
         "check",
         run_check,
-        "audit a dataset against its ledger, and fix it",
+        "compare a dataset with its ledger, and repair it",
         description="Compares every output with what was published (presence and size; SHA-256 if\n"
         "the modification time differs; --deep reads every byte) and with the present\n"
         "inputs and settings. Looks for unfinished and unknown outputs, labels of frames\n"

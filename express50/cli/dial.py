@@ -36,9 +36,10 @@ def add_commands(subparsers: Any) -> None:
     """Add ``tune``, and ``--budget`` and ``--error`` to ``run``."""
     run = subparsers.choices["run"]
     words = "choose the settings that fit in this time: 45m, 2h, 1h30m; 40ch means core hours; "
-    words += "without --preset and --print-job"
+    words += "not with --preset or --print-job"
     run.add_argument("--budget", metavar="TIME", help=words)
-    words = "choose the quickest settings with this expected error, such as 0.5mm; likewise"
+    words = "choose the quickest settings with this expected error, such as 0.5mm; "
+    words += "not with --preset or --print-job"
     run.add_argument("--error", metavar="ERROR", help=words)
     run.set_defaults(handler=run_chain)
     words = "measure the error of the whole chain against its time on this dataset"

@@ -23,29 +23,29 @@ def add_commands(subparsers: Any) -> None:
         "write tracked heads for other tools",
         description="Writes tracked heads as a GaussianAvatars data set or as meshes.",
         example="express50 export data/mine out --format gaussian-avatars --subject S001\n"
-        "writes OUT/<subject>/, replacing a former export of the subject whole",
+        "writes OUT/<subject>/; an earlier export of the subject is replaced",
     )
     add = parser.add_argument
-    add("out", type=Path, metavar="OUT", help="folder that gets one per subject")
+    add("out", type=Path, metavar="OUT", help="folder to write to, one folder per subject")
     add("--format", required=True, choices=FORMATS, help="what to write")
     for name in ("subject", "expression"):
         words = f"only this {name}; may be repeated"
         add(f"--{name}", action="append", default=[], metavar="ID", help=words)
-    words = "clips: a mesh of every tracked frame (track.frames=clips, or a video's) [peaks]"
+    words = "clips: a mesh per tracked frame (needs track.frames=clips, or a video) [peaks]"
     add("--frames", choices=("peaks", "clips"), default="peaks", help=words)
-    add = parser.add_argument_group("of gaussian-avatars").add_argument
-    words = "what is behind the head in the pictures [alpha: they keep their opacity]"
+    add = parser.add_argument_group("with --format gaussian-avatars").add_argument
+    words = "background of the pictures [alpha: pictures with opacity]"
     add("--background", choices=("alpha", "white", "black"), default="alpha", help=words)
-    words = "masks without the torso, by the regions stage"
+    words = "masks without the torso, from the regions stage"
     add("--head-only", action="store_true", help=words)
-    add("--downscale", type=int, default=1, metavar="N", help="pictures N times smaller [1]")
-    words = "divide the cameras' colour gains, measured by calibrate, out of the pictures"
+    add("--downscale", type=int, default=1, metavar="N", help="make pictures N times smaller [1]")
+    words = "divide out the cameras' colour gains that calibrate measured on a board"
     add("--even-colour", action="store_true", help=words)
-    words = "held back for testing; may be repeated [the last three tenths]"
+    words = "expression to hold back for testing; may be repeated [the last three tenths]"
     add("--test-expression", action="append", metavar="ID", help=words)
-    add("--validation-camera", metavar="ID", help="held back in training [the last]")
+    add("--validation-camera", metavar="ID", help="camera to hold back in training [the last]")
 
-    words = "gather QC into one self-contained HTML page"
+    words = "write one self-contained HTML page of results and pictures"
     parser = add_command(subparsers, "report", run_report, words, description=run_report.__doc__)
     parser.add_argument("--out", type=Path, help="folder of the page (default: DATASET/report)")
     parser.add_argument("--title", help="heading of the page")
@@ -59,13 +59,13 @@ def add_commands(subparsers: Any) -> None:
         dataset=False,
         json=False,
         example="express50 head preview build/head.png --yaws 0,40,90\n"
-        "one row per pose (those that the model has the controls for), one column per yaw",
+        "the picture has a row per pose that the model can take, and a column per yaw",
     )
     add = parser.add_argument
     add("out", type=Path, metavar="OUT", help="picture to write (.png or .jpg)")
-    words = "head model, as load_head takes it [procedural]"
+    words = "head model: procedural, or the path of a FLAME, ICT-FaceKit or .npz file [procedural]"
     add("--model", default="procedural", help=words)
-    words = "sides to look from, degrees to the subject's left [0,40,90]"
+    words = "directions to look from, degrees to the subject's left [0,40,90]"
     add("--yaws", default="0,40,90", metavar="DEG,...", help=words)
     add("--size", type=int, default=256, help="side of a picture, pixels [256]")
 
@@ -132,7 +132,7 @@ def _lines(account: dict) -> list[str]:
 
 
 def run_report(args: argparse.Namespace) -> int:
-    """Write DATASET/report/index.html from what the stages left behind."""
+    """Write DATASET/report/index.html from the stages' outputs."""
     from express50.dataset.report import render_page
     from express50.files.atomic import write_bytes
 

@@ -81,18 +81,21 @@ def add_commands(subparsers: Any) -> None:
         "(--also) separates the costs that grow with the footage from the others.",
         example="express50 plan DATASET --also OTHER --target express-50 --workers 32",
     )
-    words = "another measured dataset, of another size (repeatable)"
+    words = "another measured dataset, of another size; may be repeated"
     parser.add_argument(
         "--also", type=Path, action="append", default=[], metavar="DATASET", help=words
     )
     parser.add_argument("--target", choices=list(TARGETS), help="a named campaign")
-    words = "of the campaign (default: as in --target, else as measured)"
     for name in SIZES:
+        what = name.replace("_", " ")
+        words = f"{what} of the campaign (default: as in --target, else as measured)"
         flag = f"--{name.replace('_', '-')}"
         parser.add_argument(flag, type=int, metavar="N", help=words)
-    parser.add_argument("--size", metavar="WxH", help="pixels of the campaign's cameras")
     parser.add_argument(
-        "--workers", type=int, default=1, metavar="N", help="cores that work (default 1)"
+        "--size", metavar="WxH", help="picture size of the campaign's cameras, pixels"
+    )
+    parser.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="cores to use (default 1)"
     )
 
 

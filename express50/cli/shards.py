@@ -12,7 +12,9 @@ from express50.errors import FormatError
 
 def add_commands(subparsers: Any) -> None:
     """Add the ``shards`` command."""
-    parser = subparsers.add_parser("shards", help="look into packed shards and verify them")
+    parser = subparsers.add_parser(
+        "shards", help="verify, list, show, split or merge packed shards"
+    )
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     words = "check every file and member against checksums"
     verify = add_command(actions, "verify", run_verify, words, dataset=False)
@@ -37,10 +39,10 @@ def add_commands(subparsers: Any) -> None:
     for name in ("subject", "expression", "camera"):
         split.add_argument(f"--{name}", action="append", help="only this; may be repeated")
     for action in (listing, split):
-        action.add_argument("--split", help="only this split")
+        action.add_argument("--split", help="only samples of this split")
     for action in (split, merge):
         action.add_argument("out", type=Path, metavar="OUT", help="empty or absent folder")
-        action.add_argument("--shard-mb", type=int, default=256, help="size of a shard")
+        action.add_argument("--shard-mb", type=int, default=256, help="size of a shard, MB [256]")
 
 
 def run_split(args: argparse.Namespace) -> int:

@@ -37,7 +37,7 @@ def add_commands(subparsers: Any) -> None:
     add_run_options(parser, captures=True)
     parser.add_argument("--first", metavar="STAGE", choices=names, help="first stage to run")
     parser.add_argument("--last", metavar="STAGE", choices=names, help="last stage to run")
-    words = "print the configuration of stages as TOML"
+    words = "print the settings of stages as TOML"
     parser = add_command(subparsers, "config", show_config, words, dataset=False, json=False)
     parser.add_argument("stage", nargs="*", metavar="STAGE", help="stages to print; all by default")
     add_config_options(parser)

@@ -63,8 +63,8 @@ FLAG: dict[str, Any] = {"action": "store_true"}
 REPEATED: dict[str, Any] = {"action": "append", "default": []}
 OPTIONS: dict[str, dict[str, Any]] = {
     # Positional
-    "checkpoint": {"type": Path, "help": "checkpoint.pt of 'grmm train' or 'fit'"},
-    "renders": {"type": Path, "help": "SUBJECT_EXPRESSION_CAMERA.png, as packed"},
+    "checkpoint": {"type": Path, "help": "checkpoint.pt of 'grmm train' or 'grmm fit'"},
+    "renders": {"type": Path, "help": "folder of SUBJECT_EXPRESSION_CAMERA.png, size as packed"},
     "shards": {"type": Path, "help": "folder of shards"},
     "out": {"type": Path, "help": "folder for evaluation.csv and evaluation.json"},
     "table": {"nargs": "*", "help": f"{', '.join(TABLES)}; default: all"},
@@ -77,9 +77,9 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--config": {"type": Path, "help": "TOML file; replaces values of the preset"},
     "--set": REPEATED | {
         "metavar": "TABLE.KEY=VALUE",
-        "help": "set one value, such as train.lr=1e-3; overrides preset and file; repeatable",
+        "help": "set one value, such as train.lr=1e-3; overrides preset and file; may be repeated",
     },
-    "--also": REPEATED | {"type": Path, "metavar": "SHARDS", "help": "more shards; repeatable"},
+    "--also": REPEATED | {"type": Path, "metavar": "SHARDS", "help": "further shards; repeatable"},
     "--seconds": {"type": parse_seconds, "help": "stop after this long: 240, 4m, 2h"},
     "--holdout-cameras": {"default": "", "help": "camera ids to test on: cam02,cam05"},
     "--holdout-expressions": {
@@ -96,26 +96,38 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--images": {"type": at_least(0), "default": 0, "help": "at most this many, 0 = all"},
     "--heldout": FLAG | {"help": "leave out what training saw"},
     "--save": {"type": Path, "metavar": "FOLDER", "help": "write pictures for 'score'"},
-    "--fit-subjects": {"default": "", "help": "default: all not trained"},
+    "--fit-subjects": {
+        "default": "", "help": "people to fit (default: all that training did not see)",
+    },
     "--fit-cameras": {"default": "", "help": "fit unseen people from these views"},
-    "--fit-expression": {"default": "neutral", "help": "and this expression"},
-    "--fit-budget": {"type": parse_seconds, "help": "time for a fit: 60s, 5m"},
+    "--fit-expression": {
+        "default": "neutral", "help": "fit from this expression (neutral)",
+    },
+    "--fit-budget": {"type": parse_seconds, "help": "time per fit: 60s, 5m"},
     "--background": {"type": float, "default": 0.0, "help": "grey, 0 to 1"},
-    "--partial": FLAG | {"help": "score the pictures that exist"},
+    "--partial": FLAG | {"help": "score only the pictures that exist"},
     "--seeds": {"type": at_least(1), "default": 1, "help": "train each row this many times (1)"},
-    "--test": REPEATED | {"type": Path, "metavar": "SHARDS", "help": "fit their people only"},
-    "--rows": {"default": "", "help": "full,no_residuals,..; default: all"},
+    "--test": REPEATED | {
+        "type": Path, "metavar": "SHARDS", "help": "shards whose people are fitted, not trained on",
+    },
+    "--rows": {"default": "", "help": "rows of the table, full,no_residuals,.. (default: all)"},
     "--json": FLAG | {"help": "print the result as JSON"},
     # A head and what is drawn of it
-    "--subject": {"help": "default: the first of the checkpoint"},
-    "--expression": {"help": "default: neutral, else the first"},
-    "--expression-of": {"metavar": "SUBJECT/EXPRESSION", "help": "transfer its expression"},
-    "--z-id-of": {"metavar": "SUBJECT", "help": "residual identity code only"},
-    "--z-exp-of": {"metavar": "EXPRESSION", "help": "residual expression code only"},
+    "--subject": {"help": "person to show (default: the first of the checkpoint)"},
+    "--expression": {"help": "expression to show (default: neutral, else the first)"},
+    "--expression-of": {
+        "metavar": "SUBJECT/EXPRESSION", "help": "transfer the expression of this training frame",
+    },
+    "--z-id-of": {
+        "metavar": "SUBJECT", "help": "use only this person's residual identity code",
+    },
+    "--z-exp-of": {
+        "metavar": "EXPRESSION", "help": "use only this expression's residual code",
+    },
     "--control": REPEATED | {
         "metavar": "NAME=NUMBERS",
         "help": "jaw=0.3,0,0  neck.1=0.2  eyes=0,0.3,0  expression.NAME=1  shape.0=2  "
-        "z_exp=0 (scale)  z_id.0=1.5 (principal direction, deviations); repeatable",
+        "z_exp=0 (scale)  z_id.0=1.5 (principal direction, deviations); may be repeated",
     },
     "--camera": {"help": "a camera of the checkpoint; default: the frontal one"},
     "--size": {
@@ -123,31 +135,35 @@ OPTIONS: dict[str, dict[str, Any]] = {
     },
     "--yaw": {"type": float, "default": 0.0, "help": "degrees the camera moves around the head"},
     "--pitch": {"type": float, "default": 0.0, "help": "degrees the camera moves up"},
-    "--turntable": FLAG | {"help": "turntable.mp4"},
-    "--degrees": {"type": float, "default": 360.0, "help": "how far the turntable goes"},
-    "--frames": {"type": at_least(1), "default": 72, "help": "frames of a video"},
-    "--to": {"metavar": "SUBJECT/EXPRESSION", "help": "interpolation.mp4 ending there"},
+    "--turntable": FLAG | {"help": "write turntable.mp4"},
+    "--degrees": {"type": float, "default": 360.0, "help": "angle that the turntable covers"},
+    "--frames": {"type": at_least(1), "default": 72, "help": "number of frames of a video"},
+    "--to": {"metavar": "SUBJECT/EXPRESSION", "help": "write interpolation.mp4, which ends there"},
     "--drive": {
-        "type": Path, "metavar": "SEQUENCE.NPZ", "help": "driven.mp4: moved as tracked clips are",
+        "type": Path, "metavar": "SEQUENCE.NPZ", "help": "write driven.mp4: move as these clips do",
     },
     "--drive-cue": {"metavar": "ID", "help": "only this clip of --drive"},
-    "--views": FLAG | {"help": "views.jpg: novel views"},
-    "--controls": FLAG | {"help": "controls.jpg: one thing at a time"},
-    "--samples": {"type": at_least(0), "default": 0, "help": "samples.jpg: new heads, this many"},
-    "--spread": {"type": float, "default": 1.0, "help": "of samples, 1 = as trained"},
-    "--seed": {"type": int, "default": 0, "help": "of what is drawn at random"},
-    "--columns": {"type": at_least(1), "default": 8, "help": "expressions in grid.jpg"},
-    "--format": {"choices": commands.FORMATS, "help": "default: what the file's name ends in"},
+    "--views": FLAG | {"help": "write views.jpg: novel views"},
+    "--controls": FLAG | {"help": "write controls.jpg: each control changed alone"},
+    "--samples": {
+        "type": at_least(0), "default": 0, "help": "write samples.jpg with this many new heads",
+    },
+    "--spread": {
+        "type": float, "default": 1.0, "help": "spread of the samples, 1 = as in training",
+    },
+    "--seed": {"type": int, "default": 0, "help": "seed of random choices"},
+    "--columns": {"type": at_least(1), "default": 8, "help": "number of expressions in grid.jpg"},
+    "--format": {"choices": commands.FORMATS, "help": "format (default: from the file name)"},
     "--shards": {"type": Path, "help": ".html: measure the loss on this footage"},
-    "--still": {"type": at_least(16), "default": 512, "help": "height once they rest, pixels"},
+    "--still": {"type": at_least(16), "default": 512, "help": "height of still pictures, pixels"},
     "--host": {"default": "127.0.0.1", "help": "address to listen on (this machine)"},
     "--port": {"type": at_least(1, 65535), "default": 8080},
     # Studies
-    "--reference": {"type": Path, "required": True, "help": "pictures of the truth"},
-    "--ours": {"type": Path, "required": True, "help": "a method's pictures, named alike"},
-    "--theirs": {"type": Path, "required": True, "help": "the other method's"},
+    "--reference": {"type": Path, "required": True, "help": "true pictures"},
+    "--ours": {"type": Path, "required": True, "help": "a method's pictures, with the same names"},
+    "--theirs": {"type": Path, "required": True, "help": "the other method's pictures"},
     "--names": {"nargs": 2, "default": ["Ours", "Theirs"], "metavar": "NAME"},
-    "--examples": {"type": int, "default": 15, "help": "a participant sees (15)"},
+    "--examples": {"type": int, "default": 15, "help": "examples per participant (15)"},
     "--participants": {"type": int, "default": 20},
 }  # fmt: skip
 ALIASES = {"--seconds": ["--budget"]}
@@ -197,23 +213,26 @@ COMMANDS = {
         "--cameras cam02,cam03 --budget 60s",
         changes={
             "out": {"help": "folder for checkpoint.pt, metrics.json, pictures"},
-            "--subject": {"required": True, "help": "whom to fit"},
+            "--subject": {"required": True, "help": "person to fit"},
             "--expression": {"default": "*", "help": PATTERNS},
-            "--set": {"metavar": "fit.KEY=VALUE", "help": "one setting of the fit; repeatable"},
-            "--anew": {"help": "write over the fit that OUT has"},
+            "--set": {
+                "metavar": "fit.KEY=VALUE",
+                "help": "one setting of the fit; may be repeated",
+            },
+            "--anew": {"help": "replace the fit in OUT"},
         },
     ),
     "config": GrmmCommand(
         handler=commands.config,
         options=f"table {TRAINING} --paper-diff",
-        help="print every setting with its meaning, as --config takes them",
+        help="print every setting with its meaning, in the form that --config reads",
         example="grmm config train fit --preset demo",
     ),
     "render": GrmmCommand(
         handler=commands.render,
         options=f"checkpoint out {EDIT} --yaw --pitch --turntable --degrees --frames --to --drive "
         "--drive-cue --views --controls --samples --spread --seed --columns",
-        help="draw a head, edited as asked: pictures, sheets, videos",
+        help="draw a head, edited if you like, as pictures, sheets or videos",
         example="grmm render run/checkpoint.pt pictures --subject S002 --expression-of S001/smile "
         "--control jaw.0=0.2 --turntable --views",
         changes={"out": {"help": "folder for pictures and videos"}},
@@ -240,7 +259,7 @@ COMMANDS = {
             "--size": {
                 "type": at_least(16),
                 "default": 320,
-                "help": "height while things move, pixels",
+                "help": "height while the picture moves, pixels",
             }  # fmt: skip
         },
     ),

@@ -43,7 +43,7 @@ STAGE = Stage(
     items=Dataset.subjects,  # a rig may be bumped between two: each has its own cameras
     inputs=inputs,
     run=run,
-    help="take or solve the cameras",
+    help="use the given cameras, or solve them from a board or the footage",
     purpose="Cameras: given, or solved from the board or the footage.",
     growth=Growth(items=("subjects",), time=("views", "pixels"), disk=("views",)),
 )

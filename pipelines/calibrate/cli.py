@@ -34,7 +34,7 @@ def add_commands(subparsers: Any) -> None:
     importing.add_argument("source", type=Path, help="file or folder of the other tool")
     importing.add_argument("out", type=Path, help="calibration.json to write")
     importing.add_argument(
-        "--overwrite", action="store_true", help="write over other cameras that OUT holds"
+        "--overwrite", action="store_true", help="replace the cameras that OUT holds"
     )
     checking = actions.add_parser("check", help="say whether a rig's cameras fit together")
     checking.set_defaults(handler=run_check)
@@ -44,7 +44,9 @@ def add_commands(subparsers: Any) -> None:
     )
     checking.add_argument("--frames", type=int, default=4, help="frame sets compared (default: 4)")
     for action in (importing, checking):
-        action.add_argument("--format", choices=FORMATS, help="what it is (default: guessed)")
+        action.add_argument(
+            "--format", choices=FORMATS, help="format of the source (default: guessed)"
+        )
         action.add_argument("--size", help="WIDTHxHEIGHT of the footage; K is scaled to it")
         action.add_argument(
             "--scale", type=float, default=1.0, help="metres per unit of its world (default: 1)"

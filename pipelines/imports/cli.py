@@ -71,7 +71,7 @@ def add_commands(subparsers: Any) -> None:
         dest="action", metavar="ACTION", required=True
     )
     for action, what in WORDS.items():
-        parser = add_command(actions, action, run_import, f"take in {what}")
+        parser = add_command(actions, action, run_import, f"import {what}")
         add = parser.add_argument
         add("pattern", metavar="PATH", help=TRACKS if action == "track" else PATTERN)
         add(

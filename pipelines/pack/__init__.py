@@ -76,7 +76,7 @@ ENCODE = Stage(
     items=included,
     inputs=encode_inputs,
     run=encode_run,
-    help="crop and encode each subject's samples (pack runs it first)",
+    help="crop and encode each subject's samples (pack runs this first)",
     purpose="Each subject's samples, cropped to the head and encoded.",
     growth=Growth(
         items=("subjects",),
@@ -93,7 +93,7 @@ STAGE = Stage(
     items=items,
     inputs=inputs,
     run=run,
-    help="write shards, splits and dataset card",
+    help="gather all samples into shards with splits and a dataset card",
     purpose="Samples packed into shards.",
     runs_first=(ENCODE.name,),
     growth=Growth(items=(), time=("subjects", "expressions", "views"), disk=("subjects",)),

@@ -57,7 +57,7 @@ def add_commands(subparsers: Any) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--windows", type=int, default=8, metavar="N",
-        help="parts of a video; a frame of each is fitted for the shape [8]",
+        help="parts of a video; one frame of each part fits the shape [8]",
     )  # fmt: skip
     parser.add_argument(
         "--matte",
