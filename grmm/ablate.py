@@ -213,7 +213,7 @@ def _row(run: Ablation, name: str, variant: Variant, seed: int) -> dict:
         if row.get("digest") == digest:
             log(f"ablate: {name}{ending} is measured")
             return row
-        log(f"ablate: {name}{ending} was measured with other settings: again")
+        log(f"ablate: {name}{ending} was measured with other settings, so it is measured again")
     folder = run.out / f"{variant.trains_as or name}{ending}"
     if not variant.trains_as:
         _train(used, folder, settings)

@@ -44,7 +44,7 @@ class ShardSource:
         self.head = str(first.get("head"))
         if first.get("torso") != "removed" and not first.get("parts"):
             log(
-                f"{root}: has no labels of parts, so shoulders count as head; to leave them out run"
+                f"{root}: has no part labels, so shoulders count as head; to leave them out, run"
                 " 'express50 regions' and pack the dataset again"
             )
         lines = (

@@ -107,7 +107,7 @@ def train(
         if state.perceptual is None:
             log("the perceptual term is off: loss.vgg16 names no weights")
         if device.type == "cpu" and not config.train.seconds and config.train.iterations > PATIENT:
-            log("this takes days on a CPU; '--preset auto --budget 1h' does what an hour allows")
+            log("this takes days on a CPU; '--preset auto --budget 1h' suits an hour")
 
     # --- The loop ------------------------------------------------------------------------------
     started, saved, cost = time.perf_counter() - state.seconds, state.seconds, 0.0

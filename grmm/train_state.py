@@ -259,7 +259,7 @@ def restore(state: TrainState, path: Path, config: Config, device: torch.device)
     state.iteration, state.seconds = loaded.loop["iteration"], loaded.loop["seconds"]
     if finished(state, config):
         log(
-            f"{path}: has all of its {state.iteration} iterations; to train on, raise "
+            f"{path}: already has all of its {state.iteration} iterations; to train on, raise "
             "train.iterations or --seconds"
         )
     else:
@@ -289,7 +289,7 @@ def append_log(path: Path, state: TrainState) -> None:
         with path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(entry) + "\n")
     except OSError as error:  # a full disk; the weights matter more than a line about them
-        log(f"{path}: a line is not written ({error})")
+        log(f"{path}: a line was not written ({error})")
 
 
 @contextlib.contextmanager

@@ -114,7 +114,7 @@ def run(
         "score_median": round(float(np.median(scores)), 4),
     }
     beyond = (e for e in cues if e not in windows)
-    return Result(metrics, [Note(e, "its cue lies beyond the footage") for e in beyond])
+    return Result(metrics, [Note(e, "its cue window is outside the footage") for e in beyond])
 
 
 def cue_frames(index: Index, cue: Cue, stride: int = 1) -> np.ndarray:

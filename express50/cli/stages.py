@@ -154,7 +154,8 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
             items = _items(stage, dataset, args, pattern)
             failed = [summary.stage for summary in summaries if not summary.ok]
             if failed and not (stage.items(dataset) if items is None else items):
-                log(f"express50: {stage.name} has nothing to do, as {failed[-1]} failed; see above")
+                why = f"because {failed[-1]} failed; see above"
+                log(f"express50: {stage.name} has nothing to do, {why}")
                 break
             summaries.append(run_stage(stage, dataset, config, items, pool=pool))
             if not args.json:

@@ -111,7 +111,7 @@ def measured_figures(
             if clock.budget is None or not clock.closed():
                 raise
             raise ConfigError(
-                f"--budget {clock.budget.text}: it ended before the footage of {subject} was"
+                f"--budget {clock.budget.text}: the time ended before the footage of {subject} was"
                 " ingested; give more"
             ) from error
         broken = broken_stage(chain, found.trials[0])

@@ -394,8 +394,9 @@ def _refuse_alike(stage: Stage, ended: list[Receipt], former: Mapping[str, Recei
     made = all(r.item in former and not former[r.item].reason for r in ended)
     if made and all(r.status == "failed" and r.reason == ended[0].reason for r in ended):
         raise StageError(
-            f"{stage.name}: the first {len(ended)} items fail alike, though they were made before:"
-            f" {ended[0].reason}; fix the setting, or run the same again to go on with the others"
+            f"{stage.name}: the first {len(ended)} items fail with the same error, though"
+            f" they worked before: {ended[0].reason}; fix the setting, or run the same command"
+            " again to continue with the others"
         )
 
 

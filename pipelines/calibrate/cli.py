@@ -65,7 +65,7 @@ def run_import(args: argparse.Namespace) -> int:
             same = False
         if not same:
             raise ConfigError(
-                f"{args.out} holds something else; write elsewhere, or over it with --overwrite"
+                f"{args.out} holds other cameras; write to another file, or add --overwrite"
             )
     if not verdict.problem:
         write_cameras(args.out, cameras)

@@ -64,7 +64,7 @@ def make_view(camera: Camera, rgb: np.ndarray, alpha: np.ndarray, side: int) -> 
     camera, rgb, alpha = reduced(camera, rgb, alpha, side)
     if not (alpha > INSIDE).any():
         raise StageError(
-            f"its matte is empty at {camera.width}x{camera.height}: it holds nothing but specks"
+            f"its matte is empty at {camera.width}x{camera.height}: it contains only specks"
         )
     alpha = repaired_matte(alpha)
     return DepthView(camera, rgb, alpha, silhouette_distance(alpha))

@@ -146,9 +146,9 @@ def check_outlines(
     found = float(np.median([edge_contrast(pictures[name], masks[name]) for name in masks]))
     if found < LEAST_CONTRAST:
         raise StageError(
-            f"{where}: the pictures are {found:.1f} times as steep at the masks' outlines as beside"
-            f" them, expected {LEAST_CONTRAST}: they are of another subject or frame, or distorted"
-            " (--distorted)"
+            f"{where}: the pictures change {found:.1f} times as fast at the masks' outlines as"
+            f" beside them, expected {LEAST_CONTRAST} or more: the masks are of another subject or"
+            " frame, or distorted (--distorted)"
         )
     return round(found, 2)
 

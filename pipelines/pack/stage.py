@@ -147,7 +147,7 @@ def _read_accounts(dataset: Dataset) -> tuple[dict[str, dict], list[Note]]:
         if (reason := exclusion_reason(dataset, name)) is not None:
             dropped.append(Note(name, f"excluded: {reason}"))
         elif not metrics.is_file():
-            dropped.append(Note(name, "not encoded; see what 'express50 encode' says of it"))
+            dropped.append(Note(name, "not encoded; run 'express50 encode' to see why"))
         else:
             accounts[name] = read_json_table(metrics, FormatError)
     return accounts, dropped

@@ -213,8 +213,8 @@ def find_faces(path: Path, images: list[np.ndarray], config: TrackConfig) -> lis
     if not faces:
         best = max(face.score for face in seen)
         raise CaptureError(
-            f"{path}: no face found (best score {best:.2f}, expected {FACE_SCORE} or more); give a "
-            "picture in which the face is seen from the front or the side, whole, and at "
+            f"{path}: no face found (best score {best:.2f}, expected {FACE_SCORE} or more); use a "
+            "picture that shows the whole face from the front or the side, at "
             f"least {config.search / 3:.0%} of the picture wide, or lower track.search"
         )
     return faces

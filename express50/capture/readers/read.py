@@ -164,8 +164,8 @@ def read_any(path: Path) -> RawCapture:
     doubled = sorted({clip for clip in raw.clips if raw.clips.count(clip) > 1})
     if doubled:
         raise CaptureError(
-            f"{path}: several sequences are the expression {', '.join(doubled)}; give each its own "
-            "id in [expressions] of capture.toml"
+            f"{path}: several sequences have the expression id {', '.join(doubled)}; give each its"
+            " own id in [expressions] of capture.toml"
         )
     calibration = {k: c for k, c in (raw.calibration or {}).items() if k in raw.cameras}
     return replace(

@@ -160,7 +160,7 @@ def test_a_chain_that_cannot_go_on_ends_with_the_cause(run, data, tmp_path):
     (tmp_path / "S002" / "cues.csv").write_text("expression_id\n")
     code, _, err = run("run", data, tmp_path / "S002", "--workers", "0")
     assert code == 1
-    assert "calibrate has nothing to do, as ingest failed" in err.splitlines()[-1]
+    assert "calibrate has nothing to do, because ingest failed" in err.splitlines()[-1]
 
 
 def test_a_dataset_in_the_place_of_a_capture_is_refused(run, data, capture):

@@ -280,7 +280,7 @@ def test_a_setting_that_every_item_fails_by_stops_after_a_few(tmp_path, workers)
     names = [f"a{n}" for n in range(8)]
     dataset = make_dataset(tmp_path / "data", names)
     run_toy(dataset)
-    with pytest.raises(StageError, match="first 3 items fail alike, though they were made before"):
+    with pytest.raises(StageError, match="first 3 items fail with the same error, though they"):
         run_toy(dataset, workers=workers, files=-1)
     assert set(statuses(run_toy(dataset)).values()) == {"skipped"}
 
