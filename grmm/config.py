@@ -126,7 +126,7 @@ class DataConfig:
     background: float = 0.0
     """Grey behind footage and renderings, sRGB in [0, 1]. G15."""
     skip_hidden_neck: bool = False
-    """Do not count pixels in which the torso stands before the neck: each camera looks a different
+    """Do not count pixels where the torso is in front of the neck: each camera looks a different
     way behind the collar. In the paper they are background, which contradicts other views."""
 
     def __post_init__(self) -> None:
@@ -154,7 +154,7 @@ class TrainConfig:
     final_lr: float = 1.0
     """Last rate over the first, reached along a half cosine. G16."""
     warm_start: bool = False
-    """Start from the footage's mean texture, not from grey. G17."""
+    """Start from the footage's mean texture instead of grey. G17."""
     accumulate: int = 1
     """Views whose gradients are averaged per step; 4 stands for the paper's four GPUs."""
     seed: int = 0

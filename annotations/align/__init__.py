@@ -22,9 +22,9 @@ class AlignConfig:
     """Settings of the align stage."""
 
     accept: float = 0.0
-    """Accept suggestions at least this sure without a person, 0 (all) to 1 (none)."""
+    """Accept suggestions with at least this confidence without a person, 0 (all) to 1 (none)."""
     match: bool = True
-    """Match to the reference identity's canonical frames; off, take each subject's own peak."""
+    """Match to the reference person's canonical frames; false takes each subject's own peak."""
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""

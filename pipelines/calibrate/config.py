@@ -25,7 +25,7 @@ class CalibrateConfig:
     solve_frame_sets: int = 8
     """Frame sets from which cameras are solved if there is neither a calibration nor a board."""
     distance_m: float = 1.0
-    """Rough distance of cameras from the head: where the solution from footage starts if neither
+    """Rough distance of the cameras from the head, at which solving from footage starts if neither
     EXIF nor capture.toml gives the focal lengths."""
     eye_distance_mm: float = 63.0
     """Distance between the subject's pupils, which gives a solution from footage its metre. Adult

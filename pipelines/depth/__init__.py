@@ -22,7 +22,7 @@ class DepthConfig:
     image_side: int = 1024
     """Longest side, pixels, of the images that silhouettes and photo-consistency use."""
     noise: float = 0.8
-    """Texture under this standard deviation (8-bit steps, after blurring) does not count."""
+    """Texture with a smaller standard deviation (8-bit steps, after blurring) is ignored."""
 
     def __post_init__(self) -> None:
         """Check ranges."""

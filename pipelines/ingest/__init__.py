@@ -22,7 +22,7 @@ class IngestConfig:
     proxy_quality: int = 85
     """JPEG quality of proxies, 1 to 100."""
     sync_frames: int = 8
-    """Largest number of frames by which a camera out of step is found, 1 to 100; 0: no check."""
+    """Largest offset searched for in a camera out of step, frames, 1 to 100; 0: no check."""
     focus_every: int = 24
     """Sharpness is measured in every n-th frame at full resolution, 1 or more; 0: no check."""
     blur_ratio: float = 2.0

@@ -16,8 +16,8 @@ class MatteConfig:
     """Set how each camera is matted, and whether the cameras of a peak correct each other."""
 
     method: Literal["key", "grabcut", "bgmv2", "salient"] = "key"
-    """Key against the plate, and without one cut by colours and by what the other cameras see
-    (grabcut does so everywhere), or run a network."""
+    """key: against the plate; cameras without one are cut by colours and by what the other cameras
+    see. grabcut: cut all cameras so. bgmv2, salient: run a network."""
     weights: str = ""
     """File of the network's weights, TorchScript or ONNX; such a file is a program, so trust its
     origin."""

@@ -19,9 +19,9 @@ class EncodeConfig:
     """Divide out the cameras' different response to the same light, where calibration measured
     it."""
     torso: Literal["remove", "keep"] = "remove"
-    """Alpha without or with shoulders and clothes, where the regions stage separated them."""
+    """remove: alpha leaves out shoulders and clothes, if the regions stage found them; keep: not."""
     min_confidence: float = 0.0
-    """Depth pixels with less confidence count as not valid, 0 to 1; 0.5 keeps bounds up to 2 mm."""
+    """Depth pixels with less confidence count as unknown, 0 to 1; 0.5 keeps bounds up to 2 mm."""
 
     def __post_init__(self) -> None:
         """Check ranges."""

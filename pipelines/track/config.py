@@ -28,7 +28,7 @@ class TrackConfig:
     neutral: str = "neutral"
     """Expression id of the resting face; it need not exist."""
     cameras: int = 0
-    """Cameras whose landmarks are used at the peaks, those that see the face best; 0 uses all.
+    """How many cameras' landmarks are used at the peaks, the best views of the face; 0: all.
     Clips use all."""
     search: float = 0.25
     """Smallest window searched for a face, as a share of the image's longer side. A face is found
@@ -49,7 +49,7 @@ class TrackConfig:
     texture_side: int = 512
     """Texels per side of the subject's albedo texture (albedo.png); 0 for none."""
     clip_rounds: int = 2
-    """Rounds in which a frame of a clip is fitted to its pictures; 0 for landmarks alone."""
+    """Rounds in which a frame of a clip is fitted to its pictures; 0 uses landmarks alone."""
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""

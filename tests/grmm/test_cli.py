@@ -39,9 +39,9 @@ def test_source_gives_back_what_was_packed(shards):
     assert np.abs(got.image.astype(int) - expected.image).mean() < 8  # JPEG
     np.testing.assert_array_equal(got.alpha, expected.alpha)
     np.testing.assert_allclose(got.depth, expected.depth, atol=2.6e-5)
-    np.testing.assert_array_equal(got.K, expected.K)
-    for name, value in vars(expected.tracked).items():
-        np.testing.assert_array_equal(getattr(got.tracked, name), value)
+    np.testing.assert_array_equal(got.place.K, expected.place.K)
+    for name, value in vars(expected.place.tracked).items():
+        np.testing.assert_array_equal(getattr(got.place.tracked, name), value)
 
 
 def test_what_the_camera_did_not_see_is_left_out():
