@@ -19,7 +19,7 @@ class EncodeConfig:
     """Divide out the cameras' different response to the same light, where calibration measured
     it."""
     torso: Literal["remove", "keep"] = "remove"
-    """remove: alpha leaves out shoulders and clothes, if the regions stage found them; keep: not."""
+    """remove: alpha leaves out shoulders and clothes, if regions separated them; keep: not."""
     min_confidence: float = 0.0
     """Depth pixels with less confidence count as unknown, 0 to 1; 0.5 keeps bounds up to 2 mm."""
 
