@@ -76,9 +76,9 @@ def test_rebuilt_vertices_are_the_tracked_ones(packed) -> None:
     views, seen = HeadViews(source, head), set()
     for index, key in enumerate(source.keys):
         if key.subject != "S001":
-            assert len(source.read(index).tracked.offsets) == 0
+            assert len(source.read(index).place.tracked.offsets) == 0
             continue
-        tracked = source.read(index).tracked
+        tracked = source.read(index).place.tracked
         rebuilt = views.state(index).vertices.double().numpy() @ tracked.R.T + tracked.t
         row = arrays["expressions"].tolist().index(key.expression)
         np.testing.assert_allclose(rebuilt, arrays["vertices"][row], atol=1e-6)
@@ -191,7 +191,9 @@ def test_copied_samples_keep_what_lies_beside_their_shards(packed, tmp_path) -> 
 def test_checkpoints_transfer_and_interpolation_keep_offsets(packed, tmp_path) -> None:
     root, arrays = packed
     source, head = ShardSource(root, "*"), load_head("procedural")
-    frames = {(k.subject, k.expression): source.read(i).tracked for i, k in enumerate(source.keys)}
+    frames = {
+        (key.subject, key.expression): source.place(i).tracked for i, key in enumerate(source.keys)
+    }
     one, other = frames["S001", "smile"], frames["S002", "neutral"]
     assert transfer(one, other).offsets is one.offsets
     assert len(transfer(other, one).offsets) == 0

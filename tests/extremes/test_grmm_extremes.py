@@ -164,7 +164,7 @@ def test_slerp_goes_at_constant_speed():
 
 
 def test_interpolation_of_a_frame_with_itself_is_the_frame():
-    tracked = EllipsoidSource(size=8).read(0).tracked
+    tracked = EllipsoidSource(size=8).read(0).place.tracked
     again = interpolate_tracked(tracked, tracked, 0.3)
     np.testing.assert_allclose(again.jaw, tracked.jaw, atol=1e-12)
     np.testing.assert_allclose(again.expression, tracked.expression, atol=1e-12)
