@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import open3d as o3d
 
 from express50.geometry.cameras import rays
 from express50.geometry.conventions import cell_to_corner
-from express50.geometry.raycast import mesh_scene
+from express50.geometry.raycast import camera_rays, mesh_scene
 from express50.geometry.sampling import bilinear
-from pipelines.depth.views import DepthView
+from pipelines.depth.views import DepthView, hull_distance, silhouette_distance
 
 REACH = 0.015  # metres that the hull may rise above a mesh that is believed; more is hair, cloth
 BORDER = 0.03  # metres from the mesh's open border over which belief fades in; collars are there
+BODY = 0.5  # metres that the body goes on below the neck and widens; shoulders are nearer
 NECK = 0.08  # metres; an open border larger than this is a neck, not an eye or a nostril
 # 26 directions to the neighbours of a cell, the six axes first, as a mesh hides most points there
 _CELL: np.ndarray = (
@@ -26,15 +27,26 @@ DIRECTIONS = _CELL / np.linalg.norm(_CELL, axis=1, keepdims=True)
 
 @dataclass(frozen=True)
 class TrackedSolid:
-    """A tracked mesh with caps over its holes, and those over large ones (the neck) as `border`."""
+    """A tracked mesh with caps over its holes, and those over large ones (the neck) as `border`.
+
+    `body` goes on below large holes: silhouettes of a torso are no silhouettes of a head.
+    """
 
     scene: o3d.t.geometry.RaycastingScene
     border: o3d.t.geometry.RaycastingScene | None
+    body: o3d.t.geometry.RaycastingScene
     low: np.ndarray
     high: np.ndarray
 
-    def merge(self, points: np.ndarray, hull: np.ndarray, reach: float) -> np.ndarray:
-        """Blend the solid's distances into those (N,) to the hull, where under ``reach`` metres."""
+    def merge(
+        self, points: np.ndarray, hull: np.ndarray, outlines: Sequence[DepthView], reach: float
+    ) -> np.ndarray:
+        """Blend the solid's distances into those (N,) to the hull, where under ``reach`` metres.
+
+        Where the hull of the body's own `outlines` stands far above it, no silhouette shows the
+        surface. There the surface lies no further before or behind the body than the mattes reach
+        beside it.
+        """
         within = hull < reach
         points, own = points[within], hull[within]
         distance = self.distance(points)
@@ -42,23 +54,24 @@ class TrackedSolid:
         belief = self.belief(points, distance - own)
         merged = hull.copy()
         merged[within] += belief * (np.maximum(distance, own) - own)
+        apart, beside = signed_distance(self.body, points), hull_distance(outlines, points)
+        known = 1 - np.clip((apart - beside) / REACH - 1, 0, 1)
+        limit = apart - np.maximum(beside, 0) - known * REACH
+        merged[within] = np.maximum(merged[within], limit)
         return merged
 
-    def distance(self, points: np.ndarray) -> np.ndarray:
-        """Measure signed distances (N,) float32, metres, negative inside the closed mesh.
+    def outlines(self, views: Sequence[DepthView]) -> list[DepthView]:
+        """Replace the views' mattes by the body's own."""
+        masks = [self.body.test_occlusions(camera_rays(v.camera), nthreads=1) for v in views]
+        alphas = [mask.numpy().astype(np.float32) for mask in masks]
+        return [
+            replace(view, alpha=alpha, silhouette_px=silhouette_distance(alpha))
+            for view, alpha in zip(views, alphas, strict=True)
+        ]
 
-        A point is inside if all of 26 directions hit the mesh: parity and winding tests fail on the
-        open sheets of eyes, teeth and mouth inside the skin.
-        """
-        query = o3d.core.Tensor(np.ascontiguousarray(points, np.float32))
-        gap = self.scene.compute_distance(query, nthreads=1).numpy()
-        inside = np.ones(len(points), bool)
-        for direction in DIRECTIONS:
-            left = np.flatnonzero(inside)
-            row = np.concatenate([points[left], np.broadcast_to(direction, (len(left), 3))], axis=1)
-            ray = o3d.core.Tensor(np.ascontiguousarray(row, np.float32))
-            inside[left] = self.scene.test_occlusions(ray, nthreads=1).numpy()
-        return np.where(inside, -gap, gap)
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Measure signed distances (N,) float32, metres, negative inside the closed mesh."""
+        return signed_distance(self.scene, points)
 
     def belief(self, points: np.ndarray, height: np.ndarray) -> np.ndarray:
         """Weigh the mesh, (N,) in [0, 1], at points (N, 3); the hull is ``height`` (N,) above."""
@@ -70,21 +83,53 @@ class TrackedSolid:
         return near * np.clip(edge / BORDER - 1.0, 0, 1)
 
 
+def signed_distance(scene: o3d.t.geometry.RaycastingScene, points: np.ndarray) -> np.ndarray:
+    """Measure distances (N,) float32, metres, of points (N, 3); negative inside a closed mesh.
+
+    A point is inside if all of 26 directions hit the mesh: parity and winding tests fail on the
+    open sheets of eyes, teeth and mouth inside the skin.
+    """
+    query = o3d.core.Tensor(np.ascontiguousarray(points, np.float32))
+    gap = scene.compute_distance(query, nthreads=1).numpy()
+    inside = np.ones(len(points), bool)
+    for direction in DIRECTIONS:
+        left = np.flatnonzero(inside)
+        row = np.concatenate([points[left], np.broadcast_to(direction, (len(left), 3))], axis=1)
+        ray = o3d.core.Tensor(np.ascontiguousarray(row, np.float32))
+        inside[left] = scene.test_occlusions(ray, nthreads=1).numpy()
+    return np.where(inside, -gap, gap)
+
+
 def close_mesh(vertices: np.ndarray, faces: np.ndarray) -> TrackedSolid:
     """Close the tracked mesh (V, 3), (F, 3): holes get fans to their middles."""
-    points, caps, borders = [vertices], [], []
+    points, caps, borders, below = [vertices], [], [], []
     for loop in boundary_loops(faces):
-        ring = vertices[loop]
-        middle = len(vertices) + len(points) - 1
-        points.append(ring.mean(0, keepdims=True))
-        fan = np.stack([loop, np.roll(loop, -1), np.full(len(loop), middle)], axis=1)
-        caps.append(fan)
+        ring, count = vertices[loop], sum(map(len, points))
+        middle = ring.mean(0)
+        points.append(middle[None])
+        caps.append(_fan(loop, count))
         if np.ptp(ring, axis=0).max() > NECK:
-            borders.append(fan)
-    all_points = np.concatenate(points)
-    scene = mesh_scene(all_points, np.concatenate([faces, *caps]))
-    border = mesh_scene(all_points, np.concatenate(borders)) if borders else None
-    return TrackedSolid(scene, border, vertices.min(0), vertices.max(0))
+            borders.append(caps[-1])
+            ways = (middle - vertices.mean(0), ring - middle)  # down and outward alike
+            norms = [np.linalg.norm(way, axis=-1, keepdims=True) for way in ways]
+            lower = ring + BODY * sum(
+                w / np.maximum(n, 1e-9) for w, n in zip(ways, norms, strict=True)
+            )
+            points += [lower, lower.mean(0, keepdims=True)]
+            row = count + 1 + np.arange(len(loop))
+            wall = np.stack([loop, np.roll(loop, -1), np.roll(row, -1), row], axis=1)
+            below += [wall[:, :3], wall[:, [0, 2, 3]], _fan(row, row[-1] + 1)]
+    every = np.concatenate(points)
+    scene = mesh_scene(every, np.concatenate([faces, *caps]))
+    if not borders:
+        return TrackedSolid(scene, None, scene, vertices.min(0), vertices.max(0))
+    body = mesh_scene(every, np.concatenate([faces, *caps, *below]))
+    border = mesh_scene(every, np.concatenate(borders))
+    return TrackedSolid(scene, border, body, vertices.min(0), vertices.max(0))
+
+
+def _fan(loop: np.ndarray, middle: int) -> np.ndarray:
+    return np.stack([loop, np.roll(loop, -1), np.full(len(loop), middle)], axis=1)
 
 
 def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:

@@ -89,9 +89,11 @@ def reconstruct(
     coarser = np.log(COARSE_M / fine) / np.log(LEVEL_RATIO)
     voxels = [fine * LEVEL_RATIO**k for k in reversed(range(1 + max(0, round(coarser))))]
 
+    outlines = [] if solid is None else solid.outlines(views)
+
     def start(points: np.ndarray) -> np.ndarray:
         hull = hull_distance(views, points)
-        return hull if solid is None else solid.merge(points, hull, 2 * voxels[0])
+        return hull if solid is None else solid.merge(points, hull, outlines, 2 * voxels[0])
 
     grid = build(low, high, voxels[0], start)
     for level, voxel in enumerate(voxels):

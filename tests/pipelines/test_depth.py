@@ -91,6 +91,21 @@ def test_a_tracked_mesh_4_mm_off_does_no_harm(views, shots, surface):
     assert np.median(errors_mm(moved, shots)) < np.median(errors_mm(surface, shots)) + 0.2
 
 
+@pytest.mark.parametrize(("count", "bland"), [(2, False), (2, True), (3, False)])
+def test_few_views_30_degrees_apart_keep_to_the_track(count, bland):
+    """Their hull reaches centimetres before the face, which no silhouette shows."""
+    shots = [(camera, *render(camera)) for camera in ring(count, 160, 30.0 * count)]
+    grey = [(c, np.full_like(rgb, 128) if bland else rgb, alpha) for c, rgb, alpha, _ in shots]
+    few = [make_view(*shot, 1024) for shot in grey]
+    vertices, faces = mesh()
+    wave = 0.003 * np.sin(vertices[:, [1, 2, 0]] * 50)
+    keep = (vertices[faces][:, :, 1] > -0.06).all(1)
+    error = errors_mm(reconstruct(few, close_mesh(vertices + wave, faces[keep]), QUICK), shots)
+    assert np.median(error) < (5.0 if bland else 1.5)
+    assert np.percentile(error, 90) < (20.0 if bland else 8.0)
+    assert np.percentile(error, 95) < (30.0 if bland else 16.0)
+
+
 def test_a_track_elsewhere_is_noticed(views):
     vertices, faces = mesh()
     assert matte_agreement(views, vertices, faces) > 0.97
@@ -109,17 +124,20 @@ def test_prior_counts_inner_sheets_and_capped_holes_as_inside():
     assert believed.tolist() == [1.0, 0.0]
 
 
-def test_prior_gives_way_where_the_hull_rises_far_above_it():
+def test_prior_gives_way_where_the_hull_rises_far_above_it(shots):
     """Hair and shoulders rise above the tracked mesh; they are kept whole, without a shell."""
     vertices, faces = mesh()
     prior = close_mesh(vertices, faces)
     axis = np.linspace(-0.25, 0.25, 31)
     cube = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    far = (np.linalg.norm(cube, axis=-1) - 0.2).astype(np.float32)
-    np.testing.assert_array_equal(prior.merge(cube, far, 0.02), far)
+    far = (np.linalg.norm(cube, axis=-1) - 0.15).astype(np.float32)
+    outlines = prior.outlines([make_view(*shot[:3], 1024) for shot in shots])
+    kept = prior.merge(cube, far, outlines, 0.02) < 0
+    assert kept.sum() > 0.98 * (far < 0).sum()
+    assert not (kept & (far >= 0)).any()
     own = prior.distance(cube)
     near = (own - 0.01).astype(np.float32)
-    merged = prior.merge(cube, near, 0.02)
+    merged = prior.merge(cube, near, outlines, 0.02)
     np.testing.assert_allclose(merged[near < 0.02], own[near < 0.02], atol=1e-6)
     np.testing.assert_array_equal(merged[near >= 0.02], near[near >= 0.02])
 
