@@ -155,6 +155,8 @@ def measure_all(out: Path, runs: Sequence[Run], truth: Truth | None) -> None:
 def true_errors(dataset: Dataset, truth: Truth) -> dict[str, float]:
     """Return the typical error of each result's items, in the measure that its stage states."""
     rows: dict[str, list[float]] = {}
+    if not all(dataset.peaks_file(subject).is_file() for subject in truth.subjects()):
+        return {}  # the run ended before
     for sample in (*row_samples(dataset, truth), *peak_samples(dataset, truth)):
         typical = np.mean if sample.stage == "matte" else np.median
         rows.setdefault(MAKERS[sample.stage], []).append(float(typical(sample.errors)))
@@ -163,6 +165,8 @@ def true_errors(dataset: Dataset, truth: Truth) -> dict[str, float]:
 
 def figures(runs: Sequence[Run], grid: Sequence[Run], true: bool) -> dict:
     """Compute the figures of the issue from all runs."""
+    unfinished = [run.name for run in runs if not run.errors]
+    runs = [run for run in runs if run.errors]
     everyone = [*runs, *grid]
     scale = {
         name: max(float(np.median([r.errors[name] for r in everyone if name in r.errors])), 1e-9)
@@ -191,6 +195,7 @@ def figures(runs: Sequence[Run], grid: Sequence[Run], true: bool) -> dict:
         "promise_kept_percent": round(100 * float(np.mean(kept)), 1) if kept else None,
         "promises": len(kept),
         "time_saved_percent": saved(runs, grid, final),
+        "unfinished": unfinished,
         "runs": [vars(run) for run in everyone],
     }
 

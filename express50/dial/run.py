@@ -50,6 +50,7 @@ from express50.runner.runner import Summary, run_stage
 PILOT_SHARE = 0.1  # of the budget, for trials that are not what the run makes anyway
 SAFETY = 0.95  # of the time left is planned with: what items take varies
 BELIEVED = 0.1  # of the expected time must have passed before its speed changes choices
+GRACE = 0.1  # of the budget by which a run may end late rather than stop with nothing made
 PILOTS = 3  # subjects whose footage is tried if the first one's is bad
 
 
@@ -332,8 +333,11 @@ def _run_one(run: _Run, stage: Stage) -> Summary | None:
         min(stage_seconds(load, other, one) for one in labels_of(load, other.name))
         for other in chain.stages[chain.names.index(stage.name) + 1 :]
     )
-    slow = run.slowness()
-    clock.expect(item * slow, rest * slow if clock.budget else 0.0)
+    slow, early = run.slowness(), 0.0
+    if clock.budget:
+        own = stage_seconds(load, stage, label) * slow
+        early = reserved(own, rest * slow, clock.left(), clock.budget.seconds)
+    clock.expect(item * slow, early)
     before = clock.now()
     if not stage.items(chain.dataset):  # an earlier stage made nothing
         return None
@@ -344,6 +348,16 @@ def _run_one(run: _Run, stage: Stage) -> Summary | None:
         run.real += clock.now() - before
         run.expected += stage_seconds(load, stage, label, min(1.0, made / items))
     return summary
+
+
+def reserved(own: float, rest: float, left: float, budget: float) -> float:
+    """Return the seconds that a stage must leave to those after it.
+
+    Where its own seconds and the rest are over the time left by a tenth of the budget at most, the
+    run goes on and ends late rather than with nothing made.
+    """
+    short = own + rest - left
+    return rest - short if 0 < short <= GRACE * budget else rest
 
 
 def error_text(name: str, error: Expected) -> str:

@@ -10,7 +10,7 @@ from express50.contract.layout import Dataset
 from express50.dial.budget import Clock, parse_budget, parse_goal
 from express50.dial.figures import Cost, Footage, Trial, dial_dir
 from express50.dial.pilot import Pilot, pilot_dir, spare_seconds, trial_seconds
-from express50.dial.run import closing_lines, run_within
+from express50.dial.run import closing_lines, reserved, run_within
 from express50.dial.tune import tune
 from express50.errors import ConfigError, StageError
 from express50.runner.runner import run_stage
@@ -207,6 +207,12 @@ def test_time_that_runs_out_leaves_items_for_a_larger_budget(tmp_path, captures,
     monkeypatch.setenv(PAUSE, "0.001")
     summaries, state = one_setting("6s")
     assert state.finished and summaries[-1].count("skipped") == made < 12
+
+
+def test_a_run_that_is_a_little_short_of_time_goes_on():
+    assert reserved(own=5, rest=20, left=30, budget=40) == 20
+    assert reserved(own=5, rest=20, left=22, budget=40) == 17  # late by 3 of 40
+    assert reserved(own=5, rest=20, left=20, budget=40) == 20  # by 5: what is left is not begun
 
 
 def test_one_item_is_enough(tmp_path):
