@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import functools
 import json
 import resource
 import sys
@@ -112,6 +114,8 @@ def run_task(task: Task) -> Receipt:
     if (restored := restore(*where, task.fingerprint, task.former)) is not None:
         return restored
     cap_threads(task.threads)
+    if allocator := keep_freed_memory():
+        allocator.malloc_trim(0)  # what the item before left counts neither as its nor as our peak
     reset_peak_memory()
     started, cores = time.perf_counter(), core_seconds()
     reason, made = "", None
@@ -174,6 +178,24 @@ def core_seconds() -> float:
     """Return the processor time of this process and of its children that ended."""
     children = resource.getrusage(resource.RUSAGE_CHILDREN)
     return time.process_time() + children.ru_utime + children.ru_stime
+
+
+@functools.cache
+def keep_freed_memory() -> ctypes.CDLL | None:
+    """Let this process use freed memory again instead of giving it back to the system at once.
+
+    An array of a 4K picture has 25 to 100 MB. By default the system maps and clears such blocks
+    anew for every operation, which took a third of the time of keying. Returns the allocator; None
+    where it is not glibc's.
+
+    Source: mallopt(3); M_TRIM_THRESHOLD is -1, M_MMAP_MAX -4.
+    """
+    library = ctypes.CDLL(None)
+    if not hasattr(library, "mallopt") or not hasattr(library, "malloc_trim"):
+        return None
+    library.mallopt(-1, 2**31 - 1)
+    library.mallopt(-4, 0)
+    return library
 
 
 def reset_peak_memory() -> None:

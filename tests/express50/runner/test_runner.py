@@ -5,6 +5,7 @@ import dataclasses
 import json
 import logging
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from logging.handlers import BufferingHandler
 from pathlib import Path
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
 
 from express50.cli.status import read_status
@@ -23,7 +25,7 @@ from express50.runner.clusters import RemoteWorkers
 from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger
 from express50.runner.runner import run_stage, select_items
-from express50.runner.worker import Task
+from express50.runner.worker import Task, keep_freed_memory, peak_memory, reset_peak_memory
 from tests.faults import toy
 from tests.faults.toy import make_dataset, run_toy, tree
 
@@ -453,3 +455,24 @@ def test_bar_on_a_terminal_shows_counts_and_failures(tmp_path):
     text = shown.decode()
     assert "3/3" in text
     assert "failed" in text
+
+
+def test_freed_memory_is_used_again_and_is_given_back_between_items():
+    allocator = keep_freed_memory()
+    if allocator is None:
+        pytest.skip("the C library is not glibc")
+
+    def cycle():
+        for _ in range(20):
+            np.ones(5_000_000, np.float32)
+
+    cycle()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    cycle()
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before < 1000  # of 97,000 pages
+    np.ones(50_000_000, np.float32)
+    reset_peak_memory()
+    held = peak_memory()
+    allocator.malloc_trim(0)
+    reset_peak_memory()
+    assert peak_memory() < held - 150_000_000
