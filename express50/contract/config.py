@@ -192,9 +192,17 @@ def config_toml(name: str, config: Any) -> str:
 
 
 def made_with(path: Path, stage: Stage, known: Mapping[str, Any]) -> str | None:
-    """Return the name of the configuration that a file of a stage holds; None of another one."""
+    """Return the name of the configuration that a file of a stage holds; None of another one.
+
+    Its comments, the settings' documentation, may be those of another version.
+    """
     text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
-    return next((k for k, c in known.items() if config_toml(stage.name, c) == text), None)
+
+    def values(text: str) -> list[str]:
+        return [line for line in text.splitlines() if not line.startswith("#")]
+
+    found = values(text)
+    return next((k for k, c in known.items() if values(config_toml(stage.name, c)) == found), None)
 
 
 def field_documents(config: type) -> dict[str, str]:

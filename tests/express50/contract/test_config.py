@@ -7,7 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from express50.contract.config import config_toml, field_documents, parse_assignment, resolve_config
+from express50.contract.config import (
+    config_toml,
+    field_documents,
+    made_with,
+    parse_assignment,
+    resolve_config,
+)
 from express50.contract.stage import Result, Stage
 from express50.errors import ConfigError
 
@@ -121,6 +127,15 @@ def test_documents_stand_in_the_toml():
     text = config_toml("track", Sample())
     assert field_documents(Sample) == {"iterations": "Steps, 1 to 10000; more is better."}
     assert "# Steps, 1 to 10000; more is better.\niterations = 100\n" in text
+
+
+def test_settings_are_known_again_when_their_documentation_changes(tmp_path):
+    known = {"few": Sample(iterations=7), "many": Sample(iterations=900)}
+    path = tmp_path / "track.toml"
+    path.write_text(config_toml("track", known["many"]).replace("more is better", "few do"))
+    assert made_with(path, STAGE, known) == "many"
+    path.write_text(path.read_text().replace("900", "901"))
+    assert made_with(path, STAGE, known) is None
 
 
 @settings(deadline=None, max_examples=30)
