@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+import torch
 
 from express50.cli.main import main
 from express50.errors import CaptureError
@@ -18,6 +19,8 @@ from express50.files.calibration import read_cameras
 from express50.files.containers import read_picture
 from express50.files.images import write_image
 from express50.files.video import iterate_video
+from express50.head.load import load_head
+from express50.head.model import landmarks, pose
 from pipelines.photo.capture import (
     guess_focal,
     make_photo_capture,
@@ -226,7 +229,7 @@ def test_a_telephones_video_is_stored_upright(tmp_path: Path, astronaut: np.ndar
 
 
 def test_a_video_is_tracked_in_every_frame(tmp_path: Path, astronaut: np.ndarray) -> None:
-    """The photograph moves sideways a pixel a frame; so does the head."""
+    """The photograph moves sideways a pixel per frame; so does the face."""
     images = [np.ascontiguousarray(astronaut[20:260, 90 - n : 350 - n]) for n in range(5)]
     write_video(tmp_path / "clip.mp4", images)
     settings = ["--preset", "draft", "--windows", "2"]
@@ -234,9 +237,17 @@ def test_a_video_is_tracked_in_every_frame(tmp_path: Path, astronaut: np.ndarray
     assert main([*command, *settings]) == 0
     with np.load(tmp_path / "out/track/clip/sequence.npz", allow_pickle=False) as sequence:
         assert sequence["frames"].tolist() == [0, 1, 2, 3, 4]
-        moved = sequence["t"][:, 0] / -sequence["t"][:, 2] * 700
-        np.testing.assert_allclose(np.diff(moved), 1.0, atol=1.0)
-        assert moved[-1] - moved[0] == pytest.approx(4.0, abs=1.0)
+        parts = {
+            name: torch.from_numpy(sequence[name]).float()
+            for name in ("expression", "neck", "jaw", "eyes")
+        }
+        head, shape = load_head("procedural"), torch.from_numpy(sequence["shape"]).float()
+        marks = landmarks(head, pose(head, shape.expand(5, -1), **parts)).numpy()[:, 17:]
+        face = marks @ sequence["R"].transpose(0, 2, 1) + sequence["t"][:, None]
+    # The origin lies in the neck: one view can hardly say whether that moves or the head turns.
+    moved = (face[..., 0] / -face[..., 2] * 700).mean(1)
+    np.testing.assert_allclose(np.diff(moved), 1.0, atol=0.6)
+    assert moved[-1] - moved[0] == pytest.approx(4.0, abs=0.5)
 
 
 @pytest.mark.parametrize(
