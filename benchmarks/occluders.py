@@ -10,7 +10,8 @@ truly hides the face, hair alone is asked for. The ratios say what a thing costs
 without: ``face_error_ratio`` of the rms vertex error of the face, hidden or not;
 ``depth_error_ratio`` and ``depth_coverage_ratio`` of the mean error and the known share of the
 face's skin that is truly seen. ``together`` pools the kinds. Seconds are processor seconds of the
-three stages per expression. The last line is one JSON object.
+three stages per expression. ``--quick`` takes smaller footage and leaves `off` out. The last line
+is one JSON object.
 """
 
 from __future__ import annotations
@@ -72,7 +73,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--side", type=int, default=448, help="pixels of the recorded footage")
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=[*KINDS, *FURTHER])
     parser.add_argument("--ways", nargs="+", default=["off", "on"], choices=["off", "on"])
+    parser.add_argument("--quick", action="store_true", help="320 px, 10 cameras, on alone")
     options = parser.parse_args(arguments)
+    if options.quick:
+        options.cameras, options.side, options.ways = 12, 320, ["on"]
     twin = TwinConfig(
         subjects=1, first_subject=options.subject, cameras=options.cameras, width=options.side,
         height=options.side, expressions=("neutral", "smile", "jaw_open"),
@@ -83,7 +87,8 @@ def main(arguments: list[str] | None = None) -> int:
     for way in options.ways:
         rows = {}
         for name, worn in kinds.items():
-            source = recorded(replace(twin, wear=worn), options.recording / name)
+            folder = f"{options.subject}-{options.cameras}x{options.side}"
+            source = recorded(replace(twin, wear=worn), options.recording / folder / name)
             rows[name] = measured(*source, way, LABEL.get(name, "hair"))
             print(way, name, summary([rows[name]], [rows["none"]]), file=sys.stderr, flush=True)
         bare = rows.pop("none")
