@@ -277,9 +277,9 @@ def estimate(
         if stage.name in measured[0][1]:
             footage, cost = runs[0]
         alike = [(f, c) for f, c in runs if c.preset == cost.preset]
-        samples = [MeasuredSize(f.work(growth.time), c.seconds) for f, c in alike]
-        item = forecast(samples, target.work(growth.time))
-        ratio = target.work(growth.time) / footage.work(growth.time)
+        samples = [MeasuredSize(f.time(growth), c.seconds) for f, c in alike]
+        item = forecast(samples, target.time(growth))
+        ratio = target.time(growth) / footage.time(growth)
         disk = cost.bytes * target.work(growth.disk) / footage.work(growth.disk)
         rows.append(
             Row(

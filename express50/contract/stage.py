@@ -138,12 +138,15 @@ class Growth:
         time: seconds per item.
         disk: bytes per item.
         more: number of further items, such as one of plates per subject; none by default.
+        side: pixels to whose longer side most of the work reduces pictures, at standard settings;
+            larger ones take no longer. 0 if they do.
     """
 
     items: tuple[str, ...] = ("subjects",)
     time: tuple[str, ...] = ()
     disk: tuple[str, ...] = ()
     more: tuple[str, ...] = ()
+    side: int = 0
 
 
 @dataclass(frozen=True)

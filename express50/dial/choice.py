@@ -121,7 +121,7 @@ def item_seconds(load: Workload, stage: Stage, label: str) -> tuple[int, float]:
         share = first.costs[stage.name].items / max(first.footage.items(stage.growth), 1e-9)
     count = max(1, round(share * load.footage.items(stage.growth)))
     samples = sizes_of(load.measured, stage)
-    work = [footage.work(stage.growth.time) for footage in (load.footage, trial.footage)]
+    work = [footage.time(stage.growth) for footage in (load.footage, trial.footage)]
     grown = typical_seconds(samples, work[0]) / typical_seconds(samples, work[1])
     return count, (cost.core_seconds if load.cores else cost.seconds) * grown
 
@@ -131,9 +131,9 @@ def sizes_of(measured: PilotFigures, stage: Stage) -> list[MeasuredSize]:
     base, *others = measured.trials
     small = [t for t in others if t.footage.expressions < base.footage.expressions]
     return [
-        MeasuredSize(t.footage.work(stage.growth.time), [t.costs[stage.name].core_seconds])
+        MeasuredSize(t.footage.time(stage.growth), [t.costs[stage.name].core_seconds])
         for t in (base, *small[:1]) if stage.name in t.costs
-    ] or [MeasuredSize(base.footage.work(stage.growth.time), [1.0])]  # fmt: skip
+    ] or [MeasuredSize(base.footage.time(stage.growth), [1.0])]  # fmt: skip
 
 
 def stage_seconds(load: Workload, stage: Stage, label: str, left: float = 1.0) -> float:

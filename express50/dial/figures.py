@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,8 @@ from express50.contract.layout import Dataset
 from express50.contract.stage import Growth
 from express50.errors import FormatError, StageError
 from express50.files.text import read_json_table
+
+SHORT_SIDE = 0.75  # of a picture over its long side; cameras have 0.56 to 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +30,11 @@ class Footage:
     def work(self, factors: Sequence[str]) -> float:
         """Multiply some of its sizes."""
         return math.prod(getattr(self, name) for name in factors)
+
+    def time(self, growth: Growth) -> float:
+        """Return what the seconds of a stage's item are proportional to."""
+        most = SHORT_SIDE * growth.side**2 if growth.side else math.inf
+        return replace(self, pixels=min(self.pixels, most)).work(growth.time)
 
     def items(self, growth: Growth) -> float:
         """Return how many items of a stage it gives."""

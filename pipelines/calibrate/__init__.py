@@ -45,5 +45,7 @@ STAGE = Stage(
     run=run,
     help="use the given cameras, or solve them from a board or the footage",
     purpose="Cameras: given, or solved from the board or the footage.",
-    growth=Growth(items=("subjects",), time=("views", "pixels"), disk=("views",)),
+    growth=Growth(
+        items=("subjects",), time=("views", "pixels"), disk=("views",), side=1280
+    ),  # of pictures in which features are found
 )

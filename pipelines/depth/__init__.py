@@ -82,6 +82,9 @@ STAGE = Stage(
     purpose="A level set starts from the visual hull and the tracked mesh and moves to where the"
     " views agree; every camera gets depth, normals and confidence.",
     growth=Growth(
-        items=("subjects", "expressions"), time=("views", "pixels"), disk=("views", "pixels")
+        items=("subjects", "expressions"),
+        time=("views", "pixels"),
+        disk=("views", "pixels"),
+        side=DepthConfig.image_side,
     ),
 )

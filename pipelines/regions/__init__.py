@@ -94,6 +94,9 @@ STAGE = Stage(
     purpose="The tracked mesh, each view's colours and depth label skin, ears, lips, eyes, mouth,"
     " hair, neck, torso, glasses and hands; a second matte holds the head alone.",
     growth=Growth(
-        items=("subjects", "expressions"), time=("views", "pixels"), disk=("views", "pixels")
+        items=("subjects", "expressions"),
+        time=("views", "pixels"),
+        disk=("views", "pixels"),
+        side=RegionsConfig.image_side,
     ),
 )

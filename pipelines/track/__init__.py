@@ -83,6 +83,9 @@ STAGE = Stage(
     purpose="A head model is fitted to every peak frame: shape per subject, expression and pose"
     " per frame, and an albedo texture.",
     growth=Growth(
-        items=("subjects",), time=("expressions", "views", "pixels"), disk=("expressions",)
+        items=("subjects",),
+        time=("expressions", "views", "pixels"),
+        disk=("expressions",),
+        side=TrackConfig.photo_side,
     ),
 )

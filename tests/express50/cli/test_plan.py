@@ -36,13 +36,23 @@ def cost(seconds, size=1e6, memory=1e9, preset="draft"):
 def test_express_50_is_scaled_linearly_from_one_dataset():
     target = target_of("express-50", {}, SMALL)
     assert target == Footage(subjects=50, expressions=60, views=24, pixels=8294400, frames=360)
-    (row,) = estimate([stages()["depth"]], target, [(SMALL, {"depth": cost(2.0)})], workers=10)
+    (row,) = estimate([stages()["matte"]], target, [(SMALL, {"matte": cost(2.0)})], workers=10)
     ratio = 24 * 8294400 / (8 * 1e5)
     assert row.items == 3000 and row.seconds == pytest.approx(2 * ratio)
     assert row.core_hours == pytest.approx(3000 * 2 * ratio / 3600)
     assert row.days == pytest.approx(row.core_hours / 240)
     assert row.disk == pytest.approx(3000 * 1e6 * ratio)
     assert row.memory == 1e9  # the part that does not grow is unknown: no guess is printed
+
+
+def test_a_stage_that_reduces_pictures_takes_no_longer_for_larger_ones():
+    full, huge = (replace(SMALL, pixels=side * side) for side in (2048.0, 8192.0))
+    found = [
+        estimate([stages()["depth"]], target, [(SMALL, {"depth": cost(2.0)})], workers=1)[0]
+        for target in (full, huge)
+    ]
+    assert found[0].seconds == found[1].seconds == pytest.approx(2.0 * 0.75 * 1024**2 / 1e5)
+    assert found[0].disk < found[1].disk, "maps are written at full size"
 
 
 def test_plates_are_an_item_per_subject_not_per_expression():
@@ -97,13 +107,13 @@ def test_figures_are_those_of_the_receipts(tmp_path, capsys):
 
 
 def test_two_sizes_tell_what_does_not_grow_and_the_interval_holds_a_third():
-    stage = stages()["depth"]
+    stage = stages()["matte"]
     large, unseen = (replace(SMALL, pixels=SMALL.pixels * k) for k in (4, 20))
 
     def seconds(footage):  # 3 s whatever the footage
         return 3.0 + 2.0 * footage.pixels / SMALL.pixels
 
-    measured = [(f, {"depth": cost(seconds(f))}) for f in (SMALL, large)]
+    measured = [(f, {"matte": cost(seconds(f))}) for f in (SMALL, large)]
     (row,) = estimate([stage], unseen, measured, 1)
     assert row.sizes == 2 and row.seconds == pytest.approx(seconds(unseen))
     assert row.core_hours_low < row.core_hours < row.core_hours_high < 1.3 * row.core_hours
