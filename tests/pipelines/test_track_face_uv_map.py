@@ -79,7 +79,9 @@ def test_landmarks_of_any_head_lie_at_the_same_texels(head, chart) -> None:
         got = (flat.places[corners] * model.landmark_bary.numpy()[..., None]).sum(1)
         # The ends of the jaw line are where the cylinder turns away, those of the brows where faces
         # are large: the map is bent within them.
-        assert np.abs(got - to_texels(MARKS))[17:].max() < 0.7
+        off = np.abs(got - to_texels(MARKS)).max(1)
+        assert off[[17, 26]].max() < 0.7
+        assert np.delete(off, [*range(17), 17, 26]).max() < 0.6
 
 
 def test_eyes_and_mouth_are_not_skin_and_a_head_without_regions_is_all_skin(head, chart) -> None:
