@@ -7,7 +7,7 @@ from pathlib import Path
 from express50.capture.index import calibration_file, read_index
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
-from pipelines.calibrate.config import PRESETS, CalibrateConfig
+from pipelines.calibrate.config import LONG_SIDE, PRESETS, CalibrateConfig
 
 __all__ = ["STAGE", "CalibrateConfig"]
 
@@ -45,7 +45,5 @@ STAGE = Stage(
     run=run,
     help="use the given cameras, or solve them from a board or the footage",
     purpose="Cameras: given, or solved from the board or the footage.",
-    growth=Growth(
-        items=("subjects",), time=("views", "pixels"), disk=("views",), side=1280
-    ),  # of pictures in which features are found
+    growth=Growth(items=("subjects",), time=("views", "pixels"), disk=("views",), side=LONG_SIDE),
 )

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from express50.errors import ConfigError
 
 AUTO = "auto"
+LONG_SIDE = 1280  # pixels of the reduced images in which features are found
 REFINE = ("none", "poses", "all")
 MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 

@@ -27,9 +27,9 @@ from express50.geometry.conventions import opencv_pixels_to_corner
 from express50.landmarks.detector import detect
 from express50.landmarks.network import load_network
 from pipelines.calibrate.board import even
+from pipelines.calibrate.config import LONG_SIDE
 from pipelines.calibrate.tracks import FEATURE_SIGMA_PX, Features, FrameSetPoints
 
-LONG_SIDE = 1280  # pixels of reduced images
 FEATURES = 4000  # kept per image, strongest first
 FACE_SCORE = 0.4  # profiles have no more; their landmarks come with a large sigma
 LANDMARK_INFLATION = 3.0  # of sigma, as errors within a view are correlated

@@ -82,7 +82,7 @@ ENCODE = Stage(
         items=("subjects",),
         time=("expressions", "views", "pixels"),
         disk=("expressions", "views"),
-        side=2 * EncodeConfig.size,  # a head fills about half of a picture
+        side=2 * EncodeConfig.size,  # if the head fills half of a picture
     ),
 )
 
