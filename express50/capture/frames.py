@@ -21,10 +21,12 @@ from express50.files.calibration import read_cameras
 from express50.files.containers import inside, read_picture, read_srgb
 from express50.files.digests import cached_by_file
 from express50.files.images import decode_image, upright
-from express50.files.text import read_json, read_json_table
+from express50.files.text import read_bytes, read_json, read_json_table
 from express50.files.video import VideoReader
 from express50.geometry.cameras import Camera, pinhole
 from express50.geometry.sampling import undistort_image
+
+LARGEST_FRAME = 1 << 30  # bytes of a file that `write_frame` wrote
 
 
 def dhash(image: np.ndarray) -> str:
@@ -194,7 +196,7 @@ def read_peak_frame(dataset: Dataset, subject: str, expression: str, camera_id: 
             f"{path}: no frame of {camera_id}; run 'express50 frames {dataset.root}', or see "
             f"'express50 status {dataset.root}' for the reason"
         )
-    return read_srgb(path)
+    return _read_written(path)
 
 
 def read_plate_image(dataset: Dataset, subject: str, camera_id: str) -> np.ndarray | None:
@@ -204,7 +206,20 @@ def read_plate_image(dataset: Dataset, subject: str, camera_id: str) -> np.ndarr
         CaptureError: it cannot be read.
     """
     path = dataset.plate_file(subject, camera_id)
-    return read_srgb(path) if path.is_file() else None
+    return _read_written(path) if path.is_file() else None
+
+
+def _read_written(path: Path) -> np.ndarray:
+    """Read what ``write_frame`` wrote, in three quarters of the time of ``read_srgb``."""
+    fix = "delete its folder and run 'express50 frames' again"
+    data = read_bytes(path, CaptureError, LARGEST_FRAME, fix)
+    try:
+        image = imagecodecs.jpegxl_decode(data, numthreads=1)
+    except (RuntimeError, ValueError) as error:
+        raise CaptureError(f"{path}: truncated or damaged ({error}); {fix}") from error
+    if image.dtype != np.uint8 or image.shape[2:] != (3,):
+        raise CaptureError(f"{path}: {image.dtype} {image.shape}, expected 8-bit RGB; {fix}")
+    return image
 
 
 def frame_inputs(dataset: Dataset, subject: str, expression: str) -> dict[str, Path]:

@@ -140,3 +140,13 @@ def test_the_same_image_gives_the_same_bytes(tmp_path):
         write_frame(tmp_path / f"{name}.jxl", image)
     assert (tmp_path / "a.jxl").read_bytes() == (tmp_path / "b.jxl").read_bytes()
     assert np.array_equal(read_image(tmp_path / "a.jxl"), image)
+
+
+@pytest.mark.parametrize("cut", [0, 10, 300, -3])
+def test_a_damaged_peak_frame_is_one_clear_line(tmp_path, cut):
+    make_capture(tmp_path / "raw", cameras=1)
+    dataset = make_dataset(tmp_path, [tmp_path / "raw"])
+    path = dataset.frame_file("S001", "smile", "cam00")
+    path.write_bytes(path.read_bytes()[:cut])
+    with pytest.raises(CaptureError, match=r"cam00\.jxl: truncated or damaged.*again"):
+        read_peak_frame(dataset, "S001", "smile", "cam00")
