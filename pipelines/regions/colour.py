@@ -19,7 +19,9 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from express50.contract.segmentation_labels import LABELS, label_mask
+from express50.files.images import LIGHT_OF_LEVEL
 from pipelines.regions.geometry import HAIR, SCALP, TORSO, HeadGeometry
+from pipelines.track.surface import like_skin
 
 SKIN, NECK, EARS = (np.uint8(LABELS.index(name)) for name in ("skin", "neck", "ears"))
 
@@ -31,7 +33,8 @@ SMOOTH = 1.5  # cells; a few hundred pixels fill a smooth histogram
 LEAST = 30  # fewest pixels that make a histogram
 FEATURES = 0.003  # share of the mesh that eyes and lips fill where a view sees the face
 SHARED = 10_000  # pixels that own and other views' skin colours each count as, if both teach
-RELEARNT = 2  # times that skin's colours are learnt again, without what proved to be hair
+COVERED = 0.1  # share of a view's skin: bare faces have 0.02 to 0.05 of other colours
+DARK = 1e-3  # root of light that is added: keeps logarithms finite
 RARE = 1e-6  # share of a cell that no pixel taught: keeps logarithms finite
 UNTAUGHT = 1.2e-4  # share of every cell of a class without pixels: spread over 8000 cells
 
@@ -64,8 +67,24 @@ def face_colours(rgb: np.ndarray, alpha: np.ndarray, mesh: np.ndarray) -> np.nda
         alpha: (H, W) in [0, 1].
         mesh: (H, W) labels of the mesh alone.
     """
-    skin = (mesh == SKIN) & (alpha > SOLID)
+    skin = usual(rgb, (mesh == SKIN) & (alpha > SOLID))
     return _counts(_cells(rgb), skin) if _sees_face(mesh) and skin.sum() >= LEAST else None
+
+
+def usual(rgb: np.ndarray, skin: np.ndarray) -> np.ndarray:
+    """Leave out of the pixels (H, W) of skin a beard or a fringe: colours unlike most of it.
+
+    Brows, nostrils and shadows alone are fewer than COVERED; they are skin.
+    """
+    if not skin.any():
+        return skin
+    logs = np.log(np.sqrt(LIGHT_OF_LEVEL[rgb[skin]].astype(np.float64)) + DARK)
+    alike = like_skin(logs, logs)
+    if alike.mean() > 1 - COVERED:
+        return skin
+    kept = skin.copy()
+    kept[skin] = alike
+    return kept
 
 
 def _sees_face(mesh: np.ndarray) -> bool:
@@ -95,6 +114,8 @@ def by_colour(
     skin = solid & (geometry.mesh > 0) & (labels == SKIN)
     if skin.sum() < LEAST:  # the neck, which hair may cover, teaches only where no face does
         skin = skin | (solid & (labels == NECK) & (geometry.height > SURE_ABOVE))
+    if _sees_face(geometry.mesh):  # from behind, most of it may be hair
+        skin = usual(rgb, skin)
     torso = solid & (labels == TORSO) & (geometry.height < SURE_BELOW)
     beyond = IMPOSSIBLE
     if bare:
@@ -108,14 +129,6 @@ def by_colour(
         counts[1] = SHARED * (own + others)
     priors = _priors(labels, geometry, beyond)
     best = (_likelihoods(counts, cells) + priors).argmax(0)
-    for _ in range(RELEARNT):
-        beard = skin & (best == 0)
-        if not beard.any() or (skin & ~beard).sum() < LEAST:
-            break
-        # A beard or a fringe was among the skin that taught: the face is looked at again without.
-        counts[1] = np.maximum(counts[1] - _counts(cells, beard), 0)
-        skin = skin & ~beard
-        best = (_likelihoods(counts, cells) + priors).argmax(0)
     around = (geometry.mesh > 0) | geometry.rim | bare
     kept = np.isin(geometry.near, (SKIN, NECK, EARS)) & around
     skin_label = np.where(kept, geometry.near, SKIN)

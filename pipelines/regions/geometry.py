@@ -19,7 +19,6 @@ from express50.head.model import HeadModel
 
 SCALP = len(LABELS)
 """Skin that may bear hair: a label of the mesh alone, never written."""
-APPAREL = LABELS.index("apparel")
 HAIR, TORSO = np.uint8(LABELS.index("hair")), np.uint8(LABELS.index("torso"))
 BEARINGS = 36  # around the neck, at which the height of its lower end is known
 CLEAR_M, HAND_M, WIDTH_M = 0.007, 0.022, 0.006  # off the face; a hand's back; least width
@@ -107,6 +106,7 @@ class TrackedHead:
 
     Attributes:
         vertices: (V, 3) world, metres.
+        R: (3, 3) world from head axes; y up, z along the gaze.
         labels: the head model's.
         end: the neck's lower end; None if the model does not mark it.
         center: (3,) origin of the scene, so that far subjects lose no digits.
@@ -114,6 +114,7 @@ class TrackedHead:
     """
 
     vertices: np.ndarray
+    R: np.ndarray
     labels: HeadLabels
     end: NeckEnd | None
     center: np.ndarray
@@ -125,14 +126,14 @@ def make_head(vertices: np.ndarray, R: np.ndarray, labels: HeadLabels) -> Tracke
     center = vertices.mean(0)
     scene = mesh_scene(vertices - center, labels.faces)
     if "torso" in labels.missing:
-        return TrackedHead(vertices, labels, None, center, scene)
+        return TrackedHead(vertices, R, labels, None, center, scene)
     loop = vertices[labels.end]
     middle = 0.5 * (loop.min(0) + loop.max(0))
     x, y, z = ((loop - middle) @ R).T
     place = np.arctan2(z, x) / (2 * np.pi) * BEARINGS
     order = np.argsort(place, kind="stable")
     heights = np.interp(np.arange(BEARINGS), place[order], y[order], period=BEARINGS)
-    return TrackedHead(vertices, labels, NeckEnd(middle, R, heights), center, scene)
+    return TrackedHead(vertices, R, labels, NeckEnd(middle, R, heights), center, scene)
 
 
 def see(head: TrackedHead, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -177,6 +178,7 @@ class HeadGeometry:
 
     Attributes:
         mesh: (H, W) uint8 label of the mesh, SCALP among them, 0 beside it.
+        depth: (H, W) float32 camera z of the mesh, metres, 0 beside it.
         near: (H, W) uint8 label at the nearest pixel of the mesh; 0 if no pixel shows it.
         rim: (H, W) bool, just beyond the mesh.
         height: (H, W) float32 metres above the neck's end; inf if the model does not mark it.
@@ -184,6 +186,7 @@ class HeadGeometry:
     """
 
     mesh: np.ndarray
+    depth: np.ndarray
     near: np.ndarray
     rim: np.ndarray
     height: np.ndarray
@@ -222,7 +225,7 @@ def place(
     hit = mesh > 0
     if not hit.any():
         height = np.full(mesh.shape, np.inf if head.end is None else -np.inf, np.float32)
-        return HeadGeometry(mesh, mesh, hit, height, np.zeros_like(height))
+        return HeadGeometry(mesh, mesh_depth, mesh, hit, height, np.zeros_like(height))
     row, column, pixels = _nearest(hit)
     surface = mesh_depth[row, column]
     rim = ~hit & (pixels * surface / camera.K[0, 0] <= rim_m)
@@ -240,15 +243,14 @@ def place(
         before = (depth[y, x] > 0) & (mesh_depth[y, x] > depth[y, x])
         places = o3d.core.Tensor((points[before] - head.center).astype(np.float32))
         off[y[before], x[before]] = head.scene.compute_distance(places, nthreads=1).numpy()
-    return HeadGeometry(mesh, mesh[row, column], rim, height, off)
+    return HeadGeometry(mesh, mesh_depth, mesh[row, column], rim, height, off)
 
 
 def before_face(geometry: HeadGeometry, labels: np.ndarray, metre_px: float) -> np.ndarray:
-    """Label what stands off the face (H, W) uint8: hand or apparel, 0 elsewhere.
+    """Find hands (H, W) bool: what stands far off the face, wider than hairs.
 
-    Only parts that are wider than hairs and clear of the mesh count, without what `labels` (H, W)
-    call hair. Glasses stand closely before the eyes, hands further off. ``metre_px`` is the number
-    of pixels that a metre spans at the head.
+    Only parts that are clear of the mesh count, without what `labels` (H, W) call hair.
+    ``metre_px`` is the number of pixels that a metre spans at the head.
     """
     face = label_mask(geometry.mesh, "skin", "lips", "eyes")
     clear = face & (geometry.off > CLEAR_M) & (labels != HAIR)
@@ -256,19 +258,8 @@ def before_face(geometry: HeadGeometry, labels: np.ndarray, metre_px: float) -> 
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     solid = cv2.morphologyEx(clear.astype(np.uint8), cv2.MORPH_OPEN, kernel)
     count, part = cv2.connectedComponents(solid, connectivity=8)
-    found = np.zeros(labels.shape, np.uint8)
-    eyes = geometry.mesh == LABELS.index("eyes")
-    for k in range(1, count):
-        here = part == k
-        far = np.quantile(geometry.off[here], 0.9)
-        if far > HAND_M:
-            found[here] = LABELS.index("hand")
-        elif (here & eyes).any():
-            # A lens and its frame bulge; where they end, the surface runs back to the skin.
-            outline = cv2.convexHull(cv2.findNonZero(here.astype(np.uint8)))
-            whole = cv2.fillConvexPoly(np.zeros_like(found), outline, 1)
-            found[(cv2.dilate(whole, kernel) > 0) & (geometry.mesh > 0)] = APPAREL
-    return found
+    far = [k for k in range(1, count) if np.quantile(geometry.off[part == k], 0.9) > HAND_M]
+    return np.isin(part, far)
 
 
 def _nearest(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

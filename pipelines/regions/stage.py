@@ -19,7 +19,7 @@ from express50.errors import CaptureError, FormatError, StageError
 from express50.files.images import contact_sheet, fit_into, read_alpha, shrink, write_image
 from express50.geometry.cameras import Camera, resized
 from express50.head.load import load_head
-from pipelines.regions.colour import SKIN, Scalp, by_colour, decide, face_colours, scalp_votes
+from pipelines.regions.colour import EARS, SKIN, Scalp, by_colour, decide, face_colours, scalp_votes
 from pipelines.regions.geometry import (
     HAIR,
     SCALP,
@@ -31,8 +31,10 @@ from pipelines.regions.geometry import (
     place,
     see,
 )
+from pipelines.regions.glasses import Picture, find_glasses, shown_before
 
 VOTERS, VOTING_SIDE = 4, 512  # cameras, and their pixels, that show skin colours and bare scalps
+WITNESSES = 10  # cameras, of that size, that show glasses
 AGREEMENT = 0.85  # a camera with less of the tracked mesh inside its matte gets a warning
 SHOWN = 4  # cameras in the contact sheet
 TILE = (260, 260)
@@ -65,6 +67,7 @@ def run(
     subject, expression = item.split("/")
     head = read_head(dataset, subject, expression)
     scalp, skin, frames = study_person(dataset, item, head)
+    glasses = find_glasses(head, facing(dataset, item, head))
     if scalp_is != "auto":
         scalp = replace(scalp, is_skin=scalp_is == "skin")
     figures, rows = {}, {}
@@ -77,7 +80,7 @@ def run(
         except UNREADABLE as error:
             dropped.append(Note(name, str(error)))
             continue
-        view = label_view(head, camera, rgb, alpha, depth, scalp.is_skin, side, skin)
+        view = label_view(head, camera, rgb, alpha, depth, scalp.is_skin, side, skin, glasses)
         figures[name], rows[name] = _write_view(out, name, rgb, alpha, view, weights)
     if not figures:
         why = "; ".join(f"{note.what}: {note.why}" for note in dropped[:3])
@@ -177,6 +180,18 @@ def study_person(
     return decide(votes), sum(colours[1:], colours[0]) if colours else None, frames
 
 
+def facing(dataset: Dataset, item: str, head: TrackedHead) -> list[Picture]:
+    """Read reduced pictures of up to WITNESSES cameras, of those that see the face evenly."""
+    ahead, cameras = head.R[:, 2], read_cameras_of(dataset, item.split("/")[0]).values()
+    seeing = [c for c in cameras if (c.center - head.center) @ ahead > 0]
+    found = []
+    for k in np.unique(np.linspace(0, len(seeing) - 1, WITNESSES).round().astype(int)):
+        with contextlib.suppress(*UNREADABLE):  # the stage names them
+            pair = read_pair(dataset, item, seeing[k])
+            found.append(_shrunk(seeing[k], *pair, None, VOTING_SIDE)[:3])
+    return found
+
+
 def label_view(
     head: TrackedHead,
     camera: Camera,
@@ -186,6 +201,7 @@ def label_view(
     bare: bool,
     side: int,
     skin_colours: np.ndarray | None = None,
+    glasses: np.ndarray | None = None,
 ) -> ViewLabels:
     """Label one camera at the working size.
 
@@ -198,15 +214,21 @@ def label_view(
         bare: the scalp is skin.
         side: longest side, pixels, of the labels.
         skin_colours: of views of the face (``colour.face_colours``).
+        glasses: places (n, 3) of ``glasses.find_glasses``.
     """
     camera, rgb, alpha, depth = _shrunk(camera, rgb, alpha, depth, side)
     geometry = place(head, camera, alpha, depth)
     labels = by_colour(rgb, alpha, geometry, bare, skin_colours)
     labels = np.where(labels == SCALP, SKIN if bare else HAIR, labels)
+    if glasses is not None and len(glasses):
+        # Hair lies over what holds them.
+        bearing = (geometry.mesh == SCALP) | (geometry.mesh == EARS)
+        worn = shown_before(glasses, camera, geometry.depth) & ~bearing
+        labels = np.where(worn, np.uint8(LABELS.index("apparel")), labels)
     if depth is not None:
         distance = np.linalg.norm(head.center - camera.center)
-        thing = before_face(geometry, labels, camera.K[0, 0] / distance)
-        labels = np.where(thing > 0, thing, labels)
+        hand = before_face(geometry, labels, camera.K[0, 0] / distance)
+        labels = np.where(hand, np.uint8(LABELS.index("hand")), labels)
     return ViewLabels(np.where(alpha > 0, labels, np.uint8(0)), geometry.mesh > 0)
 
 
