@@ -32,7 +32,7 @@ from pipelines.depth.maps import picture_of, surface_maps
 from pipelines.depth.prior import close_mesh
 from pipelines.depth.surface import HeadSurface
 from pipelines.matte.config import MatteConfig
-from pipelines.matte.doubt import rim_figures, rim_of
+from pipelines.matte.stage import rim_figures, rim_of
 from pipelines.register.lay import LaidMesh, mesh_normals
 from pipelines.register.stage import error_figures as laid_figures
 from pipelines.register.stage import lone_sigma

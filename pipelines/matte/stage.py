@@ -22,8 +22,7 @@ from express50.geometry.sampling import undistorted_mask
 from pipelines.matte.config import NETWORKS, WITHOUT_PLATE, MatteConfig
 from pipelines.matte.consensus import Agreement, agree
 from pipelines.matte.cutout import CutView, cut_out, make_cut_view, soft_alpha
-from pipelines.matte.doubt import rim_figures
-from pipelines.matte.key import key_alpha
+from pipelines.matte.key import dilated, key_alpha
 from pipelines.matte.plates import LEAST_SHARE, exposed, exposure_gain, match_plate
 from pipelines.matte.visual_hull import (
     INSIDE,
@@ -39,6 +38,8 @@ RED, GREEN = (235, 50, 40), (50, 220, 80)
 EMPTY = 0.003  # share of the image below which a matte counts as empty
 # Share of the image's top or of a side that the subject may cover before it counts as cut off.
 MOST_CONTACT = 0.02
+RIM = 0.008  # share of the longer side: so far from the outline a matte can be wrong by a part
+WINDOW = 5  # pixels, odd
 
 Matter = Callable[[np.ndarray, Any, np.ndarray], np.ndarray]
 """Frame (H, W, 3) uint8, plate or None and valid pixels (H, W) to opacity (H, W) float32."""
@@ -245,6 +246,43 @@ def border_contact(alpha: np.ndarray) -> dict[str, float]:
     """Return share of each side of image that an alpha (H, W) uint8 covers: where it is cut off."""
     sides = {"top": alpha[0], "right": alpha[:, -1], "bottom": alpha[-1], "left": alpha[:, 0]}
     return {side: round(float((line > 127).mean()), 4) for side, line in sides.items()}
+
+
+def rim_of(alpha: np.ndarray) -> np.ndarray:
+    """Return the pixels (H, W) bool about the outline of an alpha (H, W) uint8."""
+    reach = max(1, round(RIM * max(alpha.shape)))
+    return dilated(alpha > 12, reach) & dilated(alpha < 243, reach)
+
+
+def rim_figures(
+    alpha: np.ndarray, rgb: np.ndarray, plated: bool, views: int
+) -> dict[str, np.ndarray | float]:
+    """Describe the N pixels of the rim of an alpha (H, W) uint8.
+
+    The frame (h, w, 3) uint8 may be reduced; its grain off the subject stands for noise.
+    """
+    rim, share = rim_of(alpha), alpha.astype(np.float32) / 255
+    open_part = share * (1 - share)
+    inside = (share > 0.5).astype(np.uint8)
+    edge = int((inside - cv2.erode(inside, np.ones((3, 3)))).sum())
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    behind = cv2.resize(cv2.dilate(alpha, np.ones((5, 5))), grey.shape[::-1]) < 3
+    grain = np.abs(cv2.Laplacian(grey, cv2.CV_32F))[behind]
+    return {
+        "soft": 0.05 + 4 * open_part[rim],
+        "spread": 0.01 + deviation(share)[rim],
+        "noise": 0.2 + float(np.median(grain)) if grain.size else np.inf,
+        "width": 0.1 + float(open_part.sum()) / max(edge, 1),
+        "side": float(max(alpha.shape)),
+        "plated": 1.0 if plated else 2.0,
+        "views": float(views),
+    }
+
+
+def deviation(values: np.ndarray) -> np.ndarray:
+    """Return the standard deviation (H, W) of values (H, W) within a window."""
+    mean, square = (cv2.blur(v, (WINDOW, WINDOW)) for v in (values, values * values))
+    return np.sqrt(np.maximum(square - mean * mean, 0))
 
 
 def matte_warnings(alphas: dict[str, np.ndarray]) -> list[Note]:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from express50.contract.stage import ExpectedError
 from express50.error_model import error_bounds, error_models, size_sigma
 from express50.geometry.cameras import Camera
-from pipelines.matte.doubt import rim_figures, rim_of
+from pipelines.matte.stage import rim_figures, rim_of
 
 STAGES = ("calibrate", "align", "matte", "track", "depth", "register")
 ANY = st.floats(allow_nan=True, allow_infinity=True)
