@@ -6,11 +6,11 @@ import json
 import subprocess
 import sys
 
-# Hours on two cores, most of them in `align`, `track`, `depth` and `grmm`. `regions` wants the
-# dataset of the demo; `demo` and the sweeps are jobs of their own.
+# Hours on two cores, most of them in `ablate`, `align`, `track`, `depth` and `grmm`. `regions`
+# wants the dataset of the demo; `demo` and the sweeps are jobs of their own.
 NAMES = (
-    "align", "calibrate", "depth", "faults", "fps", "grmm", "head", "matte", "matte_views",
-    "occluders --quick", "raster", "register", "shards", "stage_overhead", "track",
+    "ablate", "align", "calibrate", "depth", "faults", "fps", "grmm", "head", "matte",
+    "matte_views", "occluders --quick", "raster", "register", "shards", "stage_overhead", "track",
 )  # fmt: skip
 
 

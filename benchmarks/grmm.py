@@ -2,12 +2,12 @@
 
 Eight people, the last never trained on; twelve expressions; twelve cameras of 256 px, two held out;
 three frames of training people held out. Footage goes through every stage, so that the shards have
-the faults of tracked, matted and fused data. The full model, each ablation of the paper with the
-same number of steps, and the baseline (texel colours averaged on the tracked mesh, drawn as
-Gaussians, nothing trained) are measured in one run, which goes on where a stopped one ended. The
-unseen person is tracked and fitted from one picture of the frontal camera and from two; figures
-that end in ``tracked_from_all_db`` and the ablations' fits take a track of all cameras. Frame
-rates are by the clock, of one process with ``--threads`` threads. The last line is one JSON object.
+the faults of tracked, matted and fused data. The model and the baseline (texel colours averaged on
+the tracked mesh, drawn as Gaussians, nothing trained) are measured in one run, which goes on where
+a stopped one ended. The unseen person is tracked and fitted from one picture of the frontal camera
+and from two; figures that end in ``tracked_from_all_db`` take a track of all cameras. Frame rates
+are by the clock, of one process with ``--threads`` threads. `benchmarks.ablate` has the components.
+The last line is one JSON object.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import itertools
 import json
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -52,10 +52,16 @@ HELD_FRAMES = 3
 TURN_DEGREES = 3.0  # between pictures of a moving camera
 
 
-def make_shards(out: Path, workers: int) -> Path:
+def make_shards(
+    out: Path,
+    workers: int,
+    twin: Mapping[str, int] = TWIN,
+    expressions: Sequence[str] = EXPRESSIONS,
+    options: Sequence[str] = (),
+) -> Path:
     """Record the captures and run every stage over them; what is done already is kept."""
     out.mkdir(parents=True, exist_ok=True)
-    record_twin(out / "twin", workers, TWIN, EXPRESSIONS)
+    record_twin(out / "twin", workers, twin, expressions, options)
     captures = sorted((out / "twin" / "captures").iterdir())
     (out / "data").mkdir(exist_ok=True)
     run_stages(out / "data", captures, subject_of(captures[-1]), workers, "grmm.toml")
@@ -168,24 +174,15 @@ def speeds(loaded: Loaded) -> dict[str, float]:
     }
 
 
-def measure(
-    shards: Path, out: Path, iterations: int, images: int, rows: list[str], seeds: int
-) -> dict:
-    """Return the baseline, full model and ablations on one folder of shards."""
+def measure(shards: Path, out: Path, iterations: int, images: int) -> dict:
+    """Return the figures of the baseline and of the model on one folder of shards."""
     config = resolve("demo", None, [f"train.iterations={iterations}"])
     config, given = held_out(shards, config)
     protocol = FitProtocol(cameras=(given[0],), expression="neutral", images=images)
-    run = Ablation(
-        roots=[shards], out=out / "ablation", config=config, protocol=protocol, seeds=seeds
-    )
-    table = ablate(run, rows)["rows"]
-    full, groups = table["full"], table["full"]["groups"]
+    run = Ablation(roots=[shards], out=out / "ablation", config=config, protocol=protocol)
+    full = ablate(run, ["full"])["rows"]["full"]
+    groups = full["groups"]
     loaded = load_checkpoint(out / "ablation" / "full" / "checkpoint.pt")
-    others = {
-        name: {key: row[key] for key in ("difference_db", "interval_db", "regions_db", "paper_db")}
-        for name, row in table.items()
-        if name != "full"
-    }
     return {
         "psnr_heldout_view_db": groups["view"]["psnr_db"],
         "psnr_head_heldout_view_db": groups["view"]["psnr_head_db"],
@@ -195,7 +192,6 @@ def measure(
         **fit_figures(loaded, shards, given, out, images),
         "psnr_fit_one_view_other_expressions_db": groups["unseen_expression"]["psnr_db"],
         "baseline_textured_tracked_mesh": baseline(shards, config, images),
-        "ablations": others,
         "iterations": full["iterations"],
         "iterations_per_second": round(full["iterations"] / full["seconds"], 2),
         "gaussians": full["gaussians"],
@@ -210,15 +206,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, nargs="?", default=Path("build/benchmark_grmm"))
     parser.add_argument("--shards", type=Path, help="packed shards instead of twin captures")
-    parser.add_argument("--iterations", type=int, default=2000, help="steps of every row")
-    parser.add_argument("--images", type=int, default=48, help="pictures measured a row and group")
-    parser.add_argument("--rows", nargs="*", default=[], help="ablations; all by default")
-    parser.add_argument("--seeds", type=int, default=1, help="trainings of every row")
+    parser.add_argument("--iterations", type=int, default=2000, help="steps of training")
+    parser.add_argument("--images", type=int, default=48, help="pictures measured per group")
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     args = parser.parse_args()
     shards = args.shards or make_shards(args.out, args.threads)
     torch.set_num_threads(args.threads)
-    result = measure(shards, args.out, args.iterations, args.images, args.rows, args.seeds)
+    result = measure(shards, args.out, args.iterations, args.images)
     result |= {"threads": args.threads, "peak_memory_gib": round(peak_memory() / 2**30, 2)}
     write_json(args.out / "grmm.json", result)
     print(json.dumps(result))

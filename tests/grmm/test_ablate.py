@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.ablate import differences, earned
 from express50.errors import FormatError
 from express50.files.images import read_image, write_image
 from grmm import ablate as ablate_module
@@ -199,3 +200,17 @@ def test_seeds_give_intervals_and_test_shards_give_people_alone(tmp_path, capsys
     assert row["groups"]["unseen"]["images"] == 2 and " ± " in capsys.readouterr().out
     assert main([*arguments, f"--test={roots[0]}"]) == 2
     assert "S000, S001 are trained on too" in capsys.readouterr().err
+
+
+def test_the_benchmark_names_what_is_lost_beyond_its_interval():
+    row = {
+        "difference_db": {"view": -0.5, "unseen": -0.1},
+        "interval_db": {"view": 0.2, "unseen": 0.3},
+        "regions_db": {
+            "view": {"psnr_mouth_db": (-1.5, 0.4), "psnr_hair_db": (0.5, 0.1)},
+            "unseen": {"psnr_mouth_db": (-2.0, None)},  # one seed has no interval
+        },
+    }
+    found = differences(row)
+    assert found["view"]["all"] == (-0.5, 0.2) and found["unseen"]["mouth"] == (-2.0, None)
+    assert earned(found) == ["view/all", "view/mouth"]
