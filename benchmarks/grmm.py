@@ -58,14 +58,19 @@ def make_shards(
     twin: Mapping[str, int] = TWIN,
     expressions: Sequence[str] = EXPRESSIONS,
     options: Sequence[str] = (),
+    people: int = 0,
 ) -> Path:
-    """Record the captures and run every stage over them; what is done already is kept."""
+    """Record the captures and run every stage over the first ``people`` (0: over all).
+
+    What is done already is kept.
+    """
     out.mkdir(parents=True, exist_ok=True)
     record_twin(out / "twin", workers, twin, expressions, options)
     captures = sorted((out / "twin" / "captures").iterdir())
-    (out / "data").mkdir(exist_ok=True)
-    run_stages(out / "data", captures, subject_of(captures[-1]), workers, "grmm.toml")
-    return out / "data" / "pack" / "shards"
+    data, captures = out / f"data{people or ''}", captures[: people or None]
+    data.mkdir(exist_ok=True)
+    run_stages(data, captures, subject_of(captures[-1]), workers, "grmm.toml")
+    return data / "pack" / "shards"
 
 
 def held_out(shards: Path, config: Config) -> tuple[Config, list[str]]:
@@ -195,6 +200,7 @@ def measure(shards: Path, out: Path, iterations: int, images: int) -> dict:
         "iterations": full["iterations"],
         "iterations_per_second": round(full["iterations"] / full["seconds"], 2),
         "gaussians": full["gaussians"],
+        "people": [*loaded.model.subjects],
         "holdout_cameras": list(config.data.holdout_cameras),
         "holdout_expressions": list(config.data.holdout_expressions),
         "fit_from": given,
@@ -206,11 +212,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, nargs="?", default=Path("build/benchmark_grmm"))
     parser.add_argument("--shards", type=Path, help="packed shards instead of twin captures")
+    parser.add_argument("--people", type=int, default=0, help="the first so many of the twin's 8")
     parser.add_argument("--iterations", type=int, default=2000, help="steps of training")
     parser.add_argument("--images", type=int, default=48, help="pictures measured per group")
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     args = parser.parse_args()
-    shards = args.shards or make_shards(args.out, args.threads)
+    shards = args.shards or make_shards(args.out, args.threads, people=args.people)
     torch.set_num_threads(args.threads)
     result = measure(shards, args.out, args.iterations, args.images)
     result |= {"threads": args.threads, "peak_memory_gib": round(peak_memory() / 2**30, 2)}
