@@ -184,7 +184,9 @@ def run_stage(
     shared = nullcontext(pool) if pool else Pool(workers, scheduler)
     with shared as workers_pool, stage_lock(dataset, stage.name), Ledger(dataset.ledger) as ledger:
         clean_leftovers(dataset, stage.name)
-        _save_config(dataset, stage, config)
+        path, data = dataset.config_file(stage.name), config_toml(stage.name, config).encode()
+        if not path.is_file() or path.read_bytes() != data:
+            write_bytes(path, data)
         if items is None:
             gone = sorted(set(ledger.read(stage.name)) - set(chosen))
             for item in gone:
@@ -241,12 +243,13 @@ def _sort_items(
     # Items share inputs; what a stage reads does not change while it runs.
     digest_of = functools.cache(lambda path: path_digest(path, ledger.sha256))
     for item in chosen:
+        task = Task(stage, dataset, item, config, "", {}, threads)
         was_imported = item in receipts and receipts[item].imported
         if was_imported:
             why = import_trouble(dataset, receipts[item], made.get(item), digest_of)
-            task = Task(stage, dataset, item, config, receipts[item].fingerprint, {}, threads)
             if why:
-                work.unreadable.append(failed_receipt(task, why, 0))
+                imported = replace(task, fingerprint=receipts[item].fingerprint)
+                work.unreadable.append(failed_receipt(imported, why, 0))
                 continue
             if _is_there(task, made.get(item), ledger):
                 kept = _outcome(receipts[item], status="skipped")
@@ -258,14 +261,12 @@ def _sort_items(
             raise
         except Exception as error:  # noqa: BLE001 (one damaged item must not stop the others)
             reason = failure_reason(dataset, stage.name, item, error)
-            task = Task(stage, dataset, item, config, "", {}, threads)
             work.unreadable.append(failed_receipt(task, reason, 0))
             # A StageError: an earlier stage has taken back what the item was made of.
             if item in done and not isinstance(error, StageError):
                 work.stands.add(item)
             continue
-        digest = fingerprint(stage, config, inputs)
-        task = Task(stage, dataset, item, config, digest, inputs, threads)
+        task = replace(task, fingerprint=fingerprint(stage, config, inputs), inputs=inputs)
         if was_imported:
             work.tasks.append(task)
             work.again[item] = "its import is gone"
@@ -425,13 +426,6 @@ def _retire(dataset: Dataset, ledger: Ledger, stage: str, item: str) -> None:
     if receipt is not None and not receipt.imported:
         former = replace(receipt, made=made)
     set_aside(dataset, stage, item, keeping(dataset, former))
-
-
-def _save_config(dataset: Dataset, stage: Stage, config: Any) -> None:
-    """Save the resolved config of a stage where it has changed."""
-    path, data = dataset.config_file(stage.name), config_toml(stage.name, config).encode()
-    if not path.is_file() or path.read_bytes() != data:
-        write_bytes(path, data)
 
 
 def _outcome(receipt: Receipt, status: str = "", again: str = "") -> Outcome:

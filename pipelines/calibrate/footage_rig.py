@@ -58,6 +58,24 @@ NOMINAL = 2.5  # focal length, in longer sides, at which distances are first est
 INNER = slice(17, 68)  # the jaw's outline is not the same skin from every side
 BY_CHANCE = 0.025  # share of wrong points that fit a wrong pose, at most
 NEAR_DEG = 25.0  # frame sets whose relative pose is further from the mean are wrong
+LONE = "it sees a face, but never together with the cameras of the largest group"
+BLIND = (
+    "it sees no face well, and too few of its features fit points that other cameras know: add a"
+    " camera between it and the next, board images or calibration.json"
+)
+
+
+@dataclass(frozen=True)
+class EyeScale:
+    """How many metres a unit is by the distance between the eyes.
+
+    It was measured in `frame_sets` frame sets; `spread` is its robust standard deviation, as a
+    share.
+    """
+
+    metres: float
+    frame_sets: int
+    spread: float
 
 
 @dataclass(frozen=True)
@@ -65,9 +83,7 @@ class FootageSolution:
     """A rig solved from footage, in metres and in the canonical world.
 
     `errors` (N, 2), pixels, are those of `tracks`; `inliers` (N,) marks the features that are not
-    mismatches. `dropped` and `weak` (held by the face alone) give a reason per camera. The distance
-    between the eyes was measured in `eye_frames` frame sets; `eye_spread` is its robust standard
-    deviation, as a share.
+    mismatches. `dropped` and `weak` (held by the face alone) give a reason per camera.
     """
 
     cameras: dict[str, Camera]
@@ -77,8 +93,7 @@ class FootageSolution:
     dropped: dict[str, str]
     weak: dict[str, str]
     uncertainty: dict[str, HeadError]
-    eye_frames: int
-    eye_spread: float
+    eyes: EyeScale
 
 
 def solve_footage(
@@ -104,18 +119,15 @@ def solve_footage(
     """
     head = mean_landmarks()
     # A landmark is off by much the same in every frame set: more of them make it no surer.
+    wider = len(seen) ** 0.5
     seen = {
-        frame: replace(
-            points, landmarks=[(n, p, s * len(seen) ** 0.5) for n, p, s in points.landmarks]
-        )
+        frame: replace(points, landmarks=[(n, p, s * wider) for n, p, s in points.landmarks])
         for frame, points in seen.items()
     }
     share = focal_at(distance_m, seen, sizes, head)
+    guesses = {n: focals.get(n, share * max(size)) for n, size in sizes.items()}
     lens = "SIMPLE_RADIAL" if model == AUTO else model
-    start = {
-        name: as_model(start_camera(name, size, focals.get(name, share * max(size))), lens)
-        for name, size in sizes.items()
-    }
+    start = {n: as_model(start_camera(n, sizes[n], focal), lens) for n, focal in guesses.items()}
     rig = face_rig(start, seen, head)
     faces = {name for points in seen.values() for name, _, _ in points.landmarks}
     if len(rig) < 2:
@@ -125,15 +137,38 @@ def solve_footage(
             f" {', '.join(sorted(faces)) or 'none'}: add calibration.json or board/<camera>/*.png"
             " with board.toml, then run 'express50 ingest' again"
         )
-    known = all(name in focals for name in sizes)
     priors = RigPriors(
-        focal=KNOWN_FOCAL if known else GUESSED_FOCAL,
+        focal=KNOWN_FOCAL if all(name in focals for name in sizes) else GUESSED_FOCAL,
         focal_spread=SAME_LENS if same_lens else FOCAL_SPREAD,
         centre=CENTRE,
         bend=BEND,
     )
     tracks, adjusted, expected = _adjust(rig, start, seen, priors)
     shapes = _landmark_points(adjusted.cameras, seen)
+    eyes = eye_scale(shapes, 1e-3 * eye_distance_mm, where)
+    metric = in_metres(adjusted.cameras, eyes.metres)
+    middle = eyes.metres * np.median([p.mean(0) for p in shapes], axis=0)
+    up = np.mean([rigid_fit(head, p)[0] for p in shapes], axis=0)[:, 1]
+    sigmas = np.linalg.norm(adjusted.errors, axis=1) / tracks.sigma
+    away = {n: float(np.linalg.norm(camera.center - middle)) for n, camera in metric.items()}
+    return FootageSolution(
+        cameras=move_cameras(metric, canonical_from_rig(metric, middle, up)),
+        tracks=tracks,
+        errors=adjusted.errors,
+        inliers=tracks.features() & (sigmas < OUTLIER),
+        dropped={n: LONE if n in faces else BLIND for n in sorted(sizes) if n not in metric},
+        weak=_weak(tracks),
+        uncertainty={n: head_error_of(metric[n], px**2, away[n]) for n, px in expected.items()},
+        eyes=eyes,
+    )
+
+
+def eye_scale(shapes: Sequence[np.ndarray], eye_distance_m: float, where: str) -> EyeScale:
+    """Measure the unit of triangulated landmarks (68, 3) by the distance between the eyes.
+
+    Raises:
+        CalibrationError: the eyes are nowhere known.
+    """
     gaps = np.array([np.linalg.norm(p[EYES[0]].mean(0) - p[EYES[1]].mean(0)) for p in shapes])
     gaps = gaps[gaps > 0]
     if len(gaps) == 0:
@@ -142,30 +177,8 @@ def solve_footage(
             " calibration.json or board images, then run 'express50 ingest' again"
         )
     eyes = float(np.median(gaps))
-    scale = eye_distance_mm * 1e-3 / eyes
-    metric = in_metres(adjusted.cameras, scale)
-    middle = scale * np.median([p.mean(0) for p in shapes], axis=0)
-    up = np.mean([rigid_fit(head, p)[0] for p in shapes], axis=0)[:, 1]
-    lone = "it sees a face, but never together with the cameras of the largest group"
-    blind = (
-        "it sees no face well, and too few of its features fit points that other cameras know:"
-        " add a camera between it and the next, board images or calibration.json"
-    )
-    return FootageSolution(
-        cameras=move_cameras(metric, canonical_from_rig(metric, middle, up)),
-        tracks=tracks,
-        errors=adjusted.errors,
-        inliers=tracks.features()
-        & (np.linalg.norm(adjusted.errors, axis=1) / tracks.sigma < OUTLIER),
-        dropped={n: lone if n in faces else blind for n in sorted(sizes) if n not in metric},
-        weak=_weak(tracks),
-        uncertainty={
-            n: head_error_of(metric[n], px**2, float(np.linalg.norm(metric[n].center - middle)))
-            for n, px in expected.items()
-        },
-        eye_frames=len(gaps),
-        eye_spread=1.4826 * float(np.median(np.abs(gaps - eyes))) / eyes,
-    )
+    spread = 1.4826 * float(np.median(np.abs(gaps - eyes))) / eyes
+    return EyeScale(eye_distance_m / eyes, len(gaps), spread)
 
 
 def _adjust(

@@ -302,8 +302,8 @@ def _from_footage(index: Index, config: CalibrateConfig) -> CalibratedRig:
         figures={
             "features": int(good.sum()),
             "known_focals": sorted(set(focals) & set(solved.cameras)),
-            "eye_frame_sets": solved.eye_frames,
-            "eye_spread": round(solved.eye_spread, 5),
+            "eye_frame_sets": solved.eyes.frame_sets,
+            "eye_spread": round(solved.eyes.spread, 5),
             "uncertainty": {
                 name: {"px": round(error.px * at_full[name], 4), "mm": round(error.mm, 4)}
                 for name, error in solved.uncertainty.items()

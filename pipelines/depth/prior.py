@@ -102,30 +102,40 @@ def signed_distance(scene: o3d.t.geometry.RaycastingScene, points: np.ndarray) -
 
 def close_mesh(vertices: np.ndarray, faces: np.ndarray) -> TrackedSolid:
     """Close the tracked mesh (V, 3), (F, 3): holes get fans to their middles."""
-    points, caps, borders, below = [vertices], [], [], []
-    for loop in boundary_loops(faces):
-        ring, count = vertices[loop], sum(map(len, points))
-        middle = ring.mean(0)
-        points.append(middle[None])
-        caps.append(_fan(loop, count))
-        if np.ptp(ring, axis=0).max() > NECK:
-            borders.append(caps[-1])
-            ways = (middle - vertices.mean(0), ring - middle)  # down and outward alike
-            norms = [np.linalg.norm(way, axis=-1, keepdims=True) for way in ways]
-            lower = ring + BODY * sum(
-                w / np.maximum(n, 1e-9) for w, n in zip(ways, norms, strict=True)
-            )
-            points += [lower, lower.mean(0, keepdims=True)]
-            row = count + 1 + np.arange(len(loop))
-            wall = np.stack([loop, np.roll(loop, -1), np.roll(row, -1), row], axis=1)
-            below += [wall[:, :3], wall[:, [0, 2, 3]], _fan(row, row[-1] + 1)]
-    every = np.concatenate(points)
-    scene = mesh_scene(every, np.concatenate([faces, *caps]))
-    if not borders:
-        return TrackedSolid(scene, None, scene, vertices.min(0), vertices.max(0))
-    body = mesh_scene(every, np.concatenate([faces, *caps, *below]))
-    border = mesh_scene(every, np.concatenate(borders))
-    return TrackedSolid(scene, border, body, vertices.min(0), vertices.max(0))
+    low, high = vertices.min(0), vertices.max(0)
+    loops = boundary_loops(faces)
+    middles = [vertices[loop].mean(0, keepdims=True) for loop in loops]
+    caps = [_fan(loop, len(vertices) + k) for k, loop in enumerate(loops)]
+    points, solid = [np.concatenate([vertices, *middles])], [np.concatenate([faces, *caps])]
+    scene = mesh_scene(points[0], solid[0])
+    large = [k for k, loop in enumerate(loops) if np.ptp(vertices[loop], axis=0).max() > NECK]
+    if not large:
+        return TrackedSolid(scene, None, scene, low, high)
+    border = mesh_scene(points[0], np.concatenate([caps[k] for k in large]))
+    for k in large:
+        lower, walls = _body_below(vertices, loops[k], sum(map(len, points)))
+        points.append(lower)
+        solid.append(walls)
+    body = mesh_scene(np.concatenate(points), np.concatenate(solid))
+    return TrackedSolid(scene, border, body, low, high)
+
+
+def _body_below(
+    vertices: np.ndarray, loop: np.ndarray, first: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Continue a mesh below a large hole: new vertices (L + 1, 3), from number `first`, and faces.
+
+    The walls go down and outward alike, and end in a cap.
+    """
+    ring = vertices[loop]
+    middle = ring.mean(0)
+    ways = (middle - vertices.mean(0), ring - middle)
+    down, outward = (w / np.maximum(np.linalg.norm(w, axis=-1, keepdims=True), 1e-9) for w in ways)
+    lower = ring + BODY * (down + outward)
+    row = first + np.arange(len(loop))
+    wall = np.stack([loop, np.roll(loop, -1), np.roll(row, -1), row], axis=1)
+    walls = np.concatenate([wall[:, :3], wall[:, [0, 2, 3]], _fan(row, first + len(loop))])
+    return np.concatenate([lower, lower.mean(0, keepdims=True)]), walls
 
 
 def _fan(loop: np.ndarray, middle: int) -> np.ndarray:

@@ -158,15 +158,7 @@ def make_photo_capture(
     """
     torch.set_num_threads(1)
     digest = file_sha256(picture.path)
-    try:
-        known = tomllib.loads((folder / "capture.toml").read_text()).get("picture_sha256", digest)
-    except (OSError, ValueError):  # nothing is there, or nothing that could be lost
-        known = digest
-    if known != digest:
-        raise CaptureError(
-            f"{picture.path}: {folder} was made of another picture; name this one with --subject,"
-            " or remove that folder"
-        )
+    _check_folder(folder, picture.path, digest)
     # A video is decoded twice, so that not all of its frames are held.
     frames = sum(1 for _ in upright_frames(picture)) if picture.video else 1
     probes = set(np.linspace(0, frames - 1, PROBES).round().astype(int).tolist())
@@ -186,14 +178,7 @@ def make_photo_capture(
     _write_footage(picture, folder / "cameras" / CAMERA)
     camera = single_camera(CAMERA, width, height, focal.pixels)
     write_bytes(folder / "calibration.json", dump_json(camera_rows({CAMERA: camera})))
-    rows = ["expression_id,start_frame,end_frame"]
-    if frames == 1:
-        rows.append("photo,0,0")
-    else:
-        edges = np.unique(np.linspace(0, frames, min(windows, frames) + 1).round().astype(int))
-        pairs = zip(edges[:-1], edges[1:], strict=True)
-        rows += [f"clip_{n:02d},{a},{b - 1}" for n, (a, b) in enumerate(pairs)]
-    write_bytes(folder / "cues.csv", ("\n".join(rows) + "\n").encode())
+    write_bytes(folder / "cues.csv", _cues(frames, windows).encode())
     fps = video_fps(picture.path) if picture.video else PHOTO_FPS
     meta = (
         f'subject = "{subject}"\nfps = {fps:.6g}\n'
@@ -203,6 +188,31 @@ def make_photo_capture(
     )
     write_bytes(folder / "capture.toml", meta.encode())
     return focal
+
+
+def _check_folder(folder: Path, picture: Path, digest: str) -> None:
+    """Raise CaptureError if a folder holds the capture of a picture with another digest."""
+    try:
+        known = tomllib.loads((folder / "capture.toml").read_text()).get("picture_sha256", digest)
+    except (OSError, ValueError):  # nothing is there, or nothing that could be lost
+        return
+    if known != digest:
+        raise CaptureError(
+            f"{picture}: {folder} was made from another picture; name this one with --subject, or"
+            " remove that folder"
+        )
+
+
+def _cues(frames: int, windows: int) -> str:
+    """Return the text of cues.csv: one frame is `photo`, more are cut into windows."""
+    rows = ["expression_id,start_frame,end_frame"]
+    if frames == 1:
+        rows.append("photo,0,0")
+    else:
+        edges = np.unique(np.linspace(0, frames, min(windows, frames) + 1).round().astype(int))
+        pairs = zip(edges[:-1], edges[1:], strict=True)
+        rows += [f"clip_{n:02d},{a},{b - 1}" for n, (a, b) in enumerate(pairs)]
+    return "\n".join(rows) + "\n"
 
 
 def find_faces(path: Path, images: list[np.ndarray], config: TrackConfig) -> list[Detection]:

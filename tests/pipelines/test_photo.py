@@ -115,7 +115,7 @@ def test_a_second_picture_of_the_same_name_takes_nobodys_place(
     out = tmp_path / "out"
     make_photo_capture(open_picture(tmp_path / "a/eva.png"), out, "eva", config)
     before = (out / "cameras/photo/frames/000000.png").read_bytes()
-    with pytest.raises(CaptureError, match="made of another picture; name this one"):
+    with pytest.raises(CaptureError, match="made from another picture; name this one"):
         make_photo_capture(open_picture(tmp_path / "b/eva.png"), out, "eva", config)
     assert (out / "cameras/photo/frames/000000.png").read_bytes() == before
     make_photo_capture(open_picture(tmp_path / "a/eva.png"), out, "eva", config)

@@ -7,7 +7,8 @@ import torch
 
 from benchmarks.head import draw_people, measure
 from express50.head.generator.head import procedural_mesh
-from express50.head.generator.people import FLIP, KEPT_VARIANCE, principal_directions
+from express50.head.generator.ict_registration import FLIP
+from express50.head.generator.people import KEPT_VARIANCE, principal_directions
 from express50.head.load import load_builtin
 
 
