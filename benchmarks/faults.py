@@ -1,13 +1,13 @@
 """Hurt runs in every way that we know, at random moments, and measure what is lost.
 
 ``python -m benchmarks.faults --hours 1`` runs one case after the other until the time is over. A
-case makes a dataset, runs a stage of slow items on it, hurts it, and runs it again until it
-is complete; then every byte is compared with what it must be, and `express50.dataset.audit` must find no
-fault. In a longer storm every third case kills a real stage, or a training, on a small recording,
-which takes some minutes to make. Each case has a number, which is the seed of all that is random in
-it: ``--seed N`` runs one again. With ``--folder`` a stopped storm goes on. `seconds_lost_per_kill`
-is work that was begun and not published; starting again, up to the first item, is in
-`restart_seconds_median`. The last line printed is one JSON object.
+case makes a dataset, runs a stage of slow items on it, hurts it, and runs it again until it is
+complete; then every byte is compared with what it must be, and `express50.dataset.audit` must find
+no fault. In a longer storm every third case kills a real stage, or a training, on a small
+recording, which takes some minutes to make. Each case has a number, which is the seed of all that
+is random in it: ``--seed N`` runs one again. With ``--folder`` a stopped storm goes on.
+`seconds_lost_per_kill` is work that was begun and not published; starting again, up to the first
+item, is in `restart_seconds_median`. The last line printed is one JSON object.
 """
 
 from __future__ import annotations
