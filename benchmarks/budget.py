@@ -5,7 +5,8 @@ from a minute to an hour and with every preset, and measures each run against th
 takes one person of two expressions, one pilot for all runs, and three budgets along the
 front, in processor time, which means something on a busy machine too. ``--captures`` takes footage
 without truth: errors are then differences from the dearest run, and promises cannot be checked.
-The last line printed is one JSON object.
+A budget that ends early, or is refused although a fixed preset takes no longer, is a miss of 100 %
+of its time, and keeps no promise. The last line printed is one JSON object.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ MAKERS = {
 
 @dataclass
 class Run:
-    """One run of the chain: what it was asked, took, promised and gave."""
+    """One run of the chain: what it was asked, took, promised and gave, and whether it ended."""
 
     name: str
     seconds: float
@@ -56,6 +57,7 @@ class Run:
     settings: dict[str, str]
     promised: dict[str, dict]
     errors: dict[str, float]
+    finished: bool = True
 
 
 def main() -> None:
@@ -126,11 +128,14 @@ def run_one(
         )
         (dataset.root / "done.json").write_text(json.dumps({"code": code}))
     record = dataset.root / "dial" / "run.json"
+    budget = parse_budget(options[1]).seconds if options[0] == "--budget" else None
     if not record.is_file():
-        return Run(name, core_seconds(dataset), None, None, {}, {}, {})
+        made = json.loads((dataset.root / "done.json").read_text())["code"] == 0
+        return Run(name, core_seconds(dataset), budget, None, {}, {}, {}, made)
     row = json.loads(record.read_text())
-    budget = parse_budget(row["budget"]).seconds
-    return Run(name, row["spent"], budget, row["seconds"], row["settings"], row["promised"], {})
+    keys = ("spent", "seconds", "settings", "promised", "finished")
+    spent, expected, settings, promised, finished = (row[key] for key in keys)
+    return Run(name, spent, budget, expected, settings, promised, {}, finished)
 
 
 def core_seconds(dataset: Dataset) -> float:
@@ -141,6 +146,9 @@ def core_seconds(dataset: Dataset) -> float:
 
 def measure_all(out: Path, runs: Sequence[Run], truth: Truth | None) -> None:
     """Measure every run against the truth, or against the dearest of them."""
+    runs = [run for run in runs if run.finished]
+    if not runs:
+        return
     best = Dataset(out / max(runs, key=lambda run: core_seconds(Dataset(out / run.name))).name)
     for run in runs:
         dataset = Dataset(out / run.name)
@@ -155,8 +163,6 @@ def measure_all(out: Path, runs: Sequence[Run], truth: Truth | None) -> None:
 def true_errors(dataset: Dataset, truth: Truth) -> dict[str, float]:
     """Return the typical error of each result's items, in the measure that its stage states."""
     rows: dict[str, list[float]] = {}
-    if not all(dataset.peaks_file(subject).is_file() for subject in truth.subjects()):
-        return {}  # the run ended before
     for sample in (*row_samples(dataset, truth), *peak_samples(dataset, truth)):
         typical = np.mean if sample.stage == "matte" else np.median
         rows.setdefault(MAKERS[sample.stage], []).append(float(typical(sample.errors)))
@@ -164,10 +170,9 @@ def true_errors(dataset: Dataset, truth: Truth) -> dict[str, float]:
 
 
 def figures(runs: Sequence[Run], grid: Sequence[Run], true: bool) -> dict:
-    """Compute the figures of the issue from all runs."""
-    unfinished = [run.name for run in runs if not run.errors]
-    runs = [run for run in runs if run.errors]
-    everyone = [*runs, *grid]
+    """Compute the figures of the issue from all runs; None where no run has any."""
+    asked, everyone = runs, [run for run in (*runs, *grid) if run.finished]
+    runs, grid = ([run for run in some if run.finished] for some in (runs, grid))
     scale = {
         name: max(float(np.median([r.errors[name] for r in everyone if name in r.errors])), 1e-9)
         for name in MAKERS.values()
@@ -183,21 +188,34 @@ def figures(runs: Sequence[Run], grid: Sequence[Run], true: bool) -> dict:
         best = min(map(final, fitting), default=final(run))
         regrets.append(100 * (final(run) / max(best, 1e-9) - 1))
     kept = [
-        p["low"] <= run.errors[name] <= p["high"]
-        for run in runs for name, p in run.promised.items() if p["stated"] and true
+        run.finished and p["low"] <= run.errors.get(name, math.inf) <= p["high"]
+        for run in asked for name, p in run.promised.items() if p["stated"] and true
     ]  # fmt: skip
-    over = [100 * max(0.0, run.seconds / run.budget - 1) for run in runs if run.budget]
+    over = [missed(run, everyone) for run in asked if run.budget]
     off = [100 * abs(r.seconds / r.expected - 1) for r in runs if r.expected]
     return {
-        "time_miss_percent": round(float(np.percentile(over, 90)), 1),
-        "forecast_miss_percent": round(float(np.percentile(off, 90)), 1),
-        "regret_percent": round(max(regrets), 1),
+        "time_miss_percent": round(float(np.percentile(over, 90)), 1) if over else None,
+        "forecast_miss_percent": round(float(np.percentile(off, 90)), 1) if off else None,
+        "regret_percent": round(max(regrets), 1) if regrets else None,
         "promise_kept_percent": round(100 * float(np.mean(kept)), 1) if kept else None,
         "promises": len(kept),
-        "time_saved_percent": saved(runs, grid, final),
-        "unfinished": unfinished,
-        "runs": [vars(run) for run in everyone],
+        "time_saved_percent": saved(runs, grid, final) if grid else None,
+        "unfinished": [run.name for run in asked if not run.finished],
+        "runs": [vars(run) for run in (*asked, *grid)],
     }
+
+
+def missed(run: Run, everyone: Sequence[Run]) -> float:
+    """Return by how many percent a budgeted run missed its time; 100 where it made too little.
+
+    A budget is refused before the run starts if nothing fits into it. That is right unless some
+    finished run took no longer.
+    """
+    budget = run.budget or math.inf
+    if run.finished:
+        return 100 * max(0.0, run.seconds / budget - 1)
+    begun = bool(run.settings)
+    return 100.0 if begun or any(other.seconds <= budget for other in everyone) else 0.0
 
 
 def saved(runs: Sequence[Run], grid: Sequence[Run], final) -> float | None:  # noqa: ANN001

@@ -2,7 +2,8 @@
 
 A cheaper setting of one stage is assumed to change a result independently of the other stages:
 squared differences add up, on top of the error that remains at the dearest settings. That remainder
-comes from the errors that stages state; where no stage states one, only the differences are known.
+comes from the errors that stages state, less what of the differences these errors confirm; where no
+stage states one, only the differences are known.
 """
 
 from __future__ import annotations
@@ -10,8 +11,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from statistics import median
 from typing import NamedTuple
+
+import numpy as np
 
 from express50.contract.stage import Stage
 from express50.dial.budget import Goal
@@ -21,7 +23,6 @@ from express50.dial.pilot import Ladder, standard_of
 from express50.dial.results import RESULTS, ResultKind
 from express50.errors import ConfigError
 
-LEAST_REST = 0.25  # of the error that was stated: differences may not explain it all
 STATES = 400  # partial choices that are kept; far more than a front has points
 
 
@@ -153,19 +154,32 @@ def rest_of(load: Workload, result: str) -> tuple[float, float, float] | None:
     None where no stage states this error.
     """
     losses = load.measured.losses
-    rests, ratios = [], []
-    for trial in load.measured.trials:
-        if result not in trial.errors:
-            continue
-        value, low, high = trial.errors[result]
-        lost = sum(
-            losses[name].get(trial.settings[name], {}).get(result, 0.0) ** 2 for name in losses
-        )
-        rests.append(max(value**2 - lost, (LEAST_REST * value) ** 2))
-        ratios.append((low / value, high / value) if value else (1.0, 1.0))
-    if not rests:
+    trials = [trial for trial in load.measured.trials if result in trial.errors]
+    if not trials:
         return None
-    return median(rests), median(r[0] for r in ratios), median(r[1] for r in ratios)
+    stated, low, high = np.array([trial.errors[result] for trial in trials]).T
+    known = stated > 0
+    ratios = [np.median(end[known] / stated[known]) if known.any() else 1.0 for end in (low, high)]
+    lost = [
+        sum(row.get(t.settings[name], {}).get(result, 0.0) ** 2 for name, row in losses.items())
+        for t in trials
+    ]
+    return remainder(stated**2, np.array(lost)), float(ratios[0]), float(ratios[1])
+
+
+def remainder(stated: np.ndarray, lost: np.ndarray) -> float:
+    """Return the squared error left where nothing is lost, from N trials' squares (N,).
+
+    Two settings may differ by as much as both are wrong, and be equally wrong. Therefore `lost`
+    counts as far as the stated errors fall with it: not at all where they do not, and in full where
+    they fall as much.
+    """
+    away = lost - lost.mean()
+    if not away.any():
+        return float(np.median(stated))
+    slope = away @ stated / (away @ away)
+    share = max(0.0, min(1.0, slope, (stated[lost > 0] / lost[lost > 0]).min()))
+    return float(np.median(stated - share * lost))
 
 
 def expected_errors(load: Workload, lost: Mapping[str, float]) -> dict[str, Expected]:

@@ -35,6 +35,7 @@ from express50.runner.runner import run_stage
 PEAKS = 3  # expressions of a trial
 SPARE_SHARE = 0.5  # of the time that the cheapest settings would leave over, for trials
 STEEPER = 3.0  # a setting that was not tried may cost this many times the one below it
+MEASURES = 2  # version of how results are compared
 Ladder = Mapping[str, Any]  # configurations of a stage by the name of the setting, cheapest first
 
 
@@ -69,7 +70,7 @@ class Chain:
             stage.name: [stage.version, {k: vars(c) for k, c in self.ladders[stage.name].items()}]
             for stage in self.stages
         }
-        return value_digest([steps, os.cpu_count(), self.pool.threads])[:16]
+        return value_digest([MEASURES, steps, os.cpu_count(), self.pool.threads])[:16]
 
     def measurable(self) -> list[str]:
         """Return the names of the stages up to the last one that makes a measured result."""

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 
 from express50.capture.frames import read_cameras_of
 from express50.contract.layout import Dataset
@@ -22,6 +23,8 @@ from express50.errors import Express50Error, FormatError
 from express50.files.images import read_image
 from express50.files.text import read_json_table
 from express50.geometry.transforms import rigid_fit
+from express50.head.load import load_head
+from express50.head.model import vertex_normals
 
 RIM = 0.008  # share of a picture's longer side: how wide the band about an outline is
 COMPARED = 4  # cameras of an expression; more change the mean by less than expressions do
@@ -115,22 +118,33 @@ def _tracks_apart(a: Dataset, b: Dataset, subject: str, names: Sequence[str]) ->
 
 
 def _meshes_apart(a: Dataset, b: Dataset, subject: str, names: Sequence[str]) -> list[float]:
+    """Compare registrations along their normals, as their error is stated."""
     files = [[d.registration_file(subject, name) for d in (a, b)] for name in names]
     there = [pair for pair in files if all(path.is_file() for path in pair)]
     both = [[read_registration(path).vertices for path in pair] for pair in there]
-    return _medians_apart([[pair[k] for pair in both] for k in (0, 1)])
+    if not both:
+        return []
+    faces = load_head(read_track(b.track_file(subject)).head).faces
+    return _medians_apart([[pair[k] for pair in both] for k in (0, 1)], faces)
 
 
-def _medians_apart(meshes: Sequence[Sequence[np.ndarray]]) -> list[float]:
+def _medians_apart(
+    meshes: Sequence[Sequence[np.ndarray]], faces: torch.Tensor | None = None
+) -> list[float]:
     """Return the median distance of vertices of E pairs of meshes (V, 3), millimetres.
 
-    One rigid motion is taken out before: solved rigs have worlds of their own.
+    With `faces` (F, 3) only what lies along the second mesh's normals counts. One rigid motion is
+    taken out before: solved rigs have worlds of their own.
     """
     if not meshes[0] or meshes[0][0].shape != meshes[1][0].shape:
         return []
-    one, two = (np.concatenate(list(some)).astype(np.float64) for some in meshes)
-    R, t = rigid_fit(one, two)
-    apart = np.linalg.norm(one @ R.T + t - two, axis=1).reshape(len(meshes[0]), -1)
+    one, two = (np.stack(list(some)).astype(np.float64) for some in meshes)
+    R, t = rigid_fit(one.reshape(-1, 3), two.reshape(-1, 3))
+    off = one @ R.T + t - two
+    apart = np.linalg.norm(off, axis=2)
+    if faces is not None:
+        centred = torch.from_numpy(two - two.mean(1, keepdims=True))
+        apart = np.abs((off * vertex_normals(centred, faces).numpy()).sum(2))
     return list(1000 * np.median(apart, axis=1))
 
 

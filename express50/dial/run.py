@@ -97,14 +97,23 @@ def measured_figures(
         ConfigError: the budget ended before any footage was ingested.
         StageError: no footage can be measured.
     """
-    root, path = chain.dataset.root, dial_dir(chain.dataset) / "measured.json"
+    path = dial_dir(chain.dataset) / "measured.json"
     found = read_measured(path, chain.key())
     if found is not None and (chosen or not found.untried):
         return found
+    found = _measure_one(chain, clock, allowance)
+    if not clock.closed():  # folders of trials go; no figure names a person
+        trials = [replace(trial, folder="") for trial in found.trials]
+        write_json(path, asdict(replace(found, trials=trials)))
+    return found
+
+
+def _measure_one(chain: Chain, clock: Clock, allowance: float) -> PilotFigures:
+    """Measure the first subject whose footage every stage can work on; raises what callers do."""
+    root = chain.dataset.root
     subjects = [s for s in chain.dataset.captures() if not exclusion_reason(chain.dataset, s)]
     if not subjects:
         raise StageError(f"{root}: no capture is registered; name a CAPTURE")
-    reason = ""
     for subject in subjects[:PILOTS]:
         try:
             found = measure(Pilot(chain, subject, clock), allowance)
@@ -116,19 +125,14 @@ def measured_figures(
                 " ingested; give more"
             ) from error
         broken = broken_stage(chain, found.trials[0])
-        reason = f"{broken}: {found.trials[0].failed[broken]}" if broken else ""
-        if not reason or clock.closed():
-            break
+        if not broken or clock.closed():  # a stage without time makes nothing
+            return found
+        reason = f"{broken}: {found.trials[0].failed[broken]}"
         chain.tell(f"{subject} cannot be measured: {reason}")
-    if found is None or (reason and not clock.closed()):  # a stage without time makes nothing
-        raise StageError(
-            f"{root}: no subject could be measured: {reason}; correct that, or run without --budget"
-            " to see what each stage says"
-        )
-    if not clock.closed():  # folders of trials go; no figure names a person
-        trials = [replace(trial, folder="") for trial in found.trials]
-        write_json(path, asdict(replace(found, trials=trials)))
-    return found
+    raise StageError(
+        f"{root}: no subject could be measured: {reason}; correct that, or run without --budget to"
+        " see what each stage says"
+    )
 
 
 def workload(

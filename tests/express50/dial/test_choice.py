@@ -1,0 +1,92 @@
+"""What the dial takes to be left at the dearest settings, and how differences are measured."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.budget import Run, figures
+from express50.contract.layout import Dataset
+from express50.dial.choice import remainder
+from express50.dial.results import RESULTS
+from express50.head.load import load_head
+from express50.head.model import vertex_normals
+
+LOST = np.array([0.5, 0.4, 0.1])  # squares: all cheap, then one stage dear, then another
+
+
+def test_what_stated_errors_confirm_is_taken_off():
+    assert remainder(0.25 + LOST, LOST) == pytest.approx(0.25)
+    assert remainder(0.25 + 0.5 * LOST, LOST) == pytest.approx(0.25)
+
+
+def test_differences_that_no_stated_error_confirms_promise_nothing():
+    same = np.full(3, 0.44)  # as of the mesh of the twin: a quarter was promised
+    assert remainder(same, LOST) == pytest.approx(0.44)
+    assert remainder(np.array([0.3, 0.35, 0.5]), LOST) == pytest.approx(0.35)  # they rise instead
+
+
+def test_a_remainder_is_not_below_zero():
+    assert remainder(np.array([0.4, 0.3, 0.0]), LOST) >= 0
+    assert remainder(np.array([0.3]), np.array([0.5])) == pytest.approx(0.3)
+
+
+def test_registrations_differ_along_their_normals_alone(tmp_path, monkeypatch):
+    head = load_head("procedural")
+    mesh = head.template.double()
+    normals = vertex_normals(mesh[None], head.faces)[0].numpy()
+    tangent = np.cross(normals, np.roll(normals, 1, axis=1))
+    mesh = mesh.numpy()
+    rng = np.random.default_rng(0)
+    out, along = 2e-4 * rng.normal(size=len(mesh)), 2e-3 * rng.normal(size=len(mesh))
+    moved = mesh + out[:, None] * normals + along[:, None] * tangent
+    kind = next(kind for kind in RESULTS if kind.name == "mesh")
+    found = apart_of(kind, tmp_path, monkeypatch, moved, mesh)
+    assert found == pytest.approx(1e3 * np.median(np.abs(out)), rel=0.05)
+
+
+def apart_of(kind, root, monkeypatch, one, two):
+    """Compare two meshes as registrations of one expression."""
+    where = {"a": one, "b": two}
+    for name in where:
+        path = Dataset(root / name).registration_file("S0", "e0")
+        path.parent.mkdir(parents=True)
+        path.touch()
+
+    class Stored:
+        head = "procedural"
+
+        def __init__(self, path):
+            self.vertices = where[Path(path).relative_to(root).parts[0]]
+
+    for reader in ("read_registration", "read_track"):
+        monkeypatch.setattr(f"express50.dial.results.{reader}", Stored)
+    (found,) = kind.apart(Dataset(root / "a"), Dataset(root / "b"), "S0", ["e0"])
+    return found
+
+
+def run(name, seconds, budget=None, finished=True, error=1.0):
+    promise = {"value": 1.0, "low": 0.5, "high": 1.5, "unit": "mm", "stated": True}
+    promised = {"depth": promise} if budget else {}
+    errors = {"depth": error} if finished else {}
+    settings = {"depth": "draft"} if promised else {}
+    return Run(name, seconds, budget, seconds, settings, promised, errors, finished)
+
+
+def test_a_budget_that_stops_early_is_a_miss_and_keeps_no_promise():
+    presets = [run("draft", 30.0), run("standard", 60.0, error=0.9)]
+    kept = figures([run("b", 50.0, 55.0)], presets, True)
+    assert (kept["time_miss_percent"], kept["promise_kept_percent"]) == (0, 100)
+    early = run("c", 20.0, 50.0, finished=False)
+    found = figures([early], presets, True)
+    assert found["unfinished"] == ["c"] and found["regret_percent"] is None
+    assert (found["time_miss_percent"], found["promise_kept_percent"]) == (100, 0)
+    both = figures([run("b", 50.0, 55.0), early], presets, True)
+    assert both["promise_kept_percent"] == 50 and both["regret_percent"] == 0
+
+
+def test_a_refused_budget_is_a_miss_only_where_a_preset_would_have_fitted():
+    presets = [run("draft", 30.0), run("standard", 60.0)]
+    small, fair = (Run("d", 5.0, budget, None, {}, {}, {}, False) for budget in (20.0, 40.0))
+    assert figures([small], presets, True)["time_miss_percent"] == 0
+    assert figures([fair], presets, True)["time_miss_percent"] == 100
