@@ -464,7 +464,9 @@ def run_exclusion(args: argparse.Namespace) -> int:
     chosen_subjects(args.dataset, [args.subject])
     reason = args.reason.strip() if args.verb == "exclude" else None
     if reason == "":
-        raise AnnotationError(f"{args.subject}: an exclusion needs a reason, as 'heavy makeup'")
+        raise AnnotationError(
+            f"{args.subject}: an exclusion needs a reason, such as 'heavy makeup'"
+        )
     event = Label(
         subject=args.subject, expression="", action=args.verb, annotator=args.annotator,
         time=time.time(), reason=reason,

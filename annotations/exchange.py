@@ -137,7 +137,7 @@ def _label(row: object, where: str) -> Label:
     needed = {"frame", "camera", "dhash"} if framed else set()
     needed |= {"reason"} if given["action"] == "flag" else set()
     if lacking := sorted(needed - set(given)):
-        raise AnnotationError(f"{where}: a {given['action']} without {', '.join(lacking)}")
+        raise AnnotationError(f"{where}: a {given['action']} needs {', '.join(lacking)}")
     try:
         return Label(**{k: _typed(k, v) for k, v in given.items()})
     except ValueError as error:

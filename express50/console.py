@@ -62,7 +62,7 @@ def run_handler(
         with readers_may_leave(sys.stdout):
             sys.stdout.flush()
         return code
-    except Exception as error:  # noqa: BLE001 (nobody is helped by a page of a library's files)
+    except Exception as error:  # noqa: BLE001 (a page of a library's files helps no user)
         log(f"{program}: {_line_of(error)}")
         if os.environ.get(DEBUG):
             traceback.print_exception(error)

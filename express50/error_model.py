@@ -90,7 +90,7 @@ def error_bounds(
     """
     model = model or error_models()[stage]
     score = scores_of(model, figures)
-    # Beyond the table errors go on as their scores, which are logarithms of errors.
+    # Outside the table errors follow their scores, which are logarithms of errors.
     beyond = score - np.clip(score, model.scores[0], model.scores[-1])
     typical, bound = (
         np.exp(np.interp(score, model.scores, table) + beyond)
@@ -103,7 +103,7 @@ def error_bounds(
 def size_sigma(cameras: Sequence[Camera], places: np.ndarray) -> np.ndarray:
     """Return deviations (N,), millimetres, of places (N, 3), metres, along a lone camera's rays.
 
-    One camera cannot tell a large head from a near one. With several cameras they are 0.
+    One camera cannot distinguish a large head from a near one. With several cameras they are 0.
     """
     if len(cameras) != 1:
         return np.zeros(len(places))

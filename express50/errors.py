@@ -69,7 +69,7 @@ class HeadModelError(Express50Error):
 
 
 class TrainError(Express50Error):
-    """Training or fitting cannot go on."""
+    """Training or fitting cannot continue."""
 
 
 def check_known(

@@ -75,7 +75,7 @@ class PageServer(ThreadingHTTPServer):
     daemon_threads = True
 
     def __init__(self, get: Get, post: Post | None, host: str, port: int) -> None:
-        """Listen, without serving yet; ConfigError if the port is taken, or is not one."""
+        """Listen, without serving yet; ConfigError if the port is taken or invalid."""
         self.door, self.get, self.post = Door(host), get, post
         self._free = BoundedSemaphore(AT_ONCE)
         try:

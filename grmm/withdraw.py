@@ -34,7 +34,7 @@ def _without(content: dict[str, Any], subject: str) -> dict[str, Any]:
     rows = [row for row, name in enumerate(content["subjects"]) if name != subject]
     places = [n for n, frame in enumerate(content["frames"]) if frame["subject"] != subject]
     frames = [content["frames"][n] for n in places]
-    # No one else shows an expression that this person alone performed.
+    # No other person shows an expression that this person alone performed.
     lost = {f["expression_id"] for f in content["frames"]} - {f["expression_id"] for f in frames}
     kept = [row for row, name in enumerate(content["expressions"]) if name not in lost]
     # Indexing with a list copies: a view would carry the removed row to the disk.

@@ -103,7 +103,7 @@ def _error(path: Path, role: Role, why: str) -> StageError:
 
 
 def _reason(error: BaseException) -> str:
-    """Return the last telling line of a library's message, which may run over pages."""
+    """Return the last informative line of a library's message, which may run over pages."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[-1][:200] if lines else type(error).__name__
 

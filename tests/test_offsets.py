@@ -140,7 +140,7 @@ def test_registered_meshes_are_packed_and_others_are_named(packed) -> None:
         for subject in ("S001", "S002")
         for row in json.loads((encoded / subject / "metrics.json").read_text())["warnings"]
     }
-    assert "of another track; run 'express50 register' again" in why["S001/neutral"]
+    assert "belongs to another track; run 'express50 register' again" in why["S001/neutral"]
     assert "not a registration" in why["S002/neutral"]
 
 

@@ -62,7 +62,7 @@ def expand(linear: np.ndarray, terms: int) -> np.ndarray:
 
 
 def correct_srgb(image: np.ndarray, matrix: tuple[tuple[float, ...], ...]) -> np.ndarray:
-    """Correct an sRGB image (H, W, 3) uint8; what leaves the range is clipped."""
+    """Correct an sRGB image (H, W, 3) uint8; values out of range are clipped."""
     rows = np.asarray(matrix, dtype=np.float32)
     out = np.empty_like(image)
     for top in range(0, len(image), STRIPE):

@@ -305,7 +305,7 @@ def decode_proxy(folder: Path, camera_id: str, frame: int) -> np.ndarray:
     except FileNotFoundError as error:
         raise FormatError(f"{folder}: proxies are missing; run 'express50 ingest' again") from error
     except (OSError, ValueError, TypeError, IndexError) as error:
-        raise FormatError(f"{table}: no table of proxies ({error}); ingest again") from None
+        raise FormatError(f"{table}: not a table of proxies ({error}); ingest again") from None
     return decode_image(data, f"{tar}: frame {frame}")
 
 

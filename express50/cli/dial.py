@@ -102,9 +102,13 @@ def _chain(args: argparse.Namespace) -> Iterator[Any]:
     from express50.runner.threads import cap_threads
 
     if args.preset is not None:
-        raise ConfigError("--preset: settings are measured and chosen here; leave it out, or --set")
+        raise ConfigError(
+            "--preset: --budget and --error choose the settings; leave it out, or use --set"
+        )
     if args.print_job:
-        raise ConfigError("--print-job: settings are not chosen yet; give --preset instead")
+        raise ConfigError(
+            "--print-job: the settings are not chosen yet; give --preset instead of --budget"
+        )
     check_workers(args)
     cap_threads(args.threads)
     known, dataset = list(stages().values()), Dataset(args.dataset.resolve())

@@ -206,7 +206,7 @@ def measure(dataset: Dataset, known: Sequence[Stage]) -> dict[str, Measured]:
         StageError: the ledger is missing.
     """
     if not dataset.ledger.is_file():
-        raise StageError(f"{dataset.root}: no ledger.sqlite; expected a dataset that was made")
+        raise StageError(f"{dataset.root}: not a dataset (no ledger.sqlite)")
     found = {}
     with Ledger(dataset.ledger, read_only=True) as ledger:
         for stage in known:

@@ -110,7 +110,7 @@ def run_one(args: argparse.Namespace) -> int:
 
 
 def run_all(args: argparse.Namespace) -> int:
-    """Run all stages in order; one that fails for some items goes on with the others."""
+    """Run all stages in order; a stage that fails for some items continues with the others."""
     names = list(stages())
     first = names.index(args.first) if args.first else 0
     last = names.index(args.last) if args.last else len(names) - 1
@@ -206,10 +206,10 @@ def slurm_jobs(args: argparse.Namespace) -> Mapping[str, Any] | None:
     """Read what the jobs of every stage ask for, where stages run in SLURM jobs."""
     if args.slurm is None:
         if args.print_job:
-            raise ConfigError("--print-job: expected --slurm JOBS beside it")
+            raise ConfigError("--print-job needs --slurm JOBS")
         return None
     if args.scheduler is not None:
-        raise ConfigError("--slurm and --scheduler: expected one of them")
+        raise ConfigError("--slurm and --scheduler: give only one of them")
     from express50.runner.slurm import check_slurm, read_slurm
 
     check_slurm(submit=not args.print_job)

@@ -23,7 +23,7 @@ from express50.local_server import NOT_FOUND, PageServer, Reply
 from express50.runner.ledger import COLUMNS, Ledger, Receipt, Run
 from express50.runner.outdated import few, outdated
 
-PAGE_SECONDS = 3.0  # between two pages while a run goes on
+PAGE_SECONDS = 3.0  # between two pages while a run lasts
 SILENT_SECONDS = 15.0  # a run without a sign of life for this long was killed
 RECENT = 50  # items whose rate counts for the time left
 FAILED_SHOWN = 200
@@ -103,7 +103,7 @@ def show_status(args: argparse.Namespace) -> int:
         table = _read(dataset)
         with Ledger(dataset.ledger, read_only=True) as ledger:
             why = {(s, i): w for s, i, w in outdated(dataset, list(stages().values()), ledger)}
-        # Receipts but for their files, which `express50 check` looks at.
+        # Receipts without their files, which `express50 check` looks at.
         rows = {
             s.stage: [
                 {k: getattr(r, k) for k in COLUMNS} | {"outdated": why.get((s.stage, r.item), "")}

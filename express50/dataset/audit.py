@@ -177,7 +177,7 @@ def _label_findings(dataset: Dataset, problems: LabelProblems) -> Iterator[Findi
 def _ledger_finding(dataset: Dataset, fix: bool, read_only: bool) -> Finding | None:
     """Find a ledger that is missing or damaged; rename it, so that stages start a new one."""
     again = f"express50 run {dataset.root}: every item is made again, to the same bytes"
-    what = "is missing; without it every output counts as made by nobody"
+    what = "is missing; without it no output counts as made by a run"
     if dataset.ledger.is_file():
         try:
             with Ledger(dataset.ledger, read_only) as ledger:
@@ -251,7 +251,7 @@ class _StageAudit:
     def _stage(self, stage: Stage) -> None:
         try:
             known = set(stage.items(self.dataset))
-        except BAD_INPUT:  # what names the items is damaged
+        except BAD_INPUT:  # the list of items is damaged
             known = None
         receipts = self.receipts[stage.name]
         faults = list(self._output_faults(stage.name))
@@ -345,7 +345,7 @@ class _StageAudit:
         elif fault.foreign:
             how = "move what no run wrote out of the folder, then check again"
         elif not known and fault.kind == "unknown":
-            how = f"{stage} has no such item now; move it away if nobody needs it"
+            how = f"{stage} has no such item now; move it away if it is not needed"
         elif self.fix:
             fixed, how = True, f"set aside; make it again: {again}"
             set_aside(self.dataset, stage, fault.item)

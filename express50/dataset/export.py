@@ -139,7 +139,9 @@ def with_clips(dataset: Dataset, head: Head, wanted: Sequence[str]) -> Head:
     path = existing_track(dataset, head.subject).with_name("sequence.npz")
     clips, track = read_sequence(path), head.track
     if clips.head != track.head or len(clips.shape) != len(track.shape):
-        raise FormatError(f"{path}: is not of the track beside it; run 'express50 track' again")
+        raise FormatError(
+            f"{path}: does not belong to the track beside it; run 'express50 track' again"
+        )
     rows = [i for i, cue in enumerate(clips.cues) if not wanted or cue in wanted]
     if not rows:
         raise StageError(f"{path}: holds no frame of {', '.join(wanted) or 'any clip'}")

@@ -128,7 +128,7 @@ def _check_options(track: Track, cameras: dict[str, Camera], options: AvatarOpti
             f" {', '.join(track.expressions)}"
         )
     if set(options.test_expressions or ()) >= set(track.expressions):
-        raise ConfigError("test expressions: all of them are, which leaves none to train on")
+        raise ConfigError("test expressions: all are chosen, which leaves none to train on")
     if options.validation_camera not in (None, *cameras):
         raise ConfigError(
             f"validation camera {options.validation_camera!r}: expected one of {', '.join(cameras)}"

@@ -208,7 +208,7 @@ def registration_of(path: Path, track: Track, digest: str) -> Registration | Non
         return None
     found = read_registration(path)
     if found.track != digest or found.vertices.shape != track.vertices.shape[1:]:
-        raise FormatError(f"{path}: is of another track; run 'express50 register' again")
+        raise FormatError(f"{path}: belongs to another track; run 'express50 register' again")
     return found
 
 

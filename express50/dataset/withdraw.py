@@ -1,7 +1,7 @@
 """Withdraw a subject: remove all that the dataset holds of a person, then search for the id.
 
-Whatever mixes subjects (packed shards, reports, trained models' pictures) is removed whole and made
-again without the person by running its command; others' outputs that name the person go too. A
+Everything that mixes subjects (packed shards, reports, trained models' pictures) is removed and
+made again without the person by running its command; others' outputs that name the person go too. A
 checkpoint loses the person's codes and frames; only a new training removes what its other
 weights learned. The raw capture lies outside the dataset and stays its owner's task.
 
@@ -116,7 +116,7 @@ def _mixed_paths(dataset: Dataset) -> Iterator[Path]:
     whole = (dataset.report_dir, dataset.root / "accuracy", dataset.replaced_dir)
     yield from (path for path in whole if path.exists())
     yield from (path for path in dataset.staging_dir.glob("*") if path.is_dir())
-    for path in (dataset.root / "grmm").rglob("*"):  # pictures and figures of whoever was trained
+    for path in (dataset.root / "grmm").rglob("*"):  # pictures and figures of the trained people
         if path.is_file() and path.suffix != ".pt":
             yield path
 

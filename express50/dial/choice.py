@@ -62,7 +62,7 @@ class Point:
 
 @dataclass(frozen=True, kw_only=True)
 class Workload:
-    """What is to be made.
+    """The work of a run.
 
     Attributes:
         stages: in order.

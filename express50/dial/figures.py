@@ -129,7 +129,7 @@ def read_measured(path: Path, key: str | None = None) -> PilotFigures | None:
             key=table["key"], trials=trials, losses=table["losses"], untried=table["untried"]
         )
     except (KeyError, TypeError) as error:
-        raise FormatError(f"{path}: not figures of a pilot ({error}); delete it") from error
+        raise FormatError(f"{path}: not the figures of a pilot ({error}); delete it") from error
 
 
 def trial_of(row: Mapping[str, Any]) -> Trial:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 DRAWS = 400
-LEAST_SPREAD = 0.05  # of a mean: machines are no more repeatable from day to day
+LEAST_SPREAD = 0.05  # of a mean: machines vary as much from day to day
 ALONE = 0.15  # of an item's seconds: their spread where no size has two items
 
 

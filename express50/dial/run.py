@@ -125,7 +125,7 @@ def _measure_one(chain: Chain, clock: Clock, allowance: float) -> PilotFigures:
                 " ingested; give more"
             ) from error
         broken = broken_stage(chain, found.trials[0])
-        if not broken or clock.closed():  # a stage without time makes nothing
+        if not broken or clock.closed():  # a stage without time has no output
             return found
         reason = f"{broken}: {found.trials[0].failed[broken]}"
         chain.tell(f"{subject} cannot be measured: {reason}")

@@ -1,4 +1,4 @@
-"""Write files so that after a crash each is absent or whole: aside, synced, renamed.
+"""Write files so that after a crash each is absent or complete: aside, synced, renamed.
 
 A full disk becomes one error, which stops a run before it computes what cannot be kept.
 """

@@ -80,7 +80,7 @@ def read_surface(path: Path) -> Surface:
 
 
 def check_faces(faces: np.ndarray, count: int) -> None:
-    """Raise ValueError if faces (F, 3) name vertices beyond a mesh's `count`."""
+    """Raise ValueError if faces (F, 3) name vertices that a mesh of `count` does not have."""
     if len(faces) and (faces.min() < 0 or faces.max() >= count):
         raise ValueError(f"triangles name vertices {faces.min()} to {faces.max()} of {count}")
 

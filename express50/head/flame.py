@@ -88,7 +88,7 @@ def read_flame_arrays(path: Path) -> dict[str, np.ndarray]:
     arrays = {key: to_array(content[key], key, str(path)) for key in _REQUIRED}
     vertices = arrays["v_template"].shape[0] if arrays["v_template"].ndim == 2 else -1
     if arrays["f"].ndim != 2 or arrays["shapedirs"].ndim != 3 or vertices < 1:
-        raise HeadModelError(f"{path}: v_template, f or shapedirs has no shape of FLAME's")
+        raise HeadModelError(f"{path}: v_template, f or shapedirs does not have FLAME's shape")
     expected = {
         "v_template": (vertices, 3),
         "f": (arrays["f"].shape[0], 3),

@@ -24,7 +24,7 @@ from express50.head.model import PARENTS, HeadModel, check_head
 
 VERTEX_COUNT = 26719
 METRES_PER_UNIT = 0.01
-# ICT-FaceKit's own, but for the brows (17 to 26), which its README has up to 8 mm above where
+# ICT-FaceKit's own, except for the brows (17 to 26), which its README has up to 8 mm above where
 # published marks have them, and 56, 58, 61, 63, 65 and 67 of the lips, nearer to their middle.
 LANDMARKS = (
     1225, 1888, 1052, 367, 1719, 1722, 2199, 1447, 966, 3661, 4390, 3927, 3924, 2608, 3272, 4088,

@@ -39,7 +39,7 @@ from express50.landmarks.network import (
 HALF_CONFIDENCE_SHARE = 0.025
 # Points outside a face are vague: at this share the score is halved.
 VAGUE_SHARE = 0.06
-# Where nothing scores as much the search goes on.
+# Where no face scores as much the search continues.
 FOUND_SCORE = 0.5
 # The network sees a face whose box is 0.5 to 1.4 of the one it was trained on, up to a quarter of
 # the window off its middle: the next windows are smaller by SHRINK, and STEP of their side apart.

@@ -59,7 +59,7 @@ def _existing_files(landmarks: str) -> dict[str, Path]:
 
 
 def try_source(landmarks: str) -> None:
-    """Read the files of a source as far as that goes without cameras; raises as `open_source`."""
+    """Read the files of a source as far as possible without cameras; raises as `open_source`."""
     files = _existing_files(landmarks)
     if "landmarks" in files:
         _read_raw(files["landmarks"])
@@ -181,8 +181,8 @@ def _read_raw(path: Path) -> Table:
         return _read_npz(path) if path.suffix.lower() == ".npz" else _read_json(path)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise FormatError(
-            f"{path}: no file of landmarks ({type(error).__name__}: {error}); expected the layout "
-            "of docs/FORMAT.md"
+            f"{path}: not a file of landmarks ({type(error).__name__}: {error}); expected the"
+            " layout of docs/FORMAT.md"
         ) from error
 
 
@@ -262,7 +262,7 @@ def load_fan(path: Path) -> torch.jit.ScriptModule:
             output = _heat(fan, torch.zeros(1, 3, FAN_CROP, FAN_CROP))
     except (*DAMAGE, torch.jit.Error) as error:
         # PyTorch's own words are a page, and guess at what happened to the file.
-        raise ConfigError(f"landmarks: {path} cannot be loaded, or not called; {wanted}") from error
+        raise ConfigError(f"landmarks: {path} cannot be loaded or called; {wanted}") from error
     if tuple(output.shape) != (1, POINTS, HEAT, HEAT):
         raise ConfigError(f"landmarks: {path} gives {tuple(output.shape)}; {wanted}")
     return fan

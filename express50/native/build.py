@@ -79,7 +79,7 @@ def compile_variant(variant: str, target: Path) -> None:
     """
     command = [compiler(), *FLAGS, *VARIANTS[variant], f'-DEXPRESS50_DIGEST="{source_digest()}"']
     target.parent.mkdir(parents=True, exist_ok=True)
-    # Written aside and renamed, so that a process that has the old one open keeps it whole.
+    # Written aside and renamed, so that a process that has the old one open keeps all of it.
     partial = target.with_name(f".{target.name}.{os.getpid()}")
     for openmp in (["-fopenmp"], []):
         run = subprocess.run(

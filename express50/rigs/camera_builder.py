@@ -130,7 +130,7 @@ def as_rig(cameras: Iterable[Camera], path: Path) -> dict[str, Camera]:
     for camera in cameras:
         if found.setdefault(camera.id, camera) is not camera:
             raise CalibrationError(
-                f"{path}: two cameras are called {camera.id}, expected a name each; rename one"
+                f"{path}: two cameras are called {camera.id}, give each its own name"
             )
     return checked(found, path)
 

@@ -83,7 +83,7 @@ class RemoteWorkers:
             parts = urlsplit(address if "://" in address else f"tcp://{address}")
             if parts.hostname is None or parts.port is None:
                 raise ValueError("it has no port")
-            # If nobody answers, dask itself would try for half a minute.
+            # Without an answer, dask itself would try for half a minute.
             if parts.scheme in ("tcp", "tls"):
                 socket.create_connection((parts.hostname, parts.port), KNOCK_SECONDS).close()
             client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)

@@ -1,4 +1,4 @@
-"""Publish outputs safely: an item appears whole, in one rename; a stage runs once at a time."""
+"""Publish outputs safely: an item appears complete, in one rename; a stage runs once at a time."""
 
 from __future__ import annotations
 

@@ -209,7 +209,7 @@ def run_stage(
 
 @dataclass(frozen=True)
 class _Work:
-    """The items of a stage by what is to be done with them.
+    """The items of a stage, sorted by the work that they need.
 
     Attributes:
         former: receipts of former runs.
@@ -417,7 +417,7 @@ def _record(dataset: Dataset, ledger: Ledger, receipt: Receipt, stands: bool) ->
 
 
 def _retire(dataset: Dataset, ledger: Ledger, stage: str, item: str) -> None:
-    """Set an output aside that no later stage may read; it is kept for when it is right again."""
+    """Set an output aside that no later stage may read; kept in case it becomes valid again."""
     if not dataset.item_dir(stage, item).exists():
         return
     receipt, made = ledger.read(stage).get(item), ledger.made(stage).get(item)

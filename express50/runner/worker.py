@@ -185,7 +185,7 @@ def keep_freed_memory() -> ctypes.CDLL | None:
     """Let this process use freed memory again instead of giving it back to the system at once.
 
     An array of a 4K picture has 25 to 100 MB. By default the system maps and clears such blocks
-    anew for every operation, which took a fifth of the time of keying. Returns the allocator; None
+    again for every operation, which took a fifth of the time of keying. Returns the allocator; None
     where it is not glibc's.
 
     Source: mallopt(3); M_TRIM_THRESHOLD is -1, M_MMAP_MAX -4.

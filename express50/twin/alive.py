@@ -140,7 +140,7 @@ def living_skin(
     folds = {}
     for kind, muscles in MUSCLES.items():
         for side in SIDES:
-            # Nobody folds evenly, on both sides alike.
+            # No face folds evenly on both sides.
             depth, gain = sum(values.get(f"{m}_{side}", 0.0) for m in muscles), rng.uniform(0.6, 1)
             folds[f"{kind}_{side}"] = float(gain * lines * np.clip(depth, 0, 1))
     # Two of three redden with effort, the others pale.

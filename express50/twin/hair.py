@@ -1,7 +1,7 @@
 """Grow hair: thin ribbons that flow over the head and break its silhouette.
 
 Strands march over the head in a flow field (away from the crown, combed, falling), in layers
-above the skin. They hang on the skull rigidly; the whole mesh is made once a subject.
+above the skin. They hang on the skull rigidly; the mesh is made once per subject.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ from express50.twin.subjects import TwinPerformance, make_subject, perform
 from express50.twin.truth import write_truth
 
 # Rays and plates of so many pixels are kept between frames (about 50 bytes each); beyond, every
-# band is made anew for every frame.
+# band is made again for every frame.
 _KEEP_PIXELS = 4_000_000
 
 # Loading a head model takes seconds, and a worker films several subjects.
@@ -49,7 +49,7 @@ def cast_subject(config: TwinConfig, subject_id: str) -> tuple[Body, TwinPerform
 
 @dataclass(frozen=True, kw_only=True)
 class StudioView:
-    """One camera with what every frame shares; ``bands`` are `studio_bands`, kept or made anew."""
+    """One camera with what every frame shares; ``bands`` are `studio_bands`, kept or made again."""
 
     camera: Camera
     index: int

@@ -22,7 +22,7 @@ from express50.files.containers import read_picture
 from express50.geometry.conventions import mirror_opencv_pixels, opencv_pixels_to_corner
 
 REQUIRED = ("squares_x", "squares_y", "square_length_m", "marker_length_m", "dictionary")
-ENOUGH = 4  # corners that show which way an image is to be read
+ENOUGH = 4  # corners that show an image's reading direction
 
 
 @dataclass(frozen=True)

@@ -211,7 +211,7 @@ def relative_pose(
     tested = [shared[i] for i in even(len(shared), 30)]
     near = NEAR * float(np.hypot(camera.width, camera.height))
     predict = _predictor([views[f] for f in tested], [from_poses[f] for f in tested], camera)
-    # Candidates are alike between frames: a fixed, even sample keeps the search small.
+    # Candidates are similar between frames: a fixed, even sample keeps the search small.
     sample = [candidates[i] for i in even(len(candidates), 80)]
     errors = np.stack([predict(candidate) for candidate in sample])
     best = int(np.argmin(np.minimum(errors, near).sum(1)))

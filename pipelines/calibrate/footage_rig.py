@@ -253,8 +253,8 @@ def _landmark_points(
 def _weak(tracks: PointTracks) -> dict[str, str]:
     features = tracks.select(tracks.features())
     return {
-        name: f"shares {count} features with two others, expected {LEAST_POINTS} or more: little"
-        " but the face holds it, its pose may be off by degrees"
+        name: f"shares {count} features with two others, expected {LEAST_POINTS} or more: its"
+        " pose depends almost only on the face and may be off by degrees"
         for name, count in zip(tracks.names, features.shared_points(), strict=True)
         if count < LEAST_POINTS
     }

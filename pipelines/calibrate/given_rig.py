@@ -120,8 +120,8 @@ def _free_moved_cameras(
 ) -> tuple[dict[str, Camera], list[str]]:
     """Free one camera after the other while that explains enough; at most a third of the rig.
 
-    The first-order gain does not tell a moved camera from its neighbours where few cameras see
-    each other. So the three with the largest gain are each freed in a fit of their own.
+    The first-order gain does not distinguish a moved camera from its neighbours where few cameras
+    see each other. So the three with the largest gain are each freed in a fit of their own.
     """
     points = triangulate_tracks(cameras, tracks)
     free: tuple[str, ...] = ()

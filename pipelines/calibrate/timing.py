@@ -140,7 +140,7 @@ def _noise(
     camera: np.ndarray,
     frame: np.ndarray,
 ) -> np.ndarray:
-    """Return what standard deviations (C, 2) for errors of one pixel are to be multiplied with.
+    """Return the factors of standard deviations (C, 2) that hold for errors of one pixel.
 
     `pulls` (N, 2) are the weighted errors. Corners of one image are off together where exposures
     are not periodic: then images count, not corners.

@@ -108,7 +108,7 @@ def join_tracks(
             if verified
             else {}
         )
-        if not found:  # less can be mistaken where only what is near the lines is compared
+        if not found:  # fewer mistakes are possible where only features near the lines are compared
             found = {
                 f: match_descriptors(p[1], q[1], epipolar_distance(*rig, p[0], q[0]) < reach)
                 for f, (p, q) in both.items()

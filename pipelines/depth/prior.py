@@ -29,7 +29,7 @@ DIRECTIONS = _CELL / np.linalg.norm(_CELL, axis=1, keepdims=True)
 class TrackedSolid:
     """A tracked mesh with caps over its holes, and those over large ones (the neck) as `border`.
 
-    `body` goes on below large holes: silhouettes of a torso are no silhouettes of a head.
+    `body` goes on below large holes: silhouettes of a torso are not those of a head.
     """
 
     scene: o3d.t.geometry.RaycastingScene

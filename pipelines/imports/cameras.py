@@ -44,7 +44,7 @@ def aligning_transform(
     if not shared:
         raise CalibrationError(
             f"{where}: its cameras are {', '.join(list(theirs)[:4])}, the dataset's"
-            f" {', '.join(list(ours)[:4])}: none match; is it of another capture?"
+            f" {', '.join(list(ours)[:4])}: none match; is it from another capture?"
         )
     for name in shared:
         _check_intrinsics(theirs[name], ours[name], f"{where}: camera {name}")
@@ -84,7 +84,7 @@ def _check_intrinsics(theirs: Camera, ours: Camera, where: str) -> None:
             f"{where}: focal length {theirs.K[0, 0]:.1f} px in {theirs.width}x{theirs.height}"
             f" pictures with the axis at ({centre[0]:.1f}, {centre[1]:.1f}); expected"
             f" {ours.K[0, 0]:.1f} px in {ours.width}x{ours.height} with ({cx:.1f}, {cy:.1f}), or"
-            " a whole picture made smaller: its intrinsics are of other pictures"
+            " a whole picture made smaller: its intrinsics belong to other pictures"
         )
 
 
@@ -102,7 +102,7 @@ def _check_unit(theirs: list[np.ndarray], ours: list[np.ndarray], where: str) ->
     if abs(scale - 1) > 2 * SHARE:
         raise CalibrationError(
             f"{where}: its rig is {scale:.4g} times as large as the dataset's: its unit is not the"
-            " metre, or it is of another rig; export it in metres"
+            " metre, or it is another rig; export it in metres"
         )
 
 

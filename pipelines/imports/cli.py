@@ -111,7 +111,7 @@ def add_commands(subparsers: Any) -> None:
 
 
 def run_remove(args: argparse.Namespace) -> int:
-    """Set imported items aside, and say which."""
+    """Set imported items aside and name them."""
     dataset = existing_dataset(args.dataset)
     with stage_lock(dataset, args.stage):
         gone = remove_imports(dataset, args.stage, lambda i: fnmatch.fnmatchcase(i, args.items))
@@ -120,7 +120,7 @@ def run_remove(args: argparse.Namespace) -> int:
 
 
 def run_import(args: argparse.Namespace) -> int:
-    """Import every item of the chosen subjects; one that is wrong is named, the others go on."""
+    """Import every item of the chosen subjects; a wrong one is named, and the others continue."""
     dataset, stage = existing_dataset(args.dataset.resolve()), stages()[args.action]
     subjects, rows = _subjects(dataset, args), []
     with stage_lock(dataset, stage.name), Ledger(dataset.ledger) as ledger:

@@ -55,7 +55,7 @@ def check_in_view(cameras: Mapping[str, Camera], vertices: np.ndarray, where: st
     if 2 * seen <= len(cameras):
         raise StageError(
             f"{where}: {seen} of {len(cameras)} cameras have the head in their picture: the track"
-            " is of another world than the cameras; name the calibration it was made with"
+            " has another world frame than the cameras; name the calibration it was made with"
             " (--cameras)"
         )
 

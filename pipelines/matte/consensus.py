@@ -25,7 +25,7 @@ from pipelines.matte.visual_hull import (
     subject_place,
 )
 
-FEWEST = 4  # views; of three, two that err alike would overrule one that does not
+FEWEST = 4  # views; of three, two with the same error would overrule a correct one
 EMPTY, FULL = 0.003, 0.98  # shares of the image
 # Share of a matte elsewhere than the others' subject, and of that which it lacks: together they
 # mean another place. Lacking this much more is enough by itself.

@@ -251,7 +251,7 @@ def find_support(
     """
     solid = (firm & region).astype(np.uint8)
     radius, edge = _pixels(CORE, length), _pixels(FILL, length)
-    # The image's border cuts the subject off; it goes on behind it.
+    # The image's border cuts the subject off; the subject continues behind it.
     pad = 4 * radius + edge + 2
     solid = cv2.copyMakeBorder(solid, pad, pad, pad, pad, cv2.BORDER_REPLICATE)
     thick = opened(solid, _pixels(0.006, length), erode)
@@ -313,7 +313,7 @@ def subject_colour(image: np.ndarray, core: np.ndarray, length: int) -> np.ndarr
 
 
 def _rim(core: np.ndarray, length: int) -> np.ndarray:
-    """Return pixels (H, W) of core near its edge, but for those that may be mixed with plate."""
+    """Return pixels (H, W) of core near its edge, except those that may be mixed with plate."""
     inner = eroded(core, 2)
     inner = inner if inner.any() else core
     return inner & ~eroded_about(inner, 2 * _pixels(REACH, length))

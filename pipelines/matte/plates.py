@@ -5,7 +5,7 @@ frame itself, where that shows plate: it grows with brightness and, through comp
 resampling, with the plate's own contrast, and its channels are correlated.
 
 A pixel is ``alpha * F + (1 - alpha) * B`` in linear light, which is what a lens averages. B, the
-plate, is known but for noise; F has the mean and the covariance of the subject's colours nearby.
+plate, is known up to noise; F has the mean and the covariance of the subject's colours nearby.
 The likeliest alpha under both is the Bayesian matting of Chuang et al. 2001 with B given: the
 covariance lets a strand be lighter or darker than its neighbours without being called more or
 less opaque. The deviation of alpha is large where F and B are alike.

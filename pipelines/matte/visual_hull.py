@@ -106,7 +106,7 @@ def label_pixels(view: MatteView, margin: float) -> np.ndarray:
         distance = cv2.distanceTransform((~opaque).astype(np.uint8), cv2.DIST_L2, 5)
         labels[distance <= margin] = RIM
     labels[view.alpha > INSIDE] = SOLID
-    # What the image cuts off goes on behind its border: nothing is clear next to no footage.
+    # What the image cuts off continues behind its border: nothing is clear next to missing footage.
     beyond = cv2.dilate((~view.valid).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     labels[beyond & (labels == CLEAR)] = OUT
     labels[~view.valid] = OUT
@@ -218,7 +218,7 @@ def evidence_of(view: MatteView, space: Space, place: np.ndarray) -> Evidence:
     np.minimum.at(front, pixels[sure], depth[sure])
     disc = np.ones((2 * spread + 1,) * 2, np.uint8)
     front = cv2.erode(front[:-1].reshape(shape), disc)
-    # As much as the cells were widened, lest a rim of them is taken for solid.
+    # As much as the cells were widened, so that no rim of them is taken for solid.
     solid = cv2.erode(np.isfinite(front).astype(np.uint8), disc) > 0
     solid &= _thick(view, np.bincount(pixels[sure], minlength=front.size + 1)[:-1])
     return Evidence(

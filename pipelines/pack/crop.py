@@ -150,7 +150,7 @@ def own_colours(image: np.ndarray, alpha: np.ndarray, plate: np.ndarray | None) 
     mean, covariance = local_colours(light, solid, soft, reach, SPREAD)
     share = opacity[soft].astype(np.float64)[:, None]
     if plate is None:
-        # Mostly subject: what is seen is as good a guess as what is nearby.
+        # Mostly subject: the pixel itself is as good a guess as its neighbours.
         colour = mean + share**4 * (light[soft] - mean)
     else:
         behind = to_light(plate)[soft]

@@ -126,7 +126,7 @@ def pack(dataset: Dataset, config: PackConfig, out: Path) -> Result:
     rows = [row for account in accounts.values() for row in account["dropped"]]
     left_out = dropped + [Note(row["what"], row["why"]) for row in rows]
     people = read_people(dataset, sorted(accounts))
-    # Of a large dataset whole metas would fill the memory.
+    # All metas of a large dataset would fill the memory.
     metas = (reader.meta(number) for number in range(len(reader)))
     shown = [{key: meta[key] for key in ON_CARD} for meta in metas]
     card = write_card(splits, shown, left_out, _statistics(totals), people)

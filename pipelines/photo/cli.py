@@ -120,11 +120,11 @@ def _account(focal: Focal, summaries: list[Summary]) -> None:
     for summary in summaries:
         say(*summary.lines())
     say(
-        f"focal length {focal.pixels:.0f} px ({focal.source}); the face alone is explained as well "
-        f"by {focal.low:.0f} to {focal.high:.0f} px"
+        f"focal length {focal.pixels:.0f} px ({focal.source}); by the face alone, "
+        f"{focal.low:.0f} to {focal.high:.0f} px fit as well"
     )
     if not focal.low <= focal.pixels <= focal.high:
-        say("warning: the focal length is not among these; check it, or name --focal-px")
+        say("warning: the focal length is outside this range; check it, or give --focal-px")
 
 
 def write_panel(dataset: Dataset, subject: str, config: TrackConfig, path: Path) -> None:

@@ -23,7 +23,7 @@ class RegionsConfig:
     image_side: int = 1536
     """Longest side, pixels, at which views are labelled; larger frames get enlarged labels."""
     depth: bool = True
-    """Use depth maps, if there are any, to tell pixels above the neck's end from those below."""
+    """Use depth maps, if there are any, to separate pixels above and below the neck's end."""
     scalp: Literal["auto", "hair", "skin"] = "auto"
     """Label of the mesh's scalp; auto: skin where its colours are those of the face."""
 

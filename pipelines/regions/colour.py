@@ -119,7 +119,7 @@ def by_colour(
     torso = solid & (labels == TORSO) & (geometry.height < SURE_BELOW)
     beyond = IMPOSSIBLE
     if bare:
-        # No scalp teaches hair, and what juts out beyond the mesh is skin as likely.
+        # Without a scalp hair has no samples, and what juts out of the mesh may as well be skin.
         labels = np.where(labels == SCALP, SKIN, labels)
         hair, beyond = np.zeros_like(hair), 0.0
     counts = [_counts(cells, mask) for mask in (hair, skin, torso)]

@@ -137,7 +137,7 @@ def _ava256_cameras(path: Path) -> dict[str, Camera]:
     """Read cameras by id (``cam<number>``), metres, for pictures of 2668 x 4096."""
     rows = read_json_table(path, CalibrationError).get("KRT")
     if not isinstance(rows, list) or not rows:
-        raise CalibrationError(f"{path}: has no list KRT of cameras; copy the file again")
+        raise CalibrationError(f"{path}: has no list of cameras called KRT; copy the file again")
     found = {}
     for row in rows:
         where = f"{path}: camera {row.get('cameraId') if isinstance(row, dict) else row!r}"

@@ -105,7 +105,7 @@ def _colours(path: Path, serials: set[str]) -> tuple[dict, dict[str, str]]:
 
 @dataclass(frozen=True, order=True)
 class Clip:
-    """The words that the parts of a RAVDESS file's name stand for."""
+    """The meaning of the parts of a RAVDESS file's name."""
 
     channel: str
     emotion: str

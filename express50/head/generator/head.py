@@ -1,7 +1,7 @@
 """Make the built-in head: a full head in FLAME's layout with the variety of people.
 
 Run `python -m express50.head.generator.head` after a change here: it rewrites `builtin.npz` with
-the mean and the shape directions that the file has. With `--people ict.npz` these are fitted anew
+the mean and the shape directions that the file has. With `--people ict.npz` these are fitted again
 to the people of ICT-FaceKit (`people`), which takes some minutes.
 
 The generator draws a head by rule, features placed by anthropometry (Farkas 1994). The mean of

@@ -396,7 +396,7 @@ def test_every_frame_of_a_clip_is_a_mesh(dataset, tmp_path):
         ({"R": np.ones((6, 3, 3))}, "R is not a rotation"),
         ({"t": np.full((6, 3), np.nan)}, "t has 18 values that are not finite"),
         ({"cues": np.array(["../x"] * 6)}, "expected letters"),
-        ({"head": "other"}, "is not of the track beside it"),
+        ({"head": "other"}, "does not belong to the track beside it"),
     ],
 )
 def test_a_damaged_sequence_is_one_line(dataset, tmp_path, capsys, changes, words):

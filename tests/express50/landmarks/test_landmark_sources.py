@@ -194,6 +194,6 @@ def test_files_that_are_none_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="cameras z"):
         read_points(path, {"a": LENS})
     path.write_text("{}")
-    with pytest.raises(FormatError, match="no file of landmarks"):
+    with pytest.raises(FormatError, match="not a file of landmarks"):
         read_points(path, {"a": LENS})
     assert source_files(str(path)) == {"landmarks": path}

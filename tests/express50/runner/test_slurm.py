@@ -207,7 +207,7 @@ def test_without_dask_jobqueue_is_one_error(tmp_path, monkeypatch, capsys):
 
 def test_options_that_exclude_each_other(tmp_path, capsys):
     assert main(["depth", str(tmp_path), "--print-job"]) == 2
-    assert "expected --slurm JOBS beside it" in capsys.readouterr().err
+    assert "needs --slurm JOBS" in capsys.readouterr().err
     slurm_and = ["--slurm", "time=10,memory=1G", "--scheduler", "tcp://host:1"]
     assert main(["depth", str(tmp_path), *slurm_and]) == 2
-    assert "expected one of them" in capsys.readouterr().err
+    assert "give only one of them" in capsys.readouterr().err
