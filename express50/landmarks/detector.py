@@ -23,12 +23,12 @@ import torch
 from express50.geometry.conventions import affine_to_opencv
 from express50.landmarks.network import (
     CROP,
-    EYE_CROP,
-    EYE_ZOOM,
     LEFT_EYE,
     MIRROR,
+    MOUTH,
     OUTLINE,
     POINTS,
+    CloseNet,
     LandmarkNet,
     Output,
     face_box,
@@ -52,6 +52,8 @@ KEEP_SHARE = 0.8
 # coins and backs of heads by more: there the score falls.
 LAST = ((0.75, False), (1.0, True), (1.0, False), (1.25, True))
 DIFFER_SHARE = 0.013
+# A close-up of the mouth is trusted where most of it is as likely in sight: not in profile.
+MOUTH_SEEN = 0.75
 
 
 @dataclass(frozen=True)
@@ -158,7 +160,7 @@ def detect_many(
             if held.score >= FOUND_SCORE:
                 del left[one]
     found = [place for place in best if place is not None]
-    return [_detection(place) for place in _with_eyes(net, pyramids, found)]
+    return [_detection(place) for place in _with_close_ups(net, pyramids, found)]
 
 
 def _detection(place: _Place) -> Detection:
@@ -343,36 +345,48 @@ def window_about(points: np.ndarray) -> np.ndarray:
     return place_window(centre @ turn, max(side, 8.0), angle)
 
 
-def eye_window(points: np.ndarray, left: bool) -> np.ndarray:
-    """Place the crop of an eye of landmarks (68, 2): the subject's left, or mirrored the right."""
-    ids = LEFT_EYE if left else MIRROR[LEFT_EYE]
-    turn = EYE_ZOOM * window_about(points)[:, :2] @ np.diag([1.0 if left else -1.0, 1.0])
-    return place_crop(points[ids].mean(0), turn, EYE_CROP)
+def close_window(
+    net: CloseNet, points: np.ndarray, ids: np.ndarray, flipped: bool = False
+) -> np.ndarray:
+    """Place the close-up of landmarks `ids` (N,) of (68, 2); a flipped one is mirrored."""
+    turn = net.zoom * window_about(points)[:, :2] @ np.diag([-1.0 if flipped else 1.0, 1.0])
+    return place_crop(points[ids].mean(0), turn, net.crop)
 
 
-def _with_eyes(
+def _with_close_ups(
     net: LandmarkNet, pyramids: list[list[np.ndarray]], places: list[_Place]
 ) -> list[_Place]:
-    """Look at the eyes again; a point stays where that is less sure of it."""
-    if net.eyes is None:
-        return places
+    """Look at eyes and mouth again; a point stays where that is less sure of it."""
     found = []
     for pyramid, place in zip(pyramids, places, strict=True):
-        points, sigma = place.points.copy(), place.sigma.copy()
-        windows = [eye_window(place.points, left) for left in (True, False)]
-        crops = np.stack([sample_window(pyramid, window, EYE_CROP) for window in windows])
-        with torch.inference_mode():
-            answer = net.eyes(torch.from_numpy(crops).permute(0, 3, 1, 2).float() / 255.0)
-        eyes, scales = (part.double().numpy() for part in answer)
-        for ids, window, eye, scale in zip(
-            (LEFT_EYE, MIRROR[LEFT_EYE]), windows, eyes, np.exp(scales), strict=True
-        ):
-            scale = scale * np.sqrt(abs(np.linalg.det(window[:, :2])))
-            surer = scale < place.sigma[ids]
-            points[ids[surer]] = (eye @ window[:, :2].T + window[:, 2])[surer]
-            sigma[ids[surer]] = scale[surer]
-        found.append(replace(place, points=points, sigma=sigma))
+        if net.eyes is not None:
+            eyes = ((LEFT_EYE, False), (MIRROR[LEFT_EYE], True))
+            place = _looked_closer(net.eyes, pyramid, place, eyes)
+        if net.mouth is not None and np.median(place.seen[MOUTH]) > MOUTH_SEEN:
+            place = _looked_closer(net.mouth, pyramid, place, ((MOUTH, False),))
+        found.append(place)
     return found
+
+
+def _looked_closer(
+    net: CloseNet,
+    pyramid: list[np.ndarray],
+    place: _Place,
+    looks: tuple[tuple[np.ndarray, bool], ...],
+) -> _Place:
+    """Look at some landmarks of a face, by their ids and whether the close-up is flipped."""
+    points, sigma = place.points.copy(), place.sigma.copy()
+    windows = [close_window(net, place.points, *look) for look in looks]
+    crops = np.stack([sample_window(pyramid, window, net.crop) for window in windows])
+    with torch.inference_mode():
+        answer = net(torch.from_numpy(crops).permute(0, 3, 1, 2).float() / 255.0)
+    found, scales = (part.double().numpy() for part in answer)
+    for (ids, _), window, at, scale in zip(looks, windows, found, np.exp(scales), strict=True):
+        scale = scale * np.sqrt(abs(np.linalg.det(window[:, :2])))
+        surer = scale < place.sigma[ids]
+        points[ids[surer]] = (at @ window[:, :2].T + window[:, 2])[surer]
+        sigma[ids[surer]] = scale[surer]
+    return replace(place, points=points, sigma=sigma)
 
 
 def make_pyramid(image: np.ndarray) -> list[np.ndarray]:
@@ -459,5 +473,5 @@ def follow(net: LandmarkNet, image: np.ndarray, window: np.ndarray) -> Detection
     part = np.ascontiguousarray(image[low[1] : high[1], low[0] : high[0]])
     moved = window - np.column_stack([np.zeros((2, 2)), low])
     pyramid = make_pyramid(part)
-    place = _with_eyes(net, [pyramid], _run(net, [Look(pyramid, moved)]))[0]
+    place = _with_close_ups(net, [pyramid], _run(net, [Look(pyramid, moved)]))[0]
     return _detection(replace(place, points=place.points + low, outline=place.outline + low))

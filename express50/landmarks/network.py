@@ -6,8 +6,9 @@ then corrects what does not look like a face, as where a heat map was fooled by 
 says of each point how far off it may be (the scale of a two-dimensional Laplace distribution) and
 whether it can be seen.
 
-The eyes are looked at once more, at twice the resolution: a small network of its own finds their
-six points each, as the first one hardly tells half shut lids from open ones.
+Eyes and mouth are looked at once more, at about twice the resolution: small networks of their own
+find their points, as the first one hardly tells half shut lids from open ones, or shows of teeth
+from shut lips.
 
 The landmarks are fixed places of a head. The outline, 17 points of the edge of the face that a
 picture shows, is what published marks have in place of the jaw line's. The dense points, found on
@@ -44,10 +45,10 @@ MIRROR = np.array(
      45, 44, 43, 42, 47, 46, 39, 38, 37, 36, 41, 40,
      54, 53, 52, 51, 50, 49, 48, 59, 58, 57, 56, 55, 64, 63, 62, 61, 60, 67, 66, 65]
 )  # fmt: skip
-# An eye is seen in a crop of EYE_CROP pixels, each EYE_ZOOM of a pixel of the face's crop; the
-# subject's right eye is mirrored. Its points are the landmarks LEFT_EYE, or their partners.
-EYE_CROP, EYE_ZOOM = 48, 0.6
-LEFT_EYE = np.arange(42, 48)
+# The landmarks of the subject's left eye and of the mouth.
+LEFT_EYE, MOUTH = np.arange(42, 48), np.arange(48, 68)
+# Those of the inner lips that meet, the upper ones first.
+INNER_LIPS = ((61, 62, 63), (67, 66, 65))
 # Suffix of buffers that are not stored: batch normalisation counts its batches.
 COUNTERS = "num_batches_tracked"
 
@@ -172,24 +173,40 @@ class DensePart(MorePoints):
         self.register_buffer("weights", torch.zeros(count, 3))
 
 
-class EyeNet(nn.Module):
-    """Finds the points of the subject's left eye in crops (B, 3, 48, 48) in [0, 1]."""
+class CloseNet(nn.Module):
+    """Finds points in close-ups (B, 3, crop, crop) in [0, 1].
 
-    def __init__(self) -> None:
+    Attributes:
+        crop: side of the close-ups, a multiple of 8.
+        zoom: size of one of their pixels, in pixels of the face's crop.
+    """
+
+    def __init__(self, count: int, crop: int, zoom: float) -> None:
         super().__init__()
+        self.crop, self.zoom = crop, zoom
         self.stem, self.block24 = _conv(3, 16, 5, 2), Residual(16)
         self.down12, self.block12 = _conv(16, 32, 3, 2), Residual(32)
         self.down6, self.block6 = _conv(32, 48, 3, 2), Residual(48)
-        self.first, self.second = nn.Linear(48 * 36, 64), nn.Linear(64, 3 * len(LEFT_EYE))
+        self.first, self.second = nn.Linear(48 * (crop // 8) ** 2, 64), nn.Linear(64, 3 * count)
 
     def forward(self, crops: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return points (B, 6, 2) in crop pixels and log scales (B, 6), as of the landmarks."""
+        """Return points (B, N, 2) in crop pixels and log scales (B, N), as of the landmarks."""
         x = functional.relu(self.stem(_normalised(crops)))
         x = functional.relu(self.down12(self.block24(x)))
         x = self.block6(functional.relu(self.down6(self.block12(x))))
-        out = self.second(functional.relu(self.first(x.flatten(1)))).view(-1, 3, len(LEFT_EYE))
-        points = 0.5 * EYE_CROP + 8.0 * out[:, :2].transpose(1, 2)
+        out = self.second(functional.relu(self.first(x.flatten(1)))).unflatten(1, (3, -1))
+        points = 0.5 * self.crop + 8.0 * out[:, :2].transpose(1, 2)
         return points, (0.5 + out[:, 2]).clamp(-3.0, 4.0)
+
+
+def eye_net() -> CloseNet:
+    """Return a network for the subject's left eye, or the right one mirrored."""
+    return CloseNet(len(LEFT_EYE), 48, 0.6)
+
+
+def mouth_net() -> CloseNet:
+    """Return a network for the mouth."""
+    return CloseNet(len(MOUTH), 64, 0.65)
 
 
 class LandmarkNet(nn.Module):
@@ -198,15 +215,16 @@ class LandmarkNet(nn.Module):
     Crops of half the size (64, 64) are understood as well; points are in pixels of 128 all the
     same. Training begins with them, for a quarter of the time.
 
-    A network for other pictures than of `whole` heads finds no outline and has no `eyes`; one of
-    no `dense` points finds none.
+    A network for other pictures than of `whole` heads finds no outline and has neither `eyes` nor
+    `mouth`; one of no `dense` points finds none.
     """
 
-    def __init__(self, whole: bool = False, dense: int = 0) -> None:
+    def __init__(self, whole: bool = False, dense: int = 0, mouth: bool = True) -> None:
         super().__init__()
         self.outline = MorePoints(OUTLINE, 48, 128, 3) if whole else None
         self.dense = DensePart(dense, 64, 128) if dense else None
-        self.eyes = EyeNet() if whole else None
+        self.eyes = eye_net() if whole else None
+        self.mouth = mouth_net() if whole and mouth else None
         self.stem1, self.stem2 = _conv(3, 16, 5, 2), _conv(16, 32, 3, 2)
         self.block32 = Residual(32)
         self.down16, self.block16 = _conv(32, 64, 3, 2), Residual(64)
@@ -333,7 +351,8 @@ def trainable_network(path: Path = WEIGHTS) -> LandmarkNet:
     """
     names = [key for key in LandmarkNet().state_dict() if not key.endswith(COUNTERS)]
     arrays = read_arrays(path, FormatError, "landmark weights", names)
-    net = LandmarkNet("outline.spread" in arrays, len(arrays.get("dense.faces", ())))
+    mouth = "mouth.first.weight" in arrays
+    net = LandmarkNet("outline.spread" in arrays, len(arrays.get("dense.faces", ())), mouth)
     names = [key for key in net.state_dict() if not key.endswith(COUNTERS)]
     try:
         state = {key: torch.from_numpy(arrays[key].astype(np.float32)) for key in names}

@@ -24,7 +24,7 @@ from express50.geometry.cameras import Camera, normalised
 from express50.geometry.conventions import cell_to_corner
 from express50.landmarks import source_files
 from express50.landmarks.detector import SMALLEST, Detection, cut_crop, detect, place_crop
-from express50.landmarks.eyes_and_lips import Irises, find_irises, open_lips
+from express50.landmarks.irises import Irises, find_irises
 from express50.landmarks.network import load_network
 
 SCHEMA = "express50.landmarks/1"
@@ -105,7 +105,7 @@ def open_source(
 
     def find(image: np.ndarray, camera_id: str, frame: int) -> Marked:
         face = detect(net, image, refinements, smallest)
-        face = open_lips(image, face) if fan is None else find_with_fan(fan, image, face)
+        face = face if fan is None else find_with_fan(fan, image, face)
         return Marked(face, find_irises(image, face), visible_contour=fan is not None)
 
     return find

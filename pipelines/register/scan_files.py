@@ -27,7 +27,7 @@ from pipelines.register.scan_mesh import KINDS, UNITS, Scan, read_scan
 from pipelines.register.stage import LEAST_SEEN, write_registration
 from pipelines.track.stage import write_track
 
-VERSION = 4  # raise it when the same scan gives other files
+VERSION = 5  # raise it when the same scan gives other files
 INDEX = "index.csv"
 COLUMNS = (
     "name", "scan", "parameters", "mesh", "parameters_mm_median", "parameters_mm_p95",

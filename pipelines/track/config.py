@@ -8,7 +8,7 @@ from typing import Literal
 
 from express50.errors import ConfigError
 
-VERSION = 18
+VERSION = 19
 UV_WEIGHTS = Path(__file__).with_name("face_uv_weights.npz")
 
 

@@ -1,4 +1,4 @@
-"""Use eyes and jaw line: irises turn the eyes, shut lids meet, the jaw line lies on the rim.
+"""Use eyes, lips and jaw line: irises turn the eyes, what is shut meets, the jaw is on the rim.
 
 **Irises** are pixels that the iris vertices should project to. An eyeball misplaced by a millimetre
 turns the gaze by five degrees in every expression alike, so the median offset over a subject's
@@ -7,6 +7,9 @@ expressions is attributed to misplacement, and only the rest to gaze.
 **Lids**: an eye is shut if cameras find no iris that they find at other times. Contrast decides
 that over some twenty pixels, whereas the distance between the lids is a few. Half-shut eyes stay
 as seen.
+
+**Lips** are shut if they are not surely seen apart. A fit to landmarks that err one by one would
+part them, and most in depth, which a single picture does not show.
 
 **Jaw line**: people, and networks trained on their marks, mark the visible edge of the cheek where
 the head turns away. A landmark whose skin faces the camera keeps its place in the embedding, one
@@ -27,10 +30,11 @@ import torch
 from express50.geometry.cameras import Camera, project_with_slope
 from express50.geometry.raycast import mesh_scene
 from express50.head.model import HeadModel, vertex_normals
-from express50.landmarks.eyes_and_lips import EYES
+from express50.landmarks.irises import EYES
+from express50.landmarks.network import INNER_LIPS
 from pipelines.track.observe import LandmarkView, Observation, agree
 from pipelines.track.state import Target
-from pipelines.track.terms import LidTerm, MeshPlaces, PixelTerm, Sighting, landmark_anchors
+from pipelines.track.terms import MeshPlaces, PixelTerm, ShutTerm, Sighting, landmark_anchors
 
 LOOKS_AT = 0.3  # cosine between gaze and camera below which an iris is not trusted
 # Standard deviations of an eyeball's misplacement: what remains of it, and the prior of it.
@@ -46,6 +50,9 @@ LEAST_CAMERAS = 2
 # squared confidences over the cameras sum to at most this share of the usual.
 CHANCE = 0.3
 GAP = 0.1  # share of the gap between the lids that is left
+# Lips are shut if they are seen apart by less than so many standard deviations, which no number of
+# views makes smaller than half of the best one's: all views of a mouth err alike.
+LIPS_SHUT, COMMON_SHARE = 3.0, 0.5
 
 JAW = 17
 # Cosine between skin and line of sight: above it a point is in plain view, and within RIM of a
@@ -184,15 +191,38 @@ def _jaw_term(
     return PixelTerm(MeshPlaces.of_vertices(line.places.vertices[taken, 0]), (seen,))
 
 
-def lid_terms(model: HeadModel, observation: Observation) -> tuple[LidTerm, ...]:
-    """Make the term of an observation's shut eyes, if there are any."""
-    if not observation.shut:
+def shut_terms(model: HeadModel, observation: Observation) -> tuple[ShutTerm, ...]:
+    """Make the term of an observation's shut eyes and lips, if there are any."""
+    gap, sigma = lips_gap(observation)
+    lips = [INNER_LIPS] if abs(gap) < LIPS_SHUT * sigma else []
+    pairs = [*(EYES[side][2:] for side in observation.shut), *lips]
+    if not pairs:
         return ()
     marks = landmark_anchors(model)
-    upper, lower = (
-        np.concatenate([EYES[side][lid] for side in observation.shut]) for lid in (2, 3)
-    )
-    return (LidTerm(marks.some(upper).minus(marks.some(lower))),)
+    upper, lower = (np.concatenate(ids) for ids in zip(*pairs, strict=True))
+    return (ShutTerm(marks.some(upper).minus(marks.some(lower))),)
+
+
+def lips_gap(observation: Observation) -> tuple[float, float]:
+    """Return how far apart the inner lips are seen, in shares of the mouth's width, and its sigma.
+
+    The mean over the views by how well they see it; both are infinite if none does.
+    """
+    upper, lower = (list(ids) for ids in INNER_LIPS)
+    gaps, sigmas = [], []
+    for view in observation.views:
+        along = view.points[54] - view.points[48]
+        width = float(np.linalg.norm(along))
+        sigma = float(view.sigma[upper + lower].mean())
+        if 0 < sigma < np.inf and width > 0:
+            across = np.array([-along[1], along[0]]) / width**2
+            gaps.append(float((view.points[lower] - view.points[upper]).mean(0) @ across))
+            sigmas.append(sigma / width)
+    if not gaps:
+        return np.inf, np.inf
+    weights = np.array(sigmas) ** -2
+    least = COMMON_SHARE * min(sigmas)
+    return float(np.average(gaps, weights=weights)), max(float(weights.sum() ** -0.5), least)
 
 
 def shut_lids(

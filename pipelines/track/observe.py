@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from express50.geometry.cameras import Camera, project_pinhole, project_with_slope, triangulate
-from express50.landmarks.eyes_and_lips import Irises
+from express50.landmarks.irises import Irises
 
 PAIR_LIMIT = 120
 LANDMARK_FLOOR_PX = 1.0  # least error assumed of a landmark, for a face 128 px tall

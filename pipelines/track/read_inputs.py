@@ -17,7 +17,7 @@ from express50.files.images import read_alpha
 from express50.geometry.cameras import Camera, project_pinhole
 from express50.landmarks import EMBEDDED
 from express50.landmarks.detector import follow, window_about
-from express50.landmarks.eyes_and_lips import find_irises, open_lips
+from express50.landmarks.irises import find_irises
 from express50.landmarks.network import face_box, load_network
 from express50.landmarks.sources import Marked, Source, open_source
 from pipelines.track.eyes_and_jaw import shut_lids
@@ -64,7 +64,6 @@ def open_follower(landmarks: str) -> Follow | None:
         middle, side = face_box(face.points)
         if np.linalg.norm(middle - face_box(expected)[0]) > MOVED_SHARE * side:
             face = follow(net, image, window_about(face.points))
-        face = open_lips(image, face)
         return Marked(face, find_irises(image, face), visible_contour=False)
 
     return look

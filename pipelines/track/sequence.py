@@ -29,7 +29,7 @@ from express50.files.atomic import write_bytes
 from express50.files.digests import text_digest
 from pipelines.track.basis import POSE_SIZE, Basis, Points
 from pipelines.track.config import VERSION
-from pipelines.track.eyes_and_jaw import EyeOffsets, lid_terms, with_irises_and_jaw
+from pipelines.track.eyes_and_jaw import EyeOffsets, shut_terms, with_irises_and_jaw
 from pipelines.track.face_uv import FaceUvMap, slide_term, with_slide
 from pipelines.track.fit import condensed, fit
 from pipelines.track.observe import Observation
@@ -124,7 +124,7 @@ def _track_frame(
     pose = _start(person, observation, before)
     # Views from behind are left out as at the peaks.
     sigma = posed_sigma(observation, pose.rotation, pose.own[-3:])
-    target = Target(observation, sigma, False, lid_terms(model, observation))
+    target = Target(observation, sigma, False, shut_terms(model, observation))
     if before is None:
         pose = _fitted(person, target, pose, LANDMARK_STEPS)
     mesh = _mesh(person, pose)

@@ -25,7 +25,7 @@ from express50.head.model import landmarks
 from pipelines.track.appearance import write_texture
 from pipelines.track.basis import Basis, freeze_shape, make_basis, split_shape, with_modes
 from pipelines.track.config import TrackConfig
-from pipelines.track.eyes_and_jaw import lid_terms, measure_eyes
+from pipelines.track.eyes_and_jaw import measure_eyes, shut_terms
 from pipelines.track.fit import consistent_sigma, fit, vertex_sigma
 from pipelines.track.observe import Observation
 from pipelines.track.read_inputs import (
@@ -175,7 +175,7 @@ def fit_landmarks(
             lost.append(Note(observation.expression, str(error)))
             continue
         poses.append(pose)
-        terms = (*lid_terms(basis.model, observation), *further)
+        terms = (*shut_terms(basis.model, observation), *further)
         sigma = posed_sigma(observation, *pose)
         targets.append(Target(observation, sigma, observation.expression == neutral, terms))
     state = start_state(basis, poses)

@@ -16,7 +16,7 @@ from express50.geometry.cameras import Camera, project_with_slope
 from express50.head.model import HeadModel
 
 HUBER = 1.5  # standard deviations beyond which a residual counts by its length, not its square
-LID_GAP_M = 0.0005  # standard deviation of the gap between the lids of a shut eye
+SHUT_GAP_M = 0.0005  # standard deviation of the gap between lids or lips that are shut
 SLIDE_OUTLIER_M = 0.004
 
 Residuals = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -208,15 +208,15 @@ class SlideTerm:
 
 
 @dataclass(frozen=True)
-class LidTerm:
-    """Differences between upper and lower lid of shut eyes should vanish, wherever the lids are."""
+class ShutTerm:
+    """Differences between lids or lips that are shut should vanish, wherever these are."""
 
     anchors: MeshPlaces
 
     def residuals(self, places: np.ndarray) -> Residuals:
         """Return the metres apart, over sigma."""
-        slope = np.broadcast_to(np.eye(3) / LID_GAP_M, (len(places), 3, 3))
-        return np.arange(len(places)), places / LID_GAP_M, slope
+        slope = np.broadcast_to(np.eye(3) / SHUT_GAP_M, (len(places), 3, 3))
+        return np.arange(len(places)), places / SHUT_GAP_M, slope
 
     def loss(self, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Evaluate least squares."""

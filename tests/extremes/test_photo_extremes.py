@@ -16,7 +16,7 @@ from express50.head.load import load_head
 from express50.head.model import landmarks, pose
 from express50.head.preview import render_preview
 from express50.landmarks.detector import Detection, detect
-from express50.landmarks.eyes_and_lips import find_irises
+from express50.landmarks.irises import find_irises
 from express50.landmarks.network import load_network
 from pipelines.photo.capture import find_faces, single_camera, weigh_focal
 from pipelines.track.basis import Basis, Points, make_basis

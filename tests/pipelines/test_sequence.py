@@ -17,7 +17,7 @@ from express50.errors import StageError
 from express50.geometry.cameras import project
 from express50.geometry.transforms import axis_angle_to_matrix
 from express50.landmarks.detector import Detection
-from express50.landmarks.eyes_and_lips import Irises
+from express50.landmarks.irises import Irises
 from express50.landmarks.sources import Marked
 from pipelines.track import sequence
 from pipelines.track.basis import Points, freeze_shape

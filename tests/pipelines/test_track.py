@@ -17,7 +17,7 @@ from express50.geometry.cameras import Camera, project, project_with_slope
 from express50.geometry.transforms import axis_angle_to_matrix, look_at
 from express50.head.model import landmarks, pose
 from express50.landmarks.detector import Detection
-from express50.landmarks.eyes_and_lips import Irises
+from express50.landmarks.irises import Irises
 from express50.landmarks.sources import Marked
 from pipelines.track.basis import Basis, Points, make_basis
 from pipelines.track.config import TrackConfig

@@ -11,7 +11,7 @@ import torch
 from express50.geometry.cameras import project, triangulate
 from express50.head.load import load_head
 from express50.head.model import HeadModel, landmarks, vertex_normals
-from express50.landmarks.eyes_and_lips import Irises
+from express50.landmarks.irises import Irises
 from pipelines.track.basis import make_basis
 from pipelines.track.eyes_and_jaw import (
     JAW,

@@ -10,7 +10,7 @@ import pytest
 from express50.geometry.cameras import project
 from express50.head.load import load_head
 from express50.landmarks.detector import Detection
-from express50.landmarks.eyes_and_lips import Irises
+from express50.landmarks.irises import Irises
 from express50.landmarks.network import face_box
 from express50.landmarks.sources import Marked
 from express50.landmarks.training.random_heads import random_head

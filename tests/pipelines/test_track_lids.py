@@ -1,4 +1,4 @@
-"""Shut eyes are recognised by irises that cameras find at other times."""
+"""Shut eyes are recognised by irises that cameras find at other times, shut lips by their gap."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from express50.geometry.cameras import project
 from express50.geometry.transforms import axis_angle_to_matrix
 from express50.head.load import load_head
 from express50.head.model import landmarks, pose
-from express50.landmarks.eyes_and_lips import EYES, Irises
+from express50.landmarks.irises import EYES, Irises
+from express50.landmarks.network import INNER_LIPS
 from pipelines.track.basis import make_basis
-from pipelines.track.eyes_and_jaw import lid_terms, shut_lids
+from pipelines.track.eyes_and_jaw import shut_lids, shut_terms
 from pipelines.track.fit import fit
 from pipelines.track.observe import LandmarkView, Observation, agree, landmark_sigma
 from pipelines.track.state import Target, initial_pose, start_state
@@ -29,9 +30,13 @@ LEFT, RIGHT = 0, 1
 RIG = [make_camera(angle) for angle in np.linspace(-0.7, 0.7, 6)]
 
 
-def face() -> np.ndarray:
+def face(lips_m: float = 0.01) -> np.ndarray:
     """Landmarks (68, 3) of a head before the rig, the lids a centimetre apart."""
     marks = make_scene().marks.copy()
+    mouth = marks[27] - [0.0, 0.06, 0.0]
+    marks[48], marks[54] = mouth - [0.025, 0, 0], mouth + [0.025, 0, 0]
+    for ids, side in zip(INNER_LIPS, (0.5, -0.5), strict=True):
+        marks[list(ids)] = mouth + np.outer((-0.01, 0.0, 0.01), (1, 0, 0)) + [0, side * lips_m, 0]
     for side, (first, last, upper, lower) in enumerate(EYES):
         middle = marks[27] + np.array([0.03 if side == LEFT else -0.03, 0.0, 0.0])
         marks[first], marks[last] = middle - [0.015, 0, 0], middle + [0.015, 0, 0]
@@ -136,7 +141,7 @@ def test_without_irises_and_without_observations():
 def test_the_lids_term_has_the_slope_it_says(seed, shut):
     rng = np.random.default_rng(seed)
     observation = replace(observe(np.ones((3, 2), dtype=bool), "neutral"), shut=shut)
-    (term,) = lid_terms(tiny_head(), observation)
+    (term,) = shut_terms(tiny_head(), observation)
     assert len(term.anchors.vertices) == 2 * len(shut)
     vertices = rng.normal(size=(200, 3)) * 0.01
     way = rng.normal(size=vertices.shape)
@@ -157,14 +162,14 @@ def test_eyes_that_are_known_to_be_shut_shut_the_mesh():
     marks = marks - marks.mean(0)
     found = seen(len(RIG)) | {"wink_left": np.tile([False, True], (len(RIG), 1))}
     observation = shut_lids([observe(table, time, marks) for time, table in found.items()])[2]
-    assert observation.shut == (LEFT,) and len(lid_terms(head, observation)) == 1
+    assert observation.shut == (LEFT,) and len(shut_terms(head, observation)) == 1
     basis = make_basis(head)
     template = landmarks(head, head.template[None])[0].double().numpy()
     start = start_state(basis, [initial_pose(observation, template)])
     sigma = landmark_sigma(observation)
     fitted = {}
     for known in (True, False):
-        terms = lid_terms(head, observation) if known else ()
+        terms = shut_terms(head, observation) if known else ()
         state, _ = fit(basis, [Target(observation, sigma, False, terms=terms)], start, 20)
         blink = state.poses[0].own[[head.expression_names.index(f"eyeBlink_{s}") for s in "LR"]]
         fitted[known] = blink
@@ -172,5 +177,18 @@ def test_eyes_that_are_known_to_be_shut_shut_the_mesh():
     assert abs(fitted[True][RIGHT]) < 0.1
 
 
-def test_open_eyes_add_no_term():
-    assert lid_terms(tiny_head(), observe(np.ones((3, 2), dtype=bool), "neutral")) == ()
+def test_open_eyes_and_lips_add_no_term():
+    assert shut_terms(tiny_head(), observe(np.ones((3, 2), dtype=bool), "neutral")) == ()
+
+
+@pytest.mark.parametrize("count", [1, len(RIG)])
+def test_lips_that_are_hardly_seen_apart_meet(count):
+    (term,) = shut_terms(tiny_head(), observe(np.ones((count, 2), bool), "neutral", face(0.0005)))
+    assert len(term.anchors.vertices) == 3
+    assert cost_at(term, np.zeros((200, 3))) == 0.0
+
+
+def test_lips_that_nobody_sees_are_not_shut():
+    seen_by = observe(np.ones((2, 2), dtype=bool), "neutral", face(0.0))
+    blind = [replace(view, sigma=np.full(68, np.inf)) for view in seen_by.views]
+    assert shut_terms(tiny_head(), replace(seen_by, views=tuple(blind))) == ()

@@ -16,12 +16,14 @@ import torch
 
 from express50.capture.expressions import Expression, load_script
 from express50.head.model import HeadModel, landmarks, pose, vertex_normals
+from express50.landmarks.network import INNER_LIPS
 from express50.landmarks.training.places import Places, closest_places, place_points
 
 BROWS = slice(17, 27)
 SCRIPTED_SHARE = 0.6  # of the heads play entries of the script
 LASHES = "eyelashes"
 BLINKS = 0.22  # share of the heads that close an eye, or both
+SHUT, TEETH = 0.3, 0.75  # shares of drawn mouths that are shut, and that are so or show teeth
 Rng = np.random.Generator
 
 
@@ -72,18 +74,22 @@ class Canvas:
         return replace(self, rest=rest.astype(np.float32), region=region)
 
 
-def random_head(model: HeadModel, rng: Rng, blinks: float = BLINKS) -> RandomHead:
+def random_head(
+    model: HeadModel, rng: Rng, blinks: float = BLINKS, mouths: float = 0.0
+) -> RandomHead:
     """Draw shape, expression, pose, smooth deformation, hair and colours.
 
-    The share `blinks` of the heads close an eye or both; the lids then stop anywhere.
+    The share `blinks` of the heads close an eye or both; the lids then stop anywhere. A share
+    `mouths` shut their lips, part them a little or show their teeth.
     """
-    draw = random_parameters(model, rng, blinks)
+    draw = random_parameters(model, rng, blinks, mouths)
     with torch.no_grad():
         vertices = pose(model, **draw)
     vertices = torch.from_numpy(deform(vertices[0].numpy(), rng))[None]
     canvas, brows = _move_brows(model, Canvas.of(model), rng)
     points = landmarks(model, vertices)[0].numpy()
     points[BROWS] = place_points(model, brows, vertices[0].numpy())
+    _meet_lips(points)
     look = int(rng.integers(2**31))
     hair = paint(canvas, np.random.default_rng(look))[1]
     skin = vertices[0].numpy()
@@ -110,6 +116,15 @@ def _move_brows(model: HeadModel, canvas: Canvas, rng: Rng) -> tuple[Canvas, Pla
     marks = canvas.marks.copy()
     marks[BROWS] = place_points(model, places)
     return replace(canvas, marks=marks), places
+
+
+def _meet_lips(points: np.ndarray) -> None:
+    """Put inner lips (of points (68, 3)) that passed through each other where they meet."""
+    upper, lower = (list(ids) for ids in INNER_LIPS)
+    through = (points[upper] - points[lower]) @ (points[27] - points[8]) < 0
+    middle = 0.5 * (points[upper] + points[lower])
+    for ids in (upper, lower):
+        points[ids] = np.where(through[:, None], middle, points[ids])
 
 
 def waves(points: np.ndarray, rng: Rng, count: int, low: float, high: float) -> np.ndarray:
@@ -263,7 +278,7 @@ def _color_eyes_and_mouth(colors: np.ndarray, canvas: Canvas, rng: Rng) -> None:
 
 
 def random_parameters(
-    model: HeadModel, rng: Rng, blinks: float = BLINKS
+    model: HeadModel, rng: Rng, blinks: float = BLINKS, mouths: float = 0.0
 ) -> dict[str, torch.Tensor]:
     """Draw arguments for `express50.head.model.pose`, a batch of one."""
     shape = rng.normal(size=len(model.shape_names)) * rng.uniform(0.5, 1.4)
@@ -290,6 +305,8 @@ def random_parameters(
         expression = np.clip(expression, -1.0, 1.2)
     if rng.random() < 0.25:
         jaw[0] = rng.uniform(0.0, 0.65)  # up to a scream
+    if model.unit_expressions and mouths and rng.random() < mouths:
+        _draw_mouth(expression, jaw, model, rng)
     eyes = np.array([*gaze, 0.0, *gaze, 0.0])
     drawn = {"shape": shape, "expression": expression, "neck": neck, "jaw": jaw, "eyes": eyes}
     return {name: torch.from_numpy(v.astype(np.float32))[None] for name, v in drawn.items()}
@@ -320,3 +337,19 @@ def _close_eyes(expression: np.ndarray, model: HeadModel, rng: Rng, share: float
         name = f"eyeBlink_{side}"
         if name in model.expression_names:
             expression[model.expression_names.index(name)] = rng.uniform(least, 1.0)
+
+
+def _draw_mouth(expression: np.ndarray, jaw: np.ndarray, model: HeadModel, rng: Rng) -> None:
+    """Shut the lips, show the teeth, or open the jaw a little, in place."""
+    kind, names = rng.random(), model.expression_names
+    jaw[0] = 0.0 if kind < SHUT else rng.uniform(0.0, 0.15 if kind < TEETH else 0.3)
+    if kind >= TEETH:
+        return
+    moves = [k for k, name in enumerate(names) if name.startswith(("mouth", "jaw", "tongue"))]
+    expression[moves] *= 0.3 * rng.random() if kind < SHUT else 0.0
+    opening = ("mouthUpperUp", "mouthLowerDown", "mouthFunnel", "tongueOut")
+    for name in opening if kind < SHUT else ():
+        expression[[k for k in moves if names[k].startswith(name)]] = 0.0
+    showing = {"mouthUpperUp": 1.0, "mouthLowerDown": 1.0, "mouthSmile": 1.0, "mouthStretch": 0.6}
+    for name, most in showing.items() if kind >= SHUT else ():
+        expression[[k for k in moves if names[k].startswith(name)]] = rng.uniform(0.0, most)

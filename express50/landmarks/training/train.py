@@ -38,9 +38,10 @@ from express50.landmarks.network import (
     save_network,
     trainable_network,
 )
+from express50.landmarks.training.close_ups import PARTS as CLOSE_UPS
+from express50.landmarks.training.close_ups import train_part
 from express50.landmarks.training.dense import carry_places, choose_places
 from express50.landmarks.training.descent import descend
-from express50.landmarks.training.eyes import train_eyes
 from express50.landmarks.training.places import Places
 from express50.landmarks.training.scene import TrainingView
 from express50.landmarks.training.views import (
@@ -56,8 +57,8 @@ RATE, RATE_ON = 2e-3, 1e-3  # from nothing, from given weights
 FIRST_FILES = 6
 STEPS_PER_FILE = 300
 HELD_OUT = 0
-# Of the network: those that find points and faces, the eyes' own, and what these (not eyes) share.
-PARTS = ("trunk", "heat", "shape", "face", "outline", "dense", "eyes")
+# Of the network: those that find points and faces, close-ups, and what these (not close-ups) share.
+PARTS = ("trunk", "heat", "shape", "face", "outline", "dense", *CLOSE_UPS)
 SMALL_EVERY = 4  # after the small steps one in so many stays small, so that blurred faces are kept
 
 
@@ -101,8 +102,8 @@ def main(arguments: list[str] | None = None) -> int:
     models = [load_head(spec) for spec in ("procedural", options.ict) if spec]
     plan = TrainingPlan(**{name: getattr(options, name) for name in words})
     net = train(models, plan, options.views, options.start, options.parts)
-    if "eyes" in options.parts:
-        net.eyes = train_eyes(models, options.views, plan.seed)
+    for name in set(options.parts) & set(CLOSE_UPS):
+        setattr(net, name, train_part(CLOSE_UPS[name], models, options.views, plan.seed))
     save_network(net, options.out)
     net = load_network(options.out)
     for model, places in zip(models, places_of(models, plan.dense), strict=True):
@@ -169,7 +170,7 @@ def train(
         ]
         return crop_loss(net, crops)
 
-    rate, steps = RATE_ON if start else RATE, plan.steps if set(parts) != {"eyes"} else 0
+    rate, steps = RATE_ON if start else RATE, plan.steps if set(parts) - set(CLOSE_UPS) else 0
     return descend(net, steps, rate, folder / f"training-{name}.pt", loss_at)
 
 

@@ -12,7 +12,7 @@ import torch
 
 from express50.capture.expressions import load_script
 from express50.head.load import load_head
-from express50.head.model import landmarks, pose, vertex_normals
+from express50.head.model import HeadModel, landmarks, pose, vertex_normals
 from express50.landmarks import WEIGHTS
 from express50.landmarks.detector import (
     detect,
@@ -373,28 +373,63 @@ def test_a_network_without_a_dense_part_finds_no_dense_points(network: LandmarkN
     assert none.points.shape == (0, 2) and none.sigma.shape == (0,)
 
 
-def test_shut_eyes_are_told_from_open_ones(network: LandmarkNet) -> None:
-    model, gaps = load_head("procedural"), {0.0: [], 1.0: []}
-    column = model.expression_names.index("eyeBlink_L")
-    for blink, seen in gaps.items():
-        rng = np.random.default_rng(77)
-        for _ in range(6):
-            draw = random_parameters(model, rng)
-            draw["expression"][:] = 0.0
-            draw["expression"][:, column : column + 2] = blink
-            with torch.no_grad():
-                vertices = pose(model, **draw)
-            head = replace(
-                random_head(model, np.random.default_rng(5)),
-                vertices=vertices[0].numpy(), skin=vertices[0].numpy(),
-                normals=vertex_normals(vertices, model.faces)[0].numpy(),
-                landmarks=landmarks(model, vertices)[0].numpy(),
-            )  # fmt: skip
-            view = HeadScene(model, head).render(rng, 208, 0.0)
-            face = detect(network, on_canvas(view.rgba, 4, (90, 90)))
-            width = np.linalg.norm(face.points[45] - face.points[42])
-            seen.append(np.linalg.norm(face.points[47] - face.points[43]) / width)
-    assert np.median(gaps[1.0]) < 0.6 * np.median(gaps[0.0])
+OPENINGS = {
+    "eye": ({"eyeBlink_L": 0.0}, {"eyeBlink_L": 1.0}, (47, 43), (42, 45)),
+    "teeth": (
+        {f"{name}_{side}": 0.7 for name in ("mouthUpperUp", "mouthLowerDown") for side in "LR"},
+        {}, (66, 62), (48, 54),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("opening", OPENINGS)
+def test_shut_eyes_and_lips_are_told_from_open_ones(network: LandmarkNet, opening: str) -> None:
+    model = load_head("procedural")
+    *moves, gap, width = OPENINGS[opening]
+    opened, shut = (np.median(gaps_seen(network, model, move, gap, width)) for move in moves)
+    assert shut < 0.6 * opened
+
+
+def gaps_seen(
+    network: LandmarkNet,
+    model: HeadModel,
+    moves: dict[str, float],
+    gap: tuple[int, int],
+    width: tuple[int, int],
+) -> list[float]:
+    """Detect six rendered people in one expression; returns a gap over a width of each."""
+    rng, seen = np.random.default_rng(77), []
+    for _ in range(6):
+        draw = random_parameters(model, rng)
+        draw["expression"][:] = 0.0
+        draw["jaw"][:] = 0.0
+        for name, value in moves.items():
+            draw["expression"][:, model.expression_names.index(name)] = value
+        with torch.no_grad():
+            vertices = pose(model, **draw)
+        head = replace(
+            random_head(model, np.random.default_rng(5)),
+            vertices=vertices[0].numpy(), skin=vertices[0].numpy(),
+            normals=vertex_normals(vertices, model.faces)[0].numpy(),
+            landmarks=landmarks(model, vertices)[0].numpy(),
+        )  # fmt: skip
+        view = HeadScene(model, head).render(rng, 208, 0.0)
+        face = detect(network, on_canvas(view.rgba, 4, (90, 90)))
+        along, across = (np.linalg.norm(np.subtract(*face.points[list(p)])) for p in (gap, width))
+        seen.append(float(along / across))
+    return seen
+
+
+def test_drawn_mouths_are_shut_or_show_teeth() -> None:
+    """Inner lips never pass through each other; of those asked for, some touch and some do not."""
+    model, rng = load_head("procedural"), np.random.default_rng(3)
+    gaps = []
+    for _ in range(20):
+        points = random_head(model, rng, mouths=1.0).landmarks
+        up = points[27] - points[8]
+        gaps.append((points[62] - points[66]) @ up / np.linalg.norm(up))
+    assert min(gaps) > -1e-6
+    assert min(gaps) < 0.0005 and max(gaps) > 0.005
 
 
 def test_points_follow_the_frame(network: LandmarkNet, unseen_views: list[TrainingView]) -> None:

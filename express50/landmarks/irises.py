@@ -1,17 +1,13 @@
-"""Find irises and inner lips in the pixels, where the network's points are too coarse.
+"""Find irises in the pixels.
 
-Irises: every eye is brought to one size by its corners. A disc and the ring around it, both cut by
-the opening, are compared at every place and a few radii: iris and pupil are darker than the white
+Every eye is brought to one size by its corners. A disc and the ring around it, both cut by the
+opening, are compared at every place and a few radii: iris and pupil are darker than the white
 around them (Daugman 1993 has the difference across a circle). Shut eyes say nothing.
-
-Lips: the network sees a mouth in some thirty pixels and often takes a row of teeth for closed lips.
-Lips are redder than teeth, and much lighter than an open mouth's dark. Down each of three columns
-between the outer lips the longest run of pixels that do not look like lips is taken as the opening.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -132,76 +128,3 @@ def _peak(score: np.ndarray, row: int, column: int) -> np.ndarray:
         if bend < -1e-9:
             offset[axis] = np.clip(0.5 * float(line[0] - line[2]) / bend, -0.5, 0.5)
     return offset
-
-
-# Outer lip above, inner above, inner below, outer lip below, of each column.
-LIP_COLUMNS = ((50, 61, 67, 58), (51, 62, 66, 57), (52, 63, 65, 56))
-LIP_SIDE, LIP_SPAN = 72, 1.2
-LEAST_MOUTH_PX = 12.0
-# Inner lips further apart than this share of the mouth's width are open already: they are kept.
-LIP_SHUT = 0.08
-# Half the columns' width that is averaged, rows kept clear of the outer lips (shares of the
-# mouth's width), and the least height of an opening.
-HALF, CLEAR, LEAST_GAP = 0.03, 0.03, 0.045
-# A pixel is not lip if it is this much less red than the lips, next to the skin's difference from
-# grey, or has less than this share of their light.
-PALE, DARK = 0.5, 0.55
-LIP_SIGMA = 0.02
-
-
-def open_lips(image: np.ndarray, seen: Detection) -> Detection:
-    """Part a detection's inner lips where the image (H, W, 3) uint8 RGB shows an opening.
-
-    The detection stays where the network saw the mouth open, or where it is shut or small.
-    """
-    along = seen.points[54] - seen.points[48]
-    width = float(np.linalg.norm(along))
-    if not np.isfinite(seen.points[48:]).all() or width < LEAST_MOUTH_PX:
-        return seen
-    gaps = seen.points[[67, 66, 65]] - seen.points[[61, 62, 63]]
-    if np.linalg.norm(gaps, axis=1).mean() > LIP_SHUT * width:
-        return seen
-    window = place_level_crop(seen.points[48:60].mean(0), LIP_SPAN * along / LIP_SIDE, LIP_SIDE)
-    crop = cut_crop(image, window, LIP_SIDE).astype(np.float64) / 255.0
-    inside = points_in_crop(window, seen.points)
-    found = _openings(crop, inside)
-    if found is None:
-        return seen
-    points, sigma = seen.points.copy(), seen.sigma.copy()
-    for (_, upper, lower, _), (top, bottom) in zip(LIP_COLUMNS, found, strict=True):
-        for point, y in ((upper, top), (lower, bottom)):
-            points[point] = window[:, :2] @ [inside[point, 0], y] + window[:, 2]
-            sigma[point] = max(LIP_SIGMA * width, 0.5 * seen.sigma[point])
-    return replace(seen, points=points, sigma=sigma)
-
-
-def _openings(crop: np.ndarray, points: np.ndarray) -> list[tuple[float, float]] | None:
-    """Find the opening's upper and lower edge (crop rows) in each column; None where shut."""
-    light = crop.mean(2) + 1e-3
-    redness = (crop[..., 0] - crop[..., 1]) / light
-    polygon = np.zeros((LIP_SIDE, LIP_SIDE), np.uint8)
-    cv2.fillPoly(polygon, [np.round(points[48:60]).astype(np.int32)], 1)
-    mouth = polygon > 0
-    if mouth.sum() < 40:
-        return None
-    # Whatever is open, the reddest of the mouth is lip, and the lightest of that is lit lip.
-    red = float(np.percentile(redness[mouth], 75))
-    lit = float(np.median(light[mouth & (redness >= np.median(redness[mouth]))]))
-    no_lip = (redness < PALE * red) | (light < DARK * lit)
-    found = []
-    for above, _, _, below in LIP_COLUMNS:
-        x = 0.5 * (points[above, 0] + points[below, 0])
-        reach = max(1, round(HALF * LIP_SIDE / LIP_SPAN))
-        columns = slice(max(0, round(x) - reach), round(x) + reach + 1)
-        clear = CLEAR * LIP_SIDE / LIP_SPAN
-        low, high = round(points[above, 1] + clear), round(points[below, 1] + 2 * clear)
-        flags = no_lip[max(low, 0) : high, columns].mean(1) > 0.5
-        # First and past-the-last row of each run.
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
-        runs = edges.reshape(-1, 2)
-        lengths = runs[:, 1] - runs[:, 0]
-        if not len(runs) or lengths.max() < LEAST_GAP * LIP_SIDE / LIP_SPAN:
-            return None
-        first, last = max(low, 0) + runs[int(np.argmax(lengths))]
-        found.append((float(first), float(last)))
-    return found
