@@ -25,7 +25,7 @@ from express50.geometry.raycast import mesh_scene
 from express50.geometry.sampling import bilinear_slope
 from express50.head.model import HeadModel, vertex_normals
 from pipelines.track.basis import in_regions
-from pipelines.track.surface import FEATURES, SignedDistance, Visibility, like_skin, look_up
+from pipelines.track.surface import FEATURES, SignedDistance, Visibility, behind, like_skin, look_up
 from pipelines.track.terms import MeshPlaces, Residuals, huber
 
 # Head outlines count as about this many independent points per view.
@@ -168,13 +168,23 @@ def outline_terms(
     pictures: int,
     bald: bool,
     hidden: np.ndarray,
+    things: np.ndarray,
 ) -> list[OutlineTerm]:
-    """Make a frame set's outline terms on the current mesh (V, 3); `hidden` (V,) is left out."""
+    """Make a frame set's outline terms on the current mesh (V, 3).
+
+    Vertices that are `hidden` (V,), lie behind `things` (n, 3) in a view, or whose nearest edge of
+    the matte is that of a thing, are left out.
+    """
     allowed = in_regions(model, BARE + COVERED) & ~in_regions(model, ("boundary",)) & ~hidden
     covered = in_regions(model, ("neck",) if bald else COVERED)
     faces, terms = model.faces.numpy(), []
     for distance in distances:
-        ids = outline_vertices(mesh, faces, distance.camera, allowed)
+        camera = distance.camera
+        ids = outline_vertices(mesh, faces, camera, allowed)
+        pixels, _ = project_pinhole(camera, mesh[ids])
+        value, slope = sample_distance(distance, pixels)
+        edge = pixels - value[:, None] * slope  # of the matte, which may be a thing's
+        ids = ids[~(behind(things, camera, pixels) | behind(things, camera, edge))]
         if len(ids) >= 8:
             terms.append(OutlineTerm.of(distance, ids, mesh[ids], covered[ids], pictures, bald))
     return terms

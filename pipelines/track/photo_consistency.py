@@ -53,6 +53,11 @@ COVERED_SHARE, COVERED_TRUST = 0.25, 0.3
 # Share of neighbouring samples that are unlike skin from which on a beard or a fringe covers them;
 # brows and nostrils are narrower.
 BESIDE, COVERING = 40, 0.65
+# A thing hides the face where views agree so far before the mesh, and better by a margin than at
+# it. So many neighbours are asked, and a share of them must find it at the same height. Fewer
+# places than LEAST_PLACES are mismatches: a bare face has up to 15.
+CLEAR_M, BEFORE_M, MARGIN = 0.008, 0.045, 0.1
+EVERY, ASKED, AGREEING, SAME_M, LEAST_PLACES = 2, 16, 0.4, 0.004, 24
 
 SkinSamples = list[tuple[MeshPlaces, float]]
 """Where the surface is searched for, and the trust in what is found there."""
@@ -83,18 +88,40 @@ def search(
 ) -> PatchSearch:
     """Search for the surface within `reach` metres of places (S, 3) along unit normals (S, 3).
 
+    The rest is as in `agreement`.
+    """
+    pixel = pixel_size(images, places)
+    steps = max(3, int(np.ceil(reach / (STEP_PX * pixel))))
+    heights = np.arange(-steps, steps + 1) * (reach / steps)
+    score = agreement(images, weights, places, normals, mesh, faces, heights)
+    return _peaks(score, heights, pixel)
+
+
+def pixel_size(images: list[tuple[np.ndarray, Camera]], places: np.ndarray) -> float:
+    """Return how wide a pixel is at places (S, 3), metres."""
+    middle = places.mean(0)
+    sizes = [np.linalg.norm(middle - camera.center) / camera.K[0, 0] for _, camera in images]
+    return float(np.median(sizes)) if sizes else 1e-3
+
+
+def agreement(
+    images: list[tuple[np.ndarray, Camera]],
+    weights: np.ndarray,
+    places: np.ndarray,
+    normals: np.ndarray,
+    mesh: np.ndarray,
+    faces: np.ndarray,
+    heights: np.ndarray,
+) -> np.ndarray:
+    """Score (S, D) how alike views see patches at places (S, 3) moved by heights (D,), metres.
+
     Images are C grey pictures (H, W) float32, root of light, with their pinhole cameras; `weights`
     (C, S) are 0 where a place is not seen. Patches are bent to follow the mesh (V, 3), (F, 3).
     """
-    middle = places.mean(0)
-    sizes = [np.linalg.norm(middle - camera.center) / camera.K[0, 0] for _, camera in images]
-    pixel = float(np.median(sizes)) if sizes else 1e-3
     if len(weights) > VIEWS:  # more views add little
         weights = np.where(weights >= np.sort(weights, axis=0)[-VIEWS], weights, 0.0)
-    steps = max(3, int(np.ceil(reach / (STEP_PX * pixel))))
-    heights = np.arange(-steps, steps + 1) * (reach / steps)
-    centre = mesh.mean(0)
-    shapes = _shapes(mesh_scene(mesh - centre, faces), centre, places, normals, SPACING_PX * pixel)
+    spacing, centre = SPACING_PX * pixel_size(images, places), mesh.mean(0)
+    shapes = _shapes(mesh_scene(mesh - centre, faces), centre, places, normals, spacing)
     count, size = len(places), PATCH * PATCH
     total = np.zeros((count, len(heights), size), np.float32)
     mass, square = np.zeros(count), np.zeros(count)
@@ -111,7 +138,7 @@ def search(
     score = np.zeros((count, len(heights)))
     together = np.einsum("sdk,sdk->sd", total[enough], total[enough]).astype(np.float64)
     score[enough] = (together - square[enough, None]) / pairs[enough, None]
-    return _peaks(score, heights, pixel)
+    return score
 
 
 def _patches(
@@ -275,3 +302,30 @@ def under_hair(
     near = cKDTree(places[seen]).query(mesh[face], BESIDE)[1]
     hidden[face] = odd[near].mean(1) > COVERING
     return hidden
+
+
+def things_before(
+    model: HeadModel, skin: SkinSamples, pictures: FrameSetCrops, mesh: np.ndarray
+) -> np.ndarray:
+    """Find places (n, 3) on the surface of what stands clear of the face of the mesh (V, 3).
+
+    There the views agree better than on the mesh behind. Things thinner than a patch are missed.
+    """
+    samples = skin[0][0].some(slice(None, None, EVERY))
+    faces = model.faces.numpy()
+    images = [(root @ GREY, camera) for root, camera in pictures.images()]
+    places, normals = samples.at(mesh), sample_normals(samples, mesh)
+    views = view_weights(Visibility(mesh, faces), pictures, places, normals)
+    views = np.where(views > SLANT, views**2, 0.0)
+    pixel = pixel_size(images, places)
+    heights = np.arange(-CLEAR_M, BEFORE_M, min(STEP_PX * pixel, SAME_M))
+    score = agreement(images, views, places, normals, mesh, faces, heights)
+    before = heights > CLEAR_M
+    found = _peaks(score[:, before], heights[before], pixel)
+    at_mesh = score[:, ~before].max(1)
+    sure = found.score > np.maximum(LEAST_SCORE, at_mesh + MARGIN)
+    tops = places + found.height[:, None] * normals
+    near = cKDTree(places).query(places, ASKED)[1]
+    same = sure[near] & (np.abs(found.height[near] - found.height[:, None]) < SAME_M)
+    agreed = tops[sure & (same.mean(1) > AGREEING)]
+    return agreed if len(agreed) >= LEAST_PLACES else agreed[:0]

@@ -10,7 +10,11 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
+from express50.files.images import shrink
+from express50.geometry.cameras import resized
 from express50.head.model import HeadModel
+from pipelines.regions.geometry import head_labels, make_head
+from pipelines.regions.glasses import find_glasses
 from pipelines.track.basis import ALONG, OFF, Basis, freeze_shape
 from pipelines.track.eyes_and_jaw import EyeOffsets, with_irises_and_jaw
 from pipelines.track.face_uv import FaceUvMap, make_uv_map, reading_map, slide_term, with_slide
@@ -20,11 +24,12 @@ from pipelines.track.photo_consistency import (
     SkinSamples,
     patch_terms,
     skin_samples,
+    things_before,
     under_hair,
 )
 from pipelines.track.skin_flow import FINE, flow_term, skin_map
 from pipelines.track.state import State, Target, all_vertices, rotations
-from pipelines.track.surface import FrameSetCrops
+from pipelines.track.surface import FrameSetCrops, behind, without
 from pipelines.track.terms import NormalTerm, SlideTerm, landmark_anchors
 
 LANDMARK_STEPS = 14  # of the first fit, to landmarks alone; 6 measure the same on the twin
@@ -33,6 +38,8 @@ EYE_ROUNDS = 2  # irises and visible jaw lines are found anew at least so often
 PATCH_REACH_M = 0.008  # of the first search, to either side of the mesh
 NARROWING, NARROWINGS = 0.6, 3  # factor of the reach from round to round, and how often
 IN_HAIR = 30.0  # times a landmark's standard deviation, where hair is around it
+BESIDE_M, BESIDE_THING = 0.02, 6.0  # metres from a thing, and the same there
+GLASSES_SIDE = 320  # pixels of a head's crop, some millimetre each, in which glasses are looked for
 FOLLOWING = 3  # rounds in which the skin is followed
 # Far from the surface, whole patches of skin may match wrongly together: trust grows by this
 # factor towards the last round.
@@ -142,16 +149,26 @@ def refine(
     """Run the rounds; also returns the targets with the last round's terms."""
     model, found = basis.model, targets
     slides: list[SlideTerm | None] = [None] * len(targets)
+    things = [np.zeros((0, 3)) for _ in targets]
+    hiding = list(things)  # and glasses
+    glasses: dict[int, np.ndarray] = {}  # by expression, found once
     outlines = sum(len(one.distances) for one in evidence.pictures)
     for one in schedule:
         meshes, turns, found = all_vertices(model, state), rotations(state), []
-        flows = skin_flows(model, targets, evidence, meshes) if one.follow_skin else {}
+        clear = [without(*pair) for pair in zip(evidence.pictures, hiding, strict=True)]
+        flows = skin_flows(model, targets, evidence, clear, meshes) if one.follow_skin else {}
         for index, (target, pictures) in enumerate(zip(targets, evidence.pictures, strict=True)):
             mesh, terms = meshes[index], [*target.terms]
             hidden = under_hair(model, evidence.skin, pictures, mesh)
+            if one.patch_reach_m:
+                things[index] = things_before(model, evidence.skin, pictures, mesh)
+                if index not in glasses:
+                    glasses[index] = glasses_on(model, pictures, mesh, turns[index])
+                hiding[index] = np.concatenate([things[index], glasses[index]])
+            pictures = without(pictures, hiding[index])
             if one.outlines:
                 terms += outline_terms(
-                    model, pictures.distances, mesh, outlines, evidence.bald, hidden
+                    model, pictures.distances, mesh, outlines, evidence.bald, hidden, hiding[index]
                 )
             if one.patch_reach_m:
                 reach, weight = one.patch_reach_m, one.patch_weight
@@ -159,7 +176,9 @@ def refine(
             if one.read_uv and evidence.uv_map is not None:
                 slides[index] = slide_term(model, evidence.uv_map, pictures, mesh)
             terms += flows.get(index, [])
-            seen = replace(target, terms=tuple(terms), sigma=doubted(model, target.sigma, hidden))
+            seen = replace(
+                target, terms=tuple(terms), sigma=doubted(model, target, hidden, things[index])
+            )
             seen = with_irises_and_jaw(model, seen, mesh, turns[index], evidence.eyes)
             found.append(with_slide(seen, slides[index]))
         if one.follow_skin:
@@ -171,36 +190,61 @@ def refine(
     return state, found
 
 
+def glasses_on(
+    model: HeadModel, pictures: FrameSetCrops, mesh: np.ndarray, rotation: np.ndarray
+) -> np.ndarray:
+    """Find places (n, 3) on glasses before a mesh (V, 3) whose `rotation` is world from head.
+
+    Landmarks on them keep their weight: detectors know glasses.
+    """
+    head, seen = make_head(mesh, rotation, head_labels(model)), []
+    for crop in pictures.crops:
+        if crop.alpha is not None and (crop.camera.center - head.center) @ rotation[:, 2] > 0:
+            rgb = shrink(crop.image, GLASSES_SIDE)
+            camera = resized(crop.camera, rgb.shape[1], rgb.shape[0])
+            seen.append((camera, rgb, shrink(crop.alpha, GLASSES_SIDE) / 255))
+    return find_glasses(head, seen)
+
+
 def free_modes(targets: list[Target]) -> tuple[str, ...]:
     """Name the offset modes that the targets' terms can determine."""
     kinds = {type(term) for target in targets for term in target.terms}
     return tuple(name for kind, name in ((NormalTerm, OFF), (SlideTerm, ALONG)) if kind in kinds)
 
 
-def doubted(model: HeadModel, sigma: np.ndarray, hidden: np.ndarray) -> np.ndarray:
-    """Return landmarks' sigma (views, 68) with those in hair vague, as `hidden` (V,) says.
+def doubted(model: HeadModel, target: Target, hidden: np.ndarray, things: np.ndarray) -> np.ndarray:
+    """Return landmarks' sigma (views, 68) with those vague that hair or a thing hides.
 
+    `hidden` (V,) are vertices in hair, `things` places (n, 3) on what else hides the face.
     Detectors take a beard's rim for the jaw, and shift the mouth within it.
     """
-    marks = hidden[landmark_anchors(model).vertices].any(1)
-    factor = np.where(marks, IN_HAIR, 1.0)
-    factor[:17][marks[:17]] = np.inf
-    return sigma * factor
+    marks = np.tile(hidden[landmark_anchors(model).vertices].any(1), (len(target.sigma), 1))
+    near = np.zeros_like(marks)
+    for row, beside, view in zip(marks, near, target.observation.views, strict=True):
+        row |= behind(things, view.camera, view.points)
+        beside |= behind(things, view.camera, view.points, BESIDE_M)
+    factor = np.where(marks, IN_HAIR, np.where(near, BESIDE_THING, 1.0))
+    factor[:, :17][marks[:, :17]] = np.inf
+    return target.sigma * factor
 
 
 def skin_flows(
-    model: HeadModel, targets: list[Target], evidence: SubjectEvidence, meshes: np.ndarray
+    model: HeadModel,
+    targets: list[Target],
+    evidence: SubjectEvidence,
+    pictures: list[FrameSetCrops],
+    meshes: np.ndarray,
 ) -> dict[int, list[SlideTerm]]:
     """Follow the skin from the resting face to the other expressions, by their index."""
     rest = next((k for k, target in enumerate(targets) if target.neutral), None)
     uv_map = evidence.fine_map
     if rest is None or uv_map is None:
         return {}
-    still = skin_map(model, uv_map, evidence.pictures[rest], meshes[rest])
+    still = skin_map(model, uv_map, pictures[rest], meshes[rest])
     found = {}
-    for index, (pictures, mesh) in enumerate(zip(evidence.pictures, meshes, strict=True)):
+    for index, (own, mesh) in enumerate(zip(pictures, meshes, strict=True)):
         if index != rest:
-            moved = skin_map(model, uv_map, pictures, mesh)
+            moved = skin_map(model, uv_map, own, mesh)
             term = flow_term(uv_map, still, moved, mesh)
             found[index] = [] if term is None else [term]
     return found

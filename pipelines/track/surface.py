@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import open3d as o3d
+from scipy.spatial import cKDTree
 
 from express50.files.images import LIGHT_OF_LEVEL, resize_area
 from express50.geometry.cameras import Camera, crop_camera, inside_frame, project_pinhole, resized
+from express50.geometry.conventions import corner_to_cell
 from express50.geometry.raycast import mesh_scene
 from express50.geometry.sampling import bilinear_slope
 from express50.geometry.transforms import unit
@@ -36,6 +38,7 @@ HEAD_M = 0.5
 GRAZING = 0.25
 # Of the natural logarithm of the face's brightness and of its two ratios of colours.
 LEAST_SPREAD, WITHIN = np.array([0.2, 0.03, 0.03]), 3.0
+THING_M = 0.005  # about a place on a thing's surface, what it stands for
 MARGIN = 0.15  # about the head in its crop, as a share of the head's size
 
 
@@ -133,6 +136,34 @@ def matte_weights(crop: HeadCrop, places: np.ndarray) -> np.ndarray:
     size = np.array([crop.camera.width, crop.camera.height])
     column, row = np.clip(pixels.astype(np.int64), 0, size - 1).T
     return inside * (crop.alpha[row, column] / 255.0)
+
+
+def without(pictures: FrameSetCrops, things: np.ndarray) -> FrameSetCrops:
+    """Take what places (n, 3) on the surface of things hide out of the crops' mattes."""
+    if not len(things):
+        return pictures
+    crops = []
+    for crop in pictures.crops:
+        height, width = crop.image.shape[:2]
+        seen = np.zeros((height, width), np.uint8)
+        pixels, ahead = project_pinhole(crop.camera, things)
+        size = THING_M * crop.camera.K[0, 0] / np.maximum(ahead, 1e-3)
+        for (x, y), radius in zip(corner_to_cell(pixels), size, strict=True):
+            cv2.circle(seen, (round(x), round(y)), max(1, round(radius)), 1, -1)
+        whole = np.full((height, width), 255, np.uint8) if crop.alpha is None else crop.alpha
+        crops.append(replace(crop, alpha=np.where(seen > 0, np.uint8(0), whole)))
+    return replace(pictures, crops=tuple(crops))
+
+
+def behind(
+    things: np.ndarray, camera: Camera, pixels: np.ndarray, within: float = THING_M
+) -> np.ndarray:
+    """Return which pixels (N, 2) of a camera lie `within` metres of places (n, 3) on things."""
+    if not len(things):
+        return np.zeros(len(pixels), bool)
+    shown, ahead = project_pinhole(camera, things)
+    reach = within * camera.K[0, 0] / max(float(np.median(ahead)), 1e-3)
+    return cKDTree(shown).query(pixels)[0] < reach
 
 
 def look_up(camera: Camera, image: np.ndarray, places: np.ndarray) -> np.ndarray:

@@ -142,9 +142,8 @@ def test_empty_mattes_show_nobody(tmp_path) -> None:
     assert search(crops, mesh) is None
     assert texture(tmp_path, crops, mesh) is None
     assert signed_distance(empty, rig()[0]) is None
-    assert (
-        outline_terms(ball_head(), (), mesh, 0, bald=False, hidden=np.zeros(len(mesh), bool)) == []
-    )
+    hidden, things = np.zeros(len(mesh), bool), np.zeros((0, 3))
+    assert outline_terms(ball_head(), (), mesh, 0, False, hidden, things) == []
 
 
 def test_no_camera_at_all(tmp_path) -> None:

@@ -1,11 +1,15 @@
-"""Beards and fringes: colours unlike the face's, and landmarks that are not trusted in them."""
+"""Hair and things on the face: colours unlike it, and landmarks that are not trusted there."""
 
 import numpy as np
 
+from express50.geometry.cameras import unproject
 from express50.head.load import load_head
-from pipelines.track.schedule import IN_HAIR, doubted
+from pipelines.track.observe import LandmarkView, Observation
+from pipelines.track.schedule import BESIDE_M, BESIDE_THING, IN_HAIR, doubted
+from pipelines.track.state import Target
 from pipelines.track.surface import like_skin
 from pipelines.track.terms import landmark_anchors
+from tests.pipelines.textured_scenes import rig
 
 
 def test_shading_is_like_skin_and_hair_is_not():
@@ -16,13 +20,37 @@ def test_shading_is_like_skin_and_hair_is_not():
     assert like_skin(skin, face).mean() > 0.95 and not like_skin(hair, face).any()
 
 
+def target_of(cameras) -> Target:
+    """Views that see all landmarks in a row, 20 pixels apart."""
+    points = np.stack([20.0 * np.arange(68), np.full(68, 100.0)], axis=1)
+    views = tuple(LandmarkView(c.id, c, points, np.full(68, 2.0), 1.0) for c in cameras)
+    none = np.full((68, 3), np.nan)
+    seen = Observation("neutral", 0, views, np.ones((len(views), 68), bool), none, none[:, None])
+    return Target(seen, np.full((len(views), 68), 2.0), neutral=True)
+
+
 def test_landmarks_in_a_beard_are_vague_and_its_rim_is_no_jaw():
     model = load_head("procedural")
-    hidden = np.zeros(len(model.template), bool)
-    sigma = np.full((2, 68), 2.0)
-    assert np.array_equal(doubted(model, sigma, hidden), sigma)
+    hidden, things = np.zeros(len(model.template), bool), np.zeros((0, 3))
+    target = target_of(rig()[:2])
+    assert np.array_equal(doubted(model, target, hidden, things), target.sigma)
     anchors = landmark_anchors(model).vertices
     hidden[anchors[[8, 57]]] = True
-    found = doubted(model, sigma, hidden)
+    found = doubted(model, target, hidden, things)
     assert np.isinf(found[:, 8]).all() and (found[:, 57] == 2.0 * IN_HAIR).all()
     assert (found[:, 36] == 2.0).all()
+
+
+def test_landmarks_on_a_thing_are_vague_where_it_is_seen_and_those_beside_it_less_so():
+    model, (one, other) = load_head("procedural"), rig()[:2]
+    hidden, target = np.zeros(len(model.template), bool), target_of((one, other))
+    # Before landmark 10 in one camera; the other sees it elsewhere.
+    at = target.observation.views[0].points[10]
+    thing = unproject(one, at[None], np.array([0.9]))
+    found = doubted(model, target, hidden, thing)
+    pixel = 0.9 / one.K[0, 0]
+    near = np.flatnonzero(20 * pixel * np.abs(np.arange(68) - 10) < BESIDE_M)
+    assert np.isinf(found[0, 10])
+    assert (found[0, near[near != 10]] == 2.0 * BESIDE_THING).all()
+    assert (np.delete(found[0], near) == 2.0).all()
+    assert not np.array_equal(found[0], found[1])

@@ -47,15 +47,17 @@ def paint(places: np.ndarray, wave: float = 0.016) -> np.ndarray:
     return np.clip(0.5 + total, 0.0, 1.0)
 
 
-def picture(camera: Camera, centre: np.ndarray = ORIGIN, colour=paint) -> np.ndarray:
-    """Root of light (H, W, 3) float32 of the sphere before black, one ray a pixel."""
+def picture(
+    camera: Camera, centre: np.ndarray = ORIGIN, colour=paint, radius: float = RADIUS
+) -> np.ndarray:
+    """Root of light (H, W, 3) float32 of a sphere before black, one ray a pixel."""
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     K, R = camera.K, camera.cam_from_world[:3, :3]
     ray = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1) @ R
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
     to = camera.center - centre
     half = ray @ to
-    root = half**2 - (to @ to - RADIUS**2)
+    root = half**2 - (to @ to - radius**2)
     hit = (root > 0) & (half < 0)
     image = np.zeros((*hit.shape, 3), np.float32)
     image[hit] = colour(to + (-half - np.sqrt(np.maximum(root, 0)))[hit][:, None] * ray[hit])

@@ -1,0 +1,90 @@
+"""What stands before the face is found where views agree on it; nothing behind it counts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from express50.files.images import linear_to_srgb
+from express50.geometry.cameras import project, unproject
+from pipelines.track.outline import outline_terms, sample_distance, signed_distance
+from pipelines.track.photo_consistency import patch_terms, skin_samples, things_before
+from pipelines.track.surface import FrameSetCrops, HeadCrop, behind, without
+from tests.pipelines.textured_scenes import ORIGIN, RADIUS, ball_head, paint, picture, rig
+
+SMALL = 0.018
+PLACE = np.array([0.015, 0.01, RADIUS + 0.015])
+
+
+def shots(thing: bool, place: np.ndarray = PLACE) -> FrameSetCrops:
+    """Crops of the painted ball, with a small one before it or without."""
+    crops = []
+    for camera in rig():
+        root = picture(camera)
+        if thing:
+            near = picture(camera, place, lambda p: paint(p[:, ::-1] + 0.3), SMALL)
+            root = np.where(near.any(2, keepdims=True), near, root)
+        levels = np.rint(255 * linear_to_srgb(root.astype(float) ** 2)).astype(np.uint8)
+        crops.append(HeadCrop(camera, levels, None))
+    return FrameSetCrops((), tuple(crops))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """The ball as a head, its samples, the crops with a thing, and the thing's places."""
+    model = ball_head()
+    skin = skin_samples(model, 30_000)
+    pictures = shots(thing=True)
+    return model, skin, pictures, things_before(model, skin, pictures, model.template.numpy())
+
+
+def test_a_thing_before_the_face_is_found_and_a_bare_face_has_none(scene) -> None:
+    model, skin, pictures, things = scene
+    off = np.linalg.norm(things - PLACE, axis=1) - SMALL
+    assert len(things) > 20 and np.quantile(np.abs(off), 0.9) < 0.004
+    bare = things_before(model, skin, shots(thing=False), model.template.numpy())
+    assert len(bare) == 0
+    assert len(things_before(model, skin, FrameSetCrops((), ()), model.template.numpy())) == 0
+
+
+def test_what_a_thing_hides_is_not_looked_at(scene) -> None:
+    model, skin, pictures, things = scene
+    mesh = model.template.numpy()
+    clear = without(pictures, things)
+    for crop, before in zip(clear.crops, pictures.crops, strict=True):
+        middle = np.floor(project(crop.camera, PLACE[None])[0][0]).astype(int)
+        assert crop.alpha[middle[1], middle[0]] == 0
+        assert 0.002 < (crop.alpha == 0).mean() < 0.05 and before.alpha is None
+    found = patch_terms(model, skin, clear, mesh, 0.006, 1.0)
+    goals = np.concatenate([term.goals for term in found])
+    assert np.quantile(np.abs(np.linalg.norm(goals - ORIGIN, axis=1) - RADIUS), 0.99) < 0.0015
+    assert without(pictures, things[:0]) is pictures
+
+
+def test_pixels_behind_a_thing(scene) -> None:
+    _, _, pictures, things = scene
+    for crop in pictures.crops:
+        pixels = project(crop.camera, np.stack([PLACE, PLACE * (-3, -3, 0.7)]))[0]
+        assert behind(things, crop.camera, pixels).tolist() == [True, False]
+    assert not behind(things[:0], pictures.crops[0].camera, np.zeros((3, 2))).any()
+
+
+def test_an_edge_of_the_matte_that_is_a_things_does_not_pull() -> None:
+    model, camera = ball_head(), rig()[0]
+    alpha = np.where(picture(camera).any(2), 255, 0).astype(np.uint8)
+    rim = np.flatnonzero(alpha[128])[-1]
+    alpha[110:146, rim - 5 : rim + 25] = 255  # glasses in profile stick out of the face
+    mesh, hidden = model.template.numpy(), np.zeros(len(model.template), bool)
+    distance = signed_distance(alpha, camera)
+    assert distance is not None
+    y, x = np.mgrid[112:144:3, rim + 2 : rim + 24 : 3]
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1) + 0.5
+    things = unproject(camera, pixels, np.full(len(pixels), 0.98))
+
+    def pulls(things: np.ndarray) -> np.ndarray:
+        (term,) = outline_terms(model, (distance,), mesh, 1, True, hidden, things)
+        return sample_distance(distance, project(camera, term.anchors.at(mesh))[0])[0]
+
+    with_thing, without_thing = pulls(things[:0]), pulls(things)
+    assert with_thing.min() < -8 and without_thing.min() > -6
+    assert len(without_thing) > 0.75 * len(with_thing)
