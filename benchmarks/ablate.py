@@ -32,7 +32,7 @@ TWIN = {"subjects": 5, "first-subject": 71, "cameras": 8, "width": 256, "height"
 PERSONAL = ("--personal=1",)
 ITERATIONS, FIT = 2000, (120, 200)
 QUICK_TWIN = TWIN | {"subjects": 4, "cameras": 7, "width": 224, "height": 224}
-QUICK_EXPRESSIONS, QUICK_ITERATIONS, QUICK_FIT = 4, 300, (60, 80)
+QUICK_EXPRESSIONS, QUICK_ITERATIONS, QUICK_FIT = 4, 250, (40, 60)
 
 
 def differences(row: dict) -> dict[str, dict[str, tuple[float, float | None]]]:
@@ -96,6 +96,7 @@ def main() -> None:
         f"train.iterations={steps}",
         f"fit.stage1_iterations={fit[0]}",
         f"fit.stage2_iterations={fit[1]}",
+        f"train.evaluate_images={args.images}",
     ]
     changes = [*budget, *args.changes]
     result = measure(shards, args.out / "ablation", changes, args.seeds, args.images)

@@ -21,15 +21,12 @@ from express50.errors import FormatError
 from express50.geometry.transforms import make_transform
 from express50.head.model import HeadModel, pose
 from grmm.config import DataConfig
-from grmm.head_crop import GROW_PX, behind_torso, crop_view, head_window
+from grmm.head_crop import behind_torso, crop_view, head_window
 from grmm.model import HeadState, PinholeView
 
 NO_OFFSETS = np.zeros((0, 3), np.float32)
 CACHE_BYTES = 512 << 20  # of decoded samples: some hundred of 512 px
 DEFAULTS = DataConfig()  # black behind the head
-# Share of the picture's height by which training takes the neck as wider: a torso beside it says
-# that something stands before the neck's end, not that the neck ends there. What is judged counts.
-COLLAR = 0.024
 Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
 
@@ -193,9 +190,7 @@ class HeadViews:
         """Wrap a source whose parameters belong to ``head``, on whose device items will be."""
         self.source, self.head = source, head
         self.background, self.skip_hidden = data.background, data.skip_hidden_neck
-        self._hidden: Cache[tuple[int, int], np.ndarray] = Cache(
-            CACHE_BYTES // 8, lambda bits: bits.nbytes
-        )
+        self._hidden: Cache[int, np.ndarray] = Cache(CACHE_BYTES // 8, lambda bits: bits.nbytes)
         self._samples: Cache[int, Sample] = Cache(CACHE_BYTES, lambda sample: sample.nbytes)
         self._coming: dict[int, Future[Sample]] = {}
         self._reader = ThreadPoolExecutor(max_workers=1)
@@ -213,7 +208,7 @@ class HeadViews:
 
         Shoulders and clothes are background, where the shards leave them out or label them. With
         ``crop`` only the window around head and matte, as training takes it: outside it, footage
-        and rendering are both the background. Training also counts less of the torso (COLLAR).
+        and rendering are both the background.
         """
         sample, state = self.sample(index), self.state(index)
         height, width = sample.alpha.shape
@@ -223,8 +218,7 @@ class HeadViews:
         if sample.parts is not None and not sample.bare:
             torso = sample.parts == TORSO
             matte, depth = np.where(torso, 0, matte), np.where(torso, 0, depth)
-        grow_px = max(GROW_PX, round(COLLAR * height)) if crop else GROW_PX
-        hidden = self._hidden_neck(index, sample, state, view, grow_px)
+        hidden = self._hidden_neck(index, sample, state, view)
         rows, columns = slice(0, height), slice(0, width)
         if crop:
             rows, columns = head_window(state.vertices, view, matte)
@@ -246,7 +240,7 @@ class HeadViews:
         )
 
     def _hidden_neck(
-        self, index: int, sample: Sample, state: HeadState, view: PinholeView, grow_px: int
+        self, index: int, sample: Sample, state: HeadState, view: PinholeView
     ) -> np.ndarray:
         """Find the pixels (H, W) where the torso hides the neck; the masks are kept as bits."""
         height, width = sample.alpha.shape
@@ -255,9 +249,9 @@ class HeadViews:
         torso = sample.parts == TORSO
 
         def make() -> np.ndarray:
-            return np.packbits(behind_torso(self.head, state.vertices, view, torso, grow_px))
+            return np.packbits(behind_torso(self.head, state.vertices, view, torso))
 
-        bits = np.unpackbits(self._hidden.get((index, grow_px), make), count=height * width)
+        bits = np.unpackbits(self._hidden.get(index, make), count=height * width)
         return bits.reshape(height, width).astype(bool)
 
     def prefetch(self, index: int) -> None:

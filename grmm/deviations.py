@@ -87,8 +87,7 @@ REASONS: dict[str, tuple[str, str]] = {
         "the neck ends elsewhere in every view, above the collar; as background the views"
         " contradict each other",
         "neck of held-out views 20.6 to 25.2 dB, within 3 px of the collar 14.3 to 19.8, skin +0.05"
-        " (120 steps of demo, 96 texels). Training takes the neck as wider by 2.4 % of the"
-        " picture's height: +0.32, head +0.58, SSIM -0.005 (350 steps of demo)",
+        " (120 steps of demo, 96 texels)",
     ),
     "model.refine_alpha": (
         "normalised depth is 0 at the nearest pixel and in the background; alpha tells them apart",

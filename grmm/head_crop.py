@@ -129,16 +129,12 @@ def _span(low: float, high: float, size: int) -> slice:
 
 
 def behind_torso(
-    head: HeadModel,
-    vertices: Tensor,
-    view: PinholeView,
-    torso: np.ndarray,
-    grow_px: int = GROW_PX,
+    head: HeadModel, vertices: Tensor, view: PinholeView, torso: np.ndarray
 ) -> np.ndarray:
     """Mark the pixels (H, W) bool of a torso (H, W) that stand before the neck of the mesh.
 
-    ``vertices`` (V, 3) are those of the tracked mesh, head space, as the view is; its neck is taken
-    as wider by ``grow_px`` on all sides. A head model without a region ``neck`` has none.
+    ``vertices`` (V, 3) are those of the tracked mesh, head space, as the view is. A head model
+    without a region ``neck`` has none.
     """
     found = np.zeros(torso.shape, np.uint8)
     regions = [head.regions[name] for name in ("neck", "boundary") if name in head.regions]
@@ -154,7 +150,7 @@ def behind_torso(
     for corners in np.round(places[faces[ahead]].clip(-FAR_PX, FAR_PX)).astype(np.int32):
         cv2.fillConvexPoly(found, corners, 1)
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-    return torso & (cv2.dilate(found, cross, iterations=grow_px) > 0)
+    return torso & (cv2.dilate(found, cross, iterations=GROW_PX) > 0)
 
 
 def crop_view(view: PinholeView, rows: slice, columns: slice) -> PinholeView:

@@ -86,11 +86,3 @@ def test_a_hidden_neck_neither_teaches_nor_counts():
     shown = item.comparable(image)
     assert torch.equal(shown[:, item.hidden], item.target[:, item.hidden])
     assert torch.equal(shown[:, ~item.hidden], image[:, ~item.hidden])
-
-
-def test_training_counts_less_of_the_torso_beside_the_neck_than_what_is_judged():
-    views = HeadViews(Labelled(size=192), necked_head(), DataConfig(skip_hidden_neck=True))
-    judged, taught = views.item(0), views.item(0, crop=True)
-    shirt = Labelled(size=192).read(0).parts == TORSO
-    assert judged.hidden.sum() < taught.hidden.sum() < shirt.sum()
-    assert not (taught.hidden & taught.mask).any()
