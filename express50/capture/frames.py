@@ -20,7 +20,7 @@ from express50.errors import CaptureError, FormatError, StageError
 from express50.files.calibration import read_cameras
 from express50.files.containers import inside, read_picture, read_srgb
 from express50.files.digests import cached_by_file
-from express50.files.images import decode_image, upright
+from express50.files.images import decode_image, read_alpha, upright
 from express50.files.text import read_bytes, read_json, read_json_table
 from express50.files.video import VideoReader
 from express50.geometry.cameras import Camera, pinhole
@@ -197,6 +197,27 @@ def read_peak_frame(dataset: Dataset, subject: str, expression: str, camera_id: 
             f"'express50 status {dataset.root}' for the reason"
         )
     return _read_written(path)
+
+
+def read_matted_frame(dataset: Dataset, item: str, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Read a camera's peak frame (H, W, 3) uint8 of `subject/expression`, and its matte (H, W).
+
+    Raises:
+        StageError: it has no matte.
+        FormatError: the matte is not an 8-bit grey image of the camera's size.
+        CaptureError: the frame cannot be read.
+    """
+    subject, expression = item.split("/")
+    path = dataset.matte_file(subject, expression, camera.id)
+    if not path.is_file():
+        raise StageError("it has no matte")
+    alpha = read_alpha(path)
+    if alpha.shape != (camera.height, camera.width):
+        raise FormatError(
+            f"{path}: {alpha.shape[1]}x{alpha.shape[0]}, expected the camera's"
+            f" {camera.width}x{camera.height}; run 'express50 matte' again"
+        )
+    return read_peak_frame(dataset, subject, expression, camera.id), alpha
 
 
 def read_plate_image(dataset: Dataset, subject: str, camera_id: str) -> np.ndarray | None:

@@ -9,14 +9,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.capture.frames import read_cameras_of, read_peak_frame
+from express50.capture.frames import read_cameras_of, read_matted_frame
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
 from express50.dataset.depth_files import write_depth, write_normals
 from express50.dataset.tracks import read_track
 from express50.error_model import error_models, expect, size_sigma
 from express50.errors import CaptureError, FormatError, StageError
-from express50.files.images import contact_sheet, read_alpha, shrink, srgb_to_linear, write_image
+from express50.files.images import contact_sheet, shrink, srgb_to_linear, write_image
 from express50.geometry import meshes
 from express50.head.load import load_head
 from pipelines.depth.maps import DepthMaps, PhotoErrors, Picture, picture_of, surface_maps
@@ -99,7 +99,7 @@ def read_views(
     pictures: list[Picture] = []
     dropped = []
     for camera_id, camera in read_cameras_of(dataset, item.split("/")[0]).items():
-        read = partial(_read_pair, dataset, item, camera_id)
+        read = partial(read_matted_frame, dataset, item, camera)
         try:
             rgb, alpha = read()
             views.append(make_view(camera, rgb, alpha.astype(np.float32) / 255, image_side))
@@ -110,14 +110,6 @@ def read_views(
     gone = {note.what for note in contradicting}
     pictures = [picture for picture in pictures if picture.camera.id not in gone]
     return views, pictures, sorted([*dropped, *contradicting], key=lambda note: note.what)
-
-
-def _read_pair(dataset: Dataset, item: str, camera_id: str) -> tuple[np.ndarray, np.ndarray]:
-    subject, expression = item.split("/")
-    path = dataset.matte_file(subject, expression, camera_id)
-    if not path.is_file():
-        raise StageError("it has no matte")
-    return read_peak_frame(dataset, subject, expression, camera_id), read_alpha(path)
 
 
 def read_tracked(

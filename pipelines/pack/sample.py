@@ -7,7 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from express50.capture.frames import read_cameras_of, read_gains, read_peak_frame, read_plate_image
+from express50.capture.frames import (
+    read_cameras_of,
+    read_gains,
+    read_matted_frame,
+    read_plate_image,
+)
 from express50.capture.index import read_index, read_peaks
 from express50.contract.layout import Dataset
 from express50.contract.segmentation_labels import label_mask
@@ -183,14 +188,11 @@ def load_sample(
     if expression not in subject.tracked:
         raise StageError("it is not tracked")
     item = f"{subject.name}/{expression}"
-    matte_path = dataset.matte_file(subject.name, expression, camera.id)
     folder = dataset.item_dir("depth", item)
-    if not matte_path.is_file():
-        raise StageError("it has no matte")
+    rgb, alpha = read_matted_frame(dataset, item, camera)
+    matte = alpha
     if (depth_path := depth_file(folder, camera.id)) is None:
         raise StageError("it has no depth")
-    rgb = read_peak_frame(dataset, subject.name, expression, camera.id)
-    matte = alpha = read_alpha(matte_path)
     depth, valid = read_depth(depth_path)
     parts, head = _read_regions(dataset, item, camera.id)
     sizes = [image.shape[:2] for image in (rgb, matte, depth, parts, head) if image is not None]

@@ -9,14 +9,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.capture.frames import read_cameras_of, read_peak_frame
+from express50.capture.frames import read_cameras_of, read_matted_frame
 from express50.contract.layout import Dataset
 from express50.contract.segmentation_labels import COLOURS, LABELS
 from express50.contract.stage import Note, Result
 from express50.dataset.depth_files import depth_file, read_depth
 from express50.dataset.tracks import existing_track, read_track
 from express50.errors import CaptureError, FormatError, StageError
-from express50.files.images import contact_sheet, fit_into, read_alpha, shrink, write_image
+from express50.files.images import contact_sheet, fit_into, shrink, write_image
 from express50.geometry.cameras import Camera, resized
 from express50.head.load import load_head
 from pipelines.regions.colour import EARS, SKIN, Scalp, by_colour, decide, face_colours, scalp_votes
@@ -127,23 +127,10 @@ def read_head(dataset: Dataset, subject: str, expression: str) -> TrackedHead:
 def read_pair(dataset: Dataset, item: str, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Read the undistorted frame (H, W, 3) uint8 and alpha (H, W) float32 of one camera.
 
-    Raises:
-        StageError: it has no matte.
-        FormatError: the matte is not an 8-bit grey image of the camera's size.
-        CaptureError: the frame cannot be read.
+    Raises as `read_matted_frame`.
     """
-    subject, expression = item.split("/")
-    path = dataset.matte_file(subject, expression, camera.id)
-    if not path.is_file():
-        raise StageError("it has no matte")
-    matte = read_alpha(path)
-    if matte.shape != (camera.height, camera.width):
-        raise FormatError(
-            f"{path}: {matte.shape[1]}x{matte.shape[0]}, expected the camera's"
-            f" {camera.width}x{camera.height}; run 'express50 matte' again"
-        )
-    rgb = read_peak_frame(dataset, subject, expression, camera.id)
-    return rgb, matte.astype(np.float32) / 255
+    rgb, alpha = read_matted_frame(dataset, item, camera)
+    return rgb, alpha.astype(np.float32) / 255
 
 
 def read_depth_of(dataset: Dataset, item: str, camera: Camera) -> np.ndarray | None:
