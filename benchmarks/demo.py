@@ -169,16 +169,16 @@ def run_grmm(dataset: Path, unseen: str, seconds: tuple[int, int]) -> list[Step]
             "track_given", "benchmarks.given_views", str(dataset), str(alone), *fitted,
         ),
         run_step(
-            "train", "grmm", "train", str(shards), str(out / "train"), "--anew", "--preset=demo",
-            f"--seconds={seconds[0]}", f"--holdout-cameras={held_out}",
+            "train", "grmm", "train", str(shards), str(out / "train"), "--overwrite",
+            "--preset=demo", f"--seconds={seconds[0]}", f"--holdout-cameras={held_out}",
         ),
         run_step(
-            "fit", "grmm", "fit", checkpoint, str(alone / "shards"), str(out / "fit"), "--anew",
-            *fitted, f"--seconds={seconds[1]}",
+            "fit", "grmm", "fit", checkpoint, str(alone / "shards"), str(out / "fit"),
+            "--overwrite", *fitted, f"--seconds={seconds[1]}",
         ),
         run_step(
             "fit_all_cameras", "grmm", "fit", checkpoint, str(shards), str(out / "fit_all_cameras"),
-            "--anew", *fitted, f"--seconds={seconds[1]}",
+            "--overwrite", *fitted, f"--seconds={seconds[1]}",
         ),
         run_step("render", "grmm", "render", checkpoint, str(out / "render"), "--turntable"),
     ]  # fmt: skip

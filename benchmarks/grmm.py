@@ -153,7 +153,7 @@ def frames_per_second(draw: Callable[[], object], seconds: float = 4.0) -> float
 
 
 def speeds(loaded: Loaded) -> dict[str, float]:
-    """Measure frame rates: everything anew at 256 px.
+    """Measure frame rates: everything from scratch at 256 px.
 
     At 512 px a head at rest before a moving camera.
     """

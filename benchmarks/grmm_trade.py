@@ -2,7 +2,7 @@
 
 Usage: ``python -m benchmarks.grmm_trade SHARDS [--budgets 60 240]``.
 
-One thing is changed at a time from the demo preset; every setting trains anew for each budget of
+One thing is changed at a time from the demo preset; every setting trains again for each budget of
 processor seconds, so that other work on the machine disturbs little, and is judged on one held-out
 camera at the shards' own size. Writes the table into docs/TRADEOFFS.md with ``--doc``, and what
 ``grmm train --budget`` chooses from with ``--choices``. The last line is one JSON object.

@@ -20,7 +20,7 @@ per scene and of all scenes together.
 recorded and the cluttered set: ``sad`` as `match_plate` brings them to the frame, ``sad_untouched``
 as they are, ``sad_right`` with the right plate, and the share that is ``refused``.
 
-Disturbances are laid on the recorded frames in linear light with the true alpha, and keyed anew.
+Disturbances are laid on the recorded frames in linear light with the true alpha, and keyed again.
 ``sad`` is the summed absolute error in thousands, ``mae`` its mean, both means over cameras and
 peaks; ``*_key`` is each camera alone. ``named`` counts the cameras that were found wrong, of which
 ``bumped`` has one a peak. ``seconds_per_moment`` is processor time, reading and keying excluded.

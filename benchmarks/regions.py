@@ -1,6 +1,6 @@
 """Measure labels and head mattes against the twin's truth: ``python -m benchmarks.regions``.
 
-Every preset labels the same items anew from the same mattes, tracks and depth maps. Beside it stand
+Every preset labels the same items from the same mattes, tracks and depth maps. Beside it stand
 simpler ways to lose the torso: keep it (``no_cut``), cut along the image row of the tracked chin
 (``chin_line``) or of the neck's tracked end (``neck_line``); and two limits: the standard preset on
 the true mesh instead of the tracked one (``true_mesh``), and the same matte without the pixels that

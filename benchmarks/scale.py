@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.scale OUT`` records one moment (one expression of one person) with 24 cameras
 of 3840 x 2160, without a board, and runs every stage with each preset, every stage in a process of
-its own. ``--cameras`` and ``--size`` make smaller ones; the footage is recorded anew if they
+its own. ``--cameras`` and ``--size`` make smaller ones; the footage is recorded again if they
 change. What a stage does once per subject counts in full, as if the subject had one expression.
 ``--smaller`` names sizes at which the same is run; from their receipts `express50.cli.plan`
 predicts the large one. The last line printed is one JSON object: ``<preset>``'s

@@ -285,7 +285,7 @@ def locality_loss(state: FitState, item: Item, rng: np.random.Generator) -> Tens
     """Compare the tuned model and the loaded one between a training identity and the subject.
 
     Codes and coefficients are blended at a fixed t (weight of the subject), jaw and neck by SLERP
-    (paper, supplement); a random training camera sees the mesh posed anew from the blend.
+    (paper, supplement); a random training camera sees the mesh posed again from the blend.
     """
     frames = sorted(f for f in state.loaded.gallery.frames if f[0] in state.loaded.model.subjects)
     frame = frames[int(rng.integers(len(frames)))]

@@ -174,7 +174,7 @@ def _add_gradients(
     except NotFiniteTensorError as error:
         raise TrainError(
             f"iteration {state.iteration}: training diverged ({error}); lower train.lr and "
-            "start over with --anew"
+            "start over with --overwrite"
         ) from None
     terms = objective(state, rendering, item, config)
     loss = torch.stack(list(terms.values())).sum()

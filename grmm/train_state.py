@@ -233,7 +233,7 @@ def restore(state: TrainState, path: Path, config: Config, device: torch.device)
     if not loaded.loop:
         raise ConfigError(
             f"{path}: holds no state to resume from (a person was withdrawn from it, or it is a "
-            "fit); train into another folder, or start over with --anew"
+            "fit); train into another folder, or start over with --overwrite"
         )
     old, new = as_tables(loaded.config), as_tables(config)
     changed = [
@@ -250,7 +250,7 @@ def restore(state: TrainState, path: Path, config: Config, device: torch.device)
     if changed:
         raise ConfigError(
             f"{path}: cannot resume, these differ: {'; '.join(changed)}. "
-            "Keep these settings, train into another folder, or start over with --anew"
+            "Keep these settings, train into another folder, or start over with --overwrite"
         )
     state.model.load_state_dict(loaded.model.state_dict())
     state.optimizer.load_state_dict(loaded.optimizer)

@@ -86,7 +86,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "default": "", "metavar": "SUBJECT/EXPRESSION,..", "help": "expressions to test on",
     },
     "--paper-diff": FLAG | {"help": "print differences from the paper instead"},
-    "--anew": FLAG | {"help": "start over even if OUT has a checkpoint"},
+    "--overwrite": FLAG | {"help": "start over even if OUT has a checkpoint"},
     # Measuring
     "--alexnet": {"default": "", "help": "torchvision's alexnet state dict, for LPIPS"},
     "--inception": {"default": "", "help": "Inception as TorchScript, for FID"},
@@ -191,7 +191,7 @@ class GrmmCommand:
 COMMANDS = {
     "train": GrmmCommand(
         handler=commands.train,
-        options=f"shards out {TRAINING} --anew --json",
+        options=f"shards out {TRAINING} --overwrite --json",
         help="train on packed shards",
         example="grmm train data/pack/shards run --preset demo --budget 4m; the same command again "
         "continues from run/checkpoint.pt",
@@ -206,8 +206,8 @@ COMMANDS = {
     ),
     "fit": GrmmCommand(
         handler=commands.fit,
-        options="checkpoint shards out --subject --expression --cameras --seconds --set --anew "
-        f"{METRICS} --json",
+        options="checkpoint shards out --subject --expression --cameras --seconds --set "
+        f"--overwrite {METRICS} --json",
         help="fit an unseen subject",
         example="grmm fit run/checkpoint.pt shards out --subject S004 --expression neutral "
         "--cameras cam02,cam03 --budget 60s",
@@ -219,7 +219,7 @@ COMMANDS = {
                 "metavar": "fit.KEY=VALUE",
                 "help": "one setting of the fit; may be repeated",
             },
-            "--anew": {"help": "replace the fit in OUT"},
+            "--overwrite": {"help": "replace the fit in OUT"},
         },
     ),
     "config": GrmmCommand(

@@ -42,7 +42,7 @@ def train(args: argparse.Namespace) -> int:
     _no_file(args.out)
     config = train_config(args)
     source = open_shards([args.shards, *args.also], "train")
-    resume = not args.anew and (args.out / "checkpoint.pt").exists()
+    resume = not args.overwrite and (args.out / "checkpoint.pt").exists()
     metrics = train(source, load_head(source.head), args.out, config, resume=resume)
     names = ("psnr_heldout_view_db", "psnr_train_db", "ssim", "iterations", "gaussians")
     lines = [f"{name}: {metrics.get(name)}" for name in names]
@@ -104,8 +104,8 @@ def fit(args: argparse.Namespace) -> int:
     made = args.out / "checkpoint.pt"
     if made.exists() and made.samefile(args.checkpoint):
         raise ConfigError(f"{made} is the checkpoint to fit from; name another folder")
-    if made.exists() and not args.anew:
-        raise ConfigError(f"{made} exists; name another folder, or overwrite it with --anew")
+    if made.exists() and not args.overwrite:
+        raise ConfigError(f"{made} exists; name another folder, or overwrite it with --overwrite")
     loaded = _load(args.checkpoint, [*args.set, *_metric_settings(args)], args.seconds)
     if not loaded.loop and len(loaded.model.subjects) == 1:
         log(

@@ -42,8 +42,8 @@ class TrackConfig:
     patch_rounds: int = 6
     """Rounds in which the surface is searched for along the normals; 0 for none."""
     uv_rounds: int = 6
-    """First rounds in which landmarks are found anew on the face UV map; later rounds keep the last
-    reading. 0 for none."""
+    """First rounds that find landmarks on the face UV map; later rounds keep the last reading. 0
+    for none."""
     offset_modes: int = 150
     """Smooth static offsets of the skin beyond the head's shape directions; 0 for none."""
     texture_side: int = 512

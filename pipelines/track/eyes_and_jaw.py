@@ -14,7 +14,7 @@ part them, and most in depth, which a single picture does not show.
 **Jaw line**: people, and networks trained on their marks, mark the visible edge of the cheek where
 the head turns away. A landmark whose skin faces the camera keeps its place in the embedding, one
 that turned past the rim moves along its line of candidates to the rim, and one that the head hides
-is left out. The choice is made anew for every mesh. The embedded network marks fixed places and
+is left out. The choice is made again for every mesh. The embedded network marks fixed places and
 needs none of this.
 """
 

@@ -1,6 +1,6 @@
 """Run the rounds of tracking: read evidence from pictures on the current mesh, fit, again.
 
-Every round makes the terms of every expression anew, as outlines, visibility and patches depend on
+Every round makes the terms of every expression again, as outlines, visibility and patches depend on
 the mesh. The schedule is a table, made once from the settings and written to metrics.json.
 """
 
@@ -34,7 +34,7 @@ from pipelines.track.terms import NormalTerm, SlideTerm, landmark_anchors
 
 LANDMARK_STEPS = 14  # of the first fit, to landmarks alone; 6 measure the same on the twin
 ROUND_STEPS = 4
-EYE_ROUNDS = 2  # irises and visible jaw lines are found anew at least so often
+EYE_ROUNDS = 2  # irises and visible jaw lines are found again at least so often
 PATCH_REACH_M = 0.008  # of the first search, to either side of the mesh
 NARROWING, NARROWINGS = 0.6, 3  # factor of the reach from round to round, and how often
 IN_HAIR = 30.0  # times a landmark's standard deviation, where hair is around it
@@ -54,7 +54,7 @@ class Round:
         outlines: fit the outlines of the mattes.
         patch_reach_m: how far along the normals the surface is searched for; 0 for no search.
         patch_weight: trust in what the search finds.
-        read_uv: find landmarks on the face UV map anew; otherwise the last reading stays.
+        read_uv: find landmarks on the face UV map again; otherwise the last reading stays.
         follow_skin: follow the skin's texture from the resting face to the other expressions. The
             shape is held: the texture shows how a face moves, not what it is.
     """

@@ -334,7 +334,7 @@ def _read_window(file: Path) -> dict[int, Pose] | None:
         rows = zip(data["frames"].tolist(), data["own"], data["rotation"], strict=True)
         return {frame: Pose(own, rotation) for frame, own, rotation in rows}
     except (FormatError, ValueError, TypeError):
-        return None  # damaged: tracked anew
+        return None  # damaged: tracked again
 
 
 def _jitter(tracker: ClipTracker, rows: list[tuple[str, int, Pose]]) -> dict[str, float]:

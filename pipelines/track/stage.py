@@ -25,7 +25,7 @@ from express50.head.model import landmarks
 from pipelines.track.appearance import write_texture
 from pipelines.track.basis import Basis, freeze_shape, make_basis, split_shape, with_modes
 from pipelines.track.config import TrackConfig
-from pipelines.track.eyes_and_jaw import measure_eyes, shut_terms
+from pipelines.track.eyes_and_jaw import EyeOffsets, measure_eyes, shut_terms
 from pipelines.track.fit import consistent_sigma, fit, vertex_sigma
 from pipelines.track.observe import Observation
 from pipelines.track.read_inputs import (
@@ -112,27 +112,38 @@ def run(
     write_sheet(out / "qc", tiles, metrics["landmark_rms_px"])
     metrics["schedule"] = schedule_table(schedule)
     if config.frames == "clips":
-        shape = split_shape(basis.model, state.shape)[0]
         tracker = ClipTracker(
             freeze_shape(basis, state.shape, state.bias), config.stride, eyes, evidence.skin,
             evidence.uv_map, config.clip_rounds,
         )  # fmt: skip
         follow = open_follower(config.landmarks)
         read = partial(read_clip, dataset, item, source, follow, peaks, config.photo_side)
-        # Windows that a stopped run finished are taken over if this digest is the same. The peaks'
-        # fit follows from inputs and settings, up to how the machine rounds.
-        fitted = (shape.tobytes(), state.bias.tobytes(), eyes and vars(eyes))
-        digests = {k: path_digest(v) if isinstance(v, Path) else v for k, v in inputs.items()}
-        identity = repr((value_digest(digests), asdict(config), fitted))
+        shape = split_shape(basis.model, state.shape)[0]
         metrics["clips"], lost = write_clips(
             out, tracker, config.head, shape, read_index(dataset, item).cues, read,
-            dataset.windows_dir(item), identity,
+            dataset.windows_dir(item), clips_identity(inputs, config, shape, state, eyes),
         )  # fmt: skip
         dropped += lost
     shared = size_sigma(list(read_cameras_of(dataset, item).values()), meshes.reshape(-1, 3))
     typical = np.concatenate([one.typical for one in bounds])
     expected = expect(error_models()["track"], typical, shared)
     return Result(metrics, dropped, expected_error=expected)
+
+
+def clips_identity(
+    inputs: Mapping[str, Path | str],
+    config: TrackConfig,
+    shape: np.ndarray,
+    state: State,
+    eyes: EyeOffsets | None,
+) -> str:
+    """Identify what clips are tracked from: windows of a stopped run with the same are kept.
+
+    The peaks' fit follows from inputs and settings, up to how the machine rounds.
+    """
+    fitted = (shape.tobytes(), state.bias.tobytes(), eyes and vars(eyes))
+    digests = {k: path_digest(v) if isinstance(v, Path) else v for k, v in inputs.items()}
+    return repr((value_digest(digests), asdict(config), fitted))
 
 
 def stated_bounds(

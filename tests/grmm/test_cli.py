@@ -79,13 +79,13 @@ def test_training_again_goes_on_and_refuses_what_differs(shards, tmp_path, capsy
     before = (tmp_path / "checkpoint.pt").read_bytes()
     assert main([*train, "--set=train.lr=0.5"]) == 2
     printed = capsys.readouterr().err
-    assert "train.lr 0.002 -> 0.5" in printed and "--anew" in printed
+    assert "train.lr 0.002 -> 0.5" in printed and "--overwrite" in printed
     write_shards(tmp_path / "others", EllipsoidSource(subjects=3, size=24))
     assert main(["train", str(tmp_path / "others"), str(tmp_path), *TINY]) == 2
     assert "the samples of the shards" in capsys.readouterr().err
     assert (tmp_path / "checkpoint.pt").read_bytes() == before
 
-    assert main([*train, "--anew", "--set=train.lr=0.5"]) == 0
+    assert main([*train, "--overwrite", "--set=train.lr=0.5"]) == 0
     assert "resuming" not in capsys.readouterr().err
     assert json.loads((tmp_path / "metrics.json").read_text())["iterations"] == 3
 
@@ -100,7 +100,7 @@ def test_fit_reports_held_out_views_and_writes_over_nothing(checkpoint, shards, 
     assert stages["stage2"]["psnr_given_db"] > stages["mean_code"]["psnr_given_db"]
     made = tmp_path / "fit" / "checkpoint.pt"
     before = made.read_bytes()
-    assert main(fit) == 2 and main([fit[0], str(made), *fit[2:], "--anew"]) == 2
+    assert main(fit) == 2 and main([fit[0], str(made), *fit[2:], "--overwrite"]) == 2
     assert made.read_bytes() == before, "neither a former fit nor the checkpoint read is replaced"
 
 

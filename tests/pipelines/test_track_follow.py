@@ -1,4 +1,4 @@
-"""Faces are followed through a clip; one that is lost is searched for anew."""
+"""Faces are followed through a clip; one that is lost is searched for again."""
 
 from __future__ import annotations
 

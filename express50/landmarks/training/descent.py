@@ -62,5 +62,5 @@ def take_up(path: Path, net: Net, optimiser: torch.optim.Optimizer) -> int:
     state = read_weights(path, TrainError, str(path), "a state of training", "delete it")
     net.load_state_dict(state["net"])
     optimiser.load_state_dict(state["optimiser"])
-    print(f"going on from step {state['step']} ({path}; delete it to begin anew)")
+    print(f"continuing from step {state['step']} ({path}; delete it to start over)")
     return state["step"]
