@@ -69,7 +69,8 @@ def _fit(samples: Sequence[Sample], unit: Unit) -> ErrorModel:
 def _proportional(names: tuple[str, ...], unit: Unit, samples: Sequence[Sample]) -> ErrorModel:
     """Fit errors that are proportional to the one figure: a stage's own deviation."""
     ratios = np.concatenate([s.errors / s.figures[names[0]] for s in samples])
-    typical, bound = (np.log(np.quantile(ratios, [q])) for q in (0.5, NOMINAL))
+    share = np.concatenate([np.full(len(s.errors), 1 / len(s.errors)) for s in samples])
+    typical, bound = (np.log([_quantile(ratios, share, q)]) for q in (0.5, NOMINAL))
     wide = np.array([[np.log(TINY), -np.log(TINY)]])
     return ErrorModel(unit, names, np.ones(1), wide, np.zeros(1), typical, bound, (1, 1, 1))
 

@@ -1,0 +1,36 @@
+"""What the benchmark of error bounds says of few people, and how it weighs items."""
+
+import numpy as np
+import pytest
+
+from benchmarks.intervals import spread
+from benchmarks.intervals_collect import sampled
+from benchmarks.intervals_fit import fit_model
+
+
+def test_a_rows_interval_is_wide_where_few_people_differ_much():
+    alike = {"few": [90.0, 90.5], "many": [90.0, 90.5] * 8}
+    apart = {"few": [80.0, 98.0], "many": [80.0, 98.0] * 8}
+    (_, narrow), (_, narrower) = spread(alike)
+    (_, wide), (_, less) = spread(apart)
+    assert narrower[0] > narrow[0] > 88 and narrow[1] < 92
+    assert wide[0] < less[0] < 89 < less[1] < wide[1]
+    assert list(spread({"one": [90.0]})) == [("one", None)]
+
+
+def test_intervals_of_rows_hold_the_true_coverage_nine_times_in_ten():
+    rng, held = np.random.default_rng(3), []
+    for _ in range(300):
+        rows = {name: list(rng.normal(90, 4, 2)) for name in "abcd"}
+        held += [low <= 90 <= high for _, (low, high) in spread(rows)]
+    assert 0.87 < np.mean(held) < 0.93
+
+
+def test_a_proportional_model_weighs_rigs_of_any_number_of_cameras_alike():
+    def rig(count, ratio):
+        figures = [{"stated_mm": np.full(count, 0.1)}]
+        return "rig", sampled("calibrate", f"rig {ratio}", figures, [np.full(count, 0.1 * ratio)])
+
+    model = fit_model([rig(100, 1.0), rig(2, 2.0), rig(2, 3.0)], "mm")
+    assert np.exp(model.typical[0]) == pytest.approx(2.0)
+    assert np.exp(model.bound[0]) == pytest.approx(3.0)
