@@ -173,11 +173,11 @@ def figures(runs: Sequence[Run], grid: Sequence[Run], true: bool) -> dict:
     """Compute the figures of the issue from all runs; None where no run has any."""
     asked, everyone = runs, [run for run in (*runs, *grid) if run.finished]
     runs, grid = ([run for run in some if run.finished] for some in (runs, grid))
-    scale = {
-        name: max(float(np.median([r.errors[name] for r in everyone if name in r.errors])), 1e-9)
-        for name in MAKERS.values()
-        if any(name in r.errors for r in everyone)
-    }
+    scale = {}
+    for name in MAKERS.values():
+        found = [run.errors[name] for run in everyone if name in run.errors]
+        if size := float(np.median(found) or max(found)) if found else 0.0:  # most peaks are right
+            scale[name] = size
 
     def final(run: Run) -> float:
         return float(np.mean([run.errors.get(name, 0.0) / size for name, size in scale.items()]))

@@ -243,7 +243,8 @@ def front(load: Workload) -> list[Point]:
 def scales(load: Workload) -> dict[str, float]:
     """Return what a result's error is counted in: what the dearest settings leave, or differences.
 
-    Results that no setting changes are left out.
+    Differences count where nothing is left, as of peaks that are right to the frame. Results that
+    no setting changes are left out.
     """
     found = {}
     for kind in load.kinds:
@@ -252,7 +253,7 @@ def scales(load: Workload) -> dict[str, float]:
             for row in ladder.values()
         ]  # fmt: skip
         rest = rest_of(load, kind.name)
-        size = math.sqrt(rest[0]) if rest else max(changes, default=0.0)
+        size = math.sqrt(rest[0]) if rest and rest[0] else max(changes, default=0.0)
         if any(changes):
             found[kind.name] = max(size, 1e-12)
     return found

@@ -90,3 +90,15 @@ def test_a_refused_budget_is_a_miss_only_where_a_preset_would_have_fitted():
     small, fair = (Run("d", 5.0, budget, None, {}, {}, {}, False) for budget in (20.0, 40.0))
     assert figures([small], presets, True)["time_miss_percent"] == 0
     assert figures([fair], presets, True)["time_miss_percent"] == 100
+
+
+def test_a_result_that_is_right_in_most_runs_does_not_outweigh_all_others():
+    presets = [run("draft", 30.0), run("standard", 60.0, error=0.9)]
+    for one, peaks in zip(presets, (0.5, 0.0), strict=True):
+        one.errors["peaks"] = peaks
+    budget = run("b", 61.0, 65.0, error=0.9)
+    budget.errors["peaks"] = 0.0
+    late = run("c", 61.0, 65.0, error=1.0)
+    late.errors["peaks"] = 0.5
+    assert figures([budget], presets, True)["regret_percent"] == 0
+    assert 0 < figures([late], presets, True)["regret_percent"] < 1000
