@@ -257,7 +257,7 @@ def halves(options: argparse.Namespace) -> dict:
 
 def write_models(rows: Sequence[Row]) -> None:
     """Fit every stage's constants and write them; stages without samples keep theirs."""
-    former = json.loads(FILE.read_text())["stages"]
+    former = json.loads(FILE.read_text())
     models: dict[str, ErrorModel] = {}
     for stage, unit in UNITS.items():
         mine = [(name, sample) for name, sample in rows if sample.stage == stage]
@@ -269,7 +269,8 @@ def write_models(rows: Sequence[Row]) -> None:
     content = {
         "made_by": "python -m benchmarks.intervals --fit",
         "nominal": NOMINAL,
-        "fitted_on": {
+        "fitted_on": former["fitted_on"]
+        | {
             stage: {
                 "items": sum(sample.stage == stage for _, sample in rows),
                 "conditions": list(dict.fromkeys(n for n, s in rows if s.stage == stage)),
@@ -279,7 +280,7 @@ def write_models(rows: Sequence[Row]) -> None:
             }
             for stage in models
         },
-        "stages": former | fitted,
+        "stages": former["stages"] | fitted,
     }
     FILE.write_bytes(dump_json(content))
     error_models.cache_clear()
