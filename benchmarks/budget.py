@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.budget build/budget`` records twin captures, runs the chain for five budgets
 from a minute to an hour and with every preset, and measures each run against the truth. ``--quick``
-takes one person of two expressions, one pilot for all runs, and three budgets along the
+takes one person of two expressions, one pilot for all runs, and budgets for three points of the
 front, in processor time, which means something on a busy machine too. ``--captures`` takes footage
 without truth: errors are then differences from the dearest run, and promises cannot be checked.
 A budget that ends early, or is refused although a fixed preset takes no longer, is a miss of 100 %
@@ -36,6 +36,7 @@ from express50.twin.truth import Truth
 TWIN = {"subjects": 3, "cameras": 8, "width": 320, "height": 320, "frames-per-expression": 6}
 QUICK = {"subjects": 1, "cameras": 8, "width": 320, "height": 320, "frames-per-expression": 6}
 BUDGETS = ("1m", "5m", "15m", "30m", "1h")
+ALIKE = 1.02  # errors that differ by less are equal
 # Stages whose samples hold the true errors of each result, as the stage states its own.
 MAKERS = {
     "register": "mesh",
@@ -76,8 +77,8 @@ def main() -> None:
         truth = Truth(args.out / "twin" / "truth")
     workers = 0 if args.quick else args.workers
     tuned = args.out / "tuned"
-    front = tune(tuned, captures, workers)
-    budgets = quick_budgets(front) if args.quick else BUDGETS
+    table = tune(tuned, captures, workers)
+    budgets = quick_budgets(table) if args.quick else BUDGETS
     runs = [
         run_one(args.out, f"budget-{text}", captures, workers, ["--budget", text], args.quick)
         for text in budgets
@@ -92,13 +93,13 @@ def main() -> None:
     print(json.dumps(figures(runs, grid, truth is not None) | {"core_time": args.quick}))
 
 
-def tune(root: Path, captures: Sequence[Path], workers: int) -> list[dict]:
-    """Measure the front of the captures; returns its points."""
+def tune(root: Path, captures: Sequence[Path], workers: int) -> dict:
+    """Measure the front of the captures; returns its table."""
     front = root / "dial" / "front.json"
     if not front.is_file():
         command = ["tune", str(root), *map(str, captures), "--workers", str(workers)]
         express50(command)
-    return json.loads(front.read_text())["front"]
+    return json.loads(front.read_text())
 
 
 def express50(arguments: Sequence[str]) -> int:
@@ -107,11 +108,16 @@ def express50(arguments: Sequence[str]) -> int:
     return subprocess.run(command, stdout=sys.stderr, check=False).returncode
 
 
-def quick_budgets(front: Sequence[Mapping]) -> list[str]:
-    """Choose processor times along the front: near its cheapest point, its middle and its end."""
-    every = [1.15 * point["core_seconds"] for point in front]
-    low, high = min(every), max(every)
-    return [f"{s / 3600:.4f}ch" for s in (low, math.sqrt(low * high), high)]
+def quick_budgets(table: Mapping) -> list[str]:
+    """Choose processor times for three points of a front.
+
+    They are the cheapest, the quickest that should be as good as the best preset, and the dearest.
+    """
+    points = table["front"]
+    wanted = ALIKE * min(point["worse"] for point in table["presets"].values())
+    alike = next((point for point in points if point["worse"] <= wanted), points[-1])
+    times = sorted({point["core_seconds"] for point in (points[0], alike, points[-1])})
+    return [f"{1.15 * seconds / 3600:.4f}ch" for seconds in times]
 
 
 def run_one(
@@ -224,8 +230,8 @@ def saved(runs: Sequence[Run], grid: Sequence[Run], final) -> float | None:  # n
     The best preset is the one with the least error, the quicker of two that differ by under 2 %.
     """
     least = min(map(final, grid))
-    best = min((r for r in grid if final(r) <= 1.02 * least), key=lambda run: run.seconds)
-    alike = [run.seconds for run in runs if final(run) <= 1.02 * final(best)]
+    best = min((r for r in grid if final(r) <= ALIKE * least), key=lambda run: run.seconds)
+    alike = [run.seconds for run in runs if final(run) <= ALIKE * final(best)]
     return round(100 * (1 - min(alike) / best.seconds), 1) if alike else None
 
 

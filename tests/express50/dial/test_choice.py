@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.budget import Run, figures
+from benchmarks.budget import Run, figures, quick_budgets
 from express50.contract.layout import Dataset
 from express50.dial.choice import remainder
 from express50.dial.results import RESULTS
@@ -102,3 +102,11 @@ def test_a_result_that_is_right_in_most_runs_does_not_outweigh_all_others():
     late.errors["peaks"] = 0.5
     assert figures([budget], presets, True)["regret_percent"] == 0
     assert 0 < figures([late], presets, True)["regret_percent"] < 1000
+
+
+def test_the_quick_form_asks_for_what_should_be_as_good_as_the_best_preset():
+    rows = ((36.0, 5.0), (45.0, 4.2), (55.0, 4.05), (60.0, 4.0))
+    points = [{"core_seconds": seconds, "worse": worse} for seconds, worse in rows]
+    table = {"front": points, "presets": {"draft": points[0], "standard": points[-1]}}
+    assert quick_budgets(table) == ["0.0115ch", "0.0176ch", "0.0192ch"]
+    assert len(quick_budgets(table | {"front": points[-1:]})) == 1
