@@ -20,7 +20,7 @@ from functools import cache
 
 import cv2
 import numpy as np
-from scipy.ndimage import binary_fill_holes
+from scipy.ndimage import binary_fill_holes, gaussian_filter
 
 from express50.errors import NoFaceError
 from express50.files.images import edge_distance, shrink
@@ -49,6 +49,8 @@ HOLE_M2 = 1.5e-3  # larger gaps show the background
 CUTS = 6  # of GrabCut, each time
 FEWEST = 4  # cameras that can overrule each other
 SLACK_PX = (3.0, 1.5)  # distance from an outline that proves nothing, per round
+COLOURS, RARE = 32, 1e-5  # cells of colour along each axis of Lab; share of one never seen
+UNSEEN = 2 / COLOURS**3  # share that the person does not have
 CELLS = 96  # along each side of the cube in which cameras are compared
 
 # Lengths on the head, metres.
@@ -295,22 +297,73 @@ def _overruled(
     ]  # fmt: skip
     space = make_space(mattes, CELLS, slack)
     place = subject_place(space)
+    seen = [evidence_of(matte, space, place) for matte in mattes]
+    foreign = _foreign(
+        mattes,
+        [
+            one.solid | (guess.labels == cv2.GC_FGD)
+            for one, guess in zip(seen, guesses, strict=True)
+        ],
+    )
     return [
-        _cut(view, _labels(matte, evidence_of(matte, space, place), guess.labels), guess)
+        _cut(view, _labels(matte, evidence, guess.labels, odd), guess)
         if view.known is None
         else view.known
-        for view, matte, guess in zip(views, mattes, guesses, strict=True)
+        for view, matte, evidence, guess, odd in zip(
+            views, mattes, seen, guesses, foreign, strict=True
+        )
     ]
 
 
-def _labels(view: MatteView, evidence: Evidence, guess: np.ndarray) -> np.ndarray:
-    """Return GrabCut's labels (h, w) by a view's mask, what the others say, and the guess."""
-    inside = (view.alpha > 0) | evidence.solid
+def _labels(
+    view: MatteView, evidence: Evidence, guess: np.ndarray, foreign: np.ndarray
+) -> np.ndarray:
+    """Return GrabCut's labels (h, w) by a view's mask, what the others say, and the guess.
+
+    The person's colours are learnt where no other view sees the wall and nothing is `foreign`
+    (h, w); whole patches of that are wall.
+    """
+    inside = ((view.alpha > 0) & evidence.likely & ~foreign) | evidence.solid
     labels = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     beyond = (evidence.known & ~evidence.possible) | (guess == cv2.GC_BGD)
+    patches = cv2.morphologyEx(foreign.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3))) > 0
+    beyond |= patches & (guess != cv2.GC_FGD)
     labels[beyond | ~view.valid] = cv2.GC_BGD
     labels[cv2.erode(evidence.solid.astype(np.uint8), np.ones((5, 5))) > 0] = cv2.GC_FGD
     return labels
+
+
+def _foreign(views: Sequence[MatteView], sure: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return for each view the pixels (h, w) bool whose colours the person has not.
+
+    The person's colours are those of what the other views cut out, without the view in which a
+    colour is most common, as a cut may hold a piece of its wall; and, since cameras differ, those
+    of the pixels (h, w) of the view itself that are `sure`.
+    """
+    cells = [_colour_cells(view.rgb) for view in views]
+    person = np.array(
+        [_shares(cell[view.alpha > 0]) for cell, view in zip(cells, views, strict=True)]
+    )
+    found = []
+    for k, one in enumerate(sure):
+        others = np.delete(person, k, axis=0)
+        known = (others.sum(0) - others.max(0)) / (len(others) - 1)
+        known = np.maximum(known, _shares(cells[k][one]))
+        found.append((known < UNSEEN)[cells[k]])
+    return found
+
+
+def _colour_cells(rgb: np.ndarray) -> np.ndarray:
+    """Find the cell of Lab colour (h, w) of pixels (h, w, 3) uint8."""
+    lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB).astype(np.int64) // (256 // COLOURS)
+    return (lab[..., 0] * COLOURS + lab[..., 1]) * COLOURS + lab[..., 2]
+
+
+def _shares(cells: np.ndarray) -> np.ndarray:
+    """Return the smoothed share (COLOURS**3,) of each cell of colour among pixels (N,)."""
+    counts = np.bincount(cells.ravel(), minlength=COLOURS**3).reshape((COLOURS,) * 3)
+    smooth = gaussian_filter(counts.astype(np.float32), 1.0).ravel()
+    return smooth / max(len(cells), 1) + RARE
 
 
 def soft_alpha(frame: np.ndarray, valid: np.ndarray, cut: Cut) -> np.ndarray:
