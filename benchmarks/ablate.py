@@ -4,9 +4,10 @@ The twin's people smile, fold and redden in ways of their own (``--personal 1``)
 through every stage; then `grmm.ablate` trains and fits the model whole, and without one component
 at a time, with several seeds. Differences are of a row to the row that it is compared with, dB,
 with half of their 95 % interval; ``earned`` lists the groups and regions in which a component's
-loss is beyond its interval. ``contributes_db`` is what the whole model loses on held-out views when
-a component is taken out after training: near 0 means that training left it inert. ``--quick`` ends
-within some 20 minutes of one core. The last line is one JSON object.
+loss is beyond its interval. `identity_modes` are off, as in the paper: without residuals, shape
+coefficients would drive them. ``contributes_db`` is what the whole model loses on held-out views
+when a component is taken out after training: near 0 means that training left it inert. ``--quick``
+ends within some 20 minutes of one core. The last line is one JSON object.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ TWIN = {"subjects": 5, "first-subject": 71, "cameras": 8, "width": 256, "height"
 PERSONAL = ("--personal=1",)
 ITERATIONS, FIT = 2000, (120, 200)
 QUICK_TWIN = TWIN | {"subjects": 4, "cameras": 7, "width": 224, "height": 224}
-QUICK_EXPRESSIONS, QUICK_ITERATIONS, QUICK_FIT = 4, 250, (40, 60)
+QUICK_EXPRESSIONS, QUICK_ITERATIONS, QUICK_FIT = 4, 150, (30, 40)
 
 
 def differences(row: dict) -> dict[str, dict[str, tuple[float, float | None]]]:
@@ -93,6 +94,7 @@ def main() -> None:
     shards = make_shards(args.out, args.threads, twin, expressions, PERSONAL)
     torch.set_num_threads(args.threads)
     budget = [
+        "model.identity_modes=0",
         f"train.iterations={steps}",
         f"fit.stage1_iterations={fit[0]}",
         f"fit.stage2_iterations={fit[1]}",
