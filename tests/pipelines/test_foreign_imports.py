@@ -180,7 +180,7 @@ WRONG = {
     "world to camera": (change_matrix(np.linalg.inv), "world to camera"),
     "millimetres": (change_matrix(in_millimetres), "its unit is not the metre"),
     "moved": (moved, "camera cam02"),
-    "names": (lambda row: row.update(camera_id="x" + row["camera_id"]), "of another capture"),
+    "names": (lambda row: row.update(camera_id="x" + row["camera_id"]), "from another capture"),
     "frame": (lambda row: row.update(timestep_index_original=7), "is of frame 7"),
 }
 
