@@ -31,7 +31,7 @@ LEAST_SKIN = 200  # pixels by which a view knows the skin's colours
 LEAST_CELLS = 20  # of a connected part
 FRONT_M, BRIDGE_M, REACH_M = 0.015, 0.005, 0.045  # depth of a rim, half a bridge, rim from its eye
 BEARINGS, AROUND = 24, 0.6  # about an eye, and the share of them that shows a rim
-EYE_M = 0.011  # from an eye's middle, within which its own dark parts may stand out
+EYE_M = 0.015  # half an eye: from its middle, within which lashes and shadow are its own
 WIDER_M = 0.0012  # by which cells stand out from glasses: odd pixels are widened by one
 DARK = 1e-3  # root of light that is added: keeps logarithms finite
 

@@ -35,10 +35,10 @@ def eyes() -> np.ndarray:
     return np.array([[*side.mean(0)[:2], side[:, 2].max()] for side in sides])
 
 
-def rims(share: float = 1.0) -> np.ndarray:
+def rims(share: float = 1.0, radius: float = RADIUS, lift: float = LIFT_M) -> np.ndarray:
     """Points (N, 3) along two rims, from the bearing of the temples on."""
     turn = np.linspace(0, share * 2 * np.pi, 400)
-    ring = np.stack([RADIUS * np.cos(turn), RADIUS * np.sin(turn), 0 * turn + LIFT_M], axis=1)
+    ring = np.stack([radius * np.cos(turn), radius * np.sin(turn), 0 * turn + lift], axis=1)
     return (eyes()[:, None] + ring).reshape(-1, 3)
 
 
@@ -94,7 +94,11 @@ def brows() -> np.ndarray:
     return skin[(brow.any(1) & (skin[:, 1] > eyes()[:, 1].mean())) | (off < 0.008).all(2).any(1)]
 
 
-@pytest.mark.parametrize("places", [rims(0.45), brows()], ids=["half a rim", "brows"])
+@pytest.mark.parametrize(
+    "places",
+    [rims(0.45), brows(), rims(radius=0.0115, lift=0.006)],
+    ids=["half a rim", "brows", "long dark lashes"],
+)
 def test_what_is_not_a_rim_before_the_face_is_not_glasses(places: np.ndarray) -> None:
     assert len(places) > 100
     assert len(find_glasses(scenes()[0].head, pictures(places))) == 0
