@@ -19,9 +19,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from express50.contract.segmentation_labels import LABELS, label_mask
-from express50.files.images import LIGHT_OF_LEVEL
 from pipelines.regions.geometry import HAIR, SCALP, TORSO, HeadGeometry
-from pipelines.track.surface import like_skin
+from pipelines.track.surface import colour_logs, like_skin
 
 SKIN, NECK, EARS = (np.uint8(LABELS.index(name)) for name in ("skin", "neck", "ears"))
 
@@ -34,7 +33,6 @@ LEAST = 30  # fewest pixels that make a histogram
 FEATURES = 0.003  # share of the mesh that eyes and lips fill where a view sees the face
 SHARED = 10_000  # pixels that own and other views' skin colours each count as, if both teach
 COVERED = 0.1  # share of a view's skin: bare faces have 0.02 to 0.05 of other colours
-DARK = 1e-3  # root of light that is added: keeps logarithms finite
 RARE = 1e-6  # share of a cell that no pixel taught: keeps logarithms finite
 UNTAUGHT = 1.2e-4  # share of every cell of a class without pixels: spread over 8000 cells
 
@@ -78,7 +76,7 @@ def usual(rgb: np.ndarray, skin: np.ndarray) -> np.ndarray:
     """
     if not skin.any():
         return skin
-    logs = np.log(np.sqrt(LIGHT_OF_LEVEL[rgb[skin]].astype(np.float64)) + DARK)
+    logs = colour_logs(rgb[skin])
     alike = like_skin(logs, logs)
     if alike.mean() > 1 - COVERED:
         return skin

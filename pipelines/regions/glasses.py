@@ -16,10 +16,9 @@ import open3d as o3d
 from scipy import ndimage
 
 from express50.contract.segmentation_labels import LABELS
-from express50.files.images import LIGHT_OF_LEVEL
 from express50.geometry.cameras import Camera, inside_frame
 from pipelines.regions.geometry import TrackedHead, see
-from pipelines.track.surface import like_skin
+from pipelines.track.surface import colour_logs, like_skin
 
 EYES, SKIN = LABELS.index("eyes"), LABELS.index("skin")
 CELL_M = 0.002
@@ -33,7 +32,6 @@ FRONT_M, BRIDGE_M, REACH_M = 0.015, 0.005, 0.045  # depth of a rim, half a bridg
 BEARINGS, AROUND = 24, 0.6  # about an eye, and the share of them that shows a rim
 EYE_M = 0.015  # half an eye: from its middle, within which lashes and shadow are its own
 WIDER_M = 0.0012  # by which cells stand out from glasses: odd pixels are widened by one
-DARK = 1e-3  # root of light that is added: keeps logarithms finite
 
 Picture = tuple[Camera, np.ndarray, np.ndarray]
 """A pinhole camera, its frame (H, W, 3) uint8 and its matte (H, W) in [0, 1]."""
@@ -74,7 +72,7 @@ def _odd(head: TrackedHead, pictures: Sequence[Picture], grid: np.ndarray) -> np
         skin = (mesh == SKIN) & (alpha > 0.99)
         if skin.sum() < LEAST_SKIN:
             continue
-        logs = np.log(np.sqrt(LIGHT_OF_LEVEL[rgb].astype(np.float64)) + DARK)
+        logs = colour_logs(rgb)
         unlike = ~like_skin(logs.reshape(-1, 3), logs[skin]).reshape(skin.shape)
         shown = cv2.dilate((unlike & (alpha > 0.5)).astype(np.uint8), np.ones((3, 3), np.uint8))
         pixels, inside = inside_frame(camera, local + head.center)

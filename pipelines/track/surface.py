@@ -36,6 +36,7 @@ TOUCH_M = 3e-4
 # What hides a sample is part of the head: rays begin so far before it, none behind its camera.
 HEAD_M = 0.5
 GRAZING = 0.25
+DARK = 1e-3  # root of light that is added to pixels: keeps logarithms finite
 # Of the natural logarithm of the face's brightness and of its two ratios of colours.
 LEAST_SPREAD, WITHIN = np.array([0.2, 0.03, 0.03]), 3.0
 THING_M = 0.005  # about a place on a thing's surface, what it stands for
@@ -250,6 +251,11 @@ def view_weights(
         for crop in pictures.crops
     ]
     return np.array(rows).reshape(-1, len(places))
+
+
+def colour_logs(rgb: np.ndarray) -> np.ndarray:
+    """Return what `like_skin` compares (..., 3) of pixels (..., 3) uint8."""
+    return np.log(np.sqrt(LIGHT_OF_LEVEL[rgb].astype(np.float64)) + DARK)
 
 
 def like_skin(values: np.ndarray, face: np.ndarray) -> np.ndarray:
