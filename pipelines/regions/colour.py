@@ -19,8 +19,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from express50.contract.segmentation_labels import LABELS, label_mask
+from express50.files.images import LIGHT_OF_LEVEL
 from pipelines.regions.geometry import HAIR, SCALP, TORSO, HeadGeometry
-from pipelines.track.surface import colour_logs, like_skin
 
 SKIN, NECK, EARS = (np.uint8(LABELS.index(name)) for name in ("skin", "neck", "ears"))
 
@@ -33,6 +33,9 @@ LEAST = 30  # fewest pixels that make a histogram
 FEATURES = 0.003  # share of the mesh that eyes and lips fill where a view sees the face
 SHARED = 10_000  # pixels that own and other views' skin colours each count as, if both teach
 COVERED = 0.1  # share of a view's skin: bare faces have 0.02 to 0.05 of other colours
+DARK = 1e-3  # root of light that is added to pixels: keeps logarithms finite
+# Of the natural logarithm of the face's brightness and of its two ratios of colours.
+LEAST_SPREAD, WITHIN = np.array([0.2, 0.03, 0.03]), 3.0
 RARE = 1e-6  # share of a cell that no pixel taught: keeps logarithms finite
 UNTAUGHT = 1.2e-4  # share of every cell of a class without pixels: spread over 8000 cells
 
@@ -67,6 +70,24 @@ def face_colours(rgb: np.ndarray, alpha: np.ndarray, mesh: np.ndarray) -> np.nda
     """
     skin = usual(rgb, (mesh == SKIN) & (alpha > SOLID))
     return _counts(_cells(rgb), skin) if _sees_face(mesh) and skin.sum() >= LEAST else None
+
+
+def colour_logs(rgb: np.ndarray) -> np.ndarray:
+    """Return what `like_skin` compares (..., 3) of pixels (..., 3) uint8."""
+    return np.log(np.sqrt(LIGHT_OF_LEVEL[rgb].astype(np.float64)) + DARK)
+
+
+def like_skin(values: np.ndarray, face: np.ndarray) -> np.ndarray:
+    """Return which colours (N, 3) are like most of the face's (M, 3); logarithms of root light."""
+
+    def ratios(logs: np.ndarray) -> np.ndarray:
+        # Shading changes brightness much, ratios of colours little.
+        r, g, b = logs.T
+        return np.stack([(r + g + b) / 3.0, r - g, g - b], axis=1)
+
+    usual = np.median(ratios(face), axis=0)
+    spread = 1.4826 * np.median(np.abs(ratios(face) - usual), axis=0)
+    return (np.abs(ratios(values) - usual) < WITHIN * np.maximum(spread, LEAST_SPREAD)).all(1)
 
 
 def usual(rgb: np.ndarray, skin: np.ndarray) -> np.ndarray:

@@ -17,8 +17,8 @@ from scipy import ndimage
 
 from express50.contract.segmentation_labels import LABELS
 from express50.geometry.cameras import Camera, inside_frame
+from pipelines.regions.colour import colour_logs, like_skin
 from pipelines.regions.geometry import TrackedHead, see
-from pipelines.track.surface import colour_logs, like_skin
 
 EYES, SKIN = LABELS.index("eyes"), LABELS.index("skin")
 CELL_M = 0.002

@@ -24,8 +24,9 @@ from express50.geometry.cameras import (
 from express50.geometry.raycast import mesh_scene
 from express50.geometry.sampling import bilinear_slope
 from express50.head.model import HeadModel, vertex_normals
+from pipelines.regions.colour import like_skin
 from pipelines.track.basis import in_regions
-from pipelines.track.surface import FEATURES, SignedDistance, Visibility, behind, like_skin, look_up
+from pipelines.track.surface import FEATURES, SignedDistance, Visibility, behind, look_up
 from pipelines.track.terms import MeshPlaces, Residuals, huber
 
 # Head outlines count as about this many independent points per view.

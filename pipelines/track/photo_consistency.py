@@ -19,6 +19,7 @@ from express50.geometry.cameras import Camera, project_pinhole, project_with_slo
 from express50.geometry.conventions import corner_to_cell
 from express50.geometry.raycast import mesh_scene
 from express50.head.model import HeadModel
+from pipelines.regions.colour import like_skin
 from pipelines.track.basis import in_regions
 from pipelines.track.surface import (
     COVERED,
@@ -26,7 +27,6 @@ from pipelines.track.surface import (
     SEEN,
     FrameSetCrops,
     Visibility,
-    like_skin,
     sample_normals,
     spread,
     view_colours,

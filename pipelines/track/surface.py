@@ -36,9 +36,6 @@ TOUCH_M = 3e-4
 # What hides a sample is part of the head: rays begin so far before it, none behind its camera.
 HEAD_M = 0.5
 GRAZING = 0.25
-DARK = 1e-3  # root of light that is added to pixels: keeps logarithms finite
-# Of the natural logarithm of the face's brightness and of its two ratios of colours.
-LEAST_SPREAD, WITHIN = np.array([0.2, 0.03, 0.03]), 3.0
 THING_M = 0.005  # about a place on a thing's surface, what it stands for
 MARGIN = 0.15  # about the head in its crop, as a share of the head's size
 
@@ -251,24 +248,6 @@ def view_weights(
         for crop in pictures.crops
     ]
     return np.array(rows).reshape(-1, len(places))
-
-
-def colour_logs(rgb: np.ndarray) -> np.ndarray:
-    """Return what `like_skin` compares (..., 3) of pixels (..., 3) uint8."""
-    return np.log(np.sqrt(LIGHT_OF_LEVEL[rgb].astype(np.float64)) + DARK)
-
-
-def like_skin(values: np.ndarray, face: np.ndarray) -> np.ndarray:
-    """Return which colours (N, 3) are like most of the face's (M, 3); logarithms of root light."""
-
-    def ratios(logs: np.ndarray) -> np.ndarray:
-        # Shading changes brightness much, ratios of colours little.
-        r, g, b = logs.T
-        return np.stack([(r + g + b) / 3.0, r - g, g - b], axis=1)
-
-    usual = np.median(ratios(face), axis=0)
-    spread = 1.4826 * np.median(np.abs(ratios(face) - usual), axis=0)
-    return (np.abs(ratios(values) - usual) < WITHIN * np.maximum(spread, LEAST_SPREAD)).all(1)
 
 
 def view_colours(

@@ -4,10 +4,10 @@ import numpy as np
 
 from express50.geometry.cameras import unproject
 from express50.head.load import load_head
+from pipelines.regions.colour import like_skin
 from pipelines.track.observe import LandmarkView, Observation
 from pipelines.track.schedule import BESIDE_M, BESIDE_THING, IN_HAIR, doubted
 from pipelines.track.state import Target
-from pipelines.track.surface import like_skin
 from pipelines.track.terms import landmark_anchors
 from tests.pipelines.textured_scenes import rig
 
