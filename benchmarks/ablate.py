@@ -7,7 +7,7 @@ with half of their 95 % interval; ``earned`` lists the groups and regions in whi
 loss is beyond its interval. `identity_modes` are off, as in the paper: without residuals, shape
 coefficients would drive them. ``contributes_db`` is what the whole model loses on held-out views
 when a component is taken out after training: near 0 means that training left it inert. ``--quick``
-ends within some 20 minutes of one core. The last line is one JSON object.
+takes a smaller twin and shorter trainings. The last line is one JSON object.
 """
 
 from __future__ import annotations
