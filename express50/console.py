@@ -1,4 +1,4 @@
-"""Frame every command line: one-line errors, exit codes 0, 1 and 2, clean stops."""
+"""Run a command line's handler with one-line errors, exit codes 0, 1 and 2, and clean stops."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from typing import IO, Any
 from express50.errors import ConfigError, Express50Error, nearest
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
-DEBUG = "EXPRESS50_DEBUG"  # variable of the environment
+DEBUG = "EXPRESS50_DEBUG"  # environment variable
 REMEDY = "check the path, its permissions and the free disk space"
 REMEDIES = {
     errno.ENOENT: "check the path",
     errno.EEXIST: "give another path",
     errno.ENOTDIR: "give another path",
     errno.EISDIR: "give the path of a file",
-    errno.EACCES: "check whose it is, or give another path",
-    errno.EPERM: "check whose it is, or give another path",
-    errno.EROFS: "give a path that can be written to",
+    errno.EACCES: "check its owner and permissions, or give another path",
+    errno.EPERM: "check its owner and permissions, or give another path",
+    errno.EROFS: "give a path that is writable",
     errno.ENOSPC: "free some space",
     errno.EDQUOT: "free some space, your quota is used up",
 }
 
 
 class Parser(argparse.ArgumentParser):
-    """Parses a command line; names the nearest known word where one is unknown."""
+    """Parses a command line; suggests the nearest known word for an unknown one."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
-        """Take ``-4m`` and ``-1e3`` for values, which their options then refuse by name."""
+        """Read ``-4m`` and ``-1e3`` as values, so that the option they belong to refuses them."""
         super().__init__(*arguments, **options)
         self._negative_number_matcher = re.compile(r"-\.?\d\S*")
 
@@ -52,7 +52,7 @@ class Parser(argparse.ArgumentParser):
 def run_handler(
     program: str, handler: Callable[[argparse.Namespace], int], args: argparse.Namespace
 ) -> int:
-    """Call a command's handler and turn its ending into an exit code.
+    """Call a command's handler and return its exit code, also when it fails or is stopped.
 
     Any error becomes one line on standard error; with EXPRESS50_DEBUG=1 the traceback follows.
     """
@@ -78,14 +78,14 @@ def _line_of(error: Exception) -> str:
     name, words = type(error).__name__, " ".join(str(error).split())
     if isinstance(error, Express50Error):
         return f"{name}: {words}"
-    if isinstance(error, OSError):  # the machine's, not a defect: permissions, a folder
+    if isinstance(error, OSError):  # not a bug: permissions, a missing folder, a full disk
         place = f" {error.filename}:" if error.filename is not None else ""
         words = error.strerror or words or "no reason given"
         return f"{name}:{place} {words}; {REMEDIES.get(error.errno or 0, REMEDY)}"
     last = traceback.extract_tb(error.__traceback__)[-1]
     return (
         f"{name}: {Express50Error(words)} (unexpected, in {Path(last.filename).name} line "
-        f"{last.lineno}); set {DEBUG}=1, run the same again and report what it prints"
+        f"{last.lineno}); set {DEBUG}=1, run the same command again and report what it prints"
     )
 
 
@@ -93,14 +93,14 @@ def add_command(
     subparsers: Any,
     name: str,
     handler: Callable[[argparse.Namespace], int],
-    help: str,  # noqa: A002  as argparse has it
+    help: str,  # noqa: A002  argparse's name
     *,
     dataset: bool = True,
     json: bool = True,
     example: str | None = None,
     **options: Any,
 ) -> argparse.ArgumentParser:
-    """Add a command's parser; most commands take a DATASET, and --json to print for programs."""
+    """Add a command's parser, for most commands with the arguments DATASET and --json."""
     if example is not None:
         options |= {"epilog": f"example:\n  {example}"}
         options |= {"formatter_class": argparse.RawDescriptionHelpFormatter}
@@ -115,7 +115,7 @@ def add_command(
 
 @contextlib.contextmanager
 def readers_may_leave(stream: IO[str]) -> Iterator[None]:
-    """Continue without complaint when the reader of a stream has closed it."""
+    """Ignore that the reader of a stream has closed it."""
     try:
         yield
     except BrokenPipeError:
@@ -126,7 +126,7 @@ def readers_may_leave(stream: IO[str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _stop_on_sigterm() -> Iterator[None]:
-    """Let SIGTERM, which batch systems send, stop a command as Ctrl-C does."""
+    """Handle SIGTERM, which batch systems send, like Ctrl-C."""
 
     def stop(number: int, frame: object) -> None:
         raise KeyboardInterrupt
@@ -150,14 +150,14 @@ def say(*lines: str) -> None:
 
 
 def log(line: str) -> None:
-    """Write a line of progress to standard error: standard output is for results."""
+    """Write a line of progress to standard error; standard output is for results."""
     with readers_may_leave(sys.stderr):
         sys.stderr.write(printable(line) + "\n")
         sys.stderr.flush()
 
 
 def printable(text: str) -> str:
-    """Return text with control characters written out: names from outside may hold them.
+    """Return text with control characters escaped, as in names from foreign files.
 
     They could move a terminal's cursor, change its title or hide a line.
     """
@@ -173,7 +173,7 @@ def say_json(value: object) -> None:
 
 
 def answer(args: argparse.Namespace, data: object, *lines: str) -> int:
-    """Print data as JSON where ``--json`` asks for it, else the lines; return the exit code OK."""
+    """Print data as JSON if ``--json`` was given, else the lines; return the exit code OK."""
     if args.json:
         say_json(data)
     else:
@@ -183,7 +183,7 @@ def answer(args: argparse.Namespace, data: object, *lines: str) -> int:
 
 @contextlib.contextmanager
 def stdout_to_stderr() -> Iterator[None]:
-    """Send what is written to standard output, also by native code, to standard error."""
+    """Redirect standard output, also that of native code, to standard error."""
     sys.stdout.flush()
     with contextlib.redirect_stdout(sys.stderr):
         saved = os.dup(1)

@@ -1,12 +1,11 @@
-"""State how wrong results probably are, from what stages see of themselves.
+"""Estimate how wrong results probably are, from figures that stages measure without ground truth.
 
 A stage describes each element of a result (a pixel, a vertex, a camera, a peak) by a few positive
-figures: residuals, standard deviations, sizes. Their logarithms, weighed and summed, are a score; a
-rising table turns the score into the typical error and into the bound that holds nine errors in
-ten. Weights and tables were fitted on synthetic people whose truth is known, by ``python -m
-benchmarks.intervals --fit``, and lie in ``error_models.json`` with what they were fitted on. Where
-figures lie beyond those met there, they count as the nearest met; a figure that is not finite
-counts as the worst met.
+figures: residuals, standard deviations, sizes. The weighted sum of their logarithms is a score; a
+monotonic table maps the score to the typical error and to a bound that nine errors in ten stay
+under. Weights and tables were fitted on synthetic people by ``python -m benchmarks.intervals
+--fit`` and are in ``error_models.json``, with a description of the data. Figures are clipped to the
+range of that data; a figure that is not finite counts as the worst in it.
 """
 
 from __future__ import annotations
@@ -23,10 +22,10 @@ from express50.contract.stage import ExpectedError, Unit
 from express50.geometry.cameras import Camera
 
 FILE = Path(__file__).with_name("error_models.json")
-NOMINAL = 0.9  # share of the true errors that bounds and intervals are meant to hold
+NOMINAL = 0.9  # share of the true errors that bounds and intervals should contain
 TINY = 1e-6
 PEOPLE_DIFFER = 0.04  # standard deviation of heads' size, as a share
-# Of a normal error's size: median, 90th percentile; 5th, 50th and 95th percentile.
+# Percentiles of |x| for a standard normal x: 50th and 90th; 5th, 50th and 95th.
 HALF, NINE_IN_TEN = 0.674, 1.645
 SHARED = 0.063, HALF, 1.96
 
@@ -36,14 +35,14 @@ class ErrorModel:
     """The fitted constants of one stage.
 
     Attributes:
-        unit: of errors.
-        features: names of F figures.
-        weights: (F,) of their logarithms; positive where more is worse.
-        limits: (F, 2) least and greatest logarithms met.
-        scores: (K,) rising knots of the table.
-        typical, bound: (K,) logarithms of the median error and of the bound, not falling.
-        item: an item's error over the median of its elements' typical errors: the 5th, 50th and
-            95th percentile.
+        unit: unit of errors.
+        features: names of the F figures.
+        weights: (F,) weights of their logarithms; positive if a larger figure is worse.
+        limits: (F, 2) smallest and largest logarithm in the data.
+        scores: (K,) ascending knots of the table.
+        typical, bound: (K,) logarithms of the median error and of the bound, non-decreasing.
+        item: 5th, 50th and 95th percentile of an item's error divided by the median of its
+            elements' typical errors.
     """
 
     unit: Unit
@@ -58,7 +57,7 @@ class ErrorModel:
 
 @dataclass(frozen=True)
 class Bounds:
-    """The typical error and the bound (N,) of N elements, and what to expect of them together."""
+    """The typical error and the bound (N,) of N elements, and the expected error of their item."""
 
     typical: np.ndarray
     bound: np.ndarray
@@ -67,7 +66,7 @@ class Bounds:
 
 @functools.cache
 def error_models() -> dict[str, ErrorModel]:
-    """Read the shipped constants, by stage."""
+    """Return the shipped constants, by stage."""
     found = {}
     for stage, row in json.loads(FILE.read_text())["stages"].items():
         arrays = {k: np.array(row[k]) for k in ("weights", "limits", "scores", "typical", "bound")}
@@ -85,12 +84,12 @@ def error_bounds(
 ) -> Bounds:
     """Return the bounds of N elements from their figures, each (N,) or one for all.
 
-    `shared` are standard deviations of a further error that all elements have in common, such as
-    that of a lone camera's distance. `expected` is None if N is 0.
+    `shared` is the standard deviation of an additional error that all elements have in common, such
+    as that of the distance from a single camera. `expected` is None if N is 0.
     """
     model = model or error_models()[stage]
     score = scores_of(model, figures)
-    # Outside the table errors follow their scores, which are logarithms of errors.
+    # Extrapolate with slope 1 beyond the table: scores are logarithms of errors.
     beyond = score - np.clip(score, model.scores[0], model.scores[-1])
     typical, bound = (
         np.exp(np.interp(score, model.scores, table) + beyond)
@@ -101,9 +100,9 @@ def error_bounds(
 
 
 def size_sigma(cameras: Sequence[Camera], places: np.ndarray) -> np.ndarray:
-    """Return deviations (N,), millimetres, of places (N, 3), metres, along a lone camera's rays.
+    """Return the depth uncertainty (N,) in millimetres of points (N, 3) in metres.
 
-    One camera cannot distinguish a large head from a near one. With several cameras they are 0.
+    A single camera cannot distinguish a large head from a near one. With several cameras it is 0.
     """
     if len(cameras) != 1:
         return np.zeros(len(places))
@@ -125,9 +124,9 @@ def scores_of(model: ErrorModel, figures: Mapping[str, np.ndarray | float]) -> n
 def expect(
     model: ErrorModel, typical: np.ndarray, shared: np.ndarray | float = 0.0
 ) -> ExpectedError | None:
-    """Return what an item of elements with these typical errors (N,) is expected to err.
+    """Return the expected error of an item whose elements have these typical errors (N,).
 
-    `shared` are deviations that are part of them, as in `error_bounds`.
+    `shared` standard deviations are included in them, as in `error_bounds`.
     """
     if not typical.size:
         return None
@@ -141,8 +140,8 @@ def expect(
 
 
 def item_error(errors: np.ndarray, unit: Unit) -> float:
-    """Return the error of an item from its elements' (N,): the median, or of opacity the mean.
+    """Return the error of an item from its elements' errors (N,): the median, for opacity the mean.
 
-    Most of a matte's rim is right to the last bit, so that the median would say nothing.
+    Most pixels of a matte's rim are exactly right, so their median would be 0.
     """
     return float(np.mean(errors) if unit == "alpha" else np.median(errors))

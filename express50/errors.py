@@ -1,19 +1,19 @@
-"""Define the errors a user sees: one line with where, what, got, expected and how to fix it."""
+"""Define the errors that users see: one line with where, what, got, expected and how to fix it."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Collection, Iterable
 
-FEW = 8  # names in a list that is read at a glance
-LONGEST = 1200  # characters; what a hostile file says must not fill a terminal
+FEW = 8  # names that a message lists before it says how many more there are
+LONGEST = 1200  # characters; text from a hostile file must not fill a terminal
 
 
 class Express50Error(Exception):
     """Base of every error that the command line turns into one line and exit code 1.
 
-    Quoted messages of libraries may run over pages: they are folded into one line without control
-    characters, and the middle is left out where they are too long, as the end says what to do.
+    A message may quote pages from a library: it is folded into one line without control
+    characters. If it is too long its middle is cut, because the end says what to do.
     """
 
     def __init__(self, message: str) -> None:
@@ -49,7 +49,7 @@ class FormatError(Express50Error):
 
 
 class DiskFullError(Express50Error):
-    """The disk, or a quota on it, leaves no room; what is finished is kept."""
+    """The disk is full, or a quota on it is used up; finished work is kept."""
 
 
 class StageError(Express50Error):
@@ -82,7 +82,7 @@ def check_known(
     """Refuse names that are not known.
 
     Raises:
-        UnknownNameError: one is not, or an error of another ``kind``; it lists those that are.
+        UnknownNameError: a name is unknown (or an error of another ``kind``); lists known names.
     """
     for name in wanted:
         if name not in known:
@@ -92,7 +92,7 @@ def check_known(
 
 
 def nearest(word: str, known: Iterable[str], likeness: float = 0.5) -> str:
-    """Return the words ``, did you mean 'x'?`` when a known name is near, else nothing."""
+    """Return ``, did you mean 'x'?`` if a known name is similar, else an empty string."""
     names = list(known)
     close = difflib.get_close_matches(word, names, n=1, cutoff=likeness)
     return f", did you mean {close[0]!r}?" if close else ""

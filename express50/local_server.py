@@ -2,7 +2,7 @@
 
 Every address begins with a random token, so that neither another user of the machine nor a web page
 can guess it. Requests that name another host (DNS rebinding) or come from another site's page are
-refused, slow ones are cut off, and only so many are answered at once.
+refused, slow requests are cut off, and the number of simultaneous ones is limited.
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ class Door:
         """Return why a request with these headers is refused, or None."""
         name = urlsplit(f"//{host or ''}").hostname
         if self.host in LOOPBACK and name not in LOOPBACK:
-            return "this server answers to its own address alone\n"
+            return "this server only answers requests to its own address\n"
         if origin is not None and origin != f"http://{host}":
-            return "this server does not answer to the pages of other sites\n"
+            return "this server does not answer requests from other sites' pages\n"
         return None
 
     def inside(self, path: str) -> str | None:
@@ -70,12 +70,12 @@ class Door:
 
 
 class PageServer(ThreadingHTTPServer):
-    """A server of a few pages; ``serve_forever`` answers until Ctrl-C."""
+    """Serves a few pages; ``serve_forever`` answers until Ctrl-C."""
 
     daemon_threads = True
 
     def __init__(self, get: Get, post: Post | None, host: str, port: int) -> None:
-        """Listen, without serving yet; ConfigError if the port is taken or invalid."""
+        """Bind the port without serving yet; ConfigError if it is taken or invalid."""
         self.door, self.get, self.post = Door(host), get, post
         self._free = BoundedSemaphore(AT_ONCE)
         try:
@@ -107,7 +107,7 @@ class PageServer(ThreadingHTTPServer):
             self._free.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say in one line what went wrong, unless the browser just went away."""
+        """Log one line on what went wrong, unless the browser just closed the connection."""
         error = sys.exc_info()[1]
         if not isinstance(error, OSError):
             log(f"a request failed: {type(error).__name__}: {error}")
@@ -152,4 +152,4 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: object) -> None:
-        """Say nothing: pages ask every few seconds."""
+        """Log nothing, because pages poll every few seconds."""

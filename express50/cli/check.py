@@ -50,12 +50,12 @@ def add_commands(subparsers: Any) -> None:
         subject.add_subparsers(dest="action", metavar="ACTION", required=True),
         "withdraw",
         run_withdraw,
-        "remove all that the dataset holds of a subject",
+        "remove everything that the dataset holds about a subject",
         description="Removes a subject's index, derived files, labels and receipts, the packed\n"
         "shards, and everything else that names the person. Takes codes and frames out\n"
         "of checkpoints, notes the time in withdrawn.json, then searches the rest for\n"
-        "the subject's id. Without --yes it only lists. 'express50 check' proves the\n"
-        "removal at any later time.",
+        "the subject's id. Without --yes it only lists what it would remove.\n"
+        "'express50 check' proves the removal at any later time.",
         example="express50 subject withdraw DATASET S001 --yes",
     )
     withdraw.add_argument("subject", metavar="SUBJECT")
@@ -72,7 +72,7 @@ def run_check(args: argparse.Namespace) -> int:
     from express50.dataset.audit import audit
 
     started = time.perf_counter()
-    if not (args.dataset / "ingest").exists():  # with it, a ledger that is gone is a finding
+    if not (args.dataset / "ingest").exists():  # if it exists, a missing ledger is a finding
         existing_dataset(args.dataset)
     for path in args.checkpoint:
         hook("read_checkpoint")(path)

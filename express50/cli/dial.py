@@ -54,7 +54,7 @@ def add_commands(subparsers: Any) -> None:
 
 
 def run_chain(args: argparse.Namespace) -> int:
-    """Run all stages with the settings that suit a budget or a goal, if one is given."""
+    """Run all stages, with settings chosen for the budget or the goal if one is given."""
     if args.budget is None and args.error is None:
         return run_all(args)
     from express50.dial.budget import parse_budget, parse_goal
@@ -83,7 +83,7 @@ def run_chain(args: argparse.Namespace) -> int:
 
 
 def run_tune(args: argparse.Namespace) -> int:
-    """Measure every setting of every stage on a few items, and write the front."""
+    """Measure every setting of every stage on a few items, and write the Pareto front."""
     from express50.dial.tune import tune
 
     with _chain(args) as chain:
@@ -95,7 +95,7 @@ def run_tune(args: argparse.Namespace) -> int:
 
 @contextmanager
 def _chain(args: argparse.Namespace) -> Iterator[Any]:
-    """Open the chain of a dataset with all settings of its stages; None where it cannot run."""
+    """Open a dataset's chain with all settings of its stages; yield None if it cannot run."""
     from express50.dial.pilot import Chain
     from express50.runner.executor import Pool
     from express50.runner.preflight import problems

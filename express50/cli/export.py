@@ -100,7 +100,7 @@ def run_export(args: argparse.Namespace) -> int:
         head = read_tracked(dataset, subject, args.expression)
         if args.frames == "clips":
             head = with_clips(dataset, head, args.expression)
-        elif args.format != "gaussian-avatars":  # that one is parameters and what they pose
+        elif args.format != "gaussian-avatars":  # it holds parameters and the meshes they pose
             head = with_registered(dataset, head)
         with exporting(args.out, subject) as folder:
             if args.format == "gaussian-avatars":

@@ -1,4 +1,4 @@
-"""Run ``express50``: one sub-command per stage, and those on datasets, shards and heads."""
+"""Run ``express50``: one sub-command per stage, and others for datasets, shards and heads."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ something that a run needs is missing (nothing was started)"""
 def build_parser(command: str | None = None) -> argparse.ArgumentParser:
     """Build the parser of all commands.
 
-    Other packages' commands are loaded when they are asked for; else they are only listed.
+    A command of another package is loaded only when it is called; otherwise it is just listed.
     """
     parser = Parser(
         prog="express50",

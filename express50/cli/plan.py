@@ -1,9 +1,9 @@
 """``express50 plan`` scales measured datasets' receipts to the cost of a capture campaign.
 
-Seconds per item are a constant and a part that grows with the product of the sizes that each stage
-names in its `Growth`; datasets of two sizes tell these apart, and every figure has an interval.
-Bytes are proportional. Memory has a part that does not grow, so it is given as measured: a lower
-bound.
+Seconds per item are modelled as a constant plus a term proportional to the product of the sizes
+that the stage's `Growth` names. Datasets of two sizes separate the two terms, and every figure has
+an interval. Bytes are taken as proportional. Part of the memory is constant, so memory is given as
+measured, which is a lower bound.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ TARGETS: dict[str, dict[str, float]] = {
 class Measured:
     """Holds what one stage cost in a dataset: per item, peak over items, and the preset.
 
-    Seconds are processor time, where the receipts have it.
+    Seconds are processor time if the receipts hold it, else clock time.
     """
 
     seconds: tuple[float, ...]
@@ -51,7 +51,7 @@ class Measured:
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """Holds the estimate of one stage; ``why`` instead of figures where there are none."""
+    """Holds the estimate of one stage; if there is no estimate, ``why`` says the reason."""
 
     stage: str
     items: int
@@ -137,15 +137,17 @@ def run_plan(args: argparse.Namespace) -> int:
         f"target   {args.target or 'as given'}: {_words(target)}",
         *dict.fromkeys(f"measured {_words(size)}" for size, _ in measured),
         *format_table(columns, cells),
-        "core hours: with a 90 % interval; a stage measured at one size may have a part that does "
-        "not grow, which --also DATASET of another size would tell",
+        "core hours: with a 90 % interval; part of a stage's cost may be constant, which only a "
+        "second dataset of another size can show (--also DATASET)",
         "s per item: of one core; stages one after the other, no item split over workers",
         "peak memory: as measured; more footage may need more",
-        f"disk: without outputs that were replaced, {decimal(replaced)} of them here; stages keep "
-        "two per item while there are 2 GB left, and 'express50 prune' deletes them",
+        f"disk: without replaced outputs ({decimal(replaced)} here); stages keep two per item "
+        "while 2 GB are free, and 'express50 prune' deletes them",
     ]
     if total["not_measured"]:
-        lines.append(f"the sum lacks {', '.join(total['not_measured'])}")
+        lines.append(
+            f"the sum leaves out what was not measured: {', '.join(total['not_measured'])}"
+        )
     return answer(args, data, *lines)
 
 
@@ -173,7 +175,7 @@ def _words(footage: Footage) -> str:
 def measure_sizes(
     dataset: Dataset, known: Sequence[Stage]
 ) -> list[tuple[Footage, dict[str, Measured]]]:
-    """Return what stages cost at each size that was measured: by the run first, then by ``tune``.
+    """Return what stages cost at each measured size: first from the run, then from ``tune``.
 
     Raises:
         StageError: nothing was measured.
@@ -200,7 +202,7 @@ def measure_sizes(
 
 
 def measure(dataset: Dataset, known: Sequence[Stage]) -> dict[str, Measured]:
-    """Measure what every stage that was run cost, from its receipts and files.
+    """Return what each stage that has run cost, from its receipts and files.
 
     Raises:
         StageError: the ledger is missing.
@@ -224,7 +226,7 @@ def measure(dataset: Dataset, known: Sequence[Stage]) -> dict[str, Measured]:
 
 
 def preset_of(dataset: Dataset, stage: Stage) -> str:
-    """Return the preset whose values a stage last ran with, or ``own`` and a digest of these."""
+    """Return the preset that a stage last ran with, or ``own`` and a digest of its settings."""
     presets = {preset: resolve_config(stage, preset) for preset in ("standard", *PRESETS)}
     path = dataset.config_file(stage.name)
     text = path.read_text(encoding="utf-8") if path.is_file() else ""
@@ -232,10 +234,10 @@ def preset_of(dataset: Dataset, stage: Stage) -> str:
 
 
 def target_of(name: str | None, sizes: Mapping[str, float], measured: Footage) -> Footage:
-    """Choose the campaign to estimate: a named one, single sizes over it, the rest as measured.
+    """Return the campaign to estimate: given sizes first, then the named campaign's, then measured.
 
     Args:
-        name: of `TARGETS`, or None.
+        name: a key of `TARGETS`, or None.
         sizes: given sizes by their names in `Footage`, and ``frames_per_expression``.
         measured: footage of the measured dataset.
 
@@ -272,7 +274,7 @@ def estimate(
         if not runs:
             rows.append(Row(stage=stage.name, items=items, why="was not run"))
             continue
-        # Of a pilot's settings, standard is what a run would have.
+        # A pilot tried several settings; a run would use standard.
         footage, cost = next((run for run in runs if run[1].preset == "standard"), runs[0])
         if stage.name in measured[0][1]:
             footage, cost = runs[0]

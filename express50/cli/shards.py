@@ -67,7 +67,7 @@ def run_merge(args: argparse.Namespace) -> int:
 
 
 def run_verify(args: argparse.Namespace) -> int:
-    """Print every fault; exit code 1 when there is one."""
+    """Print every fault; return exit code 1 if there is one."""
     from express50.shards.writer import verify
 
     faults = verify(args.directory)

@@ -44,9 +44,10 @@ def add_commands(subparsers: Any) -> None:
 
 
 def add_run_options(parser: argparse.ArgumentParser, captures: bool, preset: bool = True) -> None:
-    """Add the options that say with what and where stages run.
+    """Add the options that say on what, where and with which settings stages run.
 
-    Without ``preset``, the command chooses settings itself and has no option that needs them.
+    Without ``preset``, the command chooses the settings itself, so options that need them are
+    left out.
     """
     add = parser.add_argument
     if captures:
@@ -70,7 +71,7 @@ def add_run_options(parser: argparse.ArgumentParser, captures: bool, preset: boo
         add("--print-job", action="store_true", help=words)
     words = "threads an item may use (default 1)"
     add("--threads", type=int, default=1, metavar="N", help=words)
-    words = "exit code 1 also if a part of an item was dropped, such as a camera"
+    words = "exit with 1 also if part of an item was dropped, such as a camera"
     add("--strict", action="store_true", help=words)
 
 
@@ -98,7 +99,7 @@ def config_of(stage: Stage, args: argparse.Namespace) -> Any:
 
 
 def run_one(args: argparse.Namespace) -> int:
-    """Run one stage, and what its command runs first."""
+    """Run one stage, after the stages that its command runs first."""
     chosen = with_required([args.stage])
     for text in args.set:
         if not text.startswith(tuple(f"{stage.name}." for stage in chosen)):
@@ -126,7 +127,7 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
     from express50.runner.threads import cap_threads
 
     check_workers(args)
-    # Before NumPy comes in with a stage: its BLAS reads the cap when it is loaded.
+    # Set before a stage imports NumPy, whose BLAS reads the thread limit when it is loaded.
     cap_threads(args.threads)
     dataset = Dataset(args.dataset)
     refuse_swapped(dataset, getattr(args, "captures", ()), args.command)
@@ -144,7 +145,7 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
         stdout_to_stderr() if args.json else nullcontext(),
         Pool(args.workers, args.scheduler, args.threads, slurm) as pool,
     ):
-        # All of it is checked before the first stage spends hours.
+        # Everything is checked before the first stage spends hours.
         work = [(stage, config_of(stage, args)) for stage in chosen]
         if found := list(problems(dataset, work, pool, all_items=pattern is None)):
             for line in found:
@@ -187,7 +188,7 @@ def refuse_swapped(dataset: Dataset, captures: Sequence[Path], command: str) -> 
 
 
 def say_account(stage: Stage, dataset: Dataset, summary: Any) -> None:
-    """Print what a stage did."""
+    """Print the account of a stage."""
     say(*summary.lines())
     if stage.account is not None:
         done = [o.item for o in summary.outcomes if o.status == "done"]
@@ -203,7 +204,7 @@ def check_workers(args: argparse.Namespace) -> None:
 
 
 def slurm_jobs(args: argparse.Namespace) -> Mapping[str, Any] | None:
-    """Read what the jobs of every stage ask for, where stages run in SLURM jobs."""
+    """Return the resources that SLURM jobs ask for, per stage; None if stages run elsewhere."""
     if args.slurm is None:
         if args.print_job:
             raise ConfigError("--print-job needs --slurm JOBS")
@@ -234,7 +235,7 @@ def _items(
         raise ConfigError(f"{dataset.root}: it has no captures yet; name a CAPTURE after it")
     if pattern is None:
         return None
-    # A stage that another's command runs first may have other items: those of the same subjects.
+    # A stage that runs first in another's command may have other items; take the same subjects'.
     asked = select_items(stages()[args.stage], dataset, pattern)
     if stage.name == args.stage:
         return asked

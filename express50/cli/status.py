@@ -1,6 +1,6 @@
-"""``express50 status`` shows what is done, failed, running and missing: a table or a live page.
+"""``express50 status`` shows what is done, failed, running and missing, as a table or a live page.
 
-All of it is read from the ledger.
+It reads only the ledger.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from express50.local_server import NOT_FOUND, PageServer, Reply
 from express50.runner.ledger import COLUMNS, Ledger, Receipt, Run
 from express50.runner.outdated import few, outdated
 
-PAGE_SECONDS = 3.0  # between two pages while a run lasts
-SILENT_SECONDS = 15.0  # a run without a sign of life for this long was killed
-RECENT = 50  # items whose rate counts for the time left
+PAGE_SECONDS = 3.0  # between two writes of the page during a run
+SILENT_SECONDS = 15.0  # a run that has not updated the ledger for this long was killed
+RECENT = 50  # the time left is estimated from the rate of this many last items
 FAILED_SHOWN = 200
 SLOWEST_SHOWN = 10
 RUNNING_SHOWN = 40
@@ -37,17 +37,17 @@ class StageStatus:
 
     Attributes:
         stage: stage name.
-        state: ``running``, ``stopped`` (its run was killed), ``failed`` (items did), ``done``, or
-            ``not run``.
-        done: items that are.
+        state: ``running``, ``stopped`` (its run was killed), ``failed`` (some items failed),
+            ``done``, or ``not run``.
+        done: number of finished items.
         failed: receipts of items whose last attempt failed.
-        running: when each item that is worked at was begun, seconds since 1970.
-        missing: items of the last run that wait or were left when it was stopped.
-        rate: items per second of late; 0 while none has ended.
-        left_s: seconds until the run ends at that rate, None where that is not known.
-        seconds: work of all items.
-        peak_memory: of the item that took most, bytes.
-        receipts: all of them.
+        running: start of each item in progress, seconds since 1970.
+        missing: number of items of the last run that are waiting, or were not reached.
+        rate: recent items per second; 0 before the first has finished.
+        left_s: estimated seconds until the run ends; None if unknown.
+        seconds: total seconds of all items.
+        peak_memory: largest peak memory of an item, bytes.
+        receipts: the receipts of all items.
     """
 
     stage: str
@@ -63,12 +63,12 @@ class StageStatus:
     receipts: tuple[Receipt, ...]
 
     def counts(self) -> dict[str, int]:
-        """Count the items by what became of them."""
+        """Return the number of items per outcome."""
         failed, running = len(self.failed), len(self.running)
         return {"done": self.done, "failed": failed, "running": running, "missing": self.missing}
 
     def expected_error(self) -> str:
-        """Say how wrong the typical item probably is; empty where the stage states nothing."""
+        """Return the median item's expected error in words; empty if the stage states none."""
         return str(typical_error(r.metrics for r in self.receipts) or "")
 
 
@@ -93,7 +93,7 @@ def add_commands(subparsers: Any) -> None:
 
 
 def show_status(args: argparse.Namespace) -> int:
-    """Print or publish how far the stages are; exit code 1 when an item's last run failed."""
+    """Print or publish the progress of the stages; return exit code 1 if an item failed."""
     dataset = existing_dataset(args.dataset)
     if args.serve is not None:
         return _serve(dataset, args.serve)
@@ -103,7 +103,7 @@ def show_status(args: argparse.Namespace) -> int:
         table = _read(dataset)
         with Ledger(dataset.ledger, read_only=True) as ledger:
             why = {(s, i): w for s, i, w in outdated(dataset, list(stages().values()), ledger)}
-        # Receipts without their files, which `express50 check` looks at.
+        # This looks at receipts only; `express50 check` looks at files.
         rows = {
             s.stage: [
                 {k: getattr(r, k) for k in COLUMNS} | {"outdated": why.get((s.stage, r.item), "")}
@@ -121,7 +121,7 @@ def _read(dataset: Dataset) -> list[StageStatus]:
 
 
 def _keep_page(dataset: Dataset, path: Path) -> list[StageStatus]:
-    """Write the page again and again until no stage runs."""
+    """Rewrite the page every few seconds until no stage runs."""
     said = False
     while True:
         table = _read(dataset)
@@ -133,7 +133,7 @@ def _keep_page(dataset: Dataset, path: Path) -> list[StageStatus]:
         if not runs:
             return table
         if not said:
-            say("keeping it up to date until the run ends; Ctrl-C stops that, not the run")
+            say("updating the page until the run ends; Ctrl-C stops the updates, not the run")
         said = True
         time.sleep(PAGE_SECONDS)
 
@@ -171,7 +171,7 @@ def _lines(table: list[StageStatus]) -> Iterator[str]:
     yield from format_table(header, rows)
     for row in table:
         if imported := sum(receipt.imported for receipt in row.receipts):
-            yield f"imported {row.stage}: {imported} of its items were made elsewhere"
+            yield f"imported {row.stage}: {imported} of its items were made by another tool"
     for row in table:
         for receipt in row.failed:
             yield f"failed {receipt.stage} {receipt.item}: {receipt.reason}"
@@ -184,7 +184,7 @@ def _outdated_lines(why: Mapping[tuple[str, str], str]) -> Iterator[str]:
     for (stage, words), items in groups.items():
         yield f"outdated {stage} {few(items, 2)}: {words}"
     if groups:
-        yield "the next run makes these again; where only settings changed, the former keep them"
+        yield "the next run makes these again, unless only settings changed and it has the old ones"
 
 
 def read_status(
@@ -204,12 +204,12 @@ def _stage(name: str, table: dict[str, Receipt], run: Run | None, now: float) ->
     if run is not None:
         alive = not run.ended and now - run.seen < SILENT_SECONDS
         settled = [r.time for r in receipts if r.time >= run.begun]
-        # An item may be in the ledger before the run's next sign says that it is over.
+        # An item's receipt may be written before the run's next update says that it has ended.
         began = run.running if alive else {}
         running = {k: t for k, t in began.items() if k not in table or table[k].time < t}
         open_items = max(0, run.items - run.current - len(settled))
         rate = _rate(settled, run.begun, now if alive else run.ended or run.seen)
-        # Items that wait to be made again still have their former receipts.
+        # Items waiting to be made again still have their old receipts.
         older = sum(r.status == "done" and r.time < run.begun for r in receipts)
         former = min(open_items, max(0, older - run.current))
     if alive:
@@ -234,7 +234,7 @@ def _stage(name: str, table: dict[str, Receipt], run: Run | None, now: float) ->
 
 
 def _rate(ends: list[float], begun: float, now: float) -> float:
-    """Return items per second over the last ones, up to now: it falls while nothing ends."""
+    """Return recent items per second up to now, so that the rate falls while no item ends."""
     recent = sorted(ends)[-RECENT - 1 :]
     if len(recent) <= RECENT:  # the start of the run counts as an end
         recent = [begun, *recent]
@@ -244,7 +244,7 @@ def _rate(ends: list[float], begun: float, now: float) -> float:
 def status_page(name: str, table: Sequence[StageStatus], refresh_s: float | None) -> str:
     """Render the page of a dataset's stages.
 
-    A browser loads it again after ``refresh_s`` seconds; with None it stays as it is.
+    The browser reloads it every ``refresh_s`` seconds; with None, never.
     """
     import jinja2
 

@@ -52,7 +52,7 @@ def problems(
 
 
 def _folder_problems(dataset: Dataset, stages: Iterable[Stage]) -> Iterator[str]:
-    """Find folders that the stages write to and that cannot be written to."""
+    """Yield a line per folder that the stages write to and that is not writable."""
     inside = [dataset.stage_dir(stage.name) for stage in stages]
     inside += [dataset.staging_dir, dataset.config_file("").parent]
     for folder in [_existing(dataset.root), *(one for one in inside if one.exists())]:
@@ -60,9 +60,9 @@ def _folder_problems(dataset: Dataset, stages: Iterable[Stage]) -> Iterator[str]
             with tempfile.TemporaryFile(dir=folder):
                 pass
         except NotADirectoryError:
-            yield f"{folder}: a file, expected a folder that can be written to"
+            yield f"{folder}: is a file, expected a writable folder"
         except OSError as error:
-            yield f"{folder}: cannot be written to ({error.strerror}); check whose it is"
+            yield f"{folder}: not writable ({error.strerror}); check its owner and permissions"
 
 
 def _worker_problems(work: Sequence[tuple[Stage, Any]], pool: Pool) -> Iterator[str]:

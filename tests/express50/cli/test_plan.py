@@ -42,7 +42,7 @@ def test_express_50_is_scaled_linearly_from_one_dataset():
     assert row.core_hours == pytest.approx(3000 * 2 * ratio / 3600)
     assert row.days == pytest.approx(row.core_hours / 240)
     assert row.disk == pytest.approx(3000 * 1e6 * ratio)
-    assert row.memory == 1e9  # the part that does not grow is unknown: no guess is printed
+    assert row.memory == 1e9  # the constant part is unknown: no guess is printed
 
 
 def test_a_stage_that_reduces_pictures_takes_no_longer_for_larger_ones():
@@ -102,7 +102,7 @@ def test_figures_are_those_of_the_receipts(tmp_path, capsys):
     assert first["items"] == 10 and first["seconds"] == pytest.approx(2 * sum(found.seconds) / 2)
     assert main(["plan", str(root), "--target", "renderme-360"]) == 0
     said = capsys.readouterr().out
-    assert "was not run" in said and "the sum lacks calibrate" in said
+    assert "was not run" in said and "not measured: calibrate" in said
     assert main(["plan", str(root), "--size", "big"]) == 2
 
 

@@ -78,14 +78,14 @@ def test_folders_are_tried(dataset, folder, monkeypatch):
     monkeypatch.setattr(preflight.tempfile, "TemporaryFile", read_only)
     dataset = type(dataset)(dataset.root.resolve())
     assert found(dataset) == [
-        f"{refused}: cannot be written to (Permission denied); check whose it is"
+        f"{refused}: not writable (Permission denied); check its owner and permissions"
     ]
 
 
 def test_a_file_in_place_of_a_dataset(tmp_path, capsys):
     (tmp_path / "data").write_text("x")
     assert main(["matte", str(tmp_path / "data")]) == 2
-    assert "data: a file, expected a folder" in capsys.readouterr().err
+    assert "data: is a file, expected a writable folder" in capsys.readouterr().err
 
 
 def test_space_is_compared_with_what_items_took(dataset, monkeypatch):
