@@ -15,6 +15,7 @@ import numpy as np
 from benchmarks.calibrate import figures as rig_figures
 from benchmarks.depth_score import cast
 from benchmarks.regions_truth import iou_figures, true_head_alpha, true_labels, view_row
+from express50.capture.expressions import NEUTRAL
 from express50.capture.frames import read_cameras_of
 from express50.capture.index import read_peaks
 from express50.contract.layout import Dataset
@@ -30,7 +31,6 @@ VIEWS_A_PEAK = 2  # views measured of every peak; they walk around the rig from 
 SHEET_ROWS = 7
 ERROR_RANGE_MM = 8.0  # full colour in the error pictures
 ERROR_RANGE_DEG = 45.0  # white in those of normals
-NEUTRAL = "neutral"
 
 
 def measure_dataset(dataset: Dataset, truth_root: Path, out: Path | None = None) -> dict:

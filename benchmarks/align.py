@@ -25,10 +25,11 @@ import numpy as np
 
 from annotations import align, observe
 from annotations.labels import append_label, make_mark
-from annotations.observe.stage import NEUTRAL, STABLE, cue_frames, read_observations, similarity_2d
+from annotations.observe.stage import STABLE, cue_frames, read_observations, similarity_2d
 from annotations.suggestions import read_suggestions, reference_subject
 from benchmarks.document import replace_section
 from benchmarks.replay import measure_steps, replay
+from express50.capture.expressions import NEUTRAL
 from express50.capture.frames import read_proxy
 from express50.capture.index import Cue, read_index
 from express50.contract.config import PRESETS, build_config

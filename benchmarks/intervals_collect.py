@@ -18,6 +18,7 @@ import open3d as o3d
 
 from annotations.align.stage import error_figures as peak_figures
 from annotations.suggestions import read_suggestions
+from express50.capture.expressions import NEUTRAL
 from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.capture.index import read_peaks
 from express50.contract.layout import Dataset
@@ -40,7 +41,6 @@ from pipelines.track.report import error_figures as track_figures
 
 SAMPLES = 6000  # elements of an item at most
 TRACK = "track "  # before the names of the track's figures
-NEUTRAL = "neutral"
 
 Figures = dict[str, np.ndarray | float]
 

@@ -54,6 +54,7 @@ class Condition:
         distance: of the cameras, in the rig's usual one; the focal length grows with it.
         noise: of the sensor, in that of a good studio camera.
         harm: ``blur``, ``light``, ``turned`` or nothing.
+        preset: settings of all stages; the demo's if it is empty.
         head: model of the person.
         costly: takes more than ten minutes of a core, and is run only if it is named.
     """
@@ -64,6 +65,7 @@ class Condition:
     distance: float = 1.0
     noise: float = 1.0
     harm: str = ""
+    preset: str = ""
     head: str = "procedural"
     costly: bool = False
 
@@ -93,6 +95,8 @@ CONDITIONS = (
     Condition(name="focal length 2,500 px", distance=4.0),
     Condition(name="focal length 20,000 px", distance=32.0),
     Condition(name="24 views", views=24),
+    Condition(name="draft", preset="draft"),
+    Condition(name="standard", preset="standard"),
     Condition(name="1920 px", side=1920, costly=True),
     Condition(name="3840 px", side=3840, costly=True),
 )
@@ -115,15 +119,17 @@ def make_row(condition: Condition, number: int, root: Path) -> tuple[Dataset, Tr
     if not capture.is_dir():
         shutil.copytree(film / "captures" / subject, capture)
         _harm(capture, condition)
-    run_chain(dataset, capture, truth.peaks(subject))
+    run_chain(dataset, capture, truth.peaks(subject), condition.preset)
     return dataset, truth
 
 
-def run_chain(dataset: Dataset, capture: Path, peaks: dict[str, int]) -> None:
+def run_chain(dataset: Dataset, capture: Path, peaks: dict[str, int], preset: str = "") -> None:
     """Run the stages from ingest to registration; a stage that fails ends the row there."""
     take_in(dataset, [capture])
     for stage in (ingest, calibrate, frames, matte, track, depth, register):
-        settings = build_config(stage.STAGE, SETTINGS.get(stage.STAGE.name, {}))
+        name, presets = stage.STAGE.name, stage.STAGE.presets
+        chosen = presets.get(preset, {}) if preset else SETTINGS.get(name, {})
+        settings = build_config(stage.STAGE, chosen)
         if stage is frames:
             write_peaks(dataset, capture.name, peaks)
         summary = run_stage(stage.STAGE, dataset, settings, workers=0, progress=False)

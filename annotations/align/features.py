@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 
 from annotations.observe.stage import (
-    NEUTRAL,
     SEEN_SCORE,
     STABLE,
     FaceObservations,
@@ -21,7 +20,7 @@ from annotations.observe.stage import (
     similarity_2d,
     steady,
 )
-from express50.capture.expressions import Expression
+from express50.capture.expressions import NEUTRAL, Expression
 from express50.capture.index import Index
 from express50.geometry.shapes import check_finite
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from annotations.align.features import Features, expression_values, shared_columns
-from annotations.observe.stage import NEUTRAL, steady
-from express50.capture.expressions import Expression
+from annotations.observe.stage import steady
+from express50.capture.expressions import NEUTRAL, Expression
 
 CANDIDATES, CANDIDATE_GAP = 5, 3
 NEAR_FRAMES = 2.0  # an event's direction is learnt from frames about its apex (sigma)

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import torch
 
+from express50.capture.expressions import NEUTRAL
 from express50.capture.frames import read_proxy
 from express50.capture.index import Cue, Index, read_index
 from express50.contract.layout import Dataset
@@ -26,7 +27,6 @@ from express50.landmarks.detector import SMALLEST, cut_crop, detect, window_abou
 from express50.landmarks.network import CROP, MIRROR, LandmarkNet, face_box, load_network
 
 SCHEMA = "express50.observations/1"
-NEUTRAL = "neutral"
 SEEN_SCORE = 0.15  # of a frame that shows the face at all
 TRIES = 8  # frames all over the clips in which a face is searched for, should rest show none
 RANKED_SHARE = 0.8  # of the best camera's score: one that sees less adds more noise than news

@@ -10,6 +10,7 @@ from importlib import resources
 
 from express50.errors import FormatError
 
+NEUTRAL = "neutral"  # the resting face, which has no peak
 CATEGORIES = (
     "neutral", "basic", "mouth", "eyes", "brows", "cheeks", "jaw", "tongue", "asymmetry", "gaze",
     "viseme", "extreme",

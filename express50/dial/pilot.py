@@ -35,7 +35,7 @@ from express50.runner.runner import run_stage
 PEAKS = 3  # expressions of a trial
 SPARE_SHARE = 0.5  # of the time that the cheapest settings would leave over, for trials
 STEEPER = 3.0  # a setting that was not tried may cost this many times the one below it
-MEASURES = 2  # version of how results are compared
+MEASURES = 3  # version of how results are compared
 Ladder = Mapping[str, Any]  # configurations of a stage by the name of the setting, cheapest first
 
 

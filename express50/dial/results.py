@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import torch
 
+from express50.capture.expressions import NEUTRAL
 from express50.capture.frames import read_cameras_of
 from express50.contract.layout import Dataset
 from express50.dataset.depth_files import depth_file, read_depth
@@ -87,7 +88,7 @@ def differences(
 
 def _frames_apart(a: Dataset, b: Dataset, subject: str, names: Sequence[str]) -> list[float]:
     one, two = (_peak_frames(dataset, subject) for dataset in (a, b))
-    return [float(abs(one[name] - two[name])) for name in names]
+    return [float(abs(one[name] - two[name])) for name in names if name != NEUTRAL]
 
 
 def _mattes_apart(a: Dataset, b: Dataset, subject: str, names: Sequence[str]) -> list[float]:

@@ -1,5 +1,6 @@
 """What the dial takes to be left at the dearest settings, and how differences are measured."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +64,16 @@ def apart_of(kind, root, monkeypatch, one, two):
         monkeypatch.setattr(f"express50.dial.results.{reader}", Stored)
     (found,) = kind.apart(Dataset(root / "a"), Dataset(root / "b"), "S0", ["e0"])
     return found
+
+
+def test_the_resting_face_has_no_peak_to_differ_in(tmp_path):
+    a, b = Dataset(tmp_path / "a"), Dataset(tmp_path / "b")
+    for dataset, frames in ((a, {"neutral": 2, "smile": 9}), (b, {"neutral": 5, "smile": 10})):
+        rows = {name: {"frame": frame} for name, frame in frames.items()}
+        dataset.peaks_file("S0").parent.mkdir(parents=True)
+        dataset.peaks_file("S0").write_text(json.dumps(rows))
+    (kind,) = [kind for kind in RESULTS if kind.name == "peaks"]
+    assert kind.apart(a, b, "S0", ["neutral", "smile"]) == [1.0]
 
 
 def run(name, seconds, budget=None, finished=True, error=1.0):
