@@ -8,15 +8,17 @@ preset, then the defaults.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from express50.contract.config import build_dataclass, known_assignments, read_tables
+from express50.contract.config import build_dataclass, check_ranges, known_assignments, read_tables
 from express50.errors import ConfigError
 
 FRAMES = ("head", "tangent")
+NOT_NEGATIVE = (0, math.inf)
 SCALE_RANGE_MM = (0.1, 10.0)  # of Gaussians, from the paper; its unit is G2's
 
 
@@ -79,7 +81,7 @@ class ModelConfig:
             )
         if self.frame not in FRAMES:
             raise ConfigError(f"model.frame is {self.frame!r}, expected one of {', '.join(FRAMES)}")
-        _in_range("model.opacity_init", self.opacity_init, 0.01, 0.99)
+        check_ranges("model", self, opacity_init=(0.01, 0.99))
         if self.identity_modes > self.z_id:
             raise ConfigError(
                 f"model.identity_modes is {self.identity_modes}, "
@@ -111,7 +113,10 @@ class LossConfig:
     """Weight of the sum of squares of both codes. G13."""
 
     def __post_init__(self) -> None:
-        _not_negative("loss", self, "ssim", "depth", "scale", "laplacian", "displacement", "codes")
+        check_ranges(
+            "loss", self, ssim=NOT_NEGATIVE, depth=NOT_NEGATIVE, scale=NOT_NEGATIVE,
+            laplacian=NOT_NEGATIVE, displacement=NOT_NEGATIVE, codes=NOT_NEGATIVE,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,7 +135,7 @@ class DataConfig:
     way behind the collar. In the paper they are background, which contradicts other views."""
 
     def __post_init__(self) -> None:
-        _in_range("data.background", self.background, 0.0, 1.0)
+        check_ranges("data", self, background=(0, 1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,12 +171,11 @@ class TrainConfig:
     """Images evaluated for metrics.json, evenly chosen."""
 
     def __post_init__(self) -> None:
-        _not_negative("train", self, "seconds", "save_seconds", "final_lr")
-        _not_negative("train", self, "code_lr_scale", "texel_lr_scale", "refine_lr_scale")
-        _in_range("train.lr", self.lr, 1e-12, 1.0)
-        for name in ("iterations", "accumulate"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"train.{name} is {getattr(self, name)}, expected >= 1")
+        check_ranges(
+            "train", self, iterations=(1, math.inf), accumulate=(1, math.inf), lr=(1e-12, 1),
+            seconds=NOT_NEGATIVE, save_seconds=NOT_NEGATIVE, final_lr=NOT_NEGATIVE,
+            code_lr_scale=NOT_NEGATIVE, texel_lr_scale=NOT_NEGATIVE, refine_lr_scale=NOT_NEGATIVE,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,11 +201,10 @@ class FitConfig:
     """Steps per evaluation of the locality loss; its weight grows by the same factor."""
 
     def __post_init__(self) -> None:
-        _not_negative("fit", self, "seconds", "locality")
-        _in_range("fit.stage2_lr", self.stage2_lr, 1e-12, 1.0)
-        _in_range("fit.shuffle_directions", self.shuffle_directions, 0.0, 1.0)
-        if self.locality_every < 1:
-            raise ConfigError(f"fit.locality_every is {self.locality_every}, expected >= 1")
+        check_ranges(
+            "fit", self, seconds=NOT_NEGATIVE, locality=NOT_NEGATIVE, stage2_lr=(1e-12, 1),
+            shuffle_directions=(0, 1), locality_every=(1, math.inf),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,17 +227,6 @@ class Config:
     train: TrainConfig = field(default_factory=TrainConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     metrics: MetricsConfig = field(default_factory=MetricsConfig)
-
-
-def _not_negative(table: str, config: object, *names: str) -> None:
-    for name in names:
-        if not 0 <= getattr(config, name) < float("inf"):
-            raise ConfigError(f"{table}.{name} is {getattr(config, name)}, expected 0 or more")
-
-
-def _in_range(name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise ConfigError(f"{name} is {value}, expected {low} to {high}")
 
 
 Preset = dict[str, dict[str, Any]]

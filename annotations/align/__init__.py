@@ -13,6 +13,7 @@ from pathlib import Path
 from annotations.labels import human_digest
 from annotations.observe import STAGE as OBSERVE
 from annotations.suggestions import reference_subject
+from express50.contract.config import check_ranges
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
 
@@ -28,8 +29,7 @@ class AlignConfig:
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
-        if not 0.0 <= self.accept <= 1.0:
-            raise ValueError(f"accept {self.accept}: expected 0 to 1")
+        check_ranges("align", self, accept=(0, 1))
 
 
 def inputs(dataset: Dataset, item: str, config: AlignConfig) -> dict[str, Path | str]:

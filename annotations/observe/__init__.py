@@ -7,9 +7,11 @@ footage again.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
+from express50.contract.config import check_ranges
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
 
@@ -29,12 +31,10 @@ class ObserveConfig:
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
-        if self.cameras < 1 or self.stride < 1:
-            raise ValueError(f"cameras {self.cameras}, stride {self.stride}: expected at least 1")
-        if not 0 <= self.min_score <= 1:
-            raise ValueError(f"min_score {self.min_score}: expected 0 to 1")
-        if not 0.02 <= self.search <= 1:
-            raise ValueError(f"search {self.search}: expected 0.02 to 1")
+        check_ranges(
+            "observe", self, cameras=(1, math.inf), stride=(1, math.inf),
+            min_score=(0, 1), search=(0.02, 1),
+        )  # fmt: skip
 
 
 def inputs(dataset: Dataset, item: str, config: ObserveConfig) -> dict[str, Path | str]:

@@ -131,6 +131,19 @@ def build_dataclass(table: str, kind: type, values: Mapping[str, object], hint: 
         raise ConfigError(f"{table}: {error}") from error
 
 
+def check_ranges(table: str, config: object, **ranges: tuple[float, float]) -> None:
+    """Refuse fields of a config that lie outside their ranges; both ends belong to a range.
+
+    Raises:
+        ConfigError: a field lies outside, or is not finite.
+    """
+    for name, (low, high) in ranges.items():
+        value = getattr(config, name)
+        if not (low <= value <= high and abs(value) < math.inf):
+            expected = f"{low} or more" if high == math.inf else f"{low} to {high}"
+            raise ConfigError(f"{table}.{name} is {value}, expected {expected}")
+
+
 def parse_assignment(text: str) -> tuple[str, str, object]:
     """Split ``stage.key=value``; the value is TOML, a bare word is a string.
 

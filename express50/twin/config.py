@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from express50.contract.config import check_ranges
 from express50.errors import ConfigError
 
 KINDS = ("glasses", "hand", "beard", "moustache", "fringe", "microphone", "mask")
@@ -54,16 +55,12 @@ class TwinConfig:
     "Sensor noise relative to a good studio camera; 0 is none."
 
     def __post_init__(self) -> None:
-        limits = {
-            "subjects": (1, 10_000), "first_subject": (0, 99_999), "cameras": (1, 200),
-            "width": (32, 16_384), "height": (32, 16_384), "frames_per_expression": (4, 10_000),
-            "fps": (1, 1000), "crf": (0, 51), "board_frames": (0, 1000), "noise": (0, 100),
-            "seed": (0, 2**63 - 1), "personal": (0, 2),
-        }  # fmt: skip
-        for name, (low, high) in limits.items():
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise ConfigError(f"twin.{name} is {value}, expected {low} to {high}")
+        check_ranges(
+            "twin", self, subjects=(1, 10_000), first_subject=(0, 99_999), cameras=(1, 200),
+            width=(32, 16_384), height=(32, 16_384), frames_per_expression=(4, 10_000),
+            fps=(1, 1000), crf=(0, 51), board_frames=(0, 1000), noise=(0, 100),
+            seed=(0, 2**63 - 1), personal=(0, 2),
+        )  # fmt: skip
         if unknown := set(self.wear) - set(KINDS):
             raise ConfigError(
                 f"twin.wear names {', '.join(sorted(unknown))}, expected some of {', '.join(KINDS)}"

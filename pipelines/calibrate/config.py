@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from express50.contract.config import check_ranges
 from express50.errors import ConfigError
 
 AUTO = "auto"
@@ -51,16 +52,12 @@ class CalibrateConfig:
             )
         if self.refine not in REFINE:
             raise ConfigError(f"calibrate.refine is {self.refine!r}; expected {', '.join(REFINE)}")
-        least = {"board_frames": 0, "rounds": 1, "solve_frame_sets": 1, "check_frame_sets": 0}
-        for name, value in least.items():
-            if getattr(self, name) < value:
-                raise ConfigError(
-                    f"calibrate.{name} is {getattr(self, name)}; expected {value} or more"
-                )
-        for name in ("distance_m", "eye_distance_mm", "refine_turn_deg", "refine_move_mm"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise ConfigError(f"calibrate.{name} is {value}; expected a positive number")
+        check_ranges(
+            "calibrate", self, board_frames=(0, math.inf), rounds=(1, math.inf),
+            solve_frame_sets=(1, math.inf), check_frame_sets=(0, math.inf),
+            distance_m=(1e-6, math.inf), eye_distance_mm=(1e-6, math.inf),
+            refine_turn_deg=(1e-6, math.inf), refine_move_mm=(1e-6, math.inf),
+        )  # fmt: skip
 
 
 # More board images and frame sets than standard's take longer and gain nothing (docs/TRADEOFFS.md).

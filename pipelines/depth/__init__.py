@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from express50.capture.index import peak_items
+from express50.contract.config import check_ranges
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
-from express50.errors import ConfigError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,15 +26,10 @@ class DepthConfig:
 
     def __post_init__(self) -> None:
         """Check ranges."""
-        for name, low, high in (
-            ("voxel_mm", 0.3, 20),
-            ("voxel_px", 0, 8),
-            ("image_side", 16, 32768),
-            ("noise", 1e-6, 255),
-        ):
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise ConfigError(f"depth.{name} is {value}, expected {low:g} to {high:g}")
+        check_ranges(
+            "depth", self, voxel_mm=(0.3, 20), voxel_px=(0, 8), image_side=(16, 32_768),
+            noise=(1e-6, 255),
+        )  # fmt: skip
 
 
 PRESETS: dict[str, dict[str, object]] = {

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from express50.console import count
+from express50.contract.config import check_ranges
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
 from express50.errors import FormatError
@@ -30,16 +32,10 @@ class IngestConfig:
 
     def __post_init__(self) -> None:
         """Check ranges."""
-        if not 16 <= self.proxy_long_side <= 4096:
-            raise ValueError(f"proxy_long_side is {self.proxy_long_side}, expected 16 to 4096")
-        if not 1 <= self.proxy_quality <= 100:
-            raise ValueError(f"proxy_quality is {self.proxy_quality}, expected 1 to 100")
-        if not 0 <= self.sync_frames <= 100:
-            raise ValueError(f"sync_frames is {self.sync_frames}, expected 0 to 100")
-        if self.focus_every < 0:
-            raise ValueError(f"focus_every is {self.focus_every}, expected 0 or more")
-        if not 1 < self.blur_ratio < 100:
-            raise ValueError(f"blur_ratio is {self.blur_ratio}, expected more than 1")
+        check_ranges(
+            "ingest", self, proxy_long_side=(16, 4096), proxy_quality=(1, 100),
+            sync_frames=(0, 100), focus_every=(0, math.inf), blur_ratio=(1.01, 100),
+        )  # fmt: skip
 
 
 PRESETS: dict[str, dict[str, object]] = {

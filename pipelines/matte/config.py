@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
+from express50.contract.config import check_ranges
 from express50.errors import ConfigError
 
 NETWORKS = ("bgmv2", "salient")
@@ -38,22 +40,17 @@ class MatteConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that matte nothing or everything."""
-        if not 0.1 <= self.scale <= 1.0:
-            raise ConfigError(f"matte.scale is {self.scale}, expected 0.1 to 1")
-        if not 0.0 <= self.shadow < 1.0:
-            raise ConfigError(f"matte.shadow is {self.shadow}, expected 0 to below 1")
+        check_ranges(
+            "matte", self, scale=(0.1, 1), shadow=(0, 0.99), tile=(512, math.inf), side=(16, 2048),
+            cells=(16, 256),
+        )  # fmt: skip
         if (self.method in NETWORKS) != bool(self.weights):
             raise ConfigError(
                 f"matte.method {self.method!r} with matte.weights {self.weights!r}: key and grabcut"
                 " take none, bgmv2 and salient need the file of the network's weights"
             )
-        if self.tile < 512 or self.tile % 64:
-            raise ConfigError(f"matte.tile is {self.tile}, expected a multiple of 64, 512 or more")
-        if not 16 <= self.side <= 2048 or not 16 <= self.cells <= 256:
-            raise ConfigError(
-                f"matte.side {self.side} and matte.cells {self.cells}: expected 16 to 2048 pixels"
-                " and 16 to 256 cells"
-            )
+        if self.tile % 64:
+            raise ConfigError(f"matte.tile is {self.tile}, expected a multiple of 64")
 
 
 PRESETS: dict[str, dict[str, object]] = {

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from express50.contract.config import check_ranges
+
 
 @dataclass(frozen=True, kw_only=True)
 class EncodeConfig:
@@ -25,10 +27,7 @@ class EncodeConfig:
 
     def __post_init__(self) -> None:
         """Check ranges."""
-        if not 16 <= self.size <= 8192:
-            raise ValueError(f"size is {self.size}, expected 16 to 8192")
-        if not 0 <= self.min_confidence <= 1:
-            raise ValueError(f"min_confidence is {self.min_confidence}, expected 0 to 1")
+        check_ranges("encode", self, size=(16, 8192), min_confidence=(0, 1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,8 +41,7 @@ class PackConfig:
 
     def __post_init__(self) -> None:
         """Check ranges."""
-        if not 0 <= self.test_fraction < 1:
-            raise ValueError(f"test_fraction is {self.test_fraction}, expected 0 to under 1")
+        check_ranges("pack", self, test_fraction=(0, 0.99))
 
 
 ENCODE_PRESETS: dict[str, dict[str, object]] = {

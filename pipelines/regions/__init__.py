@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from express50.capture.index import peak_items
+from express50.contract.config import check_ranges
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
-from express50.errors import ConfigError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,8 +30,7 @@ class RegionsConfig:
 
     def __post_init__(self) -> None:
         """Check ranges."""
-        if self.image_side < 16:
-            raise ConfigError(f"regions.image_side is {self.image_side}, expected 16 or more")
+        check_ranges("regions", self, image_side=(16, math.inf))
 
 
 def inputs(dataset: Dataset, item: str, config: RegionsConfig) -> dict[str, Path | str]:

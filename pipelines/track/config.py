@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from express50.errors import ConfigError
+from express50.contract.config import check_ranges
 
 VERSION = 19
 UV_WEIGHTS = Path(__file__).with_name("face_uv_weights.npz")
@@ -53,16 +53,12 @@ class TrackConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
-        limits: dict[str, tuple[float, float]] = {
-            "stride": (1, 10_000), "cameras": (0, 10_000), "search": (0.02, 1),
-            "photo_side": (32, 8192), "samples": (100, 30_000), "outline_rounds": (0, 100),
-            "patch_rounds": (0, 100), "uv_rounds": (0, 100), "offset_modes": (0, 2000),
-            "texture_side": (0, 8192), "clip_rounds": (0, 100),
-        }  # fmt: skip
-        for name, (least, most) in limits.items():
-            value = getattr(self, name)
-            if not least <= value <= most:
-                raise ConfigError(f"track: {name} is {value}, expected {least:g} to {most:g}")
+        check_ranges(
+            "track", self, stride=(1, 10_000), cameras=(0, 10_000), search=(0.02, 1),
+            photo_side=(32, 8192), samples=(100, 30_000), outline_rounds=(0, 100),
+            patch_rounds=(0, 100), uv_rounds=(0, 100), offset_modes=(0, 2000),
+            texture_side=(0, 8192), clip_rounds=(0, 100),
+        )  # fmt: skip
 
 
 PRESETS: dict[str, dict[str, object]] = {

@@ -20,7 +20,7 @@ from annotations.suggestions import choose_reference, read_suggestions
 from express50.capture.index import read_index
 from express50.cli.main import main
 from express50.contract.config import build_config
-from express50.errors import FormatError
+from express50.errors import ConfigError, FormatError
 from express50.runner.runner import run_stage
 from tests.annotations.footage import EXPRESSIONS, FRAMES_EACH
 
@@ -186,7 +186,7 @@ def test_align_command_observes_first_and_reports_a_missing_face(dataset, capsys
 
 
 def test_settings_out_of_range_are_refused():
-    with pytest.raises(ValueError, match="1.5"):
+    with pytest.raises(ConfigError, match="1.5"):
         align.AlignConfig(accept=1.5)
-    with pytest.raises(ValueError, match="cameras"):
+    with pytest.raises(ConfigError, match="cameras"):
         observe.ObserveConfig(cameras=0)

@@ -66,7 +66,7 @@ def test_assignments_stand_over_toml_over_preset(tmp_path):
         ("model.ng=3", "did you mean 'n_g'"),
         ("modle.n_g=3", "did you mean 'model'"),
         ("model.n_g=100", "expected a multiple of 16"),
-        ("train.iterations=0", "expected >= 1"),
+        ("train.iterations=0", "expected 1 or more"),
         ("model.frame=tangant", "expected one of head, tangent"),
         ("train.lr=fast", "expected float"),
         ("model.identity_modes=99", "at most z_id"),

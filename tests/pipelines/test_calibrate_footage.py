@@ -190,7 +190,7 @@ def test_lenses_are_refined_where_all_may_move():
     ("settings", "message"),
     [
         ({"refine": "some"}, "refine is 'some'; expected none, poses, all"),
-        ({"board_frames": -3}, "board_frames is -3; expected 0 or more"),
+        ({"board_frames": -3}, "board_frames is -3, expected 0 or more"),
         ({"rounds": 0}, "rounds is 0"),
         ({"eye_distance_mm": 0.0}, "eye_distance_mm is 0.0"),
         ({"distance_m": float("nan")}, "distance_m is nan"),
