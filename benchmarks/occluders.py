@@ -58,7 +58,6 @@ OFF: dict[str, object] = {
     "pipelines.track.schedule.things_before": lambda *_: np.zeros((0, 3)),
     "pipelines.track.schedule.glasses_on": lambda *_: np.zeros((0, 3)),
     "pipelines.regions.stage.before_face": lambda _, labels, __: np.zeros(labels.shape, bool),
-    "pipelines.regions.stage.find_glasses": lambda *_: np.zeros((0, 3)),
     "pipelines.regions.colour.usual": lambda _, skin: skin,
 }
 Row = dict[str, float]

@@ -131,7 +131,7 @@ def baselines(dataset: Dataset, item: str) -> dict[str, Callable[[str], np.ndarr
     """Make head mattes (H, W) by camera: the matte as it is, and cut at an image row."""
     subject, expression = item.split("/")
     cameras = read_cameras_of(dataset, subject)
-    head = read_head(dataset, subject, expression)
+    head, _ = read_head(dataset, subject, expression)
     path = dataset.track_file(subject)
     model = load_head(read_track(path).head)
     chin = landmarks(model, model.template.new_tensor(head.vertices)[None])[0, CHIN].numpy()

@@ -47,6 +47,9 @@ class Track:
             the file has none, as of a scan.
         bound: (E, V) float32 metres: nine vertices in ten are nearer than this to the true ones;
             NaN where the file has none.
+        glasses: (n, 3) float32 metres, world, places all over frames and lenses; None where the
+            file does not say whether there are any.
+        glasses_row: (n,) int64, whose row each is.
     """
 
     head: str
@@ -63,12 +66,20 @@ class Track:
     offsets: np.ndarray
     sigma: np.ndarray
     bound: np.ndarray
+    glasses: np.ndarray | None
+    glasses_row: np.ndarray
 
     def row(self, expression: str) -> int:
         """Return the row of an expression; StageError if it is not tracked."""
         if expression not in self.expressions:
             raise StageError(f"{expression}: it is not tracked; see the metrics of track")
         return self.expressions.index(expression)
+
+    def glasses_in(self, expression: str) -> np.ndarray | None:
+        """Return the places (n, 3) of an expression's glasses; None where that is unknown."""
+        if self.glasses is None:
+            return None
+        return self.glasses[self.glasses_row == self.row(expression)].astype(np.float64)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -145,7 +156,11 @@ def read_track(path: Path) -> Track:
             numbers[name] = _doubt(arrays, name, numbers["vertices"].shape[:2])
         if len(set(names.tolist())) != len(names):
             raise ValueError("an expression appears twice")
-        return Track(head=str(arrays["head"]), expressions=tuple(names.tolist()), **numbers)
+        glasses, rows = _glasses(arrays, len(names))
+        return Track(
+            head=str(arrays["head"]), expressions=tuple(names.tolist()), **numbers,
+            glasses=glasses, glasses_row=rows,
+        )  # fmt: skip
 
 
 @contextmanager
@@ -196,6 +211,22 @@ def _doubt(arrays: dict[str, np.ndarray], name: str, shape: tuple[int, ...]) -> 
     check_shape(name, arrays[name], shape)
     check_finite(name, arrays[name])
     return arrays[name].astype(np.float32)
+
+
+def _glasses(arrays: dict[str, np.ndarray], count: int) -> tuple[np.ndarray | None, np.ndarray]:
+    """Return the places of glasses in `count` expressions, and their rows; None without any.
+
+    Raises:
+        ValueError: they do not fit each other, or are not finite.
+    """
+    if "glasses" not in arrays:
+        return None, np.zeros(0, np.int64)
+    places, rows = arrays["glasses"], arrays["glasses_row"]
+    check_shape("glasses", places, (rows.size, 3))
+    check_finite("glasses", places)
+    if rows.ndim != 1 or rows.dtype.kind not in "iu" or not np.isin(rows, np.arange(count)).all():
+        raise ValueError(f"glasses_row is not a row of {count} expressions for each place")
+    return places.astype(np.float32), rows.astype(np.int64)
 
 
 def registration_of(path: Path, track: Track, digest: str) -> Registration | None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 import open3d as o3d
+from scipy.spatial import cKDTree
 
-from express50.geometry.cameras import rays
+from express50.geometry.cameras import inside_frame, rays
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.raycast import camera_rays, mesh_scene
 from express50.geometry.sampling import bilinear
@@ -17,6 +19,8 @@ from pipelines.depth.views import DepthView, hull_distance, silhouette_distance
 REACH = 0.015  # metres that the hull may rise above a mesh that is believed; more is hair, cloth
 BORDER = 0.03  # metres from the mesh's open border over which belief fades in; collars are there
 BODY = 0.5  # metres that the body goes on below the neck and widens; shoulders are nearer
+EYES_M = 0.03  # metres from glasses within which the head is believed, whatever the hull
+WORN_M = 0.004  # about a place on glasses: what is seen there is glasses, or is seen through them
 NECK = 0.08  # metres; an open border larger than this is a neck, not an eye or a nostril
 # 26 directions to the neighbours of a cell, the six axes first, as a mesh hides most points there
 _CELL: np.ndarray = (
@@ -29,7 +33,8 @@ DIRECTIONS = _CELL / np.linalg.norm(_CELL, axis=1, keepdims=True)
 class TrackedSolid:
     """A tracked mesh with caps over its holes, and those over large ones (the neck) as `border`.
 
-    `body` goes on below large holes: silhouettes of a torso are not those of a head.
+    `body` goes on below large holes: silhouettes of a torso are not those of a head. `glasses` are
+    places (n, 3) all over frames and lenses.
     """
 
     scene: o3d.t.geometry.RaycastingScene
@@ -37,6 +42,7 @@ class TrackedSolid:
     body: o3d.t.geometry.RaycastingScene
     low: np.ndarray
     high: np.ndarray
+    glasses: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
     def merge(
         self, points: np.ndarray, hull: np.ndarray, outlines: Sequence[DepthView], reach: float
@@ -69,6 +75,26 @@ class TrackedSolid:
             for view, alpha in zip(views, alphas, strict=True)
         ]
 
+    def without_glasses(self, views: Sequence[DepthView]) -> list[DepthView]:
+        """Clear the mattes where views show glasses; the silhouettes stay."""
+        if not len(self.glasses):
+            return list(views)
+        found = []
+        for view in views:
+            way = (view.camera.center - self.glasses).astype(np.float32)
+            row = np.concatenate([self.glasses.astype(np.float32), way], axis=1)
+            pixels, shown = inside_frame(view.camera, self.glasses)
+            shown &= ~self.scene.test_occlusions(o3d.core.Tensor(row), nthreads=1).numpy()
+            worn = np.zeros(view.alpha.shape, np.uint8)
+            column, line = pixels[shown].astype(np.int64).T
+            worn[line, column] = 1
+            far = float(np.linalg.norm(way, axis=1).mean())
+            size = 2 * int(np.ceil(WORN_M * view.camera.K[0, 0] / far)) + 1
+            disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+            alpha = np.where(cv2.dilate(worn, disc) > 0, np.float32(0), view.alpha)
+            found.append(replace(view, alpha=alpha))
+        return found
+
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Measure signed distances (N,) float32, metres, negative inside the closed mesh."""
         return signed_distance(self.scene, points)
@@ -76,6 +102,8 @@ class TrackedSolid:
     def belief(self, points: np.ndarray, height: np.ndarray) -> np.ndarray:
         """Weigh the mesh, (N,) in [0, 1], at points (N, 3); the hull is ``height`` (N,) above."""
         near = np.clip(2.0 - height / REACH, 0, 1)
+        if len(self.glasses):
+            near[cKDTree(self.glasses).query(points)[0] < EYES_M] = 1
         if self.border is None:
             return near
         query = o3d.core.Tensor(np.ascontiguousarray(points, np.float32))

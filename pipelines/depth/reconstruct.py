@@ -90,6 +90,7 @@ def reconstruct(
     voxels = [fine * LEVEL_RATIO**k for k in reversed(range(1 + max(0, round(coarser))))]
 
     outlines = [] if solid is None else solid.outlines(views)
+    clear = views if solid is None else solid.without_glasses(views)
 
     def start(points: np.ndarray) -> np.ndarray:
         hull = hull_distance(views, points)
@@ -107,8 +108,8 @@ def reconstruct(
             offsets = np.arange(-INWARD_M, 1.01 * voxel, voxel / 2)
         else:
             offsets = np.arange(-2.0, 2.01, 0.4) * voxel
-        grid = combined(np.maximum, _moved(views, grid, extent, offsets, noise), hull)
-    return _finished(views, grid, noise)
+        grid = combined(np.maximum, _moved(clear, grid, extent, offsets, noise), hull)
+    return _finished(views, clear, grid, noise)
 
 
 def tracked_surface(
@@ -118,7 +119,7 @@ def tracked_surface(
     voxel = finest_voxel([view], (solid.low + solid.high) / 2, voxel_mm, voxel_px)
     low, high = solid.low - 4 * voxel, solid.high + 4 * voxel
     _check_size(low, high, voxel)
-    return _finished([view], build(low, high, voxel, solid.distance), noise)
+    return _finished([view], [view], build(low, high, voxel, solid.distance), noise)
 
 
 def finest_voxel(
@@ -180,8 +181,10 @@ def _moved(
     return advance(grid, mesh.vertices, displacement)
 
 
-def _finished(views: Sequence[DepthView], grid: LevelSet, noise: float) -> HeadSurface:
-    """Take mesh, confidence and colours from the final grid."""
+def _finished(
+    views: Sequence[DepthView], clear: Sequence[DepthView], grid: LevelSet, noise: float
+) -> HeadSurface:
+    """Take mesh, confidence and colours from the final grid; `clear` views are compared."""
     grid = largest_body(grid)
     mesh = extract_mesh(grid)
     if not len(mesh.faces):
@@ -191,7 +194,7 @@ def _finished(views: Sequence[DepthView], grid: LevelSet, noise: float) -> HeadS
         )
     mesh = mesh._replace(faces=largest_part(mesh.vertices, mesh.faces))
     offsets = np.array([-1.0, 0.0, 1.0]) * grid.voxel
-    agreement = patch_scores(views, grid, mesh, offsets, noise)[:, 1]
+    agreement = patch_scores(clear, grid, mesh, offsets, noise)[:, 1]
     confidence = averaged(np.clip(agreement, 0, 1), mesh.faces, rounds=6)
     used, faces = np.unique(mesh.faces, return_inverse=True)
     vertices, agreement, confidence = mesh.vertices[used], agreement[used], confidence[used]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -134,7 +135,10 @@ def read_tracked(
     if agreement < AGREEMENT:
         why = f"only {agreement:.0%} of it lies in the mattes, under {AGREEMENT:.0%}"
         return None, {"used": False, "why": why, "agreement": agreement}
-    return close_mesh(vertices, faces), {"used": True, "agreement": agreement}
+    solid, glasses = close_mesh(vertices, faces), track.glasses_in(expression)
+    if glasses is not None:
+        solid = replace(solid, glasses=glasses)
+    return solid, {"used": True, "agreement": agreement, "glasses": len(solid.glasses) > 0}
 
 
 def write_maps(out: Path, camera_id: str, maps: DepthMaps) -> None:

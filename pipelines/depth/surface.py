@@ -142,7 +142,7 @@ def rim_targets(views: Sequence[DepthView], grid: LevelSet, depth_range: float) 
     middle = grid.points((np.array(grid.shape) - 1) / 2)
     found = []
     for view in views:
-        edge = (view.silhouette_px > 0) & (view.silhouette_px <= 1.0)
+        edge = (view.silhouette_px > 0) & (view.silhouette_px <= 1.0) & (view.alpha > 0)
         edge[[0, -1]] = edge[:, [0, -1]] = False
         y, x = np.nonzero(edge)
         if not len(x):

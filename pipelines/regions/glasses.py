@@ -66,8 +66,11 @@ def _odd(head: TrackedHead, pictures: Sequence[Picture], grid: np.ndarray) -> np
     local = (grid @ head.R.T).astype(np.float32)
     apart = head.scene.compute_distance(o3d.core.Tensor(local), nthreads=1).numpy()
     ids = np.flatnonzero((apart > CLEAR_M) & (apart < FAR_M))
-    local, odd, seen = local[ids], np.zeros(len(ids), int), np.zeros(len(ids), int)
+    odd, seen = np.zeros(len(ids), int), np.zeros(len(ids), int)
     for camera, rgb, alpha in pictures:
+        open_still = seen - odd <= len(pictures) // ERRING  # the others are skin, or beside it
+        ids, odd, seen = ids[open_still], odd[open_still], seen[open_still]
+        places = local[ids]
         mesh, _ = see(head, camera)
         skin = (mesh == SKIN) & (alpha > 0.99)
         if skin.sum() < LEAST_SKIN:
@@ -75,11 +78,11 @@ def _odd(head: TrackedHead, pictures: Sequence[Picture], grid: np.ndarray) -> np
         logs = colour_logs(rgb)
         unlike = ~like_skin(logs.reshape(-1, 3), logs[skin]).reshape(skin.shape)
         shown = cv2.dilate((unlike & (alpha > 0.5)).astype(np.uint8), np.ones((3, 3), np.uint8))
-        pixels, inside = inside_frame(camera, local + head.center)
+        pixels, inside = inside_frame(camera, places + head.center)
         column, row = np.clip(pixels.astype(np.int64), 0, np.array(skin.shape[::-1]) - 1).T
-        towards = (camera.center - head.center - local).astype(np.float32)
-        rays = o3d.core.Tensor(np.concatenate([local, towards], axis=1))
-        inside &= ~np.isfinite(head.scene.cast_rays(rays, nthreads=1)["t_hit"].numpy())
+        towards = (camera.center - head.center - places).astype(np.float32)
+        rays = o3d.core.Tensor(np.concatenate([places, towards], axis=1))
+        inside &= ~head.scene.test_occlusions(rays, nthreads=1).numpy()
         seen += inside
         odd += inside & (shown[row, column] > 0)
     found = np.zeros(len(grid), bool)

@@ -65,9 +65,10 @@ def run(
     """Write labels and the head's matte for each camera, and a contact sheet."""
     cv2.setNumThreads(1)  # the runner counts one core per item
     subject, expression = item.split("/")
-    head = read_head(dataset, subject, expression)
+    head, glasses = read_head(dataset, subject, expression)
     scalp, skin, frames = study_person(dataset, item, head)
-    glasses = find_glasses(head, facing(dataset, item, head))
+    if glasses is None:
+        glasses = find_glasses(head, facing(dataset, item, head))
     if scalp_is != "auto":
         scalp = replace(scalp, is_skin=scalp_is == "skin")
     figures, rows = {}, {}
@@ -105,8 +106,10 @@ def run(
     return Result(metrics, dropped, warnings)
 
 
-def read_head(dataset: Dataset, subject: str, expression: str) -> TrackedHead:
-    """Read the tracked mesh of one expression.
+def read_head(
+    dataset: Dataset, subject: str, expression: str
+) -> tuple[TrackedHead, np.ndarray | None]:
+    """Read the tracked mesh of one expression, and its glasses (n, 3); None where unknown.
 
     Raises:
         StageError: the subject or the expression is not tracked.
@@ -121,7 +124,7 @@ def read_head(dataset: Dataset, subject: str, expression: str) -> TrackedHead:
             f"{path}: vertices {vertices.shape}, expected ({len(labels.vertices)}, 3) of its head"
             " model; run 'express50 track' again"
         )
-    return make_head(vertices, track.R[row], labels)
+    return make_head(vertices, track.R[row], labels), track.glasses_in(expression)
 
 
 def read_pair(dataset: Dataset, item: str, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

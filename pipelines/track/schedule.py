@@ -40,6 +40,7 @@ NARROWING, NARROWINGS = 0.6, 3  # factor of the reach from round to round, and h
 IN_HAIR = 30.0  # times a landmark's standard deviation, where hair is around it
 BESIDE_M, BESIDE_THING = 0.02, 6.0  # metres from a thing, and the same there
 GLASSES_SIDE = 320  # pixels of a head's crop, some millimetre each, in which glasses are looked for
+SEARCHES = 3  # rounds in which things are looked for; later ones look only where some were found
 FOLLOWING = 3  # rounds in which the skin is followed
 # Far from the surface, whole patches of skin may match wrongly together: trust grows by this
 # factor towards the last round.
@@ -145,22 +146,22 @@ def gather(
 
 def refine(
     basis: Basis, targets: list[Target], state: State, evidence: SubjectEvidence, schedule: Schedule
-) -> tuple[State, list[Target]]:
-    """Run the rounds; also returns the targets with the last round's terms."""
+) -> tuple[State, list[Target], list[np.ndarray]]:
+    """Run the rounds; also returns the targets with the last terms, and `glasses_on` each."""
     model, found = basis.model, targets
     slides: list[SlideTerm | None] = [None] * len(targets)
     things = [np.zeros((0, 3)) for _ in targets]
     hiding = list(things)  # and glasses
     glasses: dict[int, np.ndarray] = {}  # by expression, found once
     outlines = sum(len(one.distances) for one in evidence.pictures)
-    for one in schedule:
+    for number, one in enumerate(schedule):
         meshes, turns, found = all_vertices(model, state), rotations(state), []
         clear = [without(*pair) for pair in zip(evidence.pictures, hiding, strict=True)]
         flows = skin_flows(model, targets, evidence, clear, meshes) if one.follow_skin else {}
         for index, (target, pictures) in enumerate(zip(targets, evidence.pictures, strict=True)):
             mesh, terms = meshes[index], [*target.terms]
             hidden = under_hair(model, evidence.skin, pictures, mesh)
-            if one.patch_reach_m:
+            if one.patch_reach_m and (number < SEARCHES or len(things[index])):
                 things[index] = things_before(model, evidence.skin, pictures, mesh)
                 if index not in glasses:
                     glasses[index] = glasses_on(model, pictures, mesh, turns[index])
@@ -187,7 +188,12 @@ def refine(
             state = replace(state, poses=moved.poses)
             continue
         state, _ = fit(basis, found, state, ROUND_STEPS, free_modes(found))
-    return state, found
+    meshes, turns = all_vertices(model, state), rotations(state)
+    worn = [glasses[index] for index in sorted(glasses)]  # of all expressions, or never looked for
+    for index, seen_on in enumerate(worn):
+        if len(seen_on):
+            worn[index] = glasses_on(model, evidence.pictures[index], meshes[index], turns[index])
+    return state, found, worn
 
 
 def glasses_on(

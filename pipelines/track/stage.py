@@ -5,7 +5,7 @@ docs/TRACKING.md describes the method.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -97,14 +97,14 @@ def run(
         for target, mesh in zip(targets, meshes, strict=True)
     ]
     evidence = gather(basis.model, pictures, meshes, eyes, config.samples, schedule)
-    state, targets = refine(basis, targets, state, evidence, schedule)
+    state, targets, glasses = refine(basis, targets, state, evidence, schedule)
     state = rounded(state, DECIMALS)
     meshes, turns = all_vertices(basis.model, state), rotations(state)
     metrics = track_metrics(basis.model, targets, meshes)
     sigma = vertex_sigma(basis, targets, state, free_modes(targets))
     bounds = stated_bounds(dataset, item, sigma, meshes, metrics)
     doubt = {"sigma": sigma, "bound": 1e-3 * np.stack([one.bound for one in bounds])}
-    write_track(out / "track.npz", config.head, basis, targets, state, meshes, doubt)
+    write_track(out / "track.npz", config.head, basis, targets, state, meshes, doubt, glasses)
     if config.texture_side:
         sides = (config.samples, config.texture_side)
         write_texture(out, basis.model, targets, meshes, pictures, *sides)
@@ -208,8 +208,13 @@ def write_track(
     state: State,
     vertices: np.ndarray,
     doubt: Mapping[str, np.ndarray] | None = None,
+    glasses: Sequence[np.ndarray] = (),
 ) -> None:
-    """Write track.npz (docs/FORMAT.md); `doubt` are the vertices' deviations and bounds (E, V)."""
+    """Write track.npz (docs/FORMAT.md).
+
+    `doubt` are the vertices' deviations and bounds (E, V), `glasses` the places (n, 3) of every
+    expression's glasses, if they were looked for.
+    """
     shape, offsets = split_shape(basis.model, state.shape)
     arrays = {
         "schema": np.array(SCHEMA),
@@ -221,6 +226,9 @@ def write_track(
     }
     arrays |= pose_arrays(state.poses, basis.expression_size)
     further = {"vertices": vertices, **(doubt or {})}
+    if len(glasses):
+        further["glasses"] = np.concatenate(glasses)
+        arrays["glasses_row"] = np.repeat(np.arange(len(glasses)), [len(one) for one in glasses])
     write_npz(path, arrays | {name: array.astype(np.float32) for name, array in further.items()})
 
 

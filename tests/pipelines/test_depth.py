@@ -142,6 +142,22 @@ def test_prior_gives_way_where_the_hull_rises_far_above_it(shots):
     np.testing.assert_array_equal(merged[near >= 0.02], near[near >= 0.02])
 
 
+def test_what_glasses_hide_is_not_compared_and_the_head_is_believed_behind_them(shots):
+    views = [make_view(*shot[:3], 1024) for shot in shots]
+    bare = close_mesh(*mesh())
+    front = np.array([[x, y, 0.125] for x in (-0.01, 0, 0.01) for y in (-0.01, 0, 0.01)])
+    worn = replace(bare, glasses=front)
+    assert bare.without_glasses(views)[0] is views[0]
+    for view, clear in zip(views, worn.without_glasses(views), strict=True):
+        hidden = ((clear.alpha == 0) & (view.alpha > 0)).mean()
+        facing = view.camera.center[2] > 0.8  # from elsewhere they stand beside the head
+        assert 0.005 < hidden < 0.02 if facing else hidden < 0.001
+        np.testing.assert_array_equal(clear.silhouette_px, view.silhouette_px)
+    points, height = np.array([[0, 0, 0.12], [0, 0.12, 0]]), np.full(2, 0.05)
+    assert bare.belief(points, height).tolist() == [0, 0]
+    assert worn.belief(points, height).tolist() == [1, 0]
+
+
 def test_fewer_cameras_still_give_a_head(shots):
     few = [make_view(c, rgb, alpha, 1024) for c, rgb, alpha, _ in shots[2:6]]
     assert np.median(errors_mm(reconstruct(few, voxel_mm=QUICK), shots[2:6])) < 3.0

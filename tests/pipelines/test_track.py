@@ -345,7 +345,7 @@ def test_stage_writes_the_contracted_file(tracked_dataset, tmp_path: Path) -> No
         "schema": (), "head": (), "expressions": (2,), "frames": (2,), "shape": (5,),
         "expression": (2, 4), "neck": (2, 3), "jaw": (2, 3), "eyes": (2, 6), "R": (2, 3, 3),
         "t": (2, 3), "vertices": (2, 90, 3), "offsets": (90, 3),
-        "sigma": (2, 90), "bound": (2, 90),
+        "sigma": (2, 90), "bound": (2, 90), "glasses": (0, 3), "glasses_row": (0,),
     }  # fmt: skip
 
 

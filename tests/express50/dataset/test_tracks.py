@@ -29,6 +29,18 @@ def test_reads_back_what_was_written(arrays, tmp_path) -> None:
     assert track.row("smile") == 1
     with pytest.raises(StageError, match="wink: it is not tracked"):
         track.row("wink")
+    assert track.glasses_in("smile") is None
+
+
+def test_reads_each_expressions_glasses(arrays, tmp_path) -> None:
+    places = np.arange(9, dtype=np.float32).reshape(3, 3)
+    worn = {"glasses": places, "glasses_row": np.array([1, 0, 1])}
+    track = read_track(write_track(tmp_path / "track.npz", arrays | worn))
+    np.testing.assert_array_equal(track.glasses_in("smile"), places[[0, 2]])
+    np.testing.assert_array_equal(track.glasses_in("neutral"), places[[1]])
+    none = {"glasses": places[:0], "glasses_row": np.zeros(0, int)}
+    track = read_track(write_track(tmp_path / "bare.npz", arrays | none))
+    assert track.glasses_in("smile").shape == (0, 3)
 
 
 def bad(arrays: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
@@ -55,6 +67,16 @@ def bad(arrays: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
         "expressions are int64": {"expressions": np.arange(2)},
         "R is not a rotation": {"R": 2 * arrays["R"]},
         "differs from 1 by": {"R": -arrays["R"]},
+        "glasses has shape": {"glasses": np.zeros((2, 3)), "glasses_row": np.zeros(3, int)},
+        "glasses has 3 values": {
+            "glasses": np.full((1, 3), np.nan),
+            "glasses_row": np.zeros(1, int),
+        },
+        "glasses_row is not a row of 2": {
+            "glasses": np.zeros((1, 3)),
+            "glasses_row": np.array([2]),
+        },
+        "has no 'glasses_row'": {"glasses": np.zeros((1, 3))},
         "Python objects": {"head": np.array({"a": print}, dtype=object)},
     }
 
