@@ -1,1 +1,1 @@
-"""Every stage may rely on this room: layout, configuration, stage, labels of parts."""
+"""Define what every stage relies on: layout, configuration, stage, segmentation labels."""

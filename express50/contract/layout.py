@@ -14,7 +14,7 @@ def footage_root(capture: Path) -> Path:
     """Return the folder that a registered capture's footage is relative to.
 
     It is the capture's folder, a file's folder, or what ``source`` in capture.toml names: a capture
-    may be that one file, which says where a read-only dataset lies and how to take it.
+    may consist of capture.toml alone, which points to a read-only dataset.
 
     Raises:
         CaptureError: capture.toml is not TOML, or its source does not exist.
@@ -24,7 +24,7 @@ def footage_root(capture: Path) -> Path:
 
 
 def footage_source(capture: Path) -> Path:
-    """Return what ``source`` in capture.toml names; the capture itself where it names nothing.
+    """Return the path that ``source`` in capture.toml names; without it, the capture itself.
 
     Raises:
         CaptureError: capture.toml is not TOML, or its source does not exist.
@@ -102,7 +102,7 @@ class Dataset:
         return self.item_dir("calibrate", subject) / "cameras.json"
 
     def gains_file(self, subject: str) -> Path:
-        """Colour gains of a subject's cameras, where a board showed them."""
+        """Return the path of the cameras' colour gains, which exist if a board was recorded."""
         return self.item_dir("calibrate", subject) / "gains.json"
 
     def peaks_file(self, subject: str) -> Path:
@@ -156,7 +156,7 @@ class Dataset:
 
     @property
     def report_dir(self) -> Path:
-        """Report pages."""
+        """Return the folder of the report."""
         return self.root / "report"
 
     @property
@@ -165,7 +165,7 @@ class Dataset:
         return self.root / ".staging"
 
     def windows_dir(self, subject: str) -> Path:
-        """Return folder of finished parts of a subject's clips; it goes when these are written."""
+        """Return the folder of a subject's finished clip parts, deleted once the clips are done."""
         return self.root / ".windows" / subject
 
     @property
@@ -175,7 +175,7 @@ class Dataset:
 
     @property
     def replaced_dir(self) -> Path:
-        """Return the folder of outputs that others replaced, kept for going back to them."""
+        """Return the folder of outputs that newer ones replaced, kept in case they are needed."""
         return self.root / ".replaced"
 
     @property

@@ -43,9 +43,9 @@ class ExpectedError:
     """How wrong a result probably is, judged without ground truth.
 
     Attributes:
-        value: the error to expect, in the stage's own measure (docs/FORMAT.md).
-        low, high: the interval that holds the true error nine times in ten.
-        unit: of all three.
+        value: expected error, in the stage's own measure (docs/FORMAT.md).
+        low, high: bounds of the 90 % interval of the true error.
+        unit: unit of all three.
     """
 
     value: float
@@ -54,7 +54,7 @@ class ExpectedError:
     unit: Unit
 
     def __post_init__(self) -> None:
-        """Refuse what is not an interval around the value.
+        """Check that low and high are an interval around the value.
 
         Raises:
             StageError: a figure is not finite, they are not in order, or the unit is unknown.
@@ -77,7 +77,7 @@ class ExpectedError:
 
 
 def typical_error(metrics: Iterable[Mapping[str, Any]]) -> ExpectedError | None:
-    """Return the median of what items expect, from their metrics; None if none states any."""
+    """Return the median of the items' expected errors, from their metrics; None without any."""
     stated = []
     for row in metrics:
         with suppress(TypeError, StageError):  # absent, or a file that somebody changed
@@ -113,17 +113,17 @@ class Result:
 
 
 def no_gpu(config: Any) -> bool:
-    """Say that a stage runs on CPUs whatever its configuration."""
+    """Return False: the stage runs on CPUs whatever its configuration."""
     return False
 
 
 def no_files(config: Any) -> None:
-    """Try nothing: no setting names a file."""
+    """Check nothing, because no setting names a file."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class NoSettings:
-    """The configuration of a stage that has nothing to set."""
+    """The configuration of a stage without settings."""
 
 
 @dataclass(frozen=True)
@@ -138,8 +138,8 @@ class Growth:
         time: seconds per item.
         disk: bytes per item.
         more: number of further items, such as one of plates per subject; none by default.
-        side: pixels to whose longer side most of the work reduces pictures, at standard settings;
-            larger ones take no longer. 0 if they do.
+        side: longer side, pixels, to which the stage reduces pictures for most of its work at
+            standard settings, so that larger pictures take no longer; 0 if it does not.
     """
 
     items: tuple[str, ...] = ("subjects",)
@@ -200,7 +200,7 @@ INSTALL = "run 'pip install -e .' in the folder of the sources"
 
 @dataclass(frozen=True)
 class Command:
-    """A command of ``express50`` that another package brings.
+    """A command of ``express50`` that another package adds.
 
     Attributes:
         help: one line for the list of commands.
@@ -253,9 +253,9 @@ def with_required(names: Iterable[str]) -> list[Stage]:
 
 
 def commands() -> dict[str, Command]:
-    """Return the commands that other packages bring, by name.
+    """Return the commands that other packages add, by name.
 
-    One that does not load raises its ConfigError only when it is asked for.
+    A command that does not load raises its ConfigError only when it is called.
     """
     found = {}
     for point in sorted(entry_points(group="express50.commands")):

@@ -1,1 +1,1 @@
-"""The dial: measure what time buys on a dataset, choose settings for a budget, and keep to it."""
+"""Measure speed against accuracy on a dataset, choose settings for a budget, and keep to it."""

@@ -21,9 +21,9 @@ class Budget:
     """Seconds that a run may take: of the clock, or of all cores together.
 
     Attributes:
-        text: as it was written.
-        seconds: of the clock, or processor seconds of the items.
-        cores: whether processor seconds count.
+        text: the budget as the user wrote it.
+        seconds: clock seconds, or processor seconds of the items.
+        cores: True if ``seconds`` are processor seconds.
     """
 
     text: str
@@ -33,7 +33,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class Goal:
-    """An error that a result is to keep below, in the result's unit, and as it was written."""
+    """An upper limit for a result's error, in the result's unit, and as the user wrote it."""
 
     text: str
     value: float
@@ -77,11 +77,11 @@ class Clock:
     """Counts what a run spends, over all its sessions; a `Gate` of the runner.
 
     Attributes:
-        budget: what may be spent; None for no limit.
-        spent: of earlier sessions, seconds.
-        keep: stores what is spent; called about every two seconds while items end.
-        item: expected cost of an item of the stage that runs, which must still fit.
-        early: seconds before which the budget counts as spent, for what follows.
+        budget: the limit; None for no limit.
+        spent: seconds spent in earlier sessions.
+        keep: stores the time spent; called about every two seconds while items end.
+        item: expected seconds of one item of the running stage, which must still fit.
+        early: seconds of the budget reserved for later stages.
     """
 
     budget: Budget | None
@@ -108,7 +108,7 @@ class Clock:
         return float("inf") if self.budget is None else self.budget.seconds - self.now()
 
     def expect(self, item: float, early: float = 0.0) -> None:
-        """Say what an item of the next stage costs, and what to keep for the time after it."""
+        """Set the expected seconds of the next stage's items, and the reserve for later stages."""
         self.item, self.early, self._closed = item, early, False
 
     def settled(self, receipt: Receipt) -> None:

@@ -46,10 +46,10 @@ class Point:
     """A choice of settings.
 
     Attributes:
-        settings: name of each stage's.
-        seconds: of the clock, or of all cores, for all that is not made yet.
-        each: the same by stage.
-        worse: sum over the results of the error, relative to that at the dearest settings.
+        settings: name of each stage's setting.
+        seconds: clock or core seconds for all items that are not made yet.
+        each: the same per stage.
+        worse: sum over the results of the error, relative to that at the most expensive settings.
         errors: expected error of each result.
     """
 
@@ -65,15 +65,15 @@ class Workload:
     """The work of a run.
 
     Attributes:
-        stages: in order.
-        ladders: settings of each stage.
-        measured: of the pilot.
-        footage: of all that is to be made.
-        width: items that are worked on at once.
-        cores: whether seconds of all cores count.
+        stages: the stages, in order.
+        ladders: settings of each stage, cheapest first.
+        measured: figures of the pilot.
+        footage: size of all the footage to process.
+        width: number of items processed in parallel.
+        cores: True if core seconds count instead of clock seconds.
         fixed: settings of stages that have begun.
         kinds: results of the chain.
-        done: per stage, the setting that its folder was made with and the share that is there.
+        done: per stage, the setting that its outputs were made with and the finished share.
     """
 
     stages: Sequence[Stage]
@@ -296,7 +296,7 @@ def goal_result(load: Workload, goal: Goal) -> str:
 def choose(points: Sequence[Point], seconds: float, goal: tuple[str, float] | None) -> Point:
     """Return the best point within the time; with a goal, the quickest that reaches it.
 
-    Where none fits, the quickest.
+    If no point fits, return the quickest.
     """
     fitting = [point for point in points if point.seconds <= seconds] or [points[0]]
     if goal is not None:

@@ -28,16 +28,16 @@ class Footage:
     frames: float
 
     def work(self, factors: Sequence[str]) -> float:
-        """Multiply some of its sizes."""
+        """Return the product of the named sizes."""
         return math.prod(getattr(self, name) for name in factors)
 
     def time(self, growth: Growth) -> float:
-        """Return what the seconds of a stage's item are proportional to."""
+        """Return the size that the seconds of a stage's item are proportional to."""
         most = SHORT_SIDE * growth.side**2 if growth.side else math.inf
         return replace(self, pixels=min(self.pixels, most)).work(growth.time)
 
     def items(self, growth: Growth) -> float:
-        """Return how many items of a stage it gives."""
+        """Return the number of items of a stage."""
         return self.work(growth.items) + (self.work(growth.more) if growth.more else 0.0)
 
 
@@ -77,12 +77,12 @@ class Trial:
 
     Attributes:
         settings: name of the setting of each stage.
-        footage: what it ran on.
-        scripted: expressions of the whole capture.
-        costs: of each stage.
-        errors: ``[value, low, high]`` that stages state of each result.
-        failed: why a stage made nothing.
-        folder: of its outputs.
+        footage: size of the footage that it ran on.
+        scripted: number of expressions of the whole capture.
+        costs: cost of each stage.
+        errors: ``[value, low, high]`` that stages state for each result.
+        failed: per stage that made nothing, the reason.
+        folder: folder of its outputs.
     """
 
     settings: dict[str, str]

@@ -66,7 +66,7 @@ class LocalWorkers:
 
 
 class RemoteWorkers:
-    """Workers of a scheduler that somebody else runs."""
+    """Workers of a scheduler that the user started."""
 
     def __init__(self, client: Any) -> None:
         self.client = client
@@ -98,7 +98,7 @@ class RemoteWorkers:
         return cls(client)
 
     def keep(self, tasks: int) -> None:
-        """Do nothing: the workers are not ours."""
+        """Do nothing, because the user manages these workers."""
 
     def slots(self, stage: str, gpu: bool) -> int:
         """Return the number of tasks that may run at once; 1 while there are no workers yet.
@@ -128,7 +128,7 @@ class RemoteWorkers:
 
 
 def no_gpu(stage: str, words: str) -> StageError:
-    """Make the error of a stage that needs a GPU where there is none."""
+    """Return the error of a stage that needs a GPU when there is none."""
     return StageError(f"{stage} needs a GPU as it is configured, and {words}")
 
 

@@ -22,8 +22,8 @@ from express50.runner.worker import (
     torch_sees_cuda,
 )
 
-ATTEMPTS = 2  # an item that killed its worker this often is set aside
-SLURM_ATTEMPTS = 3  # the same where a worker may also have come to its job's time limit
+ATTEMPTS = 2  # an item whose worker died this often fails
+SLURM_ATTEMPTS = 3  # the same in SLURM jobs, where a worker may also have hit the time limit
 LARGEST_BATCH = 32
 POLL_SECONDS = 0.5
 
@@ -218,7 +218,7 @@ def _next_size(size: int, batch: list[Task], receipts: list[Receipt]) -> int:
 
 @contextmanager
 def _loss_is_one_error() -> Iterator[None]:
-    """Turn the errors by which calls find a scheduler gone into one StageError."""
+    """Turn the errors that a lost scheduler causes into one StageError."""
     try:
         yield
     except (CancelledError, OSError) as error:  # dask's CommClosedError is an OSError

@@ -1,8 +1,8 @@
-"""Publish what another tool made in a stage's place, with a receipt that says so.
+"""Publish results of other tools as a stage's output, with a receipt that marks them as imported.
 
-An imported item is the stage's own output to all later stages. A run keeps it whatever the stage's
-settings are. It belongs to the cameras and peak frames that it was imported for: with others it is
-set aside, and the stage does not make the item until it is imported again or given up.
+Later stages treat an imported item like the stage's own output. A run keeps it whatever the stage's
+settings are. It is valid for the cameras and peak frames that it was imported for: if these change
+it is set aside, and the stage does not make the item until the import is repeated or removed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Show a stage's progress: a bar or lines for people, signs of life in the ledger for others."""
+"""Show a stage's progress as a bar or lines, and record it in the ledger for other processes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BEAT_SECONDS = 2.0
 
 @contextlib.contextmanager
 def showing(stage: str, total: int, enabled: bool) -> Iterator[Callable[[Receipt], None]]:
-    """Show on standard error that items end: a bar in a terminal, else lines.
+    """Show finished items on standard error: a bar in a terminal, else lines.
 
     Yields the function that takes the receipt of each.
     """

@@ -25,8 +25,8 @@ ASIDE = re.compile(rf"(.+)-[0-9a-f]{{32}}({re.escape(FORMER)})?")
 def run_folder(dataset: Dataset, stage: str) -> Iterator[Path]:
     """Yield a run's own folder, which its workers need to publish.
 
-    A worker may live on when its run was killed, or was taken for dead. Once the folder is gone, at
-    the end of the run or when the next one begins, such a worker can no longer publish.
+    A worker may outlive its run, or be given up as dead while it still works. Once the folder is
+    gone, at the end of the run or when the next one begins, such a worker can no longer publish.
     """
     folder = dataset.staging_dir / f"{stage}-{uuid.uuid4().hex}"
     folder.mkdir(parents=True)
@@ -78,7 +78,7 @@ def set_aside(
 
 
 def discard_stale(dataset: Dataset, stage: str, item: str) -> None:
-    """Delete what a former failure of an item set aside."""
+    """Delete the stale output that an earlier failure of an item left."""
     shutil.rmtree(dataset.stale_dir / stage / item, ignore_errors=True)
 
 
@@ -127,7 +127,7 @@ GLANCE_SECONDS = 0.05
 
 @contextmanager
 def stage_lock(dataset: Dataset, stage: str) -> Iterator[None]:
-    """Hold a stage of a dataset; the system lets go when the process ends, however it ends.
+    """Lock a stage of a dataset; the system releases the lock however the process ends.
 
     Raises:
         StageError: another process holds it.
@@ -154,7 +154,7 @@ def _locked(file: IO[str], kind: int = fcntl.LOCK_EX) -> bool:
 
 @contextmanager
 def hold_stages(dataset: Dataset, names: Iterable[str]) -> Iterator[None]:
-    """Hold several stages, so that none of them can start; StageError if one runs."""
+    """Lock several stages, so that none of them can start; StageError if one is running."""
     with ExitStack() as stack:
         for name in names:
             stack.enter_context(stage_lock(dataset, name))

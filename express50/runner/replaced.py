@@ -1,8 +1,8 @@
 """Keep outputs that were replaced, so that going back to their settings or inputs is a rename.
 
-An entry of this store is an output's folder with its receipt, named by its fingerprint. Any of it
-may be lost at any moment without harm: what is missing or damaged is made again. It therefore
-gives way where a disk has little space.
+An entry of this store is an output's folder with its receipt, named by its fingerprint. Losing an
+entry does no harm, because a missing or damaged output is made again. The store is therefore
+emptied when disk space runs low.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def _whole_receipt(entry: Path) -> Receipt:
 
 
 def make_room(dataset: Dataset) -> bool:
-    """Empty the store where the disk has little space; returns whether it has."""
+    """Empty the store if the disk is nearly full; return whether it was."""
     usage = shutil.disk_usage(dataset.root)
     short = bool(usage.total) and usage.free < LEAST_ROOM
     if short:

@@ -1,4 +1,4 @@
-"""Run a stage over its items: skip current ones, isolate bad ones, account for all."""
+"""Run a stage over its items: skip those up to date, isolate failures, account for every item."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Summary:
     seconds: float
 
     def count(self, status: str) -> int:
-        """Number of items with a status."""
+        """Return the number of items with a status."""
         return sum(outcome.status == status for outcome in self.outcomes)
 
     @property
@@ -346,7 +346,7 @@ def _run_items(
     log: RunLog,
     gate: Gate | None,
 ) -> dict[str, Outcome]:
-    """Run what is to do and settle each item as it ends; returns the outcomes of all."""
+    """Run the items to do and record each as it ends; return the outcomes of all items."""
     outcomes, ended = dict(work.current), []
     log.current(len(outcomes))
 
@@ -387,10 +387,10 @@ def _run_items(
 
 
 def _refuse_alike(stage: Stage, ended: list[Receipt], former: Mapping[str, Receipt]) -> None:
-    """Stop where the first items fail for one reason though they were made before.
+    """Stop if the first items all fail for one reason although earlier runs made them.
 
     Raises:
-        StageError: they do, and did not when they were tried last: a setting is wrong.
+        StageError: they do, so that a setting is probably wrong.
     """
     made = all(r.item in former and not former[r.item].reason for r in ended)
     if made and all(r.status == "failed" and r.reason == ended[0].reason for r in ended):

@@ -1,4 +1,4 @@
-"""Cap threads: processes times pools times threads must not exceed the cores, or all crawl.
+"""Limit threads: more than one per core over all processes and pools slows everything down.
 
 The cap is the same inline and in workers: sums over a different number of threads round
 differently, and the same data must give the same bytes.
