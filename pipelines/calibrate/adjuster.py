@@ -148,6 +148,9 @@ def cameras_covariance(
         R, t = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
         row[:3, :3], row[3:6, :3] = -R, np.cross(R.T, t).T
         row[3:6, 3:6], row[3:6, 6] = -R, t
+    # A camera that has all its points behind it is not held by anything: its variance is huge.
+    unheld = columns[np.diag(H)[columns] == 0]
+    H[unheld, unheld] = 1e-9 * np.diag(H).max()
     unit = 1 / np.sqrt(np.diag(H)[columns])
     held = np.linalg.qr(same.reshape(H.shape[0], 7)[columns] / unit[:, None])[0]
     inverse = np.linalg.inv(H[np.ix_(columns, columns)] * unit * unit[:, None] + held @ held.T)

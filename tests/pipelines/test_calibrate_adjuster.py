@@ -10,10 +10,12 @@ import pytest
 from express50.geometry.cameras import Camera, project
 from express50.geometry.transforms import look_at
 from pipelines.calibrate.adjuster import (
+    AdjustedRig,
     RigPriors,
     _linearise,
     _moved,
     adjust_rig,
+    cameras_covariance,
     move_pose,
     triangulate_tracks,
 )
@@ -126,6 +128,16 @@ def test_mismatches_do_not_pull():
 def tracks_errors(rig, tracks, points):
     cameras = list(rig.values())
     return _linearise(cameras, tracks, points).errors
+
+
+def test_a_camera_that_looks_away_states_a_huge_error_and_warns_nobody():
+    rig, points = make_rig(), spots()
+    tracks, away = tracks_in(rig, points), np.diag([-1.0, 1.0, -1.0, 1.0])
+    rig["c4"] = replace(rig["c4"], cam_from_world=away @ rig["c4"].cam_from_world)
+    fit = AdjustedRig(rig, points, np.zeros((len(tracks.pixels), 2)), 0.0)
+    variance = np.diag(cameras_covariance(fit, tracks, RigPriors(), 1.5)).reshape(5, -1)
+    assert np.isfinite(variance).all()
+    assert variance[4, :3].min() > 1e4 * variance[:4, :3].max() > 0
 
 
 def test_priors_are_about_the_expected_lenses_wherever_the_fit_starts():
