@@ -10,13 +10,14 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from benchmarks.calibrate import figures as rig_figures
 from benchmarks.depth_score import cast
 from benchmarks.regions_truth import iou_figures, true_head_alpha, true_labels, view_row
 from express50.capture.expressions import NEUTRAL
-from express50.capture.frames import read_cameras_of
+from express50.capture.frames import read_cameras_of, read_recorded_cameras
 from express50.capture.index import read_peaks
 from express50.contract.layout import Dataset
 from express50.contract.segmentation_labels import COLOURS
@@ -24,7 +25,7 @@ from express50.dataset.depth_files import depth_file, read_depth, read_normals
 from express50.dataset.tracks import read_track
 from express50.errors import Express50Error
 from express50.files.images import contact_sheet, read_image, write_image
-from express50.geometry.cameras import Camera, transform_camera
+from express50.geometry.cameras import Camera, pinhole, transform_camera
 from express50.twin.truth import Truth, align_worlds
 
 VIEWS_A_PEAK = 2  # views measured of every peak; they walk around the rig from peak to peak
@@ -57,7 +58,7 @@ def measure_dataset(dataset: Dataset, truth_root: Path, out: Path | None = None)
 def measure_calibrate(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
     """Return the worst rotation, position and head-place error of the cameras over all subjects."""
     rows = [
-        rig_figures(read_cameras_of(dataset, subject, undistorted=False), truth.cameras(subject))
+        rig_figures(read_recorded_cameras(dataset, subject), truth.cameras(subject))
         for subject in calibrated_subjects(dataset)
     ]
     keys = ("rotation_error_deg_max", "translation_error_mm_max", "head_px")
@@ -88,10 +89,13 @@ def measure_align(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
 
 
 def true_world_cameras(dataset: Dataset, truth: Truth, subject: str) -> dict[str, Camera]:
-    """Return the estimated pinhole cameras, moved into the true world."""
-    estimated = read_cameras_of(dataset, subject)
-    motion = align_worlds(estimated, truth.cameras(subject))
-    return {c: transform_camera(camera, motion) for c, camera in estimated.items()}
+    """Return the estimated pinhole cameras of the recorded size, moved into the true world.
+
+    Maps that stages made of reduced pictures are enlarged to it.
+    """
+    recorded = read_recorded_cameras(dataset, subject)
+    motion = align_worlds(recorded, truth.cameras(subject))
+    return {c: transform_camera(pinhole(camera), motion) for c, camera in recorded.items()}
 
 
 def sampled_views(dataset: Dataset, truth: Truth) -> Iterator[tuple[str, str, int, Camera]]:
@@ -105,6 +109,19 @@ def sampled_views(dataset: Dataset, truth: Truth) -> Iterator[tuple[str, str, in
                 turn += 3 if len(cameras) % 3 else 1
 
 
+def enlarged(image: np.ndarray, camera: Camera, how: int = cv2.INTER_LINEAR) -> np.ndarray:
+    """Return an image (h, w[, C]) at a camera's size."""
+    size = camera.width, camera.height
+    return image if image.shape[1::-1] == size else cv2.resize(image, size, interpolation=how)
+
+
+def enlarged_depth(
+    depth: np.ndarray, valid: np.ndarray, camera: Camera
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return depth and validity (H, W) at a camera's size, valid where every neighbour is."""
+    return enlarged(depth, camera), enlarged(valid.astype(np.float32), camera) == 1
+
+
 def measure_matte(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
     """Return mean absolute alpha errors over whole images, and over the truth's soft rim."""
     whole, rim, rows, names = [], [], [], []
@@ -112,7 +129,7 @@ def measure_matte(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
         path = dataset.matte_file(subject, expression, camera.id)
         if not path.is_file():
             continue
-        alpha = read_image(path).astype(np.float64) / 255.0
+        alpha = enlarged(read_image(path), camera).astype(np.float64) / 255.0
         true = truth.render_alpha(subject, frame, camera)
         error = np.abs(alpha - true)
         soft = (true > 0.02) & (true < 0.98)
@@ -167,7 +184,7 @@ def measure_depth(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
         path = depth_file(folder, camera.id)
         if path is None:
             continue
-        depth, valid = read_depth(path)
+        depth, valid = enlarged_depth(*read_depth(path), camera)
         true, true_valid = truth.render_depth(subject, frame, camera)
         both = valid & true_valid
         errors.append(1e3 * np.abs(depth - true)[both])
@@ -205,6 +222,8 @@ def _normal_error(path: Path, truth: Truth, subject: str, frame: int, camera: Ca
     if not path.is_file():
         return np.full((camera.height, camera.width), np.nan)
     found, known = read_normals(path)
+    found = enlarged(found, camera)
+    known = enlarged(known.astype(np.float32), camera) == 1
     head = truth.vertices(subject, frame), truth.head_model(subject).faces.numpy()
     depth, normals = cast(head, camera)
     cosine = np.clip((found * normals).sum(-1), -1, 1)
@@ -218,8 +237,8 @@ def measure_regions(dataset: Dataset, truth: Truth, out: Path | None = None) -> 
         folder = dataset.item_dir("regions", f"{subject}/{expression}")
         if not (folder / f"{camera.id}.png").is_file():
             continue
-        labels = read_image(folder / f"{camera.id}.png")
-        alpha = read_image(folder / f"{camera.id}_head.png").astype(np.float64) / 255.0
+        labels = enlarged(read_image(folder / f"{camera.id}.png"), camera, cv2.INTER_NEAREST)
+        alpha = enlarged(read_image(folder / f"{camera.id}_head.png"), camera) / 255.0
         true = true_labels(truth, subject, frame, camera)
         true_alpha = true_head_alpha(truth, subject, frame, camera)
         found.append(view_row(true, true_alpha, alpha, labels))

@@ -2,6 +2,9 @@
 
 Stages after ``frames`` read the peak frames and plates that it wrote (``read_peak_frame``,
 ``read_plate_image``). ``FrameReader`` and ``FootageReader`` decode the footage itself.
+
+Pictures are what the ``frames`` stage makes of recorded frames: undistorted, and reduced if its
+settings say so. ``make_picture`` and ``read_cameras_of`` are where pictures and cameras meet.
 """
 
 from __future__ import annotations
@@ -20,10 +23,10 @@ from express50.errors import CaptureError, FormatError, StageError
 from express50.files.calibration import read_cameras
 from express50.files.containers import inside, read_picture, read_srgb
 from express50.files.digests import cached_by_file
-from express50.files.images import decode_image, read_alpha, upright
+from express50.files.images import decode_image, read_alpha, reduce_light, upright
 from express50.files.text import read_bytes, read_json, read_json_table
 from express50.files.video import VideoReader
-from express50.geometry.cameras import Camera, pinhole
+from express50.geometry.cameras import Camera, pinhole, resized
 from express50.geometry.sampling import undistort_image
 
 LARGEST_FRAME = 1 << 30  # bytes of a file that `write_frame` wrote
@@ -114,13 +117,14 @@ class FootageReader:
     """Frames of all cameras of a subject; videos stay open, so that reading forward is quick."""
 
     def __init__(self, dataset: Dataset, subject: str, undistort: bool = True) -> None:
-        """Open nothing yet; undistorted frames are as the cameras of ``read_cameras_of`` see them.
+        """Open nothing yet; with ``undistort`` frames are pictures, as peak frames are.
 
         Raises:
             StageError: ingest, or calibrate when undistorting, did not run.
         """
         self._index = read_index(dataset, subject)
-        self._cameras = read_cameras_of(dataset, subject, undistorted=False) if undistort else None
+        self._cameras = read_recorded_cameras(dataset, subject) if undistort else None
+        self._sizes = picture_sizes(dataset, subject)
         self._readers: dict[str, FrameReader] = {}
 
     def read(self, camera_id: str, frame: int) -> np.ndarray:
@@ -140,7 +144,8 @@ class FootageReader:
                 f"{self._index.subject}: camera {camera_id!r} is not calibrated; expected one of "
                 f"{', '.join(self._cameras)}"
             )
-        return undistort_image(image, self._cameras[camera_id])
+        camera = self._cameras[camera_id]
+        return make_picture(image, camera, self._sizes.get(camera_id, _size_of(camera)))
 
     def __enter__(self) -> FootageReader:
         return self
@@ -188,7 +193,8 @@ def read_peak_frame(dataset: Dataset, subject: str, expression: str, camera_id: 
     """Read a peak frame (H, W, 3) uint8 sRGB, as the pinhole camera of ``read_cameras_of`` sees it.
 
     Raises:
-        CaptureError: the frames stage did not write it, or it cannot be read.
+        CaptureError: the frames stage did not write it at the size of the subject's pictures, or it
+            cannot be read.
     """
     path = dataset.frame_file(subject, expression, camera_id)
     if not path.is_file():
@@ -196,7 +202,7 @@ def read_peak_frame(dataset: Dataset, subject: str, expression: str, camera_id: 
             f"{path}: no frame of {camera_id}; run 'express50 frames {dataset.root}', or see "
             f"'express50 status {dataset.root}' for the reason"
         )
-    return _read_written(path)
+    return _read_written(path, picture_sizes(dataset, subject).get(camera_id))
 
 
 def read_matted_frame(dataset: Dataset, item: str, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -227,10 +233,11 @@ def read_plate_image(dataset: Dataset, subject: str, camera_id: str) -> np.ndarr
         CaptureError: it cannot be read.
     """
     path = dataset.plate_file(subject, camera_id)
-    return _read_written(path) if path.is_file() else None
+    size = picture_sizes(dataset, subject).get(camera_id)
+    return _read_written(path, size) if path.is_file() else None
 
 
-def _read_written(path: Path) -> np.ndarray:
+def _read_written(path: Path, size: tuple[int, int] | None) -> np.ndarray:
     """Read what ``write_frame`` wrote, in three quarters of the time of ``read_srgb``."""
     fix = "delete its folder and run 'express50 frames' again"
     data = read_bytes(path, CaptureError, LARGEST_FRAME, fix)
@@ -240,6 +247,12 @@ def _read_written(path: Path) -> np.ndarray:
         raise CaptureError(f"{path}: truncated or damaged ({error}); {fix}") from error
     if image.dtype != np.uint8 or image.shape[2:] != (3,):
         raise CaptureError(f"{path}: {image.dtype} {image.shape}, expected 8-bit RGB; {fix}")
+    found = (image.shape[1], image.shape[0])
+    if size not in (None, found):
+        raise CaptureError(
+            f"{path}: {found[0]}x{found[1]}, expected {size[0]}x{size[1]} as the subject's other"
+            " pictures; it was written with another frames.image_side: run 'express50 frames' again"
+        )
     return image
 
 
@@ -251,23 +264,78 @@ def frame_inputs(dataset: Dataset, subject: str, expression: str) -> dict[str, P
 
 
 def read_cameras_of(dataset: Dataset, subject: str, undistorted: bool = True) -> dict[str, Camera]:
-    """Read the calibrated cameras of a subject, sorted by id.
+    """Read the cameras of a subject's pictures, sorted by id.
 
-    Undistorted frames belong to the pinhole cameras, which are given unless ``undistorted`` is
-    false.
+    They are the calibrated ones, at the size to which the frames stage reduced the pictures; as
+    recorded before it ran. Pictures belong to the pinhole cameras, which are given unless
+    ``undistorted`` is false.
+
+    Raises:
+        StageError: the subject is not calibrated.
+    """
+    sizes = picture_sizes(dataset, subject)
+    cameras = {
+        name: camera if sizes.get(name, _size_of(camera)) == _size_of(camera)
+        else resized(camera, *sizes[name])
+        for name, camera in read_recorded_cameras(dataset, subject).items()
+    }  # fmt: skip
+    return {name: pinhole(c) if undistorted else c for name, c in cameras.items()}
+
+
+def read_recorded_cameras(dataset: Dataset, subject: str) -> dict[str, Camera]:
+    """Read the calibrated cameras of a subject's footage as recorded, sorted by id.
 
     Raises:
         StageError: the subject is not calibrated.
     """
     path = dataset.cameras_file(subject)
     try:
-        cameras = _cameras_cached(path)
+        return dict(_cameras_cached(path))
     except FileNotFoundError as error:
         raise StageError(
             f"{path}: subject {subject!r} is not calibrated; "
             f"run 'express50 calibrate {dataset.root}'"
         ) from error
-    return {name: pinhole(c) if undistorted else c for name, c in cameras.items()}
+
+
+def make_picture(image: np.ndarray, camera: Camera, size: tuple[int, int]) -> np.ndarray:
+    """Make the picture of a recorded image (H, W, 3) uint8: undistort it, then reduce it.
+
+    Args:
+        image: of the recorded camera.
+        camera: as recorded.
+        size: width and height of the picture. Areas are averaged in linear light, as a sensor
+            with larger pixels would do.
+    """
+    undistorted = undistort_image(image, camera)
+    return undistorted if size == _size_of(camera) else reduce_light(undistorted, *size)
+
+
+def picture_sizes(dataset: Dataset, subject: str) -> dict[str, tuple[int, int]]:
+    """Read width and height of a subject's pictures by camera; empty before the frames stage.
+
+    Raises:
+        FormatError: the file is not {camera: [width, height]} with whole numbers above 0.
+    """
+    path = dataset.picture_sizes_file(subject)
+    return _sizes_cached(path) if path.is_file() else {}
+
+
+@cached_by_file(64)
+def _sizes_cached(path: Path) -> dict[str, tuple[int, int]]:
+    fix = "delete its folder and run 'express50 frames' again"
+    table = read_json_table(path, FormatError, fix)
+    sizes = {}
+    for name, row in table.items():
+        numbers = isinstance(row, list) and all(type(n) is int and n > 0 for n in row)
+        if not numbers or len(row) != 2:
+            raise FormatError(f"{path}: {name} is {row}, expected width and height, pixels; {fix}")
+        sizes[name] = (row[0], row[1])
+    return sizes
+
+
+def _size_of(camera: Camera) -> tuple[int, int]:
+    return camera.width, camera.height
 
 
 @cached_by_file(64)

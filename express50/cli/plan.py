@@ -186,7 +186,8 @@ def measure_sizes(
         found = [(footage_of(dataset), measure(dataset, known))]
     else:
         seen = trials[0]
-        found = [(replace(seen.footage, expressions=seen.scripted), {})]
+        # A run without a budget has standard settings, which do not reduce pictures.
+        found = [(replace(seen.footage, expressions=seen.scripted, side=0.0), {})]
     for trial in trials:
         table = {
             name: Measured(
@@ -251,7 +252,7 @@ def target_of(name: str | None, sizes: Mapping[str, float], measured: Footage) -
     values |= TARGETS.get(name or "", {}) | dict(sizes)
     each = measured.frames / max(measured.expressions, 1)
     each = values.pop("frames_per_expression", each)
-    return Footage(**values, frames=each * values["expressions"])
+    return Footage(**values, frames=each * values["expressions"], side=measured.side)
 
 
 def estimate(

@@ -137,6 +137,10 @@ class Dataset:
         """Return the path of a camera's undistorted, colour-corrected clean plate."""
         return self.frame_file(subject, PLATES, camera)
 
+    def picture_sizes_file(self, subject: str) -> Path:
+        """Return the path of the sizes of a subject's peak frames and plates, by camera."""
+        return self.item_dir("frames", f"{subject}/{PLATES}") / "pictures.json"
+
     def matte_file(self, subject: str, expression: str, camera: str) -> Path:
         """Return the path of the subject's 8-bit opacity in one peak frame."""
         return self.item_dir("matte", f"{subject}/{expression}") / f"{camera}.png"

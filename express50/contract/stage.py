@@ -130,8 +130,9 @@ class NoSettings:
 class Growth:
     """Sizes of the footage that a stage's cost is proportional to, for ``express50 plan``.
 
-    The sizes are ``subjects``, ``expressions``, ``views`` (cameras), ``pixels`` (of an image) and
-    ``frames`` (of a camera); several are multiplied.
+    The sizes are ``subjects``, ``expressions``, ``views`` (cameras), ``pixels`` (of a recorded
+    image), ``picture`` (pixels of a peak frame, which may be reduced) and ``frames`` (of a camera);
+    several are multiplied.
 
     Attributes:
         items: number of items.
@@ -140,6 +141,8 @@ class Growth:
         more: number of further items, such as one of plates per subject; none by default.
         side: longer side, pixels, to which the stage reduces pictures for most of its work at
             standard settings, so that larger pictures take no longer; 0 if it does not.
+        reduces: name of the stage's setting to whose pixels it reduces the longer side of pictures
+            for all later stages; 0 pixels leave them as they are.
     """
 
     items: tuple[str, ...] = ("subjects",)
@@ -147,6 +150,7 @@ class Growth:
     disk: tuple[str, ...] = ()
     more: tuple[str, ...] = ()
     side: int = 0
+    reduces: str = ""
 
 
 @dataclass(frozen=True)

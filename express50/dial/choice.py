@@ -122,7 +122,9 @@ def item_seconds(load: Workload, stage: Stage, label: str) -> tuple[int, float]:
         share = first.costs[stage.name].items / max(first.footage.items(stage.growth), 1e-9)
     count = max(1, round(share * load.footage.items(stage.growth)))
     samples = sizes_of(load.measured, stage)
-    work = [footage.time(stage.growth) for footage in (load.footage, trial.footage)]
+    # What reduced pictures save was measured, see `size_factor`.
+    whole = replace(load.footage, side=trial.footage.side)
+    work = [footage.time(stage.growth) for footage in (whole, trial.footage)]
     grown = typical_seconds(samples, work[0]) / typical_seconds(samples, work[1])
     return count, (cost.core_seconds if load.cores else cost.seconds) * grown
 
@@ -135,6 +137,26 @@ def sizes_of(measured: PilotFigures, stage: Stage) -> list[MeasuredSize]:
         MeasuredSize(t.footage.time(stage.growth), [t.costs[stage.name].core_seconds])
         for t in (base, *small[:1]) if stage.name in t.costs
     ] or [MeasuredSize(base.footage.time(stage.growth), [1.0])]  # fmt: skip
+
+
+def size_factor(load: Workload, stage: Stage, settings: Mapping[str, str]) -> float:
+    """Return how many times as long a stage takes on pictures of the size that settings choose.
+
+    The base is the first trial. Trials of the stages that reduce pictures measured it.
+    """
+    base, factor = load.measured.trials[0], 1.0
+    for earlier in load.stages:
+        label = settings.get(earlier.name, base.settings[earlier.name])
+        if earlier is stage:
+            break
+        if not earlier.growth.reduces or label == base.settings[earlier.name]:
+            continue
+        found = cost_at(load, earlier.name, label)
+        costs = [trial.costs.get(stage.name) for trial in (found[1], base)] if found else []
+        seconds = [cost.core_seconds for cost in costs if cost is not None]
+        if len(seconds) == 2 and min(seconds) > 0:
+            factor *= seconds[0] / seconds[1]
+    return factor
 
 
 def stage_seconds(load: Workload, stage: Stage, label: str, left: float = 1.0) -> float:
@@ -219,9 +241,11 @@ def front(load: Workload) -> list[Point]:
         there, share = load.done.get(stage.name, ("", 0.0))
         losses, grown = load.measured.losses.get(stage.name, {}), []
         for label in labels_of(load, stage.name):
-            whole, rest = (stage_seconds(load, stage, label, part) for part in (1.0, 1.0 - share))
+            parts = [stage_seconds(load, stage, label, part) for part in (1.0, 1.0 - share)]
             more = losses.get(label, {})
             for state in states:
+                factor = size_factor(load, stage, state.settings)
+                whole, rest = (factor * part for part in parts)
                 kept = state.kept and label == there
                 lost = {r: value + more.get(r, 0.0) ** 2 for r, value in state.lost.items()}
                 each = {**state.each, stage.name: rest if kept else whole}

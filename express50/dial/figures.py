@@ -10,22 +10,31 @@ from typing import Any
 
 from express50.capture.index import read_index
 from express50.contract.layout import Dataset
-from express50.contract.stage import Growth
+from express50.contract.stage import Growth, stages
 from express50.errors import FormatError, StageError
-from express50.files.text import read_json_table
+from express50.files.text import read_json_table, read_toml
 
 SHORT_SIDE = 0.75  # of a picture over its long side; cameras have 0.56 to 1
 
 
 @dataclass(frozen=True, kw_only=True)
 class Footage:
-    """Holds the size of a campaign; means over subjects where it was measured."""
+    """Holds the size of a campaign; means over subjects where it was measured.
+
+    ``side`` is the length, pixels, to which the longer side of peak frames is reduced; 0: not.
+    """
 
     subjects: float
     expressions: float
     views: float
     pixels: float
     frames: float
+    side: float = 0.0
+
+    @property
+    def picture(self) -> float:
+        """Return the pixels of a peak frame."""
+        return min(self.pixels, SHORT_SIDE * self.side**2) if self.side else self.pixels
 
     def work(self, factors: Sequence[str]) -> float:
         """Return the product of the named sizes."""
@@ -33,8 +42,9 @@ class Footage:
 
     def time(self, growth: Growth) -> float:
         """Return the size that the seconds of a stage's item are proportional to."""
-        most = SHORT_SIDE * growth.side**2 if growth.side else math.inf
-        return replace(self, pixels=min(self.pixels, most)).work(growth.time)
+        sides = [side for side in (self.side * ("picture" in growth.time), growth.side) if side]
+        seen = replace(self, side=float(min(sides, default=0)))
+        return replace(seen, pixels=seen.picture).work(growth.time)
 
     def items(self, growth: Growth) -> float:
         """Return the number of items of a stage."""
@@ -53,7 +63,19 @@ def footage_of(dataset: Dataset) -> Footage:
         views=len(cameras) / len(indices),
         pixels=sum(camera.width * camera.height for camera in cameras) / len(cameras),
         frames=sum(camera.frames for camera in cameras) / len(cameras),
+        side=_reduced_side(dataset),
     )
+
+
+def _reduced_side(dataset: Dataset) -> float:
+    """Return the side to which the settings of the last run reduced pictures; 0: not."""
+    side = 0.0
+    for name, stage in stages().items():
+        path = dataset.config_file(name)
+        if stage.growth.reduces and path.is_file():
+            table = read_toml(path, FormatError).get(name, {})
+            side = float(table.get(stage.growth.reduces, 0))
+    return side
 
 
 @dataclass(frozen=True, kw_only=True)

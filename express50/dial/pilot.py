@@ -342,7 +342,10 @@ def trial_seconds(pilot: Pilot, base: Trial, name: str, factor: float = 1.0) -> 
     """Guess the seconds of a trial that changes a stage: it, and all that follows."""
     names = pilot.chain.names
     later = [n for n in names[names.index(name) :] if n in base.costs]
-    return sum(_charged(pilot, base.costs[n]) * (factor if n == name else 1.0) for n in later)
+    reduces = pilot.chain.stages[names.index(name)].growth.reduces  # then all later ones cost more
+    return sum(
+        _charged(pilot, base.costs[n]) * (factor if reduces or n == name else 1.0) for n in later
+    )
 
 
 def _losses(

@@ -21,7 +21,7 @@ from express50.contract.layout import Dataset
 from express50.dataset.depth_files import depth_file, read_depth
 from express50.dataset.tracks import read_registration, read_track
 from express50.errors import Express50Error, FormatError
-from express50.files.images import read_image
+from express50.files.images import read_image, resize_area
 from express50.files.text import read_json_table
 from express50.geometry.transforms import rigid_fit
 from express50.head.load import load_head
@@ -100,7 +100,8 @@ def _mattes_apart(a: Dataset, b: Dataset, subject: str, names: Sequence[str]) ->
         there = [pair for pair in pairs if all(path.is_file() for path in pair)]
         for pair in there[:COMPARED]:
             one, two = (read_image(path) for path in pair)
-            if one.shape == two.shape:
+            if one.ndim == two.ndim == 2:
+                one, two = (resize_area(image, *_larger(one, two)) for image in (one, two))
                 reach = np.ones([2 * max(1, round(RIM * max(one.shape))) + 1] * 2, np.uint8)
                 highest = cv2.dilate(np.maximum(one, two), reach)
                 rim = (highest > 12) & (cv2.erode(np.minimum(one, two), reach) < 243)
@@ -157,9 +158,18 @@ def _depths_apart(a: Dataset, b: Dataset, subject: str, names: Sequence[str]) ->
         pairs = [[depth_file(folder, c) for folder in folders] for c in cameras]
         for one, two in [pair for pair in pairs if None not in pair][:COMPARED]:
             (near, valid), (far, also) = (read_depth(path) for path in (one, two) if path)
-            if near.shape == far.shape and (valid & also).any():
-                found.append(float(1000 * np.median(np.abs(near - far)[valid & also])))
+            size = _larger(near, far)
+            near, far = (resize_area(depth, *size) for depth in (near, far))
+            known = [resize_area(one.astype(np.float32), *size) == 1 for one in (valid, also)]
+            if (both := known[0] & known[1]).any():
+                found.append(float(1000 * np.median(np.abs(near - far)[both])))
     return found
+
+
+def _larger(one: np.ndarray, two: np.ndarray) -> tuple[int, int]:
+    """Return width and height of the larger of two pictures, whose sizes settings may change."""
+    height, width = max(one.shape, two.shape)[:2]
+    return width, height
 
 
 RESULTS = (

@@ -29,6 +29,7 @@ from express50.dial.choice import (
     item_seconds,
     labels_of,
     scales,
+    size_factor,
     stage_seconds,
 )
 from express50.dial.figures import PilotFigures, dial_dir, footage_of, read_measured
@@ -333,15 +334,17 @@ def _run_one(run: _Run, stage: Stage) -> Summary | None:
     chain, clock, label = run.chain, run.clock, run.state.settings[stage.name]
     load = workload(chain, run.measured, clock.cores, {})
     items, item = item_seconds(load, stage, label)
+    factor = size_factor(load, stage, run.state.settings)
     rest = sum(
         min(stage_seconds(load, other, one) for one in labels_of(load, other.name))
+        * size_factor(load, other, run.state.settings)
         for other in chain.stages[chain.names.index(stage.name) + 1 :]
     )
     slow, early = run.slowness(), 0.0
     if clock.budget:
-        own = stage_seconds(load, stage, label) * slow
+        own = factor * stage_seconds(load, stage, label) * slow
         early = reserved(own, rest * slow, clock.left(), clock.budget.seconds)
-    clock.expect(item * slow, early)
+    clock.expect(factor * item * slow, early)
     before = clock.now()
     if not stage.items(chain.dataset):  # an earlier stage made nothing
         return None
@@ -350,7 +353,7 @@ def _run_one(run: _Run, stage: Stage) -> Summary | None:
     made = sum(o.status == "done" and not o.restored for o in summary.outcomes)
     if made:
         run.real += clock.now() - before
-        run.expected += stage_seconds(load, stage, label, min(1.0, made / items))
+        run.expected += factor * stage_seconds(load, stage, label, min(1.0, made / items))
     return summary
 
 
@@ -417,6 +420,7 @@ def _why(load: Workload, stage: Stage, point: Point) -> str:
     for other in (*reversed(ladder[:here]), *ladder[here + 1 :]):
         if other in tried:
             seconds = stage_seconds(load, stage, other) - stage_seconds(load, stage, label)
+            seconds *= size_factor(load, stage, point.settings)
             time = f"{format_seconds(abs(seconds))} {'more' if seconds > 0 else 'less'}"
             words.append(f"{other}: {time}, {_change(load, name, label, other, point)}")
     if untried:

@@ -313,6 +313,10 @@ def linear_to_srgb(image_linear: np.ndarray) -> np.ndarray:
 LIGHT_OF_LEVEL = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
 """Linear light (256,) of the levels of 8-bit sRGB."""
 
+# The same in 16 bits, where the darkest levels are 20 steps apart; and the level nearest to each.
+DEEP_LIGHT_OF_LEVEL = np.rint(65535 * LIGHT_OF_LEVEL.astype(np.float64)).astype(np.uint16)
+LEVEL_OF_DEEP_LIGHT = np.rint(255 * linear_to_srgb(np.arange(65536) / 65535)).astype(np.uint8)
+
 
 def scale_light(image: np.ndarray, gain: np.ndarray) -> np.ndarray:
     """Multiply an image's (H, W, 3) uint8 sRGB linear light by gain (3,), clipping at white."""
@@ -341,13 +345,27 @@ def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
     return cv2.resize(np.ascontiguousarray(image), (width, height), interpolation=mode)
 
 
+def shrunk_size(width: int, height: int, side: int) -> tuple[int, int]:
+    """Return width and height of an image after its longer side is reduced to ``side`` pixels."""
+    scale = side / max(width, height)
+    return (width, height) if scale >= 1 else (
+        max(1, round(width * scale)), max(1, round(height * scale))
+    )  # fmt: skip
+
+
 def shrink(image: np.ndarray, side: int) -> np.ndarray:
     """Average an image (H, W[, C]) down to at most ``side`` pixels on its longer side."""
-    scale = side / max(image.shape[:2])
-    if scale >= 1:
-        return image
-    height, width = (max(1, round(n * scale)) for n in image.shape[:2])
-    return resize_area(image, width, height)
+    width, height = shrunk_size(image.shape[1], image.shape[0], side)
+    return image if image.shape[:2] == (height, width) else resize_area(image, width, height)
+
+
+def reduce_light(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Average an image (H, W, 3) uint8 sRGB to a smaller size in linear light.
+
+    A pixel at an outline then mixes subject and background by their areas, as keying assumes.
+    """
+    light = cv2.LUT(np.ascontiguousarray(image), DEEP_LIGHT_OF_LEVEL)
+    return LEVEL_OF_DEEP_LIGHT[resize_area(light, width, height)]
 
 
 def edge_distance(mask: np.ndarray) -> np.ndarray:

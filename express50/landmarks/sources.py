@@ -68,7 +68,11 @@ def try_source(landmarks: str) -> None:
 
 
 def open_source(
-    landmarks: str, cameras: Mapping[str, Camera], refinements: int = 3, smallest: float = SMALLEST
+    landmarks: str,
+    cameras: Mapping[str, Camera],
+    refinements: int = 3,
+    smallest: float = SMALLEST,
+    pictures: Mapping[str, Camera] | None = None,
 ) -> Source:
     """Make a source ready.
 
@@ -78,6 +82,7 @@ def open_source(
         cameras: as recorded, by id; points of a file are undistorted with them.
         refinements: looks of the embedded network.
         smallest: windows that it searches, see `detect`.
+        pictures: pinhole cameras of the images that are looked at, by id; by default as recorded.
 
     Raises:
         ConfigError: the file is missing, or is not of the expected kind.
@@ -85,7 +90,7 @@ def open_source(
     """
     files = _existing_files(landmarks)
     if "landmarks" in files:
-        table = read_points(files["landmarks"], cameras)
+        table = read_points(files["landmarks"], cameras, pictures)
 
         def look_up(image: np.ndarray, camera_id: str, frame: int) -> Marked:
             rows = table.get((camera_id, frame))
@@ -141,12 +146,15 @@ def given_irises(rows: np.ndarray, face: Detection) -> Irises:
 Table = dict[tuple[str, int], np.ndarray]
 
 
-def read_points(path: Path, cameras: Mapping[str, Camera]) -> Table:
+def read_points(
+    path: Path, cameras: Mapping[str, Camera], pictures: Mapping[str, Camera] | None = None
+) -> Table:
     """Read points by camera and frame, undistorted.
 
     Args:
         path: .npz or .json.
         cameras: as recorded, by id; cameras of the file that are not among them are left out.
+        pictures: pinhole cameras of the undistorted images; by default of the recorded size.
 
     Returns:
         (68 or 70, 3) rows x, y in pixels of the undistorted image and confidence 0..1; x and y are
@@ -169,7 +177,8 @@ def read_points(path: Path, cameras: Mapping[str, Camera]) -> Table:
         if key[0] in cameras:
             camera = cameras[key[0]]
             rows = _checked(read, camera, path, key).copy()
-            focal, middle = camera.K[[0, 1], [0, 1]], camera.K[:2, 2]
+            K = (pictures or cameras)[key[0]].K
+            focal, middle = K[[0, 1], [0, 1]], K[:2, 2]
             rows[:, :2] = normalised(camera, rows[:, :2]) * focal + middle
             rows[~np.isfinite(rows[:, :2]).all(1)] = (np.nan, np.nan, 0.0)
             table[key] = rows

@@ -28,7 +28,7 @@ AGAIN = "import it again, or give it up with 'express50 import remove'"
 def import_inputs(dataset: Dataset, item: str, digest: Digest = path_digest) -> dict[str, str]:
     """Return the digests of what an import belongs to: the cameras, and each peak's frame.
 
-    ``item`` is a subject, or an expression of one.
+    ``item`` is a subject, or an expression of one, whose import also belongs to pictures of a size.
 
     Raises:
         Express50Error: cameras or peaks are missing or damaged.
@@ -36,7 +36,13 @@ def import_inputs(dataset: Dataset, item: str, digest: Digest = path_digest) -> 
     subject, _, expression = item.partition("/")
     frames = read_peaks(dataset, subject).items()
     chosen = {f"frame of {e}": str(n) for e, n in frames if expression in ("", e)}
-    return {"cameras": digest(dataset.cameras_file(subject)), **chosen}
+    found = {"cameras": digest(dataset.cameras_file(subject)), **chosen}
+    if expression:
+        from express50.capture.frames import read_cameras_of  # OpenCV would slow every command
+
+        cameras = read_cameras_of(dataset, subject).values()
+        found["size of pictures"] = repr({c.id: (c.width, c.height) for c in cameras})
+    return found
 
 
 def publish_import(

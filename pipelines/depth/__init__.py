@@ -78,8 +78,8 @@ STAGE = Stage(
     " views agree; every camera gets depth, normals and confidence.",
     growth=Growth(
         items=("subjects", "expressions"),
-        time=("views", "pixels"),
-        disk=("views", "pixels"),
+        time=("views", "picture"),
+        disk=("views", "picture"),
         side=DepthConfig.image_side,
     ),
 )

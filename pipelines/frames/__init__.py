@@ -1,21 +1,40 @@
-"""Write each labelled peak frame once, undistorted and colour-corrected, and the clean plates.
+"""Write each labelled peak frame once, undistorted, colour-corrected and reduced, and the plates.
 
 An item is an expression of a subject with all cameras. A seek in 4K H.264 costs half a second
-whichever way the peaks are grouped, and a changed label redoes one expression only. The plates of a
-subject are one more item.
+whichever way the peaks are grouped, and a changed label redoes one expression only. The clean
+plates of a subject, and the sizes of its pictures, are one more item.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 from express50.capture.index import peak_items, read_index, read_peak_rows
 from express50.contract.layout import PLATES, Dataset
-from express50.contract.stage import Growth, NoSettings, Result, Stage
+from express50.contract.stage import Growth, Result, Stage
+from express50.errors import ConfigError
+
+
+@dataclass(frozen=True, kw_only=True)
+class FramesConfig:
+    """Size of the pictures that every later stage works on."""
+
+    image_side: int = 0
+    """Longest side, pixels, to which peak frames, plates and cameras are reduced for all later
+    stages and the shards, 16 to 32768; smaller footage is not enlarged. 0: as recorded."""
+
+    def __post_init__(self) -> None:
+        """Check the range."""
+        if self.image_side and not 16 <= self.image_side <= 32768:
+            raise ConfigError(f"frames.image_side is {self.image_side}, expected 16 to 32768, or 0")
+
+
+PRESETS: dict[str, dict[str, object]] = {"draft": {"image_side": 1280}}
 
 
 def items(dataset: Dataset) -> list[str]:
-    """List `subject/expression` of every labelled peak, and `subject/_plates` where there are any.
+    """List `subject/expression` of every labelled peak, and `subject/_plates`.
 
     Only aligned and calibrated subjects have items.
     """
@@ -23,10 +42,10 @@ def items(dataset: Dataset) -> list[str]:
         item for item in peak_items(dataset) if dataset.cameras_file(item.split("/")[0]).is_file()
     ]
     subjects = dict.fromkeys(item.split("/")[0] for item in peaks)
-    return peaks + [f"{s}/{PLATES}" for s in subjects if read_index(dataset, s).plates]
+    return peaks + [f"{subject}/{PLATES}" for subject in subjects]
 
 
-def inputs(dataset: Dataset, item: str, config: NoSettings) -> dict[str, Path | str]:
+def inputs(dataset: Dataset, item: str, config: FramesConfig) -> dict[str, Path | str]:
     """Name the index, the cameras, and the peak or the plates; the index holds footage hashes."""
     subject, expression = item.split("/")
     found: dict[str, Path | str] = {
@@ -40,27 +59,29 @@ def inputs(dataset: Dataset, item: str, config: NoSettings) -> dict[str, Path | 
     return found | {"peak": repr(read_peak_rows(dataset, subject)[expression])}
 
 
-def run(dataset: Dataset, item: str, config: NoSettings, out: Path) -> Result:
+def run(dataset: Dataset, item: str, config: FramesConfig, out: Path) -> Result:
     """Write one file per camera, and a contact sheet."""
     from pipelines.frames.stage import run as work
 
-    return work(dataset, item, out)
+    return work(dataset, item, out, config.image_side)
 
 
 STAGE = Stage(
     name="frames",
     version=2,
-    config=NoSettings,
+    config=FramesConfig,
     items=items,
     inputs=inputs,
     run=run,
+    presets=PRESETS,
     help="write the labelled peak frames, undistorted and colour-corrected",
     purpose="Peak frames and clean plates as every later stage reads them: undistorted to the"
-    " calibrated pinhole camera, colour-corrected, lossless.",
+    " calibrated pinhole camera, colour-corrected, lossless, and reduced if the settings say so.",
     growth=Growth(
         items=("subjects", "expressions"),
         time=("views", "pixels"),
-        disk=("views", "pixels"),
+        disk=("views", "picture"),
         more=("subjects",),
+        reduces="image_side",
     ),  # fmt: skip
 )

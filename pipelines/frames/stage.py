@@ -9,13 +9,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.capture.frames import FrameReader, read_cameras_of, read_recorded_plate, write_frame
+from express50.capture.frames import (
+    FrameReader,
+    make_picture,
+    read_recorded_cameras,
+    read_recorded_plate,
+    write_frame,
+)
 from express50.capture.index import check_peak, read_index, read_peak_rows
 from express50.contract.layout import PLATES, Dataset
 from express50.contract.stage import Note, Result
 from express50.errors import CaptureError, StageError
-from express50.files.images import shrink, tile_sheet, write_image
-from express50.geometry.sampling import pictured_share, undistort_image
+from express50.files.atomic import write_json
+from express50.files.images import shrink, shrunk_size, tile_sheet, write_image
+from express50.geometry.sampling import pictured_share
 
 COLUMNS = 6  # of the contact sheet
 TILE = 240  # pixels
@@ -28,10 +35,11 @@ Read = Callable[[str], np.ndarray]
 """Camera id to its recorded image (H, W, 3); raises CaptureError."""
 
 
-def run(dataset: Dataset, item: str, out: Path) -> Result:
+def run(dataset: Dataset, item: str, out: Path, side: int) -> Result:
     """Write `<camera>.jxl` per calibrated camera; a camera that cannot be read is dropped.
 
-    The item is `subject/expression`, or `subject/_plates`.
+    The item is `subject/expression`, or `subject/_plates`, which also holds the pictures' sizes.
+    `side` is their longer side, pixels; 0: as recorded.
 
     Raises:
         CaptureError: the labelled frame is not the one that was indexed.
@@ -39,8 +47,13 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
     """
     cv2.setNumThreads(1)  # the runner counts one core per item
     subject, expression = item.split("/")
-    cameras = read_cameras_of(dataset, subject, undistorted=False)
-    if expression == PLATES:
+    cameras = read_recorded_cameras(dataset, subject)
+    sizes = {
+        name: shrunk_size(c.width, c.height, side or max(c.width, c.height))
+        for name, c in cameras.items()
+    }
+    if plates := expression == PLATES:
+        write_json(out / "pictures.json", sizes)
         index = read_index(dataset, subject)
         cameras = {name: camera for name, camera in cameras.items() if name in index.plates}
     read = _reader(dataset, subject, expression)
@@ -49,7 +62,7 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
     tiles: dict[str, np.ndarray] = {}
     for name, camera in cameras.items():
         try:
-            image = undistort_image(read(name), camera)
+            image = make_picture(read(name), camera, sizes[name])
         except CaptureError as error:
             dropped.append(Note(name, str(error)))
             continue
@@ -57,11 +70,13 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
         if (share := pictured_share(camera)) < 1:
             warnings.append(Note(name, FOLDS.format(1 - share)))
         tiles[name] = shrink(image, TILE)
-    if not tiles:
+    if not tiles and not plates:
         why = "; ".join(f"{note.what}: {note.why}" for note in dropped[:3])
         raise StageError(f"{item}: no camera could be read ({why or 'none is calibrated'})")
-    (out / "qc").mkdir()
-    write_image(out / "qc" / "frames.jpg", tile_sheet(tiles, COLUMNS, TILE), quality=88)
+    if tiles:
+        (out / "qc").mkdir()
+        sheet = tile_sheet(tiles, COLUMNS, TILE)
+        write_image(out / "qc" / "frames.jpg", sheet, quality=88)
     return Result({"frames": len(tiles)}, dropped, warnings)
 
 

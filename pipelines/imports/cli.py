@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from express50.capture.frames import read_cameras_of, read_peak_frame
+from express50.capture.frames import read_cameras_of, read_peak_frame, read_recorded_cameras
 from express50.console import FAILED, OK, add_command, answer
 from express50.contract.layout import Dataset, existing_dataset, included_subjects
 from express50.contract.stage import Note, Result, stages
 from express50.dataset.depth_files import write_depth
 from express50.errors import ConfigError, StageError
 from express50.files.images import read_alpha, write_image
-from express50.geometry.cameras import Camera, pinhole
+from express50.geometry.cameras import Camera
 from express50.head.load import load_head
 from express50.head.model import landmarks
 from express50.runner.imported import publish_import, remove_imports
@@ -203,11 +203,12 @@ def _check_track(
 
 @dataclass(frozen=True)
 class PeakPictures:
-    """Holds the pictures of one peak frame: cameras as recorded, and a file of each."""
+    """Holds the pictures of one peak frame: cameras as recorded and as seen, a file of each."""
 
     dataset: Dataset
     subject: str
     peak: PeakFrame
+    recorded: dict[str, Camera]
     cameras: dict[str, Camera]
     files: dict[str, Path]
     args: argparse.Namespace
@@ -216,10 +217,6 @@ class PeakPictures:
     def item(self) -> str:
         """Return the name of the item."""
         return f"{self.subject}/{self.peak.expression}"
-
-    def undistorted(self) -> dict[str, Camera]:
-        """Return the cameras of what is imported."""
-        return {name: pinhole(camera) for name, camera in self.cameras.items()}
 
     def footage(self) -> dict[str, np.ndarray]:
         """Read what the cameras recorded, undistorted."""
@@ -235,11 +232,11 @@ def _plan_pictures(
     args: argparse.Namespace,
 ) -> dict[str, Write]:
     """Plan one item per expression; StageError, and no item, if files are missing."""
-    cameras = read_cameras_of(dataset, subject, undistorted=False)
+    recorded, cameras = read_recorded_cameras(dataset, subject), read_cameras_of(dataset, subject)
     every = []
     for peak in peaks:
         files = {name: fill(args.pattern, subject, peak, name) for name in cameras}
-        every.append(PeakPictures(dataset, subject, peak, cameras, files, args))
+        every.append(PeakPictures(dataset, subject, peak, recorded, cameras, files, args))
     missing = [path for one in every for path in one.files.values() if not path.is_file()]
     if missing:
         more = f" and {len(missing) - 3} more" if missing[3:] else ""
@@ -251,9 +248,11 @@ def _plan_pictures(
 
 
 def _write_masks(given: PeakPictures, out: Path) -> Result:
-    distorted = given.args.distorted
-    masks = {n: read_mask(path, given.cameras[n], distorted) for n, path in given.files.items()}
-    check_masks(given.undistorted(), masks, given.item)
+    masks = {
+        name: read_mask(path, given.recorded[name], given.cameras[name], given.args.distorted)
+        for name, path in given.files.items()
+    }
+    check_masks(given.cameras, masks, given.item)
     notes, checks = list[Note](), dict[str, object](cameras=len(masks))
     found = observe_peak(given.dataset, given.subject, given.peak, notes)
     with trusting(given.args.trust, notes):
@@ -265,9 +264,11 @@ def _write_masks(given: PeakPictures, out: Path) -> Result:
 
 
 def _write_depths(given: PeakPictures, out: Path) -> Result:
-    cameras, depths, args = given.undistorted(), {}, given.args
+    cameras, depths, args = given.cameras, {}, given.args
     for name, path in given.files.items():
-        depth = read_foreign_depth(path, given.cameras[name], args.metres, args.ray, args.distorted)
+        depth = read_foreign_depth(
+            path, given.recorded[name], cameras[name], args.metres, args.ray, args.distorted
+        )
         matte = given.dataset.matte_file(given.subject, given.peak.expression, name)
         # Depth of the set would become part of the head.
         depths[name] = depth * (read_alpha(matte) > 127) if matte.is_file() else depth

@@ -11,8 +11,15 @@ import open3d as o3d
 
 from express50.errors import FormatError, StageError
 from express50.files.arrays import read_npy
-from express50.files.images import read_image
-from express50.geometry.cameras import Camera, pinhole, project_pinhole, triangulate, unproject
+from express50.files.images import read_image, resize_area
+from express50.geometry.cameras import (
+    Camera,
+    pinhole,
+    project_pinhole,
+    resized,
+    triangulate,
+    unproject,
+)
 from express50.geometry.conventions import K_to_opencv, cell_centres, cell_to_corner
 from express50.geometry.meshes import write_ply
 from express50.geometry.sampling import undistort_image, undistort_maps
@@ -31,13 +38,14 @@ SURE = 3.0  # views of a point for full confidence
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
-def read_mask(path: Path, camera: Camera, distorted: bool) -> np.ndarray:
-    """Read a mask as opacity (H, W) uint8 of the camera's undistorted picture.
+def read_mask(path: Path, recorded: Camera, seen: Camera, distorted: bool) -> np.ndarray:
+    """Read a mask as opacity (H, W) uint8 of a pinhole camera's picture.
 
-    The opacity of a picture with four channels counts; masks of 0 and 1 are black and white.
+    The opacity of a picture with four channels counts; masks of 0 and 1 are black and white. Its
+    size is that of the footage as recorded, or that to which the `frames` stage reduced pictures.
 
     Raises:
-        FormatError: it is missing, no mask, or not of the camera's size.
+        FormatError: it is missing, no mask, or of another size.
     """
     image = read_image(path)
     if image.ndim == 3:
@@ -52,24 +60,26 @@ def read_mask(path: Path, camera: Camera, distorted: bool) -> np.ndarray:
     ):
         raise FormatError(f"{path}: holds values outside of 0 to {most:g}, expected opacity")
     alpha = np.rint(image * (255.0 / most)).astype(np.uint8)
-    _check_size(path, alpha, camera)
-    return undistort_image(alpha, camera) if distorted else alpha
+    camera = _camera_of_size(path, alpha, recorded, seen)
+    alpha = undistort_image(alpha, camera) if distorted else alpha
+    return resize_area(alpha, seen.width, seen.height) if camera is recorded else alpha
 
 
 def read_foreign_depth(
-    path: Path, camera: Camera, metres: float, along_ray: bool, distorted: bool
+    path: Path, recorded: Camera, seen: Camera, metres: float, along_ray: bool, distorted: bool
 ) -> np.ndarray:
-    """Read depth (H, W) float32, camera z in metres of the undistorted picture; 0 is unknown.
+    """Read depth (H, W) float32, metres along z of a pinhole camera's picture; 0 is unknown.
 
     Args:
-        path: 16-bit PNG or TIFF, EXR, or .npy.
-        camera: of the picture, with its distortion.
+        path: 16-bit PNG or TIFF, EXR, or .npy, of the size of the footage or of the picture.
+        recorded: camera of the footage, with its distortion.
+        seen: pinhole camera of the picture.
         metres: per unit of the file.
         along_ray: whether the file holds the length of the ray.
         distorted: whether its pixels are those of the footage as recorded.
 
     Raises:
-        FormatError: it is missing, no depth map, or not of the camera's size.
+        FormatError: it is missing, no depth map, or of another size.
     """
     if path.suffix == ".npy":
         values = read_npy(path, FormatError, "a depth map")
@@ -81,7 +91,7 @@ def read_foreign_depth(
         values = values[..., 0]
     if values.ndim != 2 or values.dtype.kind not in "fui":
         raise FormatError(f"{path}: {values.dtype} {values.shape}, expected (H, W) depth")
-    _check_size(path, values, camera)
+    camera = _camera_of_size(path, values, recorded, seen)
     known = np.isfinite(values) & (values != 0)
     depth = np.where(known, values, 0).astype(np.float32)
     if known.any() and (depth[known] < 0).mean() > 0.5:
@@ -93,7 +103,14 @@ def read_foreign_depth(
     if distorted and camera.dist.any():
         x, y = undistort_maps(camera)
         depth = cv2.remap(depth, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
-    return depth / ray_lengths(pinhole(camera)) if along_ray else depth
+    depth = depth / ray_lengths(pinhole(camera)) if along_ray else depth
+    if camera is not recorded:
+        return depth
+    rows, columns = (
+        (cell_centres(small) * (large / small)).astype(int)
+        for small, large in zip((seen.height, seen.width), depth.shape, strict=True)
+    )
+    return depth[np.ix_(rows, columns)]  # a mean across an edge would lie on neither side
 
 
 def ray_lengths(camera: Camera) -> np.ndarray:
@@ -103,16 +120,20 @@ def ray_lengths(camera: Camera) -> np.ndarray:
     return np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2).astype(np.float32)
 
 
-def _check_size(path: Path, image: np.ndarray, camera: Camera) -> None:
-    height, width = image.shape[:2]
-    if (width, height) != (camera.width, camera.height):
-        words = "export it at the footage's size"
-        if (height, width) == (camera.width, camera.height):
-            words = "it lies on its side; turn it"
-        raise FormatError(
-            f"{path}: {width}x{height}, expected the {camera.width}x{camera.height} of camera"
-            f" {camera.id}; {words}"
-        )
+def _camera_of_size(path: Path, image: np.ndarray, recorded: Camera, seen: Camera) -> Camera:
+    """Return the camera, with its distortion, that has an image's size."""
+    size = image.shape[1], image.shape[0]
+    if size == (recorded.width, recorded.height):
+        return recorded
+    if size == (seen.width, seen.height):
+        return resized(recorded, *size)
+    words = "export it at the footage's size"
+    if size == (recorded.height, recorded.width):
+        words = "it lies on its side; turn it"
+    raise FormatError(
+        f"{path}: {size[0]}x{size[1]}, expected the {recorded.width}x{recorded.height} of camera"
+        f" {recorded.id}; {words}"
+    )
 
 
 def check_masks(cameras: Mapping[str, Camera], masks: Mapping[str, np.ndarray], where: str) -> None:

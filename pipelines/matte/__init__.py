@@ -64,6 +64,6 @@ STAGE = Stage(
     purpose="The opacity of the subject in every peak frame, keyed per camera; what the other"
     " cameras ruled out is red in the pictures, what they filled green.",
     growth=Growth(
-        items=("subjects", "expressions"), time=("views", "pixels"), disk=("views", "pixels")
+        items=("subjects", "expressions"), time=("views", "picture"), disk=("views", "picture")
     ),
 )

@@ -80,7 +80,7 @@ ENCODE = Stage(
     purpose="Each subject's samples, cropped to the head and encoded.",
     growth=Growth(
         items=("subjects",),
-        time=("expressions", "views", "pixels"),
+        time=("expressions", "views", "picture"),
         disk=("expressions", "views"),
         side=2 * EncodeConfig.size,  # if the head fills half of a picture
     ),

@@ -12,6 +12,7 @@ from express50.capture.frames import (
     read_gains,
     read_matted_frame,
     read_plate_image,
+    read_recorded_cameras,
 )
 from express50.capture.index import read_index, read_peaks
 from express50.contract.layout import Dataset
@@ -59,7 +60,8 @@ class PackedSubject:
 
     Attributes:
         name: subject id.
-        cameras: pinhole cameras by id.
+        cameras: pinhole cameras of the pictures by id.
+        recorded: width and height of the footage by camera.
         gains: linear light (3,) by camera, as far as it was measured.
         peaks: decode index by expression.
         labels: label without the annotator's name, by expression.
@@ -73,6 +75,7 @@ class PackedSubject:
 
     name: str
     cameras: dict[str, Camera]
+    recorded: dict[str, list[int]]
     gains: dict[str, np.ndarray]
     peaks: dict[str, int]
     labels: dict[str, dict]
@@ -100,6 +103,7 @@ def read_subject(dataset: Dataset, name: str) -> PackedSubject:
     return PackedSubject(
         name=name,
         cameras=read_cameras_of(dataset, name),
+        recorded={c.id: [c.width, c.height] for c in read_recorded_cameras(dataset, name).values()},
         gains=read_gains(dataset, name),
         peaks=read_peaks(dataset, name),
         labels={expression: nameless(row) for expression, row in peak_rows.items()},
@@ -286,6 +290,8 @@ def encode_sample(
         "track": subject.tracked[expression],
         "width": config.size,
     }
+    if (recorded := subject.recorded[camera.id]) != meta["source_size"]:
+        meta["recorded_size"] = recorded
     text = json.dumps(meta, sort_keys=True, separators=(",", ":"), allow_nan=False)
     members["meta.json"] = text.encode()
     return PackedSample(subject.name, expression, camera.id, members), meta

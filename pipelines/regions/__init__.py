@@ -95,8 +95,8 @@ STAGE = Stage(
     " hair, neck, torso, glasses and hands; a second matte holds the head alone.",
     growth=Growth(
         items=("subjects", "expressions"),
-        time=("views", "pixels"),
-        disk=("views", "pixels"),
+        time=("views", "picture"),
+        disk=("views", "picture"),
         side=RegionsConfig.image_side,
     ),
 )

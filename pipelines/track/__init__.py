@@ -84,7 +84,7 @@ STAGE = Stage(
     " per frame, and an albedo texture.",
     growth=Growth(
         items=("subjects",),
-        time=("expressions", "views", "pixels"),
+        time=("expressions", "views", "picture"),
         disk=("expressions",),
         side=TrackConfig.photo_side,
     ),

@@ -8,7 +8,12 @@ from functools import partial
 
 import numpy as np
 
-from express50.capture.frames import FootageReader, read_cameras_of, read_peak_frame
+from express50.capture.frames import (
+    FootageReader,
+    read_cameras_of,
+    read_peak_frame,
+    read_recorded_cameras,
+)
 from express50.capture.index import read_peaks
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note
@@ -48,8 +53,8 @@ Look = Callable[[np.ndarray | None], Observation | None]
 
 def open_landmarks(dataset: Dataset, subject: str, landmarks: str, search: float) -> Source:
     """Open the source of landmarks; files of points refer to the footage as recorded."""
-    recorded = read_cameras_of(dataset, subject, undistorted=False)
-    return open_source(landmarks, recorded, DETECTOR_PASSES, search)
+    recorded, seen = read_recorded_cameras(dataset, subject), read_cameras_of(dataset, subject)
+    return open_source(landmarks, recorded, DETECTOR_PASSES, search, seen)
 
 
 def open_follower(landmarks: str) -> Follow | None:

@@ -16,14 +16,16 @@ from express50.cli.main import main
 from express50.contract.layout import Dataset
 from express50.dataset.depth_files import read_depth
 from express50.dataset.tracks import read_track
+from express50.errors import StageError
 from express50.files.calibration import read_cameras, write_cameras
-from express50.files.images import read_alpha, write_image
+from express50.files.images import read_alpha, shrink, write_image
 from express50.geometry.conventions import FLIP_YZ
 from express50.geometry.meshes import read_surface
 from express50.geometry.transforms import make_transform
 from express50.runner.ledger import Ledger
 from express50.runner.runner import run_stage
 from pipelines.depth import STAGE as DEPTH
+from pipelines.frames import STAGE as FRAMES
 from pipelines.imports.footage_check import (
     check_landmarks,
     check_masks_show_face,
@@ -283,6 +285,21 @@ def test_masks_of_every_kind_become_mattes(original, dataset, tmp_path, kind) ->
     assert done.count("skipped") == 2
 
 
+def test_masks_of_recorded_or_reduced_size_fit_reduced_pictures(dataset, tmp_path, capsys) -> None:
+    pattern = masks_of(dataset, tmp_path / "masks", write_image)
+    true = read_alpha(dataset.matte_file("S001", "smile", "cam01"))
+    assert run_stage(FRAMES, dataset, FRAMES.config(image_side=48), workers=0, progress=False).ok
+    reduced = tmp_path / "masks" / "smile" / "cam02.png"
+    write_image(reduced, shrink(read_alpha(reduced), 48))
+    assert take("matte", dataset, pattern) == 0
+    found = read_alpha(dataset.matte_file("S001", "smile", "cam01"))
+    np.testing.assert_array_equal(found, shrink(true, 48))
+    assert read_alpha(dataset.matte_file("S001", "smile", "cam02")).shape == (48, 48)
+    assert run_stage(FRAMES, dataset, FRAMES.config(), workers=0, progress=False).ok
+    with pytest.raises(StageError, match="imported for another size of pictures"):
+        run_stage(MATTE, dataset, MATTE.config(), workers=0, progress=False)
+
+
 def test_masks_that_do_not_fit_are_named(dataset, tmp_path, capsys) -> None:
     pattern = masks_of(dataset, tmp_path / "masks", write_image)
     folder = tmp_path / "masks" / "smile"
@@ -386,8 +403,6 @@ def face(cameras: dict, points: np.ndarray) -> Observation:
 
 
 def test_the_faces_of_the_footage_tell_other_subjects_apart(original) -> None:
-    from express50.errors import StageError
-
     cameras = read_cameras_of(original[0], "S001")
     points = np.random.default_rng(0).uniform([-0.06, -0.07, 0.06], [0.06, 0.05, 0.09], (68, 3))
     seen = face(cameras, points)

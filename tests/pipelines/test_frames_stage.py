@@ -19,9 +19,16 @@ from express50.capture.frames import (
 )
 from express50.capture.index import read_index, read_peaks
 from express50.contract.layout import PLATES
-from express50.errors import CaptureError
+from express50.errors import CaptureError, ConfigError, FormatError
 from express50.files.calibration import write_cameras
-from express50.files.images import read_image, write_image
+from express50.files.images import (
+    LIGHT_OF_LEVEL,
+    read_image,
+    reduce_light,
+    shrunk_size,
+    write_image,
+)
+from express50.geometry.cameras import pinhole, project
 from express50.geometry.sampling import undistort_image
 from express50.runner.runner import run_stage
 from pipelines.frames import STAGE
@@ -150,3 +157,90 @@ def test_a_damaged_peak_frame_is_one_clear_line(tmp_path, cut):
     path.write_bytes(path.read_bytes()[:cut])
     with pytest.raises(CaptureError, match=r"cam00\.jxl: truncated or damaged.*again"):
         read_peak_frame(dataset, "S001", "smile", "cam00")
+
+
+def whole_light(image):
+    return LIGHT_OF_LEVEL[image].astype(np.float64).mean((0, 1))
+
+
+@pytest.mark.parametrize("size", [(64, 48), (63, 47), (640, 1), (17, 31), (1, 1)])
+def test_reduced_pictures_keep_their_light_and_are_never_enlarged(size):
+    image = np.random.default_rng(2).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
+    for side in (16, 25, 1000):
+        width, height = shrunk_size(*size, side)
+        assert (width, height) == (size if side >= max(size) else (width, height))
+        assert max(width, height) == min(side, max(size))
+        small = reduce_light(image, width, height)
+        assert small.shape == (height, width, 3)
+        assert np.allclose(whole_light(small), whole_light(image), atol=0.01)
+        if (width, height) == size:
+            assert np.array_equal(small, image)
+
+
+def test_cameras_follow_their_pictures_exactly(dataset):
+    recorded = frames_module.read_recorded_cameras(dataset, "S001")
+    assert run(dataset, image_side=37).ok
+    seen = frames_module.read_cameras_of(dataset, "S001", undistorted=False)
+    pinholes = frames_module.read_cameras_of(dataset, "S001")
+    points = np.random.default_rng(3).normal(0, 0.05, (50, 3))
+    assert frames_module.read_recorded_cameras(dataset, "S001") == recorded
+    for name, camera in recorded.items():
+        small = seen[name]
+        assert max(small.width, small.height) == 37 and (small.dist == camera.dist).all()
+        scale = np.array([small.width / camera.width, small.height / camera.height])
+        for one, two in ((camera, small), (pinhole(camera), pinholes[name])):
+            expected = project(one, points)[0] * scale
+            np.testing.assert_allclose(project(two, points)[0], expected, rtol=0, atol=1e-9)
+        shape = (small.height, small.width, 3)
+        assert read_peak_frame(dataset, "S001", "smile", name).shape == shape
+        assert read_plate_image(dataset, "S001", name).shape == shape
+        again = read_frame(dataset, "S001", name, read_peaks(dataset, "S001")["smile"])
+        assert np.array_equal(again, read_peak_frame(dataset, "S001", "smile", name))
+
+
+def test_a_side_longer_than_the_footage_changes_nothing(dataset):
+    cameras = frames_module.read_cameras_of(dataset, "S001")
+    files = sorted(dataset.stage_dir("frames").rglob("*.jxl"))
+    before = [path.read_bytes() for path in files]
+    assert run(dataset, image_side=4000).ok
+    assert [path.read_bytes() for path in files] == before
+    after = frames_module.read_cameras_of(dataset, "S001")
+    assert {n: (c.params, c.width, c.height) for n, c in after.items()} == {
+        n: (c.params, c.width, c.height) for n, c in cameras.items()
+    }
+
+
+def test_a_frame_left_at_another_size_is_named(dataset):
+    old = dataset.frame_file("S001", "smile", "cam00").read_bytes()
+    assert run(dataset, image_side=32).ok
+    dataset.frame_file("S001", "smile", "cam00").write_bytes(old)
+    with pytest.raises(CaptureError, match=r"cam00\.jxl: \d+x\d+, expected 32x.*image_side"):
+        read_peak_frame(dataset, "S001", "smile", "cam00")
+
+
+def test_later_stages_work_at_the_reduced_size_and_rerun_with_it_alone(dataset):
+    from pipelines.matte import STAGE as MATTE
+
+    def matte():
+        return run_stage(MATTE, dataset, MATTE.config(), workers=0, progress=False)
+
+    def shape():
+        return read_image(dataset.matte_file("S001", "smile", "cam00")).shape
+
+    assert matte().count("done") == 2
+    native = shape()
+    assert run(dataset, image_side=max(native) // 2).count("done") == 3
+    assert matte().count("done") == 2
+    assert shape() == tuple(round(n * (max(native) // 2) / max(native)) for n in native)
+    assert run(dataset, image_side=max(native) // 2).count("skipped") == 3
+    assert matte().count("skipped") == 2
+    with pytest.raises(ConfigError):
+        STAGE.config(image_side=8)
+
+
+def test_unreadable_sizes_of_pictures_are_one_clear_line(dataset):
+    path = dataset.picture_sizes_file("S001")
+    for text in ("[]", '{"cam00": [0, 4]}', '{"cam00": 3}', "{"):
+        path.write_text(text)
+        with pytest.raises(FormatError, match=r"pictures\.json"):
+            frames_module.read_cameras_of(dataset, "S001")

@@ -55,6 +55,15 @@ def test_a_stage_that_reduces_pictures_takes_no_longer_for_larger_ones():
     assert found[0].disk < found[1].disk, "maps are written at full size"
 
 
+def test_reduced_pictures_bound_the_stages_after_frames_and_no_other():
+    names, target = ("ingest", "frames", "matte"), replace(SMALL, pixels=8e6)
+    chosen = [stages()[name] for name in names]
+    costs = {name: cost(2.0) for name in names}
+    bounded = estimate(chosen, replace(target, side=1280), [(replace(SMALL, side=1280), costs)], 1)
+    for row, pixels in zip(bounded, (8e6, 8e6, 0.75 * 1280**2), strict=True):
+        assert row.seconds == pytest.approx(2.0 * pixels / 1e5)
+
+
 def test_plates_are_an_item_per_subject_not_per_expression():
     (row,) = estimate([stages()["frames"]], SMALL, [(SMALL, {"frames": cost(2.0)})], workers=1)
     assert row.items == 2 * 6 + 2

@@ -8,7 +8,9 @@ import pytest
 
 from benchmarks.budget import Run, figures, quick_budgets
 from express50.contract.layout import Dataset
-from express50.dial.choice import remainder
+from express50.contract.stage import Growth, NoSettings, Stage
+from express50.dial.choice import Workload, remainder, size_factor
+from express50.dial.figures import Cost, Footage, PilotFigures, Trial
 from express50.dial.results import RESULTS
 from express50.head.load import load_head
 from express50.head.model import vertex_normals
@@ -121,3 +123,33 @@ def test_the_quick_form_asks_for_what_should_be_as_good_as_the_best_preset():
     table = {"front": points, "presets": {"draft": points[0], "standard": points[-1]}}
     assert quick_budgets(table) == ["0.0115ch", "0.0176ch", "0.0192ch"]
     assert len(quick_budgets(table | {"front": points[-1:]})) == 1
+
+
+def test_stages_after_smaller_pictures_cost_what_trials_measured():
+    stages = [
+        Stage(name=name, version=1, config=NoSettings, items=None, inputs=None, run=None,
+              growth=Growth(reduces="side" if name == "cut" else ""))
+        for name in ("read", "cut", "map")
+    ]  # fmt: skip
+
+    def trial(cut, seconds):
+        costs = {
+            name: Cost(seconds=s, core_seconds=s, bytes=1, memory=1, items=1)
+            for name, s in zip(("read", "cut", "map"), seconds, strict=True)
+        }
+        footage = Footage(subjects=1, expressions=1, views=1, pixels=1, frames=1)
+        return Trial(
+            settings={"read": "standard", "cut": cut, "map": "standard"}, footage=footage,
+            scripted=1, costs=costs, errors={}, failed={}, folder="",
+        )  # fmt: skip
+
+    trials = [trial("draft", (5.0, 1.0, 2.0)), trial("standard", (5.0, 3.0, 14.0))]
+    load = Workload(
+        stages=stages, ladders={}, measured=PilotFigures(key="", trials=trials, losses={}),
+        footage=trials[0].footage, width=1, cores=True,
+    )  # fmt: skip
+    factors = [
+        [size_factor(load, stage, {"cut": label}) for stage in stages]
+        for label in ("draft", "standard")
+    ]
+    assert factors == [[1.0, 1.0, 1.0], [1.0, 1.0, 7.0]]
