@@ -60,7 +60,7 @@ UNITS: dict[str, Unit] = {
     "depth": "mm",
     "register": "mm",
 }
-FIT, TEST = (61, 62, 63, 64), (71, 72, 73, 74)  # subjects
+FIT, TEST = tuple(range(61, 69)), (71, 72, 73, 74)  # subjects
 FIT_RIGS, TEST_RIGS = range(10), range(100, 110)  # seeds of simulated rigs
 FIT_PEAKS, TEST_PEAKS = ((81, 82), (83,)), ((91, 92), (93,))  # subjects per noise of ALIGN_NOISE
 BAR = 88.0, 92.0  # percent
