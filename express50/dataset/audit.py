@@ -1,7 +1,7 @@
 """Audit a dataset against its ledger: report what is wrong, and set aside what can be remade.
 
-Checked are captures, labels, the ledger, every stage's outputs (present, as published, made from
-the present inputs) and traces of withdrawn people.
+The audit checks captures, labels, the ledger, every stage's outputs (they exist, are unchanged and
+were made from the current inputs) and traces of withdrawn people.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ class Finding:
     Attributes:
         kind: one word for programs, such as ``missing`` or ``changed``.
         where: ``stage item``, or a file of the dataset.
-        what: is wrong, in words.
+        what: what is wrong, in words.
         fix: how it was fixed, or how to fix it.
-        fixed: True once nothing is left to do but to run the stage.
+        fixed: True if the only thing left to do is to run the stage.
     """
 
     kind: str
@@ -57,7 +57,7 @@ class Finding:
 
 @dataclass
 class Audit:
-    """Collects findings, notes on what is not a fault, files and bytes compared, bytes read."""
+    """Collects findings, notes that are not faults, and counts of files, bytes and bytes hashed."""
 
     findings: list[Finding] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -67,13 +67,13 @@ class Audit:
 
     @property
     def sound(self) -> bool:
-        """Return True when nothing wrong is left."""
+        """Return True if every finding is fixed."""
         return all(finding.fixed for finding in self.findings)
 
 
 @dataclass(frozen=True)
 class Fault:
-    """Says what is wrong with one item; files that no run wrote (`foreign`) must not be moved."""
+    """Says what is wrong with one item; one with files that no run wrote (`foreign`) stays put."""
 
     item: str
     kind: str
@@ -90,27 +90,27 @@ def audit(
     label_problems: LabelProblems = lambda dataset, subjects: (),
     checkpoints: Sequence[Path] = (),
 ) -> Audit:
-    """Check everything that the ledger knows, and set aside what can be made again.
+    """Check everything that the ledger records, and set aside what can be made again.
 
     Args:
         dataset: the dataset.
         stages: its stages in order.
-        deep: read every output's bytes; else only of files whose time of change is another.
-        fix: set wrong outputs aside and forget their receipts; nothing is deleted that no stage
-            can make again.
-        label_problems: checks the labels of subjects against their footage; records with ``kind``,
-            ``expression`` and ``what``.
-        checkpoints: files outside the dataset in which no withdrawn person may be named.
+        deep: hash every output file; otherwise only those whose modification time has changed.
+        fix: set wrong outputs aside and forget their receipts; only what a stage can make again
+            is deleted.
+        label_problems: checks the labels of subjects against their footage; returns records with
+            ``kind``, ``expression`` and ``what``.
+        checkpoints: files outside the dataset that must not name a withdrawn person.
 
     Raises:
-        StageError: a stage that is to be fixed is running.
+        StageError: ``fix`` is set and a stage is running.
     """
     dataset, result = Dataset(dataset.root.resolve()), Audit()
     with hold_stages(dataset, [stage.name for stage in stages]) if fix else nullcontext():
-        # First, as a fix takes away what labels are compared with.
+        # First, because a fix may remove the files that labels are compared with.
         result.findings += _capture_findings(dataset)
         result.findings += _label_findings(dataset, label_problems)
-        # Read-only where its folder is: such a connection leaves journals behind.
+        # Open read-only just if the folder is: a read-only connection leaves journals behind.
         read_only = not os.access(dataset.root, os.W_OK)
         if finding := _ledger_finding(dataset, fix, read_only):
             result.findings.append(finding)
@@ -119,7 +119,7 @@ def audit(
                 _StageAudit(dataset, stages, ledger, result, deep, fix).run()
         result.findings += _person_findings(dataset, checkpoints)
     what = {dataset.stale_dir: "set aside earlier, which nothing reads"}
-    what[dataset.replaced_dir] = "that others replaced, kept for going back to their settings"
+    what[dataset.replaced_dir] = "since replaced, kept in case you go back to their settings"
     for folder, words in what.items():
         files, size = size_of(folder)
         if files:
@@ -131,16 +131,16 @@ def audit(
 
 
 def _capture_findings(dataset: Dataset) -> Iterator[Finding]:
-    """Find captures that are gone, and subjects whose capture is not registered."""
+    """Find missing captures, and subjects whose capture is not registered."""
     try:
         captures = dataset.captures()
     except FormatError as error:
         yield Finding(kind="capture", where="captures.json", what=str(error), fix="restore it")
         return
-    fix = f"express50 ingest {dataset.root} CAPTURE, with its present place"
+    fix = f"express50 ingest {dataset.root} CAPTURE, with the capture's current path"
     for subject, path in captures.items():
         try:
-            what = "" if path.exists() and footage_root(path) else f"its capture {path} is gone"
+            what = "" if path.exists() and footage_root(path) else f"its capture {path} is missing"
         except Express50Error as error:
             what = str(error)
         if what:
@@ -168,7 +168,7 @@ def _label_findings(dataset: Dataset, problems: LabelProblems) -> Iterator[Findi
             continue
         fix = (
             f"express50 annotate ui {dataset.root}: undo it and mark the frame again (labels are"
-            " people's work and are never rewritten)"
+            " made by people, so the audit never changes them)"
         )
         for one in found:
             yield Finding(kind="label", where=f"{where} {one.expression}", what=one.what, fix=fix)
@@ -210,7 +210,7 @@ def _person_findings(dataset: Dataset, checkpoints: Sequence[Path]) -> Iterator[
 
 
 class _StageAudit:
-    """Audits the stages once, and keeps which subjects were found broken on the way."""
+    """Audits the stages once, and records which subjects turned out to be broken."""
 
     def __init__(
         self,
@@ -224,7 +224,7 @@ class _StageAudit:
         self.dataset, self.stages, self.ledger = dataset, stages, ledger
         self.result, self.deep, self.fix = result, deep, fix
         captures = [f.where for f in result.findings if f.kind == "capture"]
-        # Subjects of damaged items, "" is all; a capture that is gone has its own finding.
+        # Subjects of damaged items, "" for all; a missing capture has its own finding.
         self.broken = {where.removeprefix("captures.json").split(" ")[-1] for where in captures}
         self.receipts = {stage.name: ledger.read(stage.name) for stage in stages}
         self.made = {stage.name: ledger.made(stage.name) for stage in stages}
@@ -232,16 +232,16 @@ class _StageAudit:
         self.digest = published_digest(dataset, self.made, sha256)
 
     def run(self) -> None:
-        """Audit each stage; faults of an earlier stage are not reported again for a later one."""
+        """Audit each stage; a fault in one stage is not reported again for later stages."""
         for stage in self.stages:
             if not self.fix and is_running(self.dataset, stage.name):
-                self._note(stage, "runs now; its items were not looked at")
+                self._note(stage, "is running; its items were not checked")
                 self.broken.add("")
                 continue
             if found := list(self.dataset.staging_dir.glob(f"{stage.name}-*")):
                 if self.fix:
                     clean_leftovers(self.dataset, stage.name)
-                what = f"unfinished outputs of {len(found)} runs that were killed"
+                what = f"unfinished outputs of {count(len(found), 'interrupted run')}"
                 how = "deleted" if self.fix else "--fix deletes them, as the next run would"
                 self._find("leftover", f".staging {stage.name}", what, how, self.fix)
             self._stage(stage)
@@ -265,8 +265,8 @@ class _StageAudit:
             self._judge(stage, sound)
         failed = {item for item, receipt in receipts.items() if receipt.status == "failed"}
         to_do = (known or set()) - receipts.keys() - wrong
-        # None of these has an output; outputs made from an earlier one are valid again once it is
-        # back.
+        # None of these has an output now; what was made from an earlier one is valid again once
+        # the same output is back.
         self.broken |= {item.split("/")[0] for item in wrong | failed | to_do}
         if to_do and receipts:
             words = f"{len(to_do)} of {count(len(known or ()), 'item')} to do"
@@ -284,11 +284,11 @@ class _StageAudit:
         made = self.made[stage]
         for item in sorted(done):
             if item not in there:
-                yield Fault(item, "missing", "the ledger has a receipt, its output is gone")
+                yield Fault(item, "missing", "the ledger has a receipt, but the output is missing")
             elif item in made and (fault := self._changed(stage, item, made[item].files)):
                 yield fault
         for item in sorted(there - (done & made.keys())):
-            what = "an output without a receipt: its run did not end, or no run made it"
+            what = "an output without a receipt: its run did not finish, or no run made it"
             yield Fault(item, "unknown", what)
 
     def _changed(self, stage: str, item: str, marks: Mapping[str, FileMark]) -> Fault | None:
@@ -313,7 +313,7 @@ class _StageAudit:
         return Fault(item, "shards", few(faults)) if faults else None
 
     def _differs(self, path: Path, mark: FileMark) -> bool:
-        """Compare a file's bytes; a copy has another time, so time alone is not evidence."""
+        """Return True if a file's bytes changed; copying changes its time, so bytes decide."""
         stat = path.stat()
         self.result.files += 1
         self.result.bytes += stat.st_size
@@ -325,7 +325,7 @@ class _StageAudit:
         return file_sha256(path) != mark.sha256
 
     def _personal_faults(self, subjects: set[str]) -> Iterator[Fault]:
-        """Find indices that hold keys of capture.toml which must stay outside the dataset."""
+        """Find indices that hold keys of capture.toml that must stay out of the dataset."""
         for subject in sorted(subjects):
             try:
                 table = json.loads(self.dataset.index_file(subject).read_text(encoding="utf-8"))
@@ -333,7 +333,7 @@ class _StageAudit:
             except (OSError, ValueError, KeyError, TypeError):  # damaged: found elsewhere
                 continue
             if keys:
-                what = f"index.json holds {', '.join(keys)} of capture.toml, which stay outside"
+                what = f"index.json holds personal data from capture.toml: {', '.join(keys)}"
                 yield Fault(subject, "personal", what)
 
     def _settle(self, stage: str, fault: Fault, known: bool) -> None:
@@ -343,25 +343,25 @@ class _StageAudit:
         if receipt is not None and receipt.imported:  # no run can make it again
             how = AGAIN
         elif fault.foreign:
-            how = "move what no run wrote out of the folder, then check again"
+            how = "move the files that no run wrote out of the folder, then check again"
         elif not known and fault.kind == "unknown":
-            how = f"{stage} has no such item now; move it away if it is not needed"
+            how = f"{stage} no longer has such an item; move it away if you do not need it"
         elif self.fix:
             fixed, how = True, f"set aside; make it again: {again}"
             set_aside(self.dataset, stage, fault.item)
             self.ledger.forget(stage, [fault.item])
         else:
-            how = f"--fix, then {again}" if known else "--fix; the stage has no such item now"
+            how = f"--fix, then {again}" if known else "--fix; the stage no longer has such an item"
         self._find(fault.kind, f"{stage} {fault.item}", fault.what, how, fixed)
 
     def _judge(self, stage: Stage, receipts: dict[str, Receipt]) -> None:
-        """Report items that were made from other inputs, with other settings or another version."""
+        """Report items that were made from different inputs, settings or code versions."""
         path, name = self.dataset.config_file(stage.name), stage.name
         again = f"express50 {name} {self.dataset.root}"
         try:
             config = resolve_config(stage, "standard", path, (), [s.name for s in self.stages])
         except ConfigError as error:
-            how = f"{again}, with the settings that you want"
+            how = f"{again}, with valid settings"
             self._find("config", f"config/{path.name}", str(error), how)
             return
         unreadable: dict[str, list[str]] = {}
@@ -384,9 +384,9 @@ class _StageAudit:
             if not changed:
                 to_make.setdefault(why_outdated(stage, config, made, now), []).append(item)
             elif self._waits(item):
-                self._note(stage, f"{item} cannot be judged before what it reads is made again")
+                self._note(stage, f"{item} cannot be checked until its inputs are made again")
             else:
-                what = f"made from another {few(changed)} than the present one"
+                what = f"made from a different {few(changed)} than the current one"
                 self._settle(name, Fault(item, "outdated", what), True)
         for reason, items in unreadable.items():
             if not all(self._waits(item) for item in items):

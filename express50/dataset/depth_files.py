@@ -1,9 +1,9 @@
 """Read and write depth and normal maps.
 
-Depth is a 16-bit PNG in steps of 0.05 mm (rounding error at most 0.025 mm), or where it exceeds
-the 3.27 m that this holds, a float EXR in metres; 0 is unknown in both. Normal maps are RGB PNG in
-camera axes (x right, y down, z forward): component c is stored as round(127 c) + 128, so that
-(0, 0, 0) is left for unknown. A unit normal comes back within 0.4 degrees.
+Depth is stored as a 16-bit PNG in steps of 0.05 mm (rounding error at most 0.025 mm), or as a float
+EXR in metres if it exceeds the PNG's 3.27 m; 0 means unknown in both. Normal maps are RGB PNGs in
+camera axes (x right, y down, z forward): component c is stored as round(127 c) + 128, which leaves
+(0, 0, 0) for unknown. A unit normal is restored to within 0.4 degrees.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from express50.files.images import (
     write_image,
 )
 
-NORMAL_STEPS = 127  # of a component from 0 to 1
-FARTHEST_M = 1e4  # no rig is this large: its unit is wrong
+NORMAL_STEPS = 127  # from 0 to 1 in one component
+FARTHEST_M = 1e4  # no rig is this large: beyond this its unit must be wrong
 
 
 def depth_file(folder: Path, camera_id: str) -> Path | None:
@@ -64,7 +64,7 @@ def read_depth(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise FormatError(f"{path}: {depth.dtype} {depth.shape}, expected one channel of floats")
     if not (np.isfinite(depth).all() and depth.min(initial=0) >= 0):
         raise FormatError(
-            f"{path}: holds depths that are negative or not finite, expected metres and 0 where"
+            f"{path}: holds depths that are negative or not finite, expected metres, or 0 if"
             " unknown; run 'express50 depth' again"
         )
     return depth, depth > 0
@@ -93,7 +93,7 @@ def read_normals(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """
     code = read_image(path)
     if code.ndim != 3 or code.shape[2] != 3 or code.dtype != np.uint8:
-        raise FormatError(f"{path}: {code.dtype} {code.shape}, expected RGB of 8 bits")
+        raise FormatError(f"{path}: {code.dtype} {code.shape}, expected 8-bit RGB")
     valid = np.any(code, axis=-1)
     normals = (code.astype(np.float32) - (NORMAL_STEPS + 1)) / NORMAL_STEPS
     length = np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-6)

@@ -1,8 +1,8 @@
 """Choose tracked heads to export, write them as OBJ, PLY or GLB, and publish each subject's folder.
 
-Meshes are in the user's world, metres. OBJ keeps the head model's vertices and their order, with
-texture coordinates per corner; PLY keeps them with a colour each; GLB repeats vertices along the
-seams of the texture, as glTF wants them.
+Meshes are in the user's world frame, in metres. OBJ keeps the head model's vertices and their
+order, with texture coordinates per corner; PLY keeps them with a colour per vertex; GLB repeats
+vertices along the texture's seams, as glTF requires.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ class Head:
     """Holds a subject's tracked head.
 
     Attributes:
-        subject: its id.
-        track: the chosen rows of its track.
+        subject: subject id.
+        track: the chosen rows of the subject's track.
         model: the head model it was tracked with.
-        albedo: (H, W, 3) uint8 sRGB texture, its first row at v = 1; None where there is none.
+        albedo: (H, W, 3) uint8 sRGB texture, first row at v = 1; None if there is no texture.
     """
 
     subject: str
@@ -65,16 +65,16 @@ class Head:
 
 
 def tracked_subjects(dataset: Dataset, wanted: Sequence[str]) -> list[str]:
-    """List the wanted subjects, or all that are tracked and not excluded.
+    """List the wanted subjects, or by default all that are tracked and not excluded.
 
     Raises:
-        UnknownNameError: a wanted one is not ingested.
-        StageError: one is excluded or not tracked, or none is tracked.
+        UnknownNameError: a wanted subject is not ingested.
+        StageError: a wanted subject is excluded or not tracked, or no subject is tracked.
     """
     check_known(str(dataset.root), "subject", wanted, dataset.subjects())
     for name in wanted:
         if (reason := exclusion_reason(dataset, name)) is not None:
-            raise StageError(f"{name}: is excluded ({reason}); it is not exported")
+            raise StageError(f"{name}: is excluded ({reason}) and cannot be exported")
         existing_track(dataset, name)
     if wanted:
         return list(dict.fromkeys(wanted))
@@ -85,11 +85,11 @@ def tracked_subjects(dataset: Dataset, wanted: Sequence[str]) -> list[str]:
 
 
 def read_tracked(dataset: Dataset, subject: str, expressions: Sequence[str]) -> Head:
-    """Read a subject's head with the wanted expressions, or all, in the track's order.
+    """Read a subject's head with the wanted (by default all) expressions, in the track's order.
 
     Raises:
         UnknownNameError: a wanted expression is not tracked.
-        StageError: the subject is not.
+        StageError: the subject is not tracked.
         FormatError: the track is damaged or does not fit its head model.
         HeadModelError: the head model cannot be loaded.
     """
@@ -117,24 +117,24 @@ def read_tracked(dataset: Dataset, subject: str, expressions: Sequence[str]) -> 
 
 
 def with_registered(dataset: Dataset, head: Head) -> Head:
-    """Replace tracked meshes by registered ones where these exist.
+    """Replace tracked meshes with registered ones where they exist.
 
     Raises:
-        FormatError: one is damaged, or of another track.
+        FormatError: a registration is damaged, or belongs to another track.
     """
     vertices = best_vertices(dataset, head.subject, head.track)
     return replace(head, track=replace(head.track, vertices=vertices))
 
 
 def with_clips(dataset: Dataset, head: Head, wanted: Sequence[str]) -> Head:
-    """Put every tracked frame of a head's clips in the place of its peaks.
+    """Replace a head's peaks with every tracked frame of its clips.
 
-    The frames' names are the clip's and the frame's, such as ``smile_000123``; where clips are
-    wanted by id, others are left out.
+    Frames are named after their clip and number, such as ``smile_000123``; if clip ids are wanted,
+    other clips are left out.
 
     Raises:
-        StageError: its clips are not tracked, or none of these.
-        FormatError: they are damaged, or were tracked with another head model.
+        StageError: no clip, or none of the wanted ones, is tracked.
+        FormatError: the file is damaged, or its clips were tracked with another head model.
     """
     path = existing_track(dataset, head.subject).with_name("sequence.npz")
     clips, track = read_sequence(path), head.track
@@ -144,12 +144,12 @@ def with_clips(dataset: Dataset, head: Head, wanted: Sequence[str]) -> Head:
         )
     rows = [i for i, cue in enumerate(clips.cues) if not wanted or cue in wanted]
     if not rows:
-        raise StageError(f"{path}: holds no frame of {', '.join(wanted) or 'any clip'}")
+        raise StageError(f"{path}: holds no frames of {', '.join(wanted) or 'any clip'}")
     own = {name: getattr(clips, name)[rows] for name in OF_FRAMES}
     names = tuple(f"{clips.cues[i]}_{clips.frames[i]:06d}" for i in rows)
     model = head.model.to(dtype=torch.float64)
     vertices = []
-    for i in range(len(rows)):  # one after the other: all frames at once may not fit the memory
+    for i in range(len(rows)):  # one at a time: all frames together may not fit in memory
         shape, expression, neck, jaw, eyes, offsets = (
             torch.from_numpy(np.asarray(array, np.float64))[None]
             for array in (
@@ -180,24 +180,24 @@ def read_albedo(folder: Path) -> np.ndarray | None:
 
 @contextmanager
 def exporting(out: Path, subject: str) -> Iterator[Path]:
-    """Yield an empty folder aside; on a clean exit it becomes ``out/subject`` in one rename.
+    """Yield an empty temporary folder; on a clean exit it becomes ``out/subject`` in one rename.
 
-    A former export of the subject is replaced; what a killed run left aside is deleted.
+    An earlier export of the subject is replaced; what a killed run left behind is deleted.
 
     Raises:
-        StageError: ``out/subject`` holds something else than an export.
+        StageError: ``out/subject`` exists and is not an export.
     """
     target, aside = out / subject, out / f".{subject}.part"
     if target.exists() and not (target / META).is_file():
         raise StageError(
-            f"{target}: exists and holds no {META}, so it is not an export; name another folder"
+            f"{target}: exists but has no {META}, so it is not an export; choose another folder"
         )
     with folder_in_one_step(aside, target):
         yield aside
 
 
 def export_meshes(head: Head, kind: str, out: Path) -> dict:
-    """Write ``<expression>.<kind>`` of every expression into an empty folder; returns the meta."""
+    """Write ``<expression>.<kind>`` for every expression to an empty folder; return the meta."""
     model, faces = head.model, head.model.faces.numpy()
     texture = None if head.albedo is None else TEXTURE
     if head.albedo is not None and kind == "obj":
@@ -240,7 +240,7 @@ def write_head_obj(
 
 
 def _vertex_colours(model: HeadModel, albedo: np.ndarray) -> dict[str, np.ndarray]:
-    """Sample the texture (H, W, 3) uint8 at the vertices: (V,) uint8 by name of the channel."""
+    """Sample the texture (H, W, 3) uint8 at the vertices: (V,) uint8 by channel name."""
     height, width = albedo.shape[:2]
     uv = np.zeros((len(model.template), 2))
     uv[model.faces.numpy().ravel()] = model.uv.numpy()[model.uv_faces.numpy().ravel()]

@@ -3,9 +3,9 @@
 One time step per expression: ``images/<step>_<camera>.png``, ``fg_masks/``,
 ``flame_param/<step>.npz``, and ``transforms*.json`` with OpenGL camera-to-world matrices.
 
-FLAME turns a head about its root joint J, we about the origin: R (x - J) + J + T = R x + t gives
-T = t + R J - J, where J is regressed from the shaped vertices, expression and static offset
-included.
+FLAME rotates a head about its root joint J, our tracks about the origin: R (x - J) + J + T =
+R x + t gives T = t + R J - J. J is regressed from the shaped vertices, which include expression
+and static offset.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from express50.head.mouth import FLAME_VERTICES as BARE_VERTICES
 from express50.head.mouth import TOOTH_VERTICES
 
 BACKGROUNDS = {"alpha": None, "white": 255, "black": 0}
-FLAME_VERTICES = BARE_VERTICES + TOOTH_VERTICES  # of the layout's FLAME
-FLAME_SHAPES, FLAME_EXPRESSIONS = 300, 100  # its readers expect that many, or zeros
+FLAME_VERTICES = BARE_VERTICES + TOOTH_VERTICES  # of FLAME as this layout uses it
+FLAME_SHAPES, FLAME_EXPRESSIONS = 300, 100  # readers expect that many; missing ones are zero
 CANONICAL_JAW = 0.3  # radians
-# From there on, single precision rounds by more than a micrometre: the world is moved by whole
+# Beyond this, single precision rounds by more than a micrometre, so the world is shifted by whole
 # metres.
 FAR_M = 16.0
-NEAR_PX = 0.02  # what centring would move pixels by at most: not worth an interpolation
+NEAR_PX = 0.02  # if centring moves pixels by less than this, it is not worth an interpolation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,12 +48,12 @@ class AvatarOptions:
     """Says how a data set is laid out.
 
     Attributes:
-        background: ``alpha`` (pictures keep it), or the colour behind the head.
-        head_only: alpha of the head without the torso, from the regions stage.
-        downscale: whole number of times that pictures are smaller than the footage.
-        even_colour: divide each camera's colour gain, as calibrate measured it, out of its light.
-        test_expressions: those held back for testing; None: the last three tenths.
-        validation_camera: held back in training; None: the last.
+        background: ``alpha`` (keep the alpha channel), or the colour behind the head.
+        head_only: use the regions stage's alpha of the head without the torso.
+        downscale: integer factor by which images are smaller than the footage.
+        even_colour: divide each camera's images by its colour gain, as measured by calibrate.
+        test_expressions: expressions held out for testing; None for the last three tenths.
+        validation_camera: camera held out of training; None for the last one.
     """
 
     background: str = "alpha"
@@ -65,7 +65,7 @@ class AvatarOptions:
 
 
 def export_avatar(dataset: Dataset, head: Head, options: AvatarOptions, out: Path) -> dict:
-    """Write one subject's data set into the empty folder ``out``; returns its meta.
+    """Write one subject's data set to the empty folder ``out``; return its meta.
 
     Raises:
         StageError: no view of any expression has a matte.
@@ -119,16 +119,16 @@ def export_avatar(dataset: Dataset, head: Head, options: AvatarOptions, out: Pat
 def _check_options(track: Track, cameras: dict[str, Camera], options: AvatarOptions) -> None:
     if not 1 <= options.downscale <= min(min(c.width, c.height) for c in cameras.values()):
         raise ConfigError(
-            f"downscale {options.downscale}: expected 1 (full size) up to the images' height"
+            f"downscale {options.downscale}: expected 1 (full size) up to the images' shorter side"
         )
     unknown = sorted(set(options.test_expressions or ()) - set(track.expressions))
     if unknown:
         raise ConfigError(
-            f"test expressions {', '.join(unknown)}: expected some of"
+            f"test expressions: unknown {', '.join(unknown)}; expected some of"
             f" {', '.join(track.expressions)}"
         )
     if set(options.test_expressions or ()) >= set(track.expressions):
-        raise ConfigError("test expressions: all are chosen, which leaves none to train on")
+        raise ConfigError("test expressions: all are held out, which leaves none to train on")
     if options.validation_camera not in (None, *cameras):
         raise ConfigError(
             f"validation camera {options.validation_camera!r}: expected one of {', '.join(cameras)}"
@@ -147,14 +147,14 @@ def _write_view(
     """Write an undistorted frame and its matte as the target camera sees them.
 
     Raises:
-        CaptureError, FormatError, StageError: one of them is missing or damaged.
+        CaptureError, FormatError, StageError: the frame or its matte is missing or damaged.
     """
     subject, expression = item.split("/")
     path, stage = dataset.matte_file(subject, expression, camera.id), "matte"
     if options.head_only:
         path, stage = dataset.item_dir("regions", item) / f"{camera.id}_head.png", "regions"
     if not path.is_file():
-        raise StageError(f"it has no {path.name} of stage {stage}; run 'express50 {stage}'")
+        raise StageError(f"has no {path.name} from stage {stage}; run 'express50 {stage}'")
     alpha = read_alpha(path)
     if alpha.shape != (camera.height, camera.width):
         raise FormatError(
@@ -166,7 +166,7 @@ def _write_view(
     image = image if gain is None else scale_light(image, 1.0 / gain)
     image, alpha = (seen_by(one, camera, target, options.downscale) for one in (image, alpha))
     level = BACKGROUNDS[options.background]
-    if level is None:  # colours are not multiplied by the opacity
+    if level is None:  # straight alpha: colours are not multiplied by it
         pixels = np.ascontiguousarray(np.concatenate([image[..., ::-1], alpha[..., None]], -1))
         data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes()
     else:
@@ -177,7 +177,7 @@ def _write_view(
 
 
 def _described(camera: Camera, file: str) -> dict[str, object]:
-    """Make the part of a frame of transforms.json that depends on its camera."""
+    """Make the fields of a transforms.json frame that depend on its camera."""
     K = camera.K
     return {
         "camera_id": camera.id,
@@ -194,7 +194,7 @@ def _described(camera: Camera, file: str) -> dict[str, object]:
 def _write_tables(
     frames: list[dict], steps: list[str], cameras: list[str], options: AvatarOptions, out: Path
 ) -> None:
-    """Write transforms.json and its division into training, validation and test."""
+    """Write transforms.json and its training, validation and test splits."""
     held = options.test_expressions
     train = math.ceil(0.7 * len(steps))
     test = [k for k, name in enumerate(steps) if (k >= train if held is None else name in held)]
@@ -241,10 +241,10 @@ def _meta(
 
 
 def centred(camera: Camera, factor: int = 1) -> Camera:
-    """Make a pinhole camera at the same place whose image holds the given one's whole view.
+    """Make a pinhole camera at the same position whose image covers the given camera's whole view.
 
-    Its focal lengths are equal, its principal point is the middle, and ``factor`` divides its size.
-    The camera itself, where that is true of it already, to NEAR_PX.
+    Its focal lengths are equal, its principal point is the image's centre, and its size is a
+    multiple of ``factor``. A camera that already is like this, to NEAR_PX, is returned as it is.
     """
     K = camera.K
     f = K[0, 0]
@@ -259,14 +259,14 @@ def centred(camera: Camera, factor: int = 1) -> Camera:
 
 
 def _whole(length: float, factor: int) -> int:
-    """Return even number of pixels, a multiple of factor, that holds a length, rounding aside."""
+    """Return the least multiple of 2 * factor pixels that covers a length, but for rounding."""
     return 2 * factor * math.ceil((length - 1e-6) / (2 * factor))
 
 
 def seen_by(image: np.ndarray, camera: Camera, target: Camera, factor: int = 1) -> np.ndarray:
-    """Turn an image (H, W[, C]) of a pinhole camera into that of ``target``, at the same place.
+    """Warp a pinhole camera's image (H, W[, C]) to what ``target`` sees from the same position.
 
-    It is 0 outside the image, and made ``factor`` times smaller by averaging.
+    Pixels outside the source image are 0; the result is then reduced by ``factor`` by averaging.
     """
     if target is not camera:
         matrix = (target.K @ np.linalg.inv(camera.K))[:2]
@@ -284,10 +284,10 @@ def _is_flame(model: HeadModel) -> bool:
 
 
 def write_parameters(head: Head, steps: list[str], shift: np.ndarray, out: Path) -> None:
-    """Write a file of parameters per time step, the canonical one, and meshes if not FLAME.
+    """Write a parameter file per time step, the canonical one, and meshes if not FLAME.
 
-    ``steps`` are expressions in the order of the time steps; ``shift`` (3,), metres, is taken off
-    the world.
+    ``steps`` are the expressions in time-step order; ``shift`` (3,), metres, is subtracted from
+    world positions.
     """
     flame, shapes = _is_flame(head.model), head.model.shape_dirs.shape[2]
     for folder in ("flame_param",) if flame else ("flame_param", "meshes"):
@@ -298,7 +298,7 @@ def write_parameters(head: Head, steps: list[str], shift: np.ndarray, out: Path)
     for number, name in enumerate(steps):
         row = head.track.row(name)
         arrays: dict[str, Any] = _step_parameters(head, row, shift)
-        # NumPy dates the members of its archives 1980: their bytes depend on nothing else.
+        # NumPy dates all archive members 1980, so equal arrays give equal bytes.
         np.savez(out / "flame_param" / f"{number:05d}.npz", **shared, **arrays)
         if not flame:
             path = out / "meshes" / f"{number:05d}.obj"
@@ -309,7 +309,7 @@ def write_parameters(head: Head, steps: list[str], shift: np.ndarray, out: Path)
 
 
 def _step_parameters(head: Head, row: int, shift: np.ndarray) -> dict[str, np.ndarray]:
-    """Make the parameters of one row of the track, by FLAME's convention about the root joint."""
+    """Make the parameters of one row of the track; FLAME rotates about the root joint."""
     track, model = head.track, head.model
     exact = model.to(dtype=torch.float64)
     shape, expression, offsets = (

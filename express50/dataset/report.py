@@ -1,4 +1,4 @@
-"""Write one self-contained HTML page of a dataset: QC of stages, errors where truth exists."""
+"""Write a self-contained HTML page on a dataset: QC per stage, and errors if truth exists."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ mpl.use("Agg")
 from matplotlib.figure import Figure  # noqa: E402  the backend is chosen first
 
 T = TypeVar("T")
-Picture = tuple[Path, str]  # a file and the words under it
+Picture = tuple[Path, str]  # a file and its caption
 
 AGAIN = "run its stage again"
-PICTURE_WIDTH = 900  # pixels of an embedded picture: a page of forty stays below ten megabytes
-PICTURES = 12  # of a stage
+PICTURE_WIDTH = 900  # pixels; a page with forty embedded pictures stays below ten megabytes
+PICTURES = 12  # per stage
 ROWS = 12
 COLUMNS = 8
 PANELS = 4
@@ -39,15 +39,15 @@ INK = "#2457a6"
 def render_page(dataset: Dataset, title: str | None = None) -> str:
     """Return the whole page as text.
 
-    Beside the stages' folders it reads, where they exist: ``summary.json`` (figures of the run),
-    ``accuracy/`` (errors against truth, made by the benchmarks) and ``grmm/``.
+    Besides the stages' folders it reads these if they exist: ``summary.json`` (figures of the run),
+    ``accuracy/`` (errors against truth, written by the benchmarks) and ``grmm/``.
     """
     receipts: dict[str, list[Receipt]] = {}
     if dataset.ledger.is_file():
         with Ledger(dataset.ledger, read_only=True) as ledger:
             receipts = {name: list(ledger.read(name).values()) for name in stages()}
     views = [_stage_view(dataset, name, receipts.get(name, [])) for name in stages()]
-    # A stage all of whose items failed has published nothing, and is what people look for.
+    # A stage whose items all failed has published nothing, but readers look for it first.
     views = [view for view in views if view["item_count"] or view["failed"]]
     summary = _table(dataset.root / "summary.json")
     accuracy_dir = dataset.root / "accuracy"
@@ -71,7 +71,7 @@ def render_page(dataset: Dataset, title: str | None = None) -> str:
 
 
 def _stage_view(dataset: Dataset, stage: str, receipts: list[Receipt]) -> dict:
-    """Collect what the template needs of one stage, from its published items and receipts."""
+    """Collect what the template shows of one stage, from its published items and receipts."""
     root = dataset.stage_dir(stage)
     paths = sorted(root.rglob("metrics.json")) if root.is_dir() else []
     metrics = {str(p.parent.relative_to(root)): _table(p) for p in paths}
@@ -112,7 +112,7 @@ def _stage_view(dataset: Dataset, stage: str, receipts: list[Receipt]) -> dict:
 
 
 def _reasons(metrics: dict[str, dict], key: str) -> list[tuple[str, str, str]]:
-    """List (item, what, why) of the rows under a key of all items' metrics."""
+    """List (item, what, why) for the rows under a key in all items' metrics."""
     return [
         (item, str(row.get("what")), str(row.get("why")))
         for item, table in metrics.items()
@@ -131,7 +131,7 @@ def _cards(dataset: Dataset, views: list[dict], summary: dict) -> list[dict[str,
     }
     seconds = summary.get("seconds")
     if isinstance(seconds, dict):
-        cards["minutes in all"] = f"{sum(seconds.values()) / 60:.1f}"
+        cards["minutes in total"] = f"{sum(seconds.values()) / 60:.1f}"
     for key in ("train.psnr_heldout_view_db", "fit.psnr_db", "peak_memory_gib"):
         if summary.get(key) is not None:
             cards[key.replace("_", " ")] = summary[key]
@@ -165,7 +165,7 @@ def _grmm_view(root: Path) -> list[dict]:
 
 
 def _rows(table: dict, prefix: str = "") -> list[dict[str, str]]:
-    """Flatten a nested table of figures to rows of label and value; long lists are left out."""
+    """Flatten a nested table of figures into rows of label and value; lists are left out."""
     rows: list[dict[str, str]] = []
     for key, value in table.items():
         label = f"{prefix}{key}"
@@ -177,7 +177,7 @@ def _rows(table: dict, prefix: str = "") -> list[dict[str, str]]:
 
 
 def _table(path: Path) -> dict:
-    """Read a JSON table, empty where the file is absent."""
+    """Read a JSON table; return an empty one if there is no file."""
     return read_json_table(path, FormatError, AGAIN) if path.is_file() else {}
 
 
@@ -189,7 +189,7 @@ def _pictures_below(root: Path, limit: int) -> list[Picture]:
 
 
 def _embed(picture: Picture) -> dict[str, object]:
-    """Make a picture a JPEG data address, at most PICTURE_WIDTH wide; words alone if damaged."""
+    """Encode a picture as a JPEG data URI, at most PICTURE_WIDTH wide; caption only if damaged."""
     path, caption = picture
     try:
         image = read_image(path)
@@ -211,7 +211,7 @@ def _words(name: str) -> str:
 
 
 def number(value: object) -> str:
-    """Format a figure for people; n/a if it was not measured."""
+    """Format a figure for readers; n/a if it was not measured."""
     if value is None:
         return "n/a"
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -222,23 +222,23 @@ def number(value: object) -> str:
 
 
 def spread(values: list[T], count: int) -> list[T]:
-    """Return at most ``count`` of the values, evenly chosen."""
+    """Return at most ``count`` of the values, evenly spaced."""
     if len(values) <= count:
         return values
     return [values[round(i * (len(values) - 1) / (count - 1))] for i in range(count)]
 
 
 def _svg(figure: Figure) -> Markup:
-    """Draw inline SVG with a fixed id salt, so that the same data give the same page."""
+    """Draw inline SVG with a fixed id salt, so that the same data give the same bytes."""
     with mpl.rc_context({"svg.hashsalt": "express50"}):
         out = io.StringIO()
         figure.savefig(out, format="svg", bbox_inches="tight", metadata={"Date": None})
     text = out.getvalue()
-    return Markup(text[text.index("<svg") :])  # our own drawing, no user text
+    return Markup(text[text.index("<svg") :])  # Matplotlib's output, which needs no escaping
 
 
 def _metric_bars(figures: dict[str, dict[str, float]], columns: list[str]) -> Markup:
-    """Draw one panel per metric: its value over the items."""
+    """Draw one panel per metric, with a bar per item."""
     varying = [c for c in columns if len({row.get(c) for row in figures.values()}) > 1][:PANELS]
     if not varying:
         return Markup("")
@@ -274,7 +274,7 @@ def _front_view(table: dict) -> dict | None:
         for line, (name, point) in enumerate(presets.items()):
             place = point["seconds"] / 60, point["errors"][result]["value"]
             axes.plot(*place, "s", color="#b3541e", ms=4)
-            # One line apart: presets that differ in one stage share a place.
+            # One line apart: presets may share a point in this panel.
             axes.annotate(name, place, (5, 5 + 9 * line), textcoords="offset points", fontsize=7)
         error = rows[-1][1]
         axes.set_title(f"{result}, {error['unit']}", fontsize=9)
@@ -295,10 +295,10 @@ def _front_view(table: dict) -> dict | None:
 
 
 def _loss_curve(log: Path) -> Markup:
-    """Plot the training losses of a JSONL log with ``iteration`` and numbers; empty without one."""
+    """Plot the training loss from a JSONL log; empty without a log of at least two rows."""
     rows = []
     for line in read_text(log, FormatError).split("\n") if log.is_file() else ():
-        with suppress(FormatError):  # half a line of a run that was killed
+        with suppress(FormatError):  # a killed run leaves a truncated last line
             row = parse_json(line, str(log), FormatError)
             if isinstance(row, dict) and {"iteration", "loss"} <= row.keys():
                 rows.append(row)

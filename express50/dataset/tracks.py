@@ -1,7 +1,7 @@
-"""Read what was tracked and registered: a subject's head in its peak frames and its clips.
+"""Read tracks and registrations: a subject's head in its peak frames and its clips.
 
-Every package reads tracks here, so that a damaged or foreign file gives one line of error.
-Nothing in a file is executed: pickled objects are refused.
+Every package reads tracks through this module, so that a damaged or foreign file gives a one-line
+error. Nothing in a file is executed: pickled objects are refused.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ _AGAIN = "run 'express50 track' again"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Track:
-    """Holds what was tracked of a subject: E expressions, V vertices; world = R @ head + t.
+    """Holds a subject's tracked head: E expressions, V vertices; world = R @ head + t.
 
     Attributes:
-        head: head model, as ``load_head`` takes it.
-        expressions: E ids.
+        head: head model name, as ``load_head`` takes it.
+        expressions: E expression ids.
         frames: (E,) int64 decode indices.
         shape: (S,) coefficients, shared by all expressions.
         expression: (E, X) coefficients.
@@ -42,14 +42,14 @@ class Track:
         R: (E, 3, 3) rotations.
         t: (E, 3) metres.
         vertices: (E, V, 3) float32 metres, world.
-        offsets: (V, 3) float32 metres, added to the rest shape; zeros where there are none.
-        sigma: (E, V) float32 metres, standard deviations by the fit's own covariance; NaN where
-            the file has none, as of a scan.
+        offsets: (V, 3) float32 metres, added to the rest shape; zeros if there are none.
+        sigma: (E, V) float32 metres, standard deviations from the fit's own covariance; NaN if
+            the file has none, as for a scan.
         bound: (E, V) float32 metres: nine vertices in ten are nearer than this to the true ones;
-            NaN where the file has none.
-        glasses: (n, 3) float32 metres, world, places all over frames and lenses; None where the
-            file does not say whether there are any.
-        glasses_row: (n,) int64, whose row each is.
+            NaN if the file has none.
+        glasses: (n, 3) float32 metres, world, points spread over frames and lenses; None if the
+            file does not say whether glasses are worn.
+        glasses_row: (n,) int64, the track row that each point belongs to.
     """
 
     head: str
@@ -72,11 +72,11 @@ class Track:
     def row(self, expression: str) -> int:
         """Return the row of an expression; StageError if it is not tracked."""
         if expression not in self.expressions:
-            raise StageError(f"{expression}: it is not tracked; see the metrics of track")
+            raise StageError(f"{expression}: it is not tracked; see the track stage's metrics.json")
         return self.expressions.index(expression)
 
     def glasses_in(self, expression: str) -> np.ndarray | None:
-        """Return the places (n, 3) of an expression's glasses; None where that is unknown."""
+        """Return points (n, 3) on an expression's glasses; None if the file does not say."""
         if self.glasses is None:
             return None
         return self.glasses[self.glasses_row == self.row(expression)].astype(np.float64)
@@ -84,11 +84,11 @@ class Track:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sequence:
-    """Holds what was tracked of a subject's clips, F frames; arrays mean what they do in `Track`.
+    """Holds a subject's tracked clips, F frames; arrays mean what they do in `Track`.
 
     Attributes:
-        head: head model, as ``load_head`` takes it.
-        cues: (F,) ids of the clips, one per frame.
+        head: head model name, as ``load_head`` takes it.
+        cues: (F,) clip ids, one per frame.
         frames: (F,) int64 decode indices.
         shape: (S,) coefficients.
         expression, neck, jaw, eyes, R, t: (F, ...).
@@ -114,11 +114,11 @@ class Registration:
         track: SHA-256 of the track.npz that was registered.
         vertices: (V, 3) float32 metres, world.
         offsets: (V, 3) float32 metres, added to the rest shape of the tracked parameters.
-        seen: (V,) bool, where the surface was found and trusted.
-        residual: (V,) float32 metres, height of the surface over the mesh there, 0 elsewhere.
+        seen: (V,) bool, True where the surface was found and trusted.
+        residual: (V,) float32 metres, height of the surface above the mesh if seen, otherwise 0.
         sigma: (V,) float32 metres, standard deviation of the vertices along their normals.
         bound: (V,) float32 metres: along their normals nine vertices in ten are nearer than this
-            to the true ones; NaN where the file has none, as of a scan.
+            to the true ones; NaN if the file has none, as for a scan.
     """
 
     track: str
@@ -165,7 +165,7 @@ def read_track(path: Path) -> Track:
 
 @contextmanager
 def _arrays_of(path: Path, what: str, schema: str, again: str) -> Iterator[dict[str, np.ndarray]]:
-    """Read the arrays of a file; what is missing or wrong with them becomes one FormatError."""
+    """Yield a file's arrays; a missing or wrong array raises one FormatError."""
     arrays = read_arrays(path, FormatError, what, fix=again)
     try:
         if str(arrays["schema"]) != schema:
@@ -181,7 +181,8 @@ def read_registration(path: Path) -> Registration:
 
     Raises:
         StageError: the file is missing.
-        FormatError: it is not a registration, or its arrays do not fit or hold NaN or Inf.
+        FormatError: it is not a registration, its arrays do not fit each other, or one holds NaN
+            or Inf.
     """
     if not path.is_file():
         raise StageError(f"{path}: the registration is missing; run 'express50 register'")
@@ -201,10 +202,10 @@ def read_registration(path: Path) -> Registration:
 
 
 def _doubt(arrays: dict[str, np.ndarray], name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Return deviations or bounds of vertices; NaN where a file has none.
+    """Return the vertices' deviations or bounds; NaN if the file has none.
 
     Raises:
-        ValueError: they have another shape, or are not finite.
+        ValueError: they have the wrong shape, or are not finite.
     """
     if name not in arrays:
         return np.full(shape, np.nan, np.float32)
@@ -214,10 +215,10 @@ def _doubt(arrays: dict[str, np.ndarray], name: str, shape: tuple[int, ...]) -> 
 
 
 def _glasses(arrays: dict[str, np.ndarray], count: int) -> tuple[np.ndarray | None, np.ndarray]:
-    """Return the places of glasses in `count` expressions, and their rows; None without any.
+    """Return points on glasses in `count` expressions, and their rows; None without any.
 
     Raises:
-        ValueError: they do not fit each other, or are not finite.
+        ValueError: points and rows do not fit each other, or are not finite.
     """
     if "glasses" not in arrays:
         return None, np.zeros(0, np.int64)
@@ -225,15 +226,15 @@ def _glasses(arrays: dict[str, np.ndarray], count: int) -> tuple[np.ndarray | No
     check_shape("glasses", places, (rows.size, 3))
     check_finite("glasses", places)
     if rows.ndim != 1 or rows.dtype.kind not in "iu" or not np.isin(rows, np.arange(count)).all():
-        raise ValueError(f"glasses_row is not a row of {count} expressions for each place")
+        raise ValueError(f"glasses_row must name one of {count} expressions for each point")
     return places.astype(np.float32), rows.astype(np.int64)
 
 
 def registration_of(path: Path, track: Track, digest: str) -> Registration | None:
-    """Return the registration in a file, of a track whose file has a digest; None without a file.
+    """Read the registration of a track, given the track file's digest; None without a file.
 
     Raises:
-        FormatError: it is damaged, or of another track.
+        FormatError: it is damaged, or belongs to another track.
     """
     if not path.is_file():
         return None
@@ -247,7 +248,7 @@ def best_vertices(dataset: Dataset, subject: str, track: Track) -> np.ndarray:
     """Return the vertices (E, V, 3) float32 of a subject's track, registered where possible.
 
     Raises:
-        FormatError: a registration is damaged, or of another track.
+        FormatError: a registration is damaged, or belongs to another track.
     """
     vertices, digest = track.vertices.copy(), file_sha256(dataset.track_file(subject))
     for row, expression in enumerate(track.expressions):
@@ -258,7 +259,7 @@ def best_vertices(dataset: Dataset, subject: str, track: Track) -> np.ndarray:
     return vertices
 
 
-OF_FRAMES = ("frames", "expression", "neck", "jaw", "eyes", "R", "t")  # a row per frame, with cues
+OF_FRAMES = ("frames", "expression", "neck", "jaw", "eyes", "R", "t")  # one row per frame
 
 
 def read_sequence(path: Path) -> Sequence:
@@ -266,7 +267,8 @@ def read_sequence(path: Path) -> Sequence:
 
     Raises:
         StageError: the file is missing.
-        FormatError: it is not a sequence, its arrays do not fit, or one holds NaN or Inf.
+        FormatError: it is not a sequence, its arrays do not fit each other, or one holds NaN or
+            Inf.
     """
     if not path.is_file():
         raise StageError(
@@ -282,18 +284,18 @@ def read_sequence(path: Path) -> Sequence:
 def _checked(
     arrays: dict[str, np.ndarray], names: np.ndarray, further: dict[str, tuple[int | None, ...]]
 ) -> dict[str, np.ndarray]:
-    """Return the numbers of E expressions or cues with their final types.
+    """Return the numeric arrays of E expressions or cues, converted to their final types.
 
-    ``further`` are the shapes of arrays that only one kind of file has.
+    ``further`` holds the shapes of arrays that only one kind of file has.
 
     Raises:
-        ValueError: one has another shape or kind, or holds what it must not.
-        KeyError: one is missing.
+        ValueError: an array has the wrong shape or type, or holds invalid values.
+        KeyError: an array is missing.
     """
     if names.ndim != 1 or names.dtype.kind != "U" or not len(names):
         raise ValueError(f"expressions are {names.dtype} {names.shape}, expected (E,) strings")
     for name in names.tolist():
-        if not ID.fullmatch(name):  # they become names of files
+        if not ID.fullmatch(name):  # they become file names
             raise ValueError(f"expression {name!r}, expected letters, digits, _ and -")
     count = len(names)
     shapes: dict[str, tuple[int | None, ...]] = {
@@ -310,6 +312,6 @@ def _checked(
     R = arrays["R"]
     error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max()
     if error > 1e-3 or (np.linalg.det(R) < 0).any():
-        raise ValueError(f"R is not a rotation: R R^T differs from 1 by {error:.2g}")
+        raise ValueError(f"R is not a rotation: R R^T differs from identity by {error:.2g}")
     kinds = {"frames": np.int64, "vertices": np.float32, "offsets": np.float32}
     return {name: arrays[name].astype(kinds.get(name, np.float64)) for name in shapes}

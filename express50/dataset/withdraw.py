@@ -1,13 +1,13 @@
-"""Withdraw a subject: remove all that the dataset holds of a person, then search for the id.
+"""Withdraw a subject: remove everything a dataset holds about a person, then search for the id.
 
-Everything that mixes subjects (packed shards, reports, trained models' pictures) is removed and
-made again without the person by running its command; others' outputs that name the person go too. A
-checkpoint loses the person's codes and frames; only a new training removes what its other
-weights learned. The raw capture lies outside the dataset and stays its owner's task.
+Everything that mixes subjects (packed shards, reports, trained models' pictures) is removed, and
+running its command makes it again without the person; others' outputs that name the person go too.
+A checkpoint loses the person's codes and frames; only retraining removes what its other weights
+learned. The raw capture lies outside the dataset: deleting it is up to its owner.
 
-An id is found as a word: letters and digits beside it would make it another. Archives, arrays of
-texts and the ledger are searched; pixels and points are not, as they may hold any four bytes by
-chance.
+Ids match as whole words: with letters or digits next to it, it is a different id. Archives, arrays
+of text and the ledger are searched; pixels and points are not, as they may contain any four bytes
+by chance.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ OVERLAP = 256
 TEXT_LIMIT = 1 << 24
 RUN = re.compile(rb"[A-Za-z0-9][A-Za-z0-9_-]*")
 PART = re.compile(rb"[A-Za-z0-9]+")
-LONGEST_ID = 6  # parts joined by '_' or '-'
+LONGEST_ID = 6  # in parts joined by '_' or '-'
 
 
 @dataclass(frozen=True)
@@ -64,18 +64,18 @@ class Withdrawal:
 
 
 def plan(dataset: Dataset, subject: str) -> list[Path]:
-    """List files and folders of a dataset to remove so that nothing of a subject stays.
+    """List the files and folders to remove so that nothing of a subject remains in a dataset.
 
     Raises:
-        UnknownNameError: the dataset knows no such subject.
+        UnknownNameError: the dataset has no such subject.
     """
     known = {*dataset.captures(), *dataset.subjects()}
     labelled = NAME.fullmatch(subject) and dataset.labels_file(subject).is_file()
-    # Nothing else may pass: '', '..' or 'shards' would name other folders than a person's.
+    # Reject all other names: '', '..' or 'shards' would name folders that are not a person's.
     if not (subject in known or labelled or text_digest(subject) in withdrawn(dataset)):
         check_known(str(dataset.root), "subject", [subject], sorted(known))
     paths = sorted(_own_paths(dataset, subject)) + sorted(_mixed_paths(dataset))
-    # Others' outputs that name the subject, such as peaks matched to the reference person's.
+    # Other subjects' outputs that name this one, such as peaks matched to the reference person's.
     gone, naming = set(paths), []
     for path in files_that(names(subject), dataset.root):
         parts = path.relative_to(dataset.root).parts
@@ -129,25 +129,25 @@ def withdraw(
 ) -> Withdrawal:
     """Remove a subject and search what is left for its id.
 
-    A record of it is kept (`withdrawn_file`), so that ingest refuses to take the person in again.
-    ``checkpoints`` lie outside the dataset; they and those below ``grmm`` are handed to ``redact``,
-    which removes a subject from one and returns True where it was in there.
+    A record is kept (`withdrawn_file`), so that ingest refuses to add the person again.
+    ``checkpoints`` lie outside the dataset; they and those below ``grmm`` are passed to ``redact``,
+    which removes the subject from a checkpoint and returns True if it was in there.
 
     Raises:
-        UnknownNameError: the dataset knows no such subject.
-        StageError: a stage runs.
-        FormatError: the ledger is damaged; then nothing was removed.
+        UnknownNameError: the dataset has no such subject.
+        StageError: a stage is running.
+        FormatError: the ledger is damaged; nothing was removed.
     """
     with hold_stages(dataset, sorted(p.stem for p in (dataset.root / "config").glob("*.toml"))):
         paths = plan(dataset, subject)
         if dataset.ledger.is_file():
-            # Before anything is removed: half a withdrawal cannot be repeated.
+            # Check before anything is removed: a partial withdrawal cannot be repeated.
             with Ledger(dataset.ledger) as ledger:
                 ledger.check_whole()
         captures = dataset.captures()
         capture = captures.pop(subject, None)
         files = sum(1 if p.is_file() else sum(q.is_file() for q in p.rglob("*")) for p in paths)
-        # Who and how many files, without the id itself: a trace must not name the person.
+        # A digest and the number of files, not the id itself: the record must not name the person.
         now = datetime.now(UTC).isoformat(timespec="seconds")
         record = {"id_sha256": text_digest(subject), "time": now, "files": files}
         write_json(withdrawn_file(dataset), [*_withdrawals(dataset), record])
@@ -162,7 +162,7 @@ def withdraw(
                 ledger.erase(subject, dataset.root, paths, names(subject))
         changed, own = [], sorted((dataset.root / "grmm").rglob("*.pt"))
         for path in [*own, *(path for path in checkpoints if path.is_file())]:
-            with suppress(FormatError):  # not a GRMM checkpoint: searched for the id below
+            with suppress(FormatError):  # not a GRMM checkpoint; it is searched for the id below
                 if redact(path, subject):
                     changed.append(path)
     test = names(subject)
@@ -174,17 +174,17 @@ def withdraw(
 
 
 def withdrawn_file(dataset: Dataset) -> Path:
-    """Return the file of withdrawals' records."""
+    """Return the path of the file that records withdrawals."""
     return dataset.root / "withdrawn.json"
 
 
 def withdrawn(dataset: Dataset) -> set[str]:
-    """Return the SHA-256 of withdrawn subjects' ids; the ids themselves are not kept."""
+    """Return the SHA-256 digests of withdrawn subjects' ids; the ids themselves are not kept."""
     return {_digest(row) for row in _withdrawals(dataset)}
 
 
 def _withdrawals(dataset: Dataset) -> list:
-    """Read the records of withdrawals; old ones are digests alone, without time and count."""
+    """Read the records of withdrawals; old ones are plain digests, without time and count."""
     path = withdrawn_file(dataset)
     if not path.is_file():
         return []
@@ -206,11 +206,11 @@ def names(subject: str) -> Test:
 
 
 def names_any_of(digests: Collection[str]) -> Test:
-    """Make a test of whether a text holds an id whose SHA-256 is one of the given."""
+    """Make a test of whether a text holds an id whose SHA-256 is among the given ones."""
     seen: dict[bytes, bool] = {}
 
     def hit(run: bytes) -> bool:
-        # Any of its parts may be an id, and any parts together: ``S001_smile`` names S001.
+        # Any part, and any run of adjacent parts, may be an id: ``S001_smile`` names S001.
         if run not in seen:
             spans = [match.span() for match in PART.finditer(run)]
             words = (
@@ -250,7 +250,7 @@ def texts_of(path: Path) -> Iterator[bytes]:
             with closing(sqlite3.connect(path)) as database:
                 query = "SELECT name FROM sqlite_master WHERE type = 'table'"
                 for (table,) in database.execute(query).fetchall():
-                    # Row by row: a page of the file runs texts together without a gap.
+                    # Row by row: the raw file stores texts next to each other without a gap.
                     for row in database.execute(f'SELECT * FROM "{table}"'):
                         yield "\n".join(value for value in row if isinstance(value, str)).encode()
         elif head.startswith(b"PK\x03\x04") and zipfile.is_zipfile(path):
@@ -277,9 +277,9 @@ def _tar_texts(path: Path) -> Iterator[bytes]:
     with tarfile.open(path, "r:") as tar:
         for member in tar:
             yield member.name.encode(errors="surrogateescape")
-            if member.issparse():  # our shards have none; it may say to be of any size
+            if member.issparse():  # our shards have none, and it may claim any size
                 raise tarfile.ReadError("a sparse member")
-            # A link would lead to another member; only what a member itself holds counts.
+            # A link only repeats another member, so it is skipped.
             wanted = member.isreg() and member.name.endswith(".json")
             file = tar.extractfile(member) if wanted else None
             if file is not None:
@@ -287,7 +287,7 @@ def _tar_texts(path: Path) -> Iterator[bytes]:
 
 
 def _zip_texts(path: Path) -> Iterator[bytes]:
-    """Yield names and texts of an archive such as .npz or a checkpoint, without its numbers."""
+    """Yield names and text of an archive such as .npz or a checkpoint, but not its numbers."""
     import numpy as np
 
     with zipfile.ZipFile(path) as archive:

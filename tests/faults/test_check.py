@@ -132,7 +132,7 @@ def test_upstream_made_anew_with_other_bytes_blames_what_was_made_of_the_old(dat
     assert toy.run_toy(dataset, word="b").ok
     found, _ = look(dataset)
     assert set(found) == {("outdated", "after S001"), ("outdated", "after S002")}
-    assert "made from another toy" in found["outdated", "after S001"].what
+    assert "made from a different toy" in found["outdated", "after S001"].what
     assert look(dataset, fix=True)[1].sound
     assert toy.run_stage_of(LATER, dataset).count("done") == 2
     assert look(dataset)[0] == {}
@@ -171,7 +171,7 @@ def test_leftovers_are_swept_and_a_running_stage_is_left_alone(dataset):
     output(dataset).unlink()
     with stage_lock(dataset, "toy"):
         found, result = look(dataset)
-        assert found == {} and result.notes == ["toy: runs now; its items were not looked at"]
+        assert found == {} and result.notes == ["toy: is running; its items were not checked"]
         with pytest.raises(StageError, match="another 'toy' runs"):
             look(dataset, fix=True)
         assert leftover.is_dir()

@@ -66,13 +66,13 @@ def bad(arrays: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
         "expected letters, digits": {"expressions": np.array(["smile", "../../smile"])},
         "expressions are int64": {"expressions": np.arange(2)},
         "R is not a rotation": {"R": 2 * arrays["R"]},
-        "differs from 1 by": {"R": -arrays["R"]},
+        "differs from identity by": {"R": -arrays["R"]},
         "glasses has shape": {"glasses": np.zeros((2, 3)), "glasses_row": np.zeros(3, int)},
         "glasses has 3 values": {
             "glasses": np.full((1, 3), np.nan),
             "glasses_row": np.zeros(1, int),
         },
-        "glasses_row is not a row of 2": {
+        "glasses_row must name one of 2": {
             "glasses": np.zeros((1, 3)),
             "glasses_row": np.array([2]),
         },
