@@ -1,8 +1,8 @@
-"""Correct colours by polynomials fitted to colour charts: linear light in, linear light out.
+"""Correct colours with polynomials fitted to colour charts: linear light in, linear light out.
 
-Terms of V. Cheung, S. Westland, D. Connah and C. Ripamonti, "A comparative study of the
-characterisation of colour cameras by means of neural networks and polynomial transforms",
-Coloration Technology 120(1), 2004, in the order that colour-science gives them.
+The terms are those of V. Cheung, S. Westland, D. Connah and C. Ripamonti, "A comparative study of
+the characterisation of colour cameras by means of neural networks and polynomial transforms",
+Coloration Technology 120(1), 2004, in the order that the colour-science library uses.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ STRIPE = 256  # rows at a time: the terms of a whole 4K frame would take a gigab
 
 
 def check_matrix(matrix: object, where: str) -> tuple[tuple[float, ...], ...]:
-    """Check a correction matrix (3, T), T one of the known numbers of terms; return its rows.
+    """Check a correction matrix (3, T), where T is a number of terms in TERMS; return its rows.
 
     Raises:
-        CalibrationError: it has another shape, or holds NaN or infinity.
+        CalibrationError: it has the wrong shape, or holds NaN or infinity.
     """
     try:
         array = np.asarray(matrix, dtype=np.float64)
@@ -62,7 +62,7 @@ def expand(linear: np.ndarray, terms: int) -> np.ndarray:
 
 
 def correct_srgb(image: np.ndarray, matrix: tuple[tuple[float, ...], ...]) -> np.ndarray:
-    """Correct an sRGB image (H, W, 3) uint8; values out of range are clipped."""
+    """Apply a correction to an sRGB image (H, W, 3) uint8; clip values that are out of range."""
     rows = np.asarray(matrix, dtype=np.float32)
     out = np.empty_like(image)
     for top in range(0, len(image), STRIPE):

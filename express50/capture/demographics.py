@@ -1,7 +1,7 @@
 """Count the subjects by gender and age, where captures state them.
 
-What a capture says of a person stays in the capture. A dataset takes over `PUBLIC_KEYS` of its
-capture.toml and nothing else; gender and age are read from the capture when they are counted.
+What a capture says about a person stays in the capture. A dataset copies only `PUBLIC_KEYS` from
+its capture.toml; gender and age are read from the capture when they are counted.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 AGE_BANDS = ((0, 17), (18, 29), (30, 44), (45, 59), (60, 200))
-# A count of fewer people identifies them: of two subjects, one is the woman or the one aged 71.
+# Smaller counts could identify people: of two subjects, one may be the only woman, or aged 71.
 LEAST_PEOPLE = 5
 OTHERS = "others or not given"
 PUBLIC_KEYS = frozenset(
@@ -24,15 +24,15 @@ PUBLIC_KEYS = frozenset(
 
 
 def public_meta(meta: Mapping) -> dict:
-    """Return what a dataset may keep of a capture.toml: nothing that describes the person."""
+    """Return the part of a capture.toml that a dataset may keep: nothing about the person."""
     return {key: value for key, value in meta.items() if key in PUBLIC_KEYS}
 
 
 def shown_counts(counts: Mapping[str, int]) -> dict[str, int]:
-    """Keep counts of at least LEAST_PEOPLE; smaller groups are counted among the others.
+    """Keep counts of at least LEAST_PEOPLE; count smaller groups under OTHERS.
 
-    The smallest groups join the others until these are large enough too, as a single small group
-    could be inferred from the total. Empty if there are too few people, or only one group.
+    The smallest groups join OTHERS until it is large enough too, since a single small group could
+    be inferred from the total. Empty if there are too few people, or only one group.
     """
     left = sorted((n, name) for name, n in counts.items() if name != "not given")
     others = counts.get("not given", 0)
@@ -50,7 +50,7 @@ def gender_counts(metas: Sequence[Mapping]) -> dict[str, int]:
 
 
 def age_counts(metas: Sequence[Mapping]) -> dict[str, int]:
-    """Count the subjects in each band of years."""
+    """Count the subjects in each age band."""
     ages = [_age(m) for m in metas]
     counts = {}
     for low, high in AGE_BANDS:
@@ -61,13 +61,13 @@ def age_counts(metas: Sequence[Mapping]) -> dict[str, int]:
 
 
 def mean_age(metas: Sequence[Mapping], least: int = LEAST_PEOPLE) -> tuple[float, int] | None:
-    """Compute the mean age in years and the number of people; None of fewer than ``least``."""
+    """Compute the mean age in years and the number of people; None for fewer than ``least``."""
     ages = [age for m in metas if (age := _age(m)) is not None]
     return (round(sum(ages) / len(ages), 1), len(ages)) if len(ages) >= least else None
 
 
 def _age(meta: Mapping) -> float | None:
-    """Return the age in years; None where it is not given or out of range."""
+    """Return the age in years; None if it is not given or out of range."""
     age = meta.get("age")
     if isinstance(age, bool) or not isinstance(age, int | float):
         return None

@@ -23,13 +23,14 @@ class Expression:
 
     Attributes:
         id: snake_case id, used in cues, labels and file names.
-        name: short title for people.
+        name: short title shown to people.
         description: what to do, with FACS action units.
-        categories: from ``CATEGORIES``.
-        controls: activation of named expression directions; 1 is full, negative is its opposite.
+        categories: some of ``CATEGORIES``.
+        controls: activation of named expression directions; 1 is full, a negative value is the
+            opposite movement.
         jaw: (3,) axis-angle of the jaw, radians; opening is +x.
         neck: (3,) axis-angle of the neck, radians.
-        gaze: (2,) yaw to the subject's left and pitch upwards, radians.
+        gaze: (2,) yaw, positive to the subject's left, and pitch, positive upwards; radians.
     """
 
     id: str
@@ -43,7 +44,7 @@ class Expression:
 
 
 def expression_words(expression: str) -> tuple[str, str]:
-    """Return the name and description of an expression; outside the script its id and ""."""
+    """Return an expression's name and description; its id and "" if it is not in the script."""
     entry = next((e for e in load_script() if e.id == expression), None)
     return (expression, "") if entry is None else (entry.name, entry.description)
 
@@ -63,7 +64,7 @@ def select(ids: list[str] | tuple[str, ...] | None = None) -> tuple[Expression, 
     """Return the script's entries with these ids, in their order; all of them for None.
 
     Raises:
-        FormatError: an id is not in the script; the nearest one is named.
+        FormatError: an id is not in the script; the message suggests the nearest one.
     """
     script = {expression.id: expression for expression in load_script()}
     if ids is None:
@@ -71,5 +72,7 @@ def select(ids: list[str] | tuple[str, ...] | None = None) -> tuple[Expression, 
     for wanted in ids:
         if wanted not in script:
             near = difflib.get_close_matches(wanted, script, 1, cutoff=0.0)
-            raise FormatError(f"expression {wanted!r} is not in the script; nearest is {near[0]!r}")
+            raise FormatError(
+                f"expression {wanted!r} is not in the script; did you mean {near[0]!r}?"
+            )
     return tuple(script[wanted] for wanted in ids)

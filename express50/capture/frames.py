@@ -45,7 +45,7 @@ def dhash(image: np.ndarray) -> str:
 
 
 class FrameReader:
-    """Full-resolution frames of one camera; reading forward is quick."""
+    """Reads full-resolution frames of one camera; reading forward is quick."""
 
     def __init__(self, index: Index, camera_id: str) -> None:
         if camera_id not in index.cameras:
@@ -63,7 +63,7 @@ class FrameReader:
         """Read an image (H, W, 3) uint8 sRGB by decode index, colours corrected, not undistorted.
 
         Raises:
-            CaptureError: no such frame, or the footage is not what was ingested.
+            CaptureError: there is no such frame, or the footage changed since it was ingested.
         """
         if not 0 <= frame < self.source.frames:
             raise CaptureError(
@@ -78,13 +78,14 @@ class FrameReader:
             file = str(video.path)
             image = upright(video.read(number), orientation)
             if dhash(image) != expected:
-                # A decoder may conceal a missing reference after a seek; from the start it cannot.
+                # After a seek a decoder may hide a missing reference frame; from the start it
+                # cannot.
                 video.restart()
                 image = upright(video.read(number), orientation)
         if (found := dhash(image)) != expected:
             raise CaptureError(
-                f"{file}: frame {frame} has hash {found}, the index says {expected}; "
-                "the footage changed since it was ingested, run 'express50 ingest' again"
+                f"{file}: frame {frame} has hash {found}, but the index has {expected}; "
+                "the footage changed since it was ingested: run 'express50 ingest' again"
             )
         return corrected(image, self.source)
 
@@ -114,13 +115,13 @@ def corrected(image: np.ndarray, source: CameraSource | RawCamera) -> np.ndarray
 
 
 class FootageReader:
-    """Frames of all cameras of a subject; videos stay open, so that reading forward is quick."""
+    """Reads frames of all cameras of a subject; videos stay open, so reading forward is quick."""
 
     def __init__(self, dataset: Dataset, subject: str, undistort: bool = True) -> None:
-        """Open nothing yet; with ``undistort`` frames are pictures, as peak frames are.
+        """Read index and cameras, but open no video; ``undistort`` makes frames into pictures.
 
         Raises:
-            StageError: ingest, or calibrate when undistorting, did not run.
+            StageError: ingest, or calibrate if undistorting, has not run.
         """
         self._index = read_index(dataset, subject)
         self._cameras = read_recorded_cameras(dataset, subject) if undistort else None
@@ -131,8 +132,8 @@ class FootageReader:
         """Read a full-resolution frame (H, W, 3) uint8 sRGB by decode index.
 
         Raises:
-            CaptureError: no such camera or frame, or the footage changed.
-            StageError: undistorting, and the camera is not calibrated.
+            CaptureError: there is no such camera or frame, or the footage changed.
+            StageError: frames are to be undistorted, but the camera is not calibrated.
         """
         if camera_id not in self._readers:
             self._readers[camera_id] = FrameReader(self._index, camera_id)
@@ -164,26 +165,26 @@ def read_frame(
 
 
 def read_recorded_plate(index: Index, camera_id: str) -> np.ndarray:
-    """Read a clean plate (H, W, 3) uint8 sRGB of the index, colours corrected, not undistorted.
+    """Read a clean plate (H, W, 3) uint8 sRGB as recorded: colours corrected, not undistorted.
 
     Raises:
-        CaptureError: it cannot be read, or its size is not that of the footage.
+        CaptureError: it cannot be read, or its size differs from the footage's.
     """
     path = index.capture / index.plates[camera_id]
     image = read_srgb(path)
     source = index.cameras[camera_id]
     if image.shape[:2] != (source.height, source.width):
         raise CaptureError(
-            f"{path}: plate is {image.shape[1]}x{image.shape[0]}, the footage of {camera_id} is "
-            f"{source.width}x{source.height}; record the plate with the settings of the capture"
+            f"{path}: the plate is {image.shape[1]}x{image.shape[0]}, the footage of {camera_id} "
+            f"is {source.width}x{source.height}; record the plate with the same camera settings"
         )
     return corrected(image, source)
 
 
 def write_frame(path: Path, image: np.ndarray) -> None:
-    """Write an image (H, W, 3) uint8 losslessly as JPEG XL; equal images, equal bytes.
+    """Write an image (H, W, 3) uint8 losslessly as JPEG XL; equal images give equal bytes.
 
-    Effort 1 encodes a 3840x2160 frame in 0.03 s to half of a PNG's bytes (docs/LOG.md).
+    Effort 1 encodes a 3840x2160 frame in 0.03 s to half the size of a PNG (docs/LOG.md).
     """
     pixels = np.ascontiguousarray(image)
     path.write_bytes(imagecodecs.jpegxl_encode(pixels, lossless=True, effort=1, numthreads=1))
@@ -193,8 +194,8 @@ def read_peak_frame(dataset: Dataset, subject: str, expression: str, camera_id: 
     """Read a peak frame (H, W, 3) uint8 sRGB, as the pinhole camera of ``read_cameras_of`` sees it.
 
     Raises:
-        CaptureError: the frames stage did not write it at the size of the subject's pictures, or it
-            cannot be read.
+        CaptureError: the frames stage has not written it, its size differs from the subject's other
+            pictures, or it cannot be read.
     """
     path = dataset.frame_file(subject, expression, camera_id)
     if not path.is_file():
@@ -209,7 +210,7 @@ def read_matted_frame(dataset: Dataset, item: str, camera: Camera) -> tuple[np.n
     """Read a camera's peak frame (H, W, 3) uint8 of `subject/expression`, and its matte (H, W).
 
     Raises:
-        StageError: it has no matte.
+        StageError: the frame has no matte.
         FormatError: the matte is not an 8-bit grey image of the camera's size.
         CaptureError: the frame cannot be read.
     """
@@ -238,7 +239,7 @@ def read_plate_image(dataset: Dataset, subject: str, camera_id: str) -> np.ndarr
 
 
 def _read_written(path: Path, size: tuple[int, int] | None) -> np.ndarray:
-    """Read what ``write_frame`` wrote, in three quarters of the time of ``read_srgb``."""
+    """Read what ``write_frame`` wrote, which takes 25% less time than with ``read_srgb``."""
     fix = "delete its folder and run 'express50 frames' again"
     data = read_bytes(path, CaptureError, LARGEST_FRAME, fix)
     try:
@@ -250,8 +251,8 @@ def _read_written(path: Path, size: tuple[int, int] | None) -> np.ndarray:
     found = (image.shape[1], image.shape[0])
     if size not in (None, found):
         raise CaptureError(
-            f"{path}: {found[0]}x{found[1]}, expected {size[0]}x{size[1]} as the subject's other"
-            " pictures; it was written with another frames.image_side: run 'express50 frames' again"
+            f"{path}: {found[0]}x{found[1]}, expected {size[0]}x{size[1]} like the subject's other"
+            " pictures; frames.image_side changed since: run 'express50 frames' again"
         )
     return image
 
@@ -266,9 +267,9 @@ def frame_inputs(dataset: Dataset, subject: str, expression: str) -> dict[str, P
 def read_cameras_of(dataset: Dataset, subject: str, undistorted: bool = True) -> dict[str, Camera]:
     """Read the cameras of a subject's pictures, sorted by id.
 
-    They are the calibrated ones, at the size to which the frames stage reduced the pictures; as
-    recorded before it ran. Pictures belong to the pinhole cameras, which are given unless
-    ``undistorted`` is false.
+    They are the calibrated cameras, scaled to the size to which the frames stage reduced the
+    pictures; before it has run, to the recorded size. Pictures are undistorted, so the cameras are
+    pinholes unless ``undistorted`` is false.
 
     Raises:
         StageError: the subject is not calibrated.
@@ -302,8 +303,8 @@ def make_picture(image: np.ndarray, camera: Camera, size: tuple[int, int]) -> np
     """Make the picture of a recorded image (H, W, 3) uint8: undistort it, then reduce it.
 
     Args:
-        image: of the recorded camera.
-        camera: as recorded.
+        image: image as the camera recorded it.
+        camera: the camera at its recorded size.
         size: width and height of the picture. Areas are averaged in linear light, as a sensor
             with larger pixels would do.
     """
@@ -315,7 +316,7 @@ def picture_sizes(dataset: Dataset, subject: str) -> dict[str, tuple[int, int]]:
     """Read width and height of a subject's pictures by camera; empty before the frames stage.
 
     Raises:
-        FormatError: the file is not {camera: [width, height]} with whole numbers above 0.
+        FormatError: the file is not {camera: [width, height]} with positive integers.
     """
     path = dataset.picture_sizes_file(subject)
     return _sizes_cached(path) if path.is_file() else {}
@@ -345,10 +346,10 @@ def _cameras_cached(path: Path) -> dict[str, Camera]:
 
 
 def read_gains(dataset: Dataset, subject: str) -> dict[str, np.ndarray]:
-    """Read the linear light (3,) of each camera over that of the rig's mean; empty if not known.
+    """Read each camera's linear light (3,) relative to the rig's mean; empty if not known.
 
     Raises:
-        FormatError: the file is not {camera: [red, green, blue]} with numbers above 0.
+        FormatError: the file is not {camera: [red, green, blue]} with positive numbers.
     """
     path = dataset.gains_file(subject)
     if not path.is_file():
@@ -357,7 +358,7 @@ def read_gains(dataset: Dataset, subject: str) -> dict[str, np.ndarray]:
         rows = read_json_table(path, FormatError, "calibrate again")
         gains = {name: np.array(row, float) for name, row in rows.items()}
     except (ValueError, TypeError, OverflowError) as error:
-        raise FormatError(f"{path}: not camera gains ({error}); calibrate again") from error
+        raise FormatError(f"{path}: not a table of gains ({error}); calibrate again") from error
     for name, gain in gains.items():
         if gain.shape != (3,) or not np.isfinite(gain).all() or (gain <= 0).any():
             raise FormatError(
@@ -368,11 +369,11 @@ def read_gains(dataset: Dataset, subject: str) -> dict[str, np.ndarray]:
 
 
 def read_proxy(dataset: Dataset, subject: str, camera_id: str, frame: int) -> np.ndarray:
-    """Read the small JPEG copy (h, w, 3) uint8 sRGB of a frame; a read costs milliseconds.
+    """Read the small JPEG copy (h, w, 3) uint8 sRGB of a frame, which takes milliseconds.
 
     Raises:
         StageError: the subject is not ingested.
-        CaptureError: no such camera or frame.
+        CaptureError: there is no such camera or frame.
     """
     folder = dataset.proxies_dir(subject)
     index = read_index(dataset, subject)
@@ -382,12 +383,12 @@ def read_proxy(dataset: Dataset, subject: str, camera_id: str, frame: int) -> np
 
 
 def decode_proxy(folder: Path, camera_id: str, frame: int) -> np.ndarray:
-    """Read a proxy (h, w, 3) uint8 sRGB out of a folder of indexed tars."""
+    """Read a proxy (h, w, 3) uint8 sRGB from a folder of indexed tars."""
     tar, table = folder / f"{camera_id}.tar", folder / f"{camera_id}.json"
     try:
         offset, size = _proxy_table(table)[frame]
         if min(offset, size) < 0 or offset + size > tar.stat().st_size:
-            raise ValueError(f"frame {frame} lies outside of {tar.name}")
+            raise ValueError(f"frame {frame} lies outside {tar.name}")
         with tar.open("rb") as file:
             file.seek(offset)
             data = file.read(size)

@@ -13,13 +13,13 @@ from express50.files.digests import cached_by_file
 from express50.files.text import NAME, read_json_table
 
 SCHEMA = "express50.index/1"
-# `Index.calibration` of a capture in a foreign layout: its cameras stand beside the index.
+# `Index.calibration` of a capture in another layout: ingest writes its cameras beside the index.
 TRANSLATED = "ingest:calibration.json"
 
 
 @dataclass(frozen=True)
 class Cue:
-    """Frames in which one scripted expression was performed; both ends are inside."""
+    """Frames in which a scripted expression was performed; start and end are inclusive."""
 
     expression_id: str
     start_frame: int
@@ -28,23 +28,23 @@ class Cue:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSource:
-    """Footage of one camera; sequences are by 0-based decode index.
+    """Footage of one camera; sequences are indexed by 0-based decode index.
 
     Attributes:
         kind: ``video``, ``videos`` (one file per clip) or ``frames``.
-        source: video file, or folder of the names, relative to the capture.
-        width: of the footage, pixels.
-        height: of the footage, pixels.
-        frames: how many frames decode.
+        source: video file, or the folder that holds ``names``, relative to the capture.
+        width: width of the footage, pixels.
+        height: height of the footage, pixels.
+        frames: number of frames that decode.
         pts: presentation time stamp of each frame (the frame's number for image files).
         dhash: 64-bit difference hash of each frame, 16 hexadecimal digits.
-        sha256: of the video file, or of the names and digests of the image files.
+        sha256: digest of the video file, or of the image files' names and digests.
         names: images or videos in order, relative to the source; empty for a single video. An image
             may lie in a container (`express50.files.containers`).
-        clips: frames of each clip; empty where all is one.
+        clips: number of frames of each clip; empty if there is only one clip.
         correction: rows of a polynomial colour correction that `frames` applies, or none.
-        orientation: how the images are turned when they are read (`files.images`); width and
-            height are those of the turned ones.
+        orientation: how images are rotated when they are read (`files.images`); width and height
+            are those after rotation.
     """
 
     kind: str
@@ -63,10 +63,10 @@ class CameraSource:
 
 @dataclass(frozen=True, kw_only=True)
 class Index:
-    """Everything the stages need to know of one subject's capture.
+    """Everything the stages need to know about one subject's capture.
 
     Attributes:
-        subject: id.
+        subject: subject id.
         capture: folder of the footage; from the dataset's table, not from the index file.
         fps: frames per second.
         cameras: usable cameras by id.
@@ -74,7 +74,7 @@ class Index:
         board: ``{"config": board.toml's content, "cameras": {id: [files]}}`` or None.
         calibration: calibration file relative to the capture, or None; see `calibration_file`.
         cues: scripted expressions, in file order.
-        meta: content of capture.toml but for what describes the person (`demographics`).
+        meta: content of capture.toml without what describes the person (`demographics`).
     """
 
     subject: str
@@ -89,7 +89,7 @@ class Index:
 
     @property
     def frames(self) -> int:
-        """Return frames that every camera has."""
+        """Return the number of frames that every camera has."""
         return min(camera.frames for camera in self.cameras.values())
 
 
@@ -139,7 +139,7 @@ def _read_cached(path: Path, dataset: Dataset, subject: str) -> Index:
 
 
 def index_to_json(index: Index) -> dict[str, Any]:
-    """Convert an index to JSON; machine paths stay out of it."""
+    """Convert an index to JSON, without paths of this machine."""
     return {
         "schema": SCHEMA,
         "subject": index.subject,
@@ -155,11 +155,11 @@ def index_to_json(index: Index) -> dict[str, Any]:
 
 def _camera_to_json(camera: CameraSource) -> dict[str, Any]:
     row = dict(vars(camera))
-    # Strings keep the file small and quick to read: a subject has 10^5 frames.
+    # Strings keep the file small and quick to read: a subject may have 10^5 frames.
     row["pts"] = " ".join(map(str, camera.pts))
     row["dhash"] = " ".join(camera.dhash)
     row["names"] = list(camera.names)
-    # Left out where they say nothing: most captures have one clip, no correction and lie upright.
+    # Defaults are left out: most captures have one clip, no correction and upright images.
     plain = {"clips": (), "correction": (), "orientation": 1}
     return {k: v for k, v in row.items() if k not in plain or v != plain[k]}
 
@@ -168,12 +168,12 @@ def index_from_json(content: Mapping[str, Any], capture: Path) -> Index:
     """Convert JSON to an index.
 
     Raises:
-        ValueError: another schema, or sequences whose lengths differ from the frame count.
+        ValueError: the schema is wrong, or a sequence's length differs from the frame count.
     """
     if content.get("schema") != SCHEMA:
         raise ValueError(f"schema is {content.get('schema')!r}, expected {SCHEMA!r}")
     for name in (*content["cameras"], *(row[0] for row in content["cues"])):
-        if not NAME.fullmatch(name):  # they become names of files
+        if not NAME.fullmatch(name):  # they become file names
             raise ValueError(f"id {name!r}, expected letters, digits and _ . + -")
     for name in content["plates"].values():
         _check_inside(name)
@@ -191,7 +191,7 @@ def index_from_json(content: Mapping[str, Any], capture: Path) -> Index:
 
 
 def _check_inside(name: str) -> None:
-    """Refuse a name that leads out of the capture; the pictures' own are checked when read."""
+    """Refuse a name that leads out of the capture; image names are checked when read."""
     if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
         raise ValueError(f"{name!r} leads out of the capture")
 
@@ -211,17 +211,19 @@ def _camera_from_json(name: str, row: Mapping[str, Any]) -> CameraSource:
     if lengths != {camera.frames}:
         raise ValueError(f"camera {name}: {sorted(lengths)} entries for {camera.frames} frames")
     if camera.clips and sum(camera.clips) != camera.frames:
-        raise ValueError(f"camera {name}: clips of {sum(camera.clips)} of {camera.frames} frames")
+        raise ValueError(
+            f"camera {name}: clips have {sum(camera.clips)} frames, expected {camera.frames}"
+        )
     return camera
 
 
 @dataclass(frozen=True)
 class Peak:
-    """The labelled frame of one expression, with the identity that the label gave it.
+    """The labelled frame of one expression, with the time stamp and hash that the label recorded.
 
     Attributes:
         frame: decode index.
-        camera: camera on which the label was made.
+        camera: camera in which the label was made.
         pts: time stamp of the frame in that camera.
         dhash: difference hash of the frame in that camera.
     """
@@ -233,7 +235,7 @@ class Peak:
 
 
 def read_peaks(dataset: Dataset, subject: str) -> dict[str, int]:
-    """Read the peak frame (decode index) of each expression; raises as ``read_peak_rows``."""
+    """Read each expression's peak frame (decode index); raise what ``read_peak_rows`` raises."""
     return {name: peak.frame for name, peak in read_peak_rows(dataset, subject).items()}
 
 
@@ -263,10 +265,10 @@ def read_peak_rows(dataset: Dataset, subject: str) -> dict[str, Peak]:
 
 
 def check_peak(index: Index, expression: str, peak: Peak) -> None:
-    """Check that a label's frame is the one that was indexed.
+    """Check that a label's frame matches the index.
 
     Raises:
-        CaptureError: time stamp or hash differ, so that the label names another frame.
+        CaptureError: time stamp or hash differ, so the label was made on other footage.
     """
     source = index.cameras.get(peak.camera)
     there = source is not None and 0 <= peak.frame < source.frames
@@ -274,8 +276,8 @@ def check_peak(index: Index, expression: str, peak: Peak) -> None:
     if found != (peak.pts, peak.dhash):
         raise CaptureError(
             f"{index.subject}/{expression}: frame {peak.frame} of {peak.camera} has time and hash "
-            f"{found}, the label says {(peak.pts, peak.dhash)}; the footage is not the one that "
-            "was labelled, run 'express50 align' again"
+            f"{found}, but the label has {(peak.pts, peak.dhash)}; the footage changed since it "
+            "was labelled: run 'express50 align' again"
         )
 
 

@@ -1,4 +1,4 @@
-"""Read a raw capture as it comes off the rig: check the folder and name every fault.
+"""Read a raw capture as it comes off the rig: check the folder and report every fault.
 
 Layout: capture.toml, cameras/<id>/video.mp4 or cameras/<id>/frames/000000.png..., and optionally
 calibration.json, plates/<id>.png, board/<id>/*.png with board/board.toml, cues.csv.
@@ -20,7 +20,7 @@ from express50.geometry.cameras import Camera
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
-# Windows keeps these names for devices, with any letter case.
+# Windows reserves these names for devices, in any letter case.
 RESERVED = {
     "CON",
     "PRN",
@@ -33,17 +33,17 @@ CUE_COLUMNS = ("expression_id", "start_frame", "end_frame")
 
 @dataclass(frozen=True, kw_only=True)
 class RawCamera:
-    """Footage of one camera, in clips one after another.
+    """Footage of one camera, as consecutive clips.
 
     Attributes:
-        id: of the camera.
+        id: camera id.
         kind: ``video`` (``path`` is the file), ``videos`` (a file per clip) or ``frames`` (images).
         path: the video, or the folder that ``names`` are relative to.
         names: videos or images in order; an image may lie in a container (`files.containers`).
-        counts: images of each clip; one clip where it is empty.
-        stamps: the layout's own number of each image; its place where it is empty.
+        counts: number of images of each clip; if empty, there is one clip.
+        stamps: the layout's own number for each image; if empty, its position.
         correction: rows of a polynomial colour correction (`colour_correction`), or none.
-        orientation: how images are to be turned when they are read (`files.images`).
+        orientation: how images are rotated when they are read (`files.images`).
     """
 
     id: str
@@ -58,7 +58,7 @@ class RawCamera:
 
 @dataclass(frozen=True, kw_only=True)
 class RawCapture:
-    """A capture of any layout, checked without decoding footage.
+    """A capture in any layout, checked without decoding footage.
 
     Attributes:
         root: the folder that footage and plates are relative to.
@@ -67,15 +67,15 @@ class RawCapture:
         meta: content of capture.toml.
         cameras: footage by camera id.
         dropped: cameras that cannot be used, with the reason.
-        calibration: given cameras, or None when they are to be solved.
+        calibration: given cameras, or None if they are to be calibrated.
         plates: background plates by camera id, relative to the root.
-        board: content of board.toml and files by camera, or None.
+        board: content of board.toml and image files by camera, or None.
         cues: scripted expressions in file order.
         layout: name of the layout in `express50.capture.readers.read`; ours is ``express50``.
-        clips: expression of each clip where the footage comes in clips; they make the cues.
+        clips: expression of each clip, if the footage comes in clips; the cues follow from them.
         skipped: parts of a layout that were left out (sequences, frames), with the reason.
-        found: facts of the layout, for metrics.
-        warnings: oddities that may be meant, with the reason.
+        found: facts about the layout, for metrics.
+        warnings: oddities that may be intentional, with the reason.
     """
 
     root: Path
@@ -99,8 +99,8 @@ def read_capture(root: Path) -> RawCapture:
     """Read and check a raw capture.
 
     Raises:
-        CaptureError: a file is missing or malformed so that the whole capture is unusable.
-        CalibrationError: calibration.json is there but malformed.
+        CaptureError: a missing or malformed file makes the whole capture unusable.
+        CalibrationError: calibration.json exists but is malformed.
     """
     meta = read_meta(root)
     cameras, dropped = _read_cameras(root)
@@ -110,7 +110,7 @@ def read_capture(root: Path) -> RawCapture:
         for name in sorted(set(calibration) - set(cameras) - set(dropped)):
             dropped[name] = f"calibrated, but {root / 'cameras' / name} is not there"
         for name in sorted(set(cameras) - set(calibration)):
-            dropped[name] = "not in calibration.json; add it, or delete that file to solve all"
+            dropped[name] = "not in calibration.json; add it, or delete that file to calibrate all"
             del cameras[name]
     return RawCapture(
         root=root,
@@ -140,7 +140,7 @@ def read_meta(root: Path) -> dict:
     if not path.is_file():
         what = "no such folder" if not root.is_dir() else "has no capture.toml"
         raise CaptureError(
-            f"{root}: {what}; expected a capture folder whose capture.toml says subject and fps"
+            f"{root}: {what}; expected a capture folder whose capture.toml gives subject and fps"
         )
     meta = read_capture_toml(root)
     check_identity(path, meta.get("subject"), meta.get("fps"))
@@ -148,7 +148,7 @@ def read_meta(root: Path) -> dict:
 
 
 def read_capture_toml(root: Path) -> dict:
-    """Read a capture.toml, dates as text, without a check of its content; empty without one.
+    """Read a capture.toml, dates as text, without checking its content; empty if there is none.
 
     Raises:
         CaptureError: it cannot be read or is not TOML.
@@ -159,10 +159,10 @@ def read_capture_toml(root: Path) -> dict:
 
 
 def check_identity(path: Path, subject: object, fps: object) -> None:
-    """Refuse a subject or frame rate that cannot be one.
+    """Refuse an invalid subject id or frame rate.
 
     Raises:
-        CaptureError: a value is missing, of another type or out of range.
+        CaptureError: a value is missing, of the wrong type or out of range.
     """
     if not isinstance(subject, str) or not ID.fullmatch(subject):
         raise CaptureError(
@@ -171,7 +171,7 @@ def check_identity(path: Path, subject: object, fps: object) -> None:
         )
     if subject.upper() in RESERVED:
         raise CaptureError(
-            f"{path}: subject is {subject!r}, a name that Windows keeps for a device; expected"
+            f"{path}: subject is {subject!r}, a name that Windows reserves for a device; expected"
             " another, such as 'S001'"
         )
     if isinstance(fps, bool) or not isinstance(fps, int | float):
@@ -224,7 +224,7 @@ def _read_camera(folder: Path) -> RawCamera:
     frames = folder / "frames"
     if len(found) + frames.is_dir() > 1:
         names = ", ".join([video.name for video in found] + ["frames/"] * frames.is_dir())
-        raise CaptureError(f"{folder}: holds {names}, expected one of them; move the others away")
+        raise CaptureError(f"{folder}: holds {names}; expected only one, move the others away")
     if found:
         return RawCamera(id=folder.name, kind="video", path=found[0])
     if not frames.is_dir():
@@ -233,7 +233,7 @@ def _read_camera(folder: Path) -> RawCamera:
 
 
 def _frame_names(folder: Path) -> tuple[str, ...]:
-    """List image names in order; they must count up from zero, or frames would be mistaken."""
+    """List image names in order; they must count up from zero, or frames would be mixed up."""
     names = image_names(folder)
     if not names:
         raise CaptureError(f"{folder}: holds no image, expected 000000.png and so on")
@@ -265,7 +265,8 @@ def _read_board(root: Path, cameras: dict[str, RawCamera]) -> dict | None:
     path = folder / "board.toml"
     if not path.is_file():
         raise CaptureError(
-            f"{folder}: has no board.toml; describe the ChArUco board in it, see docs/FORMAT.md"
+            f"{folder}: has no board.toml; write one that describes the ChArUco board, see"
+            " docs/FORMAT.md"
         )
     config = read_toml(path, CaptureError)
     files = {name: image_names(folder / name) for name in cameras}
@@ -279,8 +280,8 @@ def read_cues(path: Path) -> tuple[Cue, ...]:
     """Read ``expression_id,start_frame,end_frame`` rows; no file means no cues.
 
     Raises:
-        CaptureError: a column is missing, a value is not a frame number, the end is before the
-            start, or an expression appears twice.
+        CaptureError: a column is missing, a value is not a frame number, a cue ends before it
+            starts, or an expression appears twice.
     """
     if not path.is_file():
         return ()
@@ -321,13 +322,13 @@ def _read_cue(path: Path, line: int, row: dict[str, str]) -> Cue:
     if not 0 <= start <= end < 2**31:
         raise CaptureError(
             f"{path}:{line}: {name} runs from {start} to {end}; expected 0 <= start <= end "
-            "(the end frame is inside)"
+            "(the end frame is included)"
         )
     return Cue(name, start, end)
 
 
 def check_calibrated_sizes(raw: RawCapture, sizes: dict[str, tuple[int, int]]) -> None:
-    """Refuse cameras calibrated for another (width, height) than their footage has.
+    """Refuse cameras whose calibrated (width, height) differs from their footage's.
 
     Raises:
         CalibrationError: a size differs; a guessed scale would give wrong depths.

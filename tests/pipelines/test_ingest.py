@@ -272,7 +272,7 @@ def test_a_focal_length_that_is_none_fails_at_once(dataset, focal):
 @pytest.mark.parametrize("subject", ["CON", "nul", "Com7"])
 def test_subjects_named_like_a_device_are_refused(tmp_path, subject):
     make_capture(tmp_path / "a", subject=subject, cameras=1)
-    with pytest.raises(CaptureError, match="a name that Windows keeps for a device"):
+    with pytest.raises(CaptureError, match="a name that Windows reserves for a device"):
         ingest.register(Dataset(tmp_path / "data"), [tmp_path / "a"])
 
 

@@ -75,7 +75,7 @@ def test_camera_without_or_with_two_kinds_of_footage_is_dropped(raw):
     (raw / "cameras/cam00/video.mp4").touch()
     (raw / "cameras/cam01/frames").rename(raw / "cameras/cam01/photos")
     dropped = read_capture(raw).dropped
-    assert "holds video.mp4, frames/, expected one of them" in dropped["cam00"]
+    assert "holds video.mp4, frames/; expected only one" in dropped["cam00"]
     assert "holds no footage" in dropped["cam01"]
 
 
