@@ -1,7 +1,7 @@
 """Run the paper's ablations: rows trained and fitted under one budget, and one table.
 
 Finished rows are kept: a row is measured again only when its settings, the shards or the protocol
-differ from those it was measured with; a half-trained row goes on from its checkpoint.
+differ from those it was measured with; a half-trained row continues from its checkpoint.
 """
 
 from __future__ import annotations
@@ -53,12 +53,12 @@ class Variant:
     """One row of the ablation.
 
     Attributes:
-        label: as in the table.
+        label: its name in the table.
         changes: table -> key -> value over the common configuration.
-        paper_db: the paper's PSNR minus that of its full model; None: no figure.
-        against: the row that it is compared with.
-        trains_as: the row whose checkpoint it uses, where only the fit differs.
-        without: the folder of shards left out.
+        paper_db: the paper's PSNR minus that of its full model; None if the paper has no figure.
+        against: the row it is compared with.
+        trains_as: the row whose checkpoint it uses, if only the fit differs.
+        without: the folder of shards that it leaves out.
     """
 
     label: str
@@ -102,14 +102,14 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True, kw_only=True)
 class Ablation:
-    """What all rows share.
+    """The settings that all rows share.
 
     Attributes:
-        roots: folders of shards; several are mixed.
-        out: gets one folder per row, and the tables.
-        config: of the full model; its budget is every row's.
+        roots: folders of shards; training mixes several.
+        out: the folder for the tables and one folder per row.
+        config: the full model's; every row has its budget.
         protocol: how unseen people are fitted.
-        subjects: unseen people; empty: all that the training split lacks.
+        subjects: unseen people; empty: everyone who is not in the training split.
         seeds: how often each row is trained; intervals need two or more.
         test: folders of shards whose people are fitted, and nobody is trained on; empty: ``roots``.
     """
@@ -123,20 +123,20 @@ class Ablation:
     test: Sequence[Path] = ()
 
     def unseen(self) -> tuple[Source, list[str]]:
-        """List the people to fit, which no row trains on, with the source of their views."""
+        """List the people to fit, whom no row trains on, with the source of their views."""
         source = open_shards(self.test or self.roots, "*")
         trained = {key.subject for key in open_shards(self.roots, "train").keys}
         known = {key.subject for key in source.keys}
         if self.test and (both := sorted(known & trained)):
             raise ConfigError(
-                f"{', '.join(map(str, self.test))}: {', '.join(both)} are trained on too; expected"
+                f"{', '.join(map(str, self.test))}: {', '.join(both)} are also trained on; expected"
                 " other people in shards to test on"
             )
         return source, list(self.subjects) or sorted(known - trained)
 
 
 def ablate(run: Ablation, names: Sequence[str] = ()) -> dict[str, Any]:
-    """Measure every row that is not measured yet; writes ablation.json and ablation.md.
+    """Measure every row that is not measured yet; write ablation.json and ablation.md.
 
     ``names`` are the rows to measure; empty: all.
 
@@ -170,7 +170,7 @@ def with_holdout(roots: Sequence[Path], config: Config) -> Config:
         return config
     cameras = sorted({key.camera for key in open_shards(roots, "train").keys})
     if len(cameras) < 2:
-        raise ConfigError(f"{roots[0]}: one camera; expected two or more, to hold one out")
+        raise ConfigError(f"{roots[0]}: has one camera; expected at least two, to hold one out")
     chosen = cameras[len(cameras) // 2]
     log(f"ablate: holding out camera {chosen}")
     return replace(config, data=replace(config.data, holdout_cameras=(chosen,)))
@@ -227,7 +227,7 @@ def _row(run: Ablation, name: str, variant: Variant, seed: int) -> dict:
 
 
 def _train(used: Sequence[Path], folder: Path, settings: Config) -> None:
-    """Train a row, or go on where it stopped; other settings or samples start afresh."""
+    """Train or resume a row; start over if its settings or samples have changed."""
     source = open_shards(used, "train")
     tables = {k: v for k, v in as_tables(settings).items() if k not in ("fit", "metrics")}
     wanted = dump_json({"tables": tables, "samples": source.digest})
@@ -243,7 +243,7 @@ def measure(run: Ablation, loaded: Loaded, used: Sequence[Path]) -> dict:
     """Measure held-out views and expressions of training people, and unseen people."""
     views, kind = loaded.views(open_shards(run.roots, "*")), partial(kind_of, loaded)
     judge, rows, efforts = PerceptualMetrics(loaded.config.metrics), [], []
-    # Without a dataset other people are trained, whose views cannot be compared.
+    # Rows without a dataset train on other people, so their views cannot be compared.
     if len(used) == len(run.roots):
         render, expressions = training_render(loaded.model, views), loaded.model.expressions
         drawn = [i for i, key in enumerate(views.keys) if key.expression in expressions]
@@ -328,7 +328,7 @@ def write_tables(out: Path, rows: Mapping[str, list[dict]], config: Config) -> d
 
 
 def compared(pairs: Sequence[tuple[dict, dict]], key: str) -> tuple[float, float | None] | None:
-    """Return a number's mean difference over pairs and half of its interval; None: unknown."""
+    """Return the mean difference over pairs and half its interval; None if unknown."""
     both = [(a.get(key), b.get(key)) for a, b in pairs]
     gains = [a - b for a, b in both if a is not None and b is not None]
     if not gains:

@@ -16,7 +16,7 @@ from express50.errors import HeadModelError
 from express50.geometry.conventions import cell_to_corner, corner_to_cell
 from express50.head.model import HeadModel
 
-NEEDLE_AREA = 1e-14  # of a UV or 3D triangle; below it no direction on it is trustworthy
+NEEDLE_AREA = 1e-14  # of a UV or 3D triangle; smaller ones have no reliable directions
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

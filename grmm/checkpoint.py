@@ -1,6 +1,6 @@
 """Read and write checkpoints: the model, its configuration and the whole state of the loop.
 
-Written whole or not at all, read with ``weights_only``: nothing in a checkpoint is executed.
+Writes are atomic. Reads use ``weights_only``, so nothing in a checkpoint is executed.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ GONE: dict[str, dict[str, object]] = {
 }  # fmt: skip
 
 
-# What checkpoints were trained with before these were settings.
+# Values that older checkpoints were trained with, before these were settings.
 UNSAID: dict[str, dict[str, object]] = {
     "model": {"refine_alpha": True}, "train": {"warm_start": True},
 }  # fmt: skip
@@ -115,7 +115,7 @@ def save_checkpoint(
     optimizer: dict[str, Any] | None = None,
     loop: dict[str, Any] | None = None,
 ) -> None:
-    """Write a checkpoint in one step; a former one stays until the new one is whole."""
+    """Write a checkpoint atomically; the previous one stays until the new one is complete."""
     # One array per parameter: thousands of small ones take seconds to write. Offsets once per
     # subject: they are larger than all other parameters together.
     frames = gallery.frames
@@ -145,7 +145,7 @@ def save_checkpoint(
 
 
 def _stacked(rows: Sequence[np.ndarray]) -> np.ndarray:
-    """Stack arrays (n, ...) of several lengths: missing trailing coefficients are zeros."""
+    """Stack arrays (n, ...) of different lengths; missing trailing coefficients become zeros."""
     length = max(map(len, rows))
     return np.stack([np.pad(r, [(0, length - len(r))] + [(0, 0)] * (r.ndim - 1)) for r in rows])
 
@@ -194,7 +194,7 @@ def read_content(path: Path) -> dict[str, Any]:
 
 
 def write_content(path: Path, content: dict[str, Any]) -> None:
-    """Write the tables of a checkpoint in one step."""
+    """Write the tables of a checkpoint atomically."""
     write_with(path, lambda file: torch.save(content, file))
 
 
@@ -209,7 +209,7 @@ def _check_finite(path: Path, name: str, value: object) -> None:
 
 
 def _current_settings(path: Path, tables: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Leave out settings that older versions had; refuse values that mattered."""
+    """Drop settings of older versions; refuse values that would change results."""
     current = {}
     for table, values in tables.items():
         gone = GONE.get(table, {})

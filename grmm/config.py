@@ -121,7 +121,7 @@ class LossConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class DataConfig:
-    """Settings of what training reads from the shards."""
+    """Settings that choose what training reads from the shards."""
 
     holdout_cameras: tuple[str, ...] = ()
     """Camera ids that training never sees; metrics.json reports on them."""
@@ -131,8 +131,8 @@ class DataConfig:
     background: float = 0.0
     """Grey behind footage and renderings, sRGB in [0, 1]. G15."""
     skip_hidden_neck: bool = False
-    """Do not count pixels where the torso is in front of the neck: each camera looks a different
-    way behind the collar. In the paper they are background, which contradicts other views."""
+    """Ignore pixels where the torso is in front of the neck: each camera sees a different side
+    of the collar. The paper treats them as background, which contradicts other views."""
 
     def __post_init__(self) -> None:
         check_ranges("data", self, background=(0, 1))
@@ -145,30 +145,30 @@ class TrainConfig:
     iterations: int = 250_000
     """Optimiser steps."""
     seconds: float = 0.0
-    """Stop after this much training time too; 0 sets no limit. Resumed runs add up."""
+    """Also stop after this much training time, summed over resumed runs; 0 sets no limit."""
     lr: float = 1e-4
     """Adam's rate."""
     code_lr_scale: float = 1.0
-    """Factor on the codes' rate. G13."""
+    """Factor on the codes' learning rate. G13."""
     texel_lr_scale: float = 1.0
-    """Factor on the rate of parameters that belong to one texel (biases and modes of the last
+    """Factor on the learning rate of per-texel parameters (biases and modes of the last
     layers), in training and in the second stage of a fit."""
     refine_lr_scale: float = 1.0
-    """Factor on the refinement's rate. At the demo's 2e-3 its first steps would overshoot, and it
-    would then learn to do nothing."""
+    """Factor on the refinement's learning rate. At the demo's 2e-3 its first steps overshoot,
+    and it then learns to do nothing."""
     final_lr: float = 1.0
-    """Last rate over the first, reached along a half cosine. G16."""
+    """Final learning rate over the initial one, along a half cosine. G16."""
     warm_start: bool = False
     """Start from the footage's mean texture instead of grey. G17."""
     accumulate: int = 1
     """Views whose gradients are averaged per step; 4 stands for the paper's four GPUs."""
     seed: int = 0
-    """Seed of weights, order and a fit's random cameras."""
+    """Seed of the initial weights, the sample order and a fit's random cameras."""
     save_seconds: float = 120.0
-    """Training time between checkpoints, the most that a kill may cost, unless saving would take
-    over a twentieth of the time. 0: only one, at the end."""
+    """Training time between checkpoints, the most that a kill can lose, unless saving would take
+    over a twentieth of the time. 0 saves only at the end."""
     evaluate_images: int = 32
-    """Images evaluated for metrics.json, evenly chosen."""
+    """Images evaluated for metrics.json, evenly spaced."""
 
     def __post_init__(self) -> None:
         check_ranges(
@@ -187,9 +187,9 @@ class FitConfig:
     stage2_iterations: int = 350
     """Steps that fine-tune the decoders."""
     seconds: float = 0.0
-    """Stop after this much time in all; 0 sets no limit."""
+    """Stop after this much time in total; 0 sets no limit."""
     stage2_lr: float = 1e-4
-    """Adam's rate for the decoders."""
+    """Adam's learning rate for the decoders."""
     shuffle_directions: float = 0.0
     """Share of stage-2 steps whose colours are decoded for another training camera's direction:
     one or two views say little about how colours change with the direction."""
@@ -209,7 +209,7 @@ class FitConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class MetricsConfig:
-    """Networks that LPIPS and FID compare images with; the user brings their weights. G23."""
+    """Networks that LPIPS and FID compare images with; the user supplies their weights. G23."""
 
     alexnet: str = ""
     """Path of torchvision's alexnet state dict for LPIPS; empty: n/a."""
@@ -230,7 +230,7 @@ class Config:
 
 
 Preset = dict[str, dict[str, Any]]
-# What we add to the paper's letter, at any size; docs/PAPER.md has what each was measured to do.
+# Our additions to the paper, at any size; docs/PAPER.md lists the measured effect of each.
 PLUS: Preset = {
     "data": {"skip_hidden_neck": True},
     "model": {"refine_alpha": True},
@@ -244,8 +244,8 @@ def _plus(changes: Preset) -> Preset:
     return {table: PLUS.get(table, {}) | changes.get(table, {}) for table in {**PLUS, **changes}}
 
 
-# ``paper`` is the paper's letter, ``paper-plus`` has its sizes with our additions, ``small`` suits
-# one GPU, ``demo`` two CPU cores and minutes.
+# ``paper`` follows the paper exactly, ``paper-plus`` adds our changes at its sizes, ``small`` suits
+# one GPU, ``demo`` a few minutes on two CPU cores.
 PRESETS: dict[str, Preset] = {
     "paper": {},
     "paper-plus": PLUS,
@@ -345,7 +345,7 @@ def as_tables(config: Config) -> dict[str, dict[str, Any]]:
 
 @dataclass(frozen=True, kw_only=True)
 class BudgetChoice:
-    """The setting that did best in a budget of processor seconds, and its held-out PSNR."""
+    """The setting that scored best in a budget of CPU seconds, and its held-out PSNR."""
 
     setting: str  # its name in docs/TRADEOFFS.md
     changes: dict[str, dict[str, Any]]  # table -> key -> value over the demo preset
@@ -356,7 +356,7 @@ class BudgetChoice:
 def choose(seconds: float, measured: Path = MEASURED) -> BudgetChoice:
     """Choose the best setting of the longest measured budget that fits in ``seconds``.
 
-    Less time than any that was measured gets the choice of the shortest. The speed of the machine
+    Less time than any measured budget gets the choice of the shortest. The speed of the machine
     is ignored: a faster one trains the same setting for longer.
     """
     rows = sorted(json.loads(measured.read_text("utf-8")), key=lambda row: row["budget_s"])

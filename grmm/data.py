@@ -25,7 +25,7 @@ from grmm.head_crop import behind_torso, crop_view, head_window
 from grmm.model import HeadState, PinholeView
 
 NO_OFFSETS = np.zeros((0, 3), np.float32)
-CACHE_BYTES = 512 << 20  # of decoded samples: some hundred of 512 px
+CACHE_BYTES = 512 << 20  # of decoded samples: a few hundred of 512 px
 DEFAULTS = DataConfig()  # black behind the head
 Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
@@ -73,7 +73,7 @@ class Tracked:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Place:
-    """Where one view's camera and head are: a sample without its pictures.
+    """The camera and head of one view: a sample without its pictures.
 
     Attributes:
         K: (3, 3) pixels, corner origin.
@@ -110,7 +110,7 @@ class Sample:
 
     @property
     def nbytes(self) -> int:
-        """Return the memory that its images take."""
+        """Return the memory that its images take, bytes."""
         images = (self.image, self.alpha, self.depth, self.parts)
         return sum(array.nbytes for array in images if array is not None)
 
@@ -164,15 +164,15 @@ class Item:
 
 
 class Cache(Generic[Key, Value]):
-    """Keeps the newest results, up to a number of bytes; the last one always stays."""
+    """A cache of the newest results, up to a number of bytes; it always keeps the last one."""
 
     def __init__(self, limit: int, size: Callable[[Value], int]) -> None:
-        """Hold entries whose ``size``, bytes, adds up to at most ``limit``."""
+        """Limit the sum of the entries' ``size``, bytes, to ``limit``."""
         self.limit, self.size, self.bytes = limit, size, 0
         self.entries: OrderedDict[Key, Value] = OrderedDict()
 
     def get(self, key: Key, make: Callable[[], Value]) -> Value:
-        """Return an entry, made if it is not there."""
+        """Return an entry; make it if it is missing."""
         if key in self.entries:
             self.entries.move_to_end(key)
             return self.entries[key]
@@ -184,10 +184,10 @@ class Cache(Generic[Key, Value]):
 
 
 class HeadViews:
-    """Samples of a source as items, with bounded caches of what took time to make."""
+    """Samples of a source as items, with bounded caches of slow results."""
 
     def __init__(self, source: Source, head: HeadModel, data: DataConfig = DEFAULTS) -> None:
-        """Wrap a source whose parameters belong to ``head``, on whose device items will be."""
+        """Wrap a source tracked with ``head``; items are put on the head's device."""
         self.source, self.head = source, head
         self.background, self.skip_hidden = data.background, data.skip_hidden_neck
         self._hidden: Cache[int, np.ndarray] = Cache(CACHE_BYTES // 8, lambda bits: bits.nbytes)
@@ -255,12 +255,12 @@ class HeadViews:
         return bits.reshape(height, width).astype(bool)
 
     def prefetch(self, index: int) -> None:
-        """Start to decode a sample that will be asked for next, beside the present step."""
+        """Start decoding the next sample in the background."""
         if index not in self._samples.entries and index not in self._coming:
             self._coming = {index: self._reader.submit(self._read, index)}
 
     def sample(self, index: int) -> Sample:
-        """Return the decoded sample, checked and from memory if it is there.
+        """Return the decoded sample, checked, from the cache if possible.
 
         Raises:
             FormatError: its images differ in size, or its parameters do not fit the head model.
@@ -287,7 +287,7 @@ class HeadViews:
         return f"{key.subject}/{key.expression}/{key.camera}"
 
     def place(self, index: int) -> Place:
-        """Return a sample's place; a FormatError refuses parameters of another head model."""
+        """Return a sample's place; raise FormatError for parameters of another head model."""
         place = self.source.place(index)
         check_tracked(self._where(index), place.tracked, self.head)
         return place
@@ -313,14 +313,14 @@ class HeadViews:
 
 
 def check_tracked(where: str, tracked: Tracked, head: HeadModel) -> None:
-    """Refuse, with a FormatError, parameters that the head model does not have."""
+    """Raise FormatError for parameters that the head model does not have."""
     shapes, expressions = head.shape_dirs.shape[2], len(head.expression_names)
     for what, got, count in (
         ("shape coefficients", len(tracked.shape), shapes),
         ("expression coefficients", len(tracked.expression), expressions),
         ("offsets", len(tracked.offsets), len(head.template)),
     ):
-        # Trailing coefficients may be missing, offsets only all of them.
+        # Trailing coefficients may be missing; offsets are either complete or absent.
         if got > count or (what == "offsets" and got not in (0, count)):
             raise FormatError(
                 f"{where}: {got} {what}, head model {head.name!r} has {count}; name the head model "
@@ -355,7 +355,7 @@ Choice = TypeVar("Choice")
 class Shuffle:
     """Endless shuffled order over ``indices``, a pure function of (seed, epoch, position).
 
-    A resumed run therefore goes on exactly where it stopped. State: how many samples were taken.
+    A resumed run therefore continues exactly where it stopped. State: the number of samples taken.
     """
 
     def __init__(self, indices: Sequence[int], seed: int, rank: int = 0, world: int = 1) -> None:

@@ -1,4 +1,4 @@
-"""Make points of the model's space and move between them: a picture's input but the camera.
+"""Make points in the model's space and move between them: all inputs of a picture but the camera.
 
 FLAME's parameters (the tracked mesh) and the residual codes are separate inputs of the model, so
 each can be changed alone: one subject's codes with another's expression, a wider jaw under the
@@ -48,7 +48,7 @@ class HeadCodes:
     Attributes:
         z_id: residual identity code.
         z_exp: residual expression code.
-        tracked: head-model parameters; its place (R, t) moves no picture in head space.
+        tracked: head-model parameters; (R, t) has no effect on pictures in head space.
     """
 
     z_id: Tensor
@@ -165,7 +165,7 @@ def controlled(
     return head
 
 
-@lru_cache(maxsize=4)  # sliders ask often
+@lru_cache(maxsize=4)  # called often by the sliders
 def principal_directions(codes: Tensor) -> Tensor:
     """Find the principal directions (K, D) of a checkpoint's codes (S, D), one deviation long."""
     centred = codes.detach().double() - codes.detach().double().mean(0)
@@ -257,7 +257,7 @@ def _with_parameter(
         twice = table == "eyes" and len(values) == 3
         changed[:] = _numbers([*values, *values] if twice else values, sizes[table], name)
     else:
-        raise ConfigError(f"control {name!r}: say which entry, for example {table}.0")
+        raise ConfigError(f"control {name!r}: expected one entry, for example {table}.0")
     return replace(tracked, **{table: changed})
 
 

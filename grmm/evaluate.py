@@ -37,7 +37,7 @@ REGIONS = {
     "mouth": ("lips", "teeth", "tongue", "mouth"), "eyes": ("eyes",), "skin": ("skin", "ears"),
     "hair": ("hair",),
 }  # fmt: skip
-LEAST_PX = 20  # of a region; the PSNR of fewer is chance
+LEAST_PX = 20  # per region; the PSNR of fewer is unreliable
 PSNRS = ("psnr_db", "psnr_head_db", *(f"psnr_{region}_db" for region in REGIONS))
 NUMBERS = (
     *PSNRS, "ssim", "ssim_head", "rmse", "rmse_head",
@@ -49,7 +49,7 @@ SEEN, HELD_VIEW, HELD_EXPRESSION, HELD_IDENTITY = (
 COMPONENTS = {"z_exp": "z_exp", "mesh_decoder": "mesh", "refinement": "refinement"}
 SUFFIXES = (".png", ".jpg", ".jpeg")
 NO_NETWORKS = PerceptualMetrics(MetricsConfig())
-NAMED = 5  # how many wrong files an error names
+NAMED = 5  # most files that an error names
 
 
 def training_render(model: GRMM, views: HeadViews) -> Render:
@@ -62,7 +62,7 @@ def training_render(model: GRMM, views: HeadViews) -> Render:
 
 
 def kind_of(loaded: Loaded, key: SampleKey) -> str:
-    """Say whether a checkpoint has seen a sample, or in which way it was held out."""
+    """Return whether a checkpoint has seen a sample, or how it was held out."""
     if key.subject not in loaded.model.subjects:
         return HELD_IDENTITY
     if key.frame not in loaded.gallery.frames:
@@ -79,7 +79,7 @@ def evaluate(
     kind: Callable[[SampleKey], str] = lambda key: "",
     keep: Callable[[int, Tensor], None] | None = None,
 ) -> list[Row]:
-    """Measure samples: one row of numbers each; see `compare`.
+    """Measure samples, one row of numbers each; see `compare`.
 
     ``depth_mm`` is the median absolute error where both depths are known (NaN: nowhere). ``keep``
     gets every index with its picture (3, H, W).
@@ -107,7 +107,7 @@ def compare(image: Tensor, item: Item, judge: PerceptualMetrics, kind: str = "")
     those of REGIONS pixels with such labels (NaN without labels, and under LEAST_PX).
 
     Raises:
-        TrainError: the picture is not finite; a mean would pass over it in silence.
+        TrainError: the picture is not finite; a mean would silently skip it.
     """
     if not bool(torch.isfinite(image).all()):
         raise TrainError(
@@ -143,7 +143,7 @@ def _regions(image: Tensor, item: Item) -> Row:
 def component_effects(
     model: GRMM, views: HeadViews, indices: Sequence[int]
 ) -> dict[str, dict[str, float | None]]:
-    """Measure what samples gain, dB, by each component that the model has; 0: it is inert.
+    """Measure how much each component of the model improves samples, dB; 0: no effect.
 
     ``z_exp`` is set to 0, the mesh decoder and the refinement are left out; the rest stays as it
     was trained with them.
@@ -164,7 +164,7 @@ def component_effects(
 
 
 def difference(rows: Sequence[Row], others: Sequence[Row], name: str) -> float | None:
-    """Return the mean of one number less that of other rows; None if either has none."""
+    """Return the mean of one number minus that of other rows; None if either has none."""
     a, b = mean(rows, name), mean(others, name)
     return None if a is None or b is None else round(a - b, 4)
 
@@ -184,7 +184,7 @@ def score(
     ``partial`` leaves samples without a picture out.
 
     Raises:
-        FormatError: missing, unreadable or mis-sized pictures, which are named.
+        FormatError: pictures are missing, unreadable or of the wrong size; lists them.
     """
     paths: dict[int, Path] = {}
     missing = []
@@ -256,7 +256,7 @@ def mean(rows: Sequence[Row], name: str) -> float | None:
 
 
 def means(rows: Sequence[Row]) -> Mapping[str, object]:
-    """Return the means of all numbers, and of how many images."""
+    """Return the means of all numbers, and the number of images."""
     return {name: mean(rows, name) for name in NUMBERS} | {"images": len(rows)}
 
 

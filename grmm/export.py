@@ -1,4 +1,4 @@
-"""Export one head: PLY for splat viewers, GLB for everything else that draws, NPZ for arrays.
+"""Export one head: PLY for splat viewers, GLB for other 3D software, NPZ for arrays.
 
 A textured mesh may get the 52 blend shapes that ARKit names, as glTF morph targets. Each is one or
 two coefficients of a head model that has them by name (the built-in head, ICT-FaceKit), the jaw's
@@ -37,7 +37,7 @@ SINGLE = (
     "mouthShrugUpper", "browInnerUp", "cheekPuff", "tongueOut",
 )  # fmt: skip
 JAW, EYE = 0.35, 0.4  # radians of jawOpen and of eyeLook...
-TURNS = {  # of joints: entry of an axis-angle, and its sign; the left is +x
+TURNS = {  # joint controls: entry of an axis-angle, and its sign; the left is +x
     "jawOpen": ("jaw.0", 1), "eyeLookDownLeft": ("eyes.0", 1), "eyeLookDownRight": ("eyes.3", 1),
     "eyeLookUpLeft": ("eyes.0", -1), "eyeLookUpRight": ("eyes.3", -1),
     "eyeLookOutLeft": ("eyes.1", 1), "eyeLookInLeft": ("eyes.1", -1),
@@ -174,7 +174,7 @@ def arkit_targets(loaded: Loaded, head: HeadCodes) -> dict[str, np.ndarray]:
         changes = {}
         for name, amount in moves:
             table, _, entry = name.partition(".")
-            # A coefficient goes to 1 whatever it is at rest; a joint turns on from there.
+            # A coefficient goes to 1 whatever its rest value; a joint turns on from its rest pose.
             own = 0.0 if table == "expression" else float(getattr(tracked, table)[int(entry)])
             changes[name] = (own + amount,)
         targets[shape] = vertices(controlled(loaded, head, changes)) - rest

@@ -35,7 +35,7 @@ from grmm.warm_start import LOGIT_LIMIT, project_texture, spread_change
 Scores = dict[str, float | None]
 LOOKED_AT = 12  # pictures scored between the stages
 STAGE1_SHARE = 0.35  # of a time budget (G22)
-STAGE1_LR = 1e-2  # of the codes: they are few and start at a mean (G22)
+STAGE1_LR = 1e-2  # learning rate of the codes: they are few and start at a mean (G22)
 STAGE1_FINAL_LR = 0.1  # rate at the end of stage 1 over the rate at its start (G22)
 LOCALITY_T = 0.3  # weight of the fitted subject in the interpolation (paper, supplement)
 
@@ -69,7 +69,7 @@ def fit(
     Raises:
         TrainError: no views, or views of several subjects.
     """
-    judge = PerceptualMetrics(loaded.config.metrics)  # first, as it may refuse its files
+    judge = PerceptualMetrics(loaded.config.metrics)  # first, because it may reject its files
     out.mkdir(parents=True, exist_ok=True)
     check_space(out)
     state = start(loaded, views, list(given))
@@ -84,7 +84,7 @@ def fit(
         "cameras": sorted({views.keys[i].camera for i in state.given}),
         "held_out_cameras": sorted({views.keys[i].camera for i in held_out}),
         "psnr_db": mean(rows, "psnr_db"),
-        "psnr_is_of": "held-out views" if held_out else "given views: all were given",
+        "psnr_is_of": "held-out views" if held_out else "given views: none was held out",
         "stages": stages,
         "lpips": mean(rows, "lpips"),
         "rmse": mean(rows, "rmse"),
@@ -244,7 +244,7 @@ def _decoder_optimizer(state: FitState) -> torch.optim.Optimizer:
 def start_texture(state: FitState) -> None:
     """Put the colours that the given views show into the bias (FitConfig.texture_warm_start).
 
-    Texels that no view shows change as seen texels do that looked alike before and lie near them
+    Texels that no view shows change like seen texels that looked similar before and lie near them
     or near their mirror image: a paler face comes with paler ears.
     """
     model = state.model

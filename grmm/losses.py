@@ -103,7 +103,7 @@ def depth_dm2(
     mask = valid & (alpha.detach() > 0.5)
     outside = nn.functional.pad((~mask)[None, None].float(), [erode_px] * 4)
     mask = mask & (nn.functional.max_pool2d(outside, 2 * erode_px + 1, 1)[0, 0] == 0)
-    # No question that a GPU would have to answer first: an empty mask gives 0 over 1.
+    # No branch, which would wait for the GPU: an empty mask gives 0 over 1.
     squares = (10.0 * torch.where(mask, depth - target, 0.0)).square()
     return squares.sum() / mask.sum().clamp_min(1)
 

@@ -23,7 +23,7 @@ from express50.files.arrays import DAMAGE
 from grmm.config import MetricsConfig
 from grmm.losses import SSIM_WINDOW, load_features, ssim_map
 
-PSNR_LIMIT_DB = 100.0  # equal images: a number that averages, where infinity would not
+PSNR_LIMIT_DB = 100.0  # for equal images: infinity could not be averaged
 SMALLEST_PX = 32  # five layers of AlexNet leave nothing of smaller images
 FID_LEAST_IMAGES = 2  # a covariance needs two; a trustworthy one needs thousands
 
@@ -138,7 +138,7 @@ def load_inception(path: Path) -> torch.jit.ScriptModule:
     """Load FID's Inception as TorchScript, which reaches neither files nor Python.
 
     Raises:
-        ConfigError: no such file, no TorchScript, or a network that is called otherwise.
+        ConfigError: no such file, not TorchScript, or a network with another call signature.
     """
     if not path.is_file():
         raise ConfigError(f"metrics.inception {path}: no such file; leave it empty to do without")

@@ -1,4 +1,4 @@
-"""Define GRMM's networks and tables of codes: all that a checkpoint holds weights of.
+"""Define GRMM's networks and code tables: everything whose weights a checkpoint holds.
 
 Widths and starting values that the paper leaves open are explained in docs/GRMM.md.
 """
@@ -204,7 +204,7 @@ class Refinement(nn.Module):
                 nn.init.kaiming_normal_(layer.weight, a=SLOPE)
                 nn.init.zeros_(layer.bias)
         nn.init.zeros_(self.head.weight)
-        # As the images are: else weights are reordered in every call, a fifth of its time.
+        # The layout of the images; otherwise each call reorders the weights, a fifth of its time.
         self.to(memory_format=torch.channels_last)
 
     def forward(self, maps: Tensor) -> Tensor:
@@ -243,7 +243,9 @@ def normalise_depth(depth: Tensor, alpha: Tensor) -> Tensor:
     mask = (alpha > 0.5) & torch.isfinite(depth)
     known = torch.where(mask, depth, 0.0)
     inner, most = known.detach(), torch.finfo(depth.dtype).max
-    low = torch.where(mask, inner, most).min()  # without asking a GPU whether there are any
+    low = torch.where(
+        mask, inner, most
+    ).min()  # without waiting for a GPU to report whether there are any
     extent = torch.where(mask, inner, -most).max() - low
     scaled = (known - low) / extent.clamp_min(EMPTY_RANGE_M)
     return torch.where(mask, scaled.clamp(0, 1), 0.0)

@@ -16,7 +16,7 @@ from express50.files.digests import text_digest
 from express50.shards.reader import ShardReader
 from grmm.data import Place, Sample, SampleKey, Tracked
 
-INSET_PX = 2  # of the footage's border: undistortion has nothing to put there
+INSET_PX = 2  # of the footage's border, which undistortion cannot fill
 SIZES: dict[str, tuple[int, ...] | None] = {  # of what is tracked; None: any vector
     "shape": None, "expression": None, "neck": (3,), "jaw": (3,), "eyes": (6,), "R": (3, 3),
     "t": (3,),
@@ -94,7 +94,7 @@ class ShardSource:
         )
 
     def window(self, index: int) -> tuple[slice, slice, tuple[int, int]]:
-        """Return what `seen_window` does of a sample."""
+        """Return the window of a sample that its camera saw; see `seen_window`."""
         return seen_window(self.reader.meta(index), f"{self.reader.root}: {self.keys[index]}")
 
     def _tracked(self, meta: dict, subject: str, where: str) -> Tracked:
@@ -135,7 +135,7 @@ class MixedSource:
                 if owners.setdefault(subject, source) is not source:
                     raise FormatError(
                         f"{source.reader.root}: subject {subject} is also in "
-                        f"{owners[subject].reader.root}; expected other ids in every dataset: "
+                        f"{owners[subject].reader.root}; expected different ids in each dataset: "
                         "rename the capture and pack it again"
                     )
         self._sources = [(source, i) for source in sources for i in range(len(source.keys))]
@@ -187,7 +187,7 @@ def seen_window(meta: dict, where: str) -> tuple[slice, slice, tuple[int, int]]:
     """Return the rows and columns of a packed sample that its camera saw, and the packed (H, W).
 
     Packing squares reach beyond the footage where a head stands at the border of the image. What
-    lies there is black in the sample, yet not background: a model taught so would learn to cut off
+    lies there is black in the sample, yet not background: a model trained on it would cut off
     necks. A sample without ``crop`` was not cut out: all of it was seen.
 
     Raises:

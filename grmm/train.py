@@ -53,9 +53,9 @@ from grmm.train_state import (
 from grmm.warm_start import warm_start
 
 LOG_EVERY = 20  # iterations between lines of progress
-SAVING_SHARE = 0.05  # of the training time at most
+SAVING_SHARE = 0.05  # at most this share of the training time
 PATIENT = 10_000  # iterations that a CPU does in a day at most
-GREY_DB = 10.0  # what a grey picture scores
+GREY_DB = 10.0  # the score of a grey picture
 GLOO_SECONDS = 0.5  # for Gloo's threads to free tensors; 0.2 was enough in every run
 
 
@@ -81,7 +81,7 @@ def train(
     # --- Processes, samples, model -------------------------------------------------------------
     rank, world, device = join_processes()
     torch.manual_seed(config.train.seed)
-    perceptual = PerceptualMetrics(config.metrics)  # first, as it may refuse its files
+    perceptual = PerceptualMetrics(config.metrics)  # first, because it may reject its files
     views = HeadViews(source, head.to(device), config.data)
     config = with_map_size(config, views)
     state = prepare(views, config, rank, world)
@@ -107,7 +107,7 @@ def train(
         if state.perceptual is None:
             log("the perceptual term is off: loss.vgg16 names no weights")
         if device.type == "cpu" and not config.train.seconds and config.train.iterations > PATIENT:
-            log("this takes days on a CPU; '--preset auto --budget 1h' suits an hour")
+            log("this takes days on a CPU; use '--preset auto --budget 1h' to train for an hour")
 
     # --- The loop ------------------------------------------------------------------------------
     started, saved, cost = time.perf_counter() - state.seconds, state.seconds, 0.0
@@ -130,7 +130,7 @@ def train(
                 save(state, checkpoint, config, source.head, gallery)
                 saved = time.perf_counter() - started
                 cost = saved - state.seconds
-            elif rank == 0 and not spare.exists():  # how large the first one will be
+            elif rank == 0 and not spare.exists():  # the size of the first one
                 save(state, spare, config, source.head, gallery)
             if interrupt.is_set():  # only now, after the save
                 raise KeyboardInterrupt
@@ -183,7 +183,7 @@ def _add_gradients(
         shown = {name: float(term) for name, term in state.terms.items()}
         raise TrainError(
             f"iteration {state.iteration}: the objective is not finite at {item.key}: "
-            f"{shown}; expected finite terms. Lower train.lr or look at this sample"
+            f"{shown}; expected finite terms. Lower train.lr or check this sample"
         )
     (loss / config.train.accumulate).backward()
 

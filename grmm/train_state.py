@@ -1,4 +1,4 @@
-"""Hold the state of a training run: its start, what a checkpoint keeps, when it ends."""
+"""Hold the state of a training run: set it up, save and resume it, and end it."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def prepare(views: HeadViews, config: Config, rank: int = 0, world: int = 1) -> 
 
 
 def with_map_size(config: Config, views: HeadViews) -> Config:
-    """Replace ``n_g = 0`` by a side that suits the head's size in the images.
+    """Replace ``n_g = 0`` with a side that suits the head's size in the images.
 
     The aim is one texel per pixel: the largest heads show half of their surface.
     """
@@ -183,9 +183,9 @@ def set_rates(state: TrainState, config: Config) -> None:
 
 @contextlib.contextmanager
 def spare_space(path: Path) -> Iterator[Path]:
-    """Yield the file that occupies the space of the next checkpoint; it goes when training ends.
+    """Yield a file that reserves disk space for the next checkpoint; delete it after training.
 
-    A disk that others fill meanwhile then still takes what was trained.
+    If others fill the disk meanwhile, the trained state can still be saved.
     """
     spare = path.with_name(f".{path.name}.spare")
     try:
@@ -224,7 +224,7 @@ def save(state: TrainState, path: Path, config: Config, head_spec: str, gallery:
 
 
 def restore(state: TrainState, path: Path, config: Config, device: torch.device) -> None:
-    """Put a run back to where rank 0 wrote its checkpoint.
+    """Restore a run to the point where rank 0 wrote its checkpoint.
 
     Raises:
         ConfigError: settings, subjects or samples differ from those of the checkpoint.
@@ -280,7 +280,7 @@ def start_log(path: Path, iteration: int) -> None:
 
 
 def append_log(path: Path, state: TrainState) -> None:
-    """Append where a run is to OUT/log.jsonl, one JSON object per line."""
+    """Append the progress of a run to OUT/log.jsonl, one JSON object per line."""
     terms = {name: float(value) for name, value in state.terms.items()}
     numbers = {"loss": sum(terms.values())} | terms
     entry = {"iteration": state.iteration, "seconds": round(state.seconds, 3)}
@@ -288,8 +288,8 @@ def append_log(path: Path, state: TrainState) -> None:
     try:
         with path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(entry) + "\n")
-    except OSError as error:  # a full disk; the weights matter more than a line about them
-        log(f"{path}: a line was not written ({error})")
+    except OSError as error:  # the disk is full; the weights matter more than a log line
+        log(f"{path}: could not write a log line ({error})")
 
 
 @contextlib.contextmanager

@@ -37,8 +37,8 @@ REST_SECONDS = 0.35  # without a change, before the still picture is drawn
 COEFFICIENTS, DIRECTIONS = 10, 4  # sliders of each kind
 QUALITY = {True: 80, False: 95}  # JPEG, while moving and at rest
 SAME = "the same"  # residual code as the expression's
-SLOW_SECONDS = 0.04  # colours that take longer are not decoded while the camera moves
-TURN_DEGREES = 1.5  # under this the eye sees no other colours
+SLOW_SECONDS = 0.04  # slower colours are not decoded while the camera moves
+TURN_DEGREES = 1.5  # smaller changes of the colours are invisible
 
 
 class Preview:
@@ -89,7 +89,7 @@ class Preview:
         self._head = head
 
     def _needs_colours(self, view: PinholeView, moving: bool) -> bool:
-        """Say whether the camera has turned so far that the last colours are wrong."""
+        """Return whether the camera has turned too far to reuse the last colours."""
         cosine = float((self._direction * view.direction()).sum())
         if not moving:
             return cosine < 1 - 1e-9
@@ -108,7 +108,7 @@ class Watcher:
 
 
 class _Server(viser.ViserServer):
-    """The library's server, behind a door and without its tunnel to a public one."""
+    """The library's server, behind a `Door` and without its tunnel to a public server."""
 
     def __init__(self, door: Door, **options: Any) -> None:
         """Start to listen; the library has no setting for what a request must hold."""

@@ -1,4 +1,4 @@
-"""Start from a sensible head: texel colours averaged from footage.
+"""Start training from a sensible head, with texel colours averaged from footage.
 
 The paper trains from scratch for 250,000 iterations; on a small budget the first thousands would
 go into finding colours that projection gives at once (G17).

@@ -1,4 +1,4 @@
-"""Take a person out of a checkpoint: codes, tracked frames, offsets and the optimizer's memory."""
+"""Remove a person from a checkpoint: codes, tracked frames, offsets and optimizer state."""
 
 from __future__ import annotations
 

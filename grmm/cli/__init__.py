@@ -1,7 +1,7 @@
 """``grmm`` trains, fits, renders, exports, views, evaluates, scores, ablates and studies.
 
-This file says what a user may type: each option once in OPTIONS, and each command as its options
-in order. `grmm.cli.commands` says what the commands do.
+This file defines what a user may type: each option once in OPTIONS, and each command as a list
+of options. `grmm.cli.commands` implements the commands.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ DESCRIPTION = "Train the Gaussian Residual Morphable Model on packed shards, and
 EPILOG = """example:
   grmm train DATASET/pack/shards OUT --budget 10m
 exit codes: 0 done, 1 failed, 2 wrong usage or configuration"""
-PATTERNS = "ids or patterns, joined by commas"
+PATTERNS = "ids or patterns, separated by commas"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -79,9 +79,9 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "metavar": "TABLE.KEY=VALUE",
         "help": "set one value, such as train.lr=1e-3; overrides preset and file; may be repeated",
     },
-    "--also": REPEATED | {"type": Path, "metavar": "SHARDS", "help": "further shards; repeatable"},
+    "--also": REPEATED | {"type": Path, "metavar": "SHARDS", "help": "more shards; repeatable"},
     "--seconds": {"type": parse_seconds, "help": "stop after this long: 240, 4m, 2h"},
-    "--holdout-cameras": {"default": "", "help": "camera ids to test on: cam02,cam05"},
+    "--holdout-cameras": {"default": "", "help": "camera ids to hold out for testing: cam02,cam05"},
     "--holdout-expressions": {
         "default": "", "metavar": "SUBJECT/EXPRESSION,..", "help": "expressions to test on",
     },
@@ -94,10 +94,10 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--expressions": {"default": "*", "help": PATTERNS},
     "--cameras": {"default": "*", "help": f"{PATTERNS}: cam02,cam05"},
     "--images": {"type": at_least(0), "default": 0, "help": "at most this many, 0 = all"},
-    "--heldout": FLAG | {"help": "leave out what training saw"},
+    "--heldout": FLAG | {"help": "leave out samples that training saw"},
     "--save": {"type": Path, "metavar": "FOLDER", "help": "write pictures for 'score'"},
     "--fit-subjects": {
-        "default": "", "help": "people to fit (default: all that training did not see)",
+        "default": "", "help": "people to fit (default: everyone that training did not see)",
     },
     "--fit-cameras": {"default": "", "help": "fit unseen people from these views"},
     "--fit-expression": {
@@ -112,7 +112,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     },
     "--rows": {"default": "", "help": "rows of the table, full,no_residuals,.. (default: all)"},
     "--json": FLAG | {"help": "print the result as JSON"},
-    # A head and what is drawn of it
+    # The head to draw and the view of it
     "--subject": {"help": "person to show (default: the first of the checkpoint)"},
     "--expression": {"help": "expression to show (default: neutral, else the first)"},
     "--expression-of": {
@@ -138,13 +138,13 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--turntable": FLAG | {"help": "write turntable.mp4"},
     "--degrees": {"type": float, "default": 360.0, "help": "angle that the turntable covers"},
     "--frames": {"type": at_least(1), "default": 72, "help": "number of frames of a video"},
-    "--to": {"metavar": "SUBJECT/EXPRESSION", "help": "write interpolation.mp4, which ends there"},
+    "--to": {"metavar": "SUBJECT/EXPRESSION", "help": "write interpolation.mp4, ending there"},
     "--drive": {
-        "type": Path, "metavar": "SEQUENCE.NPZ", "help": "write driven.mp4: move as these clips do",
+        "type": Path, "metavar": "SEQUENCE.NPZ", "help": "write driven.mp4: moved by these clips",
     },
-    "--drive-cue": {"metavar": "ID", "help": "only this clip of --drive"},
+    "--drive-cue": {"metavar": "ID", "help": "use only this clip of --drive"},
     "--views": FLAG | {"help": "write views.jpg: novel views"},
-    "--controls": FLAG | {"help": "write controls.jpg: each control changed alone"},
+    "--controls": FLAG | {"help": "write controls.jpg: one control changed at a time"},
     "--samples": {
         "type": at_least(0), "default": 0, "help": "write samples.jpg with this many new heads",
     },
@@ -160,7 +160,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--port": {"type": at_least(1, 65535), "default": 8080},
     # Studies
     "--reference": {"type": Path, "required": True, "help": "true pictures"},
-    "--ours": {"type": Path, "required": True, "help": "a method's pictures, with the same names"},
+    "--ours": {"type": Path, "required": True, "help": "one method's pictures, same names"},
     "--theirs": {"type": Path, "required": True, "help": "the other method's pictures"},
     "--names": {"nargs": 2, "default": ["Ours", "Theirs"], "metavar": "NAME"},
     "--examples": {"type": int, "default": 15, "help": "examples per participant (15)"},
@@ -232,7 +232,7 @@ COMMANDS = {
         handler=commands.render,
         options=f"checkpoint out {EDIT} --yaw --pitch --turntable --degrees --frames --to --drive "
         "--drive-cue --views --controls --samples --spread --seed --columns",
-        help="draw a head, edited if you like, as pictures, sheets or videos",
+        help="draw a head, optionally edited, as pictures, sheets or videos",
         example="grmm render run/checkpoint.pt pictures --subject S002 --expression-of S001/smile "
         "--control jaw.0=0.2 --turntable --views",
         changes={"out": {"help": "folder for pictures and videos"}},

@@ -1,6 +1,6 @@
 """Run the commands of ``grmm``: read the arguments, call the library, print.
 
-Torch takes a second to import and --help must not wait for it, so that handlers import late.
+Torch takes a second to import and --help must not wait for it, so handlers import it late.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from grmm.metrics import PerceptualMetrics
 
 AUTO = "auto"  # in place of a preset
-PAPER_GIB = 20  # a GPU's memory for the paper's size; a step takes 3.5 on a CPU, networks beside
+PAPER_GIB = 20  # GPU memory for the paper's size; a step takes 3.5 on a CPU, plus the networks
 FORMATS = ("html", "ply", "spz", "splats", "arkit", "glb", "npz")  # of an exported head
 HOLDOUTS = ("holdout_cameras", "holdout_expressions")
 CHANGEABLE = ("fit", "metrics", "loss")  # tables that may differ from those of training
 
 
 def train(args: argparse.Namespace) -> int:
-    """Train, or go on from the checkpoint in OUT."""
+    """Train, or resume from the checkpoint in OUT."""
     from express50.head.load import load_head
     from grmm.shard_source import open_shards
     from grmm.train import train
@@ -50,7 +50,7 @@ def train(args: argparse.Namespace) -> int:
 
 
 def train_config(args: argparse.Namespace) -> Config:
-    """Return the resolved configuration of ``grmm train``: its own flags stand above --set."""
+    """Return the resolved configuration of ``grmm train``: its own flags override --set."""
     name: str = args.preset
     changes: dict[str, dict[str, Any]] = {}
     if name == AUTO:
@@ -64,7 +64,7 @@ def train_config(args: argparse.Namespace) -> Config:
 
 
 def _machines_choice(seconds: float | None) -> tuple[str, dict[str, dict[str, Any]]]:
-    """Choose a preset and changes to it by what the machine has, and say so."""
+    """Choose a preset and changes to it that suit the machine, and print the choice."""
     from grmm.train_state import gpu
 
     if found := gpu():
@@ -73,10 +73,12 @@ def _machines_choice(seconds: float | None) -> tuple[str, dict[str, dict[str, An
         log(f"auto: {preset}, for {name} with {memory:.0f} GiB")
         return preset, {}
     if seconds is None:
-        raise ConfigError(f"no GPU here, and on a CPU --preset {AUTO} needs a time: --budget 1h")
+        raise ConfigError(
+            f"no GPU found; on a CPU --preset {AUTO} needs a time budget: --budget 1h"
+        )
     choice = choose(seconds)
     log(
-        f"auto: no GPU here; demo with {choice.setting}, which reached {choice.psnr_db:.1f} dB in "
+        f"auto: no GPU found; demo with {choice.setting}, which reached {choice.psnr_db:.1f} dB in "
         f"{choice.budget_s:.0f} s of one core, the longest measured time that fits"
     )
     return "demo", choice.changes
@@ -96,7 +98,7 @@ def config(args: argparse.Namespace) -> int:
 
 
 def fit(args: argparse.Namespace) -> int:
-    """Fit an unseen person and report on the views that the fit did not get."""
+    """Fit an unseen person and report on the views that the fit did not use."""
     from grmm.fit import fit
     from grmm.shard_source import ShardSource, select
 
@@ -223,7 +225,7 @@ def evaluate(args: argparse.Namespace) -> int:
     known = spread(known, args.images or len(known))
     if not known and not unseen:
         raise ConfigError(
-            f"{args.shards}: training saw all that was chosen; leave --heldout out, or train with "
+            f"{args.shards}: training saw every chosen sample; drop --heldout, or train with "
             "--holdout-cameras"
         )
     render = training_render(loaded.model, views)
@@ -239,7 +241,7 @@ def evaluate(args: argparse.Namespace) -> int:
 def _split(
     loaded: Loaded, views: HeadViews, args: argparse.Namespace
 ) -> tuple[list[int], dict[str, list[int]]]:
-    """Split samples into those that codes can draw and, by person, those to fit first."""
+    """Split samples into those with trained codes and, per person, those to fit first."""
     from grmm.shard_source import select
 
     chosen = select(views.keys, args.subjects, args.expressions, args.cameras)
@@ -421,5 +423,5 @@ def _control(text: str) -> tuple[str, tuple[float, ...]]:
 
 
 def _split_names(text: str) -> tuple[str, ...]:
-    """Split names joined by commas."""
+    """Split a comma-separated list of names."""
     return tuple(name.strip() for name in text.split(",") if name.strip())

@@ -63,7 +63,7 @@ class PlayerReport:
         megabytes: of the page.
         agreement_db: PSNR between its pictures and the full model's, in poses not fitted to.
         full_db: PSNR of the full model's pictures against footage; None without footage.
-        loss_db: how much less the page's is.
+        loss_db: how much lower the page's PSNR is.
         footage: which samples: ``held out``, or ``seen`` where training saw all.
         images: how many.
     """
@@ -240,7 +240,7 @@ def player_page(
         digest = hashlib.sha256(parts[name].encode()).digest()
         parts[f"{name}_hash"] = base64.b64encode(digest).decode()
     page = (HERE / "page.html").read_text(encoding="utf-8")
-    # In one pass: what is filled in is not looked at again.
+    # In one pass, so that inserted text is not searched again.
     return re.sub(r"{{(\w+)}}", lambda found: parts[found[1]], page).encode(), back
 
 

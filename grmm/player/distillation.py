@@ -35,7 +35,7 @@ SPREAD = {"jaw": 0.15, "neck": 0.12, "eyes": 0.2, "coefficients": 0.2}  # of sam
 BEYOND_DEGREES = 15.0  # the player may turn so far beyond the training cameras
 PICTURE_PX = 320  # of sampled views
 FAINT_PX = 0.1  # a Gaussian that colours fewer pixels in every sampled picture is left out
-MOST = 60_000  # Gaussians that are kept, those that colour most
+MOST = 60_000  # most Gaussians kept: those that colour the most pixels
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -98,7 +98,7 @@ class AvatarPose:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Person:
-    """The full model of a head, asked for poses.
+    """The full model of a head, which decodes any pose.
 
     Attributes:
         loaded: the checkpoint.
@@ -134,7 +134,7 @@ class Person:
 
 
 def person_of(loaded: Loaded, head: HeadCodes, subject: str) -> Person:
-    """Collect what a training subject's expressions do to a head."""
+    """Collect the changes that a training subject's expressions make to a head."""
     count = len(loaded.head.expression_names)
     others = {name: trained_head(loaded, subject, name) for name in loaded.model.expressions}
     own = _parameters(head.tracked, count).to(loaded.head.template)
@@ -158,7 +158,7 @@ def _parameters(tracked: Tracked, count: int) -> Tensor:
 
 @torch.no_grad()
 def distil(person: Person) -> Avatar:
-    """Distil a person, in twenty seconds at the demo's size, and leave out what never shows.
+    """Distil a person (twenty seconds at the demo's size), without Gaussians that never show.
 
     A picture is linear in the colours: its derivative by them says how many pixels each fills.
     """

@@ -74,7 +74,7 @@ def rasterize(
         normals: also give blended normals.
         backend: ``auto`` takes gsplat for CUDA tensors, else the native kernel if it was built,
             else the reference.
-        buffers: memory to put the images of the native backend into, again and again.
+        buffers: memory that the native backend reuses for its images.
 
     Raises:
         NotFiniteTensorError: an argument holds NaN or Inf.

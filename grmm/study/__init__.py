@@ -1,8 +1,8 @@
 """Ask people which of two methods is better, as the paper did: make a study, and its table.
 
 A study is counterbalanced twice: A is the first method in half of the examples, and every second
-participant sees the mirrored assignment, so that over two participants each example shows each
-method once on each side. The order of examples is another one for every participant.
+participant sees the mirrored assignment: over two participants, each example shows each
+method once on each side. Every participant sees the examples in a different order.
 
 Answers are one JSON object per line; the last answer to a question counts. Judgments of one
 participant are correlated, so intervals come from a bootstrap that draws whole participants with
@@ -57,7 +57,9 @@ def make_study(
         FormatError: a picture cannot be read.
     """
     if (out / "answers.jsonl").exists():
-        raise ConfigError(f"{out}: people have answered this study; make another in another folder")
+        raise ConfigError(
+            f"{out}: this study already has answers; make a new one in another folder"
+        )
     if examples < 1 or participants < 1:
         raise ConfigError(f"got {examples} examples and {participants} participants, expected >= 1")
     (first, ours), (second, theirs) = methods
@@ -67,7 +69,7 @@ def make_study(
     names = sorted(set.intersection(*map(set, folders)))
     if len(names) < examples:
         raise ConfigError(
-            f"{reference}, {ours}, {theirs}: {len(names)} pictures of one name in all three, "
+            f"{reference}, {ours}, {theirs}: {len(names)} pictures are common to all three, "
             f"expected {examples}; lower --examples or render more"
         )
     rng = np.random.default_rng(seed)
@@ -100,7 +102,9 @@ def make_study(
 def _pictures(folder: Path) -> dict[str, Path]:
     """Find the pictures of a folder by their stems."""
     if not folder.is_dir():
-        raise ConfigError(f"{folder}: no such folder; expected pictures named alike")
+        raise ConfigError(
+            f"{folder}: no such folder; expected pictures with the same names as the others"
+        )
     found = sorted(folder.iterdir(), reverse=True)
     return {path.stem: path for path in found if path.suffix.lower() in SUFFIXES}
 
@@ -182,7 +186,7 @@ def check_answer(study: dict, value: object, where: str = "answer") -> dict:
 def append_answer(out: Path, answer: dict) -> None:
     """Add a checked answer to OUT/answers.jsonl; it is on the disk when this returns.
 
-    A last line that a kill cut short goes: it was never acknowledged, the page asks again.
+    A last line that a kill cut short is removed: it was never acknowledged, so the page asks again.
     """
     with (out / "answers.jsonl").open("a+b") as file:
         file.seek(0)

@@ -199,7 +199,7 @@ def test_seeds_give_intervals_and_test_shards_give_people_alone(tmp_path, capsys
     )
     assert row["groups"]["unseen"]["images"] == 2 and " ± " in capsys.readouterr().out
     assert main([*arguments, f"--test={roots[0]}"]) == 2
-    assert "S000, S001 are trained on too" in capsys.readouterr().err
+    assert "S000, S001 are also trained on" in capsys.readouterr().err
 
 
 def test_the_benchmark_names_what_is_lost_beyond_its_interval():

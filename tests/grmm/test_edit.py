@@ -101,7 +101,7 @@ def test_principal_directions_rebuild_the_covariance(loaded):
         ({"jaw": (1.0,)}, "got 1 number, expected 3 with commas between, or jaw.0"),
         ({"neck.3": (1.0,)}, "3 neck parameters, 0 to 2"),
         ({"expression.e9": (1.0,)}, "4 expression parameters"),
-        ({"expression": (1.0,)}, "say which entry"),
+        ({"expression": (1.0,)}, "expected one entry"),
         ({"z_id.2": (1.0,)}, "2 principal directions"),
         ({"jaw.0": (float("nan"),)}, "expected finite"),
     ],
