@@ -1,7 +1,7 @@
 """Read arrays from ``.npz``, ``.npy``, pickle and torch files without executing anything.
 
-Sizes are checked before memory is allocated: the shape and type in an array's header must fit the
-bytes of the file, and all arrays of a file together a limit. FLAME's files are Python 2 pickles
+Sizes are checked before memory is allocated: each array's shape and type must fit the size of the
+file, and all arrays of a file together must stay below a limit. FLAME's files are Python 2 pickles
 that name chumpy and scipy classes; landmark embeddings hold torch tensors. None of those libraries
 is imported: every class comes from a short allow list, and those of chumpy, scipy and torch are
 replaced by records that only keep their state. A pickle that names anything else is refused before
@@ -30,9 +30,9 @@ import numpy as np
 from express50.errors import HeadModelError
 from express50.files.text import AGAIN, Kind, reason
 
-SIZE_LIMIT = 2 << 30  # bytes of a file, unpacked; 60 expressions of a 26,000-vertex head take 19 MB
-HEADER_LIMIT = 4096  # characters of an array's header
-# Of an array made from a list, a sparse matrix or a view; FLAME's largest has six million.
+SIZE_LIMIT = 2 << 30  # bytes per unpacked file; 60 expressions of a 26,000-vertex head take 19 MB
+HEADER_LIMIT = 4096  # characters in an array's header
+# Numbers in an array made from a list, a sparse matrix or a view; FLAME's largest has six million.
 VALUES_LIMIT = 1 << 25
 # What zipfile, NumPy, the standard unpickler and torch raise on damaged files.
 DAMAGE = (
@@ -50,13 +50,13 @@ def read_arrays(
     wanted: Collection[str] = (),
     fix: str = AGAIN,
 ) -> dict[str, np.ndarray]:
-    """Read the arrays of an ``.npz`` file by name, none of them of objects.
+    """Read the arrays of an ``.npz`` file by name; refuse arrays of objects.
 
-    For messages: ``what`` it is expected to be, such as "a track", and how to ``fix`` it.
+    Messages say ``what`` the file should be, such as "a track", and how to ``fix`` it.
 
     Raises:
-        Express50Error: of the given kind: it is missing, damaged, lacks a wanted array, or unpacks
-            to more than ``SIZE_LIMIT``.
+        Express50Error: of the given kind: the file is missing, damaged, lacks a wanted array, or
+            unpacks to more than ``SIZE_LIMIT``.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -78,10 +78,10 @@ def read_arrays(
 
 
 def read_npy(path: Path, kind: Kind, what: str, fix: str = AGAIN) -> np.ndarray:
-    """Read the array of an ``.npy`` file, not of objects.
+    """Read the array of an ``.npy`` file; refuse an array of objects.
 
     Raises:
-        Express50Error: of the given kind: it is missing or damaged.
+        Express50Error: of the given kind: the file is missing or damaged.
     """
     try:
         with path.open("rb") as file:
@@ -91,10 +91,10 @@ def read_npy(path: Path, kind: Kind, what: str, fix: str = AGAIN) -> np.ndarray:
 
 
 def read_header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype]:
-    """Read shape and type from an array's header, leaving the file behind it.
+    """Read shape and type from an array's header, leaving the file position just after it.
 
     Raises:
-        ValueError: it is damaged or of an unknown version.
+        ValueError: the header is damaged or has an unknown version.
     """
     version = np.lib.format.read_magic(file)
     readers = {
@@ -123,7 +123,7 @@ def _array(file: BinaryIO, size: int) -> np.ndarray:
 
 
 class Record:
-    """Stands for a class that is not imported; keeps what the pickle says of it."""
+    """Stands in for a class that is not imported, and keeps the state that the pickle gives it."""
 
     state: dict[str, Any]
 
@@ -144,16 +144,16 @@ class Record:
 
 
 class ChumpyArray(Record):
-    """Stands for a chumpy.Ch: the array is in state["x"]."""
+    """Stands in for a chumpy.Ch: the array is in state["x"]."""
 
 
 class SparseMatrix(Record):
-    """Stands for a scipy.sparse csr matrix."""
+    """Stands in for a scipy.sparse csr matrix."""
 
     compression = "csr_array"
 
     def dense(self) -> np.ndarray:
-        """Make a dense (rows, columns) array; SciPy checks the compressed one."""
+        """Make a dense (rows, columns) array, after SciPy has checked the compressed one."""
         import scipy.sparse
 
         rows, columns = self.state.get("_shape", self.state.get("shape"))  # type: ignore[misc]
@@ -166,17 +166,17 @@ class SparseMatrix(Record):
 
 
 class ColumnMatrix(SparseMatrix):
-    """Stands for a scipy.sparse csc matrix."""
+    """Stands in for a scipy.sparse csc matrix."""
 
     compression = "csc_array"
 
 
 class ArrayType(Record):
-    """Stands for numpy.ndarray, which, called by a pickle, would make arrays of any size."""
+    """Stands in for numpy.ndarray, with which a pickle could make arrays of any size."""
 
 
 def _new_record(kind: object = Record, *_: object) -> Record:
-    """Do what copy_reg._reconstructor does, for records alone."""
+    """Do what copy_reg._reconstructor does, but only for records."""
     if isinstance(kind, type) and issubclass(kind, Record):
         return kind()
     raise pickle.UnpicklingError("copy_reg._reconstructor of a class that is not allowed")
@@ -190,7 +190,7 @@ def _encode(text: object, encoding: object = "latin1") -> bytes:
 
 
 def _reconstruct_array(kind: object, shape: object, code: object) -> np.ndarray:
-    """Do what numpy's _reconstruct does, for plain arrays alone."""
+    """Do what numpy's _reconstruct does, but only for plain arrays."""
     if kind is not ArrayType:
         raise pickle.UnpicklingError("numpy array subclass")
     return np.ndarray((0,), np.dtype("b"))
@@ -214,7 +214,7 @@ def _scalar(dtype: np.dtype, data: object) -> np.generic:
 def _tensor(
     storage: object, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: object
 ) -> np.ndarray:
-    """Do what torch._utils._rebuild_tensor_v2 does on a NumPy storage, bounds checked."""
+    """Do what torch._utils._rebuild_tensor_v2 does, on a NumPy storage and with bounds checks."""
     if not isinstance(storage, np.ndarray) or storage.ndim != 1 or offset < 0:
         raise pickle.UnpicklingError("tensor without a storage")
     if min((*size, *stride, 0)) < 0:
@@ -281,7 +281,7 @@ _STORAGE_DTYPES = MappingProxyType(
 
 
 class SafeUnpickler(pickle.Unpickler):
-    """Resolves names from the allow list only."""
+    """Unpickles only names on the allow list."""
 
     def find_class(self, module: str, name: str) -> Any:  # noqa: ANN401 (pickle's own signature)
         """Return the stand-in for a name, or refuse."""
@@ -304,7 +304,7 @@ class SafeUnpickler(pickle.Unpickler):
             raise pickle.UnpicklingError("a persistent id outside a torch storage")
         dtype, count = _STORAGE_DTYPES[pid[1].__name__], int(pid[4])
         if not 0 <= count <= self.longest:  # type: ignore[attr-defined]
-            raise pickle.UnpicklingError(f"a torch storage of {count} numbers that are not there")
+            raise pickle.UnpicklingError(f"a torch storage of {count} numbers, more than it holds")
         return storages.setdefault(str(pid[2]), np.zeros(count, dtype))
 
 
@@ -312,7 +312,8 @@ def read_pickle(path: Path) -> Any:  # noqa: ANN401 (whatever the file holds)
     """Read a pickle without executing anything.
 
     Raises:
-        HeadModelError: unreadable, damaged, or naming something that is not on the allow list.
+        HeadModelError: the file is unreadable, damaged, or names a class that is not on the allow
+            list.
     """
     try:
         size = path.stat().st_size
@@ -325,10 +326,10 @@ def read_pickle(path: Path) -> Any:  # noqa: ANN401 (whatever the file holds)
 
 
 def read_object_array(path: Path) -> Any:  # noqa: ANN401 (whatever the file holds)
-    """Read an `.npy` file, also one that holds a pickled object, without executing anything.
+    """Read an `.npy` file, even one that holds a pickled object, without executing anything.
 
     Raises:
-        HeadModelError: as `read_pickle`.
+        HeadModelError: as for `read_pickle`.
     """
     try:
         with path.open("rb") as file:
@@ -345,9 +346,9 @@ def to_array(value: object, name: str, where: str) -> np.ndarray:
     """Convert what a pickle held (array, chumpy, sparse matrix or list) to a dense array.
 
     Raises:
-        HeadModelError: it is not numbers, is too large, or holds NaN or Inf.
+        HeadModelError: it is not numeric, is too large, or holds NaN or Inf.
     """
-    for _ in range(8):  # one may hold another; a loop of them holds nothing
+    for _ in range(8):  # they may be nested; the limit ends a cycle
         if isinstance(value, ChumpyArray):
             value = next((value.state[key] for key in ("x", "a", "v") if key in value.state), None)
     try:
@@ -364,21 +365,21 @@ def to_array(value: object, name: str, where: str) -> np.ndarray:
 
 
 def read_weights(path: Path, kind: Kind, where: str, what: str, fix: str = AGAIN) -> Any:  # noqa: ANN401
-    """Read a file of ``torch.save`` to the CPU.
+    """Read a file written by ``torch.save`` to the CPU.
 
-    For messages: ``where`` it is, ``what`` it is expected to be, such as "a torch state dict", and
-    how to ``fix`` it.
+    Messages say ``where`` the file is, ``what`` it should be, such as "a torch state dict", and how
+    to ``fix`` it.
 
     Raises:
-        Express50Error: of the given kind: it is missing, damaged, or names what ``weights_only``
-            does not allow.
+        Express50Error: of the given kind: the file is missing, damaged, or names something that
+            ``weights_only`` does not allow.
     """
     import torch
 
     if not Path(path).is_file():
         raise kind(f"{where}: no such file; {fix}")
     try:
-        with warnings.catch_warnings(action="ignore"):  # about pickles that are refused below
+        with warnings.catch_warnings(action="ignore"):  # about pickles that are refused
             return torch.load(path, map_location="cpu", weights_only=True)
     except DAMAGE as error:
         # Torch's own message says how to switch the protection off.

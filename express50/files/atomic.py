@@ -1,6 +1,6 @@
-"""Write files so that after a crash each is absent or complete: aside, synced, renamed.
+"""Write files so that after a crash each is absent or complete: write aside, sync, rename.
 
-A full disk becomes one error, which stops a run before it computes what cannot be kept.
+A full disk raises one kind of error, which stops a run before it computes what cannot be stored.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from typing import BinaryIO
 
 from express50.errors import DiskFullError
 
-LEAST_FREE = 100e6  # bytes; with less a disk counts as full
-AT_FDCWD, RENAME_EXCHANGE = -100, 2  # of Linux
-FORMER = ".former"  # ends the name of a folder that was moved out of the way
+LEAST_FREE = 100e6  # bytes; a disk with less free space counts as full
+AT_FDCWD, RENAME_EXCHANGE = -100, 2  # Linux constants
+FORMER = ".former"  # suffix of a folder that was moved out of the way
 NO_SPACE = os.strerror(errno.ENOSPC)
 
 
@@ -35,12 +35,12 @@ def dump_json(value: object) -> bytes:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file so that a reader or a crash sees the old bytes or the new, nothing between."""
+    """Write a file so that readers, even after a crash, see either the old bytes or the new."""
     write_with(path, lambda file: file.write(data))
 
 
 def write_with(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write a file as `write_bytes` does, by a function that gets it open."""
+    """Write a file as `write_bytes` does, by calling ``write`` with the open file."""
     aside = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
     with naming_full_disk(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -64,15 +64,16 @@ def check_space(folder: Path) -> None:
     """Raise DiskFullError if the disk of an existing folder has less than `LEAST_FREE` left."""
     usage = shutil.disk_usage(folder)
     if usage.total and usage.free < LEAST_FREE:  # some network drives do not report their size
-        raise _full(folder, f"{usage.free / 1e6:.0f} MB are left, expected {LEAST_FREE / 1e6:.0f}")
+        left, least = f"{usage.free / 1e6:.0f}", f"{LEAST_FREE / 1e6:.0f}"
+        raise _full(folder, f"{left} MB are free, expected at least {least}")
 
 
 @contextmanager
 def naming_full_disk(path: Path) -> Iterator[None]:
-    """Turn any error that a full disk led to, also in a library, into one that names the path.
+    """Turn any error caused by a full disk, even in a library, into one that names the path.
 
     Raises:
-        DiskFullError: the body ended by such an error.
+        DiskFullError: the body raised such an error.
     """
     try:
         yield
@@ -99,14 +100,14 @@ def _full(path: Path, why: str) -> DiskFullError:
 def folder_in_one_step(
     aside: Path, target: Path, keep: Callable[[Path], None] | None = None
 ) -> Iterator[Path]:
-    """Yield an empty folder aside; on a clean exit it is synced and replaces ``target``.
+    """Yield the empty folder ``aside``; on a clean exit it is synced and replaces ``target``.
 
-    ``keep`` may move the folder that was replaced to another place; else it is deleted.
+    ``keep`` may move the replaced folder elsewhere; otherwise it is deleted.
 
-    When the body raises, a former target stays as it was. A kill at any moment leaves the former
-    target or the new one; only where the file system cannot swap two folders, a kill between two
-    renames leaves none until the next call, which first puts the former one back. What a killed run
-    left aside is deleted. The folder that ``aside`` is in must be there, or be the target's.
+    If the body raises, an existing target stays as it was. A kill at any moment leaves the old
+    target or the new one. Only if the file system cannot swap two folders, a kill between two
+    renames leaves none until the next call, which first puts the old one back. What a killed run
+    left behind is deleted. The parent folder of ``aside`` must exist, or be the target's.
     """
     former = aside.with_name(aside.name + FORMER)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -131,7 +132,7 @@ def folder_in_one_step(
 
 
 def put_back(former: Path, target: Path) -> None:
-    """Put a former folder back where a kill between two renames has left no target."""
+    """Put the old folder back if a kill between two renames has left no target."""
     if former.is_dir() and not target.exists():
         target.parent.mkdir(parents=True, exist_ok=True)
         former.rename(target)
@@ -141,7 +142,7 @@ def put_back(former: Path, target: Path) -> None:
 def _replace(aside: Path, target: Path, former: Path) -> None:
     """Rename a folder to a target that others may make, replace or move away at the same time.
 
-    To look first, and then to rename, would fail where one of them comes between.
+    Checking first and then renaming would fail if another process came in between.
     """
     met = False
     while True:
@@ -152,12 +153,12 @@ def _replace(aside: Path, target: Path, former: Path) -> None:
             aside.rename(target)
             return
         except FileNotFoundError:
-            if not aside.exists():  # a later run has taken it away
+            if not aside.exists():  # a later run has removed it
                 raise
         except OSError as error:
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                 raise
-            if met:  # it was not made just after the attempt to swap: the file system cannot
+            if met:  # second time: the target existed during the swap, which is not supported here
                 shutil.rmtree(former, ignore_errors=True)
                 with suppress(FileNotFoundError):
                     target.rename(former)
@@ -165,9 +166,9 @@ def _replace(aside: Path, target: Path, former: Path) -> None:
 
 
 def _swap(one: Path, other: Path) -> bool:
-    """Exchange two folders in one step; False where the system cannot.
+    """Exchange two folders in one step; return False if the system cannot.
 
-    Source: renameat2(2), RENAME_EXCHANGE, which Python's library does not have.
+    Source: renameat2(2), RENAME_EXCHANGE, which Python's standard library lacks.
     """
     exchange = getattr(ctypes.CDLL(None), "renameat2", None)  # glibc 2.28 and later
     return exchange is not None and not exchange(

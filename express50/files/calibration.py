@@ -1,4 +1,4 @@
-"""Read and write the calibration file: cameras by id as JSON, every value checked."""
+"""Read and write calibration files: cameras by id as JSON, with every value checked."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from express50.geometry.shapes import PIXEL_LIMIT
 from express50.geometry.transforms import is_rigid
 
 CAMERA_ID = re.compile(r"\w[\w.+-]{0,119}")
-LARGEST = 1e12  # of a parameter or a pose, pixels or metres
+LARGEST = 1e12  # absolute value in parameters (pixels) and poses (metres)
 
 
 def read_cameras(path: Path) -> dict[str, Camera]:
@@ -35,7 +35,7 @@ def parse_cameras(table: object, where: str) -> dict[str, Camera]:
     """Make cameras of a calibration file's content.
 
     Raises:
-        CalibrationError: there are none, or one has a field of the wrong shape or value.
+        CalibrationError: there are no cameras, or a field has the wrong shape or value.
     """
     if not isinstance(table, dict) or not table:
         got = "an empty one" if isinstance(table, dict) else type(table).__name__
@@ -46,13 +46,13 @@ def parse_cameras(table: object, where: str) -> dict[str, Camera]:
 def _parse_camera(path: str, camera_id: str, row: object) -> Camera:
     """Check one camera's entry and build it."""
     where = f"{path}: camera {camera_id}"
-    if not CAMERA_ID.fullmatch(camera_id):  # it becomes the name of files
+    if not CAMERA_ID.fullmatch(camera_id):  # it becomes a file name
         raise CalibrationError(f"{where}: expected an id of letters, digits and _ . + -")
     if not isinstance(row, Mapping):
         raise CalibrationError(f"{where}: expected a table, got {type(row).__name__}")
     missing = [k for k in ("model", "width", "height", "params", "world_to_camera") if k not in row]
     if missing:
-        raise CalibrationError(f"{where}: has no {', '.join(missing)}; add it in pixels and metres")
+        raise CalibrationError(f"{where}: has no {', '.join(missing)}; see docs/FORMAT.md")
     model = row["model"]
     if not isinstance(model, str) or model not in MODELS:
         raise CalibrationError(f"{where}: model {model!r} is unknown; expected {', '.join(MODELS)}")
@@ -61,7 +61,7 @@ def _parse_camera(path: str, camera_id: str, row: object) -> Camera:
     R = pose[:3, :3]
     if not is_rigid(pose):
         raise CalibrationError(
-            f"{where}: world_to_camera has no rotation (R R^T differs from 1 by"
+            f"{where}: world_to_camera is not a rotation (R R^T differs from identity by"
             f" {np.abs(R @ R.T - np.eye(3)).max():.2g}, det {np.linalg.det(R):.3f});"
             " expected an orthonormal matrix with det 1"
         )
@@ -73,8 +73,8 @@ def _parse_camera(path: str, camera_id: str, row: object) -> Camera:
     size = [row["width"], row["height"]]
     if not all(type(n) is int and n > 0 for n in size) or size[0] * size[1] > PIXEL_LIMIT:
         raise CalibrationError(
-            f"{where}: size {size}, expected two positive whole numbers of pixels, together at most"
-            f" {PIXEL_LIMIT}"
+            f"{where}: size {size}, expected a positive integer width and height, and at most"
+            f" {PIXEL_LIMIT} pixels"
         )
     return Camera(camera_id, size[0], size[1], model, tuple(map(float, params)), pose)
 
@@ -90,7 +90,9 @@ def _numbers(where: str, name: str, value: object, shape: tuple[int, ...]) -> np
     if not np.isfinite(array).all():
         raise CalibrationError(f"{where}: {name} holds NaN or Inf, expected finite numbers")
     if np.abs(array).max(initial=0.0) > LARGEST:  # its square would not be finite
-        raise CalibrationError(f"{where}: {name} holds {np.abs(array).max():.3g}, over {LARGEST:g}")
+        raise CalibrationError(
+            f"{where}: {name} holds {np.abs(array).max():.3g}, expected at most {LARGEST:g}"
+        )
     return array
 
 

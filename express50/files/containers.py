@@ -2,7 +2,8 @@
 
 ``decoder/image/cam400.zip!/cam400/000123.avif`` is a member of a zip, and
 ``0026_e0_raw.smc!/Camera/03/color/0`` an array of encoded bytes in an HDF5 file. Nothing is
-unpacked to the disk, no name leads out of the footage's folder, and sizes are checked first.
+unpacked to disk, names that lead out of the footage's folder are refused, and sizes are checked
+before anything is read.
 """
 
 from __future__ import annotations
@@ -27,15 +28,15 @@ from express50.files.text import read_bytes
 from express50.geometry.shapes import PIXEL_LIMIT
 
 WITHIN = "!/"
-BYTES_LIMIT = 1 << 28  # of one encoded image, or of one array
-NAME_LIMIT = 255  # bytes, of each part
+BYTES_LIMIT = 1 << 28  # per encoded image or array
+NAME_LIMIT = 255  # bytes per path component
 OPEN_FILES = 4  # containers a process keeps open
 # What h5py raises on bad files.
 DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, AttributeError)
 
 
 def to_srgb(image: np.ndarray) -> np.ndarray:
-    """Convert an image (H, W[, C]) of linear floats or sRGB of 8 or 16 bits to (H, W, 3) uint8.
+    """Convert an image (H, W[, C]), linear float or 8- or 16-bit sRGB, to (H, W, 3) uint8 sRGB.
 
     Raises:
         ValueError: the image holds NaN or infinity.
@@ -56,24 +57,26 @@ def inside(root: Path, name: str) -> Path:
     """Return the path of a name relative to a folder.
 
     Raises:
-        CaptureError: it is absolute, leads out of the folder, or is a link to itself.
+        CaptureError: the name is absolute, leads out of the folder, or is a link to itself.
     """
     pure = PurePosixPath(name)
     path = root / name
     out = pure.is_absolute() or ".." in pure.parts or not name.isprintable()
     if any(len(part.encode(errors="replace")) > NAME_LIMIT for part in pure.parts):
-        raise CaptureError(f"{root}: {name[:40]!r}... is longer than a name may be")
+        raise CaptureError(
+            f"{root}: {name[:40]!r}... is too long, expected at most {NAME_LIMIT} bytes per part"
+        )
     try:
         out = out or not path.resolve().is_relative_to(root.resolve())
-    except RuntimeError:  # what pathlib raises of links in a circle
+    except RuntimeError:  # what pathlib raises for circular links
         raise CaptureError(f"{root}: {name!r} is a link to itself; copy the file there") from None
     if out:
-        raise CaptureError(f"{root}: {name!r} leads out of it; expected a name inside it")
+        raise CaptureError(f"{root}: {name!r} leads out of this folder; expected a name inside it")
     return path
 
 
 def read_picture(root: Path, name: str, orientation: int = 1) -> np.ndarray:
-    """Read an image (H, W, 3) uint8 sRGB by its name below a folder, turned by EXIF's orientation.
+    """Read an image (H, W, 3) uint8 sRGB by its name below a folder, rotated by an orientation.
 
     Raises:
         CaptureError: it is missing, damaged, too large, or its name leads out of the folder.
@@ -104,10 +107,10 @@ def read_srgb(path: Path) -> np.ndarray:
 
 
 def decode_picture(data: bytes, where: str) -> np.ndarray:
-    """Decode JPEG, PNG or AVIF bytes to (H, W, 3) uint8 sRGB; the header's size is checked first.
+    """Decode JPEG, PNG or AVIF bytes to (H, W, 3) uint8 sRGB, after checking the header's size.
 
     Raises:
-        CaptureError: the bytes are not such an image, or it has too many pixels.
+        CaptureError: the bytes are not such an image, or the image has too many pixels.
     """
     try:
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "AVIF")) as header:
@@ -125,10 +128,11 @@ def decode_picture(data: bytes, where: str) -> np.ndarray:
 
 
 def member_bytes(path: Path, member: str) -> bytes:
-    """Read a member of a container: a zip, else an HDF5 file.
+    """Read a member of a container, which is a zip or otherwise an HDF5 file.
 
     Raises:
-        CaptureError: the container is damaged, the member missing, too large or of another kind.
+        CaptureError: the container is damaged, or the member is missing, too large or of the wrong
+            type.
     """
     where = f"{path}{WITHIN}{member}"
     if path.suffix.lower() != ".zip":
@@ -190,7 +194,7 @@ _hdf5_of = cached_by_file(OPEN_FILES)(h5py.File)
 def child(file: h5py.File, name: str) -> Any:
     """Return the group or dataset at a path in an HDF5 file, or None.
 
-    Links are refused: an external one reads any file of the machine.
+    Links are refused: an external link could read any file on the machine.
 
     Raises:
         CaptureError: a part of the path is a link, or the file is damaged.
@@ -229,14 +233,16 @@ def read_array(file: h5py.File, name: str) -> np.ndarray:
     """Read a dataset's array after checking its type and size.
 
     Raises:
-        CaptureError: it is missing, not plain numbers, too large, or lies in another file.
+        CaptureError: it is missing, not plain numbers, too large, or stored in another file.
     """
     node, where = child(file, name), file.filename
     if not isinstance(node, h5py.Dataset):
         raise CaptureError(f"{where}: has no array {name}; copy the file again")
     with _damage_is_one_error(DAMAGE, f"{where}: {name} is damaged"):
         if node.dtype.kind not in "uif" or node.is_virtual or node.external:
-            raise CaptureError(f"{where}: {name} is {node.dtype}, expected numbers in the file")
+            raise CaptureError(
+                f"{where}: {name} is {node.dtype}, expected numbers stored in this file"
+            )
         size = int(np.prod(node.shape, dtype=object)) * node.dtype.itemsize
         _check_size(size, f"{where}: {name}")
         return np.asarray(node[()])

@@ -15,13 +15,13 @@ T = TypeVar("T")
 
 
 def cached_by_file(size: int) -> Callable[[Callable[..., T]], Callable[..., T]]:
-    """Cache the last `size` results of a function of a path until the file there changes.
+    """Cache the last `size` results of a function of a path until the file changes.
 
-    The function's first argument is a path, or has a method `__fspath__`; all arguments are
-    hashable. A file counts as changed when its size, time of change or inode differs.
+    The function's first argument must be a path, or have a method `__fspath__`; all arguments must
+    be hashable. A file counts as changed if its size, modification time or inode differs.
 
     Raises:
-        OSError: when the function is called and the path cannot be examined.
+        OSError: on a call of the function, if the path cannot be examined.
     """
 
     def decorate(function: Callable[..., T]) -> Callable[..., T]:
@@ -42,13 +42,13 @@ FileVersion = tuple[int, int, int]
 
 
 def file_version(path: Path) -> FileVersion:
-    """Return size, time of change (ns) and inode: they change whenever the bytes do."""
+    """Return size, modification time (ns) and inode, which change whenever the bytes do."""
     stat = Path(path).stat()
     return stat.st_size, stat.st_mtime_ns, stat.st_ino
 
 
 def file_sha256(path: Path) -> str:
-    """Return the SHA-256 of a file's bytes, hexadecimal."""
+    """Return the SHA-256 of a file's bytes in hexadecimal."""
     with Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -66,7 +66,7 @@ def files_of(folder: Path) -> list[Path]:
 def path_digest(path: Path, sha256: Callable[[Path], str] = file_sha256) -> str:
     """Digest a file's content, or the names and contents of a folder's files.
 
-    ``sha256`` digests one file; the ledger passes one that remembers.
+    ``sha256`` digests one file; the ledger passes a function that caches digests.
 
     Raises:
         StageError: the path does not exist.
@@ -74,13 +74,13 @@ def path_digest(path: Path, sha256: Callable[[Path], str] = file_sha256) -> str:
     if path.is_file():
         return sha256(path)
     if not path.is_dir():
-        raise StageError(f"{path}: input is missing; run the stage that writes it first")
+        raise StageError(f"{path}: the input is missing; run the stage that writes it first")
     lines = [f"{file.relative_to(path).as_posix()} {sha256(file)}" for file in files_of(path)]
     return text_digest("\n".join(lines))
 
 
 def stat_digest(path: Path) -> str:
-    """Digest names, sizes and times of a file or a folder's files: cheap for terabytes."""
+    """Digest names, sizes and times of a file or a folder's files: cheap even for terabytes."""
     root, files = (path.parent, [path]) if path.is_file() else (path, files_of(path))
     lines = []
     for file in files:
@@ -90,10 +90,10 @@ def stat_digest(path: Path) -> str:
 
 
 def text_digest(text: str) -> str:
-    """Return the SHA-256 of a text, hexadecimal."""
+    """Return the SHA-256 of a text in hexadecimal."""
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def value_digest(value: object) -> str:
-    """Return the SHA-256 of a value's canonical JSON (tuples are lists, keys are sorted)."""
+    """Return the SHA-256 of a value's canonical JSON (tuples as lists, keys sorted)."""
     return text_digest(json.dumps(value, sort_keys=True, ensure_ascii=False))

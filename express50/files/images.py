@@ -1,7 +1,7 @@
 """Read, write, encode and decode images; convert colour and depth; lay out contact sheets.
 
-OpenImageIO reads and writes 8 and 16 bits, half and single float, with one interface; JPEG bytes
-in memory go through OpenCV. Images are RGB, (H, W, 3); files hold sRGB unless a name says linear.
+OpenImageIO reads and writes files with 8 and 16 bits, half and single floats; OpenCV encodes and
+decodes bytes in memory. Images are RGB (H, W, 3); files hold sRGB unless a name says linear.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ import OpenImageIO as oiio
 from express50.errors import FormatError
 from express50.geometry.shapes import PIXEL_LIMIT
 
-CUT = "truncated: a JPEG without its end; copy it again"
+CUT = "truncated: the JPEG has no end marker; copy it again"
 DEPTH_UNIT_M = 5e-5  # one step of a 16-bit depth map; 3.28 m at most, 0.025 mm rounding
 DEPTH_LIMIT_M = DEPTH_UNIT_M * 65535
-JPEG_SIDE, PNG_SIDE = 65500, 1_000_000  # pixels; longer sides the encoders refuse
+JPEG_SIDE, PNG_SIDE = 65500, 1_000_000  # pixels; the encoders refuse longer sides
 # Orientation -> quarter turns counter-clockwise after an optional left-right flip (EXIF 2.3).
 TURNS = {1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (1, True), 6: (3, False),
          7: (3, True), 8: (1, False)}  # fmt: skip
@@ -34,7 +34,7 @@ def read_image(path: Path) -> np.ndarray:
     """Read an image as (H, W) or (H, W, C) RGB in the file's own type.
 
     Returns:
-        uint8, uint16 or float32 (half is widened) array.
+        A uint8, uint16 or float32 array (half floats are widened).
 
     Raises:
         FormatError: the file is missing, truncated, not a flat image, or over the pixel limit.
@@ -78,7 +78,7 @@ def open_image(path: Path) -> oiio.ImageInput:
 
 
 def _error_text(geterror: Callable[[], str]) -> str:
-    """Return OpenImageIO's error; it may quote bytes of the file that are not text."""
+    """Return OpenImageIO's error, which may quote bytes of the file that are not text."""
     try:
         return geterror().strip()
     except UnicodeDecodeError:
@@ -86,12 +86,12 @@ def _error_text(geterror: Callable[[], str]) -> str:
 
 
 def read_exif(path: Path) -> tuple[int, float]:
-    """Read orientation, 1 to 8, and focal length on 35 mm film, 0 if unknown.
+    """Read the orientation, 1 to 8, and the 35 mm equivalent focal length, 0 if unknown.
 
-    A rig's cameras are used as they are stored, since a calibration belongs to stored pixels. Bare
-    photographs have none: they are turned upright first, so that width, height and principal point
-    are those of the upright picture. The focal length of 35 mm film is that of the same diagonal,
-    which turning does not change.
+    A rig's images are used as stored, since a calibration refers to stored pixels. Bare photographs
+    have no calibration: they are rotated upright first, so that width, height and principal point
+    are those of the upright picture. A 35 mm equivalent focal length refers to the diagonal, which
+    rotation does not change.
 
     Raises:
         FormatError: the file is not an image.
@@ -110,7 +110,7 @@ def read_exif(path: Path) -> tuple[int, float]:
 
 
 def upright(image: np.ndarray, orientation: int) -> np.ndarray:
-    """Turn a stored image upright, as its EXIF orientation (1 to 8) says."""
+    """Rotate a stored image upright according to its EXIF orientation (1 to 8)."""
     turns, flipped = TURNS[orientation]
     if (turns, flipped) == (0, False):
         return image
@@ -121,7 +121,7 @@ def read_alpha(path: Path) -> np.ndarray:
     """Read an 8-bit grey image (H, W) uint8.
 
     Raises:
-        FormatError: it cannot be read, or is of another kind.
+        FormatError: it cannot be read, or is not 8-bit grey.
     """
     alpha = read_image(path)
     if alpha.ndim != 2 or alpha.dtype != np.uint8:
@@ -132,7 +132,7 @@ def read_alpha(path: Path) -> np.ndarray:
 def write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:
     """Write (H, W) or (H, W, C) RGB, uint8, uint16 or float32, as .png, .jpg, .tif or .exr.
 
-    JPEG's ``quality`` is 1 to 100, 4:4:4 from 95 upwards.
+    JPEG's ``quality`` is 1 to 100; from 95 upwards chroma is not subsampled (4:4:4).
 
     Raises:
         FormatError: the file cannot be written.
@@ -148,7 +148,7 @@ def write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:
     if quality >= 95:
         spec.attribute("jpeg:subsampling", "4:4:4")
     spec.attribute("png:compressionLevel", 3)
-    if ending == ".exr":  # the time of writing would go into its header
+    if ending == ".exr":  # otherwise its header would hold the time of writing
         spec.attribute("DateTime", "1970:01:01 00:00:00")
     target = oiio.ImageOutput.create(str(path))
     if target is None or not target.open(str(path), spec):
@@ -184,12 +184,12 @@ def encode_png(image: np.ndarray) -> bytes:
 def _check_sides(kind: str, image: np.ndarray, longest: int) -> None:
     if max(image.shape[:2]) > longest or 0 in image.shape:
         size = f"{image.shape[1]}x{image.shape[0]} pixels"
-        less = "; take PNG, or less" if kind == "JPEG" else ""
+        less = "; use PNG, or a smaller image" if kind == "JPEG" else ""
         raise FormatError(f"{kind}: {size}, expected sides of 1 to {longest}{less}")
 
 
 def has_alpha(path: Path) -> bool:
-    """Say whether a file is a PNG whose header names an alpha channel."""
+    """Return True if a file is a PNG whose header declares an alpha channel."""
     with path.open("rb") as file:
         head = file.read(26)
     return head.startswith(b"\x89PNG") and head[25:] in (b"\x04", b"\x06")  # grey or RGB, alpha
@@ -199,7 +199,7 @@ def decode_image(data: bytes, name: str = "image") -> np.ndarray:
     """Decode JPEG or PNG bytes to RGB (H, W, 3) or grey (H, W), keeping 8 or 16 bits.
 
     Raises:
-        FormatError: the bytes are not an image, or one over the pixel limit.
+        FormatError: the bytes are not an image, or the image is over the pixel limit.
     """
     width, height = image_size(data, name)
     if width * height > PIXEL_LIMIT:
@@ -208,10 +208,10 @@ def decode_image(data: bytes, name: str = "image") -> np.ndarray:
 
 
 def decode_cv(data: bytes, flags: int, name: str) -> np.ndarray:
-    """Decode bytes with OpenCV, refusing a JPEG without its end; check the image's size before.
+    """Decode bytes with OpenCV, refusing a truncated JPEG; callers check the image's size first.
 
     Raises:
-        FormatError: the bytes are damaged, or end too soon.
+        FormatError: the bytes are damaged or truncated.
     """
     if is_cut_short(data):
         raise FormatError(f"{name}: {CUT}")
@@ -225,10 +225,10 @@ def decode_cv(data: bytes, flags: int, name: str) -> np.ndarray:
 
 
 def image_size(data: bytes, where: str) -> tuple[int, int]:
-    """Read width and height from a PNG's or JPEG's header, before any pixel is decoded.
+    """Read width and height from a PNG's or JPEG's header, without decoding pixels.
 
     Raises:
-        FormatError: the bytes are neither.
+        FormatError: the bytes are neither PNG nor JPEG.
 
     Source: PNG 1.2, 11.2.2 (IHDR).
     """
@@ -244,9 +244,9 @@ def is_cut_short(data: bytes | mmap.mmap) -> bool:
     """Return True if a JPEG stops before its end marker; False for other bytes.
 
     Decoders fill what is missing with grey and do not report it. Thumbnails in the header have end
-    markers of their own, and some cameras write more after the picture's, so the marker is searched
-    behind the first scan's header. In a scan 0xFF is always followed by a byte that says what it is
-    (ITU-T T.81, B.1.1.5), so nothing else looks like it.
+    markers of their own, and some cameras write more data after the picture's, so the search starts
+    after the first scan's header. In a scan, 0xFF is always followed by a byte that says what it is
+    (ITU-T T.81, B.1.1.5), so no other data looks like an end marker.
     """
     if data[:2] != b"\xff\xd8":
         return False
@@ -255,7 +255,7 @@ def is_cut_short(data: bytes | mmap.mmap) -> bool:
 
 
 def _jpeg_header(data: bytes | mmap.mmap) -> tuple[tuple[int, int] | None, int | None]:
-    """Return a JPEG's (width, height) and the offset of its first scan; None where not found.
+    """Return a JPEG's (width, height) and the offset of its first scan; None if not found.
 
     Source: ITU-T T.81, B.1.1.2 to B.2.2 (markers, frame header).
     """
@@ -275,7 +275,7 @@ def _jpeg_header(data: bytes | mmap.mmap) -> tuple[tuple[int, int] | None, int |
 
 
 def _swap(image: np.ndarray) -> np.ndarray:
-    """Swap RGB and BGR into an array that OpenCV accepts."""
+    """Swap RGB and BGR; return a contiguous array, which OpenCV needs."""
     return np.ascontiguousarray(image[..., ::-1]) if image.ndim == 3 else image
 
 
@@ -313,7 +313,8 @@ def linear_to_srgb(image_linear: np.ndarray) -> np.ndarray:
 LIGHT_OF_LEVEL = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
 """Linear light (256,) of the levels of 8-bit sRGB."""
 
-# The same in 16 bits, where the darkest levels are 20 steps apart; and the level nearest to each.
+# The same in 16 bits, where the darkest levels are 20 steps apart; and the inverse, the nearest
+# level of each 16-bit value.
 DEEP_LIGHT_OF_LEVEL = np.rint(65535 * LIGHT_OF_LEVEL.astype(np.float64)).astype(np.uint16)
 LEVEL_OF_DEEP_LIGHT = np.rint(255 * linear_to_srgb(np.arange(65536) / 65535)).astype(np.uint8)
 
@@ -332,10 +333,10 @@ def scaled_levels(gain: np.ndarray) -> np.ndarray:
 
 
 def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Resize (H, W[, C]); averages areas when shrinking, interpolates when growing.
+    """Resize an image (H, W[, C]): average areas to shrink it, interpolate to enlarge it.
 
     Raises:
-        ValueError: the image is empty, or would be.
+        ValueError: the image or its new size is empty.
     """
     if 0 in image.shape or min(width, height) < 1:
         had = f"{image.shape[1]}x{image.shape[0]}"
@@ -371,10 +372,10 @@ def reduce_light(image: np.ndarray, width: int, height: int) -> np.ndarray:
 def edge_distance(mask: np.ndarray) -> np.ndarray:
     """Measure the distance (H, W) float32 of each pixel of a mask (H, W) to the nearest outside it.
 
-    In pixels, zero outside; a mask without an outside has no meaning. OpenCV's roots differ in the
-    last bit with where in memory a mask lies; squared distances are whole numbers, and rounding
-    them gives the same bytes everywhere (up to 1,400 pixels from the edge, where float32 no longer
-    distinguishes them).
+    Distances are in pixels, zero outside; the mask must have an outside. The last bit of OpenCV's
+    square roots depends on where the mask lies in memory; squared distances are integers, and
+    rounding them gives the same bytes everywhere (up to 1,400 pixels from the edge, beyond which
+    float32 cannot distinguish them).
     """
     rough = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return np.sqrt(np.rint(np.square(rough)))
@@ -408,7 +409,7 @@ def contact_sheet(
         tiles = [fit_into(image, *tile) for image in row]
         line = np.concatenate(tiles + [blank] * (columns - len(tiles)), axis=1)
         if labels is not None:
-            line[:20] //= 3  # a dark band, so that white words read on any picture
+            line[:20] //= 3  # a dark band, so that white text is legible on any picture
             cv2.putText(line, labels[number], (5, 14), *_LABEL)
         lines.append(line)
     return np.concatenate(lines, axis=0) if lines else blank

@@ -1,7 +1,8 @@
 """Read text, JSON, TOML, YAML and XML files, with errors that name the file and the line.
 
-A file is a regular one of at most ``TEXT_LIMIT`` bytes. In JSON and TOML keys come once and numbers
-are finite; YAML and XML are read as text, without references that could grow or name other files.
+Files must be regular and have at most ``TEXT_LIMIT`` bytes. In JSON and TOML, repeated keys and
+numbers that are not finite are refused; YAML and XML values stay text, and references that could
+grow without bound or name other files are refused.
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ import yaml
 from express50.errors import Express50Error
 
 TEXT_LIMIT = 1 << 28  # bytes; the index of 100,000 samples takes 40 MB
-TOML_LIMIT = 1 << 20  # bytes; written by hand
-YAML_LIMIT, YAML_LEVELS = 1 << 18, 16  # bytes, which take seconds to parse; of nesting
+TOML_LIMIT = 1 << 20  # bytes; these files are written by hand
+YAML_LIMIT, YAML_LEVELS = 1 << 18, 16  # bytes (that many take seconds to parse), levels of nesting
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,199}")
 """Pattern of a name that may become a file or folder."""
 ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,119}")
-"""Pattern of a subject's or expression's id: a file name without a dot, as keys of shards need."""
+"""Pattern of a subject's or expression's id: a file name without a dot, as shard keys require."""
 AGAIN = "copy or write it again"
 
 Kind = type[Express50Error]
@@ -37,26 +38,26 @@ def read_bytes(path: Path, kind: Kind, limit: int = TEXT_LIMIT, fix: str = AGAIN
     """Read the bytes of a regular file.
 
     Raises:
-        Express50Error: of the given kind: it is missing, a pipe or a device, unreadable, or larger
+        Express50Error: of the given kind: the file is missing, not regular, unreadable, or larger
             than ``limit``.
     """
     path = Path(path)
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            raise kind(f"{path}: is a folder, a pipe or a device, expected a file; {fix}")
+            raise kind(f"{path}: is a folder, pipe or device, expected a regular file; {fix}")
         if status.st_size > limit:
             raise kind(f"{path}: {status.st_size} bytes, expected at most {limit}; {fix}")
         return path.read_bytes()
-    except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
+    except (OSError, ValueError) as error:  # ValueError: a name with a null byte
         raise kind(f"{path}: cannot be read ({reason(error)}); {fix}") from None
 
 
 def read_text(path: Path, kind: Kind, limit: int = TEXT_LIMIT, fix: str = AGAIN) -> str:
-    """Read a file as UTF-8 without a byte order mark; line ends become newlines.
+    """Read a file as UTF-8, dropping a byte order mark; line ends become newlines.
 
     Raises:
-        Express50Error: as `read_bytes`, or it is not UTF-8.
+        Express50Error: as for `read_bytes`, or the file is not UTF-8.
     """
     try:
         text = read_bytes(path, kind, limit, fix).decode("utf-8-sig")
@@ -69,7 +70,7 @@ def read_json(path: Path, kind: Kind, fix: str = AGAIN) -> Any:
     """Read a JSON file.
 
     Raises:
-        Express50Error: as `read_text` and `parse_json`.
+        Express50Error: as for `read_text` and `parse_json`.
     """
     return parse_json(read_text(path, kind, fix=fix), str(path), kind, fix)
 
@@ -78,7 +79,7 @@ def read_json_table(path: Path, kind: Kind, fix: str = AGAIN) -> dict[str, Any]:
     """Read a JSON file that holds a table.
 
     Raises:
-        Express50Error: as `read_json`, or it is something else.
+        Express50Error: as for `read_json`, or the file holds no table.
     """
     table = read_json(path, kind, fix)
     if not isinstance(table, dict):
@@ -90,8 +91,8 @@ def parse_json(text: str | bytes, where: str, kind: Kind, fix: str = AGAIN) -> A
     """Parse JSON text.
 
     Raises:
-        Express50Error: it is not JSON, is nested too deeply, has a key twice, or a number that is
-            NaN, infinite or of thousands of digits.
+        Express50Error: it is not JSON, is nested too deeply, repeats a key, or has a number that is
+            NaN, infinite or thousands of digits long.
     """
     try:
         return json.loads(
@@ -107,8 +108,8 @@ def read_toml(path: Path, kind: Kind) -> dict[str, Any]:
     """Read a TOML file.
 
     Raises:
-        Express50Error: as `read_text`, or it is not TOML, nested too deeply, or holds a number that
-            is NaN or infinite.
+        Express50Error: as for `read_text`, or the file is not TOML, is nested too deeply, or holds
+            a number that is NaN or infinite.
     """
     text = read_text(path, kind, TOML_LIMIT, "correct it")
     try:
@@ -123,8 +124,8 @@ def read_yaml(path: Path, kind: Kind) -> Any:
     """Read a YAML file whose scalars stay text.
 
     Raises:
-        Express50Error: as `read_text`, or it is not YAML, nested too deeply, or has aliases, which
-            could make a small file endless.
+        Express50Error: as for `read_text`, or the file is not YAML, is nested too deeply, or has
+            aliases, with which a small file could expand without bound.
     """
     text, level = read_text(path, kind, YAML_LIMIT), 0
     text = text.replace("%YAML:1.0", "%YAML 1.0", 1)  # as OpenCV writes it
@@ -134,7 +135,7 @@ def read_yaml(path: Path, kind: Kind) -> Any:
             level -= isinstance(event, yaml.CollectionEndEvent)
             if level > YAML_LEVELS or isinstance(event, yaml.AliasEvent):
                 raise kind(
-                    f"{path}: has aliases (*name) or is nested over {YAML_LEVELS} deep, expected"
+                    f"{path}: has aliases (*name) or over {YAML_LEVELS} levels of nesting, expected"
                     f" plain values; {AGAIN}"
                 )
         return yaml.load(text, yaml.BaseLoader)
@@ -146,8 +147,8 @@ def read_xml(path: Path, kind: Kind) -> ElementTree.Element:
     """Read the root of an XML file.
 
     Raises:
-        Express50Error: as `read_text`, or it is not XML, or declares a document type, whose
-            entities could grow without bound or name other files.
+        Express50Error: as for `read_text`, or the file is not XML or declares a document type,
+            whose entities could grow without bound or name other files.
     """
     text = read_text(path, kind)
     if "<!DOCTYPE" in text:
@@ -159,7 +160,7 @@ def read_xml(path: Path, kind: Kind) -> ElementTree.Element:
 
 
 def reason(error: BaseException) -> str:
-    """Return an error's message as at most 200 characters of one line."""
+    """Return an error's message as one line of at most 200 characters."""
     if isinstance(error, RecursionError):
         return "it is nested too deeply"
     words = getattr(error, "strerror", None) or str(error) or type(error).__name__
@@ -167,10 +168,10 @@ def reason(error: BaseException) -> str:
 
 
 class NotFiniteError(ValueError):
-    """Names a number that is NaN or infinite, as it is written."""
+    """Reports a number that is NaN or infinite, as written in the file."""
 
     def located(self, text: str | bytes) -> str:
-        """Say which line holds such a number first."""
+        """Return a message that names the first line with this number."""
         lines = (text if isinstance(text, str) else text.decode(errors="replace")).split("\n")
         word = str(self)
         number = next((n for n, line in enumerate(lines, 1) if word in line), 1)

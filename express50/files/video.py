@@ -1,7 +1,7 @@
 """Read and write video frame by frame.
 
-Frames are counted by decoding and found by their time stamp: edit lists and broken muxers make a
-container's own frame count wrong. What is written has the same bytes for the same pictures.
+Frames are counted by decoding and found by their time stamp, because edit lists and broken muxers
+make a container's own frame count wrong. Writing the same pictures gives the same bytes.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from express50.files.images import encode_jpeg, encode_png
 from express50.files.text import reason
 from express50.geometry.shapes import PIXEL_LIMIT
 
-# Frames before the wanted one at which a seek aims. An H.264 or H.265 picture may be displayed
-# up to 16 pictures away from its place in the stream, so a nearer key frame may lie behind it.
+# A seek aims this many frames before the wanted one. An H.264 or H.265 picture may be displayed up
+# to 16 pictures away from its position in the stream, so a nearer key frame may come after it.
 REORDER = 16
-# Containers that are read. FFmpeg judges by content: a playlist named video.mp4 would make it read
-# other files.
+# Accepted containers. FFmpeg goes by content: a playlist named video.mp4 would make it read other
+# files.
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
-BOXES = 1_000_000  # of one file; a fragment of a second has two
+BOXES = 1_000_000  # per file; a fragment of one second has two
 DAMAGE = (av.FFmpegError, OSError, ValueError, MemoryError, OverflowError)
 
 
@@ -56,22 +56,22 @@ def check_whole(path: Path) -> None:
             length = length or size - offset
             if length < 8 or offset + length > size:
                 raise CaptureError(
-                    f"{path}: video is truncated: {size} bytes, its boxes say {offset + length} or"
-                    " more; copy the file again"
+                    f"{path}: video is truncated: it has {size} bytes, but its boxes need at least"
+                    f" {offset + length}; copy the file again"
                 )
             offset += length
     if count == BOXES:
-        raise CaptureError(f"{path}: has {BOXES} boxes and more; it is damaged, copy it again")
+        raise CaptureError(f"{path}: has {BOXES} boxes or more; it is damaged, copy it again")
     if b"ftyp" in kinds and not {b"moov", b"moof"} & kinds:
         raise CaptureError(
-            f"{path}: video has no index (moov box), the recording was cut off; "
+            f"{path}: video has no index (moov box), so it was cut off; "
             "copy the file again or record it again"
         )
 
 
 def _open(path: Path) -> tuple[av.container.InputContainer, av.VideoStream]:
     limits = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file"}
-    # To open a file FFmpeg decodes a picture, 0.26 core seconds at 4K; the header says enough.
+    # On opening, FFmpeg would decode a picture (0.26 core seconds at 4K); the header is enough.
     unseen = {"skip_frame": "all"}
     try:
         container = av.open(str(path), container_options=limits, options=unseen)
@@ -85,9 +85,9 @@ def _open(path: Path) -> tuple[av.container.InputContainer, av.VideoStream]:
     stream = container.streams.video[0]
     try:
         stream.codec_context.options = {"max_pixels": str(PIXEL_LIMIT)}
-        # The runner's cap for workers, else 0: the decoder's own choice.
+        # The runner's limit per worker, otherwise 0: the decoder chooses.
         stream.codec_context.thread_count = int(os.environ.get("OMP_NUM_THREADS") or 0)
-    except (RuntimeError, AttributeError, *DAMAGE) as error:  # a codec that is unknown
+    except (RuntimeError, AttributeError, *DAMAGE) as error:  # an unknown codec
         container.close()
         raise CaptureError(f"{path}: has no decoder ({reason(error)}); encode it again") from error
     return container, stream
@@ -99,7 +99,7 @@ def _pixels(path: Path, frame: av.VideoFrame) -> np.ndarray:
     if not 0 < size <= PIXEL_LIMIT:
         raise CaptureError(
             f"{path}: a frame is {frame.width}x{frame.height} pixels, expected at most"
-            f" {PIXEL_LIMIT} in all; encode it smaller"
+            f" {PIXEL_LIMIT} in total; encode it smaller"
         )
     try:
         return frame.to_ndarray(format="rgb24")
@@ -110,7 +110,7 @@ def _pixels(path: Path, frame: av.VideoFrame) -> np.ndarray:
 def _decode(
     path: Path, container: av.container.InputContainer, stream: av.VideoStream
 ) -> Iterator[av.VideoFrame]:
-    """Yield frames in display order from the container's position; damage is an error."""
+    """Yield frames in display order from the current position; raise CaptureError on damage."""
     try:
         for packet in container.demux(stream):
             if packet.is_corrupt:
@@ -121,7 +121,7 @@ def _decode(
             for frame in packet.decode():
                 if frame.pts is None:
                     raise CaptureError(
-                        f"{path}: frames carry no time stamps; remux it, for example with "
+                        f"{path}: frames have no time stamps; remux it, for example with "
                         "'ffmpeg -i IN -c copy OUT.mp4'"
                     )
                 yield frame
@@ -146,13 +146,13 @@ def video_fps(path: Path) -> float:
 
 
 def video_turn(path: Path) -> int:
-    """Read the quarter turns counter-clockwise that a video's container asks for, 0 to 3.
+    """Read the rotation that a video's container asks for: 0 to 3 quarter turns counter-clockwise.
 
-    Telephones store what they film upright as pictures on their side. A rig's cameras are taken as
-    they are stored, since a calibration belongs to stored pixels.
+    Phones store upright footage as pictures lying on their side. A rig's videos are used as stored,
+    since a calibration refers to stored pixels.
 
     Raises:
-        CaptureError: the file is not a video, damaged or holds no frame.
+        CaptureError: the file is not a video, is damaged, or holds no frame.
     """
     container, stream = _open(path)
     with container:
@@ -168,7 +168,7 @@ def iterate_video(path: Path) -> Iterator[tuple[int, np.ndarray]]:
         Time stamp (in the stream's own unit) and (H, W, 3) uint8 sRGB image.
 
     Raises:
-        CaptureError: the file is not a video, truncated, damaged or holds no frame.
+        CaptureError: the file is not a video, is truncated or damaged, or holds no frame.
     """
     check_whole(path)
     container, stream = _open(path)
@@ -195,7 +195,7 @@ class VideoReader:
         """Read the image (H, W, 3) uint8 sRGB at a decode index.
 
         Raises:
-            CaptureError: no such frame, or the footage no longer has the indexed time stamps.
+            CaptureError: there is no such frame, or time stamps differ from the index.
         """
         if not 0 <= frame < len(self.pts):
             raise CaptureError(
@@ -232,14 +232,14 @@ class VideoReader:
             return
         try:
             self._container.seek(self.pts[target], stream=self._stream, backward=True)
-        except DAMAGE:  # no index to seek in: start again
+        except DAMAGE:  # no index to seek with: start from the first frame
             self.restart()
             return
         self._frames = _decode(self.path, self._container, self._stream)
         self._next = target
 
     def _decode_until(self, frame: int) -> np.ndarray | None:
-        """Decode on to the frame; None when the stream is already past it or ends."""
+        """Decode forward to the frame; return None if the stream is already past it or ends."""
         wanted = self.pts[frame]
         for decoded in self._frames:
             if decoded.pts == wanted:
@@ -256,9 +256,9 @@ _BT709 = 1
 class VideoFootage:
     """Writes ``video.mp4``: H.264, 4:4:4, BT.709.
 
-    One thread, no B-frames and no lookahead, as otherwise the same pictures give different bytes
-    from run to run: libx264 reads stale memory there. It placed B-frames in six ways in 40 runs of
-    one thread, and without them weighted predictions in two ways in 3,000 runs.
+    It uses one thread, no B-frames and no lookahead, because otherwise the same pictures give
+    different bytes from run to run: libx264 reads stale memory. On one thread it placed B-frames in
+    six different ways in 40 runs, and without them weighted predictions in two ways in 3,000 runs.
     """
 
     def __init__(self, folder: Path, width: int, height: int, fps: float, crf: int) -> None:
@@ -273,7 +273,7 @@ class VideoFootage:
         context = stream.codec_context
         context.thread_count, context.gop_size = 1, 24
         context.colorspace = context.color_primaries = context.color_trc = _BT709
-        context.color_range = 1  # limited, as cameras record
+        context.color_range = 1  # limited range, as cameras record
         self._stream = stream
 
     def __enter__(self) -> VideoFootage:
