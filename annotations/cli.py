@@ -45,7 +45,7 @@ from express50.contract.layout import Dataset, included_subjects
 from express50.errors import AnnotationError, UnknownNameError, check_known
 
 _FIGURES = ("clips", "within_1", "within_2", "within_4", "median_frames", "slip_rate", "alpha")
-AROUND = 4  # frames on either side where one subject or expression is looked at
+AROUND = 4  # frames on either side when one subject or expression is shown
 
 
 def add_commands(subparsers: argparse._SubParsersAction) -> None:
@@ -78,7 +78,7 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
     parser = add(
         "reference",
         run_reference,
-        "print or choose the reference person, whose frames all others are matched to",
+        "print or choose the reference person, to whose frames all others are matched",
     )
     parser.add_argument("subject", nargs="?", metavar="SUBJECT", help="new reference")
     words = "label by RenderMe-360's rule: the last frame of a clip is its peak"
@@ -106,9 +106,7 @@ def _add_labelling_verbs(add: Callable[..., argparse.ArgumentParser]) -> None:
     parser = add("ui", run_ui, "label peak frames in the terminal", "annotator")
     parser.add_argument("--subjects", metavar="GLOB", help="only these subjects")
     parser.add_argument("--expressions", metavar="GLOB", help="only these expressions")
-    parser.add_argument(
-        "--order", choices=ORDERS, default="doubt", help="order of the tasks [%(default)s]"
-    )
+    parser.add_argument("--order", choices=ORDERS, default="doubt", help="task order [%(default)s]")
     parser.add_argument(
         "--blind", action="store_true", help="hide suggestions and others' marks until you decide"
     )
@@ -132,7 +130,7 @@ def _add_labelling_verbs(add: Callable[..., argparse.ArgumentParser]) -> None:
     parser.add_argument("--camera", help="camera it was judged in (default: the suggestion's)")
     parser.add_argument("--first", type=int, metavar="FRAME", help="first frame of its plateau")
     parser.add_argument("--last", type=int, metavar="FRAME", help="last frame of its plateau")
-    parser = add("flag", run_flag, "say that an expression has no peak", "clip", "annotator")
+    parser = add("flag", run_flag, "record that an expression has no peak", "clip", "annotator")
     parser.add_argument("reason", metavar="REASON", help=", ".join(FLAG_REASONS) + ", ...")
     words = "undo your last event on an expression"
     add("undo", run_undo, words, "clip", "annotator")
@@ -140,7 +138,7 @@ def _add_labelling_verbs(add: Callable[..., argparse.ArgumentParser]) -> None:
 
 
 def _add_reviewing_verbs(add: Callable[..., argparse.ArgumentParser]) -> None:
-    words = "check labels against the footage and each other; exit code 1 when one is wrong"
+    words = "check labels against the footage and each other; exit code 1 if one is wrong"
     add("validate", run_validate, words, "subjects")
     words = "show how well annotators agree: overall, by expression and by pair"
     add("agree", run_agree, words, "subjects")
@@ -150,9 +148,9 @@ def _add_reviewing_verbs(add: Callable[..., argparse.ArgumentParser]) -> None:
         type=int,
         default=2,
         metavar="FRAMES",
-        help="marks at most this far apart agree [2]",
+        help="marks at most this many frames apart agree [2]",
     )
-    parser.add_argument("--all", action="store_true", help="list settled ones too")
+    parser.add_argument("--all", action="store_true", help="also list settled disagreements")
     parser.add_argument(
         "--settle", nargs=3, metavar=("SUBJECT", "EXPRESSION", "VERDICT"),
         help="VERDICT is a frame, the annotator who is right, or the reason for a flag: "
@@ -161,7 +159,7 @@ def _add_reviewing_verbs(add: Callable[..., argparse.ArgumentParser]) -> None:
     add(
         "coverage",
         run_coverage,
-        "print a table of subjects and expressions that shows what is missing",
+        "print a table of subjects and expressions that shows the missing labels",
     )
     add("status", run_status, "show how many labels each subject has, and the time they took")
     words = "write a contact sheet of all labels, or of a subject or expression, as one HTML file"
@@ -182,7 +180,7 @@ def _add_reviewing_verbs(add: Callable[..., argparse.ArgumentParser]) -> None:
 
 
 def table(names: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Lay out some columns of rows; a dash stands for None."""
+    """Lay out some columns of rows; None is shown as a dash."""
     cells = [["-" if row[name] is None else str(row[name]) for name in names] for row in rows]
     return list(format_table([name.replace("_", " ") for name in names], cells))
 
@@ -233,7 +231,7 @@ def run_ui(args: argparse.Namespace) -> int:
     cell = None
     if args.pictures == "sixel":
         cell = cell_size()
-        os.environ.setdefault("COLORTERM", "truecolor")  # ssh does not hand it on
+        os.environ.setdefault("COLORTERM", "truecolor")  # ssh does not pass it on
     AnnotateApp(session, faces=FaceFinder(dataset), sixel_cell=cell).run()
     done, total = session.done, len(session.tasks)
     words = f"{done} of {total} done by {session.annotator}"
@@ -241,19 +239,19 @@ def run_ui(args: argparse.Namespace) -> int:
 
 
 def _check_terminal() -> None:
-    """Raise AnnotationError unless there is a terminal that can place text, in Unicode."""
+    """Raise AnnotationError unless the terminal can position text and shows Unicode."""
     without = "use 'express50 annotate mark' here"
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise AnnotationError(f"the annotator needs a terminal; {without}")
     name = os.environ.get("TERM", "")
     if name in ("", "dumb", "unknown"):
         raise AnnotationError(
-            f"TERM is {name!r}, a terminal that cannot place text; set TERM to what yours is, such"
+            f"TERM is {name!r}, which cannot position text; set TERM to your terminal's type, such"
             f" as xterm-256color, or {without}"
         )
     if sys.stdout.encoding.lower().replace("-", "") != "utf8":
         raise AnnotationError(
-            f"the annotator draws in UTF-8, and this terminal's texts are {sys.stdout.encoding};"
+            f"the annotator needs UTF-8, but this terminal's encoding is {sys.stdout.encoding};"
             f" set LC_ALL=C.UTF-8 and unset PYTHONIOENCODING, or {without}"
         )
 
@@ -264,7 +262,7 @@ def _matching(names: Iterable[str], pattern: str | None, what: str) -> list[str]
     found = [name for name in known if fnmatch.fnmatchcase(name, pattern or "*")]
     if pattern is not None and not found:
         listed = ", ".join(known)
-        raise UnknownNameError(f"no {what} matches {pattern!r}; expected some of {listed}")
+        raise UnknownNameError(f"no {what} matches {pattern!r}; expected one or more of {listed}")
     return found
 
 
@@ -282,7 +280,7 @@ def run_suggest(args: argparse.Namespace) -> int:
 
 
 def run_next(args: argparse.Namespace) -> int:
-    """Print the worklist's head."""
+    """Print the first tasks of the worklist."""
     tasks = worklist(args.dataset, args.annotator, args.subject, order=args.order)
     head = [asdict(task) for task in tasks[: max(0, args.count)]]
     rows = [row | {"doubt": f"{row['doubt']:.2f}"} for row in head]
@@ -324,7 +322,7 @@ def run_undo(args: argparse.Namespace) -> int:
         raise AnnotationError(
             f"{args.subject} {args.expression}: {args.annotator} has no label on it to undo"
         )
-    return _keep(args, undo, "last event taken back")
+    return _keep(args, undo, "last event undone")
 
 
 def _keep(args: argparse.Namespace, label: Label, said: str) -> int:
@@ -349,7 +347,7 @@ def run_labels(args: argparse.Namespace) -> int:
 
 
 def run_validate(args: argparse.Namespace) -> int:
-    """Print the problems; gaps in coverage alone are not a failure."""
+    """Print the problems; missing labels alone are not a failure."""
     found = problems(args.dataset, chosen_subjects(args.dataset, args.subject))
     wrong = [p for p in found if p.kind != "coverage"]
     counts = dict(sorted(Counter(p.kind for p in found).items()))
@@ -449,7 +447,7 @@ def run_reference(args: argparse.Namespace) -> int:
 
 
 def run_rule(args: argparse.Namespace) -> int:
-    """Append the rule's marks; people's labels stand above them."""
+    """Append the rule's marks; people's labels override them."""
     chosen = chosen_subjects(args.dataset, args.subject) or included_subjects(args.dataset)
     indexes = (read_index(args.dataset, subject) for subject in chosen)
     marks = [m for i in indexes for m in last_frame_marks(args.dataset, i, args.expression)]
@@ -460,7 +458,7 @@ def run_rule(args: argparse.Namespace) -> int:
 
 
 def run_exclusion(args: argparse.Namespace) -> int:
-    """Append an exclusion, or its end."""
+    """Append an exclusion, or include the subject again."""
     chosen_subjects(args.dataset, [args.subject])
     reason = args.reason.strip() if args.verb == "exclude" else None
     if reason == "":

@@ -1,10 +1,10 @@
 """Import labels from elsewhere: CSV or JSON files, and RenderMe-360's rule.
 
-A file holds every event, and importing it neither loses nor doubles one. The 12 expressions of
+A file holds every event; importing it neither loses nor duplicates any. The 12 expressions of
 RenderMe-360 are recorded so that the performer holds the target at the end of the clip; the
 dataset's users take the last frame (RenderMe-360's processing tools). That is another frame in each
 of its releases, so ingest stores which release was read and the number of its last frame, and a
-label says so. A rule's label stands below any person's and above a suggestion.
+label says so. A rule's label ranks below any person's and above a suggestion.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def export_labels(labels: Iterable[Label], path: Path) -> None:
 
 
 def import_labels(dataset: Dataset, path: Path) -> tuple[int, int]:
-    """Append the events of a file that the store does not hold yet; returns (new, known).
+    """Append the events of a file that the store does not hold yet; return (new, known).
 
     Everything is checked before anything is written.
 
@@ -125,12 +125,12 @@ def _label(row: object, where: str) -> Label:
     if not isinstance(row, dict):
         raise AnnotationError(f"{where}: expected an object, got {type(row).__name__}")
     given = {k: v for k, v in row.items() if v not in (None, "")}
-    given.setdefault("expression", "")  # an exclusion is about no expression
+    given.setdefault("expression", "")  # an exclusion names no expression
     unknown = sorted(set(map(str, given)) - set(_FIELDS))
     missing = sorted(set(_REQUIRED) - set(given))
     if unknown or missing:
         raise AnnotationError(f"{where}: unknown columns {unknown}, missing {missing}")
-    if not NAME.fullmatch(str(given["subject"])):  # it becomes the name of a file
+    if not NAME.fullmatch(str(given["subject"])):  # it becomes a file name
         raise AnnotationError(f"{where}: subject {given['subject']!r} is not an id")
     check_known(where, "action", [given["action"]], ACTIONS, AnnotationError)
     framed = given["action"] == "mark" or (given["action"] == "settle" and "reason" not in given)
@@ -166,7 +166,7 @@ RENDERME360_EXPRESSIONS = frozenset(f"e{n:0{width}}" for n in range(12) for widt
 def last_frame_marks(
     dataset: Dataset, index: Index, expressions: Collection[str] | None = None
 ) -> list[Label]:
-    """Make the rule's new marks of a subject; none where it made the same marks before.
+    """Make the rule's new marks for a subject; none if it made the same marks before.
 
     Without given expressions the rule covers RenderMe-360's: those that ingest read out of its
     files, else those with ids e0 (or e00) to e11.

@@ -1,8 +1,8 @@
-"""Make labels, each an event that is checked, and append them to a subject's file.
+"""Make labels, each a checked event, and append them to a subject's file.
 
 A label names a camera, a decode index, its pts and a perceptual hash, so that it can never point
 at another frame unnoticed. An adjudication ranks highest, then people's labels, then a rule's, then
-a suggestion accepted without a person. Nothing is ever rewritten: undo is an event of its own.
+an automatically accepted suggestion. Nothing is ever rewritten: undo is an event of its own.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from express50.files.text import parse_json, read_bytes
 AUTOMATIC = "auto"
 RULE_PREFIX = "rule:"
 FLAG_REASONS = ("failed", "occluded", "not performed", "ambiguous")
-EXCLUSION_ACTIONS = ("exclude", "include")  # of a whole subject; see contract.layout
+EXCLUSION_ACTIONS = ("exclude", "include")  # actions on a whole subject; see contract.layout
 ACTIONS = ("mark", "flag", "undo", "settle", *EXCLUSION_ACTIONS)
 
 
@@ -37,12 +37,12 @@ class Label:
     Attributes:
         subject, expression: the labelled performance; no expression for a whole subject.
         action: one of ``ACTIONS``; a settlement has a frame, or the reason for a flag.
-        annotator: who; ``auto`` for accepted suggestions, ``rule:...`` for rules.
+        annotator: the person's name; ``auto`` for accepted suggestions, ``rule:...`` for rules.
         time: seconds since 1970.
         tool: version of this toolkit.
         frame, camera, pts, dhash: the frame's identity (absent for flag and undo).
-        first, last: the plateau that the frame stands for, both inside, where it was given.
-        suggested, confidence: the frame that was suggested at that moment, and how sure, 0 to 1.
+        first, last: the plateau around the frame, inclusive, if it was given.
+        suggested, confidence: the frame suggested at that moment, and its confidence, 0 to 1.
         shown: whether the suggestion was visible before the decision.
         seconds, keys: time and keystrokes that the label took.
         reason: why it was flagged or excluded.
@@ -68,7 +68,7 @@ class Label:
     reason: str | None = None
 
 
-# Types of the fields; a whole number may stand for one with a fraction.
+# Types of the fields; an integer is accepted where a float is expected.
 KINDS = {
     name: int | float if kind is float else kind | int if kind == float | None else kind
     for name, kind in get_type_hints(Label).items()
@@ -154,7 +154,7 @@ def shows_labelled_frame(index: Index, label: Label) -> bool:
 
 
 def check_texts(label: Label) -> None:
-    """Refuse texts that would break tables, or colour terminals.
+    """Refuse texts that would break tables or control the terminal.
 
     Raises:
         AnnotationError: the annotator's name or the reason is not one line of text.
@@ -172,7 +172,7 @@ def append_label(dataset: Dataset, label: Label) -> None:
 
     Raises:
         AnnotationError: a text is not one line.
-        OSError: it could not be written; then it is missing, or a torn line that readers pass over.
+        OSError: it could not be written; it is then missing, or a torn line that readers skip.
     """
     check_texts(label)
     path = dataset.labels_file(label.subject)
@@ -234,7 +234,7 @@ def _lines(dataset: Dataset, subject: str) -> Iterator[tuple[int, Label | None]]
 
 
 def current_labels(labels: Iterable[Label]) -> dict[str, Label]:
-    """Return the label in force for each expression: the last of those that rank highest."""
+    """Return the label in force for each expression: the latest of the highest rank."""
     events = [label for stack in _stacks(labels).values() for label in stack]
     events.sort(key=lambda label: (label.expression, _rank(label), label.time))
     return {label.expression: label for label in events}  # the last one wins

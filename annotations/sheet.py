@@ -40,7 +40,7 @@ class Tile:
         state: who chose the frame (``person``, ``rule``, ``auto``: a suggestion accepted by the
             align stage, ``suggestion``: one not yet accepted), or ``flagged`` or ``missing``.
         reference: whether this is the reference's canonical frame.
-        frame, camera: what to show; no frame where there is nothing to show. A flagged tile
+        frame, camera: the picture to show; no frame if there is none. A flagged tile
             shows what was suggested, so that the flag can be judged.
         first, last: the cue window's frames.
         by: who chose, in words.
@@ -75,7 +75,7 @@ class SheetRow:
 
 @dataclass(frozen=True)
 class Sheet:
-    """Rows in the order of the script, the reference, and what the page should warn of."""
+    """Rows in the order of the script, the reference, and the page's warnings."""
 
     rows: list[SheetRow]
     reference: str
@@ -226,7 +226,7 @@ def render_sheet(
 ) -> str:
     """Render the page as text, with ``around`` frames before and after each label.
 
-    Pictures are cropped to the faces; without a finder of faces they are whole frames.
+    Pictures are cropped to the faces; without a face finder they show full frames.
     """
     pictures = {
         (tile.subject, tile.expression): take_pictures(dataset, tile, faces, around)

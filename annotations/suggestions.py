@@ -56,7 +56,7 @@ def read_suggestions(dataset: Dataset, subject: str) -> dict[str, Suggested]:
         found = {expression: Suggested(**row) for expression, row in rows.items()}
         for expression, row in found.items():
             if not all(type(n) is int for n in (row.frame, row.start, *row.candidates)):
-                raise ValueError(f"{expression}: frames are not whole numbers")
+                raise ValueError(f"{expression}: frames are not integers")
             if not 0.0 <= row.confidence <= 1.0:
                 raise ValueError(f"{expression}: confidence is {row.confidence}, expected 0 to 1")
             if not all(map(math.isfinite, [*row.activity, *(row.match or ())])):
@@ -88,7 +88,7 @@ def reference_subject(dataset: Dataset) -> str:
 
     Raises:
         StageError: nothing is ingested, or everybody is excluded.
-        AnnotationError: the chosen subject is not in the dataset any more, or is excluded.
+        AnnotationError: the chosen subject is no longer in the dataset, or is excluded.
     """
     subjects = included_subjects(dataset)
     if not subjects:

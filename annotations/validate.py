@@ -31,9 +31,9 @@ from express50.capture.index import Index, read_index
 from express50.contract.layout import Dataset, included_subjects
 from express50.errors import AnnotationError
 
-FLAG = "flag:"  # before a reason in words, which else might be a name mistyped
+FLAG = "flag:"  # prefix of a free-text reason, which might otherwise be a mistyped name
 WITHIN = (1, 2, 4)  # frames
-SLIP_FRAMES = 12  # further apart, two people did not mean the same moment
+SLIP_FRAMES = 12  # frames; further apart, two people did not mean the same moment
 BOOTSTRAP = 1000
 # Of times within clips: far below one frame of a day's recording, far above what rounding leaves.
 _NO_SPREAD = 1e-24
@@ -81,7 +81,7 @@ def problems(dataset: Dataset, subjects: list[str] | None = None) -> list[LabelP
 
 
 def footage_problems(index: Index, label: Label) -> Iterator[tuple[str, str]]:
-    """Compare one event with the footage; give the kind and the words of each problem."""
+    """Compare one event with the footage; return kind and description of each problem."""
     if not label.expression:  # about the whole subject
         return
     try:

@@ -27,7 +27,7 @@ ORDERS = ("doubt", "expression", "subject")
 
 @dataclass(frozen=True)
 class LabelTask:
-    """One label to give; doubt is 1 - confidence of the suggestion, 1 where there is none."""
+    """One label to give; doubt is 1 - confidence of the suggestion, or 1 without one."""
 
     subject: str
     expression: str

@@ -1,7 +1,7 @@
 """The align stage finds, for every expression, the frame that matches the reference's.
 
 Item: a subject. Its observations are compared with the reference identity's labels or peaks. A
-suggestion that is sure enough is accepted without a person, through the label store that annotators
+suggestion that is sure enough is accepted automatically, in the label store that annotators
 write to, under the name ``auto``; a person's label always ranks above it.
 """
 
@@ -33,7 +33,7 @@ class AlignConfig:
 
 
 def inputs(dataset: Dataset, item: str, config: AlignConfig) -> dict[str, Path | str]:
-    """List index, observations and human labels of the subject and of the reference."""
+    """List the index, observations and human labels of the subject and of the reference."""
     read: dict[str, Path | str] = {}
     subjects = {"": item}
     if config.match and (other := reference_subject(dataset)) != item:

@@ -42,8 +42,8 @@ CELLS = 24  # cells per side in which the aligned face is compared
 CELL_REACH = 0.12  # of the face's side: a cell further from every landmark shows no face
 LOOK_WEIGHT = 0.5  # of a cell against a landmark's coordinate: there are more of them
 BYSTANDER = 0.3  # weight of features the script does not name: people move more than they should
-LEAST_NOISE = 1e-4  # of a face's side, or local deviations: what rounding alone may do
-REST_DIRECTIONS = 20  # leading directions of unrest that are shrunk
+LEAST_NOISE = 1e-4  # share of a face's side, or local deviations: the effect of rounding alone
+REST_DIRECTIONS = 20  # number of leading directions of unrest that are shrunk
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Features:
         owner: (N,) landmark 0 to 67 that a feature belongs to or lies nearest to.
         camera: (N,) which camera a feature is of, 0 to C - 1.
         rest: (R,) rows of ``values`` in which the face should be at rest: the neutral clip and
-            both ends of every window. Some that are not do no harm.
+            both ends of every window. A few frames that are not at rest do no harm.
     """
 
     cameras: tuple[str, ...]
@@ -124,7 +124,7 @@ def measure(observations: FaceObservations, windows: dict[str, np.ndarray]) -> F
 def shared_columns(features: Features, other: Features) -> np.ndarray:
     """Pair the columns (2, K) that measure the same on two subjects.
 
-    Cameras of the same id are paired; where there are none, those that see each face best.
+    Cameras with the same id are paired; if there are none, those that see each face best.
     """
     common = [camera for camera in features.cameras if camera in other.cameras]
     pairs = [(features.cameras.index(c), other.cameras.index(c)) for c in common] or [(0, 0)]
@@ -138,7 +138,7 @@ def shared_columns(features: Features, other: Features) -> np.ndarray:
 def displacements(
     points: np.ndarray, neutral: np.ndarray, windows: dict[str, np.ndarray]
 ) -> np.ndarray:
-    """Measure landmark motion (F, 68, 2) from neutral (68, 2), in face sides, less the head's."""
+    """Measure landmark motion (F, 68, 2) from neutral (68, 2), in face sides, minus the head's."""
     moved = np.zeros(points.shape)
     for rows in windows.values():
         fits = [similarity_2d(frame[STABLE], neutral[STABLE]) for frame in points[rows]]

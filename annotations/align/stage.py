@@ -67,7 +67,7 @@ def run(dataset: Dataset, item: str, out: Path, *, accept: float, match: bool) -
 
 
 def expected_error(taken: Sequence[Suggested]) -> ExpectedError | None:
-    """Say how many frames off suggestions probably are; None where people chose every peak."""
+    """Estimate how many frames off suggestions are; None if people chose every peak."""
     figures = [error_figures(suggested) for suggested in taken]
     if not figures:
         return None
@@ -89,7 +89,7 @@ def error_figures(suggested: Suggested) -> dict[str, float]:
 def suggest_for(
     dataset: Dataset, index: Index, match: bool
 ) -> tuple[dict[str, Suggested], list[Note]]:
-    """Suggest a frame of every expression, and note what was missing for it.
+    """Suggest a frame for every expression, and note missing inputs.
 
     Without observations nothing is suggested: only people's labels count then.
     """

@@ -17,14 +17,18 @@ from express50.capture.expressions import NEUTRAL, Expression
 
 CANDIDATES, CANDIDATE_GAP = 5, 3
 NEAR_FRAMES = 2.0  # an event's direction is learnt from frames about its apex (sigma)
-OVERRULE = 2.0  # the clip's strongest event yields to one this much more like the reference's,
-OVERRULE_COSINE = 0.3  # if that goes the reference's way at all: two of noise are both unlike it
-DISPUTED = 0.6  # times the confidence, where the strongest event is not the likest one
-APEX_LEVEL = 0.9  # a canonical frame at this share of its apex or more is an apex
+OVERRULE = (
+    2.0  # another event replaces the strongest one if it is this much more like the reference's
+)
+OVERRULE_COSINE = (
+    0.3  # and moves in the same direction at all: two events of noise are both unlike it
+)
+DISPUTED = 0.6  # factor on the confidence if the strongest event is not the most similar one
+APEX_LEVEL = 0.9  # a canonical frame at this share of its apex or more counts as the apex
 OTHER_SIDE = 0.05  # of the apex: what being on the other side of it counts
 PLATEAU_SHARE = 0.95  # of the apex: frames that are equal to it within noise
 AGREE_FRAMES = 1
-STILL = 1.0  # in units of one feature's noise: a face that does less does not move
+STILL = 1.0  # in units of one feature's noise: a face that moves less is at rest
 LARGEST_FEATURE = 1e100  # in units of its noise; the square of more may not be finite
 _DRAWS = 24  # random halves of the features that a suggestion is repeated with
 
@@ -59,8 +63,8 @@ class Suggestion:
 
     Attributes:
         row: of the clip.
-        confidence: share of random halves of the features that say the same within a frame; lowered
-            where the clip's strongest movement is not the one most like the reference's.
+        confidence: share of random halves of the features that agree within a frame; lowered
+            if the clip's strongest movement is not the one most like the reference's.
         activity: (T,) how far the face is from rest, in units of noise.
         match: (T,) likeness to the canonical frame, 0 to 1; None without one.
         candidates: rows worth a look, best first.
@@ -75,7 +79,7 @@ class Suggestion:
 
 @dataclass(frozen=True)
 class Reference:
-    """The reference's expressions that nobody flagged, and the frames that people chose of them."""
+    """The reference's expressions that nobody flagged, and the frames that people chose."""
 
     features: Features
     chosen: Mapping[str, int]
@@ -182,7 +186,7 @@ def suggest_rest(values: np.ndarray, groups: np.ndarray, typical: float) -> Sugg
 def _check(values: np.ndarray) -> None:
     if values.size == 0 or not np.abs(values).max() < LARGEST_FEATURE:
         raise ValueError(
-            f"features are {values.shape}, expected a frame or more, all finite and below"
+            f"features are {values.shape}, expected at least one frame, all finite and below"
             f" {LARGEST_FEATURE:g}"
         )
 

@@ -1,7 +1,7 @@
 """The observe stage finds landmarks and aligned faces in every frame of a cue window.
 
 Item: a subject. This is the slow half of ``express50 align``, which runs it first. Suggesting and
-matching read only these files, so that a new label or another reference does not need the
+matching read only these files, so a new label or another reference does not need the
 footage again.
 """
 
@@ -21,9 +21,9 @@ class ObserveConfig:
     """Settings of the observe stage."""
 
     cameras: int = 3
-    """How many cameras watch the face; those that see it best at rest are taken."""
+    """Number of cameras to use: those that see the face best at rest."""
     stride: int = 1
-    """Look at every stride-th frame of a cue window, at least 1."""
+    """Use every stride-th frame of a cue window, at least 1."""
     min_score: float = 0.3
     """Leave out cameras whose face score at rest is lower, 0 to 1."""
     search: float = 0.25

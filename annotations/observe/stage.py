@@ -27,9 +27,11 @@ from express50.landmarks.detector import SMALLEST, cut_crop, detect, window_abou
 from express50.landmarks.network import CROP, MIRROR, LandmarkNet, face_box, load_network
 
 SCHEMA = "express50.observations/1"
-SEEN_SCORE = 0.15  # of a frame that shows the face at all
-TRIES = 8  # frames all over the clips in which a face is searched for, should rest show none
-RANKED_SHARE = 0.8  # of the best camera's score: one that sees less adds more noise than news
+SEEN_SCORE = 0.15  # least score of a frame that shows the face
+TRIES = 8  # number of other frames to search for a face if the frames at rest show none
+RANKED_SHARE = (
+    0.8  # share of the best camera's score: worse cameras add more noise than information
+)
 
 
 @dataclass(frozen=True)
@@ -268,7 +270,7 @@ def _cut(image: np.ndarray, window: np.ndarray, size: int) -> np.ndarray:
     """Cut a square through an affine (2, 3) from its pixels to the image's, corner origin."""
     step = float(np.sqrt(abs(np.linalg.det(window[:, :2]))))
     height, width = image.shape[:2]
-    if step > 1.5:  # averaged first: fine detail would alias
+    if step > 1.5:  # blurred first, because fine detail would alias
         small = (max(1, round(width / step)), max(1, round(height / step)))
         image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
     scale = np.array([[image.shape[1] / width], [image.shape[0] / height]])

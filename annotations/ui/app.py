@@ -48,7 +48,7 @@ LEAST_COLUMNS = 90  # of a terminal that shows three pictures: in narrower ones 
 
 
 class Desk(Screen[None]):
-    """Shows a scene, a view of it and what was said; whoever changes them calls ``draw``."""
+    """Shows a scene, a view of it and a message; call ``draw`` after changing them."""
 
     BINDINGS = [
         Binding(name, key.action.format(key=name), key.words, show=False)
@@ -117,7 +117,7 @@ class Desk(Screen[None]):
         self.call_after_refresh(self.draw)
 
     def draw(self) -> None:
-        """Bring every part up to date; parts that show the same already do nothing."""
+        """Update every part of the screen; unchanged parts do nothing."""
         self._draw_message()
         if self.scene is None:
             return
@@ -234,7 +234,7 @@ class Desk(Screen[None]):
         self.move(moves.next_candidate, by)
         if self.view is not None and not self.view.candidates:
             hidden = self.scene is not None and self.session.hidden(self.scene.task)
-            self.say("hidden until you have decided" if hidden else "no suggestion", theme.ACCENT)
+            self.say("hidden until you decide" if hidden else "no suggestion", theme.ACCENT)
 
     def on_curve_strip_picked(self, message: CurveStrip.Picked) -> None:
         """Go to the frame that was clicked on the strip."""
@@ -287,7 +287,7 @@ class Desk(Screen[None]):
 
     def action_mark(self) -> None:
         """Mark the frame under the cursor and open the next task."""
-        if self.player.plays:  # a moving frame cannot be meant
+        if self.player.plays:  # nobody can choose a frame while it plays
             self.player.stop()
             self.say("stopped; Enter again marks this frame", theme.ACCENT)
         elif self.scene is not None and self.view is not None:
@@ -330,7 +330,7 @@ class Desk(Screen[None]):
             self.say("you have nothing to undo here", theme.ACCENT)
             return
         self.open_task()
-        self.say(f"taken back: {task.subject} {task.expression}")
+        self.say(f"undone: {task.subject} {task.expression}")
 
     def action_task(self, by: int) -> None:
         """Open the next or previous task."""
@@ -364,7 +364,7 @@ class Player:
     Attributes:
         plays: whether the window is played.
         blinks: whether frame and reference take turns.
-        swapped: whether the reference stands in the frame's place.
+        swapped: whether the reference is shown in place of the frame.
     """
 
     def __init__(self, desk: Desk) -> None:
@@ -373,7 +373,7 @@ class Player:
         self.plays = self.blinks = self.swapped = False
 
     def play(self) -> None:
-        """Play from the cursor on, from the start where the cursor stands at the end; or stop."""
+        """Play from the cursor, or from the start if the cursor is at the end; or stop."""
         desk = self._desk
         if self.stop() or desk.view is None or desk.scene is None or desk.scene.index is None:
             return
@@ -434,7 +434,7 @@ class AnnotateApp(App[None]):
         self.desk = Desk(session, self.cache, faces, sixel_cell)
 
     def get_line_filters(self) -> Sequence[LineFilter]:
-        """Return what lines pass before they are drawn; Textual's own for NO_COLOR leaves greys."""
+        """Return the filters of drawn lines; Textual's own filter for NO_COLOR keeps greys."""
         return [theme.UNCOLOURED] if self.no_color else super().get_line_filters()
 
     def on_mount(self) -> None:

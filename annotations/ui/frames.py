@@ -34,10 +34,10 @@ class FrameCrop(NamedTuple):
 
 
 class FrameCache:
-    """Pictures by shot; the least recently used leave first.
+    """A cache of pictures by shot; the least recently used are dropped first.
 
-    Thread-safe. ``get`` answers at once from memory, else decodes (milliseconds); ``want`` names
-    what a background thread should decode next.
+    Thread-safe. ``get`` returns a cached picture or decodes it (milliseconds); ``want`` names
+    the pictures that a background thread should decode next.
     """
 
     def __init__(self, dataset: Dataset) -> None:
@@ -181,7 +181,7 @@ class Face:
 def zoom_box(face: Face | None, zoom: str, pane_aspect: float, image_aspect: float) -> Box:
     """Find the part of a picture that a zoom shows in a pane of that height over width.
 
-    Without a face, or for the zoom ``frame``, it is the whole picture.
+    Without a face, or for the zoom ``frame``, it is the full picture.
     """
     if face is None or zoom == "frame":
         height = max(image_aspect, pane_aspect)

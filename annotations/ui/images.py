@@ -42,7 +42,7 @@ _SPLITS = np.array(
     np.float32,
 )  # fmt: skip
 _GLYPHS = np.array(list("▀▌▚▘▝▖▗"))
-# A quadrant must be this much better than the plain half block, so that flat areas stay calm.
+# A quadrant must beat the plain half block by this much, so that flat areas do not flicker.
 _QUADRANT_GAIN = 1.02
 _STEP = 8  # colours are rounded to steps of 8: fewer styles, fewer bytes over ssh
 _BAND = 6
@@ -71,7 +71,7 @@ def cell_size() -> Size:
         if min(rows, columns) > 0 and width >= columns and height >= rows:
             return Size(width // columns, height // rows)
     raise AnnotationError(
-        "--pictures sixel: the terminal does not say how many pixels a cell has;"
+        "--pictures sixel: the terminal does not report the pixel size of a cell;"
         " use --pictures blocks"
     )
 
@@ -113,7 +113,7 @@ class SixelPainter(Painter):
         self._cell = cell
 
     def shape(self, pane: Size) -> PaneShape:
-        """Return the whole pane, or its middle where the pane has more pixels than the limit."""
+        """Return the full pane, or its middle if the pane has more pixels than the limit."""
         cells = self._cell.width * self._cell.height
         share = min(1.0, (SIXEL_PIXELS / (max(1, pane.area) * cells)) ** 0.5)
         columns, rows = (max(1, int(side * share)) for side in pane)

@@ -54,7 +54,7 @@ class PicturePane(Widget):
         self._words = ""
 
     def show(self, look: FrameLook | None, words: str) -> None:
-        """Show a look, or words where there is none; nothing is drawn when they are the same."""
+        """Show a look, or words if there is none; draw nothing if both are unchanged."""
         if (look, words) != (self.look, self._words):
             self.look, self._words = look, words
             self.refresh()
@@ -118,19 +118,19 @@ class Aim(NamedTuple):
 
 
 def camera_name(scene: TaskScene, number: int) -> str:
-    """Return a camera by its number, round and round."""
+    """Return a camera by its number, wrapping around."""
     return scene.cameras[number % len(scene.cameras)] if scene.cameras else ""
 
 
 def other_cameras(scene: TaskScene, aim: Aim) -> list[str]:
-    """List the cameras that can stand beside the first one, beginning with the chosen one."""
+    """List the cameras that can be shown beside the first one, the chosen one first."""
     others = [name for name in scene.cameras if name != camera_name(scene, aim.camera)]
     start = others.index(aim.second) if aim.second in others else 0
     return others[start:] + others[:start]
 
 
 def second_look(scene: TaskScene, view: CueView, aim: Aim) -> FrameLook | None:
-    """Look at the frame under the cursor in the second camera; None where there is only one."""
+    """Look at the frame under the cursor in the second camera; None if there is only one."""
     others = other_cameras(scene, aim)
     return subject_look(scene, view, aim, others[0]) if others else None
 
@@ -197,7 +197,7 @@ def shots_ahead(
 
 
 def strip_content(scene: TaskScene, view: CueView, hidden: bool) -> StripContent:
-    """Collect the timeline's content, without what could sway the annotator while it is hidden."""
+    """Collect the timeline's content, without suggestions while those are hidden."""
     if hidden or scene.suggestion is None:
         return StripContent(view=view, mine=scene.mine, in_force=None if hidden else scene.in_force)
     found = scene.suggestion

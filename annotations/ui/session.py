@@ -110,7 +110,7 @@ class Session:
         return True
 
     def advance(self) -> bool:
-        """Open the next undecided task, round the end; False when none is left."""
+        """Open the next undecided task, wrapping at the end; False if none is left."""
         target = self.following(1)
         if not target:
             return False
@@ -118,7 +118,7 @@ class Session:
         return True
 
     def following(self, count: int) -> list[int]:
-        """List the positions of the next undecided tasks after the open one, round the end."""
+        """List the positions of the undecided tasks after the open one, wrapping at the end."""
         total = len(self.tasks)
         order = [(self.position + n) % total for n in range(1, total + 1)] if total else []
         return [n for n in order if self.tasks[n].key in self._open][:count]
@@ -128,7 +128,7 @@ class Session:
         self.position = position
 
     def _book(self) -> None:
-        """Put the time since the last key to the open task's account."""
+        """Add the time since the last key to the open task's cost."""
         self._efforts[self.position].seconds += self._since_last_key()
         self._last_key = self._clock()
 
@@ -151,7 +151,7 @@ class Session:
         return self._save(replace(label, shown=shown))
 
     def flag(self, scene: TaskScene, reason: str) -> Label:
-        """Say that the open task has no usable peak; it is on disk when this returns.
+        """Flag the open task as having no usable peak; the flag is on disk when this returns.
 
         Raises:
             AnnotationError: the task has no footage, or the reason is empty.
@@ -172,7 +172,7 @@ class Session:
         return label
 
     def undo(self) -> LabelTask | None:
-        """Take the annotator's last decision of this session back, else that on the open task.
+        """Undo the annotator's last decision of this session, else that on the open task.
 
         The task it was about becomes the open one; None when there is nothing to take back.
         """

@@ -34,11 +34,11 @@ class TaskScene:
         first, last: the cue window, both inside.
         cameras: camera ids from the suggestion's on, which sees the face best.
         suggestion: what align suggested; None where it did not run.
-        reference: the reference's canonical frame of the expression, None where there is none.
+        reference: the reference's canonical frame of the expression, or None.
         reference_index: footage of the reference; None where it cannot be read.
         is_reference: whether this subject is the reference itself.
-        mine: this annotator's label; None where there is none.
-        in_force: the label that stands, whoever gave it.
+        mine: this annotator's label, or None.
+        in_force: the label in force, whoever gave it.
         problem: why the task cannot be labelled, in plain words.
         notes: what the annotator should know, in plain words.
     """
@@ -182,7 +182,7 @@ def view_of_scene(scene: TaskScene, hidden: bool) -> CueView | None:
 
 
 def go_to(view: CueView, frame: int) -> CueView:
-    """Move to a frame; the window's ends stop the cursor, it never wraps."""
+    """Move to a frame; the cursor stops at the window's ends."""
     return replace(view, cursor=min(max(frame, view.first), view.last))
 
 
@@ -192,7 +192,7 @@ def step(view: CueView, by: int) -> CueView:
 
 
 def next_candidate(view: CueView, by: int) -> CueView:
-    """Move to the next (1) or previous (-1) candidate, round and round."""
+    """Move to the next (1) or previous (-1) candidate, wrapping around."""
     if not view.candidates:
         return view
     # Away from every candidate the first press returns to the one visited last.
@@ -203,14 +203,14 @@ def next_candidate(view: CueView, by: int) -> CueView:
 
 
 def pick_candidate(view: CueView, rank: int) -> CueView:
-    """Move to a candidate by its rank, 1 the best; where there is none the view stays."""
+    """Move to a candidate by its rank, 1 the best; without one, stay."""
     if not 1 <= rank <= len(view.candidates):
         return view
     return replace(go_to(view, view.candidates[rank - 1]), candidate=rank - 1)
 
 
 def set_plateau(view: CueView, end: int) -> CueView:
-    """Put an end of the plateau, 0 or 1, at the cursor; once more on this frame, take that back."""
+    """Set an end of the plateau, 0 or 1, at the cursor; clear it if it is already there."""
     ends = [view.plateau_first, view.plateau_last]
     ends[end] = None if ends[end] == view.cursor else view.cursor
     first, last = ends

@@ -38,7 +38,7 @@ CURSOR_BAR = Style(color=ACCENT, bgcolor="#5e4012")
 
 
 class Uncoloured(LineFilter):
-    """Takes the colours away, for NO_COLOR; what stands out by its ground is shown in reverse."""
+    """Removes colours, for NO_COLOR; text highlighted by its background is shown in reverse."""
 
     def apply(self, segments: list[Segment], background: Color) -> list[Segment]:
         """Return segments without colours."""
@@ -89,7 +89,7 @@ FAR = 10**9  # frames: beyond any window, whose ends stop the cursor
 class KeyAction(NamedTuple):
     """Keys (Textual's names) of one action, how they are written for people, and what it does.
 
-    ``{key}`` in the action stands for the key's name.
+    ``{key}`` in the action is replaced by the key's name.
     """
 
     keys: str

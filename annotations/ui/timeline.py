@@ -51,7 +51,7 @@ def column_of(view: CueView, frame: int, width: int) -> int:
 
 
 def sign_column(view: CueView, frame: int, width: int) -> int:
-    """Return the middle cell of a frame, where signs stand."""
+    """Return the middle cell of a frame, where symbols are drawn."""
     wide, _ = frame_cells(view.last - view.first + 1, width)
     return min(column_of(view, frame, width) + wide // 2, width - 1)
 

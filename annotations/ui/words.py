@@ -118,7 +118,7 @@ def hint_line(width: int) -> Text:
 
 
 def saved(label: Label) -> str:
-    """Say that a decision is on disk."""
+    """Report that a decision is on disk."""
     what = f"frame {label.frame}" if label.action == "mark" else f"flagged {label.reason}"
     cost = f"{label.keys} key{'' if label.keys == 1 else 's'}, {label.seconds:.1f} s"
     return f"saved: {label.subject} {label.expression} {what} ({cost}); u takes it back"
@@ -187,10 +187,10 @@ class FrameDialog(ModalScreen[int | None]):
 
 
 class HelpDialog(ModalScreen[None]):
-    """Shows every key; arrows scroll where the terminal is low, any other key leaves."""
+    """Shows every key; arrows scroll if the terminal is low, any other key leaves."""
 
     def compose(self) -> ComposeResult:
-        """Lay the keys out, side by side where there is room, and explain the strip's signs."""
+        """Lay the keys out, side by side if there is room, and explain the strip's symbols."""
         signs = Text.assemble(
             ("1", theme.BEST), (" surest suggestion  ", theme.FAINT),
             ("2", theme.CANDIDATE), (" the next ones", theme.FAINT), "\n",

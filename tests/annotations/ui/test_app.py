@@ -111,7 +111,7 @@ def test_flag_by_digit_or_in_words(suggested, make_app):
 def test_undo_reopens_the_task_with_a_message(suggested, make_app):
     app = make_app(suggested)
     said = drive(app, "enter", "u", check=lambda app: line(app, "message"))
-    assert "taken back: S001 neutral" in said
+    assert "undone: S001 neutral" in said
     assert app.session.task.expression == "neutral"
     assert current_labels(labels(suggested)) == {}
     fresh = make_app(suggested, "bob")
@@ -445,8 +445,8 @@ def test_ctrl_z_is_bound_and_in_the_help(suggested, make_app, monkeypatch):
 @pytest.mark.parametrize(
     ("term", "encoding", "message"),
     [
-        ("dumb", "utf-8", "TERM is 'dumb', a terminal that cannot place text"),
-        ("", "utf-8", "TERM is '', a terminal that cannot place text"),
+        ("dumb", "utf-8", "TERM is 'dumb', which cannot position text"),
+        ("", "utf-8", "TERM is '', which cannot position text"),
         ("xterm-256color", "ascii", "set LC_ALL=C.UTF-8"),
     ],
 )
