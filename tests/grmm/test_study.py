@@ -197,7 +197,7 @@ def test_commands_make_and_table(folders, tmp_path, capsys):
         tmp_path / "c", {"participant": 0, "example": 0, "question": "identity", "answer": "="}
     )
     assert main([*make, "--names", "GRMM", "MD"]) == 2
-    assert "people have answered" in capsys.readouterr().err
+    assert "already has answers" in capsys.readouterr().err
 
 
 def test_too_few_common_pictures_are_said(folders, tmp_path):
