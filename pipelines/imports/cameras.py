@@ -44,7 +44,7 @@ def aligning_transform(
     if not shared:
         raise CalibrationError(
             f"{where}: its cameras are {', '.join(list(theirs)[:4])}, the dataset's"
-            f" {', '.join(list(ours)[:4])}: none match; is it from another capture?"
+            f" {', '.join(list(ours)[:4])}: no ids match; is it from another capture?"
         )
     for name in shared:
         _check_intrinsics(theirs[name], ours[name], f"{where}: camera {name}")
@@ -76,7 +76,7 @@ def _check_intrinsics(theirs: Camera, ours: Camera, where: str) -> None:
     plain = [(size, scale * whole), (centre, scale * ours.K[:2, 2])]
     middle = [(size, scale * padded), (centre, scale * padded / 2)]
     square = abs(theirs.K[1, 1] / theirs.K[0, 0] / (ours.K[1, 1] / ours.K[0, 0]) - 1) <= SHARE
-    # Canvases are whole and even numbers of pixels.
+    # Canvas sizes are even integers.
     slack = SHARE * size.max() + 4
     fits = any(all(np.abs(a - b).max() <= slack for a, b in pairs) for pairs in (plain, middle))
     if not fits or not (square or np.abs(centre - size / 2).max() < 1e-6):
@@ -84,7 +84,7 @@ def _check_intrinsics(theirs: Camera, ours: Camera, where: str) -> None:
             f"{where}: focal length {theirs.K[0, 0]:.1f} px in {theirs.width}x{theirs.height}"
             f" pictures with the axis at ({centre[0]:.1f}, {centre[1]:.1f}); expected"
             f" {ours.K[0, 0]:.1f} px in {ours.width}x{ours.height} with ({cx:.1f}, {cy:.1f}), or"
-            " a whole picture made smaller: its intrinsics belong to other pictures"
+            " a scaled version of it: its intrinsics belong to other pictures"
         )
 
 

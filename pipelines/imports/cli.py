@@ -115,7 +115,7 @@ def run_remove(args: argparse.Namespace) -> int:
     dataset = existing_dataset(args.dataset)
     with stage_lock(dataset, args.stage):
         gone = remove_imports(dataset, args.stage, lambda i: fnmatch.fnmatchcase(i, args.items))
-    line = f"{args.stage}: {len(gone)} imported items removed; express50 {args.stage} makes them"
+    line = f"{args.stage}: {len(gone)} imported items removed; express50 {args.stage} remakes them"
     return answer(args, {"stage": args.stage, "removed": gone}, line)
 
 
@@ -150,7 +150,7 @@ def _subjects(dataset: Dataset, args: argparse.Namespace) -> list[str]:
     places, known = check_pattern(args.pattern, needed), included_subjects(dataset)
     chosen = args.subject or known
     if unknown := sorted(set(chosen) - set(known)):
-        raise ConfigError(f"--subject {unknown[0]}: expected some of {', '.join(known)}")
+        raise ConfigError(f"--subject {unknown[0]}: expected one or more of {', '.join(known)}")
     if len(chosen) > 1 and "subject" not in places:
         raise ConfigError(
             f"{args.pattern}: has no {{subject}}, and the dataset has {len(chosen)} subjects;"

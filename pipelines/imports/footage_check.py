@@ -1,4 +1,4 @@
-"""Compare what is imported to the faces that the footage shows."""
+"""Compare imports to the faces that the footage shows."""
 
 from __future__ import annotations
 

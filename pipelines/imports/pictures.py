@@ -29,7 +29,7 @@ NEAR_M = 0.01  # a surface point of one view and of another are the same within 
 MOST_OFF = 0.6  # of half a mask's extent: its middle from that of what all masks show
 AGREE_SHARE = 0.4  # of the pixels that two views know, which must be the same surface
 LEAST_COSINE = 0.5  # between the directions of two views that are compared
-FINE_M, FINER_SHARE = 0.003, 0.1  # what another measure must gain closely, to be the right one
+FINE_M, FINER_SHARE = 0.003, 0.1  # gain that makes another unit or measure the right one
 FACTORS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
 LEAST_VOXEL_M, VOXEL_PX = 0.0015, 1.4  # as depth's own
 TRUNCATION = 4.0  # voxels
@@ -45,7 +45,7 @@ def read_mask(path: Path, recorded: Camera, seen: Camera, distorted: bool) -> np
     size is that of the footage as recorded, or that to which the `frames` stage reduced pictures.
 
     Raises:
-        FormatError: it is missing, no mask, or of another size.
+        FormatError: it is missing, not a mask, or of another size.
     """
     image = read_image(path)
     if image.ndim == 3:
@@ -79,7 +79,7 @@ def read_foreign_depth(
         distorted: whether its pixels are those of the footage as recorded.
 
     Raises:
-        FormatError: it is missing, no depth map, or of another size.
+        FormatError: it is missing, not a depth map, or of another size.
     """
     if path.suffix == ".npy":
         values = read_npy(path, FormatError, "a depth map")
@@ -129,7 +129,7 @@ def _camera_of_size(path: Path, image: np.ndarray, recorded: Camera, seen: Camer
         return resized(recorded, *size)
     words = "export it at the footage's size"
     if size == (recorded.height, recorded.width):
-        words = "it lies on its side; turn it"
+        words = "it is rotated by 90 degrees; rotate it back"
     raise FormatError(
         f"{path}: {size[0]}x{size[1]}, expected the {recorded.width}x{recorded.height} of camera"
         f" {recorded.id}; {words}"

@@ -84,10 +84,10 @@ class TrackSource:
 def read_foreign_track(
     dataset: Dataset, subject: str, peaks: list[PeakFrame], source: TrackSource
 ) -> tuple[dict[str, np.ndarray], list[Note]]:
-    """Read a subject's arrays of track.npz in its peak frames, and what is doubtful about them.
+    """Read a subject's arrays of track.npz in its peak frames, and warnings about them.
 
     Raises:
-        ConfigError: the source is of no known kind.
+        ConfigError: the source is of an unknown kind.
         CalibrationError: its cameras are not the dataset's.
         StageError: peak frames are missing, or it is another subject's.
         FormatError: parameters are damaged, or do not fit the head model.
@@ -155,7 +155,9 @@ def _steps_of_transforms(
             )
         member = folder / row["flame_param_path"]
         if not member.resolve().is_relative_to(folder.resolve()):
-            raise FormatError(f"{file}: flame_param_path {row['flame_param_path']} leaves it")
+            raise FormatError(
+                f"{file}: flame_param_path {row['flame_param_path']} points outside the folder"
+            )
         steps[expression] = _step(member, read_arrays(member, FormatError, WHAT), 0, motion)
     return steps
 

@@ -155,7 +155,7 @@ def _curve(moves: np.ndarray) -> np.ndarray:
     """Return the logarithm of movement (F,) less its running mean, scaled to unit deviation."""
     floor = max(float(np.median(moves)) * 0.2, 1e-3)
     values = np.log(moves + floor)
-    values[0] = values[1]  # nothing comes before the first frame
+    values[0] = values[1]  # the first frame has no predecessor
     span = min(SPAN, len(values) // 2 * 2 - 1)
     padded = np.pad(values, span // 2, mode="reflect")
     values = values - np.convolve(padded, np.ones(span) / span, mode="valid")
@@ -310,7 +310,7 @@ def measure_drift(cells: np.ndarray) -> Drift | None:
 
 
 def describe_drift(drift: Drift | None) -> list[str]:
-    """Describe what is wrong with a camera's light; empty where nothing is."""
+    """Describe the faults of a camera's light; empty if there are none."""
     if drift is None:
         return []
     wrong = []

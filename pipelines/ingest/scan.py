@@ -148,7 +148,7 @@ def _steps(pts: tuple[int, ...], clips: tuple[int, ...]) -> np.ndarray:
 
 
 def odd_footage(raw: RawCapture, cameras: Mapping[str, CameraSource]) -> dict[str, str]:
-    """Return what is odd about rate, time stamps and channels of the cameras, by camera."""
+    """Return warnings about rate, time stamps and channels, by camera."""
     found = {}
     for name, source in cameras.items():
         words = []
@@ -177,7 +177,7 @@ def _uneven(source: CameraSource) -> str:
     if not steps.size:
         return ""
     usual = np.median(steps)
-    # A step is a whole number of ticks, so that one tick more or less may be rounding.
+    # A step is an integer number of ticks, so a difference of one tick may be rounding.
     share = float((np.abs(steps - usual) > np.maximum(1, 0.2 * usual)).mean())
     if share <= UNEVEN:
         return ""

@@ -189,9 +189,9 @@ def _with_cues(
     dropped: dict[str, str],
     folder: Path,
 ) -> tuple[RawCapture, dict[str, str]]:
-    """Return the capture with a cue per clip, all cameras cut to the same lengths, and what is cut.
+    """Return the capture with a cue per clip, all cameras cut to the same lengths, and the cuts.
 
-    A camera with fewer frames in a clip than most is dropped, as it is unknown which it lost.
+    A camera with fewer frames in a clip than most is dropped, because the lost frames are unknown.
     """
     if not raw.clips:
         return raw, {}
@@ -306,7 +306,7 @@ def metrics(
 
 
 def write_contact_sheet(index: Index, out: Path) -> None:
-    """Write a row per camera with frames from the whole footage; dark or stuck cameras show."""
+    """Draw a row per camera with frames from all of the footage, to show dark or stuck cameras."""
     names = list(index.cameras)[:QC_CAMERAS]
     picks = np.unique(np.linspace(0, index.frames - 1, QC_COLUMNS).astype(int))
     rows = [[decode_proxy(out / "proxies", name, int(frame)) for frame in picks] for name in names]

@@ -46,7 +46,7 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
 
 
 def needs_gpu(config: MatteConfig) -> bool:
-    """Say whether a network must run on CUDA."""
+    """Return whether a network must run on CUDA."""
     return config.method in NETWORKS and config.device == "cuda"
 
 

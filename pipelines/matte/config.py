@@ -19,7 +19,7 @@ class MatteConfig:
 
     method: Literal["key", "grabcut", "bgmv2", "salient"] = "key"
     """key: against the plate; cameras without one are cut by colours and by what the other cameras
-    see. grabcut: cut all cameras so. bgmv2, salient: run a network."""
+    see. grabcut: cut all cameras that way. bgmv2, salient: run a network."""
     weights: str = ""
     """File of the network's weights, TorchScript or ONNX; such a file is a program, so trust its
     origin."""
@@ -47,7 +47,7 @@ class MatteConfig:
         if (self.method in NETWORKS) != bool(self.weights):
             raise ConfigError(
                 f"matte.method {self.method!r} with matte.weights {self.weights!r}: key and grabcut"
-                " take none, bgmv2 and salient need the file of the network's weights"
+                " take no weights; bgmv2 and salient need the network's weights file"
             )
         if self.tile % 64:
             raise ConfigError(f"matte.tile is {self.tile}, expected a multiple of 64")

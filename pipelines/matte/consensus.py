@@ -41,7 +41,7 @@ class Misfit:
 
     @property
     def size(self) -> float:
-        """Return the size of the error: over 1, the matte is wrong as a whole."""
+        """Return the size of the error; above 1 the entire matte is wrong."""
         elsewhere = min(self.stray / STRAY, self.lacking / LACKING)
         return max(elsewhere, self.lacking / MOST_LACKING)
 
@@ -60,9 +60,9 @@ class Agreement:
     """The corrections that the views of one frame set make in each other.
 
     Attributes:
-        removed, filled: (h, w) bool of each camera that something is changed of.
+        removed, filled: (h, w) bool for each camera whose matte is corrected.
         warnings: cameras that were left as they were, and why.
-        unchanged: why nothing was compared; empty where it was.
+        unchanged: why nothing was compared; empty if mattes were compared.
     """
 
     removed: dict[str, np.ndarray] = field(default_factory=dict)
@@ -81,7 +81,7 @@ def agree(views: Sequence[MatteView], cells: int) -> Agreement:
             return Agreement(warnings=_named(doubted), unchanged=few)
         removed, filled, misfits = _compare(used, cells)
         worst = max(misfits, key=lambda name: misfits[name].size)
-        # Most cameras must be right; otherwise it is unknown which is wrong.
+        # Most cameras must be right; otherwise the wrong ones cannot be identified.
         if misfits[worst].size <= 1 or len(doubted) >= len(views) // 3:
             return Agreement(removed, filled, _named(doubted))
         doubted[worst] = misfits[worst].words
@@ -92,7 +92,7 @@ def _named(doubted: dict[str, str]) -> list[Note]:
 
 
 def _useless(view: MatteView) -> str:
-    """Say why a view cannot judge the other mattes; empty where it can."""
+    """Explain why a view cannot judge the other mattes; empty if it can."""
     if view.projection[2, 3] <= 1:  # radii from the ball's centre, along its axis
         return "it stands inside what the others look at, or faces away; its matte was not changed"
     share = float((view.alpha[view.valid] > INSIDE).mean()) if view.valid.any() else 0.0

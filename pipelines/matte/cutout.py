@@ -3,8 +3,8 @@
 The faces that the cameras see place one head in the world, and with it roughly where skull, hair
 and shoulders are in every picture, those from behind included. GrabCut (Rother, Kolmogorov and
 Blake 2004) finds by colours where they end. Then the cameras overrule each other: nothing lies
-where the others see past the person, and nothing lacks where they all see the person; colours
-decide again. One camera alone has colours only.
+where the others see past the person, and nothing is missing where they all see it; colours
+decide again. A single camera has colours only.
 
 Around an outline, alpha is the posterior mean of a mixture (Bayesian matting, Chuang et al. 2001)
 of two colours: the person's nearby, and the wall's. The wall behind is filled in from what is seen
@@ -41,7 +41,7 @@ from pipelines.matte.visual_hull import (
 FACE_SCORE = 0.3  # heads from behind score up to 0.2, profiles from 0.33 on
 SEARCH = 0.08  # smallest windows searched for the face, of the longer side
 SIDE = 512  # pixels of the pictures in which faces are looked for
-PIXEL_M = 0.0015  # on the head, to which pictures are reduced to be cut; edges are solved later
+PIXEL_M = 0.0015  # on the head, in the reduced pictures that are cut; edges are solved later
 SURE, LIKELY, HAIR = 0.7, 1.3, 1.6  # skulls: no background in the first, no hair past the last
 LEAST_POINTS = 12  # landmarks on which cameras agree, to place a head by
 LEAST_DEPTH = 0.05  # metres before the camera
@@ -49,19 +49,19 @@ HOLE_M2 = 1.5e-3  # larger gaps show the background
 CUTS = 6  # of GrabCut, each time
 FEWEST = 4  # cameras that can overrule each other
 SLACK_PX = (3.0, 1.5)  # distance from an outline that proves nothing, per round
-COLOURS, RARE = 32, 1e-5  # cells of colour along each axis of Lab; share of one never seen
+COLOURS, RARE = 32, 1e-5  # cells of colour along each axis of Lab; share of a cell never seen
 UNSEEN = 2 / COLOURS**3  # share that the person does not have
-CELLS = 96  # along each side of the cube in which cameras are compared
+CELLS = 96  # cells along each side of the cube in which cameras are compared
 
 # Lengths on the head, metres.
 OUTER_M, INNER_M = 0.014, 0.010  # alpha is soft so far outside and inside the outline
-RIM_M = (0.004, 0.015)  # the person's colours are those so deep inside the outline
+RIM_M = (0.004, 0.015)  # the person's colours are sampled this deep inside the outline
 REACH_M, WALL_M, RING_M = 0.006, 0.004, 0.014  # nearest colours: of person, wall, and its error
 DOUBT_M = 0.0035  # an outline is wrong by about this
-SPREAD = 0.15  # share by which hair may be brighter or darker than what is seen of it nearby
+SPREAD = 0.15  # share by which hair may be brighter or darker than visible hair nearby
 NOISE = 1.5  # standard deviation of a pixel, 8-bit steps
 OPACITIES = np.linspace(0.0, 1.0, 9)
-MIXED, ODD = 0.2, 0.02  # chance of a soft pixel on the outline, of a wrong one far from it
+MIXED, ODD = 0.2, 0.02  # probability of a soft pixel on the outline, and of a wrong one far from it
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def make_cut_view(
 def cut_out(views: Sequence[CutView], ball: Ball | None) -> dict[str, Cut]:
     """Find the person's outline in all cameras of a moment.
 
-    `ball` is what the cameras look at; None where they do not share a place.
+    `ball` is the volume that the cameras look at; None if they share none.
 
     Raises:
         NoFaceError: no camera shows a face.
@@ -158,7 +158,7 @@ def cut_out(views: Sequence[CutView], ball: Ball | None) -> dict[str, Cut]:
 
 
 def _place_head(views: Sequence[CutView]) -> HeadPlace:
-    """Place the mean head by all faces found, or by the best of them."""
+    """Place the mean head by all faces found, or by the best one."""
     # Imported here: cameras with plates need no network, and torch takes seconds to import.
     from express50.landmarks.detector import detect_many
     from express50.landmarks.network import load_network
@@ -257,7 +257,7 @@ def _guess(view: CutView, place: HeadPlace) -> PersonGuess:
 
 
 def _cut(view: CutView, labels: np.ndarray, guess: PersonGuess) -> np.ndarray:
-    """Run GrabCut from labels (h, w); returns the person's mask (h, w), small holes filled.
+    """Run GrabCut from labels (h, w); return the person's mask (h, w), small holes filled.
 
     Parts that do not touch where the person surely is, by the `guess`, are left out.
     """
@@ -321,7 +321,7 @@ def _labels(
     """Return GrabCut's labels (h, w) by a view's mask, what the others say, and the guess.
 
     The person's colours are learnt where no other view sees the wall and nothing is `foreign`
-    (h, w); whole patches of that are wall.
+    (h, w); large foreign patches are wall.
     """
     inside = ((view.alpha > 0) & evidence.likely & ~foreign) | evidence.solid
     labels = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
@@ -334,7 +334,7 @@ def _labels(
 
 
 def _foreign(views: Sequence[MatteView], sure: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return for each view the pixels (h, w) bool whose colours the person has not.
+    """Return for each view the pixels (h, w) bool whose colours the person does not have.
 
     The person's colours are those of what the other views cut out, without the view in which a
     colour is most common, as a cut may hold a piece of its wall; and, since cameras differ, those
@@ -414,7 +414,7 @@ def _log_density(off: np.ndarray, covariance: np.ndarray, variance: np.ndarray) 
     """Return log densities (N,) of normal errors (N, 3), up to a constant.
 
     Their covariance is `covariance` (N, 3, 3) and on its diagonal `variance` (N, 3) more. By
-    cofactors: NumPy's solver takes ten times as long for so many small matrices.
+    cofactors: NumPy's solver takes ten times as long for this many small matrices.
     """
     a, b, c = (covariance[:, k, k] + variance[:, k] + 1e-8 for k in range(3))
     d, e, f = covariance[:, 1, 2], covariance[:, 0, 2], covariance[:, 0, 1]

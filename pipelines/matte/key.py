@@ -31,7 +31,7 @@ LEAST_PART = 0.02  # a part of the subject smaller than this share of the larges
 LARGEST_HOLE = 0.05  # share of the image that a plate-coloured hole in the subject may have
 REACH = 0.012  # share of the longer side: least distance from which colours are taken
 SURE = 2.0  # deviations by which a pixel of the solid must be open to count as a gap
-SPREAD = 0.2  # share by which hair may be brighter or darker than what is seen of it nearby
+SPREAD = 0.2  # share by which hair may be brighter or darker than visible hair nearby
 LOW = 1.2  # deviations of noise: as likely noise as subject; alpha is 0 below it
 HIGH = 6.0  # deviations of noise that prove foreground; weaker pixels must touch such ones
 FIRM = 0.5  # share of the local foreground's difference that may belong to the solid inside
@@ -85,7 +85,7 @@ def alpha_of(
     region = subject_region(difference)
     if not region.any():
         return alpha
-    # All else happens around the subject only.
+    # The remaining steps work around the subject only.
     x, y, width, height = cv2.boundingRect(region.astype(np.uint8))
     margin = 4 * _pixels(CORE, length)
     window = np.s_[
@@ -94,7 +94,7 @@ def alpha_of(
     part = PlateModel(model.plate[window], model.sigma[window], model.whiten)
     frame, image, dark = frame[window], image[window], dark[window]
     difference, region = difference[window], region[window]
-    # The first solid only gives the colours nearby.
+    # The first solid only provides the colours nearby.
     support = find_support(difference > 2 * LOW, region, length, eroded_about)
     if support.core.any():
         firm = firm_pixels(image, difference, support.core, part, length)
@@ -134,7 +134,7 @@ def _opacity(
     noise = light_noise(plate, model.sigma[todo], model.whiten)
     behind = to_light(plate)
     value, deviation, at_zero = solve_opacity(light[todo], behind, mean, covariance, noise)
-    # In the core what is not surely open is solid, off it what is not surely subject is plate.
+    # Unsure pixels count as solid in the core, and as plate outside it.
     solid = 1 - shrunk(1 - value, SURE * deviation)
     strand = shrunk(value, LOW * at_zero)
     alpha[todo] = np.clip(np.where(core[todo], solid, strand), 0, 1)
@@ -152,7 +152,7 @@ def eroded(mask: np.ndarray, radius: float) -> np.ndarray:
     """
     if mask.all():
         return mask > 0
-    if radius <= 2:  # a disc of few pixels is quicker laid down than measured
+    if radius <= 2:  # small discs are faster by dilation than by distances
         side = np.arange(-radius, radius + 1)
         disc = (side[:, None] ** 2 + side**2 <= radius**2).astype(np.uint8)
         return cv2.erode(mask.astype(np.uint8), disc) > 0
@@ -198,8 +198,8 @@ def plate_difference(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Measure the difference (H, W) of an image (H, W, 3) from the plate, in noise deviations.
 
-    Where a whole neighbourhood is the plate darkened (no more than by `shadow`), the difference
-    is taken from the darkened plate. A dark strand darkens too, but not a whole neighbourhood.
+    Where an entire neighbourhood is the plate darkened (at most by `shadow`), the difference
+    is taken from the darkened plate. A dark strand also darkens, but not an entire neighbourhood.
     Also returns the darkening's factor (H, W) on sRGB values there, 0 elsewhere.
     """
     off = image - model.plate
@@ -211,7 +211,7 @@ def plate_difference(
     dark = np.clip(lumas[0] / np.maximum(lumas[1], 1.0), (1 - shadow) ** (1 / 2.2), 1.0)
     off += model.plate * (1 - dark)[..., None]
     shaded = _length(off, model)
-    # Opened by a disc wider than strands and soft edges: what is left is broad.
+    # Opening by a disc wider than strands and soft edges keeps broad areas only.
     broad = opened(shaded < 3.0, _pixels(0.01, length), eroded_about)
     return dark * broad, np.where(broad, np.minimum(difference, shaded), difference)
 
@@ -220,7 +220,7 @@ def shade_of_plate(dark: np.ndarray, clear: np.ndarray, length: int) -> np.ndarr
     """Measure the shadow's factor (H, W) on the plate, seen as `dark` where `clear` (H, W)."""
     weight = ((dark > 0) & clear).astype(np.float32)
     reach = REACH * length
-    # Where no plate is in reach a shadow cannot be measured; assume none.
+    # Without plate in reach a shadow cannot be measured; assume none.
     return (blurred(dark * weight, reach) + 1e-3) / (blurred(weight, reach) + 1e-3)
 
 

@@ -23,7 +23,7 @@ SALIENT = Role(
     setting="matte.weights", inputs=("pixel_values",), outputs=("alphas", "output_image"), place=-1
 )
 MULTIPLE = 4  # BackgroundMattingV2 refines patches of 4 x 4 pixels
-LEAST_SIDE = 64  # below this its encoder has nothing left to see
+LEAST_SIDE = 64  # smaller inputs leave its encoder no pixels
 OVERLAP = 256  # pixels; half of it is context that a tile sees and does not write
 SIDE = 1024  # of the salient networks, where the file does not say
 MEAN = np.array([0.485, 0.456, 0.406], np.float32)  # ImageNet's
@@ -40,8 +40,8 @@ def background_alpha(
 ) -> np.ndarray:
     """Return opacity (H, W) float32 of a frame and its plate (H, W, 3), both in 8-bit steps.
 
-    Frames beyond `tile` pixels are cut up. The network pools over all it sees, so tiles differ a
-    little from a whole; where memory allows, let `tile` hold the frame.
+    Frames over `tile` pixels are tiled. The network pools over its entire input, so tiles differ a
+    little from the full frame; if memory allows, make `tile` as large as the frame.
 
     Raises:
         StageError: the network failed, or gave another size or numbers that are not finite.
@@ -58,7 +58,7 @@ def background_alpha(
 
 
 def salient_alpha(network: Network, frame: np.ndarray) -> np.ndarray:
-    """Return the opacity (H, W) float32 of what stands out in a frame (H, W, 3) uint8.
+    """Return the opacity (H, W) float32 of the salient subject in a frame (H, W, 3) uint8.
 
     The network sees the frame at its own size; where that is smaller, the enlarged alpha follows
     the frame's colours in the uncertain band.
@@ -238,7 +238,7 @@ def in_tiles(
 
 
 def spans(length: int, tile: int, overlap: int) -> list[slice]:
-    """Give slices that cover a length; neighbours share ``overlap``."""
+    """Return slices that cover a length; neighbours share ``overlap``."""
     starts = [0]
     while starts[-1] + tile < length:
         starts.append(starts[-1] + tile - overlap)

@@ -30,15 +30,15 @@ from express50.geometry.conventions import affine_from_opencv, affine_to_opencv
 LEVELS = np.linspace(16.0, 240.0, 8)  # 8-bit intensities at which noise is tabulated
 MOST_NOISE = 14.0  # 8-bit steps; larger differences are not noise, whatever the camera
 NOISE_FLOOR = 1.0  # least noise assumed, in 8-bit steps
-# Below this share of plate in view there is nothing to measure noise or exposure on.
+# With less than this share of plate in view, noise and exposure cannot be measured.
 LEAST_PLATE = 0.05
 # Largest changes of exposure, natural logarithms: a few tenths of a stop as a rule, else two stops.
 GAINS = (0.51, 1.41)
 # A plate that explains less than GOOD_SHARE of a frame's rim is moved and evened.
 RIM, ODD_STEPS, GOOD_SHARE, LEAST_GAIN = 0.06, 12.0, 0.97, 0.01
 WIDE_RIM = 0.15  # by which it is aligned
-MOST_MOVED = 0.03  # of the longer side; a plate that moved more is not believed to be aligned
-LEAST_SHARE = 0.9  # a plate that explains less is of another set
+MOST_MOVED = 0.03  # share of the longer side; an alignment that moves the plate further is rejected
+LEAST_SHARE = 0.9  # a plate that explains less belongs to another set
 ALIGN_SIDE = 1024  # pixels of the pictures that are aligned
 ROUNDS = 3  # the covariance a pixel sees depends on its alpha; settled to 0.01 after two
 OCTAVES = 4  # of reach, in which colours are looked for
@@ -65,8 +65,8 @@ def exposure_gain(frame: np.ndarray, plate: np.ndarray) -> np.ndarray:
     """Estimate the gain (3,) of linear light from plate to frame, (H, W, 3) uint8 sRGB each.
 
     The plate's pixels form the sharpest peak of the ratios' histogram, whatever the subject
-    does; 1 where no peak stands out (the subject fills the frame). Another stop is believed only
-    where there is no peak near the plate's own exposure.
+    does; 1 if there is no clear peak (the subject fills the frame). A larger one is accepted only
+    if there is no peak near the plate's own exposure.
     """
     gains = np.ones(3)
     step = max(1, round(np.sqrt(frame.shape[0] * frame.shape[1] / 5e5)))
@@ -100,9 +100,9 @@ class MatchedPlate:
     """A plate (H, W, 3) uint8 brought to a frame.
 
     Attributes:
-        plate: moved and evened, if that helps; else as it was.
+        plate: moved and evened, if that helps; else unchanged.
         moved_px: how far its corners moved at most.
-        evened: largest change of light, a share; 0 where none was needed.
+        evened: largest change of light, a share; 0 if none was needed.
         share: of the frame's top and sides that it explains.
     """
 
@@ -267,7 +267,7 @@ def _robust_deviation(size: np.ndarray) -> float:
     """Return the deviation from absolute errors, trimmed of subject pixels that slipped in.
 
     The median finds the scale; the mean square inside three of it does not step as the median of
-    whole numbers does. A normal variable cut at three deviations keeps 0.9866 of its own.
+    integers does. A normal variable cut at three deviations keeps 0.9866 of its deviation.
     """
     deviation = 1.4826 * float(np.median(size))
     for _ in range(3):
@@ -317,7 +317,7 @@ def local_colours(
         weight: (H, W), which of them count.
         where: (H, W) bool, N of them true.
         reach: pixels; the nearest of OCTAVES reaches that holds any colour decides.
-        spread: share by which brightness may differ from what is seen nearby.
+        spread: share by which brightness may differ from the colours nearby.
     """
     # A blur this wide has no detail, so sums are kept small; one channel at a time, for memory.
     factor = max(1, int(reach / 3))
@@ -326,7 +326,7 @@ def local_colours(
 
     def nearby(values: np.ndarray) -> np.ndarray:
         small = cv2.resize(values * weight, size, interpolation=cv2.INTER_AREA)
-        total = np.full_like(small, 1e-3 * 1e-2**OCTAVES * small.mean())  # where none is in reach
+        total = np.full_like(small, 1e-3 * 1e-2**OCTAVES * small.mean())  # if none is in reach
         for octave in range(OCTAVES):
             total += 1e-2**octave * blurred(small, reach / factor * 2**octave)
         return cv2.resize(total, (width, height), interpolation=cv2.INTER_LINEAR)[where]

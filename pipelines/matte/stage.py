@@ -68,7 +68,7 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
     if not mattes:
         raise StageError(f"{item}: {dropped[0].why if dropped else 'no camera is calibrated'}")
     alphas = {name: matte.alpha for name, matte in mattes.items()}
-    # Without a common place to look at, a view is only for the picture.
+    # If the cameras share no place, a view only serves the contact sheet.
     place = ball or Ball(np.zeros(3), 1.0)
     views = [
         make_view(cameras[name], place, matte.rgb, matte.alpha, config.side)
@@ -115,8 +115,8 @@ def camera_mattes(
 ) -> tuple[dict[str, CameraMatte], list[Note], list[Note]]:  # fmt: skip
     """Matte each camera of a peak, those without a plate together.
 
-    One camera's full images are held at a time. `ball` is what the cameras look at; None where
-    they do not share a place. Also returns the cameras without a matte, and warnings.
+    One camera's full images are held at a time. `ball` is what the cameras look at; None if
+    they share none. Also returns the cameras without a matte, and warnings.
     """
     subject, expression = item.split("/")
     read = partial(read_peak_frame, dataset, subject, expression)
@@ -171,7 +171,7 @@ def _plate(
         return matched.plate, ""
     return None, (
         f"its plate explains {matched.share:.0%} of the frame's top and sides, expected"
-        f" {LEAST_SHARE:.0%}: it is of another set or place, and the camera was cut out without it;"
+        f" {LEAST_SHARE:.0%}: it shows another set or place, so the camera was matted without it;"
         " photograph the plate again"
     )
 
@@ -259,7 +259,7 @@ def rim_figures(
 ) -> dict[str, np.ndarray | float]:
     """Describe the N pixels of the rim of an alpha (H, W) uint8.
 
-    The frame (h, w, 3) uint8 may be reduced; its grain off the subject stands for noise.
+    The frame (h, w, 3) uint8 may be reduced; its grain outside the subject measures noise.
     """
     rim, share = rim_of(alpha), alpha.astype(np.float32) / 255
     open_part = share * (1 - share)
@@ -303,7 +303,7 @@ def matte_warnings(alphas: dict[str, np.ndarray]) -> list[Note]:
 
 
 def _write_picture(out: Path, views: list[MatteView], found: Agreement) -> None:
-    """Write every camera's subject: what was removed is red, what was filled is green."""
+    """Draw every camera's subject: removed pixels are red, filled pixels are green."""
     odd = {note.what for note in found.warnings}
     tiles = {}
     for view in views:

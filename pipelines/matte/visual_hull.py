@@ -1,4 +1,4 @@
-"""Carve the space that the cameras of a frame set share, and say what each sees in it.
+"""Carve the space that the cameras of a frame set share, and find what each sees in it.
 
 Space is a cube of cells around the point that the cameras look at, in units of the rig's own, so
 that neither metres nor the world's origin matter. A ball in it is in view of most cameras; there
@@ -75,9 +75,9 @@ class Space:
 
 
 def ball_of(cameras: Mapping[str, Camera]) -> Ball | None:
-    """Return the ball about what the cameras look at, as large as most have whole in view.
+    """Return the ball around the point the cameras look at, the largest that most see completely.
 
-    None where the optical axes are parallel or most cameras do not look at where they meet.
+    None if the optical axes are parallel or most cameras do not look at their intersection.
     """
     center = meeting_point(cameras)
     if center is None:
@@ -172,7 +172,7 @@ VOTES = 2  # other cameras that must see clear background before a place counts 
 MARGIN = 0.01  # distance from a silhouette, a share of the longer side, that proves nothing
 COLOUR = 0.1  # largest difference, of full scale, of one surface in neighbouring cameras
 MOST = 0.75  # share of the other views that must see a place to call it solid
-ERRING = 8  # one of so many views may lack the same spot
+ERRING = 8  # one in this many views may miss the same spot
 THICK = 0.5  # share of the usual length of a ray in the hull that does not graze a corner
 NEIGHBOURS = 4  # cameras that are asked for the colour of a surface
 WIDEST = 0.2  # cosine of the largest angle to them
@@ -188,7 +188,7 @@ class Evidence:
     Attributes:
         known: whose rays cross the space that is compared.
         possible: whose rays pass a place that the others do not rule out.
-        likely: whose rays pass a place that not one of them rules out.
+        likely: whose rays pass a place that none of them rules out.
         solid: whose rays pass a place where nearly all others that see it see the subject.
         front: depth of the nearest such place, in radii; infinite where there is none.
     """
@@ -233,7 +233,7 @@ def evidence_of(view: MatteView, space: Space, place: np.ndarray) -> Evidence:
 def _thick(view: MatteView, cells: np.ndarray) -> np.ndarray:
     """Return pixels (h, w) bool whose rays pass as many of the solid `cells` (h * w,) as most do.
 
-    Between the tangents of few cameras the hull has corners that stand out from the subject; they
+    Between the tangents of few cameras the hull has corners that protrude from the subject; they
     are thin along the rays that pass the subject.
     """
     chord = cv2.blur(cells.reshape(view.alpha.shape).astype(np.float32), (5, 5))
@@ -258,11 +258,11 @@ def ruled_out(view: MatteView, evidence: Evidence) -> np.ndarray:
     far = (reach > STRAND * max(loose.shape)) & (known > 0.5 * area)
     far[0] = False
     wrong = far[parts]
-    # What hangs together with it is wrong by a single view's word, up to the hull of them all.
+    # For pixels connected to it one view's evidence is enough, up to the hull of all views.
     doubtful = (view.alpha > FAINT) & ~evidence.likely
     _, parts = cv2.connectedComponents(doubtful.astype(np.uint8), connectivity=8)
     bad = doubtful & np.isin(parts, np.unique(parts[wrong]))
-    # One pixel more, for what is fainter still around it.
+    # One pixel more, for the fainter pixels around it.
     return (cv2.dilate(bad.astype(np.uint8), np.ones((3, 3))) > 0) & ~evidence.likely
 
 
@@ -337,7 +337,7 @@ def missed(
 
     Filled are connected spots that lack alpha where the others see something solid, some of it
     well inside, and whose colour is that of the surface. Spots that the matte does not enclose
-    count only as deep in the hull as its corners may stand out.
+    count only if deeper in the hull than its corners may protrude.
     """
     lacking = evidence.solid & (view.alpha < INSIDE) & view.valid
     depth = _depth(evidence.solid)

@@ -1,7 +1,7 @@
 """Two stages write the shards: encode a subject's samples, and pack all subjects' in one folder.
 
-Encoding is the work, and runs subject by subject; ``express50 pack`` runs it first. Packing gathers
-what is there: a subject that joins or leaves costs no other subject's samples.
+Encoding is slow and runs per subject; ``express50 pack`` runs it first. Packing gathers the encoded
+subjects, so adding or removing a subject does not re-encode the others.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def items(dataset: Dataset) -> list[str]:
 
 
 def inputs(dataset: Dataset, item: str, config: PackConfig) -> dict[str, Path | str]:
-    """Name the encoded subjects, and say who is excluded."""
+    """Name the encoded and the excluded subjects."""
     from express50.capture.readers.read import read_people
     from pipelines.pack.card import people_lines
 
@@ -57,7 +57,7 @@ def inputs(dataset: Dataset, item: str, config: PackConfig) -> dict[str, Path | 
         for name in ("manifest.json", "metrics.json"):
             if (folder / name).exists():
                 found[f"{subject} {name}"] = folder / name
-    # The receipt keeps no more about people than the card: nothing where they are too few.
+    # Like the card, the receipt keeps nothing about people if there are too few.
     return found | {"people": "\n".join(people_lines(read_people(dataset, included(dataset))))}
 
 

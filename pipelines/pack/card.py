@@ -23,15 +23,15 @@ def split_subjects(
     """Divide the subjects into ``train`` and ``test``; no subject is in both.
 
     Without named test subjects a hash of each subject's id decides, so that a subject stays in its
-    split when others join; at least one of two or more is chosen unless the fraction is 0.
+    split when others join; of two or more at least one is chosen unless the fraction is 0.
 
     Raises:
-        StageError: a named subject does not exist, or none is left to train on.
+        StageError: a named subject does not exist, or nobody is left to train on.
     """
     unknown = sorted(set(test_subjects) - set(subjects))
     if unknown:
         raise StageError(
-            f"pack.test_subjects names {', '.join(unknown)}; expected some of"
+            f"pack.test_subjects names {', '.join(unknown)}; expected one or more of"
             f" {', '.join(sorted(subjects))}"
         )
     test = set(test_subjects)

@@ -21,7 +21,7 @@ class EncodeConfig:
     """Divide out the cameras' different response to the same light, where calibration measured
     it."""
     torso: Literal["remove", "keep"] = "remove"
-    """remove: alpha leaves out shoulders and clothes, if regions separated them; keep: not."""
+    """remove: alpha omits shoulders and clothes, if regions separated them; keep: it does not."""
     min_confidence: float = 0.0
     """Depth pixels with less confidence count as unknown, 0 to 1; 0.5 keeps bounds up to 2 mm."""
 

@@ -28,7 +28,7 @@ SOLID = 0.98  # alpha from which a pixel has the subject's colour alone
 
 @dataclass(frozen=True)
 class Crop:
-    """A square of whole source pixels; its corner (x0, y0) may lie outside the image."""
+    """A square aligned to source pixels; its corner (x0, y0) may lie outside the image."""
 
     x0: int
     y0: int
@@ -119,7 +119,7 @@ def cut_own_colours(
     """Cut a frame to (size, size, 3) with the subject's own colour in soft pixels.
 
     Frame and clean plate, or None, are (H, W, 3) uint8 sRGB; the matte (H, W) uint8 is of
-    everything that stands before the plate, torso included.
+    everything in front of the plate, torso included.
     """
     behind = None
     if plate is not None:
@@ -130,7 +130,7 @@ def cut_own_colours(
 def own_colours(image: np.ndarray, alpha: np.ndarray, plate: np.ndarray | None) -> np.ndarray:
     """Replace the colours of an image (H, W, 3) uint8 sRGB where 0 < alpha < 1, of (H, W) uint8.
 
-    The plate is what stands behind, in the frame's exposure, (H, W, 3) in 8-bit steps; or None.
+    The plate is the background in the frame's exposure, (H, W, 3) in 8-bit steps, or None.
 
     Raises:
         ValueError: sizes differ.

@@ -62,13 +62,13 @@ class PackedSubject:
         name: subject id.
         cameras: pinhole cameras of the pictures by id.
         recorded: width and height of the footage by camera.
-        gains: linear light (3,) by camera, as far as it was measured.
+        gains: linear light (3,) by camera, if measured.
         peaks: decode index by expression.
         labels: label without the annotator's name, by expression.
         tracked: head-model parameters by expression.
         vertices: (V, 3) tracked mesh in the world by expression, metres.
         offsets: (V, 3) of the rest shape; None where all are 0.
-        registered: registrations by expression, where there are any of this track.
+        registered: registrations of this track by expression, if any.
         notes: why a registration is left out.
         meta: the fields of meta.json that all samples share.
     """
@@ -206,7 +206,7 @@ def load_sample(
         )
     torso = "kept"
     if head is not None and config.torso == "remove":
-        # Depth without colour is dropped too: what is left of the torso would bend the head.
+        # Depth without colour is also dropped: the rest of the torso would bend the head.
         alpha, valid, torso = head, valid & (head > 127), "removed"
     if config.min_confidence > 0:
         sure = read_image(folder / f"{camera.id}_confidence.png")
@@ -218,7 +218,7 @@ def load_sample(
 def _read_regions(
     dataset: Dataset, item: str, camera_id: str
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Read the labels (H, W) uint8 and the head's alpha (H, W) uint8; None for what is missing.
+    """Read the labels (H, W) uint8 and the head's alpha (H, W) uint8; None if missing.
 
     The head has no alpha of its own where the regions stage could not separate the torso.
 
@@ -263,7 +263,7 @@ def encode_sample(
         )
     rgb = cut_own_colours(loaded.rgb, loaded.matte, loaded.plate, crop, config.size)
     parts = None if loaded.parts is None else cut_labels(loaded.parts, crop, config.size)
-    sample_key(subject.name, expression, camera.id)  # raises where an id cannot be a file name
+    sample_key(subject.name, expression, camera.id)  # raises if an id cannot be a file name
     gain = subject.gains.get(camera.id, np.ones(3)) if config.even_colour else np.ones(3)
     members = encode_pictures(
         rgb if (gain == 1).all() else scale_light(rgb, 1.0 / gain),

@@ -81,7 +81,7 @@ def _encode_group(
 
 
 def _write_subject_files(out: Path, subject: PackedSubject) -> None:
-    """Write what is stored once per subject, not with every sample."""
+    """Write the files that are stored once per subject, not with every sample."""
     if subject.offsets is not None:
         write_offsets(out, subject.name, subject.offsets)
     if meshes := {name: (one.offsets, one.sigma) for name, one in subject.registered.items()}:
@@ -100,7 +100,7 @@ def warn_of_gaps(metas: list[dict]) -> list[Note]:
         warnings.append(Note("regions", why))
     keys = {"consent": "consent_id", "licence": "licence"}
     if lacking := [keys[key] for key in keys if metas[0][key] is None]:
-        why = f"capture.toml gives no {' and no '.join(lacking)}; its samples lack it"
+        why = f"capture.toml gives no {' and no '.join(lacking)}; its samples will not state it"
         warnings.append(Note(name, why))
     return warnings
 
@@ -140,7 +140,7 @@ def pack(dataset: Dataset, config: PackConfig, out: Path) -> Result:
 
 
 def _read_accounts(dataset: Dataset) -> tuple[dict[str, dict], list[Note]]:
-    """Read the metrics of every encoded subject; a note says why another one is left out."""
+    """Read the metrics of every encoded subject; a note explains each subject left out."""
     accounts, dropped = {}, []
     for name in dataset.subjects():
         metrics = dataset.item_dir("encode", name) / "metrics.json"

@@ -49,7 +49,7 @@ PHOTO_FPS = 25.0  # a photograph has no rate, but a capture must state one
 # Range of possible focal lengths, in longer sides of the picture.
 FOCAL_LIMITS = (0.1, 100.0)
 TURNED_CRF = 12  # H.264 that looks like the source
-# Read as photographs; a rig's cameras write none of the last two.
+# Suffixes read as photographs; a rig's cameras write none of the last two.
 PHOTO_SUFFIXES = (*IMAGE_SUFFIXES, ".webp", ".bmp")
 LADDER = 2.0 ** np.arange(-2.0, 2.5, 0.5)
 # Two thirds of unknown lenses lie within this factor of the guess.
@@ -96,7 +96,7 @@ def open_picture(path: Path) -> PhotoSource:
         return PhotoSource(path, video=True, orientation=ORIENTATION[turns])
     if suffix not in PHOTO_SUFFIXES:
         raise CaptureError(
-            f"{path}: not a file name of a photograph or video; expected one that ends in "
+            f"{path}: not a photograph or video; expected a file name that ends in "
             f"{' '.join(PHOTO_SUFFIXES + VIDEO_SUFFIXES)}"
         )
     try:
@@ -109,7 +109,7 @@ def open_picture(path: Path) -> PhotoSource:
 def upright_frames(picture: PhotoSource) -> Iterator[np.ndarray]:
     """Decode a photograph or a whole video: frames (H, W, 3) uint8 sRGB, turned upright."""
     if not picture.video:
-        path = picture.path.resolve()  # it may be a link to elsewhere
+        path = picture.path.resolve()  # it may be a link to another place
         yield read_picture(path.parent, path.name, picture.orientation)
         return
     for _, image in iterate_video(picture.path):
@@ -154,7 +154,7 @@ def make_photo_capture(
 
     Raises:
         CaptureError: the picture cannot be read or shows no face, the folder has another picture,
-            or the focal length is that of no lens.
+            or no lens has the focal length.
     """
     torch.set_num_threads(1)
     digest = file_sha256(picture.path)
@@ -194,7 +194,7 @@ def _check_folder(folder: Path, picture: Path, digest: str) -> None:
     """Raise CaptureError if a folder holds the capture of a picture with another digest."""
     try:
         known = tomllib.loads((folder / "capture.toml").read_text()).get("picture_sha256", digest)
-    except (OSError, ValueError):  # nothing is there, or nothing that could be lost
+    except (OSError, ValueError):  # the folder is empty or holds nothing that could be lost
         return
     if known != digest:
         raise CaptureError(
@@ -237,7 +237,7 @@ def subject_id(path: Path) -> str:
 
 def _write_footage(picture: PhotoSource, folder: Path) -> None:
     """Copy the file; a turned one, or one of a kind that no stage reads, is stored upright."""
-    # A former picture of another kind or suffix would make the footage ambiguous.
+    # An earlier picture with another suffix would make the footage ambiguous.
     shutil.rmtree(folder, ignore_errors=True)
     suffix = picture.path.suffix.lower()
     name = f"video{suffix}" if picture.video else f"frames/000000{suffix}"

@@ -62,7 +62,7 @@ def add_commands(subparsers: Any) -> None:
     parser.add_argument(
         "--matte",
         action="store_true",
-        help="also make a matte and fit outlines; by colours around the face, or by your network:"
+        help="also make a matte and fit outlines; by colours around the face, or with your network:"
         " --set matte.method=salient --set matte.weights=FILE",
     )
     add_config_options(parser)
@@ -116,11 +116,11 @@ def run_photo(args: argparse.Namespace) -> int:
 
 
 def _account(focal: Focal, summaries: list[Summary]) -> None:
-    """Print what was made and how much of it is a guess."""
+    """Print the outputs and how uncertain the focal length is."""
     for summary in summaries:
         say(*summary.lines())
     say(
-        f"focal length {focal.pixels:.0f} px ({focal.source}); by the face alone, "
+        f"focal length {focal.pixels:.0f} px ({focal.source}); from the face alone, "
         f"{focal.low:.0f} to {focal.high:.0f} px fit as well"
     )
     if not focal.low <= focal.pixels <= focal.high:

@@ -39,21 +39,25 @@ SURFACE_M = 0.0004
 STAY_M = 0.003  # standard deviation of the tracked mesh where no surface is found
 FOLD_M = 0.03  # a vertex that faces the mesh itself nearer than this lies in a fold
 SAMPLES = 64  # of the posterior; their standard deviation is known to 9 %
-# Surfaces there are not the skin's, or coarser than what tracking sees; an ear is all folds.
+# There the surface is not skin, or is coarser than tracking; an ear consists of folds.
 TRUST = {
     "scalp": 0.0, "mouth_interior": 0.0, "boundary": 0.0, "neck": 0.0, "left_ear": 0.0,
     "right_ear": 0.0, "lips": 0.5, "left_eye_region": 0.1, "right_eye_region": 0.1,
 }  # fmt: skip
-FACE = ("face", "nose")  # without these, it is bare skin in nearly everybody:
+FACE = ("face", "nose")  # without these, it is bare skin in nearly everyone:
 NOT_BARE = (
     "lips", "left_eye_region", "right_eye_region", "mouth_interior", "forehead", "boundary",
 )  # fmt: skip
-NEAR_M, LIPS_M = 0.004, 0.01  # what lies nearer to the mesh is its skin; its lips
+NEAR_M, LIPS_M = 0.004, 0.01  # surfaces nearer to the mesh are its skin; its lips
 LEAST = 100  # vertices of bare skin, to know its colour
 SPREADS = (0.05, 0.05, 0.2)  # least standard deviations: red and blue over green, brightness; logs
 ODD = 3.0  # standard deviations at which a colour is half believed
 SURE = (0.5, 1.0)  # confidence, over that of bare skin: of nothing and of full trust
-AROUND_M, NEIGHBOURS, EVERY = 0.008, 12, 14  # hair's rim is hair: neighbours must be trusted too
+AROUND_M, NEIGHBOURS, EVERY = (
+    0.008,
+    12,
+    14,
+)  # the rim of hair counts as hair: neighbours must be trusted too
 
 
 @dataclass(frozen=True)

@@ -44,12 +44,12 @@ from pipelines.track.terms import MeshPlaces, NormalTerm, PointTerm, landmark_an
 REACHES = (0.015, 0.010, 0.006, 0.004)  # of the search, per round of the fit of parameters; metres
 ROUND_STEPS, SIGMA_M = 4, 0.0012
 DETAIL_M = 0.008  # wavelength of the finest detail that is followed: scans have few errors
-SIDE, AWAY_M, SPAN_M = 400, 1.2, 0.34  # of the pictures: pixels, distance, what is seen across
+SIDE, AWAY_M, SPAN_M = 400, 1.2, 0.34  # of the pictures: pixels, distance, width of the view
 YAWS, PITCHES = (-50.0, -25.0, 0.0, 25.0, 50.0), (-15.0, 15.0)
 LEAST_SCORE = 0.2
 CHIN, NOSE_BRIDGE = 8, 27
 HALF_HEAD_M = 0.06
-OFF_SCAN_M = 0.02  # given landmarks lie nearer, on hair or at the rim of a hole too
+OFF_SCAN_M = 0.02  # given landmarks must lie nearer than this, also on hair or at the rim of a hole
 INWARDS = (
     "its triangles face inwards: it is inside out, or mirrored; flip its triangles, or mirror it"
     " back"
@@ -83,7 +83,7 @@ def fit_scan(scan: Scan, head: str, given: np.ndarray | None = None) -> FittedSc
     observation = look(scan, template, given)
     check_face(observation.points, template, "the face that is seen")
     terms = given_terms(basis.model, given)
-    # It may be any face: none is neutral.
+    # The scan may show any expression: none counts as neutral.
     targets, state, lost = fit_landmarks(basis, [observation], "", terms)
     if lost:
         raise StageError(f"the scan's landmarks fit no head: {lost[0].why}")
@@ -113,7 +113,7 @@ def given_terms(model: HeadModel, given: np.ndarray) -> tuple[PointTerm, ...]:
 def surface_term(
     model: HeadModel, search: SurfaceSearch, mesh: np.ndarray, reach: float
 ) -> NormalTerm:
-    """Make the term that pulls a mesh's (V, 3) vertices to the scan, as far as it is found."""
+    """Make the term that pulls a mesh's (V, 3) vertices to the scan where it is found."""
     normals = mesh_normals(mesh, model.faces)
     height, trust = search.heights(mesh, normals, reach)
     trust = trust * trusted_vertices(model) * ~folded(mesh, normals, model.faces.numpy())
@@ -147,7 +147,7 @@ def look(scan: Scan, template: np.ndarray, given: np.ndarray) -> Observation:
         found = Observation("scan", 0, (), np.zeros((0, 68), bool), *nothing)
     else:
         raise StageError(
-            "fewer than two sides of the scan show a face; is most of it missing? Then give at"
+            "fewer than two sides of the scan show a face; if most of it is missing, give at"
             f" least {MIN_TRIANGULATED} landmarks between brows and mouth"
         )
     return replace(

@@ -184,7 +184,7 @@ def figures_of_landmarks(fitted: FittedScan, given: np.ndarray) -> dict:
 
 
 def warnings_of(metrics: dict) -> list[str]:
-    """List what is doubtful about a registered scan."""
+    """List the warnings about a registered scan."""
     seen, views, away = (metrics[k] for k in ("seen_share", "views", "landmarks_mm_largest"))
     found = {
         f"the scan was found at only {seen:.0%} of the face's vertices": seen < LEAST_SEEN,

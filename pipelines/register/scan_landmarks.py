@@ -52,7 +52,7 @@ def read_landmarks(path: Path) -> np.ndarray:
         for place, (name, xyz) in zip(_places([name for name, _ in rows]), rows, strict=True):
             if len(xyz) != 3 or not np.isfinite(xyz).all():
                 words = f"point {name or place} is {xyz}, expected 3 finite numbers"
-                raise ValueError(words + "; name the points and leave out what is not known")
+                raise ValueError(words + "; name the points and omit unknown ones")
             if np.isfinite(points[place]).all():
                 raise ValueError(f"point {name} appears twice")
             points[place] = xyz

@@ -67,7 +67,7 @@ def read_scan(path: Path) -> Scan:
         raise FormatError(
             f"{path}: its longest side is {size:.4g}{f', as in {unit}' if unit else ''}; a scan of"
             f" a head has {SMALLEST_M:g} to {LARGEST_M:g} m, in {', '.join(UNITS)}: scale it, or"
-            " cut away what is not the head"
+            " remove everything but the head"
         )
     light = np.full((len(used), 3), GREY)
     if shades is not None:

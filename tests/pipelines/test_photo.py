@@ -96,7 +96,7 @@ def test_wrong_options_and_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("no picture")
     for arguments in (["--focal-px", "-3"], ["--windows", "0"], ["--subject", "a b"]):
         assert main(["photo", str(tmp_path / "a.txt"), str(tmp_path / "o"), *arguments]) == 2
-    with pytest.raises(CaptureError, match="not a file name of a photograph"):
+    with pytest.raises(CaptureError, match="not a photograph or video"):
         open_picture(tmp_path / "a.txt")
     with pytest.raises(CaptureError, match="no such file"):
         open_picture(tmp_path / "b.png")
