@@ -1,7 +1,7 @@
 """Project, unproject, distort, crop and triangulate with cameras.
 
-World and camera units are metres, axes are OpenCV's, a pixel's origin is the image's corner.
-Models and the order of their parameters are COLMAP's.
+World and camera units are metres, axes are OpenCV's, and pixel coordinates start at the image's
+corner. Camera models and the order of their parameters are COLMAP's.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from express50.geometry.conventions import cell_centres
 from express50.geometry.shapes import check_shape
 from express50.geometry.transforms import invert_transform
 
-# Where each COLMAP parameter goes: focal x, focal y, then OpenCV's k1 k2 p1 p2 k3 k4 k5 k6.
+# What each COLMAP parameter is; distortion terms have OpenCV's names k1 k2 p1 p2 k3 k4 k5 k6.
 MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
@@ -26,9 +26,9 @@ MODELS: dict[str, tuple[str, ...]] = {
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
-NEAREST_M = 1e-9  # depth by which undistorted cameras divide at least
-WIDEST = 20.0  # radius on the plane z = 1: no perspective lens sees farther than 87 degrees
-TABLE_SIZE = 4096  # radii from which the inverse of a lens starts
+NEAREST_M = 1e-9  # least depth by which undistorted cameras divide
+WIDEST = 20.0  # radius on the plane z = 1: no perspective lens sees beyond 87 degrees off its axis
+TABLE_SIZE = 4096  # radii in the table that gives the first guess when a lens is inverted
 NEWTON_ROUNDS = 20
 _DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
@@ -41,8 +41,8 @@ class Camera:
         id: the camera's name in the capture.
         width, height: image size, pixels.
         model: COLMAP's name of the model.
-        params: the model's parameters in COLMAP's order, pixels and dimensionless.
-        cam_from_world: (4, 4) rigid, OpenCV axes, metres.
+        params: the model's parameters in COLMAP's order, in pixels or dimensionless.
+        cam_from_world: (4, 4) rigid transform, OpenCV axes, metres.
     """
 
     id: str
@@ -57,14 +57,14 @@ class Camera:
 
     @property
     def K(self) -> np.ndarray:
-        """Return intrinsics (3, 3), pixels, corner origin."""
+        """Return the intrinsics (3, 3) in pixels, with the origin at the image's corner."""
         p = self._named()
         fx, fy = p.get("fx", p.get("f", 0.0)), p.get("fy", p.get("f", 0.0))
         return np.array([[fx, 0.0, p["cx"]], [0.0, fy, p["cy"]], [0.0, 0.0, 1.0]])
 
     @property
     def dist(self) -> np.ndarray:
-        """Return the distortion (8,), OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6."""
+        """Return the distortion (8,) in OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6."""
         p = self._named()
         return np.array([p.get(name, 0.0) for name in _DISTORTION])
 
@@ -89,7 +89,7 @@ def pinhole_camera(
 
 
 def pinhole(camera: Camera) -> Camera:
-    """Return the same camera without distortion: what undistorted images are seen with."""
+    """Return the same camera without distortion, which undistorted images belong to."""
     return pinhole_camera(camera.id, camera.K, camera.width, camera.height, camera.cam_from_world)
 
 
@@ -97,7 +97,7 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
     """Return the camera of the image resized to (width, height).
 
     Raises:
-        ValueError: the image is empty, before or after.
+        ValueError: the image is empty before or after resizing.
     """
     if min(camera.width, camera.height) < 1:
         raise ValueError(
@@ -107,7 +107,7 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
 
 
 def scale_camera(camera: Camera, sx: float, sy: float) -> Camera:
-    """Return the camera of the image scaled by (sx, sy); with a corner origin K just scales.
+    """Return the camera of the image scaled by (sx, sy); with a corner origin, K only scales.
 
     Raises:
         ValueError: no pixel would be left.
@@ -127,7 +127,7 @@ def crop_camera(camera: Camera, x0: float, y0: float, width: int, height: int) -
 
 
 def _with_K(camera: Camera, K: np.ndarray) -> Camera:
-    """Return the camera with other intrinsics; a one-focal model becomes its two-focal relative."""
+    """Return the camera with other intrinsics; a model with one focal length gets one with two."""
     p = camera._named() | {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     model = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}.get(
         camera.model, camera.model
@@ -141,7 +141,7 @@ def transform_camera(camera: Camera, new_from_old: np.ndarray) -> Camera:
 
 
 def distort(camera: Camera, xy: np.ndarray) -> np.ndarray:
-    """Return distorted normalised coordinates (N, 2) of ideal ones (N, 2), folded ones included.
+    """Return distorted normalised coordinates (N, 2) of ideal ones (N, 2), even beyond a fold.
 
     Source: OpenCV's rational model, of which COLMAP's OPENCV and RADIAL are special cases.
     """
@@ -157,9 +157,10 @@ def distort(camera: Camera, xy: np.ndarray) -> np.ndarray:
 def undistort(camera: Camera, xy: np.ndarray) -> np.ndarray:
     """Return ideal normalised coordinates (N, 2) of distorted ones (N, 2).
 
-    They are NaN where the lens forms no such image point, which is where it folds.
+    They are NaN where the lens forms no such image point, because its distortion folds there.
 
-    Source: Newton's method, from a table of the radial part, which grows steadily in its field.
+    Source: Newton's method, started from a table of the radial part, which is monotonic in its
+    field.
     """
     xy = np.asarray(xy, dtype=np.float64)
     if not camera.dist.any():
@@ -169,13 +170,13 @@ def undistort(camera: Camera, xy: np.ndarray) -> np.ndarray:
     size = np.linalg.norm(xy, axis=1)
     ideal = xy * (np.interp(size, radii * radial, radii) / np.maximum(size, NEAREST_M))[:, None]
     todo = np.isfinite(xy).all(axis=1)
-    with np.errstate(all="ignore"):  # a point without an inverse may run away
+    with np.errstate(all="ignore"):  # a point without an inverse may diverge
         for _ in range(NEWTON_ROUNDS):
             error = distort(camera, ideal[todo]) - xy[todo]
             a, b, c = distortion_slopes(camera.dist, ideal[todo])
             step = np.stack([c * error[:, 0] - b * error[:, 1], a * error[:, 1] - b * error[:, 0]])
             ideal[todo] -= (step / (a * c - b * b)).T
-            # Newton doubles the digits: half of them before a step are all of them after it.
+            # A Newton step doubles the correct digits, so 1e-9 before it is exact after it.
             todo[todo] = np.abs(error).max(axis=1) > 1e-9
             if not todo.any():
                 break
@@ -184,7 +185,7 @@ def undistort(camera: Camera, xy: np.ndarray) -> np.ndarray:
 
 
 def in_field(camera: Camera, xy: np.ndarray) -> np.ndarray:
-    """Say which ideal normalised coordinates (N, 2) the lens pictures: not NaN, and not folded."""
+    """Return True (N,) for ideal normalised coordinates (N, 2) that are finite and not folded."""
     if not camera.dist.any():
         return np.isfinite(xy).all(axis=1)
     a, b, c = distortion_slopes(camera.dist, xy)
@@ -205,7 +206,7 @@ def distortion_slopes(
 
 
 def _radial_part(dist: np.ndarray, r2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the radial factor (N,) at squared radii (N,), and its derivative by them."""
+    """Return the radial factor (N,) at squared radii ``r2`` (N,), and its derivative in ``r2``."""
     k1, k2, _, _, k3, k4, k5, k6 = dist
     below = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
     radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / below
@@ -215,7 +216,7 @@ def _radial_part(dist: np.ndarray, r2: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 @lru_cache(maxsize=256)
 def _field(dist: bytes) -> float:
-    """Return the radius up to which the radial part grows: to its first fold or pole, or `WIDEST`.
+    """Return the radius of the radial part's first fold or pole, at most `WIDEST`.
 
     The derivative of r N / D by r, with N and D polynomials of u = r^2, has the numerator
     N D + 2 u (N' D - N D').
@@ -225,7 +226,7 @@ def _field(dist: bytes) -> float:
     slope = above * below + Polynomial([0, 2]) * (above.deriv() * below - above * below.deriv())
     ends = [WIDEST**2]
     for part in (slope, below):
-        # In units of WIDEST^2, so that roots far beyond it are dropped with their coefficient.
+        # In units of WIDEST^2, so that trimming small coefficients drops roots far beyond it.
         roots = part(Polynomial([0, WIDEST**2])).trim(1e-12).roots()
         real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
         ends += list(real * WIDEST**2)
@@ -233,11 +234,11 @@ def _field(dist: bytes) -> float:
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Project world points (N, 3), metres, into a camera, distortion included.
+    """Project world points (N, 3), metres, into a camera, including distortion.
 
     Returns:
-        pixels (N, 2) as (x, y), NaN where depth <= 0 and where the lens folds; depth (N,), camera
-        z, metres. Both are NaN where a point is not finite.
+        Pixels (N, 2) as (x, y), NaN if depth <= 0 or where the lens folds, and depth (N,), camera
+        z in metres. Both are NaN if a point is not finite.
 
     Raises:
         ValueError: points are not (N, 3).
@@ -251,7 +252,7 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     depth = p[:, 2]
     ahead = depth > 0
     xy = p[:, :2] / np.where(ahead, depth, np.nan)[:, None]
-    with np.errstate(all="ignore"):  # outside the field of the lens anything may come out
+    with np.errstate(all="ignore"):  # outside the lens's field values may overflow
         xy = np.where(in_field(camera, xy)[:, None], xy, np.nan)
     K = camera.K
     return distort(camera, xy) * (K[0, 0], K[1, 1]) + K[:2, 2], depth
@@ -269,7 +270,7 @@ def unproject(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarr
 def rays(camera: Camera, stride: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Return origin (3,) and directions (H', W', 3) through the centres of every stride-th pixel.
 
-    Directions have camera z 1, so that ``origin + depth * direction`` is the point at a depth.
+    Directions have a camera z of 1, so that ``origin + depth * direction`` is the point at a depth.
     """
     x, y = cell_centres(camera.width)[::stride], cell_centres(camera.height)[::stride]
     K, R = camera.K, camera.cam_from_world[:3, :3]
@@ -277,7 +278,7 @@ def rays(camera: Camera, stride: int = 1) -> tuple[np.ndarray, np.ndarray]:
         pixels = np.stack([part.ravel() for part in np.meshgrid(x, y)], axis=1)
         way = normalised(camera, pixels) @ R[:2] + R[2]
         return camera.center, way.reshape(len(y), len(x), 3)
-    # Without distortion a direction is a part of its column and a part of its row.
+    # Without distortion, a direction is the sum of a column's part and a row's part.
     across, down = ((x - K[0, 2]) / K[0, 0])[:, None] * R[0], ((y - K[1, 2]) / K[1, 1])[:, None]
     return camera.center, across + (down * R[1] + R[2])[:, None]
 
@@ -289,11 +290,11 @@ def triangulate(
 
     Args:
         cameras: C cameras.
-        pixels: (C, N, 2) distorted pixels; NaN where a camera does not see a point.
+        pixels: (C, N, 2) distorted pixels; NaN if a camera does not see a point.
         weights: (C, N) non-negative; all ones by default.
 
     Returns:
-        (N, 3) world points; NaN where fewer than two cameras see one, or it would be behind all.
+        (N, 3) world points; NaN if fewer than two cameras see a point, or it lies behind all.
 
     Source: linear triangulation (Hartley and Zisserman, 12.2), then Gauss-Newton on pixels.
     """
@@ -348,7 +349,7 @@ def project_pinhole(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def inside_frame(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return pixels (S, 2) of world points (S, 3), and whether (S,) they lie a pixel inside."""
+    """Return pixels (S, 2) of world points (S, 3), and True (S,) if a pixel or more inside."""
     pixels, depth = project_pinhole(camera, points)
     size = np.array([camera.width, camera.height])
     return pixels, (depth > 1e-3) & (pixels >= 1.0).all(1) & (pixels <= size - 1.0).all(1)
@@ -364,7 +365,7 @@ def project_with_slope(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _rays(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return coordinates (..., 2) at unit depth, depth (...), and depth that is never zero."""
+    """Return coordinates (..., 2) at unit depth, depth (...), and depth kept away from zero."""
     local = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     depth = local[..., 2]
     safe = np.where(np.abs(depth) > NEAREST_M, depth, NEAREST_M)

@@ -1,8 +1,8 @@
 """Convert between pixel origins and camera axes; no other Python file shifts by half a pixel.
 
-Inside the project a pixel's origin is the image's corner (the first pixel's centre is
-(0.5, 0.5), as COLMAP and gsplat have it) and cameras have OpenCV axes. OpenCV's own functions
-put the origin at the first pixel's centre; OpenGL's cameras look along -z with y up.
+Inside the project, pixel coordinates start at the image's corner (the first pixel's centre is
+(0.5, 0.5), as in COLMAP and gsplat) and cameras have OpenCV axes. OpenCV's own functions put the
+origin at the first pixel's centre; OpenGL's cameras look along -z with y up.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ def K_to_opencv(K: np.ndarray) -> np.ndarray:
 
 
 def K_from_opencv(K: np.ndarray) -> np.ndarray:
-    """Return the corner-origin K (3, 3) of one that an OpenCV function returned."""
+    """Return the corner-origin K (3, 3) for a K that an OpenCV function returned."""
     shifted = np.array(K, dtype=np.float64)
     shifted[:2, 2] += 0.5
     return shifted
 
 
 def affine_to_opencv(matrix: np.ndarray) -> np.ndarray:
-    """Return the affine (2, 3) between centre-origin pixels, as ``cv2.warpAffine`` has it.
+    """Return the affine (2, 3) between centre-origin pixels, as ``cv2.warpAffine`` expects it.
 
-    ``matrix`` (2, 3) does the same between corner-origin pixels.
+    ``matrix`` (2, 3) is the same map between corner-origin pixels.
     """
     shifted = np.array(matrix, dtype=np.float64)
     shifted[:, 2] += shifted[:, :2] @ [0.5, 0.5] - 0.5
@@ -62,7 +62,7 @@ def affine_from_opencv(matrix: np.ndarray) -> np.ndarray:
 
 
 def corner_to_cell(places: Places) -> Places:
-    """Return fractional indices, for interpolation, of corner-origin places; cell 0 spans 0 to 1.
+    """Return fractional indices of corner-origin positions, for interpolation; cell 0 is [0, 1].
 
     Takes and returns an array or a tensor of any shape.
     """
@@ -70,12 +70,12 @@ def corner_to_cell(places: Places) -> Places:
 
 
 def cell_to_corner(indices: Places) -> Places:
-    """Return corner-origin places of fractional indices: the inverse of ``corner_to_cell``."""
+    """Return corner-origin positions of fractional indices: the inverse of ``corner_to_cell``."""
     return indices + 0.5  # type: ignore[operator,return-value]
 
 
 def cell_centres(count: int) -> np.ndarray:
-    """Return corner-origin places (count,) of the centres of a row of cells."""
+    """Return the corner-origin positions (count,) of the centres of a row of cells."""
     return np.arange(count) + 0.5
 
 

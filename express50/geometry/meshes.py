@@ -1,7 +1,4 @@
-"""Write triangle meshes as PLY, OBJ or GLB files, in the units they have; read surfaces.
-
-Also their Laplacian.
-"""
+"""Write triangle meshes as PLY, OBJ or GLB in their own units, read surfaces, make Laplacians."""
 
 from __future__ import annotations
 
@@ -24,8 +21,8 @@ def write_ply(
 ) -> None:
     """Write a little-endian PLY file of vertices (V, 3), as float32, and faces (F, 3).
 
-    ``columns`` are further properties of the vertices by name, each (V,): uint8, else stored as
-    float32.
+    ``columns`` holds further vertex properties by name, each (V,), stored as uint8 if they are
+    uint8 and otherwise as float32.
     """
     values = dict(zip("xyz", vertices.T, strict=True)) | dict(columns)
     kinds = [(name, "|u1" if v.dtype == np.uint8 else "<f4") for name, v in values.items()]
@@ -58,7 +55,7 @@ def read_surface(path: Path) -> Surface:
     """Read a surface that the depth stage wrote.
 
     Raises:
-        FormatError: it is not such a file, holds no face, or NaN.
+        FormatError: it is not such a file, has no faces, or holds NaN.
     """
     import open3d as o3d
     import trimesh
@@ -67,20 +64,23 @@ def read_surface(path: Path) -> Surface:
         mesh = trimesh.load(path, file_type="ply", process=False, force="mesh")
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
         check_faces(faces, len(vertices))
-        # Only Open3D hands out further properties of vertices; of damaged files it reads what it
-        # can, so that trimesh, which refuses them, comes first.
+        # Only Open3D returns further vertex properties, but it reads what it can of damaged files;
+        # trimesh refuses them, so it comes first.
         columns = o3d.t.io.read_point_cloud(str(path), format="ply").point
         colors = columns["colors"].numpy()
         confidence = columns["confidence"].numpy()[:, 0].astype(np.float64)
     except Exception as error:  # noqa: BLE001  # both raise what the damage leads to
-        raise FormatError(f"{path}: not a surface of depth ({error}); {_AGAIN}") from None
+        raise FormatError(f"{path}: not a surface from depth ({error}); {_AGAIN}") from None
     if not len(faces) or not (np.isfinite(vertices).all() and np.isfinite(confidence).all()):
-        raise FormatError(f"{path}: {len(faces)} faces, or NaN in the vertices; {_AGAIN}")
+        raise FormatError(
+            f"{path}: {len(faces)} faces, possibly NaN in the vertices; expected faces and finite"
+            f" vertices; {_AGAIN}"
+        )
     return Surface(vertices, faces, colors, confidence)
 
 
 def check_faces(faces: np.ndarray, count: int) -> None:
-    """Raise ValueError if faces (F, 3) name vertices that a mesh of `count` does not have."""
+    """Raise ValueError if faces (F, 3) refer to vertices beyond the `count` that a mesh has."""
     if len(faces) and (faces.min() < 0 or faces.max() >= count):
         raise ValueError(f"triangles name vertices {faces.min()} to {faces.max()} of {count}")
 
@@ -95,8 +95,8 @@ def write_obj(
 ) -> None:
     """Write an OBJ file of vertices (V, 3) and faces (F, 3) with texture coordinates.
 
-    These are ``uv`` (T, 2) and ``uv_faces`` (F, 3). ``texture`` is the file name of a picture
-    beside the OBJ; an .mtl of the OBJ's name then names it.
+    The coordinates are ``uv`` (T, 2) and ``uv_faces`` (F, 3). ``texture`` is the file name of a
+    picture beside the OBJ; an .mtl file with the OBJ's name then refers to it.
     """
     lines = []
     if texture is not None:
@@ -121,10 +121,10 @@ def write_glb(
     uv: np.ndarray | None = None,
     **material: Any,
 ) -> None:
-    """Write a binary glTF file of one rough, not metallic mesh: vertices (V, 3) and faces (F, 3).
+    """Write a binary glTF file of one rough, non-metallic mesh: vertices (V, 3) and faces (F, 3).
 
     Normals (V, 3) have unit length; colours (V, 4) are uint8, linear light, as glTF 2.0 (3.9.2)
-    takes COLOR_0; ``uv`` is (V, 2). What is in ``material`` are further properties of trimesh's
+    defines COLOR_0; ``uv`` is (V, 2). ``material`` holds further properties of trimesh's
     PBRMaterial, such as its texture.
     """
     import trimesh
@@ -143,7 +143,7 @@ def cotangent_laplacian(
 ) -> tuple[sparse.csr_matrix, np.ndarray]:
     """Return cotangent stiffness (V, V) and lumped mass (V,) of a mesh (V, 3), (F, 3).
 
-    Source: Pinkall and Polthier 1993. Only edges' positive weights are kept, so that slivers do no
+    Source: Pinkall and Polthier 1993. Only positive edge weights are kept, so that slivers do no
     harm and the matrix is positive semi-definite.
     """
     count = len(vertices)

@@ -19,18 +19,18 @@ def mesh_scene(vertices: np.ndarray, faces: np.ndarray) -> o3d.t.geometry.Raycas
 
 
 def join_rays(origins: np.ndarray, directions: np.ndarray) -> o3d.core.Tensor:
-    """Make rays (..., 6) for Open3D of origins and directions (..., 3); one may be shared."""
+    """Make rays (..., 6) for Open3D from origins and directions (..., 3), which broadcast."""
     both = np.broadcast_arrays(origins, directions)
     return o3d.core.Tensor(np.concatenate(both, axis=-1, dtype=np.float32))
 
 
 def camera_rays(camera: Camera) -> o3d.core.Tensor:
-    """Make a ray (H, W, 6) per pixel centre; distances along it are depth, camera z."""
+    """Make a ray (H, W, 6) through each pixel centre; distance along it is depth, camera z."""
     return join_rays(*rays(camera))
 
 
 def barycentrics(hits: dict[str, o3d.core.Tensor], hit: np.ndarray) -> np.ndarray:
-    """Return the barycentric weights (N, 3), in the faces that they hit, of the marked rays."""
+    """Return the barycentric weights (N, 3) of the marked rays in the faces that they hit."""
     u, v = hits["primitive_uvs"].numpy()[hit].T
     return np.stack([1 - u - v, u, v], axis=1)
 
@@ -38,13 +38,13 @@ def barycentrics(hits: dict[str, o3d.core.Tensor], hit: np.ndarray) -> np.ndarra
 def visible_faces(
     vertices: np.ndarray, faces: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the face of a mesh (V, 3), (F, 3), metres, that each pixel centre of a pinhole sees.
+    """Find the face of a mesh (V, 3), (F, 3), metres, that each pixel of a pinhole camera sees.
 
     Returns:
-        Face ids (H, W) int64, -1 where there is none, and depth (H, W) float64, camera z in
-        metres, infinite there.
+        Face ids (H, W) int64, -1 if there is none, and depth (H, W) float64, camera z in metres,
+        infinite if there is none.
     """
-    # Far from the origin float32 rays are too coarse: everything is cast about the mesh's centre.
+    # Far from the origin float32 rays are too coarse, so rays are cast relative to the mesh centre.
     centre = vertices.mean(0)
     origin, directions = rays(camera)
     hit = mesh_scene(vertices - centre, faces).cast_rays(join_rays(origin - centre, directions))

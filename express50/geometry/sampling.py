@@ -1,4 +1,4 @@
-"""Resample: undistorted images, bilinear values, a smooth step, spherical harmonics."""
+"""Undistort and sample images; evaluate a smooth step and spherical harmonics."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import numpy as np
 from express50.geometry.cameras import Camera, in_field
 from express50.geometry.conventions import K_to_opencv, cell_centres, corner_to_cell
 
-# cv2.remap takes at most 32767 rows and columns; this many points per call fit the cache.
+# cv2.remap takes at most 32767 rows and columns; this many points per call fit in the cache.
 _COLUMNS, _ROWS = 4096, 2048
-COARSE = 64  # points across an image that say where a lens folds
-OUTSIDE = -10.0  # a place, in pixels, that no interpolation reaches the image from
+COARSE = 64  # points across an image that are tested for a fold of the lens
+OUTSIDE = -10.0  # pixels; too far outside for an interpolation to reach the image
 
 
 def undistort_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Map (H, W) x and y, float32, for ``cv2.remap`` from ``camera`` to its pinhole camera.
+    """Return maps (H, W) of x and y, float32, for ``cv2.remap`` from a camera to its pinhole.
 
     Where the lens folds, the map points outside the image.
     """
@@ -28,10 +28,10 @@ def undistort_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pictured_share(camera: Camera) -> float:
-    """Return the share of the pinhole camera's pixels, from a coarse grid, that the lens pictures.
+    """Return the share of the pinhole camera's pixels that the lens pictures, from a coarse grid.
 
-    It is under 1 where the distortion folds within the image: its coefficients then describe
-    another image size, or were fitted to points near the centre alone.
+    It is below 1 if the distortion folds within the image: its coefficients then belong to another
+    image size, or were fitted only to points near the centre.
     """
     across = np.linspace(0, camera.width, COARSE)
     return float(_pictured(camera, across, np.linspace(0, camera.height, COARSE)).mean())
@@ -61,7 +61,7 @@ def undistort_image(image: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def undistorted_mask(camera: Camera) -> np.ndarray:
-    """Return pixels (H, W), bool, of the pinhole camera that the distorted image really covers."""
+    """Return a mask (H, W) of the pinhole camera's pixels that the distorted image covers."""
     x, y = undistort_maps(camera)
     return (x >= 0) & (y >= 0) & (x <= camera.width - 1) & (y <= camera.height - 1)
 
@@ -69,9 +69,9 @@ def undistorted_mask(camera: Camera) -> np.ndarray:
 def bilinear(image: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Interpolate an image (H, W[, C]) at points (N, 2) quickly: (N[, C]) of the image's type.
 
-    The image is uint8, uint16, float32 or float64, of at most 4 channels; points are x, y with the
-    corner of the first pixel as origin. Outside the outermost pixels repeat. OpenCV rounds places
-    to 1/32 pixel; use `bilinear_slope` where that matters.
+    The image is uint8, uint16, float32 or float64 with at most 4 channels; points are x, y with the
+    corner of the first pixel as origin. Outside the image its edge pixels repeat. OpenCV rounds
+    positions to 1/32 pixel; use `bilinear_slope` if that matters.
     """
     count = len(points)
     columns = min(_COLUMNS, max(count, 1))
@@ -87,12 +87,12 @@ def bilinear(image: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def bilinear_slope(image: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate an image (H, W, C) at points (N, 2) exactly, with the slope per pixel.
+    """Interpolate an image (H, W, C) at points (N, 2) exactly, with slopes per pixel.
 
-    Outside the image the outermost pixels repeat; the slope is that of the nearest cell.
+    Outside the image its edge pixels repeat; the slope is that of the nearest cell.
 
     Returns:
-        float64 values (N, C), and their derivatives (N, C, 2) by x and y.
+        float64 values (N, C), and their derivatives (N, C, 2) with respect to x and y.
     """
     height, width, channels = image.shape
     x, y = np.clip(corner_to_cell(points), 0.0, [width - 1.001, height - 1.001]).T

@@ -1,4 +1,4 @@
-"""Check array arguments; errors say expected and got in one line."""
+"""Check array arguments; errors say in one line what was expected and what was given."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-PIXEL_LIMIT = 200_000_000  # of an image; refuses decompression bombs; six times an 8K frame
+PIXEL_LIMIT = 200_000_000  # per image, six times an 8K frame; stops decompression bombs
 
 
 def check_shape(
@@ -15,7 +15,7 @@ def check_shape(
     """Raise unless ``array`` has the expected shape (``None`` stands for any length).
 
     Raises:
-        ValueError: the shape differs; the message names the argument, got and expected.
+        ValueError: the shape differs; the message names the argument and both shapes.
     """
     shape = tuple(array.shape)
     fits = len(shape) == len(expected) and all(
@@ -31,7 +31,7 @@ def check_finite(name: str, array: np.ndarray) -> None:
     """Raise if ``array`` holds NaN or Inf.
 
     Raises:
-        ValueError: how many values are not finite, and the index of the first.
+        ValueError: a value is not finite; the message says how many, and the index of the first.
     """
     bad = ~np.isfinite(array)
     if bad.any():

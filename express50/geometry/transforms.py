@@ -11,14 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from express50.geometry.shapes import check_shape
 
-LARGEST_ANGLE = 1e15  # radians; from here on float64 counts angles in steps of 0.1 and more
+LARGEST_ANGLE = 1e15  # radians; beyond this float64 resolves angles to 0.1 or worse
 
 
 def axis_angle_to_matrix(axis_angle: np.ndarray) -> np.ndarray:
     """Return rotation matrices (..., 3, 3) of axis-angle vectors (..., 3), radians.
 
     Raises:
-        ValueError: an angle is infinite, or so large that float64 cannot hold its part of a turn.
+        ValueError: an angle is infinite, or too large for float64 to resolve a fraction of a turn.
     """
     largest = np.abs(axis_angle).max(initial=0.0)
     if largest > LARGEST_ANGLE:
@@ -33,7 +33,7 @@ def quat_to_matrix(quats: np.ndarray) -> np.ndarray:
         ValueError: a quaternion has zero length.
     """
     quats = np.asarray(quats, dtype=np.float64)
-    largest = np.abs(quats).max(-1, keepdims=True)  # the squares of tiny and huge ones are lost
+    largest = np.abs(quats).max(-1, keepdims=True)  # squares of tiny or huge ones would be lost
     scaled = quats / np.where(largest > 0, largest, 1.0)
     return Rotation.from_quat(scaled, scalar_first=True).as_matrix()
 
@@ -75,7 +75,7 @@ def invert_transform(T: np.ndarray) -> np.ndarray:
 
 
 def is_rigid(T: np.ndarray) -> bool:
-    """Say whether a transform (4, 4) is finite and turns without scaling, shearing or mirroring."""
+    """Return True if a transform (4, 4) is finite, and a rotation and translation only."""
     R = T[:3, :3]
     turns = np.isfinite(T).all() and np.abs(R @ R.T - np.eye(3)).max() <= 1e-4
     return bool(turns and np.linalg.det(R) > 0)
@@ -100,7 +100,7 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
 def rigid_fit(
     source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fit R (3, 3) and t (3,) that take ``source`` (N, 3) to ``target`` (N, 3), least squares."""
+    """Fit R (3, 3) and t (3,) that map ``source`` (N, 3) to ``target`` (N, 3) in least squares."""
     return _procrustes(source, target, weights, with_scale=False)[1:]
 
 
@@ -112,14 +112,14 @@ def similarity_fit(source: np.ndarray, target: np.ndarray) -> tuple[float, np.nd
 def _procrustes(
     source: np.ndarray, target: np.ndarray, weights: np.ndarray | None, with_scale: bool
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Fit the similarity of least weighted squares (Umeyama 1991)."""
+    """Fit a similarity by weighted least squares (Umeyama 1991)."""
     source = np.asarray(source, dtype=np.float64)
     target = np.asarray(target, dtype=np.float64)
     check_shape("source", source, (None, 3))
     check_shape("target", target, (source.shape[0], 3))
     w = np.ones(len(source)) if weights is None else np.asarray(weights, dtype=np.float64)
     if len(source) < 3 or w.sum() <= 0:
-        raise ValueError(f"a rigid fit needs 3 weighted points, got {int((w > 0).sum())}")
+        raise ValueError(f"a rigid fit needs 3 points with weight, got {int((w > 0).sum())}")
     if not (np.isfinite(source).all() and np.isfinite(target).all()):
         raise ValueError("a rigid fit needs finite points, got NaN or infinity")
     w = w / w.sum()

@@ -14,7 +14,8 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
 
     Source: Rodrigues' formula; series below 1e-3 rad keep value and gradient smooth through zero.
     """
-    # rsub(x, a, alpha=b) is a - b x; forward differentiation of x * b loads torch's compiler, 1 s.
+    # rsub(x, a, alpha=b) is a - b x; forward differentiation of x * b would load torch's compiler,
+    # which takes 1 s.
     theta2 = (axis_angle * axis_angle).sum(-1)
     small = theta2 < 1e-6
     safe = torch.where(small, torch.ones_like(theta2), theta2).sqrt()
@@ -36,7 +37,7 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
 
     A quaternion of zero length becomes the identity, with zero gradient.
     """
-    largest = quats.detach().abs().amax(-1, keepdim=True)  # squares of tiny and huge ones are lost
+    largest = quats.detach().abs().amax(-1, keepdim=True)  # squares of tiny or huge ones are lost
     zero = largest == 0
     quats = quats / torch.where(zero, torch.ones_like(largest), largest)
     norm2 = (quats * quats).sum(-1, keepdim=True)
@@ -55,8 +56,8 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
 def matrix_to_quat(R: Tensor) -> Tensor:
     """Return unit quaternions (..., 4), wxyz with w >= 0, of rotation matrices (..., 3, 3).
 
-    Takes the best conditioned of four branches (Shepperd 1978). The NumPy twin refuses reflections;
-    here they are not looked for, because each training step would wait for the GPU.
+    It takes the best conditioned of four branches (Shepperd 1978). The NumPy twin refuses
+    reflections; here they are not checked, because each training step would wait for the GPU.
     """
     m = R
     d0, d1, d2 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]

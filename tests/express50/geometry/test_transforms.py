@@ -78,7 +78,7 @@ def test_fits_recover_a_similarity_and_never_reflect():
 
 
 def test_fits_refuse_what_has_no_answer():
-    with pytest.raises(ValueError, match="3 weighted points"):
+    with pytest.raises(ValueError, match="3 points with weight"):
         transforms.rigid_fit(np.zeros((2, 3)), np.zeros((2, 3)))
     with pytest.raises(ValueError, match="not all the same"):
         transforms.rigid_fit(np.ones((5, 3)), np.zeros((5, 3)))
