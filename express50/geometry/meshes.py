@@ -69,7 +69,7 @@ def read_surface(path: Path) -> Surface:
         columns = o3d.t.io.read_point_cloud(str(path), format="ply").point
         colors = columns["colors"].numpy()
         confidence = columns["confidence"].numpy()[:, 0].astype(np.float64)
-    except Exception as error:  # noqa: BLE001  # both raise what the damage leads to
+    except Exception as error:  # noqa: BLE001  # on damage both may raise anything
         raise FormatError(f"{path}: not a surface from depth ({error}); {_AGAIN}") from None
     if not len(faces) or not (np.isfinite(vertices).all() and np.isfinite(confidence).all()):
         raise FormatError(

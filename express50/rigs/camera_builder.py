@@ -25,14 +25,14 @@ def camera_from_K(
     """Return a camera of the smallest COLMAP model that holds the distortion.
 
     Args:
-        camera_id: its name.
+        camera_id: camera name.
         K: (3, 3) pixels, corner origin.
-        dist: OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6; absent ones are 0.
+        dist: distortion in OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6; missing terms are 0.
         size: width and height, pixels.
         cam_from_world: (4, 4), OpenCV axes.
 
     Raises:
-        CalibrationError: K has skew, or distortion that no model holds (thin prism, tilt).
+        CalibrationError: K has skew, or no model holds the distortion (thin prism, tilt).
     """
     K, d = np.asarray(K, dtype=np.float64), np.zeros(14)
     given = np.asarray(dist, dtype=np.float64).ravel()
@@ -57,9 +57,10 @@ def camera_from_K(
 
 
 def names_from_files(files: Sequence[str]) -> list[str]:
-    """Name cameras after image files: the folder where each folder holds one, else the stem.
+    """Name cameras after image files: by folder if each folder holds one file, otherwise by stem.
 
-    ``cam00/000000.jpg, cam01/000000.jpg`` gives ``cam00, cam01``; ``x/a.jpg, x/b.jpg`` ``a, b``.
+    ``cam00/000000.jpg, cam01/000000.jpg`` gives ``cam00, cam01``; ``x/a.jpg, x/b.jpg`` gives
+    ``a, b``.
     """
     paths = [Path(f) for f in files]
     folders = [path.parent.name for path in paths]
@@ -76,14 +77,14 @@ def at_size(camera: Camera, size: tuple[int, int]) -> Camera:
     """Return the camera with K scaled to the footage's size (width, height).
 
     Raises:
-        CalibrationError: the aspect ratio differs: the images are cropped, not scaled.
+        CalibrationError: the aspect ratio differs, so the images were cropped, not scaled.
     """
     sx, sy = size[0] / camera.width, size[1] / camera.height
     if abs(sx / sy - 1) > 0.01:
         raise CalibrationError(
-            f"camera {camera.id}: calibrated at {camera.width}x{camera.height}, footage of"
-            f" {size[0]}x{size[1]} has another shape; expected the same aspect ratio: was the"
-            " footage cropped or turned?"
+            f"camera {camera.id}: calibrated at {camera.width}x{camera.height}, but the footage is"
+            f" {size[0]}x{size[1]}; expected the same aspect ratio: was the footage cropped or"
+            " rotated?"
         )
     return resized(camera, *size)
 
@@ -95,7 +96,7 @@ def in_metres(cameras: dict[str, Camera], metres_per_unit: float) -> dict[str, C
         CalibrationError: the factor is not a positive finite number.
     """
     if not (np.isfinite(metres_per_unit) and metres_per_unit > 0):
-        raise CalibrationError(f"scale {metres_per_unit} m per unit, expected a positive number")
+        raise CalibrationError(f"scale {metres_per_unit} m per unit; expected a positive number")
     found = {}
     for name, camera in cameras.items():
         pose = camera.cam_from_world.copy()
@@ -105,10 +106,10 @@ def in_metres(cameras: dict[str, Camera], metres_per_unit: float) -> dict[str, C
 
 
 def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Return a value as a float array of a shape.
+    """Convert a value to a finite float array of the given shape.
 
     Raises:
-        CalibrationError: it is not that; the message begins with ``what``.
+        CalibrationError: it is not such an array; the message begins with ``what``.
     """
     try:
         array = np.asarray(value, dtype=np.float64)
@@ -121,16 +122,16 @@ def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray
 
 
 def as_rig(cameras: Iterable[Camera], path: Path) -> dict[str, Camera]:
-    """Return the cameras of a file by name, after the checks of `checked`.
+    """Return the cameras of a file by name, after checking them with `checked`.
 
     Raises:
-        CalibrationError: as `checked`, or two share a name.
+        CalibrationError: as for `checked`, or two cameras share a name.
     """
     found: dict[str, Camera] = {}
     for camera in cameras:
         if found.setdefault(camera.id, camera) is not camera:
             raise CalibrationError(
-                f"{path}: two cameras are called {camera.id}, give each its own name"
+                f"{path}: two cameras are called {camera.id}; give each its own name"
             )
     return checked(found, path)
 
@@ -139,7 +140,8 @@ def checked(cameras: dict[str, Camera], path: Path) -> dict[str, Camera]:
     """Return the cameras after the checks that our own calibration file must pass.
 
     Raises:
-        CalibrationError: there are none, or one has a wrong rotation, focal length or number.
+        CalibrationError: there are no cameras, or one has an invalid rotation, focal length or
+            number.
     """
     return parse_cameras(camera_rows(cameras), str(path))
 

@@ -1,7 +1,7 @@
 """Read cameras of a COLMAP model (``cameras`` and ``images``, .bin or .txt) and nothing else.
 
-COLMAP's own reader trusts the counts in a binary file and allocates as much memory. The layout is
-that of COLMAP's documentation of its output format.
+COLMAP's own reader trusts the counts in a binary file and allocates memory for them. The layout is
+documented in COLMAP's description of its output format.
 """
 
 from __future__ import annotations
@@ -19,11 +19,10 @@ from express50.geometry.cameras import Camera
 from express50.geometry.transforms import make_transform, quat_to_matrix
 from express50.rigs.camera_builder import checked, names_from_files
 
-# COLMAP's models that our cameras have under the same name and order, by COLMAP's number: how many
-# parameters each has.
+# COLMAP's models that our cameras share, by COLMAP's number: name and number of parameters.
 HELD = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5),
         4: ("OPENCV", 8), 6: ("FULL_OPENCV", 12)}  # fmt: skip
-SIZE_LIMIT = 1 << 30  # bytes of a file; images hold every observed point
+SIZE_LIMIT = 1 << 30  # bytes per file; the images file holds every observed point
 
 
 class Lens(NamedTuple):
@@ -36,7 +35,10 @@ class Lens(NamedTuple):
 
 
 class Shot(NamedTuple):
-    """A posed image: quaternion (wxyz) and translation, world to camera; its camera's number."""
+    """A posed image: its file name, its camera's number, and its world-to-camera pose.
+
+    ``pose`` is a quaternion (wxyz) followed by a translation.
+    """
 
     name: str
     camera: int
@@ -49,12 +51,12 @@ def is_colmap(path: Path) -> bool:
 
 
 def read_colmap_images(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
-    """Return every posed image as a camera, and its image file, by camera.
+    """Return every posed image as a camera, and the image files by camera.
 
     World and unit are the model's own.
 
     Raises:
-        CalibrationError: the model cannot be read, or has a camera model that ours lack.
+        CalibrationError: the model cannot be read, or has an unsupported camera model.
     """
     binary = (path / "images.bin").is_file()
     try:
@@ -77,7 +79,7 @@ def read_colmap_images(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
         length = math.hypot(*turn)  # a damaged file's may be huge
         if lens is None or not (np.isfinite(shot.pose).all() and 0 < length < 1e6):
             raise CalibrationError(
-                f"{path}: image {shot.name} has no pose or no camera; export again"
+                f"{path}: image {shot.name} has no pose or no camera; export it again"
             )
         pose = make_transform(quat_to_matrix(turn / length), np.array(shot.pose[4:]))
         cameras[name] = Camera(name, lens.width, lens.height, lens.model, lens.params, pose)
@@ -117,7 +119,7 @@ def _read_text(path: Path) -> tuple[dict[int, Lens], list[Shot]]:
 def _read_binary(path: Path) -> tuple[dict[int, Lens], list[Shot]]:
     data = read_bytes(path / "cameras.bin", CalibrationError, SIZE_LIMIT)
     lenses, shots, place = {}, [], 8
-    # A wrong count does no harm: unpacking beyond the end raises.
+    # A wrong count does no harm: unpacking past the end raises.
     for _ in range(struct.unpack_from("<Q", data)[0]):
         number, kind, width, height = struct.unpack_from("<IiQQ", data, place)
         if kind not in HELD:

@@ -1,22 +1,22 @@
 """Read the cameras of calibrators and photogrammetry tools.
 
 - caliscope's camera_array.toml and aniposelib's calibration.toml (FreeMoCap, Pose2Sim): world to
-  camera; axes, pixels and distortion are OpenCV's; a rotation is a matrix or Rodrigues' vector. The
-  unit is the board's, metres in caliscope, whose ``rotation_count`` is how pictures are turned for
-  display: the calibration is of pictures as recorded.
-- Kalibr's camchain: ``T_cn_cnm1`` takes points from the camera before to this one. The world is the
-  first camera's; metres, OpenCV's pixels.
-- Qualisys' .qca.txt: camera to world, OpenGL's axes, each row of ``r`` an axis of the camera;
-  millimetres. Intrinsics count in 64ths of a pixel from the corner of the whole sensor, of which
-  ``fov_video`` is recorded, its last row and column included.
+  camera; axes, pixels and distortion are OpenCV's; a rotation is a matrix or a Rodrigues vector.
+  The unit is the board's (metres in caliscope). caliscope's ``rotation_count`` only rotates
+  pictures for display: the calibration is of pictures as recorded.
+- Kalibr's camchain: ``T_cn_cnm1`` maps points from the previous camera to this one. The world is
+  the first camera's; metres, OpenCV's pixels.
+- Qualisys' .qca.txt: camera to world, OpenGL's axes, each row of ``r`` is an axis of the camera;
+  millimetres. Intrinsics are in 64ths of a pixel from the corner of the whole sensor, of which
+  ``fov_video`` is recorded, including its last row and column.
 - Metashape: ``transform`` is camera to chunk, OpenCV's axes; the chunk's or the component's own
-  transform leads on to the world. ``cx`` and ``cy`` count from the picture's middle, P1 and P2 are
-  OpenCV's p2 and p1, B1 is what fx has over f, and B2 is skew.
+  transform maps it to the world. ``cx`` and ``cy`` are relative to the picture's centre, P1 and P2
+  are OpenCV's p2 and p1, B1 is fx minus f, and B2 is skew.
 - RealityCapture: one sidecar per picture. ``Rotation`` is world to camera by rows, OpenCV's axes;
-  ``Position`` is the camera's place. Focal length (for 36 mm) and principal point (from the middle)
-  are shares of the longer side; the last two distortion terms are OpenCV's p2 and p1.
-- VGGT: ``extrinsic`` is world to camera, OpenCV's axes. ``intrinsic`` is of the network's input,
-  whose middle is the principal point.
+  ``Position`` is the camera's position. Focal length (divided by 36 mm) and principal point (from
+  the centre) are fractions of the longer side; the last two distortion terms are OpenCV's p2, p1.
+- VGGT: ``extrinsic`` is world to camera, OpenCV's axes. ``intrinsic`` is for the network's input,
+  whose centre is the principal point.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ from express50.geometry.conventions import FLIP_YZ, K_from_opencv
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
 from express50.rigs.camera_builder import as_rig, camera_from_K, finite_array, names_from_files
 
-SUBPIXELS = 64  # of Qualisys in a pixel
+SUBPIXELS = 64  # Qualisys' units per pixel
 RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
 XCR = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 # Metashape's terms; the first ten are f, cx, cy, B1, B2, then OpenCV's distortion in its order.
 TERMS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "p2", "p1", "k3", "k4", "p3", "p4")
-PATCH = 14  # pixels; VGGT rounds the height of its input to a multiple, which stretches it
+PATCH = 14  # pixels; VGGT rounds its input's height to a multiple of this, which stretches it
 
 
 def read_calibration_toml(path: Path) -> dict[str, Camera]:
-    """Read the cameras of caliscope or aniposelib that have a pose, in the file's unit.
+    """Read those cameras of caliscope or aniposelib that have a pose, in the file's unit.
 
-    caliscope's are called ``cam_0`` and so on, as its videos are; aniposelib's have names.
+    caliscope's are called ``cam_0`` and so on, like its videos; aniposelib's have names.
 
     Raises:
-        CalibrationError: there are none, a value is missing, or a lens is a fisheye.
+        CalibrationError: there are no cameras, a value is missing, or a lens is a fisheye.
     """
     table = read_toml(path, CalibrationError)
     rows = table.get("cameras", table)
@@ -68,7 +68,9 @@ def read_calibration_toml(path: Path) -> dict[str, Camera]:
 
 def _toml_camera(where: str, name: str, row: dict[str, Any]) -> Camera:
     if row.get("fisheye"):
-        raise CalibrationError(f"{where}: fisheye, expected a perspective lens; undistort first")
+        raise CalibrationError(
+            f"{where}: is a fisheye, expected a perspective lens; undistort first"
+        )
     rotation = row["rotation"]
     if isinstance(rotation, list) and not any(isinstance(entry, list) for entry in rotation):
         R = axis_angle_to_matrix(finite_array(rotation, (3,), f"{where} has rotation"))
@@ -117,10 +119,10 @@ def read_kalibr(path: Path) -> dict[str, Camera]:
 
 
 def read_qualisys(path: Path) -> dict[str, Camera]:
-    """Read the active cameras of a calibration that QTM exported, by serial number, metres.
+    """Read the active cameras of a calibration exported by QTM, by serial number, metres.
 
     Raises:
-        CalibrationError: there are none, or one lacks a value.
+        CalibrationError: there are no active cameras, or one lacks a value.
     """
     cameras = read_xml(path, CalibrationError).iter("camera")
     kept = [c for c in cameras if c.get("active") != "0" and c.get("calibrated") != "false"]
@@ -153,8 +155,8 @@ def read_metashape(path: Path) -> dict[str, Camera]:
     """Read the aligned cameras of a chunk, named after their labels, in the chunk's unit.
 
     Raises:
-        CalibrationError: it is not one chunk in one piece, a value is missing, or a lens has a
-            type or terms that OpenCV's model lacks.
+        CalibrationError: it is not one chunk aligned in one component, a value is missing, or a
+            lens has a type or terms that OpenCV's model lacks.
     """
     chunks = list(read_xml(path, CalibrationError).iter("chunk"))
     aligned = [
@@ -164,7 +166,7 @@ def read_metashape(path: Path) -> dict[str, Camera]:
     if len(chunks) != 1 or len(parts) != 1:
         raise CalibrationError(
             f"{path}: {len(chunks)} chunks, {len(aligned)} aligned cameras in {len(parts)}"
-            " components; expected one chunk, aligned in one component: export that alone"
+            " components; expected one chunk, aligned in one component: export only that"
         )
     motion = _world_from_chunk(path, chunks[0], parts.pop())
     sensors = {sensor.get("id"): sensor for sensor in chunks[0].iter("sensor")}
@@ -174,7 +176,7 @@ def read_metashape(path: Path) -> dict[str, Camera]:
 
 
 def _world_from_chunk(path: Path, chunk: Element, part: str) -> np.ndarray:
-    """Read the similarity (4, 4) to the world; the identity where the chunk has none."""
+    """Read the similarity (4, 4) to the world; return the identity if the chunk has none."""
     inner = [c for c in chunk.iter("component") if c.get("id") == part]
     found = [e.find("transform") for e in [*inner, chunk]]
     element = next((e for e in found if e is not None), None)
@@ -203,8 +205,8 @@ def _metashape_camera(
     odd = [key for key in ("k4", "p3", "p4") if value.get(key)]
     if odd or "f" not in value:
         raise CalibrationError(
-            f"{where}: has {', '.join(odd) or 'no f'}, expected f cx cy b1 b2 k1 k2 k3 p1 p2 alone;"
-            " optimise the cameras without the others"
+            f"{where}: has {', '.join(odd) or 'no f'}, expected f and only cx cy b1 b2 k1 k2 k3 p1"
+            " p2; optimise the cameras without other terms"
         )
     f, cx, cy, b1, b2, *dist = (value.get(key, 0.0) for key in TERMS[:10])
     sides = {} if (size := lens.find("resolution")) is None else size.attrib
@@ -226,21 +228,21 @@ def _numbers(where: str, element: Element, child: str, count: int) -> np.ndarray
 def read_reality_capture(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
     """Read an XMP sidecar, or a folder of them, named after the files, in the project's unit.
 
-    ``size`` is the width and height of the pictures, which sidecars do not say.
+    ``size`` is the width and height of the pictures, which sidecars do not give.
 
     Raises:
         CalibrationError: no size is given, a value is missing, or a lens has a model or terms that
             OpenCV's model lacks.
     """
     if size is None:
-        raise CalibrationError(f"{path}: does not say the images' size; give --size WIDTHxHEIGHT")
+        raise CalibrationError(f"{path}: does not give the images' size; pass --size WIDTHxHEIGHT")
     files = sorted(path.glob("*.xmp")) if path.is_dir() else [path]
     named = zip(names_from_files([file.name for file in files]), files, strict=True)
     return as_rig((_sidecar(name, file, size) for name, file in named), path)
 
 
 def _sidecar(name: str, path: Path, size: tuple[int, int]) -> Camera:
-    value: dict[str, str] = {}  # properties stand as attributes or as elements
+    value: dict[str, str] = {}  # properties are either attributes or elements
     for row in read_xml(path, CalibrationError).iter(f"{RDF}Description"):
         value |= row.attrib | {child.tag: child.text or "" for child in row}
 
@@ -253,7 +255,7 @@ def _sidecar(name: str, path: Path, size: tuple[int, int]) -> Camera:
     cx, cy = (numbers(f"PrincipalPoint{axis}", 1, "0")[0] * side for axis in "UV")
     K = np.array([[f, 0, size[0] / 2 + cx], [0, f, size[1] / 2 + cy], [0, 0, 1]])
     model = value.get(f"{XCR}DistortionModel", "")
-    # RealityCapture's own spelling. Old releases leave zeros at the end out.
+    # RealityCapture's own spelling. Old releases leave out trailing zeros.
     count = min(len(value.get(f"{XCR}DistortionCoeficients", "").split()), 6)
     terms = np.pad(numbers("DistortionCoeficients", count), (0, 6 - count))
     k1, k2, k3, k4, t1, t2 = terms
@@ -269,13 +271,13 @@ def _sidecar(name: str, path: Path, size: tuple[int, int]) -> Camera:
 
 
 def read_vggt(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
-    """Read the cameras of a ``predictions.npz``, called ``cam00`` and so on in its order.
+    """Read the cameras of a ``predictions.npz``, called ``cam00`` and so on in file order.
 
-    The unit is the network's own. K is scaled to ``size`` where the network saw whole pictures,
-    stretched by no more than it rounds.
+    The unit is the network's own. K is scaled to ``size`` if the network saw whole pictures, which
+    means that their aspect ratios agree within its rounding.
 
     Raises:
-        CalibrationError: an array is missing or has another shape.
+        CalibrationError: an array is missing or has the wrong shape.
     """
     names = ("extrinsic", "intrinsic")
     arrays = read_arrays(path, CalibrationError, "VGGT's predictions", names)

@@ -27,7 +27,7 @@ def read_nersemble(path: Path) -> dict[str, Camera]:
     """Read cameras by serial number, at the release's full size.
 
     Raises:
-        CalibrationError: world_2_cam or intrinsics are missing or have another shape.
+        CalibrationError: world_2_cam or intrinsics are missing or have the wrong shape.
     """
     table = read_json_table(path, CalibrationError)
     poses, intrinsics = table.get("world_2_cam"), table.get("intrinsics")
@@ -49,14 +49,14 @@ def read_renderme(path: Path) -> dict[str, Camera]:
     """Read the cameras of an SMC with a Calibration group (in full releases the ``_anno`` one).
 
     Raises:
-        CalibrationError: the file has no calibration or no resolution, or an array's shape is off.
+        CalibrationError: the file has no calibration, or its resolution or an array is malformed.
     """
     try:
         file = open_hdf5(path)
         group = child(file, "Calibration")
         if not isinstance(group, h5py.Group):
             raise CalibrationError(
-                f"{path}: has no Calibration; expected it in the anno file of the same performance"
+                f"{path}: has no Calibration group; use the anno file of the same performance"
                 f" ({path.name.replace('_raw', '_anno')})"
             )
         size = _smc_size(path, file)
@@ -82,7 +82,7 @@ def read_renderme(path: Path) -> dict[str, Camera]:
 
 
 def _smc_size(path: Path, file: h5py.File) -> tuple[int, int]:
-    """Read width and height, which are stored the other way round; else the release's own."""
+    """Read the size, stored as height and width; return width and height, or the release's size."""
     group = child(file, "Camera")
     size = np.array((2048, 2448))
     if isinstance(group, h5py.Group):

@@ -1,7 +1,7 @@
 """Read a rig in any known format, at the footage's size, in metres.
 
-Most formats have modules of their own. OpenCV's YAML, one file per camera, is read here; it puts
-the pixel origin at the first pixel's centre, so that K is shifted.
+Most formats have modules of their own. OpenCV's YAML, one file per camera, is read here; its pixel
+origin is the first pixel's centre, so K is shifted.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ YAML = (".yml", ".yaml")
 
 
 class RigFormat(NamedTuple):
-    """A test for a format and its reader; the reader also gets the footage's size, or None."""
+    """A format's title, test and reader; the reader also gets the footage's size, or None."""
 
     title: str
     fits: Callable[[Path], bool]
@@ -112,18 +112,18 @@ def guess_format(path: Path) -> str:
     """Return the format of a file or folder.
 
     Raises:
-        CalibrationError: it does not exist, is a .json that is not JSON, or fits none.
+        CalibrationError: the path does not exist, is a .json that is not JSON, or fits no format.
     """
     if not path.exists():
         raise CalibrationError(f"{path}: does not exist")
     found = next((name for name, known in FORMATS.items() if known.fits(path)), None)
     if found is None:
         if path.suffix == ".json":
-            read_json(path, CalibrationError)  # says what is wrong where it is not JSON
+            read_json(path, CalibrationError)  # reports what is wrong if it is not JSON
         titles = [known.title for known in FORMATS.values()]
         raise CalibrationError(
-            f"{path}: no known calibration; expected {', '.join(titles[:-1])} or {titles[-1]}:"
-            " name --format"
+            f"{path}: is not a known calibration; expected {', '.join(titles[:-1])} or"
+            f" {titles[-1]}: choose one with --format"
         )
     return found
 
@@ -134,10 +134,10 @@ def read_rig(
     size: tuple[int, int] | None = None,
     metres_per_unit: float = 1.0,
 ) -> dict[str, Camera]:
-    """Read the cameras of a calibration that another tool wrote, a file or a folder.
+    """Read the cameras of a calibration file or folder that another tool wrote.
 
-    ``kind`` is one of FORMATS, None guesses; K is scaled to ``size``, width and height of the
-    footage; the file's world is in units of ``metres_per_unit``.
+    ``kind`` is one of FORMATS, or None to detect it; K is scaled to ``size``, the footage's width
+    and height; the file's unit is ``metres_per_unit`` long.
 
     Raises:
         CalibrationError: no format fits, or the content does not fit the format.
@@ -151,7 +151,7 @@ def read_rig(
 def read_opencv_yaml(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
     """Read the cameras of a folder of ``<camera>.yml`` files, or one such file.
 
-    ``size`` is the width and height of the images where the files do not say.
+    ``size`` is the width and height of the images, used if the files do not give them.
 
     Raises:
         CalibrationError: a matrix is missing or has the wrong shape, or no size is known.
@@ -179,7 +179,7 @@ def read_opencv_yaml(path: Path, size: tuple[int, int] | None) -> dict[str, Came
             shape = int(width), int(height)
         if shape is None:
             raise CalibrationError(
-                f"{file}: does not say the images' size; give --size WIDTHxHEIGHT"
+                f"{file}: does not give the images' size; pass --size WIDTHxHEIGHT"
             )
         pose = make_transform(R, t.ravel())
         found[file.stem] = camera_from_K(file.stem, K_from_opencv(K), dist, shape, pose)
@@ -187,7 +187,7 @@ def read_opencv_yaml(path: Path, size: tuple[int, int] | None) -> dict[str, Came
 
 
 def _matrix(table: object, keys: tuple[str, ...], path: Path) -> np.ndarray:
-    """Read the first of the named matrices, rows of numbers or OpenCV's own; empty without one."""
+    """Read the first matrix found, as rows of numbers or in OpenCV's form; empty if none is."""
     if not isinstance(table, dict):
         raise CalibrationError(f"{path}: holds no named values, expected OpenCV's matrices")
     name = next((key for key in keys if key in table), "")

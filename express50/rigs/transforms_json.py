@@ -1,6 +1,6 @@
 """Read cameras of ``transforms.json`` (instant-ngp, Nerfstudio, VHAP, GaussianAvatars).
 
-Poses are camera to world with OpenGL axes; intrinsics stand beside each frame or at the top.
+Poses are camera to world with OpenGL axes; intrinsics are given per frame or at the top level.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ def _file(path: Path) -> Path:
 
 
 def read_transforms(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
-    """Read one camera per frame, or per camera index where time steps share cameras.
+    """Read one camera per frame, or per camera index if time steps share cameras.
 
-    The path may be the folder of transforms.json; ``size`` is width and height where that does not
-    say.
+    The path may be the folder of transforms.json; ``size`` is the width and height to use if the
+    file gives none.
 
     Raises:
         CalibrationError: a frame lacks what a camera needs, or a camera moves between frames.
@@ -60,7 +60,7 @@ def read_transforms(path: Path, size: tuple[int, int] | None) -> dict[str, Camer
         try:
             camera = frame_camera(where, name, table | frame, size)
         except (TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
-            raise CalibrationError(f"{where}: a value has the wrong kind ({error})") from None
+            raise CalibrationError(f"{where}: a value has the wrong type ({error})") from None
         earlier = found.setdefault(name, camera)
         if np.abs(earlier.cam_from_world - camera.cam_from_world).max() > 1e-6:
             raise CalibrationError(
@@ -71,7 +71,7 @@ def read_transforms(path: Path, size: tuple[int, int] | None) -> dict[str, Camer
 
 
 def camera_names(frames: list[dict]) -> list[str]:
-    """Name the camera of each frame: by its index where all have one, else by its file."""
+    """Name the camera of each frame by its index if all have one, otherwise by its file."""
     if all("camera_index" in frame for frame in frames):
         return [f"cam{int(frame['camera_index']):02d}" for frame in frames]
     return names_from_files(
@@ -80,11 +80,11 @@ def camera_names(frames: list[dict]) -> list[str]:
 
 
 def frame_camera(where: str, name: str, row: dict, size: tuple[int, int] | None) -> Camera:
-    """Make the camera of one frame's row; ``size`` is its picture's where the row does not say.
+    """Make the camera of one frame's row; ``size`` is used if the row gives no image size.
 
     Raises:
         CalibrationError: the row lacks what a camera needs.
-        TypeError, ValueError, OverflowError, ZeroDivisionError: a value has the wrong kind.
+        TypeError, ValueError, OverflowError, ZeroDivisionError: a value has the wrong type.
     """
     model = str(row.get("camera_model", "OPENCV"))
     if model not in _HELD:
@@ -101,7 +101,7 @@ def frame_camera(where: str, name: str, row: dict, size: tuple[int, int] | None)
     if "w" in row and "h" in row:
         size = int(row["w"]), int(row["h"])
     if size is None:
-        raise CalibrationError(f"{where}: has no w and h; give --size WIDTHxHEIGHT")
+        raise CalibrationError(f"{where}: has no w and h; pass --size WIDTHxHEIGHT")
     fx, fy = _focal(row, "x", size[0]), _focal(row, "y", size[1])
     if fx is None:
         raise CalibrationError(f"{where}: has neither fl_x nor camera_angle_x; add one")
@@ -118,7 +118,7 @@ def frame_camera(where: str, name: str, row: dict, size: tuple[int, int] | None)
 
 
 def _focal(row: dict, axis: str, side: int) -> float | None:
-    """Return the focal length along an axis, pixels, or None where it is not given."""
+    """Return the focal length along an axis, pixels, or None if it is not given."""
     if f"fl_{axis}" in row:
         return float(row[f"fl_{axis}"])
     if f"camera_angle_{axis}" in row:

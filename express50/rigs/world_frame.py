@@ -1,16 +1,16 @@
-"""Check where a rig looks, as any calibration must pass, and choose a solved rig's world.
+"""Check where a rig looks, which every calibration must pass, and choose a solved rig's world.
 
-Cameras of a head rig look at one place in front of them all. A calibration read the wrong way round
-(camera to world for world to camera, or OpenGL axes for OpenCV's) fails this, and usually only one
-reading passes.
+The cameras of a head rig all look at a point in front of them. A calibration with the wrong
+convention (camera to world instead of world to camera, or OpenGL axes instead of OpenCV's) fails
+this check, and usually only one convention passes.
 
 The world of a solved rig is made from the cameras alone, so that the same footage always gives the
 same one:
 - origin: the point nearest to all optical axes (where the rig looks);
-- y: up, against the mean of the cameras' downward image axes, or the head's own up where that is
-  known and says that the cameras lie on their sides;
-- z: from the origin towards the mean camera, level; a rig round the whole subject has no such
-  side, then towards the first camera by name.
+- y: up, opposite to the mean of the cameras' downward image axes, or the head's own up if it is
+  known and shows that the cameras lie on their sides;
+- z: horizontally from the origin towards the mean camera, or towards the first camera by name if
+  the rig surrounds the subject and has no such side.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from express50.geometry.cameras import Camera, transform_camera
 from express50.geometry.conventions import FLIP_YZ
 from express50.geometry.transforms import is_rigid, make_transform
 
-# Below this the mean viewing side of a rig is noise: the cameras stand all round.
+# Below this the mean viewing direction of a rig is noise: the cameras surround the subject.
 CLEAR_SIDE = 0.15
-# Cosine to the head's up below which the cameras, not the head, lie on their side.
+# If the cosine to the head's up is below this, the cameras, not the head, lie on their side.
 ON_ITS_SIDE = 0.7
-# Axes within about 1 degree of parallel meet nowhere in particular.
+# Axes within about 1 degree of parallel have no useful meeting point.
 PARALLEL = 3e-4
-# A rig whose cameras stand closer to the head or further from it than this is not in metres.
+# A rig whose cameras are closer to the head or farther from it than this is not in metres.
 NEAR_M, FAR_M = 0.1, 10.0
 
 
@@ -52,7 +52,7 @@ def meeting_point(cameras: Mapping[str, Camera]) -> np.ndarray | None:
 def depths_behind(cameras: Mapping[str, Camera]) -> dict[str, float]:
     """Return the depths, metres, of the cameras that have the rig's meeting point behind them.
 
-    Inverted matrices (camera to world) and a wrong axis convention show here. Empty where the axes
+    Inverted matrices (camera to world) and a wrong axis convention show up here. Empty if the axes
     do not meet.
     """
     point = meeting_point(cameras)
@@ -83,7 +83,7 @@ def check_meeting(cameras: Mapping[str, Camera], where: str) -> None:
 
 
 def _describe_behind(depths: Mapping[str, float]) -> str:
-    """Put the result of `depths_behind` into words; empty where it is empty."""
+    """Describe the result of `depths_behind`; return "" if it is empty."""
     if not depths:
         return ""
     shown = ", ".join(f"{name} (z = {depth:.3g} m)" for name, depth in list(depths.items())[:4])
@@ -93,15 +93,15 @@ def _describe_behind(depths: Mapping[str, float]) -> str:
 
 @dataclass(frozen=True)
 class RigVerdict:
-    """Figures and warnings of a rig.
+    """Figures and warnings about a rig.
 
     Attributes:
-        cameras: how many.
-        meeting: (3,) world point nearest to all axes, None when they are parallel.
+        cameras: number of cameras.
+        meeting: (3,) world point nearest to all axes, None if they are parallel.
         distance_m: median distance of the cameras from it.
         miss_mm: median distance of the axes from it.
         problem: what is wrong, empty if nothing is.
-        remedy: the reading that would fix it, empty if none would.
+        remedy: the convention that would fix it, empty if none would.
         warnings: what is unusual but may be intended.
     """
 
@@ -127,15 +127,17 @@ def judge(cameras: Mapping[str, Camera]) -> RigVerdict:
     warnings = []
     if not NEAR_M < distance < FAR_M:
         warnings.append(
-            f"cameras stand {distance:.3g} m from where they look: are the units metres?"
+            f"cameras are {distance:.3g} m from the point they look at: are the units metres?"
         )
     stray = [name for name, miss in misses.items() if miss > 0.35 * distance]
     if stray:
-        warnings.append(f"{', '.join(stray)} look elsewhere than the others")
+        warnings.append(f"{', '.join(stray)}: not looking at the same point as the others")
     for name, camera in cameras.items():
         offset = np.abs(camera.K[:2, 2] / (camera.width, camera.height) - 0.5).max()
         if offset > 0.2:
-            warnings.append(f"{name}: principal point {offset:.0%} of the image from its middle")
+            warnings.append(
+                f"{name}: principal point is {offset:.0%} of the image away from its centre"
+            )
     return RigVerdict(
         cameras=len(cameras),
         meeting=(float(point[0]), float(point[1]), float(point[2])),
@@ -148,7 +150,7 @@ def judge(cameras: Mapping[str, Camera]) -> RigVerdict:
 
 
 def _remedy(cameras: Mapping[str, Camera]) -> str:
-    """Name the first other reading of the matrices that passes."""
+    """Return how to convert the matrices so that they pass; "" if no other convention does."""
     readings = {
         "the matrices are camera to world: invert them": lambda T: np.linalg.inv(T),
         "the axes are OpenGL's: flip y and z": lambda T: FLIP_YZ @ T,
@@ -169,8 +171,8 @@ def canonical_from_rig(
 ) -> np.ndarray:
     """Return the transform (4, 4) from the rig's space to the canonical world of this module.
 
-    `fallback` (3,), rig space, is the origin when the axes do not meet (one camera, or parallel);
-    `head_up` (3,) is the direction from chin to crown, where a head is known.
+    `fallback` (3,), rig space, is the origin if the axes do not meet (one camera, or parallel
+    axes); `head_up` (3,) is the direction from chin to crown, if a head is known.
     """
     met = meeting_point(cameras)
     origin = fallback if met is None else met
@@ -193,7 +195,7 @@ def canonical_from_rig(
 
 
 def _level(vector: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Return the unit direction of a vector's part across `up`; zero if there is hardly any."""
+    """Return the unit direction of a vector's part perpendicular to `up`; zero if it is tiny."""
     level = vector - up * (up @ vector)
     length = np.linalg.norm(level)
     return level / length if length > 1e-3 * np.linalg.norm(vector) else np.zeros(3)

@@ -286,5 +286,5 @@ def test_arrays_of_another_shape_and_missing_sizes_are_named(tmp_path):
 def test_footage_of_another_shape_than_the_network_saw_is_refused(tmp_path):
     path, _ = write_vggt(tmp_path)
     assert read_rig(path)["cam00"].height == 686
-    with pytest.raises(CalibrationError, match="another shape"):
+    with pytest.raises(CalibrationError, match="expected the same aspect ratio"):
         read_rig(path, size=(640, 480))

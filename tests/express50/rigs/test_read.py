@@ -259,7 +259,7 @@ def test_units_become_metres(tmp_path):
 def test_rubbish_is_one_clear_error(tmp_path, content):
     path = tmp_path / "rubbish.json"
     path.write_text(content)
-    with pytest.raises(CalibrationError, match="no known calibration|not JSON"):
+    with pytest.raises(CalibrationError, match="is not a known calibration|not JSON"):
         read_rig(path)
     for kind in ("transforms", "nersemble", "express50", "renderme360"):
         with pytest.raises(CalibrationError, match="rubbish.json"):
