@@ -37,7 +37,7 @@ REGIONS = {
     "mouth": ("lips", "teeth", "tongue", "mouth"), "eyes": ("eyes",), "skin": ("skin", "ears"),
     "hair": ("hair",),
 }  # fmt: skip
-LEAST_PX = 20  # per region; the PSNR of fewer is unreliable
+LEAST_PX = 20  # in a region; the PSNR of fewer pixels is unreliable
 PSNRS = ("psnr_db", "psnr_head_db", *(f"psnr_{region}_db" for region in REGIONS))
 NUMBERS = (
     *PSNRS, "ssim", "ssim_head", "rmse", "rmse_head",

@@ -38,7 +38,7 @@ COEFFICIENTS, DIRECTIONS = 10, 4  # sliders of each kind
 QUALITY = {True: 80, False: 95}  # JPEG, while moving and at rest
 SAME = "the same"  # residual code as the expression's
 SLOW_SECONDS = 0.04  # slower colours are not decoded while the camera moves
-TURN_DEGREES = 1.5  # smaller changes of the colours are invisible
+TURN_DEGREES = 1.5  # smaller camera turns change the colours invisibly
 
 
 class Preview:

@@ -17,12 +17,8 @@ from express50.capture.expressions import NEUTRAL, Expression
 
 CANDIDATES, CANDIDATE_GAP = 5, 3
 NEAR_FRAMES = 2.0  # an event's direction is learnt from frames about its apex (sigma)
-OVERRULE = (
-    2.0  # another event replaces the strongest one if it is this much more like the reference's
-)
-OVERRULE_COSINE = (
-    0.3  # and moves in the same direction at all: two events of noise are both unlike it
-)
+OVERRULE = 2.0  # an event this much more like the reference's replaces the strongest one,
+OVERRULE_COSINE = 0.3  # if it moves in that direction at all: noise is unlike it
 DISPUTED = 0.6  # factor on the confidence if the strongest event is not the most similar one
 APEX_LEVEL = 0.9  # a canonical frame at this share of its apex or more counts as the apex
 OTHER_SIDE = 0.05  # of the apex: what being on the other side of it counts

@@ -29,9 +29,7 @@ from express50.landmarks.network import CROP, MIRROR, LandmarkNet, face_box, loa
 SCHEMA = "express50.observations/1"
 SEEN_SCORE = 0.15  # least score of a frame that shows the face
 TRIES = 8  # number of other frames to search for a face if the frames at rest show none
-RANKED_SHARE = (
-    0.8  # share of the best camera's score: worse cameras add more noise than information
-)
+RANKED_SHARE = 0.8  # share of the best camera's score: worse cameras add mostly noise
 
 
 @dataclass(frozen=True)

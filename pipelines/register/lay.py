@@ -53,11 +53,7 @@ LEAST = 100  # vertices of bare skin, to know its colour
 SPREADS = (0.05, 0.05, 0.2)  # least standard deviations: red and blue over green, brightness; logs
 ODD = 3.0  # standard deviations at which a colour is half believed
 SURE = (0.5, 1.0)  # confidence, over that of bare skin: of nothing and of full trust
-AROUND_M, NEIGHBOURS, EVERY = (
-    0.008,
-    12,
-    14,
-)  # the rim of hair counts as hair: neighbours must be trusted too
+AROUND_M, NEIGHBOURS, EVERY = 0.008, 12, 14  # neighbours must be trusted: the rim of hair is hair
 
 
 @dataclass(frozen=True)
