@@ -1,9 +1,9 @@
 """Measure mattes against known alpha, beside plain keys and textbook matting.
 
 ``python -m benchmarks.matte`` draws scenes (`benchmarks.matte_scenes`: dark, blond and frizzy
-strands, each before a plain and a cluttered plate) and keys them with every preset; with
-``--twin`` it measures one preset on the peaks of the demo's twin too, undistorted with the true
-cameras so that only keying is measured.
+strands, each before a plain and a cluttered plate) and keys them (``standard``; presets key alike);
+with ``--twin`` it keys the peaks of the demo's twin too, undistorted with the true cameras so that
+only keying is measured.
 
 Baselines on the same pictures, with the plate in the frame's exposure as the key has it:
 ``hard_key`` (a threshold on the difference), ``soft_key`` (a ramp on the difference in measured
@@ -34,18 +34,16 @@ from benchmarks.calibrate import add_data_arguments, dataset_and_truth, rounded
 from benchmarks.matte_scenes import make_scenes
 from express50.capture.frames import read_frame, read_recorded_plate
 from express50.capture.index import read_index
-from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.files.images import srgb_to_linear
 from express50.geometry.cameras import pinhole
 from express50.geometry.sampling import undistort_image, undistorted_mask
 from express50.twin.truth import Truth
-from pipelines.matte import STAGE
+from pipelines.matte.config import MatteConfig
 from pipelines.matte.key import dilated, eroded, key_alpha
 from pipelines.matte.plates import exposed, exposure_gain
 from pipelines.pack.crop import own_colours
 
-PRESETS = ("draft", "standard", "reference")
 HARD = (4.0, 6.0, 10.0, 16.0, 24.0, 40.0)  # 8-bit steps
 LOW, HIGH = (2.0, 4.0, 8.0, 16.0, 32.0), (12.0, 25.0, 40.0, 60.0, 90.0)  # noise deviations
 RIM = 8.0  # pixels
@@ -74,34 +72,27 @@ def main() -> int:
     )
     add_data_arguments(parser)
     parser.add_argument("--size", type=int, default=640, help="pixels of a scene's side")
-    parser.add_argument("--set", dest="assignments", action="append", default=[])
-    parser.add_argument("--twin", metavar="PRESET", help="measure a preset on the twin too")
+    parser.add_argument("--twin", action="store_true", help="measure on the twin too")
     parser.add_argument("--pictures", type=int, default=24, help="of the twin, at most")
     args = parser.parse_args()
     cv2.setNumThreads(1)
     result: dict[str, object] = {"benchmark": "matte", "size": args.size}
-    result |= measured(scenes(args.size), PRESETS, args.assignments)
+    result |= measured(scenes(args.size))
     if args.twin:
         twin = pictures(*dataset_and_truth(args), args.pictures)
-        result["twin"] = measured(twin, (args.twin,), args.assignments, textbook=False)
+        result["twin"] = measured(twin, textbook=False)
     print(json.dumps(result))
     return 0
 
 
-def measured(
-    found: Iterable[Picture],
-    presets: tuple[str, ...],
-    assignments: list[str],
-    textbook: bool = True,
-) -> dict[str, object]:
-    """Return means over pictures of every preset and baseline, and ratios to the soft key."""
+def measured(found: Iterable[Picture], textbook: bool = True) -> dict[str, object]:
+    """Return means over pictures of our key and every baseline, and ratios to the soft key."""
     rows: Rows = {}
-    configs = {name: resolve_config(STAGE, name, None, assignments) for name in presets}
+    shadow = MatteConfig().shadow
     for picture in found:
-        for name, config in configs.items():
-            start = time.process_time()
-            alpha = key_alpha(picture.frame, picture.plate, picture.valid, config)
-            _add(rows, name, alpha, picture, time.process_time() - start)
+        start = time.process_time()
+        alpha = key_alpha(picture.frame, picture.plate, picture.valid, shadow)
+        _add(rows, "standard", alpha, picture, time.process_time() - start)
         for name, alpha, seconds in baselines(picture, textbook):
             _add(rows, name, alpha, picture, seconds)
         print(picture.name, rounded({n: r[-1]["sad"] for n, r in rows.items()}), file=sys.stderr)
@@ -109,12 +100,11 @@ def measured(
         name: {key: float(np.mean([row[key] for row in mine])) for key in mine[0]}
         for name, mine in rows.items()
     }
-    soft = means["soft_key"]
-    for name in presets:
-        for key in ("sad", "gradient_error", "sad_rim", "gradient_error_rim"):
-            short = key.replace("_error", "").replace("_rim", "")
-            end = "_rim" if key.endswith("_rim") else ""
-            means[name][f"{short}_ratio_to_soft_key{end}"] = means[name][key] / soft[key]
+    soft, ours = means["soft_key"], means["standard"]
+    for key in ("sad", "gradient_error", "sad_rim", "gradient_error_rim"):
+        short = key.replace("_error", "").replace("_rim", "")
+        end = "_rim" if key.endswith("_rim") else ""
+        ours[f"{short}_ratio_to_soft_key{end}"] = ours[key] / soft[key]
     return {"pictures": len(rows["soft_key"])} | {n: rounded(m) for n, m in means.items()}
 
 

@@ -186,7 +186,7 @@ def shots_of(dataset: Dataset, truth: Truth, subject: str, frame: int) -> list[S
 
 def key(shot: Shot) -> Keyed:
     """Return the shot with its camera's own alpha, by the standard preset."""
-    alpha = key_alpha(shot.frame, shot.plate, shot.valid, MatteConfig())
+    alpha = key_alpha(shot.frame, shot.plate, shot.valid, MatteConfig().shadow)
     return Keyed(shot, np.rint(255 * alpha).astype(np.uint8))
 
 

@@ -27,8 +27,6 @@ class MatteConfig:
     """Run the network on CUDA if available (auto), or only on CUDA."""
     tile: int = 2048
     """Longest side, pixels, of a tile that bgmv2 sees; larger frames are cut into tiles."""
-    scale: float = 1.0
-    """Key at this share of the resolution; the matte is enlarged afterwards."""
     shadow: float = 0.25
     """Broad darkening of the plate up to this share is a shadow; 0 turns this off."""
     agree: bool = True
@@ -41,9 +39,8 @@ class MatteConfig:
     def __post_init__(self) -> None:
         """Refuse values that matte nothing or everything."""
         check_ranges(
-            "matte", self, scale=(0.1, 1), shadow=(0, 0.99), tile=(512, math.inf), side=(16, 2048),
-            cells=(16, 256),
-        )  # fmt: skip
+            "matte", self, shadow=(0, 0.99), tile=(512, math.inf), side=(16, 2048), cells=(16, 256)
+        )
         if (self.method in NETWORKS) != bool(self.weights):
             raise ConfigError(
                 f"matte.method {self.method!r} with matte.weights {self.weights!r}: key and grabcut"
@@ -54,5 +51,5 @@ class MatteConfig:
 
 
 PRESETS: dict[str, dict[str, object]] = {
-    "draft": {"scale": 0.5, "side": 128, "cells": 64},
+    "draft": {"side": 128, "cells": 64},
 }

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.files.images import LIGHT_OF_LEVEL, edge_distance, resize_area
-from pipelines.matte.config import MatteConfig
+from express50.files.images import LIGHT_OF_LEVEL, edge_distance
 from pipelines.matte.plates import (
     PlateModel,
     blurred,
@@ -36,6 +35,8 @@ LOW = 1.2  # deviations of noise: as likely noise as subject; alpha is 0 below i
 HIGH = 6.0  # deviations of noise that prove foreground; weaker pixels must touch such ones
 FIRM = 0.5  # share of the local foreground's difference that may belong to the solid inside
 CORE = 0.018  # radius of the disc that must fit inside a part of the subject for it to be solid
+OPEN = 1.5  # deviations of noise: an area that differs by less shows the plate
+BLACK, WHITE = 24, 250  # grey levels beyond which two surfaces may look the same
 FILL = 0.012  # spots and gaps in the solid subject are filled this far from its edge
 _LUMA = np.array([[0.299, 0.587, 0.114]], dtype=np.float32)
 
@@ -52,35 +53,15 @@ class Support:
     near: np.ndarray
 
 
-def key_alpha(
-    frame: np.ndarray, plate: np.ndarray, valid: np.ndarray, config: MatteConfig
-) -> np.ndarray:
+def key_alpha(frame: np.ndarray, plate: np.ndarray, valid: np.ndarray, shadow: float) -> np.ndarray:
     """Key a frame (H, W, 3) uint8 against its plate: opacity (H, W) float32 in [0, 1].
 
-    Pixels outside `valid` (H, W) get 0.
+    Pixels outside `valid` (H, W) get 0. Darkening of the plate by up to `shadow` is a shadow.
     """
-    full = plate.shape[1], plate.shape[0]
-    size = tuple(max(8, round(n * config.scale)) for n in full)
-
-    def reduced(image: np.ndarray) -> np.ndarray:
-        return image if size == full else resize_area(image, *size)
-
-    small = reduced(frame)
-    inside = reduced(valid.astype(np.uint8) * 255) == 255
-    alpha = alpha_of(small, fit_plate(reduced(plate), small, inside), inside, config)
-    if size != full:
-        alpha = cv2.resize(alpha, full, interpolation=cv2.INTER_LINEAR)
-    return np.where(valid, alpha, np.float32(0))
-
-
-def alpha_of(
-    frame: np.ndarray, model: PlateModel, valid: np.ndarray, config: MatteConfig
-) -> np.ndarray:
-    """Key a frame (H, W, 3) uint8 at its own size; pixels outside `valid` (H, W) get 0."""
     alpha = np.zeros(valid.shape, np.float32)
     length = max(valid.shape)
-    image = frame.astype(np.float32)
-    dark, difference = plate_difference(image, model, config.shadow, length)
+    model, image = fit_plate(plate, frame, valid), frame.astype(np.float32)
+    dark, difference = plate_difference(image, model, shadow, length)
     difference[~valid] = 0.0
     region = subject_region(difference)
     if not region.any():
@@ -94,11 +75,12 @@ def alpha_of(
     part = PlateModel(model.plate[window], model.sigma[window], model.whiten)
     frame, image, dark = frame[window], image[window], dark[window]
     difference, region = difference[window], region[window]
+    clear = clear_plate(image, part, length)
     # The first solid only provides the colours nearby.
-    support = find_support(difference > 2 * LOW, region, length, eroded_about)
+    support = find_support(difference > 2 * LOW, region, clear, length, eroded_about)
     if support.core.any():
         firm = firm_pixels(image, difference, support.core, part, length)
-        support = find_support(firm, region, length)
+        support = find_support(firm, region, clear, length)
     alpha[window] = _opacity(frame, difference, dark, support, part, length)
     alpha[~valid] = 0.0
     return alpha
@@ -241,13 +223,26 @@ def subject_region(difference: np.ndarray) -> np.ndarray:
     return (sure & (area >= least))[labels]
 
 
+def clear_plate(image: np.ndarray, model: PlateModel, length: int) -> np.ndarray:
+    """Return the pixels (H, W) of wide areas that differ from the plate by mere noise.
+
+    The wall shows between a hand and the face. A shirt of the wall's colour has folds, darker and
+    brighter. Black hair before a black wall may have none, and neither has skin in front of a lamp
+    where both are white.
+    """
+    difference = _length(image - model.plate, model)
+    smooth = np.sqrt(cv2.blur(difference**2, (3, 3)))
+    exposed = (model.plate.max(axis=-1) > BLACK) & (model.plate.min(axis=-1) < WHITE)
+    return opened((smooth < OPEN) & exposed, _pixels(0.01, length), eroded_about)
+
+
 def find_support(
-    firm: np.ndarray, region: np.ndarray, length: int, erode: Erode = eroded
+    firm: np.ndarray, region: np.ndarray, clear: np.ndarray, length: int, erode: Erode = eroded
 ) -> Support:
     """Split the region (H, W) into the solid inside and the rest, where alpha is to be measured.
 
     `firm` (H, W) marks pixels that look opaque one by one; where they leave no gap that a strand
-    could make, and deep inside the outline, the subject is solid.
+    could make, and deep inside the outline, the subject is solid. `clear` (H, W) is outside.
     """
     solid = (firm & region).astype(np.uint8)
     radius, edge = _pixels(CORE, length), _pixels(FILL, length)
@@ -262,7 +257,8 @@ def find_support(
     fill = stats[:, cv2.CC_STAT_AREA] < LARGEST_HOLE * firm.size
     fill[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = False
     fill[0] = False  # the closed part itself
-    hull = closed | fill[labels]
+    wall = cv2.copyMakeBorder(clear.astype(np.uint8), pad, pad, pad, pad, cv2.BORDER_REPLICATE)
+    hull = (closed | fill[labels]) & (wall == 0)
     core = opened((solid > 0) | eroded_about(hull, 2 * edge), radius, erode)
     # The outermost pixels of the solid are mixed with plate by lens and sampling.
     core = eroded(core, 2 if length >= 256 else 1)[pad:-pad, pad:-pad]

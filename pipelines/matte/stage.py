@@ -189,7 +189,7 @@ def eight_bit(alpha: np.ndarray, valid: np.ndarray) -> np.ndarray:
 def _matter(config: MatteConfig) -> Matter:
     """Make the function that mattes one frame. Networks are imported here: torch is slow to."""
     if config.method in ("key", "grabcut"):
-        return lambda frame, plate, valid: key_alpha(frame, plate, valid, config)
+        return lambda frame, plate, valid: key_alpha(frame, plate, valid, config.shadow)
     from pipelines.matte.learned import BGMV2, SALIENT, background_alpha, salient_alpha
     from pipelines.networks import load_network as load_weights
 

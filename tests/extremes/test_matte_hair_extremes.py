@@ -13,7 +13,7 @@ from pipelines.matte.key import key_alpha
 
 def keyed(frame: np.ndarray, plate: np.ndarray) -> np.ndarray:
     """Alpha (H, W) with the default settings."""
-    return key_alpha(frame, plate, np.ones(plate.shape[:2], bool), MatteConfig())
+    return key_alpha(frame, plate, np.ones(plate.shape[:2], bool), MatteConfig().shadow)
 
 
 @pytest.mark.parametrize("blur", [0.0, 0.9])

@@ -125,7 +125,7 @@ def test_a_salient_network_needs_no_plate(tmp_path) -> None:
     alpha = read_image(folder / "cam00.png")
     assert alpha[64, 64] == 255 and alpha[2, 2] == 0
     before = {p: p.read_bytes() for p in folder.rglob("*.*")}
-    assert run(dataset, **settings, scale=0.9).count("done") == 2  # run again, the same bytes
+    assert run(dataset, **settings, shadow=0.2).count("done") == 2  # run again, the same bytes
     assert {p: p.read_bytes() for p in folder.rglob("*.*")} == before
 
 
