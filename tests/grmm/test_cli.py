@@ -148,7 +148,7 @@ def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
         (["evaluate", "{checkpoint}", "{shards}", "{out}", "--subjects=S002"], 2,
          "--fit-cameras"),
         (["evaluate", "{checkpoint}", "{shards}", "{out}", "--heldout", "--cameras=cam00"], 2,
-         "training saw all"),
+         "training saw every"),
         (["evaluate", "{checkpoint}", "{shards}", "{out}", "--subjects=S002", "--cameras=cam00",
           "--fit-cameras=cam00", "--fit-expression=e0"], 2, "no view is left to measure"),
         (["ablate", "{shards}", "{out}", *TINY, "--fit-subjects=S9"], 2,

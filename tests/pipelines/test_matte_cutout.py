@@ -98,7 +98,7 @@ def test_small_and_large_pictures_are_cut_alike(alpha: np.ndarray, scale: float)
 def test_what_shows_no_face_is_refused() -> None:
     with pytest.raises(StageError, match="no face found.*matte.method to salient"):
         alpha_of(np.repeat(data.brick()[..., None], 3, axis=2))
-    with pytest.raises(ConfigError, match="key and grabcut take none"):
+    with pytest.raises(ConfigError, match="key and grabcut take no weights"):
         MatteConfig(method="grabcut", weights="net.pt")
 
 

@@ -276,7 +276,9 @@ def test_what_an_older_ingest_kept_of_a_person_is_found_and_fixed(dataset, capsy
     assert main(["check", str(dataset.root), "--json"]) == 1
     said = capsys.readouterr().out
     (finding,) = json.loads(said)["findings"]
-    assert finding["kind"] == "personal" and "holds name" in finding["what"]
+    assert (
+        finding["kind"] == "personal" and "personal data from capture.toml: name" in finding["what"]
+    )
     assert "Jane" not in said
     assert main(["check", str(dataset.root), "--fix"]) == 0
     assert main(["ingest", str(dataset.root), "--workers", "0"]) == 0
