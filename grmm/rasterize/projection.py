@@ -145,7 +145,7 @@ def project(scene: Splats, camera: Pinhole, antialiased: bool = False) -> Projec
     # Culled points get a harmless place, so that no division by zero enters the gradients.
     points = torch.where(front[:, None], points, points.new_tensor([0.0, 0.0, 1.0]))
     jacobian = _jacobian(points, K, width, height)
-    rows = jacobian @ (R @ quat_to_matrix(quats) * scales[:, None, :])
+    rows = _product(jacobian, _product(R, quat_to_matrix(quats)) * scales[:, None, :])
     variances = rows.square().sum(2)  # of u, v and the ray length
     conics, slopes, compensation = _regression(rows, variances)
     planes = torch.cat([points.norm(dim=1, keepdim=True), slopes], 1)
@@ -192,6 +192,11 @@ def _jacobian(points: Tensor, K: Tensor, width: int, height: int) -> Tensor:
     row_v = torch.stack([zero, fy / z, -fy * tan_y / z], 1)
     row_t = points / points.norm(dim=1, keepdim=True)
     return torch.stack([row_u, row_v, row_t], 1)
+
+
+def _product(a: Tensor, b: Tensor) -> Tensor:
+    """Multiply 3 x 3 matrices; ``@`` takes 1 ms on a GPU for 200,000 of them in float64."""
+    return (a[..., :, :, None] * b[..., None, :, :]).sum(-2)
 
 
 def _clamp(value: Tensor, low: Tensor, high: Tensor) -> Tensor:
