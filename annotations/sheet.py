@@ -204,21 +204,13 @@ QUALITY = 82
 
 @dataclass(frozen=True)
 class Pictures:
-    """A tile's picture and the frames around it, side by side, as data URLs; "" for none.
+    """A tile's picture and the frames around it, side by side, as data URLs; "" for none."""
 
-    Attributes:
-        face: the frame.
-        strip: the frames around it in one picture.
-        first: frame of the strip's first picture.
-        count: how many pictures the strip holds.
-        problem: the reason where the picture is missing.
-    """
-
-    face: str = ""
-    strip: str = ""
-    first: int = 0
-    count: int = 0
-    problem: str = ""
+    face: str = ""  # the frame
+    strip: str = ""  # the frames around it in one picture
+    first: int = 0  # frame of the strip's first picture
+    count: int = 0  # how many pictures the strip holds
+    problem: str = ""  # the reason where the picture is missing
 
 
 def render_sheet(

@@ -16,30 +16,20 @@ from express50.files.text import read_json_table
 
 @dataclass(frozen=True, kw_only=True)
 class Suggested:
-    """The suggestion for one expression of one subject.
+    """The suggestion for one expression of one subject."""
 
-    Attributes:
-        frame: the suggested frame.
-        confidence: probability that it is at most one frame off, 0 to 1.
-        start: frame of the curves' first value.
-        activity: how far the face is from rest, one value per frame of the cue window.
-        candidates: frames worth a look, best first, at least three frames apart.
-        match: similarity to the reference's canonical frame, 0 to 1 per frame; None for the
-            reference itself and where it has no canonical frame.
-        kind: ``match`` where the reference decided, else ``peak``.
-        reference: ``subject``, ``frame`` and ``camera`` of the canonical frame, or None.
-        camera: the camera that sees the face best.
-    """
-
-    frame: int
-    confidence: float
-    start: int
-    activity: list[float]
-    candidates: list[int]
+    frame: int  # the suggested frame
+    confidence: float  # probability that it is at most one frame off, 0 to 1
+    start: int  # frame of the curves' first value
+    activity: list[float]  # how far the face is from rest, one value per frame of the cue window
+    candidates: list[int]  # frames worth a look, best first, at least three frames apart
+    # similarity to the reference's canonical frame, 0 to 1 per frame; None for the reference itself
+    # and where it has no canonical frame
     match: list[float] | None = None
-    kind: str = "peak"
+    kind: str = "peak"  # ``match`` where the reference decided, else ``peak``
+    # ``subject``, ``frame`` and ``camera`` of the canonical frame, or None
     reference: dict[str, Any] | None = None
-    camera: str = ""
+    camera: str = ""  # the camera that sees the face best
 
 
 def read_suggestions(dataset: Dataset, subject: str) -> dict[str, Suggested]:

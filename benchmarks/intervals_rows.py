@@ -45,29 +45,17 @@ BLUR_PX = 1.5
 
 @dataclass(frozen=True, kw_only=True)
 class Condition:
-    """What is recorded, and what goes wrong.
-
-    Attributes:
-        name: of the row.
-        views: cameras that the stages see.
-        side: pixels of the pictures' sides.
-        distance: of the cameras, in the rig's usual one; the focal length grows with it.
-        noise: of the sensor, in that of a good studio camera.
-        harm: ``blur``, ``light``, ``turned`` or nothing.
-        preset: settings of all stages; the demo's if it is empty.
-        head: model of the person.
-        costly: takes more than ten minutes of a core, and is run only if it is named.
-    """
+    """What is recorded, and what goes wrong."""
 
     name: str
-    views: int = 8
-    side: int = 256
-    distance: float = 1.0
-    noise: float = 1.0
-    harm: str = ""
-    preset: str = ""
-    head: str = "procedural"
-    costly: bool = False
+    views: int = 8  # cameras that the stages see
+    side: int = 256  # pixels of the pictures' sides
+    distance: float = 1.0  # of the cameras, in the rig's usual one; the focal length grows with it
+    noise: float = 1.0  # of the sensor, in that of a good studio camera
+    harm: str = ""  # ``blur``, ``light``, ``turned`` or nothing
+    preset: str = ""  # settings of all stages; the demo's if it is empty
+    head: str = "procedural"  # model of the person
+    costly: bool = False  # takes more than ten minutes of a core, and is run only if it is named
 
     def row(self, subject: str) -> str:
         """Return the folder of a subject's row."""

@@ -24,22 +24,15 @@ Wall = Callable[[np.random.Generator, int], np.ndarray]
 
 @dataclass(frozen=True, kw_only=True)
 class Shot:
-    """One camera of a moment: undistorted images and their truth.
+    """One camera of a moment: undistorted images and their truth."""
 
-    Attributes:
-        camera: as recorded, with distortion.
-        frame, plate: (H, W, 3) uint8.
-        valid: (H, W) bool, pixels with footage.
-        true: (H, W) alpha.
-        depth: (H, W) metres, 0 where there is nothing.
-    """
-
-    camera: Camera
+    camera: Camera  # as recorded, with distortion
+    # frame, plate: (H, W, 3) uint8
     frame: np.ndarray
     plate: np.ndarray
-    valid: np.ndarray
-    true: np.ndarray
-    depth: np.ndarray
+    valid: np.ndarray  # (H, W) bool, pixels with footage
+    true: np.ndarray  # (H, W) alpha
+    depth: np.ndarray  # (H, W) metres, 0 where there is nothing
 
 
 def undisturbed(shots: list[Shot]) -> list[Shot]:

@@ -28,31 +28,21 @@ NO_SKIN = ("mouth_interior", "teeth", "neck", "boundary")
 
 @dataclass(frozen=True)
 class Errors:
-    """One tracked frame.
+    """One tracked frame."""
 
-    Attributes:
-        distances: root mean square distance of face, head and neck, metres.
-        baseline: the same of the template laid rigidly on the true landmarks.
-        landmark_px: distances of 68 landmarks in the tracking cameras, root mean square.
-        jaw_deg: angle between the jaw's rotations.
-        expression, true_expression: (X,) coefficients.
-        motion, true_motion: (3 F,) how far these coefficients move the face's vertices, metres.
-        ious: of the head's mask, one a held-out camera.
-        psnrs: decibels, one a held-out camera that shows enough of the face.
-        true_psnrs: of the true mesh in their place: highlights, noise and gains alone.
-    """
-
-    distances: dict[str, float]
-    baseline: dict[str, float]
-    landmark_px: float
-    jaw_deg: float
+    distances: dict[str, float]  # root mean square distance of face, head and neck, metres
+    baseline: dict[str, float]  # the same of the template laid rigidly on the true landmarks
+    landmark_px: float  # distances of 68 landmarks in the tracking cameras, root mean square
+    jaw_deg: float  # angle between the jaw's rotations
+    # expression, true_expression: (X,) coefficients
     expression: np.ndarray
     true_expression: np.ndarray
+    # motion, true_motion: (3 F,) how far these coefficients move the face's vertices, metres
     motion: np.ndarray
     true_motion: np.ndarray
-    ious: list[float]
-    psnrs: list[float]
-    true_psnrs: list[float]
+    ious: list[float]  # of the head's mask, one a held-out camera
+    psnrs: list[float]  # decibels, one a held-out camera that shows enough of the face
+    true_psnrs: list[float]  # of the true mesh in their place: highlights, noise and gains alone
 
 
 def compare(

@@ -35,18 +35,12 @@ LEAST_PIXELS = 200  # of the face, for a PSNR
 
 @dataclass(frozen=True)
 class HeldOut:
-    """The true view of a held-out camera at a frame.
+    """The true view of a held-out camera at a frame."""
 
-    Attributes:
-        camera: true pinhole camera.
-        mask: (H, W) bool, the true head mesh.
-        face: (H, W) bool, the face region's skin, seen first.
-        image: (H, W, 3) uint8 sRGB, undistorted; None without the capture's footage.
-    """
-
-    camera: Camera
-    mask: np.ndarray
-    face: np.ndarray
+    camera: Camera  # true pinhole camera
+    mask: np.ndarray  # (H, W) bool, the true head mesh
+    face: np.ndarray  # (H, W) bool, the face region's skin, seen first
+    # (H, W, 3) uint8 sRGB, undistorted; None without the capture's footage
     image: np.ndarray | None
 
 

@@ -32,26 +32,18 @@ SHARED = 0.063, HALF, 1.96
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """The fitted constants of one stage.
+    """The fitted constants of one stage."""
 
-    Attributes:
-        unit: unit of errors.
-        features: names of the F figures.
-        weights: (F,) weights of their logarithms; positive if a larger figure is worse.
-        limits: (F, 2) smallest and largest logarithm in the data.
-        scores: (K,) ascending knots of the table.
-        typical, bound: (K,) logarithms of the median error and of the bound, non-decreasing.
-        item: 5th, 50th and 95th percentile of an item's error divided by the median of its
-            elements' typical errors.
-    """
-
-    unit: Unit
-    features: tuple[str, ...]
-    weights: np.ndarray
-    limits: np.ndarray
-    scores: np.ndarray
+    unit: Unit  # unit of errors
+    features: tuple[str, ...]  # names of the F figures
+    weights: np.ndarray  # (F,) weights of their logarithms; positive if a larger figure is worse
+    limits: np.ndarray  # (F, 2) smallest and largest logarithm in the data
+    scores: np.ndarray  # (K,) ascending knots of the table
+    # typical, bound: (K,) logarithms of the median error and of the bound, non-decreasing
     typical: np.ndarray
     bound: np.ndarray
+    # 5th, 50th and 95th percentile of an item's error divided by the median of its elements'
+    # typical errors
     item: tuple[float, float, float]
 
 

@@ -40,37 +40,25 @@ class Event:
 
 @dataclass(frozen=True)
 class Canonical:
-    """The reference's canonical frame, in the subject's features.
+    """The reference's canonical frame, in the subject's features."""
 
-    Attributes:
-        direction: (N,) unit vector of the movement; 0 in features the reference does not have.
-        level: how far the movement was done in that frame, as a share of its apex.
-        side: -1 before the apex, 1 after it, 0 at it.
-    """
-
+    # (N,) unit vector of the movement; 0 in features the reference does not have
     direction: np.ndarray
-    level: float
-    side: int
+    level: float  # how far the movement was done in that frame, as a share of its apex
+    side: int  # -1 before the apex, 1 after it, 0 at it
 
 
 @dataclass(frozen=True)
 class Suggestion:
-    """A suggested frame.
+    """A suggested frame."""
 
-    Attributes:
-        row: of the clip.
-        confidence: share of random halves of the features that agree within a frame; lowered
-            if the clip's strongest movement is not the one most like the reference's.
-        activity: (T,) how far the face is from rest, in units of noise.
-        match: (T,) likeness to the canonical frame, 0 to 1; None without one.
-        candidates: rows worth a look, best first.
-    """
-
-    row: int
+    row: int  # of the clip
+    # share of random halves of the features that agree within a frame; lowered if the clip's
+    # strongest movement is not the one most like the reference's
     confidence: float
-    activity: np.ndarray
-    match: np.ndarray | None
-    candidates: list[int]
+    activity: np.ndarray  # (T,) how far the face is from rest, in units of noise
+    match: np.ndarray | None  # (T,) likeness to the canonical frame, 0 to 1; None without one
+    candidates: list[int]  # rows worth a look, best first
 
 
 @dataclass(frozen=True)

@@ -34,21 +34,13 @@ RANKED_SHARE = 0.8  # share of the best camera's score: worse cameras add mostly
 
 @dataclass(frozen=True)
 class FaceObservations:
-    """The faces that C cameras saw of a subject in F frames.
+    """The faces that C cameras saw of a subject in F frames."""
 
-    Attributes:
-        cameras: ids, the one that sees the face best first.
-        frames: (F,) frame numbers, increasing.
-        points: (C, F, 68, 2) landmarks in proxy pixels.
-        scores: (C, F) face scores, 0 to 1.
-        faces: (C, F, S, S) uint8 grey, head motion removed.
-    """
-
-    cameras: tuple[str, ...]
-    frames: np.ndarray
-    points: np.ndarray
-    scores: np.ndarray
-    faces: np.ndarray
+    cameras: tuple[str, ...]  # ids, the one that sees the face best first
+    frames: np.ndarray  # (F,) frame numbers, increasing
+    points: np.ndarray  # (C, F, 68, 2) landmarks in proxy pixels
+    scores: np.ndarray  # (C, F) face scores, 0 to 1
+    faces: np.ndarray  # (C, F, S, S) uint8 grey, head motion removed
 
 
 def read_observations(dataset: Dataset, subject: str) -> FaceObservations:

@@ -19,27 +19,18 @@ CATEGORIES = (
 
 @dataclass(frozen=True, kw_only=True)
 class Expression:
-    """One entry of the script.
+    """One entry of the script."""
 
-    Attributes:
-        id: snake_case id, used in cues, labels and file names.
-        name: short title shown to people.
-        description: what to do, with FACS action units.
-        categories: some of ``CATEGORIES``.
-        controls: activation of named expression directions; 1 is full, a negative value is the
-            opposite movement.
-        jaw: (3,) axis-angle of the jaw, radians; opening is +x.
-        neck: (3,) axis-angle of the neck, radians.
-        gaze: (2,) yaw, positive to the subject's left, and pitch, positive upwards; radians.
-    """
-
-    id: str
-    name: str
-    description: str
-    categories: tuple[str, ...]
+    id: str  # snake_case id, used in cues, labels and file names
+    name: str  # short title shown to people
+    description: str  # what to do, with FACS action units
+    categories: tuple[str, ...]  # some of ``CATEGORIES``
+    # activation of named expression directions; 1 is full, a negative value is the opposite
+    # movement
     controls: dict[str, float] = field(default_factory=dict)
-    jaw: tuple[float, ...] = (0.0, 0.0, 0.0)
-    neck: tuple[float, ...] = (0.0, 0.0, 0.0)
+    jaw: tuple[float, ...] = (0.0, 0.0, 0.0)  # (3,) axis-angle of the jaw, radians; opening is +x
+    neck: tuple[float, ...] = (0.0, 0.0, 0.0)  # (3,) axis-angle of the neck, radians
+    # (2,) yaw, positive to the subject's left, and pitch, positive upwards; radians
     gaze: tuple[float, ...] = (0.0, 0.0)
 
 

@@ -28,63 +28,42 @@ class Cue:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSource:
-    """Footage of one camera; sequences are indexed by 0-based decode index.
+    """Footage of one camera; sequences are indexed by 0-based decode index."""
 
-    Attributes:
-        kind: ``video``, ``videos`` (one file per clip) or ``frames``.
-        source: video file, or the folder that holds ``names``, relative to the capture.
-        width: width of the footage, pixels.
-        height: height of the footage, pixels.
-        frames: number of frames that decode.
-        pts: presentation time stamp of each frame (the frame's number for image files).
-        dhash: 64-bit difference hash of each frame, 16 hexadecimal digits.
-        sha256: digest of the video file, or of the image files' names and digests.
-        names: images or videos in order, relative to the source; empty for a single video. An image
-            may lie in a container (`express50.files.containers`).
-        clips: number of frames of each clip; empty if there is only one clip.
-        correction: rows of a polynomial colour correction that `frames` applies, or none.
-        orientation: how images are rotated when they are read (`files.images`); width and height
-            are those after rotation.
-    """
-
-    kind: str
-    source: str
-    width: int
-    height: int
-    frames: int
+    kind: str  # ``video``, ``videos`` (one file per clip) or ``frames``
+    source: str  # video file, or the folder that holds ``names``, relative to the capture
+    width: int  # width of the footage, pixels
+    height: int  # height of the footage, pixels
+    frames: int  # number of frames that decode
+    # presentation time stamp of each frame (the frame's number for image files)
     pts: tuple[int, ...]
-    dhash: tuple[str, ...]
-    sha256: str
+    dhash: tuple[str, ...]  # 64-bit difference hash of each frame, 16 hexadecimal digits
+    sha256: str  # digest of the video file, or of the image files' names and digests
+    # images or videos in order, relative to the source; empty for a single video. An image may lie
+    # in a container (`express50.files.containers`).
     names: tuple[str, ...] = ()
-    clips: tuple[int, ...] = ()
+    clips: tuple[int, ...] = ()  # number of frames of each clip; empty if there is only one clip
+    # rows of a polynomial colour correction that `frames` applies, or none
     correction: tuple[tuple[float, ...], ...] = ()
+    # how images are rotated when they are read (`files.images`); width and height are those after
+    # rotation
     orientation: int = 1
 
 
 @dataclass(frozen=True, kw_only=True)
 class Index:
-    """Everything the stages need to know about one subject's capture.
-
-    Attributes:
-        subject: subject id.
-        capture: folder of the footage; from the dataset's table, not from the index file.
-        fps: frames per second.
-        cameras: usable cameras by id.
-        plates: clean background plates by camera id, relative to the capture.
-        board: ``{"config": board.toml's content, "cameras": {id: [files]}}`` or None.
-        calibration: calibration file relative to the capture, or None; see `calibration_file`.
-        cues: scripted expressions, in file order.
-        meta: content of capture.toml without what describes the person (`demographics`).
-    """
+    """Everything the stages need to know about one subject's capture."""
 
     subject: str
-    capture: Path
-    fps: float
-    cameras: dict[str, CameraSource]
-    plates: dict[str, str]
-    board: dict | None
+    capture: Path  # folder of the footage; from the dataset's table, not from the index file
+    fps: float  # frames per second
+    cameras: dict[str, CameraSource]  # usable cameras by id
+    plates: dict[str, str]  # clean background plates by camera id, relative to the capture
+    board: dict | None  # ``{"config": board.toml's content, "cameras": {id: [files]}}`` or None
+    # calibration file relative to the capture, or None; see `calibration_file`
     calibration: str | None
-    cues: tuple[Cue, ...]
+    cues: tuple[Cue, ...]  # scripted expressions, in file order
+    # content of capture.toml without what describes the person (`demographics`)
     meta: dict = field(default_factory=dict)
 
     @property
@@ -219,19 +198,12 @@ def _camera_from_json(name: str, row: Mapping[str, Any]) -> CameraSource:
 
 @dataclass(frozen=True)
 class Peak:
-    """The labelled frame of one expression, with the time stamp and hash that the label recorded.
+    """The labelled frame of one expression, with what the label recorded of it."""
 
-    Attributes:
-        frame: decode index.
-        camera: camera in which the label was made.
-        pts: time stamp of the frame in that camera.
-        dhash: difference hash of the frame in that camera.
-    """
-
-    frame: int
-    camera: str
-    pts: int
-    dhash: str
+    frame: int  # decode index
+    camera: str  # camera in which the label was made
+    pts: int  # time stamp of the frame in that camera
+    dhash: str  # difference hash of the frame in that camera
 
 
 def read_peaks(dataset: Dataset, subject: str) -> dict[str, int]:

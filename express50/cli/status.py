@@ -33,34 +33,21 @@ RUNNING_SHOWN = 40
 
 @dataclass(frozen=True, kw_only=True)
 class StageStatus:
-    """The progress of one stage.
-
-    Attributes:
-        stage: stage name.
-        state: ``running``, ``stopped`` (its run was killed), ``failed`` (some items failed),
-            ``done``, or ``not run``.
-        done: number of finished items.
-        failed: receipts of items whose last attempt failed.
-        running: start of each item in progress, seconds since 1970.
-        missing: number of items of the last run that are waiting, or were not reached.
-        rate: recent items per second; 0 before the first has finished.
-        left_s: estimated seconds until the run ends; None if unknown.
-        seconds: total seconds of all items.
-        peak_memory: largest peak memory of an item, bytes.
-        receipts: the receipts of all items.
-    """
+    """The progress of one stage."""
 
     stage: str
+    # ``running``, ``stopped`` (its run was killed), ``failed`` (some items failed), ``done``, or
+    # ``not run``
     state: str
-    done: int
-    failed: tuple[Receipt, ...]
-    running: dict[str, float]
-    missing: int
-    rate: float
-    left_s: float | None
-    seconds: float
-    peak_memory: int
-    receipts: tuple[Receipt, ...]
+    done: int  # number of finished items
+    failed: tuple[Receipt, ...]  # receipts of items whose last attempt failed
+    running: dict[str, float]  # start of each item in progress, seconds since 1970
+    missing: int  # number of items of the last run that are waiting, or were not reached
+    rate: float  # recent items per second; 0 before the first has finished
+    left_s: float | None  # estimated seconds until the run ends; None if unknown
+    seconds: float  # total seconds of all items
+    peak_memory: int  # largest peak memory of an item, bytes
+    receipts: tuple[Receipt, ...]  # the receipts of all items
 
     def counts(self) -> dict[str, int]:
         """Return the number of items per outcome."""

@@ -40,18 +40,13 @@ Unit = Literal["mm", "px", "frames", "alpha", "dB"]
 
 @dataclass(frozen=True)
 class ExpectedError:
-    """How wrong a result probably is, judged without ground truth.
+    """How wrong a result probably is, judged without ground truth."""
 
-    Attributes:
-        value: expected error, in the stage's own measure (docs/FORMAT.md).
-        low, high: bounds of the 90 % interval of the true error.
-        unit: unit of all three.
-    """
-
-    value: float
+    value: float  # expected error, in the stage's own measure (docs/FORMAT.md)
+    # low, high: bounds of the 90 % interval of the true error
     low: float
     high: float
-    unit: Unit
+    unit: Unit  # unit of all three
 
     def __post_init__(self) -> None:
         """Check that low and high are an interval around the value.
@@ -204,15 +199,11 @@ INSTALL = "run 'pip install -e .' in the folder of the sources"
 
 @dataclass(frozen=True)
 class Command:
-    """A command of ``express50`` that another package adds.
+    """A command of ``express50`` that another package adds."""
 
-    Attributes:
-        help: one line for the list of commands.
-        add: ``add(subparsers)`` adds the command's parser; called when the command is asked for.
-            A command with a stage's name gets that stage's parser, to add options to it.
-    """
-
-    help: str
+    help: str  # one line for the list of commands
+    # ``add(subparsers)`` adds the command's parser; called when the command is asked for. A command
+    # with a stage's name gets that stage's parser, to add options to it.
     add: Callable[[Any], None]
 
 

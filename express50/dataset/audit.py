@@ -38,21 +38,13 @@ LabelProblems = Callable[[Dataset, list[str]], Iterable[Any]]
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """A fault: what is wrong, where, and how to fix it.
+    """A fault: what is wrong, where, and how to fix it."""
 
-    Attributes:
-        kind: one word for programs, such as ``missing`` or ``changed``.
-        where: ``stage item``, or a file of the dataset.
-        what: what is wrong, in words.
-        fix: how it was fixed, or how to fix it.
-        fixed: True if the only thing left to do is to run the stage.
-    """
-
-    kind: str
-    where: str
-    what: str
-    fix: str
-    fixed: bool = False
+    kind: str  # one word for programs, such as ``missing`` or ``changed``
+    where: str  # ``stage item``, or a file of the dataset
+    what: str  # what is wrong, in words
+    fix: str  # how it was fixed, or how to fix it
+    fixed: bool = False  # True if the only thing left to do is to run the stage
 
 
 @dataclass

@@ -39,18 +39,12 @@ TEXTURE = "albedo.png"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Head:
-    """Holds a subject's tracked head.
-
-    Attributes:
-        subject: subject id.
-        track: the chosen rows of the subject's track.
-        model: the head model it was tracked with.
-        albedo: (H, W, 3) uint8 sRGB texture, first row at v = 1; None if there is no texture.
-    """
+    """Holds a subject's tracked head."""
 
     subject: str
-    track: Track
-    model: HeadModel
+    track: Track  # the chosen rows of the subject's track
+    model: HeadModel  # the head model it was tracked with
+    # (H, W, 3) uint8 sRGB texture, first row at v = 1; None if there is no texture
     albedo: np.ndarray | None
 
     def meta(self, kind: str) -> dict:

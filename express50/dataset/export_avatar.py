@@ -45,23 +45,16 @@ NEAR_PX = 0.02  # if centring moves pixels by less than this, it is not worth an
 
 @dataclass(frozen=True, kw_only=True)
 class AvatarOptions:
-    """Says how a data set is laid out.
+    """Says how a data set is laid out."""
 
-    Attributes:
-        background: ``alpha`` (keep the alpha channel), or the colour behind the head.
-        head_only: use the regions stage's alpha of the head without the torso.
-        downscale: integer factor by which images are smaller than the footage.
-        even_colour: divide each camera's images by its colour gain, as measured by calibrate.
-        test_expressions: expressions held out for testing; None for the last three tenths.
-        validation_camera: camera held out of training; None for the last one.
-    """
-
-    background: str = "alpha"
-    head_only: bool = False
-    downscale: int = 1
+    background: str = "alpha"  # ``alpha`` (keep the alpha channel), or the colour behind the head
+    head_only: bool = False  # use the regions stage's alpha of the head without the torso
+    downscale: int = 1  # integer factor by which images are smaller than the footage
+    # divide each camera's images by its colour gain, as measured by calibrate
     even_colour: bool = False
+    # expressions held out for testing; None for the last three tenths
     test_expressions: tuple[str, ...] | None = None
-    validation_camera: str | None = None
+    validation_camera: str | None = None  # camera held out of training; None for the last one
 
 
 def export_avatar(dataset: Dataset, head: Head, options: AvatarOptions, out: Path) -> dict:

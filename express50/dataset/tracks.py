@@ -29,45 +29,31 @@ _AGAIN = "run 'express50 track' again"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Track:
-    """Holds a subject's tracked head: E expressions, V vertices; world = R @ head + t.
+    """Holds a subject's tracked head: E expressions, V vertices; world = R @ head + t."""
 
-    Attributes:
-        head: head model name, as ``load_head`` takes it.
-        expressions: E expression ids.
-        frames: (E,) int64 decode indices.
-        shape: (S,) coefficients, shared by all expressions.
-        expression: (E, X) coefficients.
-        neck, jaw: (E, 3) axis-angle, radians.
-        eyes: (E, 6) axis-angles, left then right.
-        R: (E, 3, 3) rotations.
-        t: (E, 3) metres.
-        vertices: (E, V, 3) float32 metres, world.
-        offsets: (V, 3) float32 metres, added to the rest shape; zeros if there are none.
-        sigma: (E, V) float32 metres, standard deviations from the fit's own covariance; NaN if
-            the file has none, as for a scan.
-        bound: (E, V) float32 metres: nine vertices in ten are nearer than this to the true ones;
-            NaN if the file has none.
-        glasses: (n, 3) float32 metres, world, points spread over frames and lenses; None if the
-            file does not say whether glasses are worn.
-        glasses_row: (n,) int64, the track row that each point belongs to.
-    """
-
-    head: str
-    expressions: tuple[str, ...]
-    frames: np.ndarray
-    shape: np.ndarray
-    expression: np.ndarray
+    head: str  # head model name, as ``load_head`` takes it
+    expressions: tuple[str, ...]  # E expression ids
+    frames: np.ndarray  # (E,) int64 decode indices
+    shape: np.ndarray  # (S,) coefficients, shared by all expressions
+    expression: np.ndarray  # (E, X) coefficients
+    # neck, jaw: (E, 3) axis-angle, radians
     neck: np.ndarray
     jaw: np.ndarray
-    eyes: np.ndarray
-    R: np.ndarray
-    t: np.ndarray
-    vertices: np.ndarray
-    offsets: np.ndarray
+    eyes: np.ndarray  # (E, 6) axis-angles, left then right
+    R: np.ndarray  # (E, 3, 3) rotations
+    t: np.ndarray  # (E, 3) metres
+    vertices: np.ndarray  # (E, V, 3) float32 metres, world
+    offsets: np.ndarray  # (V, 3) float32 metres, added to the rest shape; zeros if there are none
+    # (E, V) float32 metres, standard deviations from the fit's own covariance; NaN if the file has
+    # none, as for a scan
     sigma: np.ndarray
+    # (E, V) float32 metres: nine vertices in ten are nearer than this to the true ones; NaN if the
+    # file has none
     bound: np.ndarray
+    # (n, 3) float32 metres, world, points spread over frames and lenses; None if the file does not
+    # say whether glasses are worn
     glasses: np.ndarray | None
-    glasses_row: np.ndarray
+    glasses_row: np.ndarray  # (n,) int64, the track row that each point belongs to
 
     def row(self, expression: str) -> int:
         """Return the row of an expression; StageError if it is not tracked."""
@@ -84,20 +70,13 @@ class Track:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sequence:
-    """Holds a subject's tracked clips, F frames; arrays mean what they do in `Track`.
+    """Holds a subject's tracked clips, F frames; arrays mean what they do in `Track`."""
 
-    Attributes:
-        head: head model name, as ``load_head`` takes it.
-        cues: (F,) clip ids, one per frame.
-        frames: (F,) int64 decode indices.
-        shape: (S,) coefficients.
-        expression, neck, jaw, eyes, R, t: (F, ...).
-    """
-
-    head: str
-    cues: tuple[str, ...]
-    frames: np.ndarray
-    shape: np.ndarray
+    head: str  # head model name, as ``load_head`` takes it
+    cues: tuple[str, ...]  # (F,) clip ids, one per frame
+    frames: np.ndarray  # (F,) int64 decode indices
+    shape: np.ndarray  # (S,) coefficients
+    # expression, neck, jaw, eyes, R, t: (F, ...)
     expression: np.ndarray
     neck: np.ndarray
     jaw: np.ndarray
@@ -108,25 +87,17 @@ class Sequence:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Registration:
-    """Holds an expression's mesh on the reconstructed surface, V vertices.
+    """Holds an expression's mesh on the reconstructed surface, V vertices."""
 
-    Attributes:
-        track: SHA-256 of the track.npz that was registered.
-        vertices: (V, 3) float32 metres, world.
-        offsets: (V, 3) float32 metres, added to the rest shape of the tracked parameters.
-        seen: (V,) bool, True where the surface was found and trusted.
-        residual: (V,) float32 metres, height of the surface above the mesh if seen, otherwise 0.
-        sigma: (V,) float32 metres, standard deviation of the vertices along their normals.
-        bound: (V,) float32 metres: along their normals nine vertices in ten are nearer than this
-            to the true ones; NaN if the file has none, as for a scan.
-    """
-
-    track: str
-    vertices: np.ndarray
-    offsets: np.ndarray
-    seen: np.ndarray
+    track: str  # SHA-256 of the track.npz that was registered
+    vertices: np.ndarray  # (V, 3) float32 metres, world
+    offsets: np.ndarray  # (V, 3) float32 metres, added to the rest shape of the tracked parameters
+    seen: np.ndarray  # (V,) bool, True where the surface was found and trusted
+    # (V,) float32 metres, height of the surface above the mesh if seen, otherwise 0
     residual: np.ndarray
-    sigma: np.ndarray
+    sigma: np.ndarray  # (V,) float32 metres, standard deviation of the vertices along their normals
+    # (V,) float32 metres: along their normals nine vertices in ten are nearer than this to the true
+    # ones; NaN if the file has none, as for a scan
     bound: np.ndarray
 
 

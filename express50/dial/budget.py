@@ -18,17 +18,11 @@ PART = re.compile(r"(\d+(?:\.\d+)?)(s|min|m|ch|h|d)")
 
 @dataclass(frozen=True)
 class Budget:
-    """Seconds that a run may take: of the clock, or of all cores together.
+    """Seconds that a run may take: of the clock, or of all cores together."""
 
-    Attributes:
-        text: the budget as the user wrote it.
-        seconds: clock seconds, or processor seconds of the items.
-        cores: True if ``seconds`` are processor seconds.
-    """
-
-    text: str
-    seconds: float
-    cores: bool
+    text: str  # the budget as the user wrote it
+    seconds: float  # clock seconds, or processor seconds of the items
+    cores: bool  # True if ``seconds`` are processor seconds
 
 
 @dataclass(frozen=True)
@@ -74,21 +68,14 @@ def parse_goal(text: str) -> Goal:
 
 @dataclass
 class Clock:
-    """Counts what a run spends, over all its sessions; a `Gate` of the runner.
+    """Counts what a run spends, over all its sessions; a `Gate` of the runner."""
 
-    Attributes:
-        budget: the limit; None for no limit.
-        spent: seconds spent in earlier sessions.
-        keep: stores the time spent; called about every two seconds while items end.
-        item: expected seconds of one item of the running stage, which must still fit.
-        early: seconds of the budget reserved for later stages.
-    """
-
-    budget: Budget | None
-    spent: float = 0.0
+    budget: Budget | None  # the limit; None for no limit
+    spent: float = 0.0  # seconds spent in earlier sessions
+    # stores the time spent; called about every two seconds while items end
     keep: Callable[[], None] = lambda: None
-    item: float = 0.0
-    early: float = 0.0
+    item: float = 0.0  # expected seconds of one item of the running stage, which must still fit
+    early: float = 0.0  # seconds of the budget reserved for later stages
     core: float = 0.0
     began: float = field(default_factory=time.monotonic)
     _kept: float = 0.0

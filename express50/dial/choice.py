@@ -43,48 +43,30 @@ class Expected:
 
 @dataclass(frozen=True)
 class Point:
-    """A choice of settings.
+    """A choice of settings."""
 
-    Attributes:
-        settings: name of each stage's setting.
-        seconds: clock or core seconds for all items that are not made yet.
-        each: the same per stage.
-        worse: sum over the results of the error, relative to that at the most expensive settings.
-        errors: expected error of each result.
-    """
-
-    settings: dict[str, str]
-    seconds: float
-    each: dict[str, float]
+    settings: dict[str, str]  # name of each stage's setting
+    seconds: float  # clock or core seconds for all items that are not made yet
+    each: dict[str, float]  # the same per stage
+    # sum over the results of the error, relative to that at the most expensive settings
     worse: float
-    errors: dict[str, Expected]
+    errors: dict[str, Expected]  # expected error of each result
 
 
 @dataclass(frozen=True, kw_only=True)
 class Workload:
-    """The work of a run.
+    """The work of a run."""
 
-    Attributes:
-        stages: the stages, in order.
-        ladders: settings of each stage, cheapest first.
-        measured: figures of the pilot.
-        footage: size of all the footage to process.
-        width: number of items processed in parallel.
-        cores: True if core seconds count instead of clock seconds.
-        fixed: settings of stages that have begun.
-        kinds: results of the chain.
-        done: per stage, the setting that its outputs were made with and the finished share.
-    """
-
-    stages: Sequence[Stage]
-    ladders: Mapping[str, Ladder]
-    measured: PilotFigures
-    footage: Footage
-    width: int
-    cores: bool
-    fixed: Mapping[str, str] = field(default_factory=dict)
+    stages: Sequence[Stage]  # the stages, in order
+    ladders: Mapping[str, Ladder]  # settings of each stage, cheapest first
+    measured: PilotFigures  # figures of the pilot
+    footage: Footage  # size of all the footage to process
+    width: int  # number of items processed in parallel
+    cores: bool  # True if core seconds count instead of clock seconds
+    fixed: Mapping[str, str] = field(default_factory=dict)  # settings of stages that have begun
+    # per stage, the setting that its outputs were made with and the finished share
     done: Mapping[str, tuple[str, float]] = field(default_factory=dict)
-    kinds: Sequence[ResultKind] = RESULTS
+    kinds: Sequence[ResultKind] = RESULTS  # results of the chain
 
 
 def cost_at(load: Workload, name: str, label: str) -> tuple[Cost, Trial] | None:

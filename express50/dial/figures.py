@@ -95,25 +95,15 @@ class Cost:
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """One run of the chain on a few items.
+    """One run of the chain on a few items."""
 
-    Attributes:
-        settings: name of the setting of each stage.
-        footage: size of the footage that it ran on.
-        scripted: number of expressions of the whole capture.
-        costs: cost of each stage.
-        errors: ``[value, low, high]`` that stages state for each result.
-        failed: per stage that made nothing, the reason.
-        folder: folder of its outputs.
-    """
-
-    settings: dict[str, str]
-    footage: Footage
-    scripted: float
-    costs: dict[str, Cost]
-    errors: dict[str, list[float]]
-    failed: dict[str, str]
-    folder: str
+    settings: dict[str, str]  # name of the setting of each stage
+    footage: Footage  # size of the footage that it ran on
+    scripted: float  # number of expressions of the whole capture
+    costs: dict[str, Cost]  # cost of each stage
+    errors: dict[str, list[float]]  # ``[value, low, high]`` that stages state for each result
+    failed: dict[str, str]  # per stage that made nothing, the reason
+    folder: str  # folder of its outputs
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -41,23 +41,14 @@ Ladder = Mapping[str, Any]  # configurations of a stage by the name of the setti
 
 @dataclass
 class Chain:
-    """The stages of a dataset with their settings, and the workers that run them.
+    """The stages of a dataset with their settings, and the workers that run them."""
 
-    Attributes:
-        stages: in order.
-        dataset: the dataset.
-        ladders: settings of each stage.
-        pool: workers.
-        tell: takes lines for people.
-        kinds: results that are measured.
-    """
-
-    stages: Sequence[Stage]
+    stages: Sequence[Stage]  # in order
     dataset: Dataset
-    ladders: Mapping[str, Ladder]
+    ladders: Mapping[str, Ladder]  # settings of each stage
     pool: Pool
-    tell: Callable[[str], None]
-    kinds: Sequence[ResultKind] = RESULTS
+    tell: Callable[[str], None]  # takes lines for people
+    kinds: Sequence[ResultKind] = RESULTS  # results that are measured
 
     @property
     def names(self) -> list[str]:

@@ -57,33 +57,22 @@ PILOTS = 3  # subjects whose footage is tried if the first one's is bad
 
 @dataclass(frozen=True, kw_only=True)
 class RunState:
-    """A budgeted run, as stored.
+    """A budgeted run, as stored."""
 
-    Attributes:
-        key: of what was measured.
-        budget: as it was written; empty with a goal alone.
-        goal: as it was written, or empty.
-        spent: seconds, of the clock or of all cores.
-        settings: name of the setting of each stage.
-        begun: stages that have begun, which keep their setting.
-        promised: expected error of each result, as said before the start.
-        seconds: expected then.
-        changes: what was chosen again later, and why.
-        stated: ``[value, low, high]`` of each result, as the stages state in the end.
-        finished: whether nothing was left.
-    """
-
-    key: str
-    budget: str
-    goal: str
-    spent: float = 0.0
-    settings: dict[str, str] = field(default_factory=dict)
+    key: str  # `Chain.key` of what was measured
+    budget: str  # as it was written; empty with a goal alone
+    goal: str  # as it was written, or empty
+    spent: float = 0.0  # seconds, of the clock or of all cores
+    settings: dict[str, str] = field(default_factory=dict)  # name of the setting of each stage
+    # stages that have begun, which keep their setting
     begun: list[str] = field(default_factory=list)
+    # expected error of each result, as said before the start
     promised: dict[str, dict[str, Any]] = field(default_factory=dict)
-    seconds: float = 0.0
-    changes: list[str] = field(default_factory=list)
+    seconds: float = 0.0  # expected before the start
+    changes: list[str] = field(default_factory=list)  # what was chosen again later, and why
+    # ``[value, low, high]`` of each result, as the stages state in the end
     stated: dict[str, list[float]] = field(default_factory=dict)
-    finished: bool = False
+    finished: bool = False  # whether nothing was left
 
 
 def measured_figures(

@@ -30,44 +30,27 @@ class HeadModel:
 
     All float tensors share one dtype and device; `to` moves them. Shapes are checked on
     construction (HeadModelError), values by `check_head`, which the loaders call.
-
-    Attributes:
-        name: Where the model came from ("procedural", "flame2023", ...).
-        template: (V, 3) metres.
-        shape_dirs: (V, 3, S) metres per unit coefficient.
-        expression_dirs: (V, 3, X) metres per unit coefficient.
-        pose_dirs: (9 * (J - 1), V * 3) metres per unit of R - I, row-major.
-        joint_regressor: (J, V) rows sum to 1.
-        skinning: (V, J) rows sum to 1.
-        faces: (F, 3) int64.
-        uv: (T, 2) in [0, 1], v up.
-        uv_faces: (F, 3) int64 into uv.
-        landmark_faces: (68,) int64, iBUG-68 order (subject's right to left).
-        landmark_bary: (68, 3).
-        contour: for landmarks 0..16 the vertices that may form the visible jaw line, or None.
-        shape_names: S names.
-        expression_names: X names.
-        regions: region name -> (V,) bool.
-        unit_expressions: True where coefficients are activations in 0..1 (procedural, ICT),
-            False where they are standard deviations (FLAME).
     """
 
-    name: str
-    template: torch.Tensor
-    shape_dirs: torch.Tensor
-    expression_dirs: torch.Tensor
-    pose_dirs: torch.Tensor
-    joint_regressor: torch.Tensor
-    skinning: torch.Tensor
-    faces: torch.Tensor
-    uv: torch.Tensor
-    uv_faces: torch.Tensor
-    landmark_faces: torch.Tensor
-    landmark_bary: torch.Tensor
-    shape_names: tuple[str, ...]
-    expression_names: tuple[str, ...]
+    name: str  # Where the model came from ("procedural", "flame2023", ...)
+    template: torch.Tensor  # (V, 3) metres
+    shape_dirs: torch.Tensor  # (V, 3, S) metres per unit coefficient
+    expression_dirs: torch.Tensor  # (V, 3, X) metres per unit coefficient
+    pose_dirs: torch.Tensor  # (9 * (J - 1), V * 3) metres per unit of R - I, row-major
+    joint_regressor: torch.Tensor  # (J, V) rows sum to 1
+    skinning: torch.Tensor  # (V, J) rows sum to 1
+    faces: torch.Tensor  # (F, 3) int64
+    uv: torch.Tensor  # (T, 2) in [0, 1], v up
+    uv_faces: torch.Tensor  # (F, 3) int64 into uv
+    landmark_faces: torch.Tensor  # (68,) int64, iBUG-68 order (subject's right to left)
+    landmark_bary: torch.Tensor  # (68, 3)
+    shape_names: tuple[str, ...]  # S names
+    expression_names: tuple[str, ...]  # X names
+    # for landmarks 0..16 the vertices that may form the visible jaw line, or None
     contour: tuple[torch.Tensor, ...] | None = None
-    regions: dict[str, torch.Tensor] = field(default_factory=dict)
+    regions: dict[str, torch.Tensor] = field(default_factory=dict)  # region name -> (V,) bool
+    # True where coefficients are activations in 0..1 (procedural, ICT), False where they are
+    # standard deviations (FLAME)
     unit_expressions: bool = True
 
     def __post_init__(self) -> None:

@@ -171,15 +171,11 @@ def _detection(place: _Place) -> Detection:
 
 @dataclass(frozen=True)
 class DensePoints:
-    """Dense points of a face, those of `LandmarkNet.places`.
+    """Dense points of a face, those of `LandmarkNet.places`."""
 
-    Attributes:
-        points: (D, 2) pixels, corner origin.
-        sigma: (D,) expected error in pixels (the scale of a Laplace distribution), large where
-            the head or something before it hides a point.
-    """
-
-    points: np.ndarray
+    points: np.ndarray  # (D, 2) pixels, corner origin
+    # (D,) expected error in pixels (the scale of a Laplace distribution), large where the head or
+    # something before it hides a point
     sigma: np.ndarray
 
 

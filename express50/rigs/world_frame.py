@@ -93,25 +93,16 @@ def _describe_behind(depths: Mapping[str, float]) -> str:
 
 @dataclass(frozen=True)
 class RigVerdict:
-    """Figures and warnings about a rig.
+    """Figures and warnings about a rig."""
 
-    Attributes:
-        cameras: number of cameras.
-        meeting: (3,) world point nearest to all axes, None if they are parallel.
-        distance_m: median distance of the cameras from it.
-        miss_mm: median distance of the axes from it.
-        problem: what is wrong, empty if nothing is.
-        remedy: the convention that would fix it, empty if none would.
-        warnings: what is unusual but may be intended.
-    """
-
-    cameras: int
+    cameras: int  # number of cameras
+    # (3,) world point nearest to all axes, None if they are parallel
     meeting: tuple[float, float, float] | None
-    distance_m: float | None
-    miss_mm: float | None
-    problem: str
-    remedy: str
-    warnings: tuple[str, ...]
+    distance_m: float | None  # median distance of the cameras from it
+    miss_mm: float | None  # median distance of the axes from it
+    problem: str  # what is wrong, empty if nothing is
+    remedy: str  # the convention that would fix it, empty if none would
+    warnings: tuple[str, ...]  # what is unusual but may be intended
 
 
 def judge(cameras: Mapping[str, Camera]) -> RigVerdict:

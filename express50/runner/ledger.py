@@ -31,19 +31,13 @@ class FileMark:
 
 @dataclass(frozen=True)
 class Made:
-    """The inputs and settings that an item was made from, and its files.
+    """The inputs and settings that an item was made from, and its files."""
 
-    Attributes:
-        inputs: their digests.
-        files: what was published.
-        settings: of the stage, as written in TOML; empty in ledgers that did not keep them.
-        version: of the stage; 0 where that is not known.
-    """
-
-    inputs: dict[str, str]
-    files: dict[str, FileMark]
+    inputs: dict[str, str]  # their digests
+    files: dict[str, FileMark]  # what was published
+    # of the stage, as written in TOML; empty in ledgers that did not keep them
     settings: dict[str, str] = field(default_factory=dict)
-    version: int = 0
+    version: int = 0  # of the stage; 0 where that is not known
 
 
 IMPORTED = "imported "  # begins the fingerprint of imported items
@@ -90,25 +84,15 @@ class Receipt:
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """The last run of a stage; times are seconds since 1970.
-
-    Attributes:
-        stage: stage name.
-        items: number of items to bring up to date.
-        current: number of those that already were.
-        begun: when it began.
-        seen: when it was last known to be alive.
-        ended: when it ended; 0 if it did not.
-        running: start time of each item in work.
-    """
+    """The last run of a stage; times are seconds since 1970."""
 
     stage: str
-    items: int
-    current: int = 0
-    begun: float = 0.0
-    seen: float = 0.0
-    ended: float = 0.0
-    running: dict[str, float] = field(default_factory=dict)
+    items: int  # number of items to bring up to date
+    current: int = 0  # number of those that already were up to date
+    begun: float = 0.0  # when it began
+    seen: float = 0.0  # when it was last known to be alive
+    ended: float = 0.0  # when it ended; 0 if it did not
+    running: dict[str, float] = field(default_factory=dict)  # start time of each item in work
 
 
 def mark_file(path: Path) -> FileMark:

@@ -209,23 +209,14 @@ def run_stage(
 
 @dataclass(frozen=True)
 class _Work:
-    """The items of a stage, sorted by the work that they need.
+    """The items of a stage, sorted by the work that they need."""
 
-    Attributes:
-        former: receipts of former runs.
-        current: outcomes of items that are up to date.
-        unreadable: receipts of items whose inputs cannot be read.
-        tasks: items to run.
-        again: why items are run that a former run had made.
-        stands: items whose former output stays valid until a new one is complete.
-    """
-
-    former: Mapping[str, Receipt]
-    current: dict[str, Outcome]
-    unreadable: list[Receipt]
-    tasks: list[Task]
-    again: dict[str, str]
-    stands: set[str]
+    former: Mapping[str, Receipt]  # receipts of former runs
+    current: dict[str, Outcome]  # outcomes of items that are up to date
+    unreadable: list[Receipt]  # receipts of items whose inputs cannot be read
+    tasks: list[Task]  # items to run
+    again: dict[str, str]  # why items are run that a former run had made
+    stands: set[str]  # items whose former output stays valid until a new one is complete
 
 
 def _sort_items(

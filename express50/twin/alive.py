@@ -34,19 +34,12 @@ SIDES = {"L": 1.0, "R": -1.0}  # the subject's left is +x
 
 @dataclass(frozen=True, kw_only=True)
 class LivingSkin:
-    """Light and colour of one frame's skin, over places on the mean head.
+    """Light and colour of one frame's skin, over places on the mean head."""
 
-    Attributes:
-        folds: activation, 0 to 1, by name and side such as ``crow_L``.
-        flush: how much redder the flushed places are; negative is paler.
-        marks: (68, 3) landmarks of the mean head.
-        lattice: of the person's irregularities.
-    """
-
-    folds: Mapping[str, float]
-    flush: float
-    marks: np.ndarray
-    lattice: np.ndarray
+    folds: Mapping[str, float]  # activation, 0 to 1, by name and side such as ``crow_L``
+    flush: float  # how much redder the flushed places are; negative is paler
+    marks: np.ndarray  # (68, 3) landmarks of the mean head
+    lattice: np.ndarray  # random values that make the person's folds irregular
 
     def factor(self, places: np.ndarray) -> np.ndarray:
         """Return what multiplies the skin's colour (N, 3) at places (N, 3) of the mean head."""

@@ -56,20 +56,13 @@ _BONES = np.array([
 
 @dataclass(frozen=True, kw_only=True)
 class WornMesh:
-    """Things in rest head space, the hand in its own; lenses come last.
+    """Things in rest head space, the hand in its own; lenses come last."""
 
-    Attributes:
-        vertices: (N, 3) metres.
-        faces: (M, 3).
-        material: (M,) uint8.
-        colours: (N, 3) linear light.
-        moves: (N,) the vertex of the head that a vertex moves with, WITH_SKULL or WITH_HAND.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    material: np.ndarray
-    colours: np.ndarray
+    vertices: np.ndarray  # (N, 3) metres
+    faces: np.ndarray  # (M, 3)
+    material: np.ndarray  # (M,) uint8
+    colours: np.ndarray  # (N, 3) linear light
+    # (N,) the vertex of the head that a vertex moves with, WITH_SKULL or WITH_HAND
     moves: np.ndarray
 
 

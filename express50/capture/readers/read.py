@@ -37,21 +37,13 @@ FPS = 24.0  # stands in where only the subject is asked for
 
 @dataclass(frozen=True)
 class Layout:
-    """One layout of captures.
-
-    Attributes:
-        name: of the layout.
-        looks: its look in words, for errors.
-        fits: returns whether a file or folder is one.
-        subject_of: the subject's id.
-        read: reads the selected parts of the capture.
-    """
+    """One layout of captures."""
 
     name: str
-    looks: str
-    fits: Callable[[Path], bool]
-    subject_of: Callable[[Path], str]
-    read: Callable[[Path, Selection], RawCapture]
+    looks: str  # what it looks like in words, for errors
+    fits: Callable[[Path], bool]  # whether a file or folder is one
+    subject_of: Callable[[Path], str]  # the subject's id
+    read: Callable[[Path, Selection], RawCapture]  # the selected parts of the capture
 
 
 # The order matters: a layout that could be mistaken for another comes after it.

@@ -127,19 +127,12 @@ def check_selection(selection: Selection, sequences: Sequence[str], cameras: Seq
 
 @dataclass(frozen=True)
 class Timeline:
-    """Footage of the moments that all taken cameras share.
+    """Footage of the moments that all taken cameras share."""
 
-    Attributes:
-        cameras: the taken cameras by id.
-        sequences: in order.
-        dropped: cameras that were left out, with the reason.
-        skipped: sequences and frames that were left out, with the reason.
-    """
-
-    cameras: dict[str, RawCamera]
-    sequences: tuple[str, ...]
-    dropped: dict[str, str]
-    skipped: dict[str, str]
+    cameras: dict[str, RawCamera]  # the taken cameras by id
+    sequences: tuple[str, ...]  # in order
+    dropped: dict[str, str]  # cameras that were left out, with the reason
+    skipped: dict[str, str]  # sequences and frames that were left out, with the reason
 
 
 def common_timeline(
