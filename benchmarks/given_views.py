@@ -17,8 +17,8 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+from express50.__main__ import main as express50
 from express50.capture.frames import read_cameras_of, read_peak_frame, read_plate_image
-from express50.cli.main import main as express50
 from express50.contract.layout import Dataset
 from express50.files.atomic import write_json
 from express50.files.calibration import write_cameras

@@ -32,8 +32,7 @@ from express50.head.load import load_head
 from express50.landmarks import WEIGHTS
 from express50.landmarks.detector import Detection, detect, detect_many, find_dense
 from express50.landmarks.network import OUTLINE, POINTS, LandmarkNet, load_network
-from express50.landmarks.training.dense import carry_places
-from express50.landmarks.training.places import Places
+from express50.landmarks.training.places import Places, carry_places
 from express50.landmarks.training.random_heads import random_head
 from express50.landmarks.training.scene import HeadScene, TrainingView
 from express50.landmarks.training.views import make_backgrounds

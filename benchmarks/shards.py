@@ -29,7 +29,7 @@ import numpy as np
 from skimage.data import astronaut
 
 from express50.files.images import resize_area
-from express50.runner.threads import cap_threads
+from express50.runner.worker import cap_threads
 from express50.shards.codecs import (
     ALPHA,
     DEPTH,

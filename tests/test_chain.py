@@ -15,9 +15,9 @@ import pytest
 
 from benchmarks.accuracy import measure_dataset
 from benchmarks.demo import pick_views
+from express50.__main__ import main
 from express50.capture.frames import FrameReader
 from express50.capture.index import read_index, read_peaks
-from express50.cli.main import main
 from express50.contract.layout import Dataset
 from express50.files.images import decode_image
 from express50.runner import worker

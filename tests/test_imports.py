@@ -24,7 +24,7 @@ LIGHT = [
     "express50.geometry.transforms",
     "express50.contract.stage",
     "express50.console",
-    "express50.cli.main",
+    "express50.__main__",
     "pipelines.stages",
     *(f"pipelines.{path.parent.name}" for path in (REPOSITORY / "pipelines").glob("*/__init__.py")),
 ]

@@ -99,7 +99,7 @@ def _chain(args: argparse.Namespace) -> Iterator[Any]:
     from express50.dial.pilot import Chain
     from express50.runner.executor import Pool
     from express50.runner.preflight import problems
-    from express50.runner.threads import cap_threads
+    from express50.runner.worker import cap_threads
 
     if args.preset is not None:
         raise ConfigError(

@@ -124,7 +124,7 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
     from express50.runner.executor import Pool
     from express50.runner.preflight import problems
     from express50.runner.runner import Summary, run_stage
-    from express50.runner.threads import cap_threads
+    from express50.runner.worker import cap_threads
 
     check_workers(args)
     # Set before a stage imports NumPy, whose BLAS reads the thread limit when it is loaded.

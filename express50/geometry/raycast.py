@@ -29,7 +29,9 @@ def camera_rays(camera: Camera) -> o3d.core.Tensor:
     return join_rays(*rays(camera))
 
 
-def barycentrics(hits: dict[str, o3d.core.Tensor], hit: np.ndarray) -> np.ndarray:
+def barycentrics(
+    hits: dict[str, o3d.core.Tensor], hit: np.ndarray | slice = slice(None)
+) -> np.ndarray:
     """Return the barycentric weights (N, 3) of the marked rays in the faces that they hit."""
     u, v = hits["primitive_uvs"].numpy()[hit].T
     return np.stack([1 - u - v, u, v], axis=1)

@@ -31,11 +31,12 @@ from express50.rigs.other_tools import (
     read_calibration_toml,
     read_kalibr,
     read_metashape,
+    read_nersemble,
     read_qualisys,
     read_reality_capture,
+    read_renderme,
     read_vggt,
 )
-from express50.rigs.public_captures import read_nersemble, read_renderme
 from express50.rigs.transforms_json import is_transforms, read_transforms
 
 # Names in use: OpenCV's calibration sample, its stereo sample, ROS, and hand-written files.

@@ -13,7 +13,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from express50.errors import StageError
-from express50.runner.threads import thread_environment
+from express50.runner.worker import thread_environment
 
 GPU = "GPU"  # name of the resource; a worker offers 1 for the device that it sees
 GPU_SECONDS = 60.0  # a GPU worker that died may need this long to come back

@@ -25,7 +25,7 @@ from express50.contract.config import build_dataclass
 from express50.errors import ConfigError, StageError, nearest
 from express50.files.text import read_toml
 from express50.runner.clusters import GPU, RemoteWorkers, no_gpu, start_cluster
-from express50.runner.threads import thread_environment
+from express50.runner.worker import thread_environment
 
 QUEUE_SECONDS = 10.0  # between two looks at the queue
 SILENT_JOBS = 3  # jobs in a row that end before their worker is seen, until the run gives up

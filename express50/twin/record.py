@@ -23,7 +23,7 @@ from express50.console import count
 from express50.contract.config import field_documents
 from express50.errors import CaptureError
 from express50.files.atomic import dump_json, write_json
-from express50.runner.threads import cap_threads
+from express50.runner.worker import cap_threads
 from express50.twin.config import TwinConfig
 
 _EPILOG = """example:

@@ -23,7 +23,7 @@ from express50.head.load import load_head
 from express50.head.preview import render_preview
 from express50.runner.executor import Pool
 from express50.runner.runner import Summary, run_stage
-from express50.runner.threads import cap_threads
+from express50.runner.worker import cap_threads
 from pipelines import ingest
 from pipelines.photo.capture import Focal, make_photo_capture, open_picture, subject_id
 from pipelines.track.config import TrackConfig

@@ -17,8 +17,8 @@ from annotations.labels import (
 )
 from annotations.observe.stage import FACE, SCHEMA, read_observations
 from annotations.suggestions import choose_reference, read_suggestions
+from express50.__main__ import main
 from express50.capture.index import read_index
-from express50.cli.main import main
 from express50.contract.config import build_config
 from express50.errors import ConfigError, FormatError
 from express50.runner.runner import run_stage

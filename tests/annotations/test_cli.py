@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from annotations.validate import MarkedClip, agreement, interval_alpha
-from express50.cli.main import main
+from express50.__main__ import main
 from express50.contract.layout import included_subjects
 
 from .labelled import EXPRESSIONS, make_dataset, suggest

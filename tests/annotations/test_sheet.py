@@ -12,9 +12,9 @@ import pytest
 from annotations.labels import AUTOMATIC, append_label, make_flag, make_mark
 from annotations.sheet import STRIP_WIDTH, make_sheet, render_sheet, take_pictures
 from annotations.ui.frames import crop_to
+from express50.__main__ import main
 from express50.capture.frames import read_proxy
 from express50.capture.index import read_index
-from express50.cli.main import main
 from express50.errors import UnknownNameError
 from express50.files.images import decode_image
 from tests.annotations.footage import suggest

@@ -31,8 +31,8 @@ from annotations.validate import (
 )
 from annotations.worklist import coverage, worklist
 from benchmarks.replay import cheapest_keys
+from express50.__main__ import main
 from express50.capture.index import read_index
-from express50.cli.main import main
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.errors import FormatError

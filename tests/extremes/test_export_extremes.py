@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from express50.cli.main import main
+from express50.__main__ import main
 from express50.head.load import load_head
 from tests.express50.dataset.tracked import track_arrays, world_vertices, write_track
 from tests.express50.head.flame_reader import flame_vertices

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
+from express50.__main__ import main
 from express50.capture.index import read_index
-from express50.cli.main import main
 from express50.contract.layout import Dataset
 from tests.synth import make_capture
 

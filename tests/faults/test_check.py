@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from express50.cli.main import main
+from express50.__main__ import main
 from express50.contract.layout import Dataset
 from express50.dataset.audit import audit
 from express50.errors import StageError

@@ -96,7 +96,7 @@ def test_killed_ingest_reruns_to_the_same_bytes(tmp_path):
     calm, hurt = Dataset(tmp_path / "calm"), Dataset(tmp_path / "hurt")
     for dataset in (calm, hurt):
         ingest.register(dataset, [tmp_path / "S001"])
-    seconds = timed(["express50.cli.main", "ingest", str(calm.root)])
+    seconds = timed(["express50.__main__", "ingest", str(calm.root)])
     expected = toy.tree(calm.stage_dir("ingest"))
 
     def check():
@@ -104,7 +104,7 @@ def test_killed_ingest_reruns_to_the_same_bytes(tmp_path):
 
     rng = random.Random(3)
     delays = [seconds * part for part in (0.6, *(rng.uniform(0.1, 0.95) for _ in range(5)))]
-    command = ["express50.cli.main", "ingest", str(hurt.root)]
+    command = ["express50.__main__", "ingest", str(hurt.root)]
     assert kill_until_done(command, check, delays) > 0
     assert toy.tree(hurt.stage_dir("ingest")) == expected
 

@@ -9,7 +9,7 @@ import sys
 import time
 from pathlib import Path
 
-from express50.cli.main import main
+from express50.__main__ import main
 from tests.express50.dataset.tracked import track_arrays, write_track
 from tests.express50.head.flame_files import write_flame
 from tests.pipelines.bump_dataset import make_dataset

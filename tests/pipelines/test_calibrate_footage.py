@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from express50.cli.main import main
+from express50.__main__ import main
 from express50.contract.layout import Dataset
 from express50.errors import CalibrationError, ConfigError
 from express50.files.calibration import camera_rows

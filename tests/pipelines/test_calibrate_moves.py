@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from express50.cli.main import main
+from express50.__main__ import main
 from express50.contract.layout import Dataset
 from express50.errors import CalibrationError, CaptureError
 from express50.files.calibration import write_cameras

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
+from express50.__main__ import main
 from express50.capture.frames import read_cameras_of
-from express50.cli.main import main
 from express50.contract.layout import Dataset
 from express50.dataset.depth_files import read_depth
 from express50.dataset.tracks import read_track

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from benchmarks.calibrate import recorded
+from express50.__main__ import main
 from express50.capture.frames import read_cameras_of
 from express50.capture.index import read_index
-from express50.cli.main import main
 from express50.contract.layout import Dataset
 from express50.errors import ConfigError, StageError
 from express50.files.images import read_alpha, write_image

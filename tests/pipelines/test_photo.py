@@ -13,7 +13,7 @@ import OpenImageIO as oiio
 import pytest
 import torch
 
-from express50.cli.main import main
+from express50.__main__ import main
 from express50.errors import CaptureError
 from express50.files.calibration import read_cameras
 from express50.files.containers import read_picture

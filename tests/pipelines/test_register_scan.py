@@ -11,7 +11,7 @@ import pytest
 import torch
 import trimesh
 
-from express50.cli.main import main
+from express50.__main__ import main
 from express50.dataset.tracks import read_registration, read_track
 from express50.errors import FormatError
 from express50.geometry.transforms import axis_angle_to_matrix

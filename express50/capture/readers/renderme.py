@@ -22,7 +22,7 @@ from express50.capture.readers.selection import Moment, Selection, check_selecti
 from express50.errors import CaptureError
 from express50.files.containers import WITHIN, attribute, child, members, open_hdf5
 from express50.geometry.cameras import Camera
-from express50.rigs.public_captures import read_renderme
+from express50.rigs.other_tools import read_renderme
 
 FPS = 30.0
 FULL, KEY_FRAMES = "full", "key frames"

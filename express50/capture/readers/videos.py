@@ -30,7 +30,7 @@ from express50.errors import CalibrationError, CaptureError
 from express50.files.images import ORIENTATION
 from express50.files.text import read_json_table
 from express50.files.video import video_fps, video_turn
-from express50.rigs.public_captures import read_nersemble
+from express50.rigs.other_tools import read_nersemble
 
 CAMERAS = Path("calibration/camera_params.json")
 COLOURS = Path("calibration/color_calibration.json")

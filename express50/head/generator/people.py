@@ -20,6 +20,7 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from express50.geometry.raycast import mesh_scene
+from express50.head.generator.expressions import LID_SHARE
 from express50.head.generator.field import EYE_CENTER, EYE_RADIUS, eye_center
 from express50.head.generator.ict_registration import (
     FLAT,
@@ -35,7 +36,6 @@ from express50.head.generator.ict_registration import (
     warp_between,
 )
 from express50.head.generator.mesh import WholeMesh
-from express50.head.generator.pulls import LID_SHARE
 from express50.head.ict import RANGES, IctArrays, read_ict_npz
 
 Array = np.ndarray

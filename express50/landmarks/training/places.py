@@ -1,15 +1,28 @@
-"""Carry places from one head model to another by closest point, landmarks laid on each other."""
+"""Find the places on a head model that training needs: dense points and the outline of the face.
+
+Dense points are spread over face, ears, neck and the front of the scalp. Half of them are on the
+subject's left; the others are their mirror images. They are carried from one head model to another
+by closest point.
+
+The outline is points 0 to 16 of the published mark-up of 68. People who mark photographs
+(Multi-PIE, 300-W) put them on the visible edge of the face: from before the ear at the height of
+the eyes (0 and 16) down to the lowest edge of the chin (8), evenly spaced. The jaw's landmarks of a
+head model are fixed places instead.
+"""
 
 from __future__ import annotations
 
 from functools import lru_cache
 
+import cv2
 import numpy as np
 import open3d as o3d
 
-from express50.geometry.raycast import mesh_scene
+from express50.geometry.conventions import corner_to_cell
+from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
 from express50.geometry.transforms import similarity_fit
-from express50.head.model import HeadModel, landmarks
+from express50.head.load import load_head
+from express50.head.model import HeadModel, landmarks, vertex_normals
 
 INSIDE = (
     "teeth", "tongue", "mouth_interior", "left_eyeball", "right_eyeball", "left_iris", "right_iris",
@@ -31,9 +44,8 @@ def closest_places(model: HeadModel, points: np.ndarray) -> Places:
     """Return the places on the skin of a head model at rest nearest to points (D, 3)."""
     scene, skin = _skin(model)
     found = scene.compute_closest_points(o3d.core.Tensor(points.astype(np.float32)))
-    u, v = found["primitive_uvs"].numpy().T
-    weights = np.stack([1 - u - v, u, v], axis=1)
-    return skin[found["primitive_ids"].numpy()], weights.astype(np.float32)
+    weights = barycentrics(found).astype(np.float32)
+    return skin[found["primitive_ids"].numpy()], weights
 
 
 def place_points(
@@ -49,3 +61,130 @@ def laid_on(source: HeadModel, model: HeadModel, points: np.ndarray) -> np.ndarr
     marks = [landmarks(one, one.template[None])[0].double().numpy() for one in (source, model)]
     s, R, t = similarity_fit(*marks)
     return s * points @ R.T + t
+
+
+# Distance between dense points, as a share of that on the neck and the scalp.
+SPACING = {"face": 0.62, "nose": 0.45, "left_eye_region": 0.4, "lips": 0.35, "left_ear": 0.5}
+MIDDLE_M = 0.002  # nearer to the middle, a point and its mirror image would be nearly the same
+NECK_M = 0.055  # no points lie further below the chin: heads end differently there
+FORWARD = -0.2  # no points of the scalp face further back than this
+
+
+def choose_places(model: HeadModel, count: int) -> Places:
+    """Return places on a head model: farthest points of the left half, then their mirrors.
+
+    Of `count` those that lie too low on the neck are left out.
+    """
+    rest = model.template.double().numpy()
+    region = {name: mask.numpy() for name, mask in model.regions.items()}
+    normals = vertex_normals(model.template[None], model.faces)[0].double().numpy()
+    keep = region["face"] | region["neck"] | region["left_ear"] | region["scalp"]
+    keep &= (rest[:, 0] > MIDDLE_M) & ~np.any([region[n] for n in INSIDE if n in region], axis=0)
+    keep &= ~region["scalp"] | (normals[:, 2] > FORWARD)
+    # What can be seen from outside, straight along its normal.
+    rays = join_rays(rest + 4e-4 * normals, normals)
+    keep &= ~mesh_scene(rest, model.faces.numpy()).test_occlusions(rays).numpy()
+    spacing = np.ones(len(rest))
+    for name, share in SPACING.items():
+        spacing[region[name]] = share
+    ids = np.flatnonzero(keep)
+    chosen = [int(ids[np.argmax(rest[ids, 2])])]  # the tip of the nose, or beside it
+    distance = np.full(len(ids), np.inf)
+    while len(chosen) < count // 2:
+        step = np.linalg.norm(rest[ids] - rest[chosen[-1]], axis=1)
+        distance = np.minimum(distance, step / spacing[ids])
+        chosen.append(int(ids[np.argmax(distance)]))
+    low = landmarks(model, model.template[None])[0, 8, 1].item() - NECK_M
+    left = np.array([place for place in rest[chosen] if place[1] > low])
+    return closest_places(model, np.concatenate([left, left * (-1.0, 1.0, 1.0)]))
+
+
+def carry_places(source: HeadModel, places: Places, model: HeadModel) -> Places:
+    """Return the places of another head model that lie where a source's lie, both at rest."""
+    return closest_places(model, laid_on(source, model, place_points(source, places)))
+
+
+EYE_BAND_M, CHIN_BAND_M = 0.005, 0.004  # about the height of the eye corners; about the middle
+MASK_SIDE, MASK_SHARE = 512, 0.9  # pixels of the face's mask, and the face's share of them
+SMOOTHING = 6  # pixels of the mask: models mark out the face triangle by triangle
+HALF = 8  # steps from an ear to the chin
+
+
+class FaceFront:
+    """The part of a head model whose edge is marked: the face down to the jaw's lower edge."""
+
+    def __init__(self, model: HeadModel) -> None:
+        """Find the part; where it ends is said by the built-in head."""
+        builtin = load_head("procedural")
+        region = {name: mask.numpy() for name, mask in builtin.regions.items()}
+        front = region["face"] & ~region["nose"] & ~region["lips"]
+        rest = model.template.double().numpy()
+        marks = landmarks(model, model.template[None])[0].double().numpy()
+        if model.name != builtin.name:
+            faces, weights = closest_places(builtin, laid_on(model, builtin, rest))
+            inside = (front[builtin.faces.numpy()[faces]] * weights).sum(1) > 0.5
+            front = inside & model.regions["face"].numpy()
+        all_faces = model.faces.numpy()
+        self.faces = all_faces[front[all_faces].all(1)]
+        ids = np.unique(self.faces)
+        level = np.abs(rest[ids, 1] - marks[[36, 45], 1].mean()) < EYE_BAND_M
+        self.right, self.left = (ids[level & (sign * rest[ids, 0] > 0)] for sign in (-1, 1))
+        low = (np.abs(rest[ids, 0]) < CHIN_BAND_M) & (rest[ids, 1] < marks[57, 1])
+        self.chin = ids[low]
+
+    def outline(self, pixels: np.ndarray, marks: np.ndarray) -> np.ndarray:
+        """Return points 0 to 16 (17, 2) of a view.
+
+        Args:
+            pixels: (V, 2) where the view shows the head's vertices.
+            marks: (68, 2) where it shows the landmarks.
+        """
+        down = marks[8] - marks[27]
+        across = np.array([down[1], -down[0]])  # towards the subject's left
+        ends = (
+            self.right[np.argmin(pixels[self.right] @ across)],
+            self.chin[np.argmax(pixels[self.chin] @ down)],
+            self.left[np.argmax(pixels[self.left] @ across)],
+        )
+        edge = self._edge(pixels)
+        first, middle, last = (
+            int(np.linalg.norm(edge - pixels[one], axis=1).argmin()) for one in ends
+        )
+        edge = np.roll(edge, -first, axis=0)
+        middle, last = (middle - first) % len(edge), (last - first) % len(edge)
+        if middle > last:  # the way over the chin is the other one
+            edge = np.roll(edge[::-1], 1, axis=0)
+            middle, last = len(edge) - middle, len(edge) - last
+        halves = _spaced(edge[: middle + 1]), _spaced(edge[middle : last + 1])
+        return np.concatenate([halves[0], halves[1][1:]])
+
+    def _edge(self, pixels: np.ndarray) -> np.ndarray:
+        """Return the outer edge (n, 2) of the front in a view, smoothed."""
+        used = pixels[np.unique(self.faces)]
+        low, size = used.min(0), float(np.ptp(used, axis=0).max())
+        scale = MASK_SHARE * MASK_SIDE / max(size, 1e-6)
+        shift = 0.5 * (1 - MASK_SHARE) * MASK_SIDE
+        mask = np.zeros((MASK_SIDE, MASK_SIDE), np.uint8)
+        corners = corner_to_cell((pixels - low) * scale + shift)
+        for triangle in np.round(corners[self.faces] * 16).astype(np.int32):
+            cv2.fillConvexPoly(mask, triangle, 255, shift=4)
+        mask = cv2.GaussianBlur(mask, (0, 0), SMOOTHING)
+        found, _ = cv2.findContours(
+            (mask > 127).view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+        )
+        edge = max(found, key=len)[:, 0].astype(np.float64)
+        return (edge + 0.5 - shift) / scale + low
+
+
+@lru_cache(maxsize=4)
+def face_front(model: HeadModel) -> FaceFront:
+    """Return the marked part of a head model."""
+    return FaceFront(model)
+
+
+def _spaced(line: np.ndarray) -> np.ndarray:
+    """Return HALF + 1 points at even distances along a line (n, 2), its ends included."""
+    steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    way = np.concatenate([[0.0], np.cumsum(steps)])
+    even = np.linspace(0.0, way[-1], HALF + 1)
+    return np.stack([np.interp(even, way, line[:, axis]) for axis in (0, 1)], axis=1)

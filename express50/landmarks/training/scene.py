@@ -15,8 +15,7 @@ import open3d as o3d
 from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
 from express50.geometry.transforms import make_transform
 from express50.head.model import HeadModel
-from express50.landmarks.training.outline import face_front
-from express50.landmarks.training.places import Places, place_points
+from express50.landmarks.training.places import Places, face_front, place_points
 from express50.landmarks.training.random_heads import LASHES, Canvas, RandomHead, paint, waves
 
 FRAME_SIDE_M = 0.38

@@ -40,9 +40,8 @@ from express50.landmarks.network import (
 )
 from express50.landmarks.training.close_ups import PARTS as CLOSE_UPS
 from express50.landmarks.training.close_ups import train_part
-from express50.landmarks.training.dense import carry_places, choose_places
 from express50.landmarks.training.descent import descend
-from express50.landmarks.training.places import Places
+from express50.landmarks.training.places import Places, carry_places, choose_places
 from express50.landmarks.training.scene import TrainingView
 from express50.landmarks.training.views import (
     FILE_VIEWS,

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from express50.cli.main import main
+from express50.__main__ import main
 from express50.console import log, run_handler, say
 from express50.contract.stage import Note, Result, stages
 from tests.synth import make_capture
@@ -241,7 +241,7 @@ def test_version_and_help(run):
 def test_only_the_module_of_the_asked_command_is_imported(data):
     """Seconds of imports must not stand before a short command."""
     code = (
-        "import sys; from express50.cli.main import main; main(['status', sys.argv[1]]);"
+        "import sys; from express50.__main__ import main; main(['status', sys.argv[1]]);"
         "heavy = {'torch', 'open3d', 'pycolmap', 'cv2', 'av', 'dask', 'distributed', 'numpy'};"
         "print(sorted(heavy & set(sys.modules)))"
     )

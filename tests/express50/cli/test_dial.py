@@ -2,7 +2,7 @@
 
 import pytest
 
-from express50.cli.main import main
+from express50.__main__ import main
 from express50.console import USAGE
 from express50.contract.layout import Dataset
 from express50.dataset.report import render_page

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from express50.cli.main import main
+from express50.__main__ import main
 from express50.cli.plan import (
     TARGETS,
     Measured,

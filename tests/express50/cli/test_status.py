@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
+from express50.__main__ import main
 from express50.cli import status as status_cli
-from express50.cli.main import main
 from express50.cli.status import SILENT_SECONDS, read_status, status_page
 from express50.console import format_seconds
 from express50.runner.ledger import Ledger, Receipt, Run

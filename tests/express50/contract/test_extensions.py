@@ -5,7 +5,7 @@ from importlib.metadata import EntryPoint
 
 import pytest
 
-from express50.cli.main import main
+from express50.__main__ import main
 from express50.contract import stage
 from express50.errors import ConfigError, StageError
 from tests.faults import toy

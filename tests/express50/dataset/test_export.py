@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from express50.__main__ import main
 from express50.capture.frames import read_cameras_of, read_frame
-from express50.cli.main import main
 from express50.contract.layout import Dataset
 from express50.dataset.export_avatar import centred
 from express50.files.calibration import read_cameras, write_cameras

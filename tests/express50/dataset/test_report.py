@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from express50.cli.main import main
+from express50.__main__ import main
 from express50.contract.layout import Dataset
 from express50.dataset.report import number, render_page, spread
 from express50.files.images import write_image

@@ -9,9 +9,9 @@ from datetime import datetime
 import numpy as np
 import pytest
 
+from express50.__main__ import main
 from express50.capture.index import read_index
 from express50.capture.readers.read import read_people
-from express50.cli.main import main
 from express50.cli.status import read_status
 from express50.contract.layout import Dataset
 from express50.dataset.withdraw import (

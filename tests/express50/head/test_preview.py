@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from express50.cli.main import main
+from express50.__main__ import main
 from express50.errors import HeadModelError
 from express50.files.images import read_image
 from express50.head.load import load_builtin

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from express50.cli.main import main
+from express50.__main__ import main
 from express50.files.calibration import read_cameras, write_cameras
 from express50.geometry.conventions import FLIP_YZ
 from express50.rigs.world_frame import judge

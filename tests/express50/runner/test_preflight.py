@@ -11,8 +11,8 @@ from types import SimpleNamespace
 import psutil
 import pytest
 
+from express50.__main__ import main
 from express50.cli import stages as stage_commands
-from express50.cli.main import main
 from express50.contract import stage as contract
 from express50.errors import NotReadyError, StageError
 from express50.runner import clusters, executor, preflight

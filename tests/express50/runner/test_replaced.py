@@ -9,7 +9,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from express50.cli.main import main
+from express50.__main__ import main
 from express50.dataset.audit import audit
 from express50.runner import replaced
 from express50.runner.ledger import Ledger

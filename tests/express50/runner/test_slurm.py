@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("dask_jobqueue")
 
-from express50.cli.main import main
+from express50.__main__ import main
 from express50.errors import ConfigError, StageError
 from express50.runner import executor as pool
 from express50.runner import slurm

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from express50.cli.main import main
+from express50.__main__ import main
 from express50.errors import FormatError, UnknownNameError
 from express50.files.images import depth_to_uint16, encode_jpeg, encode_png, image_size
 from express50.shards.reader import ShardReader

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from express50.cli.main import main
+from express50.__main__ import main
 from express50.errors import FormatError, UnknownNameError
 from express50.shards.reader import ShardReader
 from express50.shards.writer import ShardWriter, copy_samples, verify, write_manifest

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from express50.__main__ import main
 from express50.capture.raw import read_capture
-from express50.cli.main import main
 from express50.console import USAGE
 from express50.errors import CaptureError, ConfigError
 from express50.files.images import read_image

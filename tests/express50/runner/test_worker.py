@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from express50.runner.threads import cap_threads
+from express50.runner.worker import cap_threads
 
 
 def test_a_loaded_blas_is_capped() -> None:
