@@ -309,7 +309,9 @@ class HeadViews:
         )
 
     def _tensor(self, array: np.ndarray) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(array)).to(self.head.device, self.head.dtype)
+        # The bytes travel to a GPU as they are, and become floats there.
+        there = torch.from_numpy(np.ascontiguousarray(array)).to(self.head.device)
+        return there.to(self.head.dtype)
 
 
 def check_tracked(where: str, tracked: Tracked, head: HeadModel) -> None:

@@ -68,8 +68,8 @@ def gaussian_window(gaussians: Gaussians, view: PinholeView) -> tuple[slice, sli
         largest = 1e-3 * gaussians.scales_mm.amax(1).clamp(*SCALE_RANGE_MM)
         sigmas = (gaussians.opacities / ALPHA_MIN).clamp_min(1.0).log().mul(2).sqrt()
         extra = CROP_MARGIN_PX + 2.0  # the rasteriser's blur reaches under two pixels
-        reach = (largest * sigmas)[visible]
-        columns, rows = _extents(gaussians.means[visible], reach, view, NEAR_M, extra)
+        reach = torch.where(visible, largest * sigmas, -math.inf)
+        columns, rows = _extents(gaussians.means, reach, view, NEAR_M, extra)
     return _span(*rows, view.height), _span(*columns, view.width)
 
 
@@ -98,24 +98,22 @@ def _extents(
     """Return the pixel range of spheres along x, then y; (inf, -inf) if none is seen.
 
     Spheres have centres (N, 3) in head space and radii (N,), metres. Those nearer than ``near_m``
-    are not seen; ``margin_px`` is added on all sides.
+    are not seen, nor are those with radius -inf; ``margin_px`` is added on all sides.
     """
     camera, K = view.cam_from_head.to(points.dtype), view.K.to(points.dtype)
     points = points @ camera[:3, :3].T + camera[:3, 3]
-    seen = points[:, 2] > near_m
-    points, radii = points[seen], radii[seen]
-    if not len(points):
-        return (math.inf, -math.inf), (math.inf, -math.inf)
+    seen = (points[:, 2] > near_m)[:, None]
+    z = torch.where(seen, points[:, 2:], 1.0)
     # A sphere off the axis projects to a longer ellipse: by 1 / cosine of its angle.
-    ray = points[:, :2] / points[:, 2:]
-    stretch = 1 + (ray**2).sum(1)
-
-    def ends(axis: int) -> tuple[float, float]:
-        centre = K[axis, axis] * ray[:, axis] + K[axis, 2]
-        wide = K[axis, axis] * radii / points[:, 2] * stretch + margin_px
-        return float((centre - wide).min()), float((centre + wide).max())
-
-    return ends(0), ends(1)
+    ray, focal = points[:, :2] / z, K.diagonal()[:2]
+    stretch = 1 + (ray**2).sum(1, keepdim=True)
+    centre = focal * ray + K[:2, 2]
+    wide = focal * radii[:, None] / z * stretch + margin_px
+    low = torch.where(seen, centre - wide, math.inf).amin(0)
+    high = torch.where(seen, centre + wide, -math.inf).amax(0)
+    # One transfer for all four, because each waits for a GPU to finish what it was given.
+    (left, top), (right, bottom) = torch.stack([low, high]).tolist()
+    return (left, right), (top, bottom)
 
 
 def _span(low: float, high: float, size: int) -> slice:

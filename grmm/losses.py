@@ -134,7 +134,9 @@ def laplacian_mm2(vertices: Tensor, edges: Tensor) -> Tensor:
     """
     field = 1e3 * vertices
     source, target = edges.unbind(1)
-    degree = torch.bincount(source, minlength=len(field))[:, None]
+    # Not bincount, which waits for a GPU to report the largest index.
+    ones = field.new_ones(len(source), 1)
+    degree = field.new_zeros(len(field), 1).index_add(0, source, ones)
     around = torch.zeros_like(field).index_add(0, source, field[target]) / degree.clamp_min(1)
     return torch.where(degree > 0, around - field, 0.0).square().sum() / max(1, len(field))
 

@@ -251,12 +251,11 @@ class GRMM(Networks):
             view.height,
             background=behind,
         )
-        maps = out.colors.permute(2, 0, 1)
-        rgb = image = maps[:3]
+        rgb = image = out.colors.permute(2, 0, 1)[:3]
         if refinement is not None:
-            shown = [maps, normalise_depth(out.depth, out.alpha)[None]]
-            shown += [out.alpha[None]] * self.config.refine_alpha
-            image = refinement(torch.cat(shown))
+            shown = [out.colors, normalise_depth(out.depth, out.alpha)[..., None]]
+            shown += [out.alpha[..., None]] * self.config.refine_alpha
+            image = refinement(torch.cat(shown, 2).permute(2, 0, 1))
         return Rendering(
             image=image, rgb=rgb, depth=out.depth, alpha=out.alpha, gaussians=gaussians
         )

@@ -210,9 +210,10 @@ class Refinement(nn.Module):
     def forward(self, maps: Tensor) -> Tensor:
         """Refine (inputs, H, W) to colours (3, H, W)."""
         height, width = maps.shape[1:]
-        pad = (0, -width % self.stride, 0, -height % self.stride)
-        x = nn.functional.pad(maps[None], pad)
-        x = nn.functional.pixel_unshuffle(x, self.unshuffle)
+        pad, x = (0, -width % self.stride, 0, -height % self.stride), maps[None]
+        # Both would copy the images even if there is nothing to pad or to fold.
+        x = nn.functional.pad(x, pad) if any(pad) else x
+        x = nn.functional.pixel_unshuffle(x, self.unshuffle) if self.unshuffle > 1 else x
         x = x.contiguous(memory_format=torch.channels_last)
         levels = [self.enter(x)]
         for block in self.down:
