@@ -331,7 +331,7 @@ def study_make(args: argparse.Namespace) -> int:
 
 def study_serve(args: argparse.Namespace) -> int:
     """Serve a study until Ctrl-C."""
-    from grmm.study.server import make_server
+    from grmm.study import make_server
 
     with make_server(args.out, args.host, args.port) as server:
         say(f"{server.address}  (Ctrl-C stops; answers are kept)")

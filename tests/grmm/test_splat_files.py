@@ -1,7 +1,8 @@
-"""GLB with KHR_gaussian_splatting and SPZ: read back by readers written from the specifications."""
+"""PLY, GLB with KHR_gaussian_splatting and SPZ: read back by readers of the specifications."""
 
 import gzip
 import json
+import math
 import os
 import shutil
 import struct
@@ -12,8 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from grmm.export import GaussianCloud, ply_bytes
-from grmm.splat_files import splats_glb, spz_bytes
+from grmm.export import GaussianCloud, ply_bytes, splats_glb, spz_bytes
 
 SH_DC = 0.28209479177387814
 ATTRIBUTES = ("/meshes/0/primitives/0/attributes/KHR_gaussian_splatting", "")
@@ -120,13 +120,41 @@ def test_what_is_written_is_read_back(cloud, write, read, means, angle, relative
     np.testing.assert_allclose(back.colors, cloud.colors, rtol=0, atol=shade)
 
 
-@pytest.mark.parametrize("write", [splats_glb, spz_bytes])
-def test_bad_values_are_refused(cloud, write):
-    with pytest.raises(ValueError, match="scales"):
-        write(replace(cloud, scales=np.full_like(cloud.scales, np.nan)))
-    if write is spz_bytes:
-        with pytest.raises(ValueError, match="128 m"):
-            write(replace(cloud, means=cloud.means + 130))
+@pytest.fixture
+def one():
+    """One Gaussian whose logarithms and logit are whole numbers."""
+    return GaussianCloud(
+        means=np.array([[1.0, 2, 3]]),
+        quats=np.array([[1.0, 0, 0, 0]]),
+        scales=np.array([[math.e, 1, 1 / math.e]]),
+        opacities=np.array([0.5]),
+        colors=np.array([[0.5, 1.0, 0.0]]),
+    )
+
+
+def test_bytes_of_one_gaussian_worked_by_hand(one):
+    header, _, body = ply_bytes(one).partition(b"end_header\n")
+    assert header.startswith(b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty")
+    dc = 0.5 * 2 * math.sqrt(math.pi)  # (1 - 0.5) / (1 / (2 sqrt pi))
+    expected = [1, 2, 3, 0, 0, 0, 0, dc, -dc, 0, 1, 0, -1, 1, 0, 0, 0]
+    assert struct.unpack("<17f", body) == pytest.approx(expected, abs=1e-6)
+
+
+def test_extreme_opacities_and_scales_stay_finite(one):
+    flat = replace(one, opacities=np.array([1.0]), scales=np.zeros((1, 3)))
+    body = ply_bytes(flat).partition(b"end_header\n")[2]
+    assert np.isfinite(np.frombuffer(body, "<f4")).all()
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "colors"])
+def test_values_that_are_not_finite_are_refused(one, name):
+    with pytest.raises(ValueError, match=name):
+        replace(one, **{name: np.full_like(getattr(one, name), np.nan)})
+
+
+def test_spz_refuses_far_positions(cloud):
+    with pytest.raises(ValueError, match="128 m"):
+        spz_bytes(replace(cloud, means=cloud.means + 130))
 
 
 def test_khronos_validator_finds_nothing_wrong(cloud, tmp_path):

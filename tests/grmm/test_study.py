@@ -14,6 +14,7 @@ from grmm.cli import main
 from grmm.study import (
     append_answer,
     check_answer,
+    make_server,
     make_study,
     markdown,
     method_of,
@@ -21,7 +22,6 @@ from grmm.study import (
     summarise,
     trials,
 )
-from grmm.study.server import make_server
 
 
 @pytest.fixture
