@@ -65,9 +65,7 @@ class PackedSubject:
         gains: linear light (3,) by camera, if measured.
         peaks: decode index by expression.
         labels: label without the annotator's name, by expression.
-        tracked: head-model parameters by expression.
-        vertices: (V, 3) tracked mesh in the world by expression, metres.
-        offsets: (V, 3) of the rest shape; None where all are 0.
+        track: the tracked head.
         registered: registrations of this track by expression, if any.
         notes: why a registration is left out.
         meta: the fields of meta.json that all samples share.
@@ -79,9 +77,7 @@ class PackedSubject:
     gains: dict[str, np.ndarray]
     peaks: dict[str, int]
     labels: dict[str, dict]
-    tracked: dict[str, dict]
-    vertices: dict[str, np.ndarray]
-    offsets: np.ndarray | None
+    track: Track
     registered: dict[str, Registration]
     notes: list[Note]
     meta: dict
@@ -97,9 +93,7 @@ def read_subject(dataset: Dataset, name: str) -> PackedSubject:
     index = read_index(dataset, name)
     peak_rows = read_json_table(dataset.peaks_file(name), FormatError)
     track = read_track(existing_track(dataset, name))
-    offsets = track.offsets if track.offsets.any() else None
     registered, notes = _read_registered(dataset, name, track)
-    shared = {"shape": track.shape.tolist(), "offsets": offsets is not None}
     return PackedSubject(
         name=name,
         cameras=read_cameras_of(dataset, name),
@@ -107,17 +101,7 @@ def read_subject(dataset: Dataset, name: str) -> PackedSubject:
         gains=read_gains(dataset, name),
         peaks=read_peaks(dataset, name),
         labels={expression: nameless(row) for expression, row in peak_rows.items()},
-        tracked={
-            expression: {key: getattr(track, key)[row].tolist() for key in PARAMETERS}
-            | shared
-            | {"registered": expression in registered}
-            for row, expression in enumerate(track.expressions)
-        },
-        vertices={
-            expression: track.vertices[row].astype(np.float64)
-            for row, expression in enumerate(track.expressions)
-        },
-        offsets=offsets,
+        track=track,
         registered=registered,
         notes=notes,
         meta={
@@ -189,7 +173,7 @@ def load_sample(
         StageError: it is not tracked, an image is missing, or their sizes differ.
         FormatError, CaptureError: an image cannot be read.
     """
-    if expression not in subject.tracked:
+    if expression not in subject.track.expressions:
         raise StageError("it is not tracked")
     item = f"{subject.name}/{expression}"
     folder = dataset.item_dir("depth", item)
@@ -255,7 +239,9 @@ def encode_sample(
     Raises:
         StageError: the sample shows no head to crop, or its depth is too large for shards.
     """
-    crop = head_crop(camera, subject.vertices[expression], loaded.alpha)
+    track = subject.track
+    row = track.row(expression)
+    crop = head_crop(camera, track.vertices[row].astype(np.float64), loaded.alpha)
     depth, valid = cut_depth(loaded.depth, loaded.valid, crop, config.size)
     if (farthest := depth[valid].max(initial=0)) >= DEPTH_LIMIT_M:
         raise StageError(
@@ -287,7 +273,12 @@ def encode_sample(
         "parts": parts is not None,
         "source_size": [camera.width, camera.height],
         "torso": loaded.torso,
-        "track": subject.tracked[expression],
+        "track": {key: getattr(track, key)[row].tolist() for key in PARAMETERS}
+        | {
+            "offsets": bool(track.offsets.any()),
+            "registered": expression in subject.registered,
+            "shape": track.shape.tolist(),
+        },
         "width": config.size,
     }
     if (recorded := subject.recorded[camera.id]) != meta["source_size"]:

@@ -17,17 +17,14 @@ from express50.files.atomic import write_json
 from express50.files.images import contact_sheet, write_image
 from express50.files.text import read_json_table
 from express50.shards.reader import ShardReader, sample_panels, write_offsets, write_registered
-from express50.shards.writer import PackedSample, ShardWriter, gather_shards, write_manifest
+from express50.shards.writer import ShardWriter, gather_shards, write_manifest
 from pipelines.pack.card import split_subjects, write_card
 from pipelines.pack.config import EncodeConfig, PackConfig
-from pipelines.pack.sample import PackedSubject, encode_sample, load_sample, read_subject
+from pipelines.pack.sample import encode_sample, load_sample, read_subject
 
 SHARD_BYTES = 256_000_000  # a shard is closed at this size; an expression is never split
 QC_SAMPLES = 12
 ON_CARD = ("subject", "expression", "camera", "label", "licence", "consent", "head", "parts")
-
-Pair = tuple[PackedSample, dict]
-"""A sample and the content of its meta.json."""
 
 
 def encode(dataset: Dataset, name: str, config: EncodeConfig, out: Path) -> Result:
@@ -43,16 +40,28 @@ def encode(dataset: Dataset, name: str, config: EncodeConfig, out: Path) -> Resu
     metas: list[dict] = []
     dropped: list[Note] = []
     for expression in sorted(subject.peaks):
-        group, left_out = _encode_group(dataset, subject, expression, config)
-        dropped += left_out
+        group = []
+        for camera_id, camera in sorted(subject.cameras.items()):
+            try:
+                loaded = load_sample(dataset, subject, expression, camera, config)
+                sample, meta = encode_sample(loaded, subject, expression, camera, config)
+            except (CaptureError, FormatError, StageError) as error:
+                dropped.append(Note(f"{name}/{expression}/{camera_id}", str(error)))
+                continue
+            group.append(sample)
+            metas.append(meta)
         if group:
-            writer.add_group("subject", [sample for sample, _ in group])
-        metas += [meta for _, meta in group]
+            writer.add_group("subject", group)
     writer.close()
     if not metas:
         why = "; ".join(sorted({note.why for note in dropped})[:3])
         raise StageError(f"none of its {len(dropped)} samples can be packed ({why})")
-    _write_subject_files(out, subject)
+    # Stored once per subject, not with every sample.
+    if subject.track.offsets.any():
+        write_offsets(out, name, subject.track.offsets)
+    if subject.registered:
+        meshes = {key: (one.offsets, one.sigma) for key, one in subject.registered.items()}
+        write_registered(out, name, meshes)
     write_manifest(out, writer.digests)
     metrics = {
         "read": len(metas) + len(dropped),
@@ -64,28 +73,6 @@ def encode(dataset: Dataset, name: str, config: EncodeConfig, out: Path) -> Resu
         "profile": config.profile,
     }
     return Result(metrics, dropped, warn_of_gaps(metas) + subject.notes)
-
-
-def _encode_group(
-    dataset: Dataset, subject: PackedSubject, expression: str, config: EncodeConfig
-) -> tuple[list[Pair], list[Note]]:
-    """Encode all cameras of one expression; a note says why a camera is left out."""
-    group, dropped = [], []
-    for camera_id, camera in sorted(subject.cameras.items()):
-        try:
-            loaded = load_sample(dataset, subject, expression, camera, config)
-            group.append(encode_sample(loaded, subject, expression, camera, config))
-        except (CaptureError, FormatError, StageError) as error:
-            dropped.append(Note(f"{subject.name}/{expression}/{camera_id}", str(error)))
-    return group, dropped
-
-
-def _write_subject_files(out: Path, subject: PackedSubject) -> None:
-    """Write the files that are stored once per subject, not with every sample."""
-    if subject.offsets is not None:
-        write_offsets(out, subject.name, subject.offsets)
-    if meshes := {name: (one.offsets, one.sigma) for name, one in subject.registered.items()}:
-        write_registered(out, subject.name, meshes)
 
 
 def warn_of_gaps(metas: list[dict]) -> list[Note]:
@@ -136,7 +123,10 @@ def pack(dataset: Dataset, config: PackConfig, out: Path) -> Result:
     reader.close()
     write_manifest(out, digests)
     metrics = totals | {"samples_by_split": by_split, "depth_coverage": coverage}
-    return Result(metrics, dropped, _warn_of_mixtures(totals))
+    again = "run 'express50 pack' without a subset"
+    mixed = [key for key in ("size", "profile") if "," in totals[key]]
+    warnings = [Note(key, f"subjects were encoded with {totals[key]}; {again}") for key in mixed]
+    return Result(metrics, dropped, warnings)
 
 
 def _read_accounts(dataset: Dataset) -> tuple[dict[str, dict], list[Note]]:
@@ -165,17 +155,6 @@ def _totals(out: Path, reader: ShardReader, accounts: Mapping[str, dict]) -> dic
         "bytes_per_sample": round(size / len(reader)),
         **{key: ", ".join(sorted(values)) for key, values in kinds.items()},
     }
-
-
-def _warn_of_mixtures(totals: Mapping[str, Any]) -> list[Note]:
-    """Warn of subjects that were encoded with different settings."""
-    return [
-        Note(
-            key, f"subjects were encoded with {totals[key]}; run 'express50 pack' without a subset"
-        )
-        for key in ("size", "profile")
-        if "," in totals[key]
-    ]
 
 
 def _statistics(totals: Mapping[str, Any]) -> dict[str, str]:

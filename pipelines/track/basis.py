@@ -121,10 +121,14 @@ class Points:
         linear, pose = values[:-POSE_SIZE], values[-POSE_SIZE:]
         rest, joints = self._rest(linear), self._joints(linear)
 
-        turn, shift, turns = _transforms(pose, joints, about)
+        turns = _joint_rotations(pose)
+        turn, shift = joint_transforms(joints[None], turns[None])
+        world = axis_angle_to_matrix(pose[12:15]) @ about
+        turn, shift = world @ turn[0], shift[0] @ world.T
         by_turn, by_shift, by_turns = _transform_slopes(pose, joints, about)
         correctives = self.pose_dirs.T @ by_turns.flatten(1).T  # (3 M, 18)
-        corrected = rest + (self.pose_dirs.T @ (turns - torch.eye(3)).flatten()).view(rest.shape)
+        bent = (turns[1:] - torch.eye(3)).flatten()
+        corrected = rest + (self.pose_dirs.T @ bent).view(rest.shape)
         blended = torch.einsum("nj,jrc->nrc", self.skinning, turn)
         points = (blended @ corrected[..., None])[..., 0] + self.skinning @ shift + pose[15:]
         shared = (self.skinning[:, :, None] * corrected[:, None]).flatten(1)  # (M, 5 * 3)
@@ -134,8 +138,7 @@ class Points:
         columns[:, :, 15:] += torch.eye(3)
 
         moving = self.basis.joint_directions.permute(2, 0, 1)
-        every = _joint_rotations(pose)[None].expand(len(moving), -1, -1, -1)
-        world = axis_angle_to_matrix(pose[12:15]) @ about
+        every = turns[None].expand(len(moving), -1, -1, -1)
         moved = (joint_transforms(moving, every)[1] @ world.T).permute(1, 2, 0).flatten(1)
         by_coefficient = torch.addmm((blended @ self.directions).flatten(1), self.skinning, moved)
         return points.numpy(), torch.cat(
@@ -143,24 +146,12 @@ class Points:
         ).numpy()
 
 
-def _transforms(
-    pose: torch.Tensor, joints: torch.Tensor, about: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return the joints' turns (5, 3, 3) and shifts (5, 3) to the world, and rotations (4, 3, 3).
-
-    The latter are to the parents, without the root's.
-    """
-    turns = _joint_rotations(pose)
-    turn, shift = joint_transforms(joints[None], turns[None])
-    world = axis_angle_to_matrix(pose[12:15]) @ about
-    return world @ turn[0], shift[0] @ world.T, turns[1:]
-
-
 def _transform_slopes(
     pose: torch.Tensor, joints: torch.Tensor, about: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return the slopes of `_transforms` by the pose: (18, 5, 3, 3), (18, 5, 3), (18, 4, 3, 3).
+    """Return slopes by the pose: (18, 5, 3, 3), (18, 5, 3) and (18, 4, 3, 3).
 
+    They are those of the joints' turns and shifts to the world, and of the joints' own rotations.
     Transforms are affine in any one joint's rotation: along its slope their difference is exact.
     """
     turns, slopes = _joint_rotations(pose), rotation_slopes(pose[:15].view(5, 3))

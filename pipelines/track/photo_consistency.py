@@ -77,55 +77,72 @@ class PatchSearch:
     pixel: float
 
 
-def search(
-    images: list[tuple[np.ndarray, Camera]],
-    weights: np.ndarray,
-    places: np.ndarray,
-    normals: np.ndarray,
-    mesh: np.ndarray,
-    faces: np.ndarray,
-    reach: float,
-) -> PatchSearch:
-    """Search for the surface within `reach` metres of places (S, 3) along unit normals (S, 3).
+@dataclass(frozen=True)
+class PatchViews:
+    """How C views see S places on a mesh (V, 3) with faces (F, 3).
 
-    The rest is as in `agreement`.
+    Attributes:
+        images: grey pictures (H, W) float32, root of light, with their pinhole cameras.
+        weights: (C, S), 0 where a place is not seen.
+        places: (S, 3) in the world.
+        normals: (S, 3) of unit length.
     """
-    pixel = pixel_size(images, places)
+
+    images: list[tuple[np.ndarray, Camera]]
+    weights: np.ndarray
+    places: np.ndarray
+    normals: np.ndarray
+    mesh: np.ndarray
+    faces: np.ndarray
+
+    @property
+    def pixel(self) -> float:
+        """Return how wide a pixel is at the places, metres."""
+        middle = self.places.mean(0)
+        sizes = [
+            np.linalg.norm(middle - camera.center) / camera.K[0, 0] for _, camera in self.images
+        ]
+        return float(np.median(sizes)) if sizes else 1e-3
+
+
+def patch_views(
+    model: HeadModel, pictures: FrameSetCrops, mesh: np.ndarray, sets: list[MeshPlaces]
+) -> list[PatchViews]:
+    """Weigh how a frame set's crops see sets of samples on a mesh (V, 3)."""
+    faces = model.faces.numpy()
+    images = [(root @ GREY, camera) for root, camera in pictures.images()]
+    visibility, found = Visibility(mesh, faces), []
+    for samples in sets:
+        places, normals = samples.at(mesh), sample_normals(samples, mesh)
+        weights = view_weights(visibility, pictures, places, normals)
+        weights = np.where(weights > SLANT, weights**2, 0.0)
+        found.append(PatchViews(images, weights, places, normals, mesh, faces))
+    return found
+
+
+def search(views: PatchViews, reach: float) -> PatchSearch:
+    """Search for the surface within `reach` metres of the places, along the normals."""
+    pixel = views.pixel
     steps = max(3, int(np.ceil(reach / (STEP_PX * pixel))))
     heights = np.arange(-steps, steps + 1) * (reach / steps)
-    score = agreement(images, weights, places, normals, mesh, faces, heights)
-    return _peaks(score, heights, pixel)
+    return _peaks(agreement(views, heights), heights, pixel)
 
 
-def pixel_size(images: list[tuple[np.ndarray, Camera]], places: np.ndarray) -> float:
-    """Return how wide a pixel is at places (S, 3), metres."""
-    middle = places.mean(0)
-    sizes = [np.linalg.norm(middle - camera.center) / camera.K[0, 0] for _, camera in images]
-    return float(np.median(sizes)) if sizes else 1e-3
+def agreement(views: PatchViews, heights: np.ndarray) -> np.ndarray:
+    """Score (S, D) how alike views see patches that are moved by heights (D,), metres.
 
-
-def agreement(
-    images: list[tuple[np.ndarray, Camera]],
-    weights: np.ndarray,
-    places: np.ndarray,
-    normals: np.ndarray,
-    mesh: np.ndarray,
-    faces: np.ndarray,
-    heights: np.ndarray,
-) -> np.ndarray:
-    """Score (S, D) how alike views see patches at places (S, 3) moved by heights (D,), metres.
-
-    Images are C grey pictures (H, W) float32, root of light, with their pinhole cameras; `weights`
-    (C, S) are 0 where a place is not seen. Patches are bent to follow the mesh (V, 3), (F, 3).
+    Patches are bent to follow the mesh.
     """
+    weights, places, normals = views.weights, views.places, views.normals
     if len(weights) > VIEWS:  # more views add little
         weights = np.where(weights >= np.sort(weights, axis=0)[-VIEWS], weights, 0.0)
-    spacing, centre = SPACING_PX * pixel_size(images, places), mesh.mean(0)
-    shapes = _shapes(mesh_scene(mesh - centre, faces), centre, places, normals, spacing)
+    spacing, centre = SPACING_PX * views.pixel, views.mesh.mean(0)
+    scene = mesh_scene(views.mesh - centre, views.faces)
+    shapes = _shapes(scene, centre, places, normals, spacing)
     count, size = len(places), PATCH * PATCH
     total = np.zeros((count, len(heights), size), np.float32)
     mass, square = np.zeros(count), np.zeros(count)
-    for (image, camera), weight in zip(images, weights, strict=True):
+    for (image, camera), weight in zip(views.images, weights, strict=True):
         chosen = np.flatnonzero(weight > 0)
         if not len(chosen):
             continue
@@ -262,17 +279,15 @@ def patch_terms(
     `reach` is in metres to either side, `weight` the trust in the result; what is `covered` (V,) is
     left out.
     """
-    faces = model.faces.numpy()
-    images = [(root @ GREY, camera) for root, camera in pictures.images()]
-    visibility, terms = Visibility(mesh, faces), []
-    for samples, trust in skin:
-        if covered is not None:
-            samples = samples.some(~covered[samples.vertices].any(1))
-        places, normals = samples.at(mesh), sample_normals(samples, mesh)
-        views = view_weights(visibility, pictures, places, normals)
-        views = np.where(views > SLANT, views**2, 0.0)
-        found = search(images, views, places, normals, mesh, faces, reach)
-        term = surface_term(found, samples, places, normals, trust * weight)
+    sets = [samples for samples, _ in skin]
+    if covered is not None:
+        sets = [samples.some(~covered[samples.vertices].any(1)) for samples in sets]
+    terms = []
+    for samples, (_, trust), views in zip(
+        sets, skin, patch_views(model, pictures, mesh, sets), strict=True
+    ):
+        found = search(views, reach)
+        term = surface_term(found, samples, views.places, views.normals, trust * weight)
         if term is not None:
             terms.append(term)
     return terms
@@ -312,19 +327,15 @@ def things_before(
     There the views agree better than on the mesh behind. Things thinner than a patch are missed.
     """
     samples = skin[0][0].some(slice(None, None, EVERY))
-    faces = model.faces.numpy()
-    images = [(root @ GREY, camera) for root, camera in pictures.images()]
-    places, normals = samples.at(mesh), sample_normals(samples, mesh)
-    views = view_weights(Visibility(mesh, faces), pictures, places, normals)
-    views = np.where(views > SLANT, views**2, 0.0)
-    pixel = pixel_size(images, places)
+    (views,) = patch_views(model, pictures, mesh, [samples])
+    places, pixel = views.places, views.pixel
     heights = np.arange(-CLEAR_M, BEFORE_M, min(STEP_PX * pixel, SAME_M))
-    score = agreement(images, views, places, normals, mesh, faces, heights)
+    score = agreement(views, heights)
     before = heights > CLEAR_M
     found = _peaks(score[:, before], heights[before], pixel)
     at_mesh = score[:, ~before].max(1)
     sure = found.score > np.maximum(LEAST_SCORE, at_mesh + MARGIN)
-    tops = places + found.height[:, None] * normals
+    tops = places + found.height[:, None] * views.normals
     near = cKDTree(places).query(places, ASKED)[1]
     same = sure[near] & (np.abs(found.height[near] - found.height[:, None]) < SAME_M)
     agreed = tops[sure & (same.mean(1) > AGREEING)]

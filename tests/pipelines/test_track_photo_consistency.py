@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipelines.track.photo_consistency import PatchViews, surface_term
 from pipelines.track.photo_consistency import search as search_patches
-from pipelines.track.photo_consistency import surface_term
 from pipelines.track.terms import MeshPlaces, NormalTerm, information
 from tests.pipelines.term_checks import cost_at, gradient_at, slope_along
 from tests.pipelines.textured_scenes import (
@@ -29,10 +29,9 @@ def search(cameras, images, radius=RADIUS + 0.003, weights=None, centre=ORIGIN):
     samples = places_on(faces, vertices - centre)
     places, normals, seen = seen_weights(cameras, samples, vertices, faces)
     weights = seen**2 if weights is None else weights
-    found = search_patches(
-        list(zip(images, cameras, strict=True)), weights, places, normals, vertices, faces, REACH
-    )
-    return found, samples, places, normals
+    images = list(zip(images, cameras, strict=True))
+    views = PatchViews(images, weights, places, normals, vertices, faces)
+    return search_patches(views, REACH), samples, places, normals
 
 
 def relief_of(found, samples, places, normals) -> NormalTerm | None:
