@@ -28,7 +28,7 @@ from express50.head.load import load_builtin, load_head
 from express50.head.model import HeadModel, landmarks, pose
 from express50.head.preview import render_preview
 from pipelines.register.scan import fit_scan
-from pipelines.register.scan_mesh import GREY, Scan
+from pipelines.register.scan_input import GREY, Scan
 
 SAMPLES = 200
 SHEET_PEOPLE, SHEET_SIDES, SHEET_PX = 24, (0.0, 40.0, 90.0), 160

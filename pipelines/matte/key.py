@@ -38,6 +38,7 @@ CORE = 0.018  # radius of the disc that must fit inside a part of the subject fo
 OPEN = 1.5  # deviations of noise: an area that differs by less shows the plate
 BLACK, WHITE = 24, 250  # grey levels beyond which two surfaces may look the same
 FILL = 0.012  # spots and gaps in the solid subject are filled this far from its edge
+WIDE = 0.01  # radius of a disc that is wider than strands and soft edges
 _LUMA = np.array([[0.299, 0.587, 0.114]], dtype=np.float32)
 
 
@@ -61,8 +62,8 @@ def key_alpha(frame: np.ndarray, plate: np.ndarray, valid: np.ndarray, shadow: f
     alpha = np.zeros(valid.shape, np.float32)
     length = max(valid.shape)
     model, image = fit_plate(plate, frame, valid), frame.astype(np.float32)
-    dark, difference = plate_difference(image, model, shadow, length)
-    difference[~valid] = 0.0
+    dark, difference, unshaded = plate_difference(image, model, shadow, length)
+    difference = np.where(valid, difference, 0.0)
     region = subject_region(difference)
     if not region.any():
         return alpha
@@ -75,7 +76,7 @@ def key_alpha(frame: np.ndarray, plate: np.ndarray, valid: np.ndarray, shadow: f
     part = PlateModel(model.plate[window], model.sigma[window], model.whiten)
     frame, image, dark = frame[window], image[window], dark[window]
     difference, region = difference[window], region[window]
-    clear = clear_plate(image, part, length)
+    clear = clear_plate(unshaded[window], part, length)
     # The first solid only provides the colours nearby.
     support = find_support(difference > 2 * LOW, region, clear, length, eroded_about)
     if support.core.any():
@@ -177,25 +178,28 @@ def _length(error: np.ndarray, model: PlateModel) -> np.ndarray:
 
 def plate_difference(
     image: np.ndarray, model: PlateModel, shadow: float, length: int
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Measure the difference (H, W) of an image (H, W, 3) from the plate, in noise deviations.
 
     Where an entire neighbourhood is the plate darkened (at most by `shadow`), the difference
     is taken from the darkened plate. A dark strand also darkens, but not an entire neighbourhood.
-    Also returns the darkening's factor (H, W) on sRGB values there, 0 elsewhere.
+
+    Returns:
+        The darkening's factor (H, W) on sRGB values there, 0 elsewhere; the difference; and the
+        difference from the plate as it is.
     """
     off = image - model.plate
     difference = _length(off, model)
     if shadow <= 0:
-        return np.zeros_like(difference), difference
+        return np.zeros_like(difference), difference, difference
     # Darkening linear light by s darkens sRGB values by about s^(1/2.2).
     lumas = [cv2.transform(values, _LUMA) for values in (image, model.plate)]
     dark = np.clip(lumas[0] / np.maximum(lumas[1], 1.0), (1 - shadow) ** (1 / 2.2), 1.0)
     off += model.plate * (1 - dark)[..., None]
     shaded = _length(off, model)
-    # Opening by a disc wider than strands and soft edges keeps broad areas only.
-    broad = opened(shaded < 3.0, _pixels(0.01, length), eroded_about)
-    return dark * broad, np.where(broad, np.minimum(difference, shaded), difference)
+    # Opening keeps broad areas only.
+    broad = opened(shaded < 3.0, _pixels(WIDE, length), eroded_about)
+    return dark * broad, np.where(broad, np.minimum(difference, shaded), difference), difference
 
 
 def shade_of_plate(dark: np.ndarray, clear: np.ndarray, length: int) -> np.ndarray:
@@ -223,17 +227,16 @@ def subject_region(difference: np.ndarray) -> np.ndarray:
     return (sure & (area >= least))[labels]
 
 
-def clear_plate(image: np.ndarray, model: PlateModel, length: int) -> np.ndarray:
-    """Return the pixels (H, W) of wide areas that differ from the plate by mere noise.
+def clear_plate(difference: np.ndarray, model: PlateModel, length: int) -> np.ndarray:
+    """Return the pixels (H, W) of wide areas whose difference from the plate is mere noise.
 
     The wall shows between a hand and the face. A shirt of the wall's colour has folds, darker and
     brighter. Black hair before a black wall may have none, and neither has skin in front of a lamp
     where both are white.
     """
-    difference = _length(image - model.plate, model)
     smooth = np.sqrt(cv2.blur(difference**2, (3, 3)))
     exposed = (model.plate.max(axis=-1) > BLACK) & (model.plate.min(axis=-1) < WHITE)
-    return opened((smooth < OPEN) & exposed, _pixels(0.01, length), eroded_about)
+    return opened((smooth < OPEN) & exposed, _pixels(WIDE, length), eroded_about)
 
 
 def find_support(

@@ -32,8 +32,7 @@ from pipelines.register.lay import (
     skin_trust,
     trusted_vertices,
 )
-from pipelines.register.scan_landmarks import GIVEN_M, check_face
-from pipelines.register.scan_mesh import Scan
+from pipelines.register.scan_input import GIVEN_M, Scan, check_face
 from pipelines.track.basis import OFF, Basis, make_basis
 from pipelines.track.fit import fit
 from pipelines.track.observe import JAW_LINE_WEIGHT, LandmarkView, Observation, agree

@@ -22,8 +22,14 @@ from express50.geometry.raycast import mesh_scene
 from express50.head.load import load_head
 from express50.head.model import landmarks
 from pipelines.register.scan import PITCHES, YAWS, FittedScan, fit_scan
-from pipelines.register.scan_landmarks import landmarks_beside, read_landmarks
-from pipelines.register.scan_mesh import KINDS, UNITS, Scan, read_scan
+from pipelines.register.scan_input import (
+    KINDS,
+    UNITS,
+    Scan,
+    landmarks_beside,
+    read_landmarks,
+    read_scan,
+)
 from pipelines.register.stage import LEAST_SEEN, write_registration
 from pipelines.track.stage import write_track
 

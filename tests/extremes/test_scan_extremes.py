@@ -14,8 +14,7 @@ from express50.geometry.transforms import axis_angle_to_matrix
 from express50.head.load import load_builtin
 from express50.head.model import landmarks, pose
 from pipelines.register.scan import look
-from pipelines.register.scan_landmarks import check_face
-from pipelines.register.scan_mesh import GREY, UNITS, Scan, read_scan
+from pipelines.register.scan_input import GREY, UNITS, Scan, check_face, read_scan
 
 NONE = np.full((68, 3), np.nan)
 

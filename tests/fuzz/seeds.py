@@ -39,8 +39,7 @@ from express50.shards.codecs import decode_picture, encode_pictures
 from express50.shards.reader import ShardReader, read_entries, write_offsets, write_registered
 from express50.shards.writer import verify, write_manifest
 from pipelines import ingest
-from pipelines.register.scan_landmarks import read_landmarks
-from pipelines.register.scan_mesh import KINDS, read_scan
+from pipelines.register.scan_input import KINDS, read_landmarks, read_scan
 from tests.express50.capture.layouts import (
     write_ava,
     write_colmap,

@@ -116,7 +116,7 @@ def test_the_difference_of_mere_noise_is_one() -> None:
     )
     model = fit_plate(plate, frame, np.ones(plate.shape[:2], bool))
     assert np.median(model.sigma) == pytest.approx(3 * np.sqrt(2), rel=0.1)
-    _, difference = plate_difference(frame.astype(np.float32), model, 0.0, 200)
+    _, difference, _ = plate_difference(frame.astype(np.float32), model, 0.0, 200)
     assert np.sqrt(np.mean(difference**2)) == pytest.approx(1.0, abs=0.1)
 
 

@@ -17,7 +17,7 @@ from express50.errors import FormatError
 from express50.geometry.transforms import axis_angle_to_matrix
 from express50.head.load import load_head
 from express50.head.model import landmarks, pose
-from pipelines.register.scan_landmarks import landmarks_beside, read_landmarks
+from pipelines.register.scan_input import landmarks_beside, read_landmarks
 
 
 @pytest.fixture(scope="module")
