@@ -22,7 +22,7 @@ from express50.geometry.shapes import PIXEL_LIMIT, check_shape
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from grmm.config import Config, ModelConfig, as_tables, from_tables
-from grmm.data import NO_OFFSETS, HeadViews, Source, Tracked, check_tracked
+from grmm.data import NO_OFFSETS, HeadViews, Source, Tracked, check_tracked, stacked
 from grmm.model import GRMM, PinholeView
 from grmm.networks import Networks
 
@@ -54,8 +54,6 @@ GONE: dict[str, dict[str, object]] = {
         "seed": ANY,
     },
 }  # fmt: skip
-
-
 # Values that older checkpoints were trained with, before these were settings.
 UNSAID: dict[str, dict[str, object]] = {
     "model": {"refine_alpha": True}, "train": {"warm_start": True},
@@ -120,7 +118,7 @@ def save_checkpoint(
     # subject: they are larger than all other parameters together.
     frames = gallery.frames
     parameters = {
-        name: torch.from_numpy(_stacked([getattr(frame, name) for frame in frames.values()]))
+        name: torch.from_numpy(stacked([getattr(frame, name) for frame in frames.values()]))
         for name in PARAMETERS
     }
     offsets = {s: torch.from_numpy(np.ascontiguousarray(t.offsets)) for (s, _), t in frames.items()}
@@ -142,12 +140,6 @@ def save_checkpoint(
         "loop": loop or {},
     }
     write_content(path, content)
-
-
-def _stacked(rows: Sequence[np.ndarray]) -> np.ndarray:
-    """Stack arrays (n, ...) of different lengths; missing trailing coefficients become zeros."""
-    length = max(map(len, rows))
-    return np.stack([np.pad(r, [(0, length - len(r))] + [(0, 0)] * (r.ndim - 1)) for r in rows])
 
 
 def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Loaded:

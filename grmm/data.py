@@ -29,6 +29,7 @@ CACHE_BYTES = 512 << 20  # of decoded samples: a few hundred of 512 px
 DEFAULTS = DataConfig()  # black behind the head
 Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
+Choice = TypeVar("Choice")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -351,7 +352,15 @@ def pose_state(head: HeadModel, tracked: Tracked) -> HeadState:
     )
 
 
-Choice = TypeVar("Choice")
+def padded(values: np.ndarray, length: int) -> np.ndarray:
+    """Pad rows (n, ...) with zeros, which missing coefficients are."""
+    return np.pad(values, [(0, length - len(values)), *[(0, 0)] * (values.ndim - 1)])
+
+
+def stacked(rows: Sequence[np.ndarray]) -> np.ndarray:
+    """Stack arrays (n, ...) of different lengths; shorter ones are `padded`."""
+    length = max(map(len, rows))
+    return np.stack([padded(row, length) for row in rows])
 
 
 class Shuffle:

@@ -1,8 +1,8 @@
-"""Say where we deviate from the paper's letter, why, and what that was measured to do.
+"""List where we deviate from the paper, why, and what effect was measured.
 
-``grmm config --paper-diff`` prints it for any settings; docs/PAPER.md holds the same tables.
-Effects were measured on the demo's shards (three people, seven cameras of 256 px, one held out, or
-a fourth person fitted), unless they name something else. Where none was, it says so.
+``grmm config --paper-diff`` prints the list for any settings; docs/PAPER.md holds the same tables.
+Unless an effect says otherwise, it was measured on the demo's shards: three people, seven cameras
+of 256 px, one camera held out, or a fourth person fitted.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ NOT_MEASURED = "not measured"
 
 @dataclass(frozen=True, kw_only=True)
 class Deviation:
-    """One thing that we do otherwise: what the paper has, what we have, why, and its effect."""
+    """One deviation: what the paper has, what we have, why, and its effect."""
 
     paper: str
     ours: str
@@ -25,17 +25,17 @@ class Deviation:
     effect: str = NOT_MEASURED
 
 
-# At every setting, the preset ``paper`` too.
+# With all settings, those of the preset ``paper`` included.
 ALWAYS = (
     Deviation(
         paper="s_in = 0, s = delta_s",
         ours="s = softplus(delta_s + bias) mm, which starts at the texel spacing",
-        reason="a Gaussian of no size shows nothing and gets no gradient (G2)",
+        reason="a Gaussian of size zero is invisible and gets no gradient (G2)",
     ),
     Deviation(
         paper="r_in in R^3 is 0, r = delta_r",
         ours="a quaternion, normalise(delta_r + identity)",
-        reason="ten channels are 3 + 4 + 3; zeros shall mean no rotation (G1)",
+        reason="ten channels are 3 + 4 + 3, and zeros mean no rotation (G1)",
     ),
     Deviation(
         paper="N_g^2 Gaussians",
@@ -71,12 +71,12 @@ ALWAYS = (
     ),
     Deviation(
         paper="L2 of depth, no unit",
-        ours="squared decimetres, over pixels that both cover and 2 px inside their border",
-        reason="in metres the term would vanish beside colours, in millimetres dominate (G11)",
+        ours="squared decimetres, over pixels that both cover, 2 px or more inside their borders",
+        reason="in metres colours would outweigh the term, in millimetres it would dominate (G11)",
     ),
     Deviation(
         paper="locality: neck and jaw by SLERP",
-        ours="eyes too, offsets linearly; both I and I_rgb, a random training camera",
+        ours="eyes by SLERP too, offsets linearly; I and I_rgb, seen by a random training camera",
         reason="the paper names no camera, and our meshes have eyes and offsets (G22)",
     ),
 )
@@ -84,21 +84,21 @@ ALWAYS = (
 # By setting: why a preset has another value than ``paper``, and its effect.
 REASONS: dict[str, tuple[str, str]] = {
     "data.skip_hidden_neck": (
-        "the neck ends elsewhere in every view, above the collar; as background the views"
+        "the collar hides another part of the neck in every view; as background, these views"
         " contradict each other",
         "neck of held-out views 20.6 to 25.2 dB, within 3 px of the collar 14.3 to 19.8, skin +0.05"
         " (120 steps of demo, 96 texels)",
     ),
     "model.refine_alpha": (
-        "normalised depth is 0 at the nearest pixel and in the background; alpha tells them apart",
+        "normalised depth is 0 at the nearest pixel and in the background; alpha separates them",
         NOT_MEASURED,
     ),
     "train.warm_start": (
-        "projecting the footage gives at once the colours that the first thousands of steps find",
+        "projecting the footage gives at once the colours that thousands of steps would find",
         "+0.27 dB, on training views +1.2 (400 steps of demo, 27.60 to 27.88)",
     ),
     "loss.laplacian": (
-        "the Laplacian of the mesh penalises the head's own curvature; the displacement is kept"
+        "the Laplacian of the mesh penalises the head's own curvature, so displacements are kept"
         " small instead",
         "both terms instead of the Laplacian of the mesh: +0.25 dB (400 steps of demo)",
     ),
@@ -130,7 +130,7 @@ SMALLER = ("a size or rate for a smaller machine", NOT_MEASURED)
 
 
 def paper_diff(config: Config) -> list[str]:
-    """List the deviations of settings from the paper's letter, as Markdown lines."""
+    """List how settings deviate from the paper's, as Markdown lines."""
     letter = as_tables(resolve("paper"))
     rows = []
     for table in ("model", "loss", "data", "train", "fit"):
@@ -139,14 +139,14 @@ def paper_diff(config: Config) -> list[str]:
             if value != letter[table][key] and name not in OF_A_RUN:
                 shown = (_shown(letter[table][key]), _shown(value))
                 rows.append([f"`{name}`", *shown, *REASONS.get(name, SMALLER)])
-    lines = ["Settings of the paper's letter: all."]
+    lines = ["All settings are the paper's."]
     if rows:
         lines = markdown_table(["setting", "paper", "here", "reason", "measured effect"], rows)
-    return [*lines, "", "At every setting:", "", *always_table()]
+    return [*lines, "", "With all settings:", "", *always_table()]
 
 
 def always_table() -> list[str]:
-    """Return the table of what we do otherwise at every setting, as Markdown lines."""
+    """Return the table of the deviations that all settings have, as Markdown lines."""
     rows = [[row.paper, row.ours, row.reason, row.effect] for row in ALWAYS]
     return markdown_table(["paper", "here", "reason", "measured effect"], rows)
 

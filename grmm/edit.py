@@ -25,7 +25,7 @@ from express50.geometry.transforms import (
     slerp,
 )
 from grmm.checkpoint import Loaded
-from grmm.data import Tracked, pose_state
+from grmm.data import Tracked, padded, pose_state, stacked
 from grmm.model import HeadState
 
 ANGLES = {"neck": 3, "jaw": 3, "eyes": 6}  # axis-angles by name, radians
@@ -191,10 +191,10 @@ def sample_identity(
     model, frames = loaded.model, loaded.gallery.frames
     own = [next(t for (s, _), t in frames.items() if s == subject) for subject in model.subjects]
     weights = _sample_weights(len(own), rng, spread, "subjects")
-    shape = _combine([frame.shape for frame in own], weights)
-    offsets = _combine([frame.offsets for frame in own], weights).astype(np.float32)
+    shape = np.tensordot(weights, stacked([frame.shape for frame in own]), 1)
+    offsets = np.tensordot(weights, stacked([frame.offsets for frame in own]), 1)
     z_id = torch.as_tensor(weights).to(model.z_id) @ model.z_id.detach()
-    tracked = replace(head.tracked, shape=shape, offsets=offsets)
+    tracked = replace(head.tracked, shape=shape, offsets=offsets.astype(np.float32))
     return replace(head, z_id=z_id, tracked=tracked)
 
 
@@ -215,7 +215,7 @@ def sample_expression(
             for expression in model.expressions
         ]
         every = np.concatenate(rows)
-        means = _combine([np.mean(row, 0) for row in rows], weights)
+        means = np.tensordot(weights, [np.mean(row, 0) for row in rows], 1)
         return np.clip(means, every.min(0), every.max(0))
 
     tracked = replace(head.tracked, expression=drawn("expression", length), jaw=drawn("jaw", 3))
@@ -229,16 +229,6 @@ def _sample_weights(rows: int, rng: np.random.Generator, spread: float, what: st
         raise ConfigError(f"the checkpoint has {rows} of {what}, expected two or more to draw from")
     noise = spread * rng.standard_normal(rows) / np.sqrt(rows - 1)
     return 1 / rows + noise - noise.mean()
-
-
-def _combine(rows: Sequence[np.ndarray], weights: np.ndarray) -> np.ndarray:
-    length = max(len(row) for row in rows)
-    return np.tensordot(weights, np.stack([padded(row, length) for row in rows]), 1)
-
-
-def padded(values: np.ndarray, length: int) -> np.ndarray:
-    """Pad with zeros, which missing coefficients are."""
-    return np.pad(values, [(0, length - len(values)), *[(0, 0)] * (values.ndim - 1)])
 
 
 def _with_parameter(
@@ -292,5 +282,5 @@ def _lerp(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
     """Blend, (1 - t) a + t b; the shorter one is padded with zeros."""
     if a is b:
         return a
-    length = max(len(a), len(b))
-    return ((1 - t) * padded(a, length) + t * padded(b, length)).astype(a.dtype)
+    first, last = stacked([a, b])
+    return ((1 - t) * first + t * last).astype(a.dtype)

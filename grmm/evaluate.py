@@ -1,8 +1,8 @@
 """Measure renderings against footage, over the whole image and over the head.
 
 Held-out samples are views of trained frames, unseen frames of trained subjects and expressions, or
-subjects that training never saw (fitted first). Another method's pictures pass through the same
-comparison as our renderings: same crop, background and pixels counted.
+subjects that training never saw (fitted first). Another method's pictures are compared in the same
+way as our renderings: with the same crop, background and pixels.
 """
 
 from __future__ import annotations

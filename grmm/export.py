@@ -1,8 +1,8 @@
 """Export one head: PLY for splat viewers, GLB for other 3D software, NPZ for arrays.
 
-A textured mesh may get the 52 blend shapes that ARKit names, as glTF morph targets. Each is one or
-two coefficients of a head model that has them by name (the built-in head, ICT-FaceKit), the jaw's
-turn, or an eye's; the mesh decoder answers too.
+A textured mesh may get ARKit's 52 blend shapes as glTF morph targets. Each moves one or two
+coefficients that the head model has by name (the built-in head, ICT-FaceKit), the jaw or an eye;
+what the mesh decoder adds for these parameters is included.
 
 Gaussians are written as 3DGS' PLY, as GLB with KHR_gaussian_splatting (the ratified glTF extension:
 linear scales, opacities from 0 to 1, quaternions xyzw, display-referred sRGB) and as Niantic's SPZ,
@@ -57,7 +57,7 @@ EXTENSION = "KHR_gaussian_splatting"
 FLOAT, ARRAY_BUFFER, POINTS = 5126, 34962, 0  # of glTF
 SPZ_MAGIC, SPZ_VERSION = 0x5053474E, 3
 FRACTION_BITS = 16  # of SPZ's positions: 15 micrometres, up to 128 m
-SPZ_COLOUR = 0.15  # bytes per coefficient of the constant harmonic, over 255
+SPZ_COLOUR = 0.15  # share of a byte's range per unit of the constant harmonic's coefficient
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -215,7 +215,7 @@ def arkit_targets(loaded: Loaded, head: HeadCodes) -> dict[str, np.ndarray]:
         changes = {}
         for name, amount in moves:
             table, _, entry = name.partition(".")
-            # A coefficient goes to 1 whatever its rest value; a joint turns on from its rest pose.
+            # A coefficient is set to 1; a joint's turn is added to its pose.
             own = 0.0 if table == "expression" else float(getattr(tracked, table)[int(entry)])
             changes[name] = (own + amount,)
         targets[shape] = vertices(controlled(loaded, head, changes)) - rest

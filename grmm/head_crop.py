@@ -1,7 +1,6 @@
 """Find the window around the head, draw in it, and find the neck that a torso hides.
 
-Training crops to the window, and pictures are drawn in it: what lies outside is neither rasterised
-nor refined.
+Training and drawing are limited to the window; outside of it nothing is rasterised or refined.
 """
 
 from __future__ import annotations
@@ -37,9 +36,9 @@ def draw_window(
 ) -> Rendering:
     """Draw the window around the Gaussians with `GRMM.draw`; the rest is background.
 
-    Colours before refinement, depth and alpha are those of the whole image. Refined ones differ
-    near the window's border as they do in training, whose crops have the same margin. ``colours``
-    (N, 3 + features) are from `GRMM.appearance`; ``background`` is grey, sRGB in [0, 1].
+    Refined colours near the window's border differ from those of the whole image, as they do in
+    training, whose crops have the same margin; everything else is the same. ``colours`` (N, 3 +
+    features) are from `GRMM.appearance`; ``background`` is grey, sRGB in [0, 1].
     """
     rows, columns = gaussian_window(gaussians, view)
     out = model.draw(gaussians, colours, crop_view(view, rows, columns), background, refine)
@@ -60,8 +59,8 @@ def draw_window(
 def gaussian_window(gaussians: Gaussians, view: PinholeView) -> tuple[slice, slice]:
     """Return the rows and columns that hold every pixel a Gaussian reaches, with a margin.
 
-    A sphere bounds a Gaussian: its largest scale, out to where alpha falls under a level of 8 bits.
-    The whole image where none is in view.
+    A Gaussian is bounded by the sphere outside of which its alpha is under 1/255. The whole image
+    is returned if no Gaussian is in view.
     """
     with torch.no_grad():
         visible = gaussians.opacities > ALPHA_MIN
@@ -79,7 +78,7 @@ def head_window(
     """Return the window around the projected mesh (V, 3) and the matte (H, W).
 
     Sizes are rounded up to WINDOW_STEP where the image allows, so that few sizes occur: every new
-    size costs convolutions their set-up.
+    size makes convolutions set up again.
     """
     extents = _extents(vertices, vertices.new_zeros(len(vertices)), view, NEAR_VERTEX_M)
     spans = []
@@ -129,10 +128,10 @@ def _span(low: float, high: float, size: int) -> slice:
 def behind_torso(
     head: HeadModel, vertices: Tensor, view: PinholeView, torso: np.ndarray
 ) -> np.ndarray:
-    """Mark the pixels (H, W) bool of a torso (H, W) that stand before the neck of the mesh.
+    """Mark the pixels (H, W) bool of a torso (H, W) that hide the neck of the tracked mesh.
 
-    ``vertices`` (V, 3) are those of the tracked mesh, head space, as the view is. A head model
-    without a region ``neck`` has none.
+    ``vertices`` (V, 3) and the view are in head space. Without a region ``neck`` in the head model
+    no pixel is marked.
     """
     found = np.zeros(torso.shape, np.uint8)
     regions = [head.regions[name] for name in ("neck", "boundary") if name in head.regions]

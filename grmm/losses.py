@@ -1,7 +1,7 @@
 """Define the objective's terms (paper: Training and Losses), each in the unit its name states.
 
-All return 0-d tensors, are finite for equal and for constant images, and are 0 where there is
-nothing to compare.
+All return 0-d tensors, which are finite for equal and for constant images and 0 if there is nothing
+to compare.
 """
 
 from __future__ import annotations

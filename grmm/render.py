@@ -17,12 +17,11 @@ from express50.dataset.tracks import OF_FRAMES, Sequence, read_sequence
 from express50.errors import ConfigError
 from express50.files.images import contact_sheet, write_image
 from grmm.checkpoint import Loaded
-from grmm.data import HeadViews
+from grmm.data import HeadViews, stacked
 from grmm.edit import (
     HeadCodes,
     between,
     controlled,
-    padded,
     principal_directions,
     sample_expression,
     sample_identity,
@@ -206,9 +205,7 @@ def control_sheet(loaded: Loaded, head: HeadCodes, view: PinholeView) -> Sheet:
 
 def strongest_coefficients(loaded: Loaded, count: int) -> dict[int, float]:
     """Find the expression coefficients that vary most in training, and how large each gets."""
-    shown = [frame.expression for frame in loaded.gallery.frames.values()]
-    length = max(map(len, shown))
-    rows = np.stack([padded(expression, length) for expression in shown])
+    rows = stacked([frame.expression for frame in loaded.gallery.frames.values()])
     order = np.argsort(-np.std(rows, axis=0), kind="stable")[:count]
     return {int(number): float(np.abs(rows[:, number]).max()) for number in order}
 

@@ -1,8 +1,8 @@
 """``grmm view`` shows a head in the browser, with sliders for its parameters and codes.
 
-One thread draws the newest camera and sliders, so that a slow machine shows fewer pictures, never
-old ones. Pictures of people leave the machine through this port alone: the library's sharing
-service is off. Its page asks Google's tag manager to count visitors where the browser is online.
+One thread draws the newest camera and sliders, so that a slow machine shows fewer pictures, but no
+old ones. Pictures leave the machine through this port only: the library's sharing service is off.
+The library's page asks Google's tag manager to count visitors if the browser is online.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ class Viewer:
         self._add_controls()
         self.head = self._described()
         self.server.on_client_connect(self._join)
-        self.server.on_client_disconnect(self._leave)
+        self.server.on_client_disconnect(lambda c: self._watchers.pop(c.client_id, None))
 
     def run(self) -> None:
         """Draw until `stop` (or Ctrl-C)."""
@@ -222,9 +222,6 @@ class Viewer:
 
         client.camera.on_update(camera_moved)
         self._wake.set()
-
-    def _leave(self, client: viser.ClientHandle) -> None:
-        self._watchers.pop(client.client_id, None)
 
     def _head_moved(self, event: object = None) -> None:
         self._head_changed = time.perf_counter()

@@ -1,7 +1,7 @@
 """Start training from a sensible head, with texel colours averaged from footage.
 
-The paper trains from scratch for 250,000 iterations; on a small budget the first thousands would
-go into finding colours that projection gives at once (G17).
+The paper trains from scratch for 250,000 iterations. With a small budget, thousands of them would
+be spent on colours that projection gives at once (G17).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from grmm.model import GRMM, Gaussians
 IMAGES_PER_SUBJECT = 96  # more hardly change the mean texture
 FACING = 0.25  # cosine of normal and view below which a texel is seen too obliquely
 OCCLUSION_M = 0.012  # a texel this far behind the rendered surface is hidden; hair is this thick
-ALIKE_COLOUR, ALIKE_M = 0.08, 0.04  # how far texels may differ and still change alike
+ALIKE_COLOUR, ALIKE_M = 0.08, 0.04  # differences up to which texels change alike
 SAMPLES = 1024  # of seen texels, from which the changes of the others are predicted
 LOGIT_LIMIT = 0.01  # colours are kept this far from 0 and 1 before the logit
 

@@ -88,7 +88,7 @@ def paper() -> str:
     text = (ROOT / "docs" / "PAPER.md").read_text(encoding="utf-8")
     before, _, after = text.split(DEVIATIONS)
     lines = paper_diff(resolve("paper-plus"))
-    cut = lines.index("At every setting:")
+    cut = lines.index("With all settings:")
     for name in PRESETS:
         if name not in ("paper", "paper-plus"):
             known = set(lines[:cut])

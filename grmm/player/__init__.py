@@ -37,6 +37,7 @@ from grmm.player.distillation import (
     sampled_poses,
     sampled_views,
     seen_angles,
+    turning_point,
 )
 from grmm.render import VIDEO_RATE, check_clips
 
@@ -208,9 +209,9 @@ def player_page(
     """
     back, arrays, content = stored(avatar)
     mesh, view = person.loaded.head, front_view(person.loaded, 1)
-    camera = view.cam_from_head.double().cpu()
+    camera, target = view.cam_from_head.double().cpu(), turning_point(person.loaded)
     centre = -camera[:3, :3].T @ camera[:3, 3]
-    distance = float(camera[2, :3] @ (_target(person) - centre))
+    distance = float(camera[2, :3] @ (target - centre))
     yaw, pitch = (np.deg2rad(limits).tolist() for limits in seen_angles(person.loaded))
     header: dict[str, object] = {
         "arrays": arrays,
@@ -226,7 +227,7 @@ def player_page(
             for name, (controls, reach) in POSES.items()
         ],
         "camera": {
-            "target": _rounded(_target(person)), "distance": distance, "focal": float(view.K[0, 0]),
+            "target": _rounded(target), "distance": distance, "focal": float(view.K[0, 0]),
         },
         "limits": {"yaw": yaw, "pitch": pitch},
         "clip": None if clip is None else {"rate": rate, "frames": np.round(clip, 4).tolist()},
@@ -242,13 +243,6 @@ def player_page(
     page = (HERE / "page.html").read_text(encoding="utf-8")
     # In one pass, so that inserted text is not searched again.
     return re.sub(r"{{(\w+)}}", lambda found: parts[found[1]], page).encode(), back
-
-
-def _target(person: Person) -> Tensor:
-    """Return the point (3,) that the player's camera turns about."""
-    template, centre = person.loaded.head.template, person.loaded.model.head_centre
-    middle = (template[:, 1].amax() + template[:, 1].amin()) / 2
-    return torch.stack([torch.zeros_like(middle), middle, centre[2]]).double().cpu()
 
 
 def _rounded(values: Tensor) -> list:

@@ -20,8 +20,8 @@ from express50.head.model import joint_transforms
 from grmm.anchors import interpolate, tangent_frames
 from grmm.checkpoint import Loaded
 from grmm.config import SCALE_RANGE_MM
-from grmm.data import Tracked
-from grmm.edit import HeadCodes, padded, trained_head
+from grmm.data import Tracked, padded
+from grmm.edit import HeadCodes, trained_head
 from grmm.head_crop import draw_window
 from grmm.model import PinholeView, quat_multiply
 from grmm.networks import DISPLACEMENT_M
@@ -206,26 +206,29 @@ def sampled_poses(person: Person, count: int, generator: torch.Generator) -> lis
     return poses
 
 
+def turning_point(loaded: Loaded) -> Tensor:
+    """Return the point (3,) of the head model that the player's camera turns about."""
+    heights = loaded.head.template[:, 1]
+    middle = (heights.amax() + heights.amin()) / 2
+    depth = loaded.model.head_centre[2]
+    return torch.stack([torch.zeros_like(middle), middle, depth]).double().cpu()
+
+
 def front_view(loaded: Loaded, size: int) -> PinholeView:
     """Return a square view from straight ahead, as far away as the training's frontal camera.
 
     The focal length lets the head model's template fill three quarters of the height.
     """
     template, centre = loaded.head.template, loaded.model.head_centre.double().cpu()
-    view = frontal(loaded)
-    camera = view.cam_from_head.double().cpu()
+    camera = frontal(loaded).cam_from_head.double().cpu()
     distance = float((camera[:3, :3] @ centre + camera[:3, 3]).norm())
     height = float(template[:, 1].max() - template[:, 1].min())
-    middle = (template[:, 1].max() + template[:, 1].min()).double().cpu() / 2
-    target = torch.stack([centre[0] * 0, middle, centre[2]]).numpy()
+    target = turning_point(loaded).numpy()
     pose = look_at(target + [0.0, 0.0, distance], target, np.array([0.0, 1.0, 0.0]))
     focal = 0.75 * size * distance / height
     K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]], dtype=torch.float64)
-    cam_from_head = torch.from_numpy(pose)
-    device = template.device
-    return PinholeView(
-        K=K.to(device), cam_from_head=cam_from_head.to(device), width=size, height=size
-    )
+    K, cam_from_head = K.to(template.device), torch.from_numpy(pose).to(template.device)
+    return PinholeView(K=K, cam_from_head=cam_from_head, width=size, height=size)
 
 
 def seen_angles(loaded: Loaded) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -256,7 +259,7 @@ def sampled_views(loaded: Loaded, count: int, generator: torch.Generator) -> lis
 
 
 def _exact_parts(person: Person) -> Avatar:
-    """Collect what needs no fit but of codes and colours: mesh, skinning, places of Gaussians."""
+    """Collect the mesh, its skinning and the Gaussians' places, and fit codes and colours."""
     loaded, head = person.loaded, person.head
     model, mesh, tracked = loaded.model, loaded.head, head.tracked
     shape = torch.as_tensor(tracked.shape).to(mesh.template)

@@ -33,7 +33,7 @@ __all__ = [
     "resolve_backend",
 ]
 
-LIMIT = 1e30  # of any argument's values
+LIMIT = 1e30  # of the size of any value: its square stays finite
 BACKENDS = ("auto", "reference", "cpu", "gsplat")
 
 
@@ -68,7 +68,7 @@ def rasterize(
             camera keeps float32 Gaussians precise far from the origin.
         width: pixels.
         height: pixels.
-        background: (C,) colour behind the Gaussians; black without. Depth never gets one.
+        background: (C,) colour behind the Gaussians, black if None. Depth has no background.
         antialiased: scale opacity by sqrt(det before / det after dilation) (Mip-Splatting, 2024).
         median_depth: also give the median depth.
         normals: also give blended normals.
@@ -151,7 +151,7 @@ def _check(splats: Splats, camera: Pinhole, background: Tensor | None) -> None:
 def _check_values(tensors: dict[str, Tensor]) -> list[list[float]]:
     """Refuse NaN, Inf and numbers whose squares would overflow; returns K.
 
-    All extremes leave the device at once: each transfer would wait for all that was queued.
+    All extremes are transferred at once, because each transfer waits for everything queued before.
     """
     parts = {name: torch.aminmax(t.detach()) for name, t in tensors.items() if t.numel()}
     ends = [end.double() for pair in parts.values() for end in pair]

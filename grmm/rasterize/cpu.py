@@ -1,8 +1,8 @@
 """Rasterise on the CPU: a ``torch.autograd.Function`` over the native library.
 
-Deterministic: images and gradients are the same bits for any number of threads, which is taken
-from ``torch.get_num_threads()``. Large outputs ask for huge pages, since a third of the time of a
-large image with many channels would go into fresh small ones; ``RenderBuffers`` save both.
+Images and gradients are the same to the last bit for any number of threads, which is
+``torch.get_num_threads()``. Large outputs ask for huge pages: mapping small ones takes a third of
+the time of a large image with many channels. ``RenderBuffers`` need neither.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from grmm.rasterize.projection import (
 _TILE = 16  # kTile of tiles.h
 _SPLAT = 10  # numbers in Splat of blend.h
 _MOMENTS = 9  # kMoments of gaussians.cpp
-_HUGE = 1 << 22  # bytes from which huge pages pay
+_HUGE = 1 << 22  # bytes from which huge pages save time
 _SUFFIX = {torch.float32: "f32", torch.float64: "f64"}
 _scratch = threading.local()  # grown, never shrunk: fresh pages cost more than the sums in them
 
@@ -102,7 +102,7 @@ class _Rasterize(torch.autograd.Function):
         buffers: RenderBuffers | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         ctx.set_materialize_grads(False)
-        # The kernel reads raw memory: a strided view would be read as other numbers.
+        # The kernel reads raw memory, so tensors must be contiguous.
         geometry = [x.contiguous() for x in (means, quats, scales, opacities)]
         camera = _camera(K, cam_from_world, size, options)
         if options.normals:  # three more channels, which the projection fills

@@ -142,7 +142,7 @@ def project(scene: Splats, camera: Pinhole, antialiased: bool = False) -> Projec
     R, t = cam_from_world[:3, :3], cam_from_world[:3, 3]
     points = means @ R.T + t
     front = points[:, 2] > NEAR_M
-    # Culled points get a harmless place, so that no division by zero enters the gradients.
+    # Culled points get a harmless place, so that gradients contain no division by zero.
     points = torch.where(front[:, None], points, points.new_tensor([0.0, 0.0, 1.0]))
     jacobian = _jacobian(points, K, width, height)
     rows = _product(jacobian, _product(R, quat_to_matrix(quats)) * scales[:, None, :])
@@ -212,8 +212,8 @@ def _regression(rows: Tensor, variances: Tensor) -> tuple[Tensor, Tensor, Tensor
     Cov(uv)^-1 Cov(uv, t). It equals the plane of RaDe-GS without inverting a 3x3 matrix, and the
     dilated Cov(uv) keeps it bounded for flat Gaussians.
 
-    Determinants are written as products of the rows' cross products (Cauchy-Binet): for a needle,
-    ``xx * yy - xy**2`` is the difference of two numbers that agree in all their digits.
+    Determinants are computed from cross products of the rows (Cauchy-Binet): for a needle,
+    ``xx * yy - xy**2`` would be the difference of two numbers that agree in all digits.
     """
     u, v, t = rows.unbind(1)
     xx, yy = variances[:, 0], variances[:, 1]
@@ -232,7 +232,7 @@ def _regression(rows: Tensor, variances: Tensor) -> tuple[Tensor, Tensor, Tensor
 def _extents(
     means2d: Tensor, variances: Tensor, opacities: Tensor, width: int, height: int
 ) -> tuple[Tensor, Tensor]:
-    """Return half sizes (N, 2) of the alpha >= 1/255 box; (N,) bool if it is in the image."""
+    """Return half sizes (N, 2) of the boxes where alpha >= 1/255, and if they are in the image."""
     level = 2.0 * torch.log((opacities / ALPHA_MIN).clamp(min=1.0))
     extents = (level[:, None] * variances).sqrt()
     size = means2d.new_tensor([width, height])

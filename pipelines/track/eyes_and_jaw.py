@@ -8,8 +8,8 @@ expressions is attributed to misplacement, and only the rest to gaze.
 that over some twenty pixels, whereas the distance between the lids is a few. Half-shut eyes stay
 as seen.
 
-**Lips** are shut if they are not surely seen apart. A fit to landmarks that err one by one would
-part them, and most in depth, which a single picture does not show.
+**Lips** are shut unless they are clearly seen apart. Independent errors of landmarks would part
+them, mostly in depth, which a single picture does not show.
 
 **Jaw line**: people, and networks trained on their marks, mark the visible edge of the cheek where
 the head turns away. A landmark whose skin faces the camera keeps its place in the embedding, one
@@ -39,7 +39,7 @@ from pipelines.track.terms import MeshPlaces, PixelTerm, ShutTerm, Sighting, lan
 LOOKS_AT = 0.3  # cosine between gaze and camera below which an iris is not trusted
 # Standard deviations of an eyeball's misplacement: what remains of it, and the prior of it.
 EYEBALL_M, OFFSET_M = 0.0005, 0.002
-GUESSED_EXPRESSIONS = 1  # weight of the guess that eyeballs are in place, in expressions
+GUESSED_EXPRESSIONS = 1  # number of expressions that count as showing eyeballs in place
 RIM_SHARE = 0.012  # error of a rim's place along the cheek, as a share of the face
 
 # A camera counts for an eye if it finds the iris in more than this share of the other frame sets
@@ -50,8 +50,8 @@ LEAST_CAMERAS = 2
 # squared confidences over the cameras sum to at most this share of the usual.
 CHANCE = 0.3
 GAP = 0.1  # share of the gap between the lids that is left
-# Lips are shut if they are seen apart by less than so many standard deviations, which no number of
-# views makes smaller than half of the best one's: all views of a mouth err alike.
+# Lips are shut if they are seen apart by less than so many standard deviations. However many views
+# there are, the deviation is half of the best one's or more: all views of a mouth err together.
 LIPS_SHUT, COMMON_SHARE = 3.0, 0.5
 
 JAW = 17

@@ -1,16 +1,11 @@
 """Find landmarks on the face UV map; they slide the mesh along the skin to its place.
 
-Patches say how far the skin lies before or behind the mesh, not that a corner of the mouth sits a
-millimetre too far out. So the pictures are projected onto the current mesh, unwrapped to the face
-UV map, and landmarks are found there again: if a corner of the mouth appears beside its texel, the
-mesh moves by that much.
-
-The map is a cylinder about the head, unrolled and warped until the 68 landmarks of any head model
-lie where those of every other do, so one network reads the maps of all of them. On it every face is
-upright, turned to the reader and of one size, and only the mesh's error is left to find. The
-landmark network, trained on from its weights for whole heads, sees the middle of the map at twice
-the resolution it has of a head. The jaw line is not among its landmarks: the map does not end
-there.
+Patches do not show motion along the skin. If a corner of the mouth appears beside its texel on the
+map, the mesh moves by that distance. The map is a cylinder about the head, unrolled and warped
+until the 68 landmarks of all head models lie in the same places, so one network reads the maps of
+all of them. On it every face is upright, frontal and of one size, and the network, which was
+trained from the landmark network for whole heads, sees it at twice the resolution. It does not find
+the jaw line, which is not an edge on the map.
 """
 
 from __future__ import annotations
@@ -49,8 +44,8 @@ FLOOR_M = 0.0004
 VIEW_NOISE = 0.05  # standard deviation of root light between views of one place
 LEAST_SEEN, LEAST_VIEWS = 0.1, 2
 MOST_VIEWS = 6  # those from the side blur the map
-# Landmarks of whole heads are coarser and err differently in every expression: those that the map
-# shows get so many times their standard deviation. The others, as corners of open mouths, stay.
+# Factor on the standard deviations of the detector's landmarks that the map shows too: they are
+# coarser and err differently in every expression. The others, as corners of open mouths, stay.
 DISTRUST = 6.0
 TORN_M = 0.004  # texels further apart than this lie on two sides of a gap, as between open lips
 
@@ -59,7 +54,7 @@ WIDTH, HEIGHT = 192, 160
 RIGHT, TOP = 1.35, 1.2
 # Beyond this azimuth a face may straddle the seam at the back.
 BACK = 2.6
-# What lies further behind what a texel shows is another sheet of skin; outer eye corners' widths.
+# Skin that lies further behind a texel's is another sheet; in widths between outer eye corners.
 SHEET = 0.04
 # Where the landmarks' azimuths (radians) and heights (in widths between the outer eye corners) are
 # put on the map, whatever the head.

@@ -1,12 +1,8 @@
 """Fit one shape and many expressions to the residuals of `terms` (Levenberg-Marquardt).
 
-The unknowns are x = (shape, bias, own_1, ..., own_E) and the cost is the sum, over expressions and
-their terms, of the loss of the squared residuals, plus half the squared residuals of the priors. An
-expression's terms are first summed over the mesh: a sparse matrix W and a gradient over its chosen
-vertices p, since every residual is about weighted sums of vertices. With the head's Jacobian
-J = dp/dx the Gauss-Newton system of the expression is J' W J, however many views see a vertex.
-Expressions share only the shape and the detector's bias, so their own unknowns are eliminated one
-expression at a time (Schur complement): time and memory grow linearly with their number.
+The unknowns are x = (shape, bias, own_1, ..., own_E). The cost sums the losses of all terms of all
+expressions and half the squared residuals of the priors. docs/TRACKING.md, section Solver, explains
+how an expression's terms are summed over vertices and how its own unknowns are eliminated.
 """
 
 from __future__ import annotations
@@ -33,7 +29,7 @@ from pipelines.track.terms import (
 )
 
 LANDMARK_BIAS_M = 0.003  # standard deviation of the detector's constant error on a face
-KNOWN_BIAS_M, KNOWN_MODE = 1e-6, 1e8  # these hold the unknowns that are not free
+KNOWN_BIAS_M, KNOWN_MODE = 1e-6, 1e8  # hold the bias and modes that are not free
 BIAS = 68 * 3
 REJECT_SIGMA, REJECT_SHARE = 4.0, 0.12
 
@@ -85,8 +81,8 @@ def vertex_sigma(
 ) -> np.ndarray:
     """Return standard deviations (E, V), metres, of all vertices under the fit's covariance.
 
-    They take residuals for independent and the terms' own deviations for true: they say where a
-    vertex is better known than another, and `express50.error_model` says how well.
+    Residuals are taken to be independent and the terms' deviations to be true. So the values only
+    compare vertices; `express50.error_model` turns them into errors.
     """
     shared = basis.shape_size + BIAS
     precision, own = np.diag(_shared_weights(basis, len(targets), free)), []
@@ -112,8 +108,8 @@ def vertex_sigma(
 def condensed(basis: Basis, target: Target, pose: Pose) -> Target:
     """Return a target whose evidence is a quadratic about a pose that was fitted to it.
 
-    Whatever else it is then fitted to costs a small part of what the evidence did. The shape is
-    known: the basis is of `freeze_shape`.
+    Fitting it again, with other terms, takes a small part of the time. The basis is one of
+    `freeze_shape`.
     """
     one = _Expression.of(basis, target)
     hessian, gradient = _normal_equations(basis, one, pose, State(np.zeros(0), (pose,)))

@@ -16,9 +16,9 @@ LANDMARK_FLOOR_PX = 1.0  # least error assumed of a landmark, for a face 128 px 
 JAW_LINE_WEIGHT, SINGLE_VIEW_JAW_WEIGHT = 0.25, 0.7
 INLIER_SIGMA = 3.5
 MIN_SHARE = 0.4  # of its known landmarks that must agree for a view to stay
-# However vague a landmark, one that is further off than this many shares of the face disagrees.
+# Largest standard deviation, as a share of the face, so that vague landmarks can disagree too.
 SIGMA_SHARE_LIMIT = 0.04
-# Cameras whose lines of sight to the face meet under less than about this angle see it alike.
+# Cameras whose lines of sight to the face differ by less than about this angle see the same.
 SAME_DIRECTION = np.radians(2.0)
 
 

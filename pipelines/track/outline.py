@@ -1,4 +1,4 @@
-"""Outlines of mattes hold the skull, ears and jaw, which carry no landmark.
+"""Fit the skull, ears and jaw, which have no landmarks, to the outlines of mattes.
 
 The signed distance to the matte's edge is sampled under the vertices that form the outline of the
 current mesh, so no point-to-point matching is needed and the residual is smooth.
@@ -29,13 +29,13 @@ from pipelines.track.basis import in_regions
 from pipelines.track.surface import FEATURES, SignedDistance, Visibility, behind, look_up
 from pipelines.track.terms import MeshPlaces, Residuals, huber
 
-# Head outlines count as about this many independent points per view.
+# A head's outline counts as about this many independent points per view.
 EFFECTIVE_POINTS = 24
 POINTS_PER_VIEW = 60
 OUTLINE_SIDE, MATTE_SIDE = 384, 640
 EDGE_SIGMA_M = 0.0015
-# Where hair, cloth or shoulders may stand before the skin: standard deviation of their thickness,
-# and the gap (metres) at which what lies inside the matte stops to pull.
+# Where hair, cloth or shoulders may hide the skin: standard deviation of their thickness, and the
+# gap (metres) at which the pull on vertices inside the matte has faded.
 COVER_SIGMA_M, HAIR_GAP_M, BALD_GAP_M = 0.008, 0.004, 0.03
 BALD_SHARE = 0.6
 LEAST_SEEN = 0.06  # of the scalp: temples alone are bare on most people
@@ -68,10 +68,10 @@ class OutlineTerm:
     ) -> OutlineTerm:
         """Make the term of vertices `ids` (n,), now at positions (n, 3).
 
-        `covered` (n,) marks where hair or cloth may hide the skin. Its thickness is much the same
-        in all `pictures` of a subject, so more pictures are not more evidence of the skin;
-        likewise neighbours on an outline err alike. A `bald` head is pulled from any distance;
-        otherwise only a near outline pulls, as hair hides skull, temples and jaw.
+        `covered` (n,) marks where hair or cloth may hide the skin. Its thickness is similar in
+        all `pictures` of a subject, so more pictures add no evidence of the skin; neighbours on an
+        outline err together too. A `bald` head is pulled from any distance, any other only by a
+        near outline, because hair hides skull, temples and jaw.
         """
         camera, count = distance.camera, len(positions)
         depth = (positions @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]).mean()
@@ -115,7 +115,7 @@ def signed_distance(alpha: np.ndarray, camera: Camera) -> SignedDistance | None:
         return None
     # Distances are to the nearest pixel of the other side, half a pixel beyond the edge.
     values = np.where(inside, 0.5 - edge_distance(inside), edge_distance(~inside) - 0.5)
-    # Full pixels know no part cover; a light blur gives the edge its slope back.
+    # A mask has no partly covered pixels; a light blur restores the edge's slope.
     return SignedDistance(cv2.GaussianBlur(values, (0, 0), 0.8) * step.mean(), camera, step)
 
 

@@ -40,7 +40,7 @@ SPACING_PX = 1.0
 STEP_PX = 0.7
 EVEN = np.full(PATCH * PATCH, 1.0 / (PATCH * PATCH), np.float32)
 GREY = np.full(3, 1.0 / 3.0, np.float32)
-# What a patch's contrast must stand out from: root of light, 0..1.
+# Noise that a patch's contrast must exceed: root of light, 0..1.
 NOISE = 0.006
 LEAST_SCORE, LEAST_SHARP = 0.3, 0.02
 NEIGHBOURS, ODD_PX, OUTLIER_PX = 24, 1.2, 2.5
@@ -50,12 +50,12 @@ SLANT = 0.4
 # Hair and cloth may cover neck and ears: fewer samples per sample of the face, and less trust.
 COVERED_SHARE, COVERED_TRUST = 0.25, 0.3
 
-# Share of neighbouring samples that are unlike skin from which on a beard or a fringe covers them;
-# brows and nostrils are narrower.
+# A beard or a fringe covers a place if more than a share of the neighbouring samples, BESIDE of
+# them, is unlike skin; brows and nostrils are narrower.
 BESIDE, COVERING = 40, 0.65
-# A thing hides the face where views agree so far before the mesh, and better by a margin than at
-# it. So many neighbours are asked, and a share of them must find it at the same height. Fewer
-# places than LEAST_PLACES are mismatches: a bare face has up to 15.
+# A thing hides the face where views agree CLEAR_M to BEFORE_M before the mesh, better by a MARGIN
+# than at it, and a share of the ASKED neighbours finds it at the same height. Fewer places than
+# LEAST_PLACES are mismatches: a bare face has up to 15.
 CLEAR_M, BEFORE_M, MARGIN = 0.008, 0.045, 0.1
 EVERY, ASKED, AGREEING, SAME_M, LEAST_PLACES = 2, 16, 0.4, 0.004, 24
 

@@ -36,13 +36,11 @@ Read = Callable[[str], np.ndarray]
 """Read a camera's undistorted image (H, W, 3) uint8 by its id; raises CaptureError."""
 
 DETECTOR_PASSES = 3  # crops after the coarse pass; 1 measures the same on the twin
-# A followed face is looked for in so many views, those that it looks at most: more add nothing.
+# Most views in which a followed face is looked for, the most frontal ones; more add nothing.
 FOLLOWED_VIEWS = 10
-LEAST_AHEAD = 0.1  # cosine between the face's direction and a camera's, below which none looks
-MOVED_SHARE = (
-    0.12  # of its crop, from which on a face that was found off the middle is looked at again
-)
-# A face is lost unless this share of its views, or the only one, scores as much.
+LEAST_AHEAD = 0.1  # least cosine between the face's direction and that to a camera, to look there
+MOVED_SHARE = 0.12  # of a crop: a face that is further off its middle is looked at again
+# A face is lost unless more than this share of its views has at least this score.
 KEPT_SHARE, KEPT_SCORE = 0.5, 0.5
 
 Follow = Callable[[np.ndarray, np.ndarray], Marked]
@@ -58,7 +56,7 @@ def open_landmarks(dataset: Dataset, subject: str, landmarks: str, search: float
 
 
 def open_follower(landmarks: str) -> Follow | None:
-    """Return how a face is followed through a clip; None for sources that need or know no place."""
+    """Return the function that follows a face through a clip; None for sources that have none."""
     if landmarks != EMBEDDED:
         return None
     net = load_network()
@@ -119,10 +117,11 @@ def read_clip(
     cue: str,
     frames: Sequence[int],
 ) -> Iterator[tuple[Look, CutCrops]]:
-    """Yield how to look at a clip, frame set by frame set; each frame is decoded once.
+    """Yield, per frame set of a clip, functions that find its face and cut its crops.
 
-    Faces are searched for by the source, or followed where they are expected. Crops, of at most
-    `side` pixels, have no mattes. Both can be asked for until the next frame set is.
+    Each frame is decoded once. Faces are searched for by the source, or followed from where they
+    are expected. Crops have at most `side` pixels and no mattes. The functions work until the next
+    frame set is taken.
     """
     cameras = read_cameras_of(dataset, subject)
     with FootageReader(dataset, subject) as footage:
@@ -184,7 +183,7 @@ def _followed(
 
 
 def _ahead(cameras: Mapping[str, Camera], marks: np.ndarray) -> list[str]:
-    """Choose the cameras that a face with landmarks (68, 3) looks at and lies in the picture of."""
+    """Choose the cameras that a face with landmarks (68, 3) looks at and that picture it."""
     across, up = marks[45] - marks[36], marks[27] - marks[8]
     forward, middle = np.cross(across, up), marks.mean(0)
     facing = {}

@@ -37,13 +37,13 @@ ROUND_STEPS = 4
 EYE_ROUNDS = 2  # irises and visible jaw lines are found again at least so often
 PATCH_REACH_M = 0.008  # of the first search, to either side of the mesh
 NARROWING, NARROWINGS = 0.6, 3  # factor of the reach from round to round, and how often
-IN_HAIR = 30.0  # times a landmark's standard deviation, where hair is around it
-BESIDE_M, BESIDE_THING = 0.02, 6.0  # metres from a thing, and the same there
-GLASSES_SIDE = 320  # pixels of a head's crop, some millimetre each, in which glasses are looked for
+IN_HAIR = 30.0  # factor on a landmark's standard deviation where hair surrounds it
+BESIDE_M, BESIDE_THING = 0.02, 6.0  # metres from a thing, and the factor within them
+GLASSES_SIDE = 320  # pixels, about a millimetre each, of the crops in which glasses are looked for
 SEARCHES = 3  # rounds in which things are looked for; later ones look only where some were found
 FOLLOWING = 3  # rounds in which the skin is followed
-# Far from the surface, whole patches of skin may match wrongly together: trust grows by this
-# factor towards the last round.
+# Trust in patches grows by this factor per round: far from the surface whole groups of them may
+# match wrongly.
 TRUST_GROWTH = 1 / 0.3
 
 
@@ -136,7 +136,7 @@ def gather(
     bald = False
     if shown is not None:
         images = pictures[shown].images()
-        # One picture does not tell fair hair from skin.
+        # A single picture cannot distinguish fair hair from skin.
         bald = len(images) > 1 and bare_share(model, images, meshes[shown]) > BALD_SHARE
     uv_map = reading_map(model) if any(one.read_uv for one in schedule) else None
     fine_map = make_uv_map(model, FINE) if any(one.follow_skin for one in schedule) else None

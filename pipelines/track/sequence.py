@@ -1,13 +1,9 @@
 """Track clips with the peaks' shape: frame by frame, then smoothed both ways, window by window.
 
-The shape is folded into the head model's rest, so the fit of the peaks serves here too. A frame's
-landmarks are looked for where the mesh of the frame before has them; it starts from that frame's
-expression and is fitted to its landmarks, then to the surface that its pictures agree on. What that
-says is condensed to a quadratic of the frame's unknowns. Sweeps then fit every frame again, pulled
-towards the mean of its two neighbours: every second frame first, then the others, so that neither
-direction of time comes first. The first and the last frame, which have one neighbour, are treated
-alike. Windows overlap by more frames than the sweeps reach, and the overlap is dropped, so window
-ends do not show.
+docs/TRACKING.md, section Schedule, describes the steps. The shape is folded into the head model's
+rest, so that the peaks' solver serves here too. Sweeps treat both directions of time alike. Windows
+overlap by more frames than the sweeps reach, and the overlap is dropped, so that ends of windows do
+not show.
 """
 
 from __future__ import annotations
@@ -55,7 +51,7 @@ SMOOTH_M = 0.001  # standard deviation of a point about the middle of the neighb
 # Vertices beside the landmarks that neighbours are compared by, and the effective number of all.
 SPREAD_VERTICES, EFFECTIVE_POINTS = 40, 20
 MAX_GAP = 3  # strides beyond which frames do not constrain each other
-# Landmarks and the frame before leave a millimetre or two: half of what the peaks' search spans.
+# A start from landmarks and the frame before is a millimetre or two off: half of the peaks' reach.
 REACH_SHARE, FIRST_TRUST = 0.5, 0.3
 
 Observed = tuple[Look, CutCrops]
@@ -188,7 +184,7 @@ def _sweep(
     meshes = [_mesh(person, pose) for pose in poses]
     swept = list(poses)
     for number, frame in enumerate(frames):
-        # By the frame, not by its place: it is the same in every window that it is in.
+        # By the frame's number, which is the same in every window that holds the frame.
         if frame // stride % 2 != parity:
             continue
         expected, vagueness = _expected(meshes, frames, number, MAX_GAP * stride)

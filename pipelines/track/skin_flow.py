@@ -1,10 +1,7 @@
 """Follow the skin's own texture from the resting face to every other expression.
 
-Landmarks say where lips and brows are, and patches how far the skin lies before or behind the mesh.
-On cheeks and forehead neither says which piece of skin a vertex is on. So the pictures of both
-expressions are unwrapped to the face UV map, each on its current mesh. If both meshes lie on the
-same skin, both maps look the same. Where they differ, optical flow (DIS, Kroeger et al. 2016) says
-how far the expression's mesh must slide.
+Both are unwrapped to the face UV map on their current meshes. Where the maps differ, optical flow
+(DIS, Kroeger et al. 2016) measures how far the expression's mesh must slide (docs/TRACKING.md).
 """
 
 from __future__ import annotations

@@ -65,8 +65,8 @@ from pipelines.track.terms import Term
 
 SCHEMA = "express50.track/2"
 DECIMALS = 7
-# Modes along the skin, for each of three axes, per mode along the normals: the skin's texture
-# locates it less finely than patches do.
+# Number of modes along the skin (for each of three axes) per mode along the normals: texture
+# locates the skin less finely than patches do.
 ALONG_SHARE = 4 / 15
 
 
@@ -80,7 +80,7 @@ def run(
     """
     torch.set_num_threads(1)
     schedule = make_schedule(config.outline_rounds, config.patch_rounds, config.uv_rounds)
-    # Only the UV map can show where along itself the skin is.
+    # Only the UV map shows how the skin slides along itself.
     along = round(ALONG_SHARE * config.offset_modes) if config.uv_rounds else 0
     basis = _basis(config.head, config.offset_modes, along)
     source = open_landmarks(dataset, item, config.landmarks, config.search)
@@ -137,9 +137,9 @@ def clips_identity(
     state: State,
     eyes: EyeOffsets | None,
 ) -> str:
-    """Identify what clips are tracked from: windows of a stopped run with the same are kept.
+    """Identify what clips are tracked from: a run reuses windows of a stopped one with the same.
 
-    The peaks' fit follows from inputs and settings, up to how the machine rounds.
+    The peaks' fit is part of it, because machines round differently.
     """
     fitted = (shape.tobytes(), state.bias.tobytes(), eyes and vars(eyes))
     digests = {k: path_digest(v) if isinstance(v, Path) else v for k, v in inputs.items()}
@@ -167,7 +167,7 @@ def fit_landmarks(
 ) -> tuple[list[Target], State, list[Note]]:
     """Fit to landmarks alone and leave out those that contradict the fit.
 
-    `further` terms are about every expression.
+    `further` terms are added to those of every expression.
 
     Returns:
         Targets, the fitted state, and the expressions without a start.

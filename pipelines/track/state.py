@@ -20,7 +20,7 @@ from pipelines.track.basis import POSE_SIZE, Basis
 from pipelines.track.observe import Observation, facing, landmark_sigma
 from pipelines.track.terms import Term
 
-# The initial pose. Jaw-line points slide; brows to mouth are what a rigid alignment may trust.
+# The initial pose. Jaw-line points slide, so a rigid alignment uses brows to mouth only.
 INNER = np.arange(17, 68)
 MIN_TRIANGULATED = 12
 PERSON_M = 0.004  # standard deviation of one person's landmarks about the template's
@@ -56,8 +56,8 @@ class Pose:
 class State:
     """Shape (S,), one pose per expression, and the detector's bias (68, 3), head space.
 
-    A detector makes much the same error on a face in every frame and view, so more of them are not
-    independent evidence. With the bias, landmarks say how a face moves rather than what it is.
+    A detector makes nearly the same error on a face in every frame and view, so these are not
+    independent evidence. With the bias, landmarks determine how a face moves, not its shape.
     """
 
     shape: np.ndarray
@@ -168,7 +168,7 @@ def initial_pose(observation: Observation, template: np.ndarray) -> tuple[np.nda
         return _from_one_view(observation, template)
     scale = similarity_fit(template[seen], observation.points[seen])[0]
     if not SCALE_LIMITS[0] < scale < SCALE_LIMITS[1]:
-        # Heads differ, units do not: name a power of ten if one is near.
+        # Wrong units are off by powers of ten: name one if it is near.
         power = 10.0 ** round(float(np.log10(scale)))
         near = power != 1.0 and 1 / 1.5 < scale / power < 1.5
         unit = f"{power:g}" if near else f"{scale:.3g}"

@@ -28,15 +28,15 @@ FEATURES = (
     "lips", "left_eye_region", "right_eye_region", "left_eyeball", "right_eyeball",
     "mouth_interior", "teeth", "tongue",
 )  # fmt: skip
-# Skin that hair and cloth may lie before: its shape can be searched for, its colours not trusted.
+# Skin that hair or cloth may cover: its shape can be searched for, but its colours are not trusted.
 COVERED = ("neck", "left_ear", "right_ear")
 HIDDEN = ("mouth_interior", "boundary", "scalp", "teeth", "tongue")
-# A ray may end this far before a sample and still count as reaching it: a tenth of a hair.
+# A ray that ends this far before a sample still counts as reaching it.
 TOUCH_M = 3e-4
-# What hides a sample is part of the head: rays begin so far before it, none behind its camera.
+# Rays begin this far before a sample, as only the head hides it, but not behind the camera.
 HEAD_M = 0.5
 GRAZING = 0.25
-THING_M = 0.005  # about a place on a thing's surface, what it stands for
+THING_M = 0.005  # radius that a place on a thing's surface stands for
 MARGIN = 0.15  # about the head in its crop, as a share of the head's size
 
 

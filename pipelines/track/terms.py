@@ -1,8 +1,8 @@
 """Define the residuals that tracking minimises, in one form for all evidence.
 
-A term speaks about *places*, weighted sums of mesh vertices. For places (n, 3) it returns residual
-vectors in standard deviations and their slope by the place; its loss turns squared lengths into
-cost and weight. The solver (`fit`) knows no more than that.
+A term concerns *places*, which are weighted sums of mesh vertices. For places (n, 3) it returns
+residual vectors in standard deviations and their slope by the place; its loss turns squared lengths
+into cost and weight. The solver (`fit`) needs nothing else.
 """
 
 from __future__ import annotations

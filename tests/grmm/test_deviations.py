@@ -52,4 +52,4 @@ def test_the_command_prints_the_difference(capsys):
     assert main(["config", "--preset=paper-plus", "--paper-diff"]) == 0
     printed = capsys.readouterr().out
     assert settings(printed.splitlines()) == settings(paper_diff(resolve("paper-plus")))
-    assert "At every setting:" in printed and "200,476 of 262,144" in printed
+    assert "With all settings:" in printed and "200,476 of 262,144" in printed
