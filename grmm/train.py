@@ -286,7 +286,7 @@ def agree(state: TrainState, interrupt: Event, device: torch.device) -> None:
 def progress_line(state: TrainState, config: Config) -> str:
     """Describe the iteration, the speed, the time left and the terms in one line."""
     rate = state.iteration / max(state.seconds, 1e-9)
-    used = budget_used(state, config)
+    used = min(1.0, budget_used(state, config))  # the last step may end late
     left = timedelta(seconds=round(state.seconds * (1 - used) / used if used > 0 else 0))
     terms = " ".join(f"{name} {float(value):.4f}" for name, value in state.terms.items())
     return f"iteration {state.iteration}  {rate:.2f}/s  {left} left  {terms}"
