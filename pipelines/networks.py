@@ -1,9 +1,9 @@
 """Load networks from the user's TorchScript or ONNX files as functions of pictures.
 
-``torch.load``, which executes pickles, is never called. ``torch.jit.load`` reads its archive with
-an unpickler of its own: a file that names ``os.system`` is refused, a test shows it. This does not
-prove safety: TorchScript is a program, part of which runs at loading, and PyTorch's documentation
-says to load only files that one trusts.
+``torch.load``, which executes pickles, is never called. ``torch.jit.load`` has an unpickler of its
+own that refuses a file that names ``os.system``, as a test shows. This does not prove safety:
+TorchScript is a program, part of which runs at loading, and PyTorch's documentation says to load
+only files that one trusts.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def _check_inputs(path: Path, role: Role, least: int, most: int) -> None:
 
 @cached_by_file(2)
 def _torchscript(path: Path, role: Role) -> Network:
-    """Return TorchScript module: on CUDA in half precision where there is one, else on the CPU."""
+    """Load a TorchScript module: on CUDA in half precision if there is a GPU, else on the CPU."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
         module = torch.jit.load(str(path), map_location=device).eval()

@@ -3,7 +3,7 @@
 Each camera gets a lens from its own views, and for each frame the board poses that its view allows
 (two, since a flat target is ambiguous). The relative pose on which two cameras agree over their
 shared frames resolves the ambiguity and reveals cameras that are not synchronised. This only starts
-the joint solution, so surviving bad frames matters more than being exact.
+the joint solution, so it must survive bad frames rather than be exact.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ Views = Mapping[str, Mapping[int, BoardView]]
 
 
 def seen_from_front(view: BoardView) -> bool:
-    """Check the sense in which corners run round the board: its back and mirrors reverse it."""
+    """Check the sense in which corners run round the board; mirrors and its back reverse it."""
     flat = np.column_stack([view.points[:, :2], np.ones(len(view.points))])
     affine, _, rank, _ = np.linalg.lstsq(flat, view.pixels, rcond=None)
     return bool(rank == 3 and np.linalg.det(affine[:2]) > 0)

@@ -37,7 +37,7 @@ from pipelines.calibrate.timing import CameraTiming, estimate_timing, in_step
 LADDER = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")  # from few to many parameters
 WEAK_CORNERS, WEAK_FRAMES = 200, 8  # cameras with less are reported
 WEAK_TILTS_DEG = 10.0  # at 3 degrees about each axis, focal lengths were off by 1.3 %
-FITTING = 0.75  # share of a camera's corners; cameras that moved meanwhile keep less
+FITTING = 0.75  # least share of a camera's corners that fit; cameras that moved have less
 LEAST_CORNERS = 24  # that must fit the other cameras, or a camera is dropped
 REJECT_SIGMA = 4.0
 """Corners further off than this many robust standard deviations are rejected; 3 to 6 gave the same

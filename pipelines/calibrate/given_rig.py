@@ -1,10 +1,8 @@
-"""Hold given cameras against what was recorded: find those that moved, refine those a little off.
+"""Compare given cameras with what was recorded: find those that moved, refine those a little off.
 
-To find cameras that have moved, points are fitted with one camera free after the other; the one
-that explains most has moved, and the rest are tried again. So a bump is not blamed on neighbours.
-
-Refinement changes all cameras, but only if held-out points then fit
-clearly better.
+To find cameras that have moved, points are fitted with one camera free after the other. The one
+that explains most has moved, and the rest are tried again, so that a bump is not blamed on
+neighbours. Refinement changes all cameras, but only if held-out points then fit clearly better.
 """
 
 from __future__ import annotations
@@ -37,9 +35,9 @@ MOVE_PRIORS = RigPriors(turn_rad=np.radians(1.0), move_m=0.01)
 MOVE_SCALES, ITERATIONS = (6.0, 3.0, 1.5), 4
 """Sigmas at which residuals flatten: a camera that is off by a few pixels must not be rejected
 together with the mismatches. Four iterations per scale name the cameras that convergence names."""
-HELD = 5  # every fifth point judges and is not adjusted to
+HELD = 5  # every fifth point is held out: it judges the result
 CLEARLY = 0.8
-"""Held-out errors must fall to this share of what they were; even true rigs gain up to 6 %."""
+"""Held-out errors must fall below this share of those before; true rigs gain up to 6 %, too."""
 REFINE_BAND = 0.03  # of features about the given rig's epipolar lines, as a share of the diagonal
 REFINE_SCALES = (3.0, 1.5)
 LENS = RigPriors(focal=0.005, focal_spread=0.005, centre=0.002, bend=0.005)  # of given lenses

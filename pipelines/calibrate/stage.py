@@ -146,8 +146,8 @@ def _given(index: Index, path: Path, has_board: bool, config: CalibrateConfig) -
     gains: ColourGains | None = None
     warnings: tuple[Note, ...] = ()
     if config.refine != "none":
-        # One bumped camera is corrected first. Where several seem to have moved, the whole rig is
-        # off, and the check cannot say which camera is at fault.
+        # A single bumped camera is corrected first. If several seem to have moved, the whole rig is
+        # off, and the check cannot find the ones at fault.
         check = _check_footage(index, cameras, max(1, config.check_frame_sets))
         refined = refine_by_footage(
             cameras, find_points(read_footage(index, cameras, config.solve_frame_sets)),
@@ -233,7 +233,7 @@ def _from_board(index: Index, config: CalibrateConfig) -> CalibratedRig:
 
 
 def expected_error(uncertainty: Mapping[str, HeadError]) -> ExpectedError | None:
-    """Say how far cameras probably are off in the head's place; None for a lone camera."""
+    """Return how far cameras probably are off at the head; None for a single camera."""
     stated = np.array([error.mm for error in uncertainty.values()])
     return error_bounds("calibrate", {"stated_mm": stated}).expected
 

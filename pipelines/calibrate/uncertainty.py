@@ -1,11 +1,12 @@
-"""State how far the cameras of a rig may be off, in the place of the head.
+"""State how far the cameras of a rig may be off at the head.
 
 The covariance of all cameras follows from the derivatives of the corners' errors, boards' poses
-eliminated. It is carried over to points in the head's place, after worlds are laid on each other by
-these points, as nothing else matters further on. It assumes that the corners' errors are
-independent and that the lens model is true. Therefore it is enlarged where corners of one image are
-off together, and where rigs of two halves of the board images differ by more than it predicts.
-After mrcal's projection uncertainty (Kogan, https://mrcal.secretsauce.net/uncertainty.html).
+eliminated. It is carried over to points at the head, after worlds are aligned by these points,
+because later stages depend on nothing else. It assumes independent errors of corners and a true
+lens model, so it is enlarged where corners of one image are off together, and where rigs from two
+halves of the board images differ by more than it predicts.
+
+Source: mrcal's projection uncertainty (Kogan, https://mrcal.secretsauce.net/uncertainty.html).
 """
 
 from __future__ import annotations
@@ -147,7 +148,7 @@ def _covariance(
         drawn += np.einsum("nij,nj->ni", by_board, normal.follow(step)[group])
         alone += _together(drawn, corners) / DRAWS
     unknowns = np.count_nonzero(normal.diagonal) + 6 * (len(frames) - 1)
-    left = max(1 - unknowns / errors.size, 0.1)  # noise that the unknowns did not take up
+    left = max(1 - unknowns / errors.size, 0.1)  # share that the unknowns did not absorb
     return names, covariance / left, max(1.0, together / max(alone, 1e-9))
 
 

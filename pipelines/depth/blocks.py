@@ -2,7 +2,7 @@
 
 A table gives every block of the box a row in an array of blocks. Two rows are constant and shared
 by all blocks that lie wholly outside or wholly inside. Source: Nießner et al. 2013 and Museth 2013,
-with a plain table instead of a hash or a tree: it has a 512th of the box's voxels.
+with a plain table instead of a hash or a tree, as it has a 512th of the box's voxels.
 """
 
 from __future__ import annotations

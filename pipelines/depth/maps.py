@@ -1,10 +1,10 @@
 """Cast rays at the surface: depth, normals and error bounds per camera, checked by its neighbours.
 
-Bounds come from what each pixel shows of its depth: how well patches agree there, slant, jumps and
-roughness of the surface, and photometric reprojection. Each view is warped into its neighbours'
-pictures through its own depth map. Where the surface is right the colours agree up to gain,
-highlights and noise. On bare skin a small error proves little, a large one always shows (Seitz et
-al. 2006). `express50.error_model` turns these figures into millimetres.
+Bounds follow from figures of each pixel: agreement of patches, slant, jumps and roughness of the
+surface, and photometric errors. For these, each view is warped into its neighbours' pictures
+through its own depth map. Where the surface is right, colours agree up to gain, highlights and
+noise. On bare skin a small error proves little, but a large one always shows (Seitz et al. 2006).
+`express50.error_model` turns these figures into millimetres.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ SURE_MM = 2.0  # bound at which confidence is a half
 COMPARED_SIDE = 512  # longest side, pixels, at which views are compared through the depth
 NEIGHBOURS = 4  # views that each is compared with, those whose directions are closest
 CONSISTENT_STEPS = 10.0  # 8-bit steps up to which colours agree: noise and highlights take some
-DARK = 16.0  # 8-bit steps; darker pixels say nothing about gain
+DARK = 16.0  # 8-bit steps; gains are not measured on darker pixels
 FLAT = 4.0  # tangent of the angle between line of sight and normal from which colours smear
 HIDDEN_M = 0.004  # metres behind the neighbour's own depth at which a point counts as hidden
 WINDOW = 5  # pixels, odd: colours around a wrong depth agree here and there by chance
 
-GRAINS = 7  # of so many pixels one is taken for the typical grain of all views
+GRAINS = 7  # every n-th pixel counts for the typical grain of all views
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class DepthMaps:
 
     Depth is in metres, normals (H, W, 3) in camera axes, both 0 where not valid. `covered` is the
     share of the matte with depth, `spill` that of the surface outside. `figures` describe how well
-    each of the N valid pixels is known, `bounds` are what they say.
+    each of the N valid pixels is known; `bounds` follow from them.
     """
 
     depth: np.ndarray
@@ -131,7 +131,7 @@ def surface_maps(
 ) -> Iterator[tuple[str, DepthMaps, PhotoErrors]]:
     """Yield camera id, maps of the surface and neighbours' errors of one camera after the other.
 
-    What stands off the tracked head, `solid`, is hair or cloth, or wrong. All cameras' maps
+    Surface away from the tracked head, `solid`, is hair, cloth or wrong. The maps of all cameras
     together would take gigabytes.
     """
     apart = None

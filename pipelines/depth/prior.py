@@ -16,13 +16,13 @@ from express50.geometry.raycast import camera_rays, mesh_scene
 from express50.geometry.sampling import bilinear
 from pipelines.depth.views import DepthView, hull_distance, silhouette_distance
 
-REACH = 0.015  # metres that the hull may rise above a mesh that is believed; more is hair, cloth
-BORDER = 0.03  # metres from the mesh's open border over which belief fades in; collars are there
-BODY = 0.5  # metres that the body goes on below the neck and widens; shoulders are nearer
-EYES_M = 0.03  # metres from glasses within which the head is believed, whatever the hull
-WORN_M = 0.004  # about a place on glasses: what is seen there is glasses, or is seen through them
+REACH = 0.015  # metres that the hull may lie above a mesh that is trusted; beyond is hair or cloth
+BORDER = 0.03  # metres from the mesh's open border, where collars are, over which trust grows
+BODY = 0.5  # metres that the body continues below the neck, and widens; shoulders are nearer
+EYES_M = 0.03  # metres from glasses within which the head is trusted, whatever the hull
+WORN_M = 0.004  # radius about a place on glasses that shows glasses, or what is behind them
 NECK = 0.08  # metres; an open border larger than this is a neck, not an eye or a nostril
-# 26 directions to the neighbours of a cell, the six axes first, as a mesh hides most points there
+# 26 directions to the neighbours of a cell, the axes first: a mesh hides most points along these.
 _CELL: np.ndarray = (
     np.array(sorted(np.ndindex(3, 3, 3), key=lambda k: sum(abs(i - 1) for i in k))[1:]) - 1
 )
@@ -49,14 +49,13 @@ class TrackedSolid:
     ) -> np.ndarray:
         """Blend the solid's distances into those (N,) to the hull, where under ``reach`` metres.
 
-        Where the hull of the body's own `outlines` stands far above it, no silhouette shows the
-        surface. There the surface lies no further before or behind the body than the mattes reach
-        beside it.
+        Where the hull of the body's own `outlines` lies far above the body, no silhouette shows the
+        surface. There it lies no further before or behind the body than the mattes reach beside it.
         """
         within = hull < reach
         points, own = points[within], hull[within]
         distance = self.distance(points)
-        # The hull's height over the mesh is the same all along a normal, so that no shell is left.
+        # The hull's height over the mesh is the same along a normal, so that no shell is left.
         belief = self.belief(points, distance - own)
         merged = hull.copy()
         merged[within] += belief * (np.maximum(distance, own) - own)

@@ -1,10 +1,10 @@
 """Reconstruct a surface from views: visual hull, tracked mesh, photo-consistency.
 
-Patches of the surface slide along its normals and are compared across views. A patch is curved as
-the surface is, so that views far apart see it alike: a fronto-parallel sweep fails at the 35 to 45
-degrees between neighbours of a sparse ring, a flat patch at a nose. The score is zero-mean
-normalised cross-correlation, which ignores each camera's gain and offset. Tracking searches along
-normals too, with other supports and scores (docs/LOG.md, Depth).
+Patches of the surface slide along its normals and are compared across views. They are curved as the
+surface is, so that views far apart see them alike: a fronto-parallel sweep fails at the 35 to 45
+degrees between neighbours of a sparse ring, flat patches at a nose. The score is zero-mean
+normalised cross-correlation, which ignores each camera's gain and offset. Tracking has a search of
+its own with other supports and scores (docs/LOG.md, Depth).
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ LEVEL_RATIO = 1.47  # of the voxels of one level to those of the next
 INWARD_M = 0.03  # how far below the hull the first level searches: eye sockets are that deep
 FAIR_VOXELS = 1.4  # smoothing before each level; less gains 0.012 mm but fails with three views
 SMALLEST_M, LARGEST_M = 0.03, 3.0  # a head is 0.25 m high, with shoulders under 1 m
-HULL_CONFIDENCE = 0.3  # where only silhouettes speak
-LEAST_CONFIDENCE = 0.1  # where nothing does; that of a tracked head in a single view
+HULL_CONFIDENCE = 0.3  # where only silhouettes are evidence
+LEAST_CONFIDENCE = 0.1  # where nothing is; also that of a tracked head in a single view
 GRAZING = 0.25  # cosine; flatter than this, a patch is squeezed to under a quarter of its width
 SAMPLES = 5  # along a patch's side: 7 are worse (0.353 for 0.333 mm)
 SPACING_VOXELS = 0.66  # between a patch's samples
@@ -259,7 +259,7 @@ def patch_scores(
         rise = np.where(np.abs(height) < np.abs(flat).max(), -height, 0.0)
         patch = (about + rise[..., None] * normals[chunk, None]).astype(np.float32)
         scores[chunk] = _correlate(views, greys, line, patch, weights[:, chunk] ** 2, noise)
-    # Neighbours see the same: chance matches of one patch, frequent in hair, average out.
+    # Averages out chance matches of single patches, which are frequent in hair.
     return averaged(scores, faces, rounds=1)
 
 

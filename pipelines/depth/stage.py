@@ -30,7 +30,7 @@ ERROR_STEPS = 30.0  # 8-bit steps at the bright end of the error maps
 BLANK = 24  # grey of unknown pixels
 SHOWN = 4  # cameras in the contact sheet
 TILE = 240  # pixels of a picture in it
-EXPECTING = 8  # of so many pixels one is asked what error to expect
+EXPECTING = 8  # every n-th pixel counts for the expected error
 AGREEMENT = 0.85  # share of the tracked mesh that must lie in the mattes for it to be used
 
 

@@ -28,9 +28,9 @@ from pipelines.depth.blocks import (
 )
 from pipelines.depth.views import DepthView
 
-OUTLIER_STEPS = 2.0  # offsets' steps off its neighbours at which a match is believed by a quarter
-LEAST_VOXELS = 1e-3  # voxels; distances nearer to 0 are meshed as if they were this
-STIFFNESS_VOXELS = 2.2  # length under which displacements are smoothed as by a thin plate
+OUTLIER_STEPS = 2.0  # steps of offsets from the neighbours at which a match counts as a quarter
+LEAST_VOXELS = 1e-3  # voxels; smaller distances are raised to this before meshing
+STIFFNESS_VOXELS = 2.2  # length below which a thin plate smooths displacements
 COUPLINGS = (1e3, 3e3, 1e4, 2e4)  # per square metre; a gap of 10 mm costs 0.1 at first, 2 at last
 
 
@@ -46,8 +46,8 @@ class HeadMesh(NamedTuple):
 class HeadSurface:
     """The reconstructed head: a mesh as HeadMesh, and the signed distances it was taken from.
 
-    Confidence (V,) is in [0, 1], 0.3 where only silhouettes speak; colors (V, 3) are uint8 sRGB;
-    `figures` are for the metrics.
+    Confidence (V,) is in [0, 1], 0.3 where only silhouettes are evidence; colors (V, 3) are uint8
+    sRGB; `figures` are for the metrics.
     """
 
     vertices: np.ndarray
@@ -72,11 +72,11 @@ def extract_mesh(grid: LevelSet) -> HeadMesh:
     places = np.argwhere((least < 0) & (most > 0))
     if not len(places):
         return HeadMesh(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), np.int64))
-    # a cube of them, not a row: the vertices' indices are float32
+    # In a cube, not in a row: the vertices' indices are float32.
     tile, tiles = BLOCK + 1, math.ceil(len(places) ** (1 / 3))
     volume = np.ones((tiles**3, tile, tile, tile), np.float32)
     values, least = windows(grid, places, 0, 1), np.float32(LEAST_VOXELS * grid.voxel)
-    # away from 0, so that each vertex lies clearly on one edge
+    # Away from 0, so that each vertex lies clearly on one edge.
     volume[: len(places)] = np.where(np.abs(values) < least, np.copysign(least, values), values)
     volume = volume.reshape(tiles, tiles, tiles, tile, tile, tile).transpose(0, 3, 1, 4, 2, 5)
     inner = np.arange(tiles * tile) % tile > 0
@@ -175,10 +175,10 @@ def smooth_displacement(
     ``pinned`` ones (V,) (Steinbruecker et al. 2009; Newcombe et al. 2011).
     """
     peak, typical = scores.max(1), np.median(scores, axis=1)
-    # a peak counts by its height and by how far it stands out; 0.33 is what good texture gives
+    # A peak counts by its height and by how far it stands out: 0.33 on well textured skin.
     trust = np.clip(3.0 * np.clip(peak, 0, 1) * (peak - typical), 0, 1)
     plate = STIFFNESS_VOXELS**4 * (laplacian.T @ laplacian)  # against a data weight of one
-    ridge = 0.01  # a patch that nothing pins stays where it is
+    ridge = 0.01  # keeps patches without evidence in place
     rows, step = np.arange(len(scores)), offsets[1] - offsets[0]
     displacement = _plate(plate, ridge + trust + pinned_weight, pinned_weight * pinned, step)
     believed = trust

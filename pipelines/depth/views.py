@@ -28,7 +28,7 @@ UNSEEN = 1.0  # metres; the distance given to space that too few cameras see
 BOX_CELLS = 40  # along the sides of the box in which the hull is looked for
 VOTERS = 5  # fewest views of which one can be outvoted
 MISSED = 0.001  # share of the mattes that the hull may miss before any view is suspected
-OUTVOTED = 2.0  # leaving the view out must help this many times more than leaving out any other
+OUTVOTED = 2.0  # leaving the view out must help so many times more than leaving out any other
 CELLS = 64  # along the sides of the box in which views are compared
 
 
@@ -134,8 +134,8 @@ def pixel_size(view: DepthView, point: np.ndarray) -> float:
 def hull_distance(views: Sequence[DepthView], points: np.ndarray) -> np.ndarray:
     """Measure signed distances (N,) of points (N, 3) to the visual hull, metres, negative inside.
 
-    It is the maximum over the views (Laurentini 1994). Points seen by fewer than two views, or by
-    less than a third of them, are outside: otherwise phantoms would float before the head.
+    It is the maximum over the views (Laurentini 1994). Points that fewer than two views, or less
+    than a third of them, see are outside; otherwise phantoms would float before the head.
     """
     distance = np.full(len(points), -UNSEEN, np.float32)
     seen = np.zeros(len(points), np.int16)
@@ -246,7 +246,7 @@ def without_contradiction(views: Sequence[DepthView]) -> tuple[list[DepthView], 
 
 
 class _Vote(NamedTuple):
-    """The evidence of one view about P cells of space: which its matte allows, and their pixels.
+    """One view's evidence about P cells of space: which ones its matte allows, and their pixels.
 
     ``pixel`` (P,) is a flat index of ``matte`` (h, w), about one pixel per cell, -1 where unseen.
     """

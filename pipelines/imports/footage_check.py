@@ -20,17 +20,17 @@ from pipelines.imports.places import PeakFrame
 from pipelines.track.observe import Observation
 from pipelines.track.read_inputs import agreed, face_views, open_landmarks
 
-# Of a face's height. Tracks of the twin are 0.012 to 0.017 off the landmarks that are found, those
-# of another person in the same place 0.04 to 0.15.
+# Share of a face's height. Tracks of the twin are 0.012 to 0.017 off the landmarks found, those of
+# another person in the same place 0.04 to 0.15.
 LEAST_OFF = 0.035
 INSIDE_SHARE = 0.7  # of a face's landmarks that masks must hold
-# Mattes of the twin have 4 and 5, those of other people 1.0 to 1.6.
+# Contrasts of the twin's mattes are 4 and 5, those of other people's 1.0 to 1.6.
 LEAST_CONTRAST, BESIDE, RIM = 2.0, 0.04, 3
 LEAST_MARKS = 8
-# Depth of the twin is 0.003 m off the landmarks that are triangulated, that of others 0.01 to 0.02.
+# Depth of the twin is 0.003 m off triangulated landmarks, that of other people 0.01 to 0.02.
 DEPTH_OFF_M = 0.008
 SEARCH = 0.25  # smallest window searched for a face, as in tracking
-NO_FACE = "the footage shows no face that two cameras agree on; it was not compared to one"
+NO_FACE = "the footage shows no face on which two cameras agree, so nothing was compared to it"
 INNER = slice(17, 68)  # landmarks that are not on the jaw's outline
 
 

@@ -25,11 +25,11 @@ from express50.geometry.meshes import write_ply
 from express50.geometry.sampling import undistort_image, undistort_maps
 
 SAMPLES = 1500  # pixels per view that are compared to the other views
-NEAR_M = 0.01  # a surface point of one view and of another are the same within this
-MOST_OFF = 0.6  # of half a mask's extent: its middle from that of what all masks show
-AGREE_SHARE = 0.4  # of the pixels that two views know, which must be the same surface
+NEAR_M = 0.01  # distance within which surface points of two views are the same
+MOST_OFF = 0.6  # of half a mask's extent: how far its middle may be off the one all masks show
+AGREE_SHARE = 0.4  # least share of the pixels known to two views that show the same surface
 LEAST_COSINE = 0.5  # between the directions of two views that are compared
-FINE_M, FINER_SHARE = 0.003, 0.1  # another measure is right if it gains this share within it
+FINE_M, FINER_SHARE = 0.003, 0.1  # the other measure is right if so many more pixels agree so well
 FACTORS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
 LEAST_VOXEL_M, VOXEL_PX = 0.0015, 1.4  # as depth's own
 TRUNCATION = 4.0  # voxels

@@ -24,11 +24,11 @@ SIDE = 96  # longer side, pixels, of the images in which movement is measured
 FEWEST_CAMERAS, FEWEST_FRAMES = 3, 24
 SPAN = 15  # frames of the running mean that is subtracted: views differ in how much they see
 STEP_COST = 10.0  # cost of a change of lag, in units of log likelihood
-FRAME_COST = 1.0  # cost of each frame of a lag: few frames are lost more often than many
+FRAME_COST = 1.0  # cost per frame of a lag: cameras mostly lose few frames
 START_COST = 7.0  # cost of being out of step from the start
-ALIKE = 0.35  # least correlation with the other cameras for a camera to be judged
+ALIKE = 0.35  # least correlation with the other cameras at which a camera is judged
 EARLY = 8  # a change of lag before this frame looks like one before the start
-LEAST_SPREAD = 0.15  # of curves of unit variance; views are never more alike than that
+LEAST_SPREAD = 0.15  # of curves of unit variance, between different views
 STILL = 0.05  # share of a camera's usual movement below which a frame repeats the one before
 
 CELLS = 16
@@ -43,7 +43,7 @@ REACH = 8  # pixels on either side of an edge within which its two levels are lo
 SMOOTH = 0.8  # deviation, pixels, of the filter against noise; subtracted from the width again
 LEAST_HEIGHT = 30.0  # grey levels between the sides of an edge, so that noise is not an edge
 FEWEST_EDGES = 12
-SHARPEST = 20  # percentile of the widths: a face is soft, its lashes and hair are not
+SHARPEST = 20  # percentile of the widths: lashes and hair are sharp, a face is not
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ def _steps_of_clip(
     while len(curves) - len(steps) >= FEWEST_CAMERAS:
         left = {name: curve for name, curve in curves.items() if name not in steps}
         rest = {n: np.median([c for m, c in left.items() if m != n], axis=0) for n in left}
-        # The fit of the usual camera: a camera out of step would excuse itself by its own.
+        # The spread of the median camera: with its own, a camera out of step would look normal.
         misses = [np.mean((left[n] - rest[n])[1:] ** 2) for n in left]
         spread = max(float(np.median(misses)), LEAST_SPREAD)
         gains = {}
@@ -203,7 +203,7 @@ def _likeliest_lags(
     at = np.arange(count)[:, None] + lags
     beyond = (at < 0) | (at >= count)
     miss = (curve[:, None] - rest[np.clip(at, 0, count - 1)]) ** 2 / (2 * spread)
-    # Beyond the clip there is nothing to compare, so no lag fits better there than being in step.
+    # Beyond the clip there is nothing to compare: lags cost there what being in step costs.
     miss = np.minimum(np.where(beyond, miss[:, reach : reach + 1], miss), 6.0)
     total = miss[0] + (START_COST + FRAME_COST * np.abs(lags)) * (lags != 0)
     far = np.abs(lags[:, None] - lags)
@@ -211,7 +211,7 @@ def _likeliest_lags(
     never = np.where(far > 0, np.inf, 0.0)
     came = np.zeros((count, len(lags)), dtype=np.int64)
     for t in range(1, count):
-        # This near the end, mostly frames without a counterpart would decide about a change.
+        # So near the end, frames without a counterpart would decide about a change.
         late = t >= count - 2 * reach
         ways = total[:, None] + (never if late else change)
         came[t] = ways.argmin(axis=0)

@@ -1,8 +1,8 @@
 """Find the square around a head, and cut images, labels, depth and K to it.
 
-A soft pixel of the footage holds light of the plate: shown before another background it carries a
-rim of the studio. Where the plate is known, `own_colours` solves the likeliest colour of the
-subject (Chuang et al. 2001 with alpha and plate given); else the subject's colours nearby stand in.
+A soft pixel of the footage holds light of the plate, which would be a rim before another
+background. Where the plate is known, `own_colours` solves for the likeliest colour of the subject
+(Chuang et al. 2001 with alpha and plate given); elsewhere it takes the subject's colours nearby.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from pipelines.matte.plates import exposed, exposure_gain, local_colours, to_lig
 EDGE = 0.01  # neighbours whose depths differ by more than this share lie on two surfaces
 MARGIN = 0.1  # room on each side, as a share of the head's size
 HAIR = 0.3  # how far the matte may widen the mesh's box, as a share of its size: hair, no shoulders
-REACH_SHARE = 0.008  # of the image's longer side: how far away colours may be taken from
+REACH_SHARE = 0.008  # of the image's longer side: largest distance from which colours are taken
 SPREAD = 0.25  # share by which a strand may be brighter or darker than its neighbours
-NOISE = 0.01  # deviation of linear light: a sensor's, compression's, and what alpha's error makes
+NOISE = 0.01  # deviation of linear light by sensor, compression and errors of alpha
 SOLID = 0.98  # alpha from which a pixel has the subject's colour alone
 
 

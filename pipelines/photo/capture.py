@@ -1,8 +1,8 @@
 """Make a raw capture of one camera out of a photograph or a video, its focal length included.
 
-Only perspective distinguishes a near face under a wide lens from a far one under a long lens: at
-arm's length the nose is a twentieth nearer than the ears. The head model is fitted at a ladder of
-focal lengths; the fit's cost shows which explain the landmarks as well as the best one does.
+Only perspective distinguishes a near face under a wide lens from a far one under a long lens. The
+head model is fitted at a ladder of focal lengths; the fit's cost shows which of them explain the
+landmarks as well as the best one does.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ PHOTO_SUFFIXES = (*IMAGE_SUFFIXES, ".webp", ".bmp")
 LADDER = 2.0 ** np.arange(-2.0, 2.5, 0.5)
 # Two thirds of unknown lenses lie within this factor of the guess.
 GUESS_FACTOR = 1.5
-# The landmarks of one detection err together: they count as a quarter of their number.
+# Landmarks of one detection err together, so they count as this share of their number.
 INDEPENDENT = 0.25
-# Focal lengths whose cost is this much above the least (two standard deviations) are as good.
+# Focal lengths whose cost is at most this much above the least are as good: two deviations.
 AS_GOOD = 2.0
 CONSTRAINED_FACTOR = 1.6
 # World of a single camera: at the camera, y up, the camera looks along -z.

@@ -1,12 +1,9 @@
 """Separate hair, skin and torso by colour where geometry alone is not sure.
 
-The pixels of a view that geometry is sure of give histograms of the colours of hair, skin and
-torso; every other pixel takes the class that its colour and its place make most likely. Views from
-behind, where hair may cover all skin, take half of the skin's colours from views of the face. So a
-collar in front of the neck is torso, and hair over a shoulder or the forehead is hair, as far as
-their colours differ.
-
-The constants were set on the digital twin's four people (docs/LOG.md, Parts).
+Pixels that geometry is sure of give histograms of the colours of hair, skin and torso; every other
+pixel takes the class that its colour and place make most likely. In views from behind, where hair
+may cover all skin, half of the skin's colours come from views of the face. The constants were set
+on the digital twin's four people (docs/LOG.md, Parts).
 """
 
 from __future__ import annotations
@@ -31,13 +28,13 @@ CELLS, STEPS = (32, 64, 64), (8, 4, 4)  # 8-bit Lab in cells: light varies more 
 SMOOTH = 1.5  # cells; a few hundred pixels fill a smooth histogram
 LEAST = 30  # fewest pixels that make a histogram
 FEATURES = 0.003  # share of the mesh that eyes and lips fill where a view sees the face
-SHARED = 10_000  # pixels that own and other views' skin colours each count as, if both teach
-COVERED = 0.1  # share of a view's skin: bare faces have 0.02 to 0.05 of other colours
+SHARED = 10_000  # pixels that skin colours of the view itself and of others count as, if both count
+COVERED = 0.1  # share of odd colours in a view's skin that is a beard; bare faces have 0.02 to 0.05
 DARK = 1e-3  # root of light that is added to pixels: keeps logarithms finite
-# Of the natural logarithm of the face's brightness and of its two ratios of colours.
+# Least spreads of the logarithms of brightness and of two ratios of colours; and how many are skin.
 LEAST_SPREAD, WITHIN = np.array([0.2, 0.03, 0.03]), 3.0
-RARE = 1e-6  # share of a cell that no pixel taught: keeps logarithms finite
-UNTAUGHT = 1.2e-4  # share of every cell of a class without pixels: spread over 8000 cells
+RARE = 1e-6  # share of a cell without samples: keeps logarithms finite
+UNTAUGHT = 1.2e-4  # share of every cell of a class without samples: spread over 8000 cells
 
 # Places, metres above the neck's end, where geometry is sure of a class.
 SURE_BELOW, SURE_ABOVE = -0.01, 0.10
@@ -78,7 +75,7 @@ def colour_logs(rgb: np.ndarray) -> np.ndarray:
 
 
 def like_skin(values: np.ndarray, face: np.ndarray) -> np.ndarray:
-    """Return which colours (N, 3) are like most of the face's (M, 3); logarithms of root light."""
+    """Mark the colours (N, 3) that are like most of the face's (M, 3); logarithms of root light."""
 
     def ratios(logs: np.ndarray) -> np.ndarray:
         # Shading changes brightness much, ratios of colours little.
@@ -91,9 +88,9 @@ def like_skin(values: np.ndarray, face: np.ndarray) -> np.ndarray:
 
 
 def usual(rgb: np.ndarray, skin: np.ndarray) -> np.ndarray:
-    """Leave out of the pixels (H, W) of skin a beard or a fringe: colours unlike most of it.
+    """Leave a beard or a fringe, whose colours are unlike most of it, out of the skin (H, W).
 
-    Brows, nostrils and shadows alone are fewer than COVERED; they are skin.
+    Brows, nostrils and shadows stay: they are a smaller share than COVERED.
     """
     if not skin.any():
         return skin
@@ -143,7 +140,7 @@ def by_colour(
         hair, beyond = np.zeros_like(hair), 0.0
     counts = [_counts(cells, mask) for mask in (hair, skin, torso)]
     if skin_colours is not None and not bare and not _sees_face(geometry.mesh):
-        # As much of each: the back of a neck may be in a shadow that no face is in.
+        # Half of each, because the back of a neck may be darker than any face.
         own, others = (c / np.float32(max(c.sum(), 1.0)) for c in (counts[1], skin_colours))
         counts[1] = SHARED * (own + others)
     priors = _priors(labels, geometry, beyond)
@@ -202,7 +199,7 @@ def _priors(labels: np.ndarray, geometry: HeadGeometry, beyond: float) -> np.nda
 
 @dataclass(frozen=True)
 class Scalp:
-    """The scalp's state, and the share of it in the face's colours; None: unknown."""
+    """Whether the scalp is skin, and the share of it in the face's colours; None: unknown."""
 
     is_skin: bool
     skin_coloured: float | None
@@ -211,7 +208,7 @@ class Scalp:
 def scalp_votes(rgb: np.ndarray, labels: np.ndarray, alpha: np.ndarray) -> tuple[int, int]:
     """Count the pixels of scalp compared with the view's own face, and those of its colours.
 
-    A view is compared with itself, so that no other camera's gain or light plays a part.
+    The view's own face is taken, because other cameras differ in gain and light.
 
     Args:
         rgb: (H, W, 3) uint8 sRGB.

@@ -23,7 +23,7 @@ HAIR, TORSO = np.uint8(LABELS.index("hair")), np.uint8(LABELS.index("torso"))
 BEARINGS = 36  # around the neck, at which the height of its lower end is known
 CLEAR_M, HAND_M, WIDTH_M = 0.007, 0.022, 0.006  # off the face; a hand's back; least width
 RIM_M = 0.005  # what juts out this far beyond the mesh is still what the mesh shows there
-# Sheets that are seen from outside only; from inside one looks through the neck's open end.
+# Labels of skin that is seen from outside only; from inside it is seen through the neck's open end.
 _OUTER = tuple(LABELS.index(name) for name in ("skin", "ears", "lips", "neck")) + (SCALP,)
 
 # Later rows win: lids and lips are skin to some models, teeth are mouth to others.
@@ -109,7 +109,7 @@ class TrackedHead:
         R: (3, 3) world from head axes; y up, z along the gaze.
         labels: the head model's.
         end: the neck's lower end; None if the model does not mark it.
-        center: (3,) origin of the scene, so that far subjects lose no digits.
+        center: (3,) origin of the scene, which keeps digits far from the world's origin.
         scene: for casting rays.
     """
 
@@ -276,9 +276,9 @@ def _nearest(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def head_alpha(alpha: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """Keep the alpha (H, W) of the head alone by labels (h, w), which may be smaller.
 
-    What is neither head nor torso (strands that a network calls background, glasses, hats,
-    collars) goes with the nearer of the two; the cut is a pixel of the matte wide. Without a head
-    the matte is empty; without a torso it stays as it is.
+    Pixels of neither (strands that a network calls background, glasses, hats, collars) go with the
+    nearer of head and torso. The cut is a pixel of the matte wide. Without a head the matte is
+    empty, without a torso it is unchanged.
     """
     head, torso = label_mask(labels, *HEAD), label_mask(labels, "torso")
     if not head.any() or not torso.any():

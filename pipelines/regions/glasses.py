@@ -1,9 +1,9 @@
 """Find glasses before the tracked head, by colour.
 
-Frames are too thin for depth maps. But a place on one is unlike skin in every view, whatever lies
-behind it, whereas before a bare face some view always sees skin behind such a place. So space
-before the eyes is carved by colours, as silhouettes carve a hull. What is left is glasses if it
-runs around an eye; the lenses, which have the colours behind them, fill the ring.
+Frames are too thin for depth maps. But every view sees a place on a frame in a colour unlike skin,
+whereas a place before a bare face has skin behind it in some view. So colours carve the space
+before the eyes as silhouettes carve a hull. What is left is glasses if it runs around an eye;
+lenses, which show the colours behind them, fill the ring.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ CELL_M = 0.002
 # Of the searched box: half its size beside the eyes and above them, and its ends along the gaze.
 BOX_M = ((-0.08, 0.08), (-0.045, 0.04), (-0.03, 0.045))
 CLEAR_M, FAR_M = 0.003, 0.03  # from the mesh, between which glasses are looked for
-LEAST_VIEWS, ERRING = 4, 16  # that see a place odd; one of so many views may see skin there
-LEAST_SKIN = 200  # pixels by which a view knows the skin's colours
+LEAST_VIEWS, ERRING = 4, 16  # views that see an odd colour; one view in so many may see skin
+LEAST_SKIN = 200  # pixels of skin in a view that is asked
 LEAST_CELLS = 20  # of a connected part
 FRONT_M, BRIDGE_M, REACH_M = 0.015, 0.005, 0.045  # depth of a rim, half a bridge, rim from its eye
 BEARINGS, AROUND = 24, 0.6  # about an eye, and the share of them that shows a rim
-EYE_M = 0.015  # half an eye: from its middle, within which lashes and shadow are its own
-WIDER_M = 0.0012  # by which cells stand out from glasses: odd pixels are widened by one
+EYE_M = 0.015  # radius of an eye with its lashes and shadow, which are not glasses
+WIDER_M = 0.0012  # by which cells are wider than glasses: odd pixels are dilated by one
 
 Picture = tuple[Camera, np.ndarray, np.ndarray]
 """A pinhole camera, its frame (H, W, 3) uint8 and its matte (H, W) in [0, 1]."""
@@ -62,7 +62,7 @@ def find_glasses(head: TrackedHead, pictures: Sequence[Picture]) -> np.ndarray:
 
 
 def _odd(head: TrackedHead, pictures: Sequence[Picture], grid: np.ndarray) -> np.ndarray:
-    """Return which places (N,) of a grid (N, 3), about the head's centre, no view sees as skin."""
+    """Mark the places (N,) of a grid (N, 3), about the head's centre, that no view sees as skin."""
     local = (grid @ head.R.T).astype(np.float32)
     apart = head.scene.compute_distance(o3d.core.Tensor(local), nthreads=1).numpy()
     ids = np.flatnonzero((apart > CLEAR_M) & (apart < FAR_M))
@@ -91,7 +91,7 @@ def _odd(head: TrackedHead, pictures: Sequence[Picture], grid: np.ndarray) -> np
 
 
 def _is_around(rim: np.ndarray, eye: np.ndarray) -> bool:
-    """Say whether a rim (N, 3) runs around an eye (3,), in axes of the head; brows do not."""
+    """Check that a rim (N, 3) runs around an eye (3,), in axes of the head; brows do not."""
     off = rim[:, :2] - eye[:2]
     x, y = off[np.linalg.norm(off, axis=1) > EYE_M].T
     bearing = ((np.arctan2(y, x) / (2 * np.pi) % 1) * BEARINGS).astype(int)

@@ -1,11 +1,10 @@
 """Lay a tracked mesh onto a surface: match along normals, then bend the mesh as little as needed.
 
-Every vertex looks for the surface along its normal. The heights found there are data of a thin
-plate, which carries them to where nothing is found; a weak spring keeps the rest in its place. The
-plate's normal equations are factored, and samples of its posterior give the uncertainty. Vertices
-move along normals alone, so they keep their place on the skin: tracking, which sees the skin's
-texture, knows it better than a surface does. Hair and cloth are separated from skin by the
-surface's colours and confidence.
+The surface is searched for along every vertex' normal. A thin plate is fitted to the heights found
+and carries them to where none are; a weak spring keeps the rest in place. Samples of the plate's
+posterior give the uncertainty. Vertices move along normals only, because tracking, which sees the
+skin's texture, knows better where along the skin they are. Colours and confidence of the surface
+separate skin from hair and cloth.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from pipelines.track.basis import in_regions, movable_vertices
 # that the mesh follows, in multiples of the last. Broad differences are taken first.
 ROUNDS = ((0.010, 2.0), (0.008, 1.25), (0.006, 1.0), (0.004, 1.0), (0.003, 1.0), (0.002, 1.0))
 AGREE = 0.6  # least cosine between the normals of mesh and surface
-OUTLIER = 0.3  # share of the reach: a height this far from the plate gets a quarter of the weight
+OUTLIER = 0.3  # share of the reach: heights so far from the plate get a quarter of the weight
 BELIEF_STEPS = 2
 NOISE_M = 0.0003  # standard deviation of a height that is fully trusted
 # Heights err together, as neighbouring patches of a surface do: set on three synthetic people so
@@ -39,7 +38,7 @@ SURFACE_M = 0.0004
 STAY_M = 0.003  # standard deviation of the tracked mesh where no surface is found
 FOLD_M = 0.03  # a vertex that faces the mesh itself nearer than this lies in a fold
 SAMPLES = 64  # of the posterior; their standard deviation is known to 9 %
-# There the surface is not skin, or is coarser than tracking; an ear consists of folds.
+# Trust where the surface is not skin or is coarser than tracking; an ear consists of folds.
 TRUST = {
     "scalp": 0.0, "mouth_interior": 0.0, "boundary": 0.0, "neck": 0.0, "left_ear": 0.0,
     "right_ear": 0.0, "lips": 0.5, "left_eye_region": 0.1, "right_eye_region": 0.1,

@@ -1,9 +1,9 @@
 """Part lips and lids that pass through each other, with small and smooth displacements.
 
-Faces that intersect are pushed apart until a plane separates them, and a thin plate carries the
-push to the skin around. Steps add up, so what was parted does not spring back. Lips that were
-closed still touch. Neighbouring faces intersect where the skin is crumpled: their corners are
-given the mean move of the vertices around them. Eyeballs and teeth stay where they are.
+Intersecting faces are pushed apart until a plane separates them; a thin plate spreads the push over
+the skin around. Steps add up, so parted faces do not spring back, and closed lips still touch.
+Where skin is crumpled, neighbouring faces intersect: their corners take the mean move of the
+vertices around them. Eyeballs and teeth do not move.
 """
 
 from __future__ import annotations
