@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from express50.geometry.cameras import inside_frame, rays
 from express50.geometry.conventions import cell_to_corner
-from express50.geometry.raycast import camera_rays, mesh_scene
+from express50.geometry.raycast import camera_rays, join_rays, mesh_scene
 from express50.geometry.sampling import bilinear
 from pipelines.depth.views import DepthView, hull_distance, silhouette_distance
 
@@ -81,9 +81,9 @@ class TrackedSolid:
         found = []
         for view in views:
             way = (view.camera.center - self.glasses).astype(np.float32)
-            row = np.concatenate([self.glasses.astype(np.float32), way], axis=1)
             pixels, shown = inside_frame(view.camera, self.glasses)
-            shown &= ~self.scene.test_occlusions(o3d.core.Tensor(row), nthreads=1).numpy()
+            ray = join_rays(self.glasses, way)
+            shown &= ~self.scene.test_occlusions(ray, nthreads=1).numpy()
             worn = np.zeros(view.alpha.shape, np.uint8)
             column, line = pixels[shown].astype(np.int64).T
             worn[line, column] = 1
@@ -121,8 +121,7 @@ def signed_distance(scene: o3d.t.geometry.RaycastingScene, points: np.ndarray) -
     inside = np.ones(len(points), bool)
     for direction in DIRECTIONS:
         left = np.flatnonzero(inside)
-        row = np.concatenate([points[left], np.broadcast_to(direction, (len(left), 3))], axis=1)
-        ray = o3d.core.Tensor(np.ascontiguousarray(row, np.float32))
+        ray = join_rays(points[left], direction)
         inside[left] = scene.test_occlusions(ray, nthreads=1).numpy()
     return np.where(inside, -gap, gap)
 
@@ -193,13 +192,8 @@ def matte_agreement(views: Sequence[DepthView], vertices: np.ndarray, faces: np.
     scene = mesh_scene(vertices, faces)
     shares = []
     for view in views:
-        origin, directions = rays(view.camera, stride=4)
-        way = directions.reshape(-1, 3)
-        row = np.concatenate([np.broadcast_to(origin, way.shape), way], axis=1)
-        hit = scene.test_occlusions(o3d.core.Tensor(row.astype(np.float32)), nthreads=1).numpy()
-        y, x = np.nonzero(hit.reshape(directions.shape[:2]))
-        inside = (
-            bilinear(view.alpha, cell_to_corner(np.stack([4 * x, 4 * y], 1))) if len(x) else [0.0]
-        )
-        shares.append(float(np.mean(inside)))
+        ray = join_rays(*rays(view.camera, stride=4))
+        y, x = np.nonzero(scene.test_occlusions(ray, nthreads=1).numpy())
+        places = cell_to_corner(np.stack([4 * x, 4 * y], 1))
+        shares.append(float(np.mean(bilinear(view.alpha, places))) if len(x) else 0.0)
     return float(np.median(shares))

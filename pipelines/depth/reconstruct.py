@@ -14,11 +14,10 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-import open3d as o3d
 from scipy.spatial import cKDTree
 
 from express50.errors import StageError
-from express50.geometry.raycast import mesh_scene
+from express50.geometry.raycast import join_rays, mesh_scene
 from express50.geometry.sampling import bilinear
 from pipelines.depth.blocks import (
     BLOCK,
@@ -289,9 +288,8 @@ def view_weights(views: Sequence[DepthView], mesh: HeadMesh, lift: float) -> np.
         size = np.array([view.camera.width, view.camera.height])
         seen = (cosine > GRAZING) & (depth > 0) & ((pixels > 2) & (pixels < size - 2)).all(1)
         seen[seen] = bilinear(view.alpha, pixels[seen]) > 0.9
-        rays = np.concatenate([vertices + lift * (normals + towards), towards], axis=1)[seen]
-        hidden = scene.test_occlusions(o3d.core.Tensor(rays.astype(np.float32)), nthreads=1)
-        seen[seen] = ~hidden.numpy()
+        rays = join_rays((vertices + lift * (normals + towards))[seen], towards[seen])
+        seen[seen] = ~scene.test_occlusions(rays, nthreads=1).numpy()
         row[seen] = cosine[seen]
     return weights
 

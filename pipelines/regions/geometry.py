@@ -14,7 +14,7 @@ from express50.contract.segmentation_labels import HEAD, LABELS, label_mask
 from express50.files.images import edge_distance
 from express50.geometry.cameras import Camera, crop_camera, project, rays, unproject
 from express50.geometry.conventions import opencv_pixels_to_corner
-from express50.geometry.raycast import barycentrics, mesh_scene
+from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
 from express50.head.model import HeadModel
 
 SCALP = len(LABELS)
@@ -155,10 +155,7 @@ def see(head: TrackedHead, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         if (high <= low).any():
             return labels, depth
     origin, directions = rays(crop_camera(camera, *low.tolist(), *(high - low).tolist()))
-    row = np.concatenate(
-        [np.broadcast_to(origin - head.center, directions.shape), directions], axis=-1
-    )
-    hits = head.scene.cast_rays(o3d.core.Tensor(row.astype(np.float32)), nthreads=1)
+    hits = head.scene.cast_rays(join_rays(origin - head.center, directions), nthreads=1)
     distance = hits["t_hit"].numpy()
     hit = np.isfinite(distance) & (distance > 0)
     corner = barycentrics(hits, hit).argmax(1)

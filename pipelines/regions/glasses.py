@@ -17,6 +17,7 @@ from scipy import ndimage
 
 from express50.contract.segmentation_labels import LABELS
 from express50.geometry.cameras import Camera, inside_frame
+from express50.geometry.raycast import join_rays
 from pipelines.regions.colour import colour_logs, like_skin
 from pipelines.regions.geometry import TrackedHead, see
 
@@ -80,8 +81,7 @@ def _odd(head: TrackedHead, pictures: Sequence[Picture], grid: np.ndarray) -> np
         shown = cv2.dilate((unlike & (alpha > 0.5)).astype(np.uint8), np.ones((3, 3), np.uint8))
         pixels, inside = inside_frame(camera, places + head.center)
         column, row = np.clip(pixels.astype(np.int64), 0, np.array(skin.shape[::-1]) - 1).T
-        towards = (camera.center - head.center - places).astype(np.float32)
-        rays = o3d.core.Tensor(np.concatenate([places, towards], axis=1))
+        rays = join_rays(places, camera.center - head.center - places)
         inside &= ~head.scene.test_occlusions(rays, nthreads=1).numpy()
         seen += inside
         odd += inside & (shown[row, column] > 0)

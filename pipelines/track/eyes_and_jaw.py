@@ -24,11 +24,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import open3d as o3d
 import torch
 
 from express50.geometry.cameras import Camera, project_with_slope
-from express50.geometry.raycast import mesh_scene
+from express50.geometry.raycast import join_rays, mesh_scene
 from express50.head.model import HeadModel, vertex_normals
 from express50.landmarks.irises import EYES
 from express50.landmarks.network import INNER_LIPS
@@ -326,8 +325,7 @@ def contour_points(model: HeadModel, vertices: np.ndarray, camera: Camera) -> Ja
             corners[point], bary[point] = best, (1.0, 0.0, 0.0)
     clear = vertices[corners] + CLEAR_M * normals[corners]
     sight = (clear * bary[..., None]).sum(1) - camera.center
-    rays = np.concatenate([np.broadcast_to(camera.center, sight.shape), sight], axis=1)
-    hits = mesh_scene(vertices, faces).cast_rays(o3d.core.Tensor(rays.astype(np.float32)))
+    hits = mesh_scene(vertices, faces).cast_rays(join_rays(camera.center, sight))
     # Directions are not unit vectors: the ray's parameter is 1 at the point.
     seen = hits["t_hit"].numpy() > 0.999
     return JawLine(MeshPlaces(corners, bary), moved, seen)

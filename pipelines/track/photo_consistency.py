@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from express50.geometry.cameras import Camera, project_pinhole, project_with_slope
 from express50.geometry.conventions import corner_to_cell
-from express50.geometry.raycast import mesh_scene
+from express50.geometry.raycast import join_rays, mesh_scene
 from express50.head.model import HeadModel
 from pipelines.regions.colour import like_skin
 from pipelines.track.basis import in_regions
@@ -207,8 +207,7 @@ def _shapes(
     flat = u.reshape(1, -1, 1) * across[:, None] + v.reshape(1, -1, 1) * along[:, None]
     lift = 2.0 * spacing * PATCH
     start = places[:, None] - origin + flat + lift * normals[:, None]
-    rays = np.concatenate([start, np.broadcast_to(-normals[:, None], start.shape)], axis=2)
-    hit = scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))["t_hit"].numpy()
+    hit = scene.cast_rays(join_rays(start, -normals[:, None]))["t_hit"].numpy()
     rise = np.where(np.isfinite(hit), lift - hit, 0.0)
     # Another part of the face under the patch does not continue it.
     rise = np.where(np.abs(rise) < spacing * PATCH, rise, 0.0)

@@ -8,15 +8,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import open3d as o3d
 import torch
 
 from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.contract.layout import Dataset
 from express50.files.images import fit_into, write_image
-from express50.geometry.cameras import Camera, project_pinhole
+from express50.geometry.cameras import Camera, pinhole_camera, project_pinhole
 from express50.geometry.conventions import affine_to_opencv
-from express50.geometry.raycast import mesh_scene
+from express50.geometry.raycast import camera_rays, mesh_scene
 from express50.head.model import HeadModel, landmarks
 from pipelines.track.observe import facing
 from pipelines.track.outline import OutlineTerm
@@ -107,14 +106,8 @@ def _wireframe(
     """Blend visible triangle edges and the mesh's outline into a crop."""
     K = np.diag([matrix[0, 0], matrix[1, 1], 1.0]) @ camera.K
     K[:2, 2] += matrix[:, 2]
-    scene = mesh_scene(mesh, model.faces.numpy())
-    rays = o3d.t.geometry.RaycastingScene.create_rays_pinhole(
-        intrinsic_matrix=o3d.core.Tensor(K),
-        extrinsic_matrix=o3d.core.Tensor(camera.cam_from_world),
-        width_px=crop.shape[1],
-        height_px=crop.shape[0],
-    )
-    cast = scene.cast_rays(rays)
+    tile = pinhole_camera(camera.id, K, crop.shape[1], crop.shape[0], camera.cam_from_world)
+    cast = mesh_scene(mesh, model.faces.numpy()).cast_rays(camera_rays(tile))
     hit = np.isfinite(cast["t_hit"].numpy())
     bary = cast["primitive_uvs"].numpy()
     smallest = np.minimum(bary.min(2), 1 - bary.sum(2))

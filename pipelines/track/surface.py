@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import open3d as o3d
 from scipy.spatial import cKDTree
 
 from express50.files.images import LIGHT_OF_LEVEL, resize_area
 from express50.geometry.cameras import Camera, crop_camera, inside_frame, project_pinhole, resized
 from express50.geometry.conventions import corner_to_cell
-from express50.geometry.raycast import mesh_scene
+from express50.geometry.raycast import join_rays, mesh_scene
 from express50.geometry.sampling import bilinear_slope
 from express50.geometry.transforms import unit
 from express50.head.model import HeadModel
@@ -231,8 +230,7 @@ class Visibility:
         chosen = np.flatnonzero(cosine > GRAZING)
         reach = np.minimum(HEAD_M, distance[chosen])
         origin = points[chosen] - self.centre - reach[:, None] * direction[chosen]
-        cast = np.concatenate([origin, direction[chosen]], axis=1).astype(np.float32)
-        hit = self.scene.cast_rays(o3d.core.Tensor(cast))["t_hit"].numpy()
+        hit = self.scene.cast_rays(join_rays(origin, direction[chosen]))["t_hit"].numpy()
         clear = hit > reach - TOUCH_M
         weights = np.zeros(len(points))
         weights[chosen] = np.where(clear, cosine[chosen], 0.0)
