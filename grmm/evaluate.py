@@ -116,28 +116,24 @@ def compare(image: Tensor, item: Item, judge: PerceptualMetrics, kind: str = "")
         )
     shown = item.comparable(image)
     judge.remember(kind, shown, item.target)
+    regions: Row = {}
+    for region, labels in REGIONS.items():
+        mask = np.zeros((1, 1), bool) if item.parts is None else label_mask(item.parts, *labels)
+        own = torch.from_numpy(mask).to(image.device)
+        known = mask.sum() >= LEAST_PX
+        regions[f"psnr_{region}_db"] = psnr_db(image, item.target, own) if known else math.nan
     return {
         **vars(item.key),
         "kind": kind,
         "psnr_db": psnr_db(image, item.target, ~item.hidden),
         "psnr_head_db": psnr_db(image, item.target, item.mask),
-        **_regions(image, item),
+        **regions,
         "ssim": ssim_score(shown, item.target),
         "ssim_head": ssim_score(shown, item.target, item.mask),
         "rmse": rmse(image, item.target, ~item.hidden),
         "rmse_head": rmse(image, item.target, item.mask),
         "lpips": judge.lpips_of(shown, item.target),
     }
-
-
-def _regions(image: Tensor, item: Item) -> Row:
-    numbers: Row = {}
-    for region, labels in REGIONS.items():
-        mask = np.zeros((1, 1), bool) if item.parts is None else label_mask(item.parts, *labels)
-        shown = torch.from_numpy(mask).to(image.device)
-        known = mask.sum() >= LEAST_PX
-        numbers[f"psnr_{region}_db"] = psnr_db(image, item.target, shown) if known else math.nan
-    return numbers
 
 
 def component_effects(

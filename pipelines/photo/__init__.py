@@ -1,17 +1,117 @@
-"""Photo makes one photograph or video without calibration ready for the stages."""
+"""``express50 photo`` makes one photograph or video without calibration ready, and tracks it."""
 
 from __future__ import annotations
 
+import argparse
+from contextlib import nullcontext
+from pathlib import Path
 from typing import Any
 
-from express50.contract.stage import Command
+from express50.console import FAILED, OK, say, say_json, stdout_to_stderr
+from express50.contract.layout import Dataset
+from express50.contract.stage import Command, stages
+from express50.errors import ConfigError
+from express50.files.text import ID
+
+STAGES = ("ingest", "calibrate", "observe", "align", "frames", "matte", "track")
+SEARCH = 0.08  # people fill a rig's pictures, but not all photographs
+PHOTO_SETTINGS = (
+    "observe.min_score=0.2", f"track.search={SEARCH}", f"observe.search={SEARCH}",
+    "matte.method=grabcut",
+)  # fmt: skip
+WORDS = "track the face in a single photograph or video, without calibration"
 
 
 def add_commands(subparsers: Any) -> None:
-    """Add the command, see `pipelines.photo.cli`."""
-    from pipelines.photo.cli import add_commands as add
+    """Add the ``photo`` command."""
+    from express50.cli.stages import add_config_options
 
-    add(subparsers)
+    parser = subparsers.add_parser(
+        "photo", help=WORDS, description=WORDS,
+        epilog="example: express50 photo portrait.jpg out; see out/track/portrait/qc",
+    )  # fmt: skip
+    parser.add_argument("picture", type=Path, metavar="PICTURE", help="image or video file")
+    parser.add_argument("out", type=Path, metavar="OUT", help="dataset folder to make or extend")
+    parser.add_argument("--subject", metavar="ID", help="subject id [the file's name]")
+    lens = parser.add_mutually_exclusive_group()
+    lens.add_argument("--focal-px", type=float, metavar="F", help="focal length, pixels")
+    lens.add_argument(
+        "--film-mm", type=float, default=50.0, metavar="MM",
+        help="focal length on 35 mm film to assume if EXIF has none [50]",
+    )  # fmt: skip
+    parser.add_argument(
+        "--windows", type=int, default=8, metavar="N",
+        help="parts of a video; one frame of each part fits the shape [8]",
+    )  # fmt: skip
+    parser.add_argument(
+        "--matte",
+        action="store_true",
+        help="also make a matte and fit outlines; by colours around the face, or with your network:"
+        " --set matte.method=salient --set matte.weights=FILE",
+    )
+    add_config_options(parser)
+    parser.add_argument("--json", action="store_true", help="print as JSON")
+    parser.set_defaults(handler=run_photo)
 
 
-COMMAND = Command("track the face in a single photograph or video", add_commands)
+def run_photo(args: argparse.Namespace) -> int:
+    """Make the capture and run the stages on it."""
+    # Imported here: the list of commands must not wait for torch.
+    from express50.cli.stages import config_of
+    from express50.runner.executor import Pool
+    from express50.runner.runner import run_stage
+    from express50.runner.worker import cap_threads
+    from pipelines import ingest
+    from pipelines.photo.capture import make_photo_capture, open_picture, subject_id, write_panel
+
+    if args.subject is not None and not ID.fullmatch(args.subject):
+        raise ConfigError(f"--subject {args.subject!r}: expected letters, digits, '_' and '-'")
+    for name, value in (("--focal-px", args.focal_px), ("--film-mm", args.film_mm)):
+        if value is not None and not 0 < value < float("inf"):
+            raise ConfigError(f"{name} {value}: expected a number above 0")
+    if args.windows < 1:
+        raise ConfigError(f"--windows {args.windows}: expected at least 1")
+    picture = open_picture(args.picture)
+    clips = ("track.frames=clips",) if picture.video else ()
+    args.set = [*PHOTO_SETTINGS, *clips, *args.set]
+    cap_threads(1)
+    subject = args.subject or subject_id(args.picture)
+    dataset = Dataset(args.out)
+    names = [name for name in STAGES if args.matte or name != "matte"]
+    with stdout_to_stderr() if args.json else nullcontext():
+        loaded = [stages()[name] for name in names]
+        configs = [config_of(stage, args) for stage in loaded]
+        folder = dataset.root / "photos" / subject
+        focal = make_photo_capture(
+            picture, folder, subject, configs[-1],
+            focal_px=args.focal_px, film_mm=args.film_mm, windows=args.windows,
+        )  # fmt: skip
+        ingest.register(dataset, [folder])
+        with Pool(0) as pool:
+            summaries = []
+            for stage, config in zip(loaded, configs, strict=True):
+                chosen = [i for i in stage.items(dataset) if i.split("/")[0] == subject]
+                summaries.append(run_stage(stage, dataset, config, chosen, pool=pool))
+                if not summaries[-1].ok:
+                    break
+        panel = folder / "panel.jpg"
+        if summaries[-1].ok:
+            write_panel(dataset, subject, configs[-1], panel)
+    done = summaries[-1].ok
+    if args.json:
+        say_json({"focal": vars(focal), "stages": [summary.to_json() for summary in summaries]})
+    else:
+        for summary in summaries:
+            say(*summary.lines())
+        say(
+            f"focal length {focal.pixels:.0f} px ({focal.source}); from the face alone, "
+            f"{focal.low:.0f} to {focal.high:.0f} px fit as well"
+        )
+        if not focal.low <= focal.pixels <= focal.high:
+            say("warning: the focal length is outside this range; check it, or give --focal-px")
+        if done:
+            say(f"track: {dataset.item_dir('track', subject)}", f"picture: {panel}")
+    return OK if done else FAILED
+
+
+COMMAND = Command(WORDS, add_commands)

@@ -19,18 +19,22 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.capture.raw import IMAGE_SUFFIXES, VIDEO_SUFFIXES
+from express50.contract.layout import Dataset
+from express50.dataset.tracks import read_track
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.atomic import dump_json, write_bytes
 from express50.files.calibration import camera_rows
 from express50.files.containers import read_picture
 from express50.files.digests import file_sha256
-from express50.files.images import ORIENTATION, encode_png, read_exif, upright
+from express50.files.images import ORIENTATION, encode_png, read_exif, upright, write_image
 from express50.files.video import VideoFootage, iterate_video, video_fps, video_turn
 from express50.geometry.cameras import Camera, pinhole_camera
 from express50.geometry.conventions import FLIP_YZ
 from express50.head.load import load_head
 from express50.head.model import landmarks
+from express50.head.preview import render_preview
 from express50.landmarks.detector import Detection, detect
 from express50.landmarks.network import load_network
 from pipelines.calibrate.footage import focal_of_film
@@ -38,11 +42,13 @@ from pipelines.track.basis import Basis, make_basis
 from pipelines.track.config import TrackConfig
 from pipelines.track.fit import fit
 from pipelines.track.observe import LandmarkView, agree, landmark_sigma
-from pipelines.track.read_inputs import DETECTOR_PASSES
+from pipelines.track.read_inputs import DETECTOR_PASSES, open_landmarks
+from pipelines.track.report import draw_column
 from pipelines.track.schedule import LANDMARK_STEPS
 from pipelines.track.state import Target, initial_pose, start_state
 
 CAMERA = "photo"
+PANEL_TILE, PANEL_YAW = 512, 60.0  # pixels; degrees
 FACE_SCORE = 0.2
 PROBES, FOCAL_FACES = 8, 3
 PHOTO_FPS = 25.0  # a photograph has no rate, but a capture must state one
@@ -310,3 +316,21 @@ def _cost(basis: Basis, detections: list[Detection], size: tuple[int, int], foca
             return math.inf
         targets.append(Target(observation, landmark_sigma(observation), False))
     return fit(basis, targets, start_state(basis, poses), LANDMARK_STEPS)[1]
+
+
+def write_panel(dataset: Dataset, subject: str, config: TrackConfig, path: Path) -> None:
+    """Write the first tracked frame, its overlay and the turned head side by side."""
+    track = read_track(dataset.track_file(subject))
+    mesh = track.vertices[0].astype(np.float64)
+    model = load_head(config.head)
+    ((camera_id, camera),) = read_cameras_of(dataset, subject).items()
+    image = read_peak_frame(dataset, subject, track.expressions[0], camera_id)
+    source = open_landmarks(dataset, subject, config.landmarks, config.search)
+    seen = source(image, camera_id, int(track.frames[0]))
+    dots = [seen.face.marks(), seen.irises.centres[seen.irises.confidence > 0]]
+    column = draw_column(image, camera, model.to(dtype=torch.float64), mesh, dots, PANEL_TILE)
+    head = (mesh - track.t[0]) @ track.R[0]
+    turned = render_preview(model, head, yaw=PANEL_YAW, size=PANEL_TILE)
+    write_image(
+        path, np.concatenate([column[:PANEL_TILE], column[PANEL_TILE:], turned], axis=1), quality=90
+    )

@@ -130,7 +130,11 @@ def unwrap(
     the skin from one off it.
     """
     places, normals = uv_map.samples.at(mesh), sample_normals(uv_map.samples, mesh)
-    pictures = _facing(pictures, places.mean(0), normals.mean(0))
+    # Only the pictures that the face looks at most.
+    away = [crop.camera.center - places.mean(0) for crop in pictures.crops]
+    facing = [normals.mean(0) @ way / max(float(np.linalg.norm(way)), 1e-12) for way in away]
+    chosen = np.argsort(facing, kind="stable")[::-1][:MOST_VIEWS]
+    pictures = pictures.some(sorted(chosen.tolist()))
     weights = view_weights(Visibility(mesh, model.faces.numpy()), pictures, places, normals)
     # The network reads it in single precision.
     values = view_colours(pictures.images(), weights, places).astype(np.float32)
@@ -138,14 +142,6 @@ def unwrap(
     colors = robust_mean(values, np.ones((1, 1, 1), np.float32), trust, VIEW_NOISE)
     mass = trust.sum(0)[:, None].astype(np.float32)
     return uv_map.image(colors.astype(np.float32)), uv_map.image(mass)[..., 0]
-
-
-def _facing(pictures: FrameSetCrops, middle: np.ndarray, forward: np.ndarray) -> FrameSetCrops:
-    """Keep the pictures that the face at `middle` (3,) looks at most."""
-    away = [crop.camera.center - middle for crop in pictures.crops]
-    facing = [float(forward @ way) / max(float(np.linalg.norm(way)), 1e-12) for way in away]
-    chosen = sorted(np.argsort(facing, kind="stable")[::-1][:MOST_VIEWS].tolist())
-    return pictures.some(chosen)
 
 
 def between(places: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

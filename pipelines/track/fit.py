@@ -284,17 +284,11 @@ def _step(
         eliminated.append(solved)
     reduced = reduced + damping * np.diag(np.diag(reduced))
     change = np.linalg.solve(reduced, right)
-    poses = tuple(
-        _moved(pose, -(solved[:, -1] + solved[:, :-1] @ change))
-        for pose, solved in zip(state.poses, eliminated, strict=True)
-    )
-    return State(state.shape + change[:shapes], poses, state.bias + change[shapes:].reshape(68, 3))
-
-
-def _moved(pose: Pose, change: np.ndarray) -> Pose:
-    """Apply a change of the own unknowns and fold the turn into the rotation."""
-    own = pose.own + change
-    turn = slice(len(own) - 6, len(own) - 3)
-    rotation = axis_angle_to_matrix(own[turn]) @ pose.rotation
-    own[turn] = 0.0
-    return replace(pose, own=own, rotation=rotation)
+    poses = []
+    for pose, solved in zip(state.poses, eliminated, strict=True):
+        own = pose.own - (solved[:, -1] + solved[:, :-1] @ change)
+        # The turn is folded into the rotation.
+        poses.append(Pose(own, axis_angle_to_matrix(own[-6:-3]) @ pose.rotation))
+        own[-6:-3] = 0.0
+    bias = state.bias + change[shapes:].reshape(68, 3)
+    return State(state.shape + change[:shapes], tuple(poses), bias)
