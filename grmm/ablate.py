@@ -71,7 +71,7 @@ class Variant:
 
 VARIANTS = {
     "full": Variant(label="Full model", changes={}),
-    # Modes are not the paper's: they would be driven by shape coefficients in the row after.
+    # Modes are ours, not the paper's: in the next row shape coefficients would drive them.
     "no_modes": Variant(label="W/o identity modes", changes={"model": {"identity_modes": 0}}),
     "no_residuals": Variant(
         label="W/o residuals, against w/o modes",

@@ -249,7 +249,7 @@ def _build(path: Path, config: ModelConfig, head: HeadModel, content: dict[str, 
 def _gallery(
     path: Path, content: dict[str, Any], head: HeadModel, device: torch.device | str
 ) -> Gallery:
-    """Return the frames and cameras of a file's content; an image may have the cameras' sizes."""
+    """Return the frames and cameras of a file's content; refuse cameras with impossible sizes."""
     offsets = {name: tensor.numpy() for name, tensor in content.get("offsets", {}).items()}
     frames = {}
     stacks = {name: tensor.numpy() for name, tensor in content.get("parameters", {}).items()}

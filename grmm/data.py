@@ -122,7 +122,7 @@ class Source(Protocol):
     keys: Sequence[SampleKey]
     head: str
     digest: str
-    """Another one if any sample is."""
+    """Differs if any sample differs."""
 
     def read(self, index: int) -> Sample:
         """Decode one sample."""

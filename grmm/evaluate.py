@@ -103,7 +103,7 @@ def compare(image: Tensor, item: Item, judge: PerceptualMetrics, kind: str = "")
     """Compare one picture (3, H, W) in [0, 1] with its footage; the judge remembers it for FID.
 
     ``psnr_db``, ``ssim``, ``rmse``, ``lpips`` count every pixel in which no torso hides the neck;
-    ``*_head`` pixels of the footage's matte only, so that an easy background cannot flatter;
+    ``*_head`` pixels of the footage's matte only, because the background is easy;
     those of REGIONS pixels with such labels (NaN without labels, and under LEAST_PX).
 
     Raises:

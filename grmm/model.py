@@ -281,7 +281,7 @@ class GRMM(Networks):
         quats = nn.functional.normalize(offsets[:, 3:7] + unit, dim=1, eps=1e-8)
         if self.config.frame == "head":
             return base + shift, quats
-        # Frames steer, they are not learned through: their gradient is ill-conditioned on slivers.
+        # No gradient passes through the frames: it is ill-conditioned on slivers.
         with torch.no_grad():
             frames, _ = tangent_frames(vertices, self.corners, self.gradients)
             turn = matrix_to_quat(frames)

@@ -1,8 +1,8 @@
 """Colour gains of cameras against each other, per channel, from the board's white paper.
 
-Matt paper reflects much the same light everywhere, so a camera's gain is the light it records of a
-square, against what the others record at the same instant. The gloss of faces moves with the
-camera by more than gains differ (docs/LOG.md).
+Matt paper reflects nearly the same light in all directions, so a camera's gain is the light that it
+records of a square over what the others record at the same instant. Faces do not serve: their gloss
+differs between cameras by more than the gains do (docs/LOG.md).
 """
 
 from __future__ import annotations

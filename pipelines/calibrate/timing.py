@@ -2,8 +2,8 @@
 
 A corner that a camera sees late is off by its velocity times the delay; with a rolling shutter, the
 delay grows from row to row. Both are estimated together with small changes of cameras and boards,
-which they must not be mistaken for. Only where a board moves smoothly through consecutive images is
-its velocity known, so boards that are held still, or shown now and then, say nothing.
+so that they are not mistaken for these. A board's velocity is known only where it moves smoothly
+through consecutive images: boards that are held still, or shown now and then, give no estimate.
 """
 
 from __future__ import annotations
@@ -19,9 +19,8 @@ from pipelines.calibrate.board import BoardCorners
 from pipelines.calibrate.board_adjust import BoardRig, corner_errors, derive_corners, rig_covariance
 
 SMOOTH = 0.5
-"""Velocities may change by this share of themselves from one frame to the next, or else the board
-did not move smoothly there."""
-SURE = 4.0  # standard deviations from zero, so that still boards do not make cameras late
+"""Largest share by which the velocity of a smoothly moving board changes from frame to frame."""
+SURE = 4.0  # standard deviations from zero, below which a value is taken for zero
 LEAST_IMAGES = 6  # in which a board moves, for an estimate
 
 
@@ -127,7 +126,7 @@ def _solve_time(normal: Normal, cameras: int) -> tuple[np.ndarray, np.ndarray]:
     each = len(normal.right) // cameras
     times = np.add.outer(np.arange(cameras) * each + each - 2, [0, 1])
     held = np.zeros_like(normal.cameras)
-    # Boards that move on make up for all cameras being late: their mean is held.
+    # If all cameras are late, moved boards explain it as well: the cameras' mean is held.
     held[np.ix_(times[:, 0], times[:, 0])] = max(normal.diagonal[times[:, 0]].max(), 1e-12)
     inverse = rig_covariance(normal, held)
     return (inverse @ normal.right)[times], np.sqrt(np.diag(inverse)[times])
@@ -143,7 +142,7 @@ def _noise(
     """Return the factors of standard deviations (C, 2) that hold for errors of one pixel.
 
     `pulls` (N, 2) are the weighted errors. Corners of one image are off together where exposures
-    are not periodic: then images count, not corners.
+    are not periodic, so that images are independent, not corners.
     """
     noise = np.sqrt(np.mean(pulls**2)) / np.mean(weight**2)
     image = frame * (camera.max() + 1) + camera

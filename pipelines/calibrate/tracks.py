@@ -91,10 +91,10 @@ def join_tracks(
 
     A match is at most `band` off its epipolar line, as a share of the image's diagonal.
     `candidates` are those of `candidate_matches`, if they are known already. `verified` matches
-    agree on a fundamental matrix of their own pair of cameras over all frames, so that they can
-    show that a whole rig is a little off, which matches searched along wrong lines would confirm.
-    Where no matrix holds, the search along the lines offers candidates that a matrix must explain.
-    Unverified matches come from the lines alone: they are more, if most cameras are right.
+    agree on a fundamental matrix of their pair of cameras over all frames. They can show that a
+    whole rig is a little off, whereas matches found along its wrong lines would confirm it. Where
+    no matrix is found, candidates are searched along the lines, and a matrix must explain them.
+    Unverified matches come from the lines alone: there are more if most cameras are right.
     """
     names = tuple(sorted(cameras))
     ideal = {f: {n: _undistorted(cameras[n], p.features[n]) for n in names if n in p.features}

@@ -185,9 +185,9 @@ def footage_uncertainty(
     middle: np.ndarray,
     radius: float,
 ) -> dict[str, float]:
-    """Estimate each camera's error, pixels, about the middle (3,) of a head: of a rig from footage.
+    """Estimate each camera's error, pixels, about the middle (3,) of a head, of a rig from footage.
 
-    Worlds are laid on each other by similarities, as nothing in footage is sure of the metre.
+    Worlds are aligned by similarities, because footage does not determine the metre.
     """
     points = middle + radius / HEAD_RADIUS_M * head_points()
     turned = rigid_steps(points - middle)

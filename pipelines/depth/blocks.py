@@ -241,7 +241,7 @@ def windows(grid: LevelSet, places: np.ndarray, before: int, after: int) -> np.n
 
 
 def dilated(grid: LevelSet) -> LevelSet:
-    """Hold the blocks around those held too; values stay the same."""
+    """Hold the blocks around the held ones too; values stay the same."""
     wanted = binary_dilation(grid.table >= HELD, np.ones((3, 3, 3)))
     blocks = np.concatenate([grid.blocks[:HELD], grid.blocks[grid.table[wanted]]])
     table = grid.table.copy()
@@ -250,7 +250,7 @@ def dilated(grid: LevelSet) -> LevelSet:
 
 
 def largest_body(grid: LevelSet) -> LevelSet:
-    """Keep the largest connected inside; what floats beside it becomes outside."""
+    """Keep the largest connected part of the inside; other parts become outside."""
     parts, size = _inside_parts(grid)
     if np.count_nonzero(size) < 2:
         return grid
@@ -284,7 +284,7 @@ def _inside_parts(grid: LevelSet) -> tuple[LevelSet, np.ndarray]:
     for x, y, z in product((0, 1, 2), repeat=3):
         other = around[:, x : x + BLOCK, y : y + BLOCK, z : z + BLOCK]
         key = (middle * total + other)[(middle != other) & (middle > 0) & (other > 0)]
-        # runs of the same pair first: sorting all of them would take most of the time
+        # Runs of one pair are shortened first: sorting all of them would take most of the time.
         pairs.append(np.unique(key[np.diff(key, prepend=-1) != 0]))
     first, second = np.divmod(np.concatenate(pairs), total)
     graph = sparse.coo_matrix((np.ones(len(first)), (first, second)), (total, total))
@@ -305,7 +305,7 @@ def smoothed(grid: LevelSet, sigma: float, truncate: float = 4.0) -> LevelSet:
 def separably(grid: LevelSet, kernel: np.ndarray) -> LevelSet:
     """Correlate with a kernel (K,) along each axis in turn, exact in ``grid``'s blocks.
 
-    K is odd and at most 2 BLOCK + 1. The result holds the blocks around too, where it is a guess.
+    K is odd and at most 2 BLOCK + 1. The result also holds the blocks around, approximately.
     """
     wide = dilated(grid)
     radius = len(kernel) // 2
@@ -326,8 +326,8 @@ def separably(grid: LevelSet, kernel: np.ndarray) -> LevelSet:
 def refined(grid: LevelSet, voxel: float) -> LevelSet:
     """Interpolate the distances on a grid of a smaller voxel, by cubic B-splines (Unser 1999).
 
-    A block of the finer grid takes a window of coefficients, and along each axis a matrix that
-    depends on the block's place along it.
+    A block of the finer grid is a window of coefficients times one matrix per axis, which depends
+    on the block's place along it.
     """
     ratio = voxel / grid.voxel
     shape = box_shape((np.array(grid.shape) - 1) * grid.voxel, voxel)

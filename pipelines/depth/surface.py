@@ -261,7 +261,7 @@ def fair(grid: LevelSet, sigma: float) -> LevelSet:
 
 
 def largest_part(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Keep the faces (F', 3) of the largest connected part; what floats beside it is not a head."""
+    """Keep the faces (F', 3) of the largest connected part; other parts are not the head."""
     graph = sparse.coo_matrix(
         (np.ones(len(faces) * 2), (faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel())),
         (len(vertices), len(vertices)),
