@@ -7,10 +7,10 @@ points that count are those of the published mark-up, the outline in place of th
 `inner` leaves the outline out.
 
 `rendered` shows heads that training never saw, of the built-in model and of that of ``--ict``, in
-percent of the square root of the area of the landmarks' box: landmarks, outline and dense points,
-by the head's turn, and how far errors are from the stated scale (1.0: a Laplace distribution of
-that scale has such a mean). `seconds_per_view` is processor time of one core for views of 512 px,
-without dense points. `before` says the same of the weights of ``--before``. The last line printed
+percent of the square root of the area of the landmarks' box: landmarks and outline, by the head's
+turn, and how far errors are from the stated scale (1.0: a Laplace distribution of
+that scale has such a mean). `seconds_per_view` is processor time of one core for views of 512 px.
+`before` says the same of the weights of ``--before``. The last line printed
 is one JSON object.
 """
 
@@ -30,9 +30,8 @@ import torch
 
 from express50.head.load import load_head
 from express50.landmarks import WEIGHTS
-from express50.landmarks.detector import Detection, detect, detect_many, find_dense
+from express50.landmarks.detector import detect, detect_many
 from express50.landmarks.network import OUTLINE, POINTS, LandmarkNet, load_network
-from express50.landmarks.training.places import Places, carry_places
 from express50.landmarks.training.random_heads import random_head
 from express50.landmarks.training.scene import HeadScene, TrainingView
 from express50.landmarks.training.views import make_backgrounds
@@ -49,7 +48,7 @@ VIEW, HEAD = 512, 320  # pixels of a view and of the head in it
 
 @dataclass(frozen=True)
 class Frame:
-    """A picture with true points (68 or 68 + 17 + D, 2); the head's turn in degrees, if known."""
+    """A picture with true points (68 or 68 + 17, 2); the head's turn in degrees, if known."""
 
     image: np.ndarray
     points: np.ndarray
@@ -68,10 +67,7 @@ def main(arguments: list[str] | None = None) -> int:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     real = list(read_faces(options.real)) if options.real else []
-    places = load_network().places()
-    rendered = {
-        spec: draw(spec, options.heads, places) for spec in ("procedural", options.ict) if spec
-    }
+    rendered = {spec: draw(spec, options.heads) for spec in ("procedural", options.ict) if spec}
     result = {"benchmark": "landmarks"} | measure(load_network(WEIGHTS), real, rendered)
     result["before"] = "n/a: --before names no weights"
     if options.before:
@@ -142,14 +138,13 @@ def on_real(net: LandmarkNet, frames: list[Frame]) -> dict:
     }
 
 
-def draw(spec: str, heads: int, places: Places) -> list[Frame]:
+def draw(spec: str, heads: int) -> list[Frame]:
     """Draw frames of random heads of a model before random backgrounds, from all sides in turn."""
     model, rng = load_head(spec), np.random.default_rng([SEED, *spec.encode()[:1]])
-    places = carry_places(load_head("procedural"), places, model)
     backgrounds = make_backgrounds(20, rng)
     frames = []
     for _ in range(heads):
-        scene = HeadScene(model, random_head(model, rng), places)
+        scene = HeadScene(model, random_head(model, rng))
         for low, high in TURNS.values():
             yaw = float(rng.uniform(low, high) * rng.choice([-1, 1]))
             view = scene.render(rng, HEAD, np.radians(yaw))
@@ -172,30 +167,18 @@ def on_rendered(net: LandmarkNet, frames: list[Frame]) -> dict:
     """Return errors by turn of all kinds of points, and how well scales are stated."""
     result: dict = {}
     for name, (low, high) in TURNS.items():
-        marks, edges, said, dense = [], [], [], []
+        marks, edges, said = [], [], []
         some = [frame for frame in frames if low <= frame.turn < high]
         for frame, face in zip(some, detect_many(net, [one.image for one in some]), strict=True):
             marks.append(shares(face.points, frame))
             said.append(face.sigma / size_of(frame))
             edges.append(shares(face.marks()[:OUTLINE], frame, POINTS))
-            dense.append(on_dense(net, frame, face))
         result[name] = {
             "landmarks_percent": round(float(np.median(np.mean(marks, axis=1))), 2),
             "outline_percent": round(float(np.median(np.mean(edges, axis=1))), 2),
             "stated": round(float(np.sum(marks) / (200 * np.sum(said))), 2),
         }
-        if net.dense is not None:
-            table = np.stack(dense)
-            result[name]["dense_percent"] = round(float(np.median(table[:, 0].mean(1))), 2)
-            result[name]["dense_stated"] = round(float(table[:, 0].sum() / table[:, 1].sum()), 2)
     return result
-
-
-def on_dense(net: LandmarkNet, frame: Frame, face: Detection) -> np.ndarray:
-    """Return errors of the dense points and what is stated of them (2, D), percent of the face."""
-    found = find_dense(net, frame.image, face)
-    said = 200 * found.sigma / size_of(frame)
-    return np.stack([shares(found.points, frame, POINTS + OUTLINE), said])
 
 
 def seconds(net: LandmarkNet, images: list[np.ndarray]) -> dict[str, float]:

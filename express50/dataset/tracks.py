@@ -24,24 +24,31 @@ SCHEMA = "express50.track/2"
 SEQUENCE_SCHEMA = "express50.sequence/1"
 REGISTRATION_SCHEMA = "express50.registration/1"
 _WIDTHS = {"neck": (3,), "jaw": (3,), "eyes": (6,), "R": (3, 3), "t": (3,)}
-_AGAIN = "run 'express50 track' again"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Track:
-    """Holds a subject's tracked head: E expressions, V vertices; world = R @ head + t."""
+class HeadPoses:
+    """Holds parameters of a tracked head in N frames; world = R @ head + t."""
 
     head: str  # head model name, as ``load_head`` takes it
-    expressions: tuple[str, ...]  # E expression ids
-    frames: np.ndarray  # (E,) int64 decode indices
-    shape: np.ndarray  # (S,) coefficients, shared by all expressions
-    expression: np.ndarray  # (E, X) coefficients
-    # neck, jaw: (E, 3) axis-angle, radians
-    neck: np.ndarray
-    jaw: np.ndarray
-    eyes: np.ndarray  # (E, 6) axis-angles, left then right
-    R: np.ndarray  # (E, 3, 3) rotations
-    t: np.ndarray  # (E, 3) metres
+    frames: np.ndarray  # (N,) int64 decode indices
+    shape: np.ndarray  # (S,) coefficients, shared by all frames
+    expression: np.ndarray  # (N, X) coefficients
+    neck: np.ndarray  # (N, 3) axis-angle, radians
+    jaw: np.ndarray  # (N, 3) axis-angle, radians
+    eyes: np.ndarray  # (N, 6) axis-angles, left then right
+    R: np.ndarray  # (N, 3, 3) rotations
+    t: np.ndarray  # (N, 3) metres
+
+
+OF_FRAMES = ("frames", "expression", "neck", "jaw", "eyes", "R", "t")  # arrays of a row per frame
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Track(HeadPoses):
+    """Holds a subject's head in the peak frames of E expressions, a mesh of V vertices in each."""
+
+    expressions: tuple[str, ...]  # E ids, one per frame
     vertices: np.ndarray  # (E, V, 3) float32 metres, world
     offsets: np.ndarray  # (V, 3) float32 metres, added to the rest shape; zeros if there are none
     # (E, V) float32 metres, standard deviations from the fit's own covariance; NaN if the file has
@@ -69,20 +76,10 @@ class Track:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Sequence:
-    """Holds a subject's tracked clips, F frames; arrays mean what they do in `Track`."""
+class Sequence(HeadPoses):
+    """Holds a subject's head in every frame of its tracked clips."""
 
-    head: str  # head model name, as ``load_head`` takes it
-    cues: tuple[str, ...]  # (F,) clip ids, one per frame
-    frames: np.ndarray  # (F,) int64 decode indices
-    shape: np.ndarray  # (S,) coefficients
-    # expression, neck, jaw, eyes, R, t: (F, ...)
-    expression: np.ndarray
-    neck: np.ndarray
-    jaw: np.ndarray
-    eyes: np.ndarray
-    R: np.ndarray
-    t: np.ndarray
+    cues: tuple[str, ...]  # clip ids, one per frame
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -116,9 +113,7 @@ def read_track(path: Path) -> Track:
         StageError: the file is missing.
         FormatError: it is not a track, its arrays do not fit each other, or one holds NaN or Inf.
     """
-    if not path.is_file():
-        raise StageError(f"{path}: the track is missing; run 'express50 track'")
-    with _arrays_of(path, "a track", SCHEMA, _AGAIN) as arrays:
+    with _arrays_of(path, "track", SCHEMA) as arrays:
         names, vertices = arrays["expressions"], arrays["vertices"]
         count = vertices.shape[1] if vertices.ndim == 3 else None
         further = {"vertices": (names.size, count, 3), "offsets": (count, 3)}
@@ -135,16 +130,22 @@ def read_track(path: Path) -> Track:
 
 
 @contextmanager
-def _arrays_of(path: Path, what: str, schema: str, again: str) -> Iterator[dict[str, np.ndarray]]:
-    """Yield a file's arrays; a missing or wrong array raises one FormatError."""
-    arrays = read_arrays(path, FormatError, what, fix=again)
+def _arrays_of(
+    path: Path, what: str, schema: str, stage: str = "track", make: str = ""
+) -> Iterator[dict[str, np.ndarray]]:
+    """Yield a file's arrays, to be checked: a ValueError about them becomes a FormatError."""
+    command = f"'express50 {stage}'"
+    if not path.is_file():
+        raise StageError(f"{path}: the {what} is missing; run {make or command}")
+    again = f"run {command} again"
+    arrays = read_arrays(path, FormatError, f"a {what}", fix=again)
     try:
         if str(arrays["schema"]) != schema:
             raise ValueError(f"schema {str(arrays['schema'])!r}, expected {schema}")
         yield arrays
-    except (KeyError, ValueError) as error:
+    except (KeyError, ValueError, TypeError) as error:
         words = f"has no {error}" if isinstance(error, KeyError) else str(error)
-        raise FormatError(f"{path}: not {what} ({words}); {again}") from None
+        raise FormatError(f"{path}: not a {what} ({words}); {again}") from None
 
 
 def read_registration(path: Path) -> Registration:
@@ -155,29 +156,21 @@ def read_registration(path: Path) -> Registration:
         FormatError: it is not a registration, its arrays do not fit each other, or one holds NaN
             or Inf.
     """
-    if not path.is_file():
-        raise StageError(f"{path}: the registration is missing; run 'express50 register'")
-    again = "run 'express50 register' again"
-    with _arrays_of(path, "a registration", REGISTRATION_SCHEMA, again) as arrays:
+    with _arrays_of(path, "registration", REGISTRATION_SCHEMA, "register") as arrays:
         count = len(arrays["vertices"])
-        for name, width in {"vertices": (3,), "offsets": (3,), "residual": (), "sigma": ()}.items():
+        widths = {"vertices": (3,), "offsets": (3,), "seen": (), "residual": (), "sigma": ()}
+        for name, width in widths.items():
             check_shape(name, arrays[name], (count, *width))
             check_finite(name, arrays[name])
-        check_shape("seen", arrays["seen"], (count,))
-        names = ("vertices", "offsets", "seen", "residual", "sigma")
         return Registration(
             track=str(arrays["track"]),
-            **{name: arrays[name] for name in names},
+            **{name: arrays[name] for name in widths},
             bound=_doubt(arrays, "bound", (count,)),
         )
 
 
 def _doubt(arrays: dict[str, np.ndarray], name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the vertices' deviations or bounds; NaN if the file has none.
-
-    Raises:
-        ValueError: they have the wrong shape, or are not finite.
-    """
+    """Return the vertices' deviations or bounds; NaN if the file has none."""
     if name not in arrays:
         return np.full(shape, np.nan, np.float32)
     check_shape(name, arrays[name], shape)
@@ -186,11 +179,7 @@ def _doubt(arrays: dict[str, np.ndarray], name: str, shape: tuple[int, ...]) -> 
 
 
 def _glasses(arrays: dict[str, np.ndarray], count: int) -> tuple[np.ndarray | None, np.ndarray]:
-    """Return points on glasses in `count` expressions, and their rows; None without any.
-
-    Raises:
-        ValueError: points and rows do not fit each other, or are not finite.
-    """
+    """Return points on glasses in `count` expressions, and their rows; None without any."""
     if "glasses" not in arrays:
         return None, np.zeros(0, np.int64)
     places, rows = arrays["glasses"], arrays["glasses_row"]
@@ -230,9 +219,6 @@ def best_vertices(dataset: Dataset, subject: str, track: Track) -> np.ndarray:
     return vertices
 
 
-OF_FRAMES = ("frames", "expression", "neck", "jaw", "eyes", "R", "t")  # one row per frame
-
-
 def read_sequence(path: Path) -> Sequence:
     """Read and check the frames of a subject's clips.
 
@@ -241,12 +227,8 @@ def read_sequence(path: Path) -> Sequence:
         FormatError: it is not a sequence, its arrays do not fit each other, or one holds NaN or
             Inf.
     """
-    if not path.is_file():
-        raise StageError(
-            f"{path}: the sequence is missing; run 'express50 track --set track.frames=clips', or"
-            " 'express50 photo' on a video"
-        )
-    with _arrays_of(path, "a sequence", SEQUENCE_SCHEMA, _AGAIN) as arrays:
+    make = "'express50 track --set track.frames=clips', or 'express50 photo' on a video"
+    with _arrays_of(path, "sequence", SEQUENCE_SCHEMA, make=make) as arrays:
         cues = arrays["cues"]
         numbers = _checked(arrays, cues, {})
         return Sequence(head=str(arrays["head"]), cues=tuple(cues.tolist()), **numbers)
@@ -258,10 +240,6 @@ def _checked(
     """Return the numeric arrays of E expressions or cues, converted to their final types.
 
     ``further`` holds the shapes of arrays that only one kind of file has.
-
-    Raises:
-        ValueError: an array has the wrong shape or type, or holds invalid values.
-        KeyError: an array is missing.
     """
     if names.ndim != 1 or names.dtype.kind != "U" or not len(names):
         raise ValueError(f"expressions are {names.dtype} {names.shape}, expected (E,) strings")

@@ -26,13 +26,9 @@ from express50.landmarks.network import (
     LEFT_EYE,
     MIRROR,
     MOUTH,
-    OUTLINE,
-    POINTS,
     CloseNet,
     LandmarkNet,
-    Output,
     face_box,
-    mirrored,
 )
 
 # A point whose error scale is this share of the face box has half the confidence.
@@ -169,39 +165,6 @@ def _detection(place: _Place) -> Detection:
     return Detection(place.points, place.sigma, confidence, place.score, place.outline)
 
 
-@dataclass(frozen=True)
-class DensePoints:
-    """Dense points of a face, those of `LandmarkNet.places`."""
-
-    points: np.ndarray  # (D, 2) pixels, corner origin
-    # (D,) expected error in pixels (the scale of a Laplace distribution), large where the head or
-    # something before it hides a point
-    sigma: np.ndarray
-
-
-def find_dense(net: LandmarkNet, image: np.ndarray, face: Detection) -> DensePoints:
-    """Find the dense points of a detected face, in several crops as in the last look at it.
-
-    There are none where the network has no dense part.
-    """
-    pyramid = make_pyramid(image)
-    windows = _last_windows(window_about(face.points))
-    output = _answer(net, [Look(pyramid, window) for window in windows], dense=True)
-    if output.dense is None:
-        return DensePoints(np.zeros((0, 2)), np.zeros(0))
-    found, scales = (part.double().numpy() for part in output.dense[:2])
-    partner = mirrored(found.shape[1])[POINTS + OUTLINE :] - POINTS - OUTLINE
-    points, sigmas = [], []
-    for window, places, scale in zip(windows, found, np.exp(scales), strict=True):
-        determinant = np.linalg.det(window[:, :2])
-        order = partner if determinant < 0 else slice(None)
-        points.append((places @ window[:, :2].T + window[:, 2])[order])
-        sigmas.append((scale * np.sqrt(abs(determinant)))[order])
-    mean = np.mean(points, axis=0)
-    spread = np.linalg.norm(np.stack(points) - mean, axis=2).mean(0)
-    return DensePoints(mean, np.hypot(np.mean(sigmas, axis=0), spread))
-
-
 def _searches(width: int, height: int, smallest: float) -> Iterator[list[np.ndarray]]:
     """Yield windows to look in: the whole frame, it turned and smaller ones, smaller ones yet.
 
@@ -246,24 +209,16 @@ def _refined(
                 straying.add(one)
             else:
                 places[one] = refined
-    looks = [
-        Look(pyramid, window)
-        for pyramid, place in zip(pyramids, places, strict=True)
-        for window in _last_windows(window_about(place.points))
-    ]
+    looks = []
+    for pyramid, place in zip(pyramids, places, strict=True):
+        window = window_about(place.points)
+        centre = window @ [CROP / 2, CROP / 2, 1.0]
+        for scale, flipped in LAST:
+            flip = np.diag([-1.0 if flipped else 1.0, 1.0])
+            looks.append(Look(pyramid, place_crop(centre, scale * window[:, :2] @ flip, CROP)))
     found, count = _run(net, looks), len(LAST)
     return [
         _agreed(place, found[count * one : count * (one + 1)]) for one, place in enumerate(places)
-    ]
-
-
-def _last_windows(window: np.ndarray) -> list[np.ndarray]:
-    """Return the crops of the last look, about a window (2, 3)."""
-    centre = window @ [CROP / 2, CROP / 2, 1.0]
-    flip = np.diag([-1.0, 1.0])
-    return [
-        place_crop(centre, scale * window[:, :2] @ (flip if flipped else np.eye(2)), CROP)
-        for scale, flipped in LAST
     ]
 
 
@@ -410,7 +365,10 @@ def _run(net: LandmarkNet, looks: Sequence[Look]) -> list[_Place]:
     places = []
     for start in range(0, len(looks), BATCH):
         part = looks[start : start + BATCH]
-        output = _answer(net, part)
+        crops = np.stack([sample_window(look.pyramid, look.window) for look in part])
+        # (N, H, W, 3) seen as (N, 3, H, W) lies in memory as channels-last already.
+        with torch.inference_mode():
+            output = net(torch.from_numpy(crops).permute(0, 3, 1, 2).float() / 255.0)
         scales = output.log_scale.double().exp().numpy()
         visible = torch.sigmoid(output.seen).double().numpy()
         scores = torch.sigmoid(output.logit).double().numpy()
@@ -420,14 +378,6 @@ def _run(net: LandmarkNet, looks: Sequence[Look]) -> list[_Place]:
             for look, *row in zip(part, found, edges, scales, visible, scores, strict=True)
         ]
     return places
-
-
-def _answer(net: LandmarkNet, looks: Sequence[Look], dense: bool = False) -> Output:
-    crops = np.stack([sample_window(look.pyramid, look.window) for look in looks])
-    # (N, H, W, 3) seen as (N, 3, H, W) lies in memory as channels-last already.
-    with torch.inference_mode():
-        images = torch.from_numpy(crops).permute(0, 3, 1, 2)
-        return net(images.float() / 255.0, dense)
 
 
 def _placed(

@@ -10,10 +10,9 @@ Eyes and mouth are looked at once more, at about twice the resolution: small net
 find their points, as the first one hardly tells half shut lids from open ones, or shows of teeth
 from shut lips.
 
-The landmarks are fixed places of a head. The outline, 17 points of the edge of the face that a
-picture shows, is what published marks have in place of the jaw line's. The dense points, found on
-coarser maps, are fixed places spread over face, ears, neck and the front of the scalp. Both kinds
-are found in the same way and corrected by a perceptron that sees them and the landmarks.
+The landmarks are fixed places of a head. The outline, 17 points on the visible edge of the face, is
+what published marks have in place of the jaw line's. It is found in the same way and corrected by a
+perceptron that sees it and the landmarks.
 """
 
 from __future__ import annotations
@@ -39,28 +38,19 @@ POINTS, OUTLINE = 68, 17
 STRETCH = 1.15
 # Side of a crop over the longer side of the box of its landmarks.
 CROP_MARGIN = 1.55
-# Partner of each iBUG-68 point in the mirror image.
+# Partner of each iBUG-68 point in the mirror image; below, of the 68 + 17 with the outline.
 MIRROR = np.array(
     [*range(16, -1, -1), *range(26, 16, -1), 27, 28, 29, 30, 35, 34, 33, 32, 31,
      45, 44, 43, 42, 47, 46, 39, 38, 37, 36, 41, 40,
      54, 53, 52, 51, 50, 49, 48, 59, 58, 57, 56, 55, 64, 63, 62, 61, 60, 67, 66, 65]
 )  # fmt: skip
+MIRROR_WITH_OUTLINE = np.concatenate([MIRROR, np.arange(POINTS, POINTS + OUTLINE)[::-1]])
 # The landmarks of the subject's left eye and of the mouth.
 LEFT_EYE, MOUTH = np.arange(42, 48), np.arange(48, 68)
 # Those of the inner lips that meet, the upper ones first.
 INNER_LIPS = ((61, 62, 63), (67, 66, 65))
 # Suffix of buffers that are not stored: batch normalisation counts its batches.
 COUNTERS = "num_batches_tracked"
-
-
-def mirrored(dense: int) -> np.ndarray:
-    """Return the partners (68 + 17 + dense,) of landmarks, outline and dense points in a mirror.
-
-    The first half of the dense points is on the subject's left, the other its mirror image.
-    """
-    first = POINTS + OUTLINE
-    outline, others = np.arange(POINTS, first)[::-1], np.arange(first, first + dense)
-    return np.concatenate([MIRROR, outline, np.roll(others, dense // 2)])
 
 
 def face_box(points: np.ndarray) -> tuple[np.ndarray, float]:
@@ -80,8 +70,6 @@ class Output(NamedTuple):
         heat: (B, 68, H / 4, W / 4) heat maps before the softmax.
         outline: (B, 17, 2) crop pixels; the landmarks 0 to 16 of a network that does not find it.
         outline_log_scale, outline_heat: as of the landmarks.
-        dense: points (B, D, 2), log scales (B, D) and heat maps (B, D, H / 8, W / 8) of the dense
-            points, as of the landmarks; None where these are not asked for.
     """
 
     points: torch.Tensor
@@ -92,7 +80,6 @@ class Output(NamedTuple):
     outline: torch.Tensor
     outline_log_scale: torch.Tensor
     outline_heat: torch.Tensor
-    dense: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None
 
 
 class Residual(nn.Module):
@@ -131,23 +118,23 @@ class ShapeHead(nn.Module):
         return points + 8.0 * out[:, :2].transpose(1, 2), log_scale.clamp(-2.0, 4.0), out[:, 3]
 
 
-class MorePoints(nn.Module):
-    """Finds more points on maps of the trunk, by convolutions of `size`; see `Output`."""
+class OutlinePart(nn.Module):
+    """Finds the outline on maps of the trunk; see `Output`."""
 
-    def __init__(self, count: int, maps: int, features: int, size: int, width: int = 160) -> None:
+    def __init__(self, maps: int, features: int, width: int = 160) -> None:
         super().__init__()
-        self.heat = nn.Conv2d(maps, count, size, 1, size // 2)
+        self.heat = nn.Conv2d(maps, OUTLINE, 3, 1, 1)
         self.look = nn.Linear(features, 64)
-        self.first = nn.Linear(3 * count + 2 * POINTS + 64, width)
-        self.second = nn.Linear(width, 3 * count)
-        self.spread = nn.Parameter(torch.zeros(count))
+        self.first = nn.Linear(3 * OUTLINE + 2 * POINTS + 64, width)
+        self.second = nn.Linear(width, 3 * OUTLINE)
+        self.spread = nn.Parameter(torch.zeros(OUTLINE))
         nn.init.zeros_(self.second.weight)
         nn.init.zeros_(self.second.bias)
 
     def forward(
         self, maps: torch.Tensor, marks: torch.Tensor, features: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return points (B, N, 2), log scales (B, N) and heat maps (B, N, H, W)."""
+        """Return points (B, 17, 2), log scales (B, 17) and heat maps (B, 17, H, W)."""
         heat = self.heat(maps)
         points, variance = expectation(heat)
         spread = variance.clamp_min(1e-2).log()
@@ -155,22 +142,9 @@ class MorePoints(nn.Module):
         places = [((one - centre) / (0.25 * CROP)).flatten(1) for one in (points, marks)]
         look = functional.relu(self.look(features))
         hidden = functional.relu(self.first(torch.cat([*places, 0.3 * spread, look], 1)))
-        out = self.second(hidden).view(-1, 3, heat.shape[1])
+        out = self.second(hidden).view(-1, 3, OUTLINE)
         log_scale = (1.0 + out[:, 2] + self.spread * spread).clamp(-2.0, 4.0)
         return points + 8.0 * out[:, :2].transpose(1, 2), log_scale, heat
-
-
-class DensePart(MorePoints):
-    """Finds the dense points.
-
-    Attributes:
-        faces: (D,) int32, of the built-in head; weights: (D, 3) barycentric: where the points are.
-    """
-
-    def __init__(self, count: int, maps: int, features: int) -> None:
-        super().__init__(count, maps, features, 1)
-        self.register_buffer("faces", torch.zeros(count, dtype=torch.int32))
-        self.register_buffer("weights", torch.zeros(count, 3))
 
 
 class CloseNet(nn.Module):
@@ -216,13 +190,12 @@ class LandmarkNet(nn.Module):
     same. Training begins with them, for a quarter of the time.
 
     A network for other pictures than of `whole` heads finds no outline and has neither `eyes` nor
-    `mouth`; one of no `dense` points finds none.
+    `mouth`.
     """
 
-    def __init__(self, whole: bool = False, dense: int = 0, mouth: bool = True) -> None:
+    def __init__(self, whole: bool = False, mouth: bool = True) -> None:
         super().__init__()
-        self.outline = MorePoints(OUTLINE, 48, 128, 3) if whole else None
-        self.dense = DensePart(dense, 64, 128) if dense else None
+        self.outline = OutlinePart(48, 128) if whole else None
         self.eyes = eye_net() if whole else None
         self.mouth = mouth_net() if whole and mouth else None
         self.stem1, self.stem2 = _conv(3, 16, 5, 2), _conv(16, 32, 3, 2)
@@ -237,39 +210,29 @@ class LandmarkNet(nn.Module):
         self.shape = ShapeHead(128)
         self.face = nn.Linear(128, 1)
 
-    def forward(self, crops: torch.Tensor, dense: bool = False) -> Output:
-        """Run the network, with dense points if wanted; exposure and contrast are normalised."""
+    def forward(self, crops: torch.Tensor) -> Output:
+        """Run the network; exposure and contrast are normalised."""
         # Places need single precision, whatever training has the convolutions done in.
-        maps, finest, features = (part.float() for part in self.trunk(crops))
+        maps, features = (part.float() for part in self.trunk(crops))
         with torch.autocast("cpu", enabled=False):
-            heat = self.heat(finest)
+            heat = self.heat(maps)
             points, log_scale, seen = self.shape(*expectation(heat), features)
             edge = points[:, :OUTLINE], log_scale[:, :OUTLINE], heat[:, :OUTLINE]
             if self.outline is not None:
-                edge = self.outline(finest, points, features)
-            over = None
-            if self.dense is not None and dense:
-                over = self.dense(maps, points, features)
-            return Output(points, log_scale, seen, self.face(features)[:, 0], heat, *edge, over)
+                edge = self.outline(maps, points, features)
+            return Output(points, log_scale, seen, self.face(features)[:, 0], heat, *edge)
 
-    def places(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return where the dense points are: faces (D,) of the built-in head, weights (D, 3)."""
-        if self.dense is None:
-            return np.zeros(0, np.int64), np.zeros((0, 3))
-        faces, weights = self.dense.faces, self.dense.weights
-        return faces.numpy().astype(np.int64), weights.double().numpy()
-
-    def trunk(self, crops: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return maps (B, 64, H / 8, W / 8) and (B, 48, H / 4, W / 4), and features (B, 128)."""
+    def trunk(self, crops: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return maps (B, 48, H / 4, W / 4) and features (B, 128)."""
         x = functional.relu(self.stem1(_normalised(crops)))
         x32 = self.block32(functional.relu(self.stem2(x)))
         x16 = self.block16(functional.relu(self.down16(x32)))
         x8 = self.block8(functional.relu(self.down8(x16)))
         x4 = self.block4(functional.relu(self.down4(x8)))
         y = self.mix8(functional.relu(x8 + _twice(self.side4(x4))))
-        y16 = functional.relu(self.mix16(functional.relu(x16 + _twice(self.side8(y)))))
-        y = functional.relu(self.mix32(functional.relu(x32 + _twice(self.side16(y16)))))
-        return y16, y, x4.mean((2, 3))
+        y = functional.relu(self.mix16(functional.relu(x16 + _twice(self.side8(y)))))
+        y = functional.relu(self.mix32(functional.relu(x32 + _twice(self.side16(y)))))
+        return y, x4.mean((2, 3))
 
 
 def _normalised(crops: torch.Tensor) -> torch.Tensor:
@@ -351,8 +314,7 @@ def trainable_network(path: Path = WEIGHTS) -> LandmarkNet:
     """
     names = [key for key in LandmarkNet().state_dict() if not key.endswith(COUNTERS)]
     arrays = read_arrays(path, FormatError, "landmark weights", names)
-    mouth = "mouth.first.weight" in arrays
-    net = LandmarkNet("outline.spread" in arrays, len(arrays.get("dense.faces", ())), mouth)
+    net = LandmarkNet("outline.spread" in arrays, "mouth.first.weight" in arrays)
     names = [key for key in net.state_dict() if not key.endswith(COUNTERS)]
     try:
         state = {key: torch.from_numpy(arrays[key].astype(np.float32)) for key in names}

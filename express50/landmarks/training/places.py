@@ -1,8 +1,4 @@
-"""Find the places on a head model that training needs: dense points and the outline of the face.
-
-Dense points are spread over face, ears, neck and the front of the scalp. Half of them are on the
-subject's left; the others are their mirror images. They are carried from one head model to another
-by closest point.
+"""Find places on a head model by closest point, and the outline of the face in a view.
 
 The outline is points 0 to 16 of the published mark-up of 68. People who mark photographs
 (Multi-PIE, 300-W) put them on the visible edge of the face: from before the ear at the height of
@@ -19,10 +15,10 @@ import numpy as np
 import open3d as o3d
 
 from express50.geometry.conventions import corner_to_cell
-from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
+from express50.geometry.raycast import barycentrics, mesh_scene
 from express50.geometry.transforms import similarity_fit
 from express50.head.load import load_head
-from express50.head.model import HeadModel, landmarks, vertex_normals
+from express50.head.model import HeadModel, landmarks
 
 INSIDE = (
     "teeth", "tongue", "mouth_interior", "left_eyeball", "right_eyeball", "left_iris", "right_iris",
@@ -61,47 +57,6 @@ def laid_on(source: HeadModel, model: HeadModel, points: np.ndarray) -> np.ndarr
     marks = [landmarks(one, one.template[None])[0].double().numpy() for one in (source, model)]
     s, R, t = similarity_fit(*marks)
     return s * points @ R.T + t
-
-
-# Distance between dense points, as a share of that on the neck and the scalp.
-SPACING = {"face": 0.62, "nose": 0.45, "left_eye_region": 0.4, "lips": 0.35, "left_ear": 0.5}
-MIDDLE_M = 0.002  # nearer to the middle, a point and its mirror image would be nearly the same
-NECK_M = 0.055  # no points lie further below the chin: heads end differently there
-FORWARD = -0.2  # no points of the scalp face further back than this
-
-
-def choose_places(model: HeadModel, count: int) -> Places:
-    """Return places on a head model: farthest points of the left half, then their mirrors.
-
-    Of `count` those that lie too low on the neck are left out.
-    """
-    rest = model.template.double().numpy()
-    region = {name: mask.numpy() for name, mask in model.regions.items()}
-    normals = vertex_normals(model.template[None], model.faces)[0].double().numpy()
-    keep = region["face"] | region["neck"] | region["left_ear"] | region["scalp"]
-    keep &= (rest[:, 0] > MIDDLE_M) & ~np.any([region[n] for n in INSIDE if n in region], axis=0)
-    keep &= ~region["scalp"] | (normals[:, 2] > FORWARD)
-    # What can be seen from outside, straight along its normal.
-    rays = join_rays(rest + 4e-4 * normals, normals)
-    keep &= ~mesh_scene(rest, model.faces.numpy()).test_occlusions(rays).numpy()
-    spacing = np.ones(len(rest))
-    for name, share in SPACING.items():
-        spacing[region[name]] = share
-    ids = np.flatnonzero(keep)
-    chosen = [int(ids[np.argmax(rest[ids, 2])])]  # the tip of the nose, or beside it
-    distance = np.full(len(ids), np.inf)
-    while len(chosen) < count // 2:
-        step = np.linalg.norm(rest[ids] - rest[chosen[-1]], axis=1)
-        distance = np.minimum(distance, step / spacing[ids])
-        chosen.append(int(ids[np.argmax(distance)]))
-    low = landmarks(model, model.template[None])[0, 8, 1].item() - NECK_M
-    left = np.array([place for place in rest[chosen] if place[1] > low])
-    return closest_places(model, np.concatenate([left, left * (-1.0, 1.0, 1.0)]))
-
-
-def carry_places(source: HeadModel, places: Places, model: HeadModel) -> Places:
-    """Return the places of another head model that lie where a source's lie, both at rest."""
-    return closest_places(model, laid_on(source, model, place_points(source, places)))
 
 
 EYE_BAND_M, CHIN_BAND_M = 0.005, 0.004  # about the height of the eye corners; about the middle

@@ -15,7 +15,7 @@ import open3d as o3d
 from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
 from express50.geometry.transforms import make_transform
 from express50.head.model import HeadModel
-from express50.landmarks.training.places import Places, face_front, place_points
+from express50.landmarks.training.places import face_front
 from express50.landmarks.training.random_heads import LASHES, Canvas, RandomHead, paint, waves
 
 FRAME_SIDE_M = 0.38
@@ -34,8 +34,7 @@ class TrainingView:
     """A rendered view."""
 
     rgba: np.ndarray  # (S, S, 4) uint8, black where empty
-    # (68 + 17 + D, 2) float32 pixels, corner origin: landmarks, outline, dense points
-    points: np.ndarray
+    points: np.ndarray  # (68 + 17, 2) float32 pixels, corner origin: landmarks, outline
     visible: np.ndarray  # (68,) bool, nothing of the head or its glasses is before the landmark
     facing: np.float32  # cosine between the ways that the face looks and to the camera
 
@@ -54,14 +53,13 @@ class _Hits:
 class HeadScene:
     """A random head in a ray caster, to be seen from many sides."""
 
-    def __init__(self, model: HeadModel, head: RandomHead, places: Places | None = None) -> None:
-        """Compile a head; `places` of the model are its dense points."""
+    def __init__(self, model: HeadModel, head: RandomHead) -> None:
+        """Compile a head."""
         self.front = face_front(model)
         self.faces = model.faces.numpy()
         if LASHES in model.regions and head.look % 100 >= 100 * LASHES_SHARE:
             self.faces = self.faces[~model.regions[LASHES].numpy()[self.faces].all(1)]
         self.head = head
-        self.dense = np.zeros((0, 3)) if places is None else place_points(model, places, head.skin)
         self.canvas = head.canvas
         self.scene = mesh_scene(head.vertices, self.faces)
         self.openness = self._measure_openness(np.random.default_rng(head.look))
@@ -104,8 +102,7 @@ class HeadScene:
                 ring = np.round(outline).astype(np.float32)
                 visible &= [cv2.pointPolygonTest(ring, tuple(xy), False) <= 0 for xy in pixels]
         edge = self.front.outline(project(K, cam_from_world, self.head.skin), pixels)
-        dense = project(K, cam_from_world, self.dense)
-        points = np.concatenate([pixels, edge, dense]).astype(np.float32)
+        points = np.concatenate([pixels, edge]).astype(np.float32)
         return TrainingView(rgba, points, visible, facing)
 
     def _seen(self, eye: np.ndarray, points: np.ndarray) -> np.ndarray:

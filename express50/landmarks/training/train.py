@@ -29,7 +29,6 @@ from express50.head.model import HeadModel
 from express50.landmarks import WEIGHTS
 from express50.landmarks.network import (
     CROP,
-    OUTLINE,
     POINTS,
     LandmarkNet,
     Output,
@@ -41,7 +40,6 @@ from express50.landmarks.network import (
 from express50.landmarks.training.close_ups import PARTS as CLOSE_UPS
 from express50.landmarks.training.close_ups import train_part
 from express50.landmarks.training.descent import descend
-from express50.landmarks.training.places import Places, carry_places, choose_places
 from express50.landmarks.training.scene import TrainingView
 from express50.landmarks.training.views import (
     FILE_VIEWS,
@@ -57,7 +55,7 @@ FIRST_FILES = 6
 STEPS_PER_FILE = 300
 HELD_OUT = 0
 # Of the network: those that find points and faces, close-ups, and what these (not close-ups) share.
-PARTS = ("trunk", "heat", "shape", "face", "outline", "dense", *CLOSE_UPS)
+PARTS = ("trunk", "heat", "shape", "face", "outline", *CLOSE_UPS)
 SMALL_EVERY = 4  # after the small steps one in so many stays small, so that blurred faces are kept
 
 
@@ -71,8 +69,6 @@ class TrainingPlan:
     "Of these, the first that are at half resolution."
     files: int = 30
     "Files of views per head model."
-    dense: int = 256
-    "Dense points, an even number, with those low on the neck, which are left out."
     seed: int = 0
     "Of everything random."
 
@@ -105,28 +101,17 @@ def main(arguments: list[str] | None = None) -> int:
         setattr(net, name, train_part(CLOSE_UPS[name], models, options.views, plan.seed))
     save_network(net, options.out)
     net = load_network(options.out)
-    for model, places in zip(models, places_of(models, plan.dense), strict=True):
-        views = open_views(options.views, model, HELD_OUT, plan.seed, places)
+    for model in models:
+        views = open_views(options.views, model, HELD_OUT, plan.seed)
         print(f"{model.name}: held-out heads {validate(net, views, plan.seed)}")
     return 0
 
 
-def places_of(models: list[HeadModel], dense: int) -> list[Places]:
-    """Return the places of the dense points on each model: chosen on the last, the most human."""
-    chosen = choose_places(models[-1], dense)
-    return [carry_places(models[-1], chosen, model) for model in models]
-
-
-def start_network(start: Path | None, places: Places, parts: Sequence[str] = PARTS) -> LandmarkNet:
+def start_network(start: Path | None, parts: Sequence[str] = PARTS) -> LandmarkNet:
     """Return a network with what given weights hold of it, ready to train some of its parts."""
-    net = LandmarkNet(whole=True, dense=len(places[0]))
-    state = net.state_dict()
-    given = {} if start is None else trainable_network(start).state_dict()
-    # Weights of another number of dense points lack all that depends on it.
-    state |= {key: value for key, value in given.items() if value.shape == state[key].shape}
-    if "dense" in parts:
-        state["dense.faces"], state["dense.weights"] = (torch.from_numpy(part) for part in places)
-    net.load_state_dict(state)
+    net = LandmarkNet(whole=True)
+    if start is not None:
+        net.load_state_dict(trainable_network(start).state_dict(), strict=False)
     for name, module in net.named_children():
         part = name if name in PARTS else "trunk"
         module.train(part in parts).requires_grad_(part in parts)
@@ -143,8 +128,7 @@ def train(
     """Train on views of the head models; views and the run's state are kept in a folder."""
     torch.manual_seed(plan.seed)
     backgrounds = make_backgrounds(400, np.random.default_rng([plan.seed, 1]))
-    places = places_of(models, plan.dense)
-    net = start_network(start, places[0], parts)
+    net = start_network(start, parts)
     begun = hashlib.sha256(start.read_bytes()).hexdigest()[:8] if start else "anew"
     chosen = [] if set(parts) == set(PARTS) else sorted(parts)
     values = (str(value) for value in astuple(plan))
@@ -156,8 +140,7 @@ def train(
         files = min(plan.files, FIRST_FILES + step // STEPS_PER_FILE)
         while len(sets) < len(models) * files:
             number = HELD_OUT + 1 + len(sets) // len(models)
-            which = len(sets) % len(models)
-            sets.append(open_views(folder, models[which], number, plan.seed, places[which]))
+            sets.append(open_views(folder, models[len(sets) % len(models)], number, plan.seed))
         # Seeded by the step, so that a run taken up again draws what it would have drawn.
         rng = np.random.default_rng([plan.seed, 2, step])
         small = step < plan.small_steps or step % SMALL_EVERY == 0
@@ -175,7 +158,7 @@ def train(
 
 @dataclass(frozen=True)
 class LandmarkBatch:
-    """Stacked crops: images (B, 3, H, W) in [0, 1], points (B, 68 + 17 + D, 2), rest (B[, 68])."""
+    """Stacked crops: images (B, 3, H, W) in [0, 1], points (B, 68 + 17, 2), rest (B[, 68])."""
 
     images: torch.Tensor
     points: torch.Tensor
@@ -221,15 +204,13 @@ def crop_loss(net: LandmarkNet, crops: list[TrainingCrop]) -> torch.Tensor:
     """Return the points' distance and likelihood, and entropies of heat maps and answers."""
     batch = crop_batch(crops)
     with torch.autocast("cpu", torch.bfloat16):
-        output: Output = net(batch.images, dense=True)
-    marks, outline, dense = batch.points.tensor_split((POINTS, POINTS + OUTLINE), dim=1)
+        output: Output = net(batch.images)
+    marks, outline = batch.points.tensor_split((POINTS,), dim=1)
     seen = functional.binary_cross_entropy_with_logits(output.seen, batch.visible, reduction="none")
     share = batch.weight / batch.weight.sum().clamp_min(1.0)
     points = (point_loss(output, marks)[0] + 0.5 * seen).mean(1) * share
     edge = output.outline, output.outline_log_scale, output.outline_heat
     points = points + 0.5 * place_loss(*edge, outline)[0].mean(1) * share
-    if output.dense is not None:
-        points = points + 0.5 * place_loss(*output.dense, dense)[0].mean(1) * share
     return points.sum() + functional.binary_cross_entropy_with_logits(output.logit, batch.score)
 
 

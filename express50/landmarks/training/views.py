@@ -1,7 +1,6 @@
 """Cut training crops of rendered heads on random backgrounds, spoiled as cameras do.
 
-A file of views is made once; it depends on the seed, the head model, its number and the dense
-points alone.
+A file of views is made once; it depends on the seed, the head model and its number alone.
 """
 
 from __future__ import annotations
@@ -22,12 +21,10 @@ from express50.landmarks.network import (
     CROP,
     CROP_MARGIN,
     MIRROR,
-    OUTLINE,
+    MIRROR_WITH_OUTLINE,
     POINTS,
     face_box,
-    mirrored,
 )
-from express50.landmarks.training.places import Places
 from express50.landmarks.training.random_heads import random_head
 from express50.landmarks.training.scene import HeadScene, TrainingView
 
@@ -47,29 +44,25 @@ def draw_yaws(rng: np.random.Generator) -> np.ndarray:
     return np.append(front, rng.uniform(FACE_YAW, 2 * np.pi - FACE_YAW))
 
 
-def draw_views(
-    model: HeadModel, count: int, rng: np.random.Generator, places: Places | None = None
-) -> list[TrainingView]:
-    """Render `count` views of random heads, with dense points at places of the model."""
+def draw_views(model: HeadModel, count: int, rng: np.random.Generator) -> list[TrainingView]:
+    """Render `count` views of random heads."""
     views: list[TrainingView] = []
     while len(views) < count:
-        scene = HeadScene(model, random_head(model, rng), places)
+        scene = HeadScene(model, random_head(model, rng))
         yaws = draw_yaws(rng)[: count - len(views)]
         views += [scene.render(rng, SIDE, float(yaw)) for yaw in yaws]
     return views
 
 
-def open_views(
-    folder: Path, model: HeadModel, number: int, seed: int, places: Places
-) -> list[TrainingView]:
+def open_views(folder: Path, model: HeadModel, number: int, seed: int) -> list[TrainingView]:
     """Read one file of `FILE_VIEWS` views, which is rendered if it is not there yet."""
     rng = np.random.default_rng([seed, number, *model.name.encode()])
-    # Other heads, landmarks or dense points make other files.
-    parts = (model.template, model.landmark_faces, model.landmark_bary, *places)
+    # Other heads or landmarks make other files.
+    parts = (model.template, model.landmark_faces, model.landmark_bary)
     made_of = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
     digest = hashlib.sha256(made_of).hexdigest()[:8]
     path = folder / f"{model.name}-{digest}-{seed}-{number:03d}.npz"
-    return made_once(path, TrainingView, lambda: draw_views(model, FILE_VIEWS, rng, places))
+    return made_once(path, TrainingView, lambda: draw_views(model, FILE_VIEWS, rng))
 
 
 def made_once(path: Path, kind: type[Record], make: Callable[[], list[Record]]) -> list[Record]:
@@ -93,7 +86,7 @@ class TrainingCrop:
     """A training crop."""
 
     image: np.ndarray  # (size, size, 3) uint8
-    # (68 + 17 + D, 2) pixels of a crop of `CROP` pixels, whatever the image's size
+    # (68 + 17, 2) pixels of a crop of `CROP` pixels, whatever the image's size
     points: np.ndarray
     visible: np.ndarray  # (68,) float32, 1 where neither the head nor anything else hides the point
     score: float  # target of the face score
@@ -123,8 +116,7 @@ def random_crop(
     points = points @ matrix[:, :2].T + matrix[:, 2]
     visible = view.visible
     if np.linalg.det(matrix[:, :2]) < 0:
-        partner = mirrored(len(points) - POINTS - OUTLINE)
-        points, visible = points[partner], visible[MIRROR]
+        points, visible = points[MIRROR_WITH_OUTLINE], visible[MIRROR]
     pool = backgrounds[rng.integers(len(backgrounds))]
     x, y = rng.integers(0, CROP, 2)
     image = pool[y : y + CROP, x : x + CROP].copy()
