@@ -54,129 +54,97 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
     annotate = subparsers.add_parser("annotate", help=words, description=words)
     verbs = annotate.add_subparsers(dest="verb", metavar="VERB", required=True)
 
-    def add(name: str, handler: Callable, words: str, *shared: str) -> argparse.ArgumentParser:
+    def add(name: str, handler: Callable, words: str, *shared: str) -> Callable:
+        """Add a verb with some shared arguments; return the function that adds its own."""
         parser = verbs.add_parser(name, help=words, description=words)
-        parser.add_argument("dataset", type=dataset_folder, metavar="DATASET")
-        parser.add_argument("--json", action="store_true", help="print JSON")
-        if "subjects" in shared:
-            parser.add_argument(
-                "--subject", action="append", metavar="ID", help="only this one; may be repeated"
-            )
-        if "clip" in shared:
-            parser.add_argument("subject", metavar="SUBJECT")
-            parser.add_argument("expression", metavar="EXPRESSION")
-        if "annotator" in shared:
-            parser.add_argument(
-                "--annotator", type=person, default=getpass.getuser(), metavar="NAME",
-                help="annotator's name (default: your login)",
-            )  # fmt: skip
         parser.set_defaults(handler=handler)
-        return parser
+        argument = parser.add_argument
+        argument("dataset", type=dataset_folder, metavar="DATASET")
+        argument("--json", action="store_true", help="print JSON")
+        only = "only this one; may be repeated"
+        if "subjects" in shared:
+            argument("--subject", action="append", metavar="ID", help=only)
+        if "expressions" in shared:
+            argument("--expression", action="append", metavar="ID", help=only)
+        if "subject" in shared or "clip" in shared:
+            argument("subject", metavar="SUBJECT")
+        if "clip" in shared:
+            argument("expression", metavar="EXPRESSION")
+        if "annotator" in shared:
+            words = "annotator's name (default: your login)"
+            argument(
+                "--annotator", type=person, default=getpass.getuser(), metavar="NAME", help=words
+            )
+        return argument
 
     _add_labelling_verbs(add)
     _add_reviewing_verbs(add)
-    parser = add(
-        "reference",
-        run_reference,
-        "print or choose the reference person, to whose frames all others are matched",
-    )
-    parser.add_argument("subject", nargs="?", metavar="SUBJECT", help="new reference")
-    words = "label by RenderMe-360's rule: the last frame of a clip is its peak"
-    add("rule", run_rule, words, "subjects").add_argument(
-        "--expression",
-        action="append",
-        metavar="ID",
-        help="only this one; may be repeated (default: e0 to e11)",
-    )
-    parser = add(
-        "exclude", run_exclusion, "leave a subject out, and record the reason", "annotator"
-    )
-    parser.add_argument("subject", metavar="SUBJECT")
-    parser.add_argument("reason", metavar="REASON", help="heavy makeup, large glasses, ...")
-    parser = add("include", run_exclusion, "include an excluded subject again", "annotator")
-    parser.add_argument("subject", metavar="SUBJECT")
-    for parser in (
-        add("export", run_export, "write every event as .csv or .json", "subjects"),
-        add("import", run_import, "add events from a .csv or .json; known ones are skipped"),
-    ):
-        parser.add_argument("file", type=Path, metavar="FILE")
+    words = "print or choose the reference person, to whose frames all others are matched"
+    argument = add("reference", run_reference, words)
+    argument("subject", nargs="?", metavar="SUBJECT", help="new reference")
+    words = "label by RenderMe-360's rule: a clip's last frame is its peak (default: e0 to e11)"
+    add("rule", run_rule, words, "subjects", "expressions")
+    words = "leave a subject out, and record the reason"
+    argument = add("exclude", run_exclusion, words, "subject", "annotator")
+    argument("reason", metavar="REASON", help="heavy makeup, large glasses, ...")
+    words = "include an excluded subject again"
+    add("include", run_exclusion, words, "subject", "annotator")
+    argument = add("export", run_export, "write every event as .csv or .json", "subjects")
+    argument("file", type=Path, metavar="FILE")
+    words = "add events from a .csv or .json; known ones are skipped"
+    add("import", run_import, words)("file", type=Path, metavar="FILE")
 
 
-def _add_labelling_verbs(add: Callable[..., argparse.ArgumentParser]) -> None:
-    parser = add("ui", run_ui, "label peak frames in the terminal", "annotator")
-    parser.add_argument("--subjects", metavar="GLOB", help="only these subjects")
-    parser.add_argument("--expressions", metavar="GLOB", help="only these expressions")
-    parser.add_argument("--order", choices=ORDERS, default="doubt", help="task order [%(default)s]")
-    parser.add_argument(
-        "--blind", action="store_true", help="hide suggestions and others' marks until you decide"
-    )
-    parser.add_argument(
-        "--pictures", choices=("blocks", "sixel"), default="blocks",
-        help="block characters, or sixels for terminals that draw them (xterm -ti vt340, foot,"
-        " WezTerm, iTerm2) [%(default)s]",
-    )  # fmt: skip
-    add(
-        "suggest",
-        run_suggest,
-        "list the frames that align suggests, doubtful ones first",
-        "subjects",
-    )
+def _add_labelling_verbs(add: Callable[..., Callable]) -> None:
+    argument = add("ui", run_ui, "label peak frames in the terminal", "annotator")
+    argument("--subjects", metavar="GLOB", help="only these subjects")
+    argument("--expressions", metavar="GLOB", help="only these expressions")
+    argument("--order", choices=ORDERS, default="doubt", help="task order [%(default)s]")
+    words = "hide suggestions and others' marks until you decide"
+    argument("--blind", action="store_true", help=words)
+    words = "block characters, or sixels for terminals that draw them (xterm -ti vt340, foot,"
+    words += " WezTerm, iTerm2) [%(default)s]"
+    argument("--pictures", choices=("blocks", "sixel"), default="blocks", help=words)
+    add("suggest", run_suggest, "list the frames that align suggests, doubtful first", "subjects")
     words = "list what you still have to label, in the best order"
-    parser = add("next", run_next, words, "subjects", "annotator")
-    parser.add_argument("--order", choices=ORDERS, default=ORDERS[0], help="default: %(default)s")
-    parser.add_argument("--count", type=int, default=10, metavar="N", help="at most this many [10]")
-    parser = add("mark", run_mark, "mark the peak frame of an expression", "clip", "annotator")
-    parser.add_argument("frame", type=int, metavar="FRAME", help="0-based decode index")
-    parser.add_argument("--camera", help="camera it was judged in (default: the suggestion's)")
-    parser.add_argument("--first", type=int, metavar="FRAME", help="first frame of its plateau")
-    parser.add_argument("--last", type=int, metavar="FRAME", help="last frame of its plateau")
-    parser = add("flag", run_flag, "record that an expression has no peak", "clip", "annotator")
-    parser.add_argument("reason", metavar="REASON", help=", ".join(FLAG_REASONS) + ", ...")
-    words = "undo your last event on an expression"
-    add("undo", run_undo, words, "clip", "annotator")
+    argument = add("next", run_next, words, "subjects", "annotator")
+    argument("--order", choices=ORDERS, default=ORDERS[0], help="default: %(default)s")
+    argument("--count", type=int, default=10, metavar="N", help="at most this many [10]")
+    argument = add("mark", run_mark, "mark the peak frame of an expression", "clip", "annotator")
+    argument("frame", type=int, metavar="FRAME", help="0-based decode index")
+    argument("--camera", help="camera it was judged in (default: the suggestion's)")
+    argument("--first", type=int, metavar="FRAME", help="first frame of its plateau")
+    argument("--last", type=int, metavar="FRAME", help="last frame of its plateau")
+    argument = add("flag", run_flag, "record that an expression has no peak", "clip", "annotator")
+    argument("reason", metavar="REASON", help=", ".join(FLAG_REASONS) + ", ...")
+    add("undo", run_undo, "undo your last event on an expression", "clip", "annotator")
     add("labels", run_labels, "list every label in force", "subjects")
 
 
-def _add_reviewing_verbs(add: Callable[..., argparse.ArgumentParser]) -> None:
+def _add_reviewing_verbs(add: Callable[..., Callable]) -> None:
     words = "check labels against the footage and each other; exit code 1 if one is wrong"
     add("validate", run_validate, words, "subjects")
     words = "show how well annotators agree: overall, by expression and by pair"
     add("agree", run_agree, words, "subjects")
-    parser = add("review", run_review, "list disagreements, or settle one", "subjects", "annotator")
-    parser.add_argument(
-        "--beyond",
-        type=int,
-        default=2,
-        metavar="FRAMES",
-        help="marks at most this many frames apart agree [2]",
-    )
-    parser.add_argument("--all", action="store_true", help="also list settled disagreements")
-    parser.add_argument(
-        "--settle", nargs=3, metavar=("SUBJECT", "EXPRESSION", "VERDICT"),
-        help="VERDICT is a frame, the annotator who is right, or the reason for a flag: "
-        f"{', '.join(FLAG_REASONS)}, or flag:REASON",
-    )  # fmt: skip
-    add(
-        "coverage",
-        run_coverage,
-        "print a table of subjects and expressions that shows the missing labels",
-    )
+    words = "list disagreements, or settle one"
+    argument = add("review", run_review, words, "subjects", "annotator")
+    words = "marks at most this many frames apart agree [2]"
+    argument("--beyond", type=int, default=2, metavar="FRAMES", help=words)
+    argument("--all", action="store_true", help="also list settled disagreements")
+    words = "VERDICT is a frame, the annotator who is right, or the reason for a flag: "
+    words += f"{', '.join(FLAG_REASONS)}, or flag:REASON"
+    argument("--settle", nargs=3, metavar=("SUBJECT", "EXPRESSION", "VERDICT"), help=words)
+    words = "print a table of subjects and expressions that shows the missing labels"
+    add("coverage", run_coverage, words)
     add("status", run_status, "show how many labels each subject has, and the time they took")
     words = "write a contact sheet of all labels, or of a subject or expression, as one HTML file"
-    parser = add("sheet", run_sheet, words, "subjects")
-    parser.add_argument("file", type=Path, metavar="OUT.html")
-    parser.add_argument(
-        "--expression", action="append", metavar="ID", help="only this one; may be repeated"
-    )
-    parser.add_argument("--camera", metavar="ID", help="show this camera (default: the label's)")
-    parser.add_argument(
-        "--around", type=int, metavar="N",
-        help="frames before and after each label [4 for chosen subjects or expressions, else 0]",
-    )  # fmt: skip
-    parser.add_argument(
-        "--sure", type=float, default=0.5, metavar="P",
-        help="outline suggestions less sure than this [%(default)s]",
-    )  # fmt: skip
+    argument = add("sheet", run_sheet, words, "subjects", "expressions")
+    argument("file", type=Path, metavar="OUT.html")
+    argument("--camera", metavar="ID", help="show this camera (default: the label's)")
+    words = "frames before and after each label [4 for chosen subjects or expressions, else 0]"
+    argument("--around", type=int, metavar="N", help=words)
+    words = "outline suggestions less sure than this [%(default)s]"
+    argument("--sure", type=float, default=0.5, metavar="P", help=words)
 
 
 def table(names: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> list[str]:
@@ -462,9 +430,7 @@ def run_exclusion(args: argparse.Namespace) -> int:
     chosen_subjects(args.dataset, [args.subject])
     reason = args.reason.strip() if args.verb == "exclude" else None
     if reason == "":
-        raise AnnotationError(
-            f"{args.subject}: an exclusion needs a reason, such as 'heavy makeup'"
-        )
+        raise AnnotationError(f"{args.subject}: give a reason for it, such as 'heavy makeup'")
     event = Label(
         subject=args.subject, expression="", action=args.verb, annotator=args.annotator,
         time=time.time(), reason=reason,

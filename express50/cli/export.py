@@ -17,14 +17,11 @@ FORMATS = ("gaussian-avatars", "obj", "ply", "glb")
 def add_commands(subparsers: Any) -> None:
     """Add ``export``, ``report`` and ``head preview``."""
     parser = add_command(
-        subparsers,
-        "export",
-        run_export,
-        "write tracked heads for other tools",
+        subparsers, "export", run_export, "write tracked heads for other tools",
         description="Writes tracked heads as a GaussianAvatars data set or as meshes.",
         example="express50 export data/mine out --format gaussian-avatars --subject S001\n"
         "writes OUT/<subject>/; an earlier export of the subject is replaced",
-    )
+    )  # fmt: skip
     add = parser.add_argument
     add("out", type=Path, metavar="OUT", help="folder to write to, one folder per subject")
     add("--format", required=True, choices=FORMATS, help="what to write")
@@ -51,16 +48,13 @@ def add_commands(subparsers: Any) -> None:
     parser.add_argument("--title", help="heading of the page")
 
     area = subparsers.add_parser("head", help="look at a head model")
+    actions = area.add_subparsers(dest="action", metavar="ACTION", required=True)
+    words = "draw a head model in typical poses"
     parser = add_command(
-        area.add_subparsers(dest="action", metavar="ACTION", required=True),
-        "preview",
-        run_preview,
-        "draw a head model in typical poses",
-        dataset=False,
-        json=False,
+        actions, "preview", run_preview, words, dataset=False, json=False,
         example="express50 head preview build/head.png --yaws 0,40,90\n"
         "the picture has a row per pose that the model can take, and a column per yaw",
-    )
+    )  # fmt: skip
     add = parser.add_argument
     add("out", type=Path, metavar="OUT", help="picture to write (.png or .jpg)")
     words = "head model: procedural, or the path of a FLAME, ICT-FaceKit or .npz file [procedural]"
@@ -87,14 +81,12 @@ def run_export(args: argparse.Namespace) -> int:
             "--frames clips: gaussian-avatars needs a matte of every frame, and 'matte' makes those"
             " of peaks alone; export the clips as obj, ply or glb"
         )
+    held = args.test_expression
     options = AvatarOptions(
-        background=args.background,
-        head_only=args.head_only,
-        downscale=args.downscale,
-        even_colour=args.even_colour,
-        test_expressions=None if args.test_expression is None else tuple(args.test_expression),
-        validation_camera=args.validation_camera,
-    )
+        background=args.background, head_only=args.head_only, downscale=args.downscale,
+        even_colour=args.even_colour, validation_camera=args.validation_camera,
+        test_expressions=None if held is None else tuple(held),
+    )  # fmt: skip
     dataset, accounts = Dataset(args.dataset), []
     for subject in tracked_subjects(dataset, args.subject):
         head = read_tracked(dataset, subject, args.expression)

@@ -70,33 +70,24 @@ class Row:
 
 def add_commands(subparsers: Any) -> None:
     """Add the ``plan`` command."""
+    words = "estimate what a campaign costs, from measured datasets"
     parser = add_command(
-        subparsers,
-        "plan",
-        run_plan,
-        "estimate what a campaign costs, from measured datasets",
+        subparsers, "plan", run_plan, words,
         description="Scales the time and disk space that every stage took on a dataset to the\n"
         "size of a campaign. Every figure comes from receipts or from 'express50 tune' on this\n"
         "machine; stages that were not run are n/a. A second dataset of another size\n"
         "(--also) separates the costs that grow with the footage from the others.",
         example="express50 plan DATASET --also OTHER --target express-50 --workers 32",
-    )
+    )  # fmt: skip
+    add = parser.add_argument
     words = "another measured dataset, of another size; may be repeated"
-    parser.add_argument(
-        "--also", type=Path, action="append", default=[], metavar="DATASET", help=words
-    )
-    parser.add_argument("--target", choices=list(TARGETS), help="a named campaign")
+    add("--also", type=Path, action="append", default=[], metavar="DATASET", help=words)
+    add("--target", choices=list(TARGETS), help="a named campaign")
     for name in SIZES:
-        what = name.replace("_", " ")
-        words = f"{what} of the campaign (default: as in --target, else as measured)"
-        flag = f"--{name.replace('_', '-')}"
-        parser.add_argument(flag, type=int, metavar="N", help=words)
-    parser.add_argument(
-        "--size", metavar="WxH", help="picture size of the campaign's cameras, pixels"
-    )
-    parser.add_argument(
-        "--workers", type=int, default=1, metavar="N", help="cores to use (default 1)"
-    )
+        words = f"{name.replace('_', ' ')} of the campaign (default: as in --target, else measured)"
+        add(f"--{name.replace('_', '-')}", type=int, metavar="N", help=words)
+    add("--size", metavar="WxH", help="picture size of the campaign's cameras, pixels")
+    add("--workers", type=int, default=1, metavar="N", help="cores to use (default 1)")
 
 
 def run_plan(args: argparse.Namespace) -> int:
@@ -123,10 +114,11 @@ def run_plan(args: argparse.Namespace) -> int:
     target = target_of(args.target, sizes, footage)
     rows = estimate(known, target, measured, args.workers)
     total = totals(rows)
-    data: dict[str, Any] = {"target": vars(target), "measured": [vars(f) for f, _ in measured]}
-    data["workers"] = args.workers
     replaced = size_of(dataset.replaced_dir)[1]
-    data |= {"stages": [vars(row) for row in rows], "total": total, "replaced": replaced}
+    data = {
+        "target": vars(target), "measured": [vars(f) for f, _ in measured], "total": total,
+        "workers": args.workers, "stages": [vars(row) for row in rows], "replaced": replaced,
+    }  # fmt: skip
     columns = ["stage", "items", "s per item", "core hours", f"days on {args.workers}", "disk"]
     columns += ["peak memory", "preset", "sizes", "times what was measured"]
     hours = _hours(total["core_hours"], total["core_hours_low"], total["core_hours_high"])
@@ -191,13 +183,11 @@ def measure_sizes(
     for trial in trials:
         table = {
             name: Measured(
-                seconds=(cost.core_seconds,) * cost.items,
-                bytes=cost.bytes,
-                memory=cost.memory,
+                seconds=(cost.core_seconds,) * cost.items, bytes=cost.bytes, memory=cost.memory,
                 preset=trial.settings[name],
             )
             for name, cost in trial.costs.items()
-        }
+        }  # fmt: skip
         found.append((trial.footage, table))
     return found
 

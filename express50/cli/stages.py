@@ -51,14 +51,8 @@ def add_run_options(parser: argparse.ArgumentParser, captures: bool, preset: boo
     """
     add = parser.add_argument
     if captures:
-        add(
-            "captures",
-            nargs="*",
-            default=[],
-            type=Path,
-            metavar="CAPTURE",
-            help="folders of raw captures",
-        )
+        words = "folders of raw captures"
+        add("captures", nargs="*", default=[], type=Path, metavar="CAPTURE", help=words)
     add_config_options(parser, preset)
     words = "local worker processes (default 2); 0 works in this process"
     add("--workers", type=int, default=2, metavar="N", help=words)
@@ -77,20 +71,13 @@ def add_run_options(parser: argparse.ArgumentParser, captures: bool, preset: boo
 
 def add_config_options(parser: argparse.ArgumentParser, preset: bool = True) -> None:
     """Add the options that make up a configuration."""
+    add = parser.add_argument
     parser.set_defaults(preset=None)
     if preset:
-        words = f"{', '.join(PRESETS)} (default standard)"
-        parser.add_argument("--preset", metavar="P", help=words)
-    parser.add_argument(
-        "--config", type=Path, metavar="FILE", help="TOML file of settings, one table per stage"
-    )
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="STAGE.KEY=VALUE",
-        help="change one setting; may be repeated",
-    )
+        add("--preset", metavar="P", help=f"{', '.join(PRESETS)} (default standard)")
+    add("--config", type=Path, metavar="FILE", help="TOML file of settings, one table per stage")
+    words = "change one setting; may be repeated"
+    add("--set", action="append", default=[], metavar="STAGE.KEY=VALUE", help=words)
 
 
 def config_of(stage: Stage, args: argparse.Namespace) -> Any:

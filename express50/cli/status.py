@@ -63,15 +63,11 @@ def add_commands(subparsers: Any) -> None:
     """Add ``status``."""
     words = "show what is done, failed or outdated, expected errors, time and memory"
     parser = add_command(
-        subparsers,
-        "status",
-        show_status,
-        words,
-        json=False,
+        subparsers, "status", show_status, words, json=False,
         description="Shows per stage the items that are done, failed, running or missing, time,"
         " memory and the expected error; then what is outdated, and why. Exit code 1 if an item"
         " failed.",
-    )
+    )  # fmt: skip
     page = "write an HTML page, and update it while a stage runs"
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--json", action="store_true", help="print receipts as JSON")
@@ -139,17 +135,8 @@ def _serve(dataset: Dataset, port: int) -> int:
 
 
 def _lines(table: list[StageStatus]) -> Iterator[str]:
-    header = [
-        "stage",
-        "done",
-        "failed",
-        "running",
-        "missing",
-        "seconds",
-        "peak MB",
-        "state",
-        "expected error",
-    ]
+    header = ["stage", "done", "failed", "running", "missing"]
+    header += ["seconds", "peak MB", "state", "expected error"]
     rows = []
     for row in table:
         counts = [str(count) for count in row.counts().values()]
@@ -177,7 +164,7 @@ def _outdated_lines(why: Mapping[tuple[str, str], str]) -> Iterator[str]:
 def read_status(
     ledger: Ledger, names: Sequence[str], now: float | None = None
 ) -> list[StageStatus]:
-    """Read the StageStatus of every stage, in order; ``now`` is in seconds since 1970."""
+    """Read the status of every stage, in order; ``now`` is in seconds since 1970."""
     moment = time.time() if now is None else now
     runs = ledger.runs()
     return [_stage(name, ledger.read(name), runs.get(name), moment) for name in names]
@@ -195,7 +182,10 @@ def _stage(name: str, table: dict[str, Receipt], run: Run | None, now: float) ->
         began = run.running if alive else {}
         running = {k: t for k, t in began.items() if k not in table or table[k].time < t}
         open_items = max(0, run.items - run.current - len(settled))
-        rate = _rate(settled, run.begun, now if alive else run.ended or run.seen)
+        # Up to now, so that the rate falls while no item ends; the run's start counts as an end.
+        ends = [run.begun, *sorted(settled)][-RECENT - 1 :]
+        until = now if alive else run.ended or run.seen
+        rate = (len(ends) - 1) / max(until - ends[0], 1e-3)
         # Items waiting to be made again still have their old receipts.
         older = sum(r.status == "done" and r.time < run.begun for r in receipts)
         former = min(open_items, max(0, older - run.current))
@@ -218,14 +208,6 @@ def _stage(name: str, table: dict[str, Receipt], run: Run | None, now: float) ->
         peak_memory=max((r.peak_memory for r in receipts), default=0),
         receipts=receipts,
     )
-
-
-def _rate(ends: list[float], begun: float, now: float) -> float:
-    """Return recent items per second up to now, so that the rate falls while no item ends."""
-    recent = sorted(ends)[-RECENT - 1 :]
-    if len(recent) <= RECENT:  # the start of the run counts as an end
-        recent = [begun, *recent]
-    return (len(recent) - 1) / max(now - recent[0], 1e-3) if ends else 0.0
 
 
 def status_page(name: str, table: Sequence[StageStatus], refresh_s: float | None) -> str:
