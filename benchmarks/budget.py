@@ -4,7 +4,8 @@
 from a minute to an hour and with every preset, and measures each run against the truth. ``--quick``
 takes one person of two expressions, one pilot for all runs, and budgets for three points of the
 front, in processor time, which means something on a busy machine too. ``--captures`` takes footage
-without truth: errors are then differences from the dearest run, and promises cannot be checked.
+without truth: errors are then differences from the most expensive run, and promises cannot be
+checked.
 A budget that ends early, or is refused although a fixed preset takes no longer, is a miss of 100 %
 of its time, and keeps no promise. The last line printed is one JSON object.
 """
@@ -111,7 +112,8 @@ def express50(arguments: Sequence[str]) -> int:
 def quick_budgets(table: Mapping) -> list[str]:
     """Choose processor times for three points of a front.
 
-    They are the cheapest, the quickest that should be as good as the best preset, and the dearest.
+    They are the cheapest, the quickest that should be as good as the best preset, and the most
+    expensive.
     """
     points = table["front"]
     wanted = ALIKE * min(point["worse"] for point in table["presets"].values())
@@ -151,7 +153,7 @@ def core_seconds(dataset: Dataset) -> float:
 
 
 def measure_all(out: Path, runs: Sequence[Run], truth: Truth | None) -> None:
-    """Measure every run against the truth, or against the dearest of them."""
+    """Measure every run against the truth, or against the most expensive of them."""
     runs = [run for run in runs if run.finished]
     if not runs:
         return

@@ -23,7 +23,13 @@ from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.capture.index import read_peaks
 from express50.contract.layout import Dataset
 from express50.dataset.tracks import read_registration, read_track
-from express50.error_model import PEOPLE_DIFFER, ErrorModel, error_bounds, error_models, size_sigma
+from express50.error_model import (
+    PEOPLE_DIFFER,
+    ErrorModel,
+    error_bounds,
+    error_models,
+    single_camera_sigma,
+)
 from express50.files.images import read_alpha, shrink
 from express50.geometry.cameras import Camera, transform_camera
 from express50.geometry.meshes import read_surface
@@ -227,7 +233,7 @@ def _meshes_of(
     row, views = track.row(expression), list(cameras.values())
     mesh, marks = track.vertices[row].astype(np.float64), facts["landmark_rms_px"][expression]
     tracked = track_figures(track.sigma[row], mesh, cameras, marks, facts["outline_views"])
-    found["track"] = _Mesh(mesh, tracked, size_sigma(views, mesh))
+    found["track"] = _Mesh(mesh, tracked, single_camera_sigma(views, mesh))
     path = dataset.registration_file(subject, expression)
     if path.is_file():
         one = read_registration(path)

@@ -91,7 +91,7 @@ def error_bounds(
     return Bounds(typical, bound, expect(model, typical, shared))
 
 
-def size_sigma(cameras: Sequence[Camera], places: np.ndarray) -> np.ndarray:
+def single_camera_sigma(cameras: Sequence[Camera], places: np.ndarray) -> np.ndarray:
     """Return the depth uncertainty (N,) in millimetres of points (N, 3) in metres.
 
     A single camera cannot distinguish a large head from a near one. With several cameras it is 0.

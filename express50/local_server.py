@@ -43,7 +43,7 @@ Post = Callable[[str, str, Callable[[int], bytes | None]], Reply]
 
 
 @dataclass(frozen=True)
-class Door:
+class RequestGuard:
     """Decides who may ask a server that listens on ``host``."""
 
     host: str
@@ -62,7 +62,7 @@ class Door:
             return "this server does not answer requests from other sites' pages\n"
         return None
 
-    def inside(self, path: str) -> str | None:
+    def path_after_token(self, path: str) -> str | None:
         """Return the path after the token and its slash; None without the token."""
         before, slash, after = path.removeprefix("/").partition("/")
         mine = secrets.compare_digest(before.encode(), self.token.encode())
@@ -76,7 +76,7 @@ class PageServer(ThreadingHTTPServer):
 
     def __init__(self, get: Get, post: Post | None, host: str, port: int) -> None:
         """Bind the port without serving yet; ConfigError if it is taken or invalid."""
-        self.door, self.get, self.post = Door(host), get, post
+        self.guard, self.get, self.post = RequestGuard(host), get, post
         self._free = BoundedSemaphore(AT_ONCE)
         try:
             super().__init__((host, port), _Handler)
@@ -86,7 +86,7 @@ class PageServer(ThreadingHTTPServer):
     @property
     def address(self) -> str:
         """Return the address to open in a browser."""
-        return self.door.address(self.server_port)
+        return self.guard.address(self.server_port)
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Answer in a thread, if one is free."""
@@ -136,8 +136,8 @@ class _Handler(BaseHTTPRequestHandler):
         return self.rfile.read(int(length))
 
     def _answer(self, get: Get) -> None:
-        refusal = self.server.door.refusal(self.headers["Host"], self.headers["Origin"])
-        path = self.server.door.inside(self.path)
+        refusal = self.server.guard.refusal(self.headers["Host"], self.headers["Origin"])
+        path = self.server.guard.path_after_token(self.path)
         if refusal is not None:
             status, kind, body = HTTPStatus.FORBIDDEN, "text/plain", refusal.encode()
         else:

@@ -26,7 +26,7 @@ from websockets.http11 import Request, Response
 
 from express50.console import stdout_to_stderr
 from express50.geometry.transforms import invert_transform, make_transform, quat_to_matrix
-from express50.local_server import Door
+from express50.local_server import RequestGuard
 from grmm.checkpoint import Loaded
 from grmm.edit import POSES, HeadCodes, between, controlled, principal_directions, trained_head
 from grmm.head_crop import draw_window
@@ -108,14 +108,14 @@ class Watcher:
 
 
 class _Server(viser.ViserServer):
-    """The library's server, behind a `Door` and without its tunnel to a public server."""
+    """The library's server, behind a `RequestGuard` and without its tunnel to a public server."""
 
-    def __init__(self, door: Door, **options: Any) -> None:
+    def __init__(self, guard: RequestGuard, **options: Any) -> None:
         """Start to listen; the library has no setting for what a request must hold."""
         listen = websockets.asyncio.server.serve
-        websockets.asyncio.server.serve = partial(_serve_behind, door, listen)
+        websockets.asyncio.server.serve = partial(_serve_behind, guard, listen)
         try:
-            super().__init__(host=door.host, **options)
+            super().__init__(host=guard.host, **options)
         finally:
             websockets.asyncio.server.serve = listen
 
@@ -124,16 +124,20 @@ class _Server(viser.ViserServer):
 
 
 def _serve_behind(
-    door: Door, listen: Callable[..., Any], *args: Any, process_request: Any, **options: Any
+    guard: RequestGuard,
+    listen: Callable[..., Any],
+    *args: Any,
+    process_request: Any,
+    **options: Any,
 ) -> Any:  # noqa: ANN401
-    """Listen as websockets' ``serve`` does, for pages and sockets that `Door` lets in."""
+    """Listen as websockets' ``serve`` does, for pages and sockets that `RequestGuard` lets in."""
 
     def check(connection: ServerConnection, request: Request) -> Response | None:
-        refusal = door.refusal(request.headers.get("Host"), request.headers.get("Origin"))
+        refusal = guard.refusal(request.headers.get("Host"), request.headers.get("Origin"))
         if refusal is not None:
             return connection.respond(HTTPStatus.FORBIDDEN, refusal)
         socket = request.headers.get("Upgrade") == "websocket"  # asked for without the last slash
-        path = door.inside(request.path + "/" * socket)
+        path = guard.path_after_token(request.path + "/" * socket)
         if path is None or path.startswith("/") or ".." in path.split("/"):
             return connection.respond(HTTPStatus.NOT_FOUND, "no such page\n")
         request.path = f"/{path}"
@@ -153,9 +157,9 @@ class Viewer:
         self._watchers: dict[int, Watcher] = {}
         self._head_changed = time.perf_counter()
         with stdout_to_stderr():
-            door = Door(host)
-            self.server = _Server(door, port=port, label="GRMM", verbose=False)
-        self.address = door.address(int(self.server.get_port()))
+            guard = RequestGuard(host)
+            self.server = _Server(guard, port=port, label="GRMM", verbose=False)
+        self.address = guard.address(int(self.server.get_port()))
         self.server.gui.configure_theme(dark_mode=True)
         self.server.scene.set_up_direction("+y")
         self._add_controls()

@@ -11,10 +11,6 @@ from importlib import resources
 from express50.errors import FormatError
 
 NEUTRAL = "neutral"  # the resting face, which has no peak
-CATEGORIES = (
-    "neutral", "basic", "mouth", "eyes", "brows", "cheeks", "jaw", "tongue", "asymmetry", "gaze",
-    "viseme", "extreme",
-)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +20,6 @@ class Expression:
     id: str  # snake_case id, used in cues, labels and file names
     name: str  # short title shown to people
     description: str  # what to do, with FACS action units
-    categories: tuple[str, ...]  # some of ``CATEGORIES``
     # activation of named expression directions; 1 is full, a negative value is the opposite
     # movement
     controls: dict[str, float] = field(default_factory=dict)
@@ -47,7 +42,7 @@ def load_script() -> tuple[Expression, ...]:
     script = []
     for row in tomllib.loads(file.read_text(encoding="utf-8"))["expression"]:
         numbers = {key: tuple(row[key]) for key in ("jaw", "neck", "gaze") if key in row}
-        script.append(Expression(**row | numbers | {"categories": tuple(row["categories"])}))
+        script.append(Expression(**row | numbers))
     return tuple(script)
 
 

@@ -218,13 +218,19 @@ def read_matted_frame(dataset: Dataset, item: str, camera: Camera) -> tuple[np.n
     path = dataset.matte_file(subject, expression, camera.id)
     if not path.is_file():
         raise StageError("it has no matte")
+    alpha = read_matte(path, camera, "matte")
+    return read_peak_frame(dataset, subject, expression, camera.id), alpha
+
+
+def read_matte(path: Path, camera: Camera, stage: str) -> np.ndarray:
+    """Read a matte (H, W) uint8 that a stage made; FormatError if it is not of a camera's size."""
     alpha = read_alpha(path)
     if alpha.shape != (camera.height, camera.width):
         raise FormatError(
             f"{path}: {alpha.shape[1]}x{alpha.shape[0]}, expected the camera's"
-            f" {camera.width}x{camera.height}; run 'express50 matte' again"
+            f" {camera.width}x{camera.height}; run 'express50 {stage}' again"
         )
-    return read_peak_frame(dataset, subject, expression, camera.id), alpha
+    return alpha
 
 
 def read_plate_image(dataset: Dataset, subject: str, camera_id: str) -> np.ndarray | None:

@@ -257,11 +257,11 @@ def commands() -> dict[str, Command]:
         try:
             found[point.name] = _load(point)
         except ConfigError as error:
-            found[point.name] = Command("does not load", functools.partial(_refuse, error))
+            found[point.name] = Command("does not load", functools.partial(_raise, error))
     return found
 
 
-def _refuse(error: ConfigError, subparsers: Any) -> None:
+def _raise(error: ConfigError, subparsers: Any) -> None:
     raise error
 
 

@@ -205,14 +205,9 @@ class _StageAudit:
     """Audits the stages once, and records which subjects turned out to be broken."""
 
     def __init__(
-        self,
-        dataset: Dataset,
-        stages: Sequence[Stage],
-        ledger: Ledger,
-        result: Audit,
-        deep: bool,
+        self, dataset: Dataset, stages: Sequence[Stage], ledger: Ledger, result: Audit, deep: bool,
         fix: bool,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.dataset, self.stages, self.ledger = dataset, stages, ledger
         self.result, self.deep, self.fix = result, deep, fix
         captures = [f.where for f in result.findings if f.kind == "capture"]

@@ -19,13 +19,18 @@ import cv2
 import numpy as np
 import torch
 
-from express50.capture.frames import read_cameras_of, read_gains, read_peak_frame
+from express50.capture.frames import (
+    read_cameras_of,
+    read_gains,
+    read_matte,
+    read_peak_frame,
+)
 from express50.contract.layout import Dataset
 from express50.dataset.export import META, Head, write_head_obj
 from express50.dataset.tracks import Track
 from express50.errors import CaptureError, ConfigError, FormatError, StageError
 from express50.files.atomic import dump_json
-from express50.files.images import encode_png, read_alpha, resize_area, scale_light
+from express50.files.images import encode_png, resize_area, scale_light
 from express50.geometry.cameras import Camera, pinhole_camera, scale_camera, transform_camera
 from express50.geometry.conventions import affine_to_opencv, opengl_from_cam_from_world
 from express50.geometry.transforms import make_transform, matrix_to_axis_angle
@@ -129,31 +134,17 @@ def _check_options(track: Track, cameras: dict[str, Camera], options: AvatarOpti
 
 
 def _write_view(
-    dataset: Dataset,
-    item: str,
-    camera: Camera,
-    target: Camera,
-    options: AvatarOptions,
-    out: Path,
+    dataset: Dataset, item: str, camera: Camera, target: Camera, options: AvatarOptions, out: Path,
     file: str,
-) -> None:
-    """Write an undistorted frame and its matte as the target camera sees them.
-
-    Raises:
-        CaptureError, FormatError, StageError: the frame or its matte is missing or damaged.
-    """
+) -> None:  # fmt: skip
+    """Write an undistorted frame and its matte as the target camera sees them."""
     subject, expression = item.split("/")
     path, stage = dataset.matte_file(subject, expression, camera.id), "matte"
     if options.head_only:
         path, stage = dataset.item_dir("regions", item) / f"{camera.id}_head.png", "regions"
     if not path.is_file():
         raise StageError(f"has no {path.name} from stage {stage}; run 'express50 {stage}'")
-    alpha = read_alpha(path)
-    if alpha.shape != (camera.height, camera.width):
-        raise FormatError(
-            f"{path}: {alpha.shape[1]}x{alpha.shape[0]}, expected the camera's"
-            f" {camera.width}x{camera.height}; run 'express50 {stage}' again"
-        )
+    alpha = read_matte(path, camera, stage)
     image = read_peak_frame(dataset, subject, expression, camera.id)
     gain = read_gains(dataset, subject).get(camera.id) if options.even_colour else None
     image = image if gain is None else scale_light(image, 1.0 / gain)

@@ -68,7 +68,7 @@ def parse_goal(text: str) -> Goal:
 
 @dataclass
 class Clock:
-    """Counts what a run spends, over all its sessions; a `Gate` of the runner."""
+    """Counts what a run spends, over all its sessions; a `RunMonitor` of the runner."""
 
     budget: Budget | None  # the limit; None for no limit
     spent: float = 0.0  # seconds spent in earlier sessions

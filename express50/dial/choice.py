@@ -1,9 +1,9 @@
 """Choose settings: predict time and errors of the whole chain from a pilot, and find the front.
 
 A cheaper setting of one stage is assumed to change a result independently of the other stages:
-squared differences add up, on top of the error that remains at the dearest settings. That remainder
-comes from the errors that stages state, less what of the differences these errors confirm; where no
-stage states one, only the differences are known.
+squared differences add up, on top of the error that remains at the most expensive settings. What
+remains follows from the errors that stages state; where no stage states one, only the differences
+are known.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ STATES = 400  # partial choices that are kept; far more than a front has points
 class Expected:
     """A result's expected error: value and interval.
 
-    Where no stage states this error, ``stated`` is false, and all three figures are how far the
-    result differs from that of the dearest settings tried.
+    Where no stage states this error (``stated`` is false), all three are the difference from the
+    result of the most expensive settings tried.
     """
 
     value: float
@@ -152,8 +152,8 @@ def stage_seconds(load: Workload, stage: Stage, label: str, left: float = 1.0) -
     return count * seconds / min(load.width, count) + extra
 
 
-def rest_of(load: Workload, result: str) -> tuple[float, float, float] | None:
-    """Return the squared error that the dearest settings leave, and its interval as two ratios.
+def remaining_error(load: Workload, result: str) -> tuple[float, float, float] | None:
+    """Return the squared error at the most expensive settings, and its interval as two ratios.
 
     None where no stage states this error.
     """
@@ -168,15 +168,14 @@ def rest_of(load: Workload, result: str) -> tuple[float, float, float] | None:
         sum(row.get(t.settings[name], {}).get(result, 0.0) ** 2 for name, row in losses.items())
         for t in trials
     ]
-    return remainder(stated**2, np.array(lost)), float(ratios[0]), float(ratios[1])
+    return remaining_square(stated**2, np.array(lost)), float(ratios[0]), float(ratios[1])
 
 
-def remainder(stated: np.ndarray, lost: np.ndarray) -> float:
-    """Return the squared error left where nothing is lost, from N trials' squares (N,).
+def remaining_square(stated: np.ndarray, lost: np.ndarray) -> float:
+    """Return the squared error where nothing is lost, from the squares of N trials (N,).
 
     Two settings may differ by as much as both are wrong, and be equally wrong. Therefore `lost`
-    counts as far as the stated errors fall with it: not at all where they do not, and in full where
-    they fall as much.
+    counts only as far as the stated errors fall with it.
     """
     away = lost - lost.mean()
     if not away.any():
@@ -190,7 +189,7 @@ def expected_errors(load: Workload, lost: Mapping[str, float]) -> dict[str, Expe
     """Return the errors that follow from squared differences of the results."""
     found = {}
     for kind in load.kinds:
-        rest = rest_of(load, kind.name)
+        rest = remaining_error(load, kind.name)
         if rest is not None:
             value = math.sqrt(rest[0] + lost.get(kind.name, 0.0))
             low, high = (value * ratio for ratio in rest[1:])
@@ -247,10 +246,10 @@ def front(load: Workload) -> list[Point]:
 
 
 def scales(load: Workload) -> dict[str, float]:
-    """Return what a result's error is counted in: what the dearest settings leave, or differences.
+    """Return the unit that a result's error is counted in: the error at the best settings.
 
-    Differences count where nothing is left, as of peaks that are right to the frame. Results that
-    no setting changes are left out.
+    Where that is 0, as of peaks that are right to the frame, it is the largest difference. Results
+    that no setting changes are left out.
     """
     found = {}
     for kind in load.kinds:
@@ -258,7 +257,7 @@ def scales(load: Workload) -> dict[str, float]:
             row.get(kind.name, 0.0) for ladder in load.measured.losses.values()
             for row in ladder.values()
         ]  # fmt: skip
-        rest = rest_of(load, kind.name)
+        rest = remaining_error(load, kind.name)
         size = math.sqrt(rest[0]) if rest and rest[0] else max(changes, default=0.0)
         if any(changes):
             found[kind.name] = max(size, 1e-12)
@@ -292,7 +291,7 @@ def goal_result(load: Workload, goal: Goal) -> str:
         ConfigError: no stage states an error in it.
     """
     for kind in load.kinds:
-        if kind.unit == goal.unit and rest_of(load, kind.name) is not None:
+        if kind.unit == goal.unit and remaining_error(load, kind.name) is not None:
             return kind.name
     raise ConfigError(
         f"--error: no stage states its error in {goal.unit}; give --budget, or another unit"

@@ -57,25 +57,20 @@ def footage_of(dataset: Dataset) -> Footage:
     if not indices:
         raise StageError(f"{dataset.root}: nothing is ingested, so nothing was measured")
     cameras = [camera for index in indices for camera in index.cameras.values()]
+    side = 0.0  # to which the settings of the last run reduced pictures
+    for name, stage in stages().items():
+        path = dataset.config_file(name)
+        if stage.growth.reduces and path.is_file():
+            table = read_toml(path, FormatError).get(name, {})
+            side = float(table.get(stage.growth.reduces, 0))
     return Footage(
         subjects=len(indices),
         expressions=sum(len(index.cues) for index in indices) / len(indices),
         views=len(cameras) / len(indices),
         pixels=sum(camera.width * camera.height for camera in cameras) / len(cameras),
         frames=sum(camera.frames for camera in cameras) / len(cameras),
-        side=_reduced_side(dataset),
+        side=side,
     )
-
-
-def _reduced_side(dataset: Dataset) -> float:
-    """Return the side to which the settings of the last run reduced pictures; 0: not."""
-    side = 0.0
-    for name, stage in stages().items():
-        path = dataset.config_file(name)
-        if stage.growth.reduces and path.is_file():
-            table = read_toml(path, FormatError).get(name, {})
-            side = float(table.get(stage.growth.reduces, 0))
-    return side
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +108,7 @@ class PilotFigures:
     Attributes:
         key: digest of stages, settings and machine; figures of another key say nothing.
         trials: the first at the cheapest settings, the second of one peak, then one step each.
-        losses: per stage, setting and result: the difference to the dearest setting tried.
+        losses: difference from the most expensive setting tried, by stage, setting and result.
         untried: settings that there was no time to try, by stage.
     """
 

@@ -86,8 +86,14 @@ class Pilot:
         record = root / "trial.json"
         if record.is_file():
             return trial_of(json.loads(record.read_text(encoding="utf-8")))
-        if source is None:  # items of a trial that was stopped are kept
-            self._begin(root)
+        if source is None:
+            if not root.is_dir():  # otherwise items of a trial that was stopped are kept
+                given = chain.dataset
+                capture = str(given.captures()[self.subject].resolve())
+                root.mkdir(parents=True)
+                write_json(root / "captures.json", {self.subject: capture})
+                if (given.root / "labels").is_dir():  # those that people gave
+                    shutil.copytree(given.root / "labels", root / "labels")
         else:
             shutil.rmtree(root, ignore_errors=True)
             shutil.copytree(source.folder, root, copy_function=_link)
@@ -123,18 +129,6 @@ class Pilot:
             write_json(record, asdict(done))
         return done
 
-    def _begin(self, root: Path) -> None:
-        """Start a dataset with one capture, and the labels that people gave."""
-        given = self.chain.dataset
-        if root.is_dir():
-            return
-        root.mkdir(parents=True)
-        write_json(
-            root / "captures.json", {self.subject: str(given.captures()[self.subject].resolve())}
-        )
-        if (given.root / "labels").is_dir():
-            shutil.copytree(given.root / "labels", root / "labels")
-
     def _run(
         self, stage: Stage, dataset: Dataset, config: Any, anew: bool
     ) -> tuple[Cost | None, str]:
@@ -145,7 +139,7 @@ class Pilot:
         if not stage.items(dataset):
             return None, "an earlier stage made nothing for it"
         pool = self.chain.pool
-        summary = run_stage(stage, dataset, config, pool=pool, progress=False, gate=self.clock)
+        summary = run_stage(stage, dataset, config, pool=pool, progress=False, monitor=self.clock)
         counted = ("done",) if anew else ("done", "skipped")
         made = {o.item for o in summary.outcomes if o.status in counted}
         failures = [o.reason for o in summary.outcomes if o.status == "failed"]
@@ -342,7 +336,7 @@ def trial_seconds(pilot: Pilot, base: Trial, name: str, factor: float = 1.0) -> 
 def _losses(
     pilot: Pilot, trials: Sequence[Trial], cheapest: Mapping[str, str], name: str
 ) -> dict[str, dict[str, float]]:
-    """Compare the results at each tried setting of a stage with those at the dearest."""
+    """Compare the results at each tried setting of a stage with those at the most expensive one."""
     full = [t for t in trials if t.footage.expressions == trials[0].footage.expressions]
     tried = {
         label: next((t for t in full if t.settings == {**cheapest, name: label}), None)

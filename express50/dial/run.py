@@ -15,7 +15,7 @@ from typing import Any
 
 from express50.console import count, format_seconds, format_table
 from express50.contract.config import made_with
-from express50.contract.layout import Dataset, exclusion_reason
+from express50.contract.layout import exclusion_reason
 from express50.contract.stage import Stage
 from express50.dial.budget import Budget, Clock, Goal
 from express50.dial.choice import (
@@ -137,17 +137,15 @@ def workload(
         stages=chain.stages, ladders=chain.ladders, measured=measured, footage=footage,
         width=chain.pool.width(), cores=cores, fixed=begun, kinds=chain.kinds,
     )  # fmt: skip
-    return replace(load, done={s.name: _done(chain.dataset, load, s) for s in chain.stages})
-
-
-def _done(dataset: Dataset, load: Workload, stage: Stage) -> tuple[str, float]:
-    """Return the setting that a stage's folder was made with, and the share that is there."""
-    label = made_with(dataset.config_file(stage.name), stage, load.ladders[stage.name])
-    if label is None or not dataset.ledger.is_file():
-        return "", 0.0
-    with Ledger(dataset.ledger, read_only=True) as ledger:
-        done = sum(r.status == "done" for r in ledger.read(stage.name).values())
-    return label, min(1.0, done / item_seconds(load, stage, label)[0])
+    dataset, done = chain.dataset, {}
+    if dataset.ledger.is_file():
+        with Ledger(dataset.ledger, read_only=True) as ledger:
+            for stage in chain.stages:
+                path, ladder = dataset.config_file(stage.name), load.ladders[stage.name]
+                if (label := made_with(path, stage, ladder)) is not None:
+                    made = sum(r.status == "done" for r in ledger.read(stage.name).values())
+                    done[stage.name] = label, min(1.0, made / item_seconds(load, stage, label)[0])
+    return replace(load, done=done)
 
 
 @dataclass
@@ -338,7 +336,7 @@ def _run_one(run: _Run, stage: Stage) -> Summary | None:
     if not stage.items(chain.dataset):  # an earlier stage made nothing
         return None
     config = chain.ladders[stage.name][label]
-    summary = run_stage(stage, chain.dataset, config, pool=chain.pool, gate=clock)
+    summary = run_stage(stage, chain.dataset, config, pool=chain.pool, monitor=clock)
     made = sum(o.status == "done" and not o.restored for o in summary.outcomes)
     if made:
         run.real += clock.now() - before

@@ -30,13 +30,9 @@ class LocalWorkers:
         devices = cuda_devices()
         self.count, self.gpus = count, min(count, len(devices))
         shared = {
-            "nthreads": 1,
-            "host": "127.0.0.1",
-            "protocol": "tcp://",
-            "dashboard": False,
-            "memory_limit": 0.9 / count,
-            "silence_logs": logging.CRITICAL,
-        }
+            "nthreads": 1, "host": "127.0.0.1", "protocol": "tcp://", "dashboard": False,
+            "memory_limit": 0.9 / count, "silence_logs": logging.CRITICAL,
+        }  # fmt: skip
         workers: dict[int, dict] = {
             number: {"cls": Nanny, "options": dict(shared)} for number in range(count)
         }

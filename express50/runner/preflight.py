@@ -47,7 +47,9 @@ def problems(
         if dataset.ledger.is_file():
             with Ledger(dataset.ledger, read_only=True) as ledger:
                 yield from _memory_problems(ledger, chosen, pool)
-                needs = [_need(dataset, ledger, stage) for stage in chosen if all_items]
+                for stage in chosen if all_items else ():
+                    with suppress(Express50Error):  # a damaged list of items: the stage reports it
+                        needs.append(expected_bytes(ledger, stage.name, stage.items(dataset)))
     yield from _space_problems(dataset, [need for need in needs if need])
 
 
@@ -94,15 +96,6 @@ def _memory_problems(ledger: Ledger, stages: Iterable[Stage], pool: Pool) -> Ite
                 f"{stage.name}: {pool.workers} workers need {decimal(peak)} each, as the largest "
                 f"item did, and this machine has {decimal(total)}; use --workers {fit}"
             )
-
-
-def _need(dataset: Dataset, ledger: Ledger, stage: Stage) -> tuple[str, int, float] | None:
-    """Return a stage's name, items to do that have no output yet, and bytes of an item."""
-    try:
-        items = stage.items(dataset)
-    except Express50Error:  # the list of items is damaged: the stage reports it
-        return None
-    return expected_bytes(ledger, stage.name, items)
 
 
 def expected_bytes(

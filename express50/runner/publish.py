@@ -38,12 +38,9 @@ def run_folder(dataset: Dataset, stage: str) -> Iterator[Path]:
 
 @contextmanager
 def publishing(
-    folder: Path,
-    dataset: Dataset,
-    stage: str,
-    item: str,
+    folder: Path, dataset: Dataset, stage: str, item: str,
     keep: Callable[[Path], None] | None = None,
-) -> Iterator[Path]:
+) -> Iterator[Path]:  # fmt: skip
     """Yield an empty folder aside; on a clean exit it becomes the item's folder in one rename.
 
     It is made in a run's ``folder``. When the body raises, the item's former folder stays. A former

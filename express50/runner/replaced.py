@@ -56,12 +56,7 @@ def keeping(dataset: Dataset, former: Receipt | None) -> Keep | None:
 
 
 def restore(
-    folder: Path,
-    dataset: Dataset,
-    stage: str,
-    item: str,
-    fingerprint: str,
-    former: Receipt | None,
+    folder: Path, dataset: Dataset, stage: str, item: str, fingerprint: str, former: Receipt | None
 ) -> Receipt | None:
     """Publish an output of the store again, if it has this fingerprint and all of its bytes.
 

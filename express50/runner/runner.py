@@ -46,8 +46,8 @@ ALIKE = 3  # if this many first items fail for the same reason, a setting is wro
 KEPT = "imported; the stage does not make it"
 
 
-class Gate(Protocol):
-    """Watches the items of a run, and decides whether further ones may begin."""
+class RunMonitor(Protocol):
+    """Sees every receipt of a run, and may stop further items from beginning."""
 
     def settled(self, receipt: Receipt) -> None:
         """Take note of an item that ended."""
@@ -151,7 +151,7 @@ def run_stage(
     scheduler: str | None = None,
     progress: bool = True,
     pool: Pool | None = None,
-    gate: Gate | None = None,
+    monitor: RunMonitor | None = None,
 ) -> Summary:
     """Bring a stage's outputs up to date.
 
@@ -165,7 +165,7 @@ def run_stage(
         scheduler: address of a dask scheduler to use in place of local processes.
         progress: show progress on standard error.
         pool: workers shared with other stages, in place of the two arguments above.
-        gate: sees every receipt, and says when no further item may begin.
+        monitor: sees every receipt, and says when no further item may begin.
 
     Returns:
         The account of all items. A bad item is in it; it does not raise.
@@ -192,14 +192,16 @@ def run_stage(
             for item in gone:
                 _retire(dataset, ledger, stage.name, item)
             ledger.forget(stage.name, gone)
+        threads = workers_pool.threads
         with RunLog(dataset.ledger, stage.name, len(chosen)) as log:
-            threads = workers_pool.threads
             if shortage := expected_shortage(dataset, ledger, stage.name, chosen):
                 raise NotReadyError(shortage)
             work = _sort_items(stage, dataset, config, chosen, ledger, threads)
-            outcomes = _run_items(stage, dataset, work, ledger, workers_pool, progress, log, gate)
+            outcomes = _run_items(
+                stage, dataset, work, ledger, workers_pool, progress, log, monitor
+            )
     missing = set(chosen) - set(outcomes)
-    if gate is not None and gate.closed():
+    if monitor is not None and monitor.closed():
         outcomes |= {item: Outcome(item, "left") for item in missing}
     elif missing:  # read = done + skipped + failed + left
         raise StageError(f"{stage.name}: no account of {', '.join(sorted(missing))}; run it again")
@@ -220,12 +222,7 @@ class _Work:
 
 
 def _sort_items(
-    stage: Stage,
-    dataset: Dataset,
-    config: Any,
-    chosen: list[str],
-    ledger: Ledger,
-    threads: int,
+    stage: Stage, dataset: Dataset, config: Any, chosen: list[str], ledger: Ledger, threads: int
 ) -> _Work:
     """Sort items into those that are up to date, that cannot be read, and that are to do."""
     receipts, made = ledger.read(stage.name), ledger.made(stage.name)
@@ -273,13 +270,7 @@ def _sort_items(
     return work
 
 
-def _compare(
-    task: Task,
-    former: Receipt,
-    made: Made | None,
-    ledger: Ledger,
-    work: _Work,
-) -> None:
+def _compare(task: Task, former: Receipt, made: Made | None, ledger: Ledger, work: _Work) -> None:
     """Sort an item that a former run made: it is up to date, or is to be made again."""
     there, same = _is_there(task, made, ledger), former.fingerprint == task.fingerprint
     if there and same:
@@ -335,7 +326,7 @@ def _run_items(
     pool: Pool,
     progress: bool,
     log: RunLog,
-    gate: Gate | None,
+    monitor: RunMonitor | None,
 ) -> dict[str, Outcome]:
     """Run the items to do and record each as it ends; return the outcomes of all items."""
     outcomes, ended = dict(work.current), []
@@ -354,8 +345,8 @@ def _run_items(
             outcomes[receipt.item] = _outcome(receipt, again=work.again.get(receipt.item, ""))
             show(receipt)
             log.settle(receipt.item)
-            if gate is not None:
-                gate.settled(receipt)
+            if monitor is not None:
+                monitor.settled(receipt)
 
         def settle_task(receipt: Receipt) -> None:
             settle(receipt)
@@ -372,7 +363,7 @@ def _run_items(
         if work.tasks:
             with run_folder(dataset, stage.name) as folder:
                 tasks = [replace(task, folder=folder) for task in work.tasks]
-                pool.run(tasks, settle_task, begin, gate.closed if gate else lambda: False)
+                pool.run(tasks, settle_task, begin, monitor.closed if monitor else lambda: False)
     ledger.keep_digests()
     return outcomes
 
@@ -411,12 +402,12 @@ def _retire(dataset: Dataset, ledger: Ledger, stage: str, item: str) -> None:
     """Set an output aside that no later stage may read; kept in case it becomes valid again."""
     if not dataset.item_dir(stage, item).exists():
         return
-    receipt, made = ledger.read(stage).get(item), ledger.made(stage).get(item)
-    # The store may be emptied, and an import cannot be made again.
-    former = None
-    if receipt is not None and not receipt.imported:
-        former = replace(receipt, made=made)
-    set_aside(dataset, stage, item, keeping(dataset, former))
+    former = ledger.read(stage).get(item)
+    if former is not None and not former.imported:
+        keep = keeping(dataset, replace(former, made=ledger.made(stage).get(item)))
+    else:  # the store may be emptied, and an import cannot be made again
+        keep = None
+    set_aside(dataset, stage, item, keep)
 
 
 def _outcome(receipt: Receipt, status: str = "", again: str = "") -> Outcome:

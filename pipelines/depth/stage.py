@@ -15,7 +15,7 @@ from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
 from express50.dataset.depth_files import write_depth, write_normals
 from express50.dataset.tracks import read_track
-from express50.error_model import error_models, expect, size_sigma
+from express50.error_model import error_models, expect, single_camera_sigma
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.images import contact_sheet, shrink, srgb_to_linear, write_image
 from express50.geometry import meshes
@@ -60,7 +60,7 @@ def run(
     write_ply(out / "surface.ply", surface)
     write_glb(out / "surface.glb", surface)
     rows, photo, typical = write_views(out, surface, pictures, solid)
-    shared = size_sigma([picture.camera for picture in pictures], surface.vertices)
+    shared = single_camera_sigma([picture.camera for picture in pictures], surface.vertices)
     expected = expect(error_models()["depth"], typical, float(np.median(shared)))
     figures = figures_of(surface, rows, photo) | {"track": track}
     return Result(figures, dropped, expected_error=expected)

@@ -12,7 +12,7 @@ from express50.capture.frames import read_cameras_of
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
 from express50.dataset.tracks import REGISTRATION_SCHEMA, Track, existing_track, read_track
-from express50.error_model import error_bounds, size_sigma
+from express50.error_model import error_bounds, single_camera_sigma
 from express50.errors import FormatError, StageError
 from express50.files.digests import file_sha256
 from express50.files.images import contact_sheet, write_image
@@ -67,8 +67,8 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
 
 
 def lone_sigma(laid: LaidMesh, cameras: Sequence[Camera], model: HeadModel) -> np.ndarray:
-    """Return `size_sigma` (V,) along the mesh's normals."""
-    along = size_sigma(cameras, laid.vertices)
+    """Return `single_camera_sigma` (V,) along the mesh's normals."""
+    along = single_camera_sigma(cameras, laid.vertices)
     ray = laid.vertices - cameras[0].center
     cosine = (mesh_normals(laid.vertices, model.faces) * ray).sum(1) / np.linalg.norm(ray, axis=1)
     return along * np.abs(cosine)

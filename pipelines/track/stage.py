@@ -17,7 +17,7 @@ from express50.capture.frames import read_cameras_of
 from express50.capture.index import read_index
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
-from express50.error_model import Bounds, error_bounds, error_models, expect, size_sigma
+from express50.error_model import Bounds, error_bounds, error_models, expect, single_camera_sigma
 from express50.errors import StageError
 from express50.files.digests import path_digest, value_digest
 from express50.head.load import load_head
@@ -124,7 +124,9 @@ def run(
             dataset.windows_dir(item), clips_identity(inputs, config, shape, state, eyes),
         )  # fmt: skip
         dropped += lost
-    shared = size_sigma(list(read_cameras_of(dataset, item).values()), meshes.reshape(-1, 3))
+    shared = single_camera_sigma(
+        list(read_cameras_of(dataset, item).values()), meshes.reshape(-1, 3)
+    )
     typical = np.concatenate([one.typical for one in bounds])
     expected = expect(error_models()["track"], typical, shared)
     return Result(metrics, dropped, expected_error=expected)
@@ -156,7 +158,7 @@ def stated_bounds(
         error_bounds(
             "track",
             error_figures(own, mesh, cameras, marks, outlines),
-            size_sigma(list(cameras.values()), mesh),
+            single_camera_sigma(list(cameras.values()), mesh),
         )
         for own, mesh, marks in rows
     ]

@@ -11,7 +11,7 @@ import pytest
 
 from express50 import local_server
 from express50.errors import ConfigError
-from express50.local_server import NOT_FOUND, Door, PageServer, Reply
+from express50.local_server import NOT_FOUND, PageServer, Reply, RequestGuard
 
 
 def page(path):
@@ -43,7 +43,7 @@ def ask(server, path, method="GET", body=None, **headers):
 
 def test_only_the_address_that_was_printed_gives_the_page():
     with served() as server:
-        token = server.door.token
+        token = server.guard.token
         assert server.address == f"http://127.0.0.1:{server.server_port}/{token}/"
         assert ask(server, f"/{token}/").read() == b"a face"
         assert ask(server, f"/{token}/x").status == 200
@@ -52,7 +52,7 @@ def test_only_the_address_that_was_printed_gives_the_page():
             assert ask(server, path).status == 404
         again = PageServer(page, None, "127.0.0.1", 0)
         again.server_close()
-        assert again.door.token != token
+        assert again.guard.token != token
 
 
 @pytest.mark.parametrize(
@@ -68,20 +68,20 @@ def test_only_the_address_that_was_printed_gives_the_page():
 def test_other_sites_are_refused_even_with_the_token(headers):
     with served() as server:
         for method in ("GET", "POST"):
-            reply = ask(server, f"/{server.door.token}/", method, **headers)
+            reply = ask(server, f"/{server.guard.token}/", method, **headers)
             assert reply.status == 403 and b"face" not in reply.read()
 
 
 def test_a_server_for_other_machines_checks_token_and_origin():
-    door = Door("192.0.2.7", "secret")
-    assert door.refusal("lab.example:8000", "http://lab.example:8000") is None
-    assert door.refusal("lab.example:8000", "http://evil.example") is not None
-    assert door.inside("/secret/a") == "a" and door.inside("/secre/a") is None
+    guard = RequestGuard("192.0.2.7", "secret")
+    assert guard.refusal("lab.example:8000", "http://lab.example:8000") is None
+    assert guard.refusal("lab.example:8000", "http://evil.example") is not None
+    assert guard.path_after_token("/secret/a") == "a" and guard.path_after_token("/secre/a") is None
 
 
 def test_bodies_are_bounded():
     with served() as server:
-        post = f"/{server.door.token}/a"
+        post = f"/{server.guard.token}/a"
         assert ask(server, post, "POST", b"answer").read() == b"answer"
         assert ask(server, post, "POST", b"x" * 11).status == 404
         assert ask(server, post, "POST", **{"Content-Length": "-1"}).status == 404
@@ -94,19 +94,19 @@ def test_slow_requests_and_floods_end(monkeypatch):
     with served() as server:
         slow = [socket.create_connection(("127.0.0.1", server.server_port)) for _ in range(3)]
         host = f"Host: 127.0.0.1:{server.server_port}"
-        post = f"POST /{server.door.token}/a HTTP/1.0\r\n{host}\r\nContent-Length: 8\r\n\r\nab"
+        post = f"POST /{server.guard.token}/a HTTP/1.0\r\n{host}\r\nContent-Length: 8\r\n\r\nab"
         for connection in slow:
             connection.sendall(post.encode())
         time.sleep(0.1)
         with pytest.raises((OSError, http.client.HTTPException)):
-            ask(server, f"/{server.door.token}/")  # no thread is free
+            ask(server, f"/{server.guard.token}/")  # no thread is free
         for connection in slow:
             connection.settimeout(5)
             while connection.recv(4096):
                 pass
             connection.close()
         time.sleep(0.2)  # a thread is free a moment after its connection has ended
-        assert ask(server, f"/{server.door.token}/").status == 200
+        assert ask(server, f"/{server.guard.token}/").status == 200
 
 
 def test_a_bug_in_a_page_is_one_line(capsys):
@@ -115,7 +115,7 @@ def test_a_bug_in_a_page_is_one_line(capsys):
 
     with served(broken) as server:
         with pytest.raises((OSError, http.client.HTTPException)):
-            ask(server, f"/{server.door.token}/")
+            ask(server, f"/{server.guard.token}/")
         time.sleep(0.05)
     error = capsys.readouterr().err.strip()
     assert "KeyError" in error and "\n" not in error

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from express50.contract.stage import ExpectedError
-from express50.error_model import error_bounds, error_models, size_sigma
+from express50.error_model import error_bounds, error_models, single_camera_sigma
 from express50.geometry.cameras import Camera
 from pipelines.matte.stage import rim_figures, rim_of
 
@@ -64,8 +64,8 @@ def test_a_figure_that_is_not_known_counts_as_the_worst(stage):
 def test_a_lone_camera_does_not_know_how_far_away_a_head_is():
     one = Camera("a", 64, 64, "PINHOLE", (60, 60, 32, 32), np.eye(4))
     places = np.array([[0, 0, 1.0], [0, 0, 2.0]])
-    assert size_sigma([one, one], places).tolist() == [0, 0]
-    near, far = size_sigma([one], places)
+    assert single_camera_sigma([one, one], places).tolist() == [0, 0]
+    near, far = single_camera_sigma([one], places)
     assert far == pytest.approx(2 * near) and 20 < near < 80
     figures = dict.fromkeys(error_models()["track"].features, 1.0)
     alone, together = (error_bounds("track", figures, s) for s in (np.array([near]), 0.0))

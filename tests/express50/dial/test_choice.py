@@ -1,4 +1,4 @@
-"""What the dial takes to be left at the dearest settings, and how differences are measured."""
+"""The error that remains at the most expensive settings, and how differences are measured."""
 
 import json
 from pathlib import Path
@@ -9,7 +9,7 @@ import pytest
 from benchmarks.budget import Run, figures, quick_budgets
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, NoSettings, Stage
-from express50.dial.choice import Workload, remainder, size_factor
+from express50.dial.choice import Workload, remaining_square, size_factor
 from express50.dial.figures import Cost, Footage, PilotFigures, Trial
 from express50.dial.results import RESULTS
 from express50.head.load import load_head
@@ -19,19 +19,19 @@ LOST = np.array([0.5, 0.4, 0.1])  # squares: all cheap, then one stage dear, the
 
 
 def test_what_stated_errors_confirm_is_taken_off():
-    assert remainder(0.25 + LOST, LOST) == pytest.approx(0.25)
-    assert remainder(0.25 + 0.5 * LOST, LOST) == pytest.approx(0.25)
+    assert remaining_square(0.25 + LOST, LOST) == pytest.approx(0.25)
+    assert remaining_square(0.25 + 0.5 * LOST, LOST) == pytest.approx(0.25)
 
 
 def test_differences_that_no_stated_error_confirms_promise_nothing():
     same = np.full(3, 0.44)  # as of the mesh of the twin: a quarter was promised
-    assert remainder(same, LOST) == pytest.approx(0.44)
-    assert remainder(np.array([0.3, 0.35, 0.5]), LOST) == pytest.approx(0.35)  # they rise instead
+    assert remaining_square(same, LOST) == pytest.approx(0.44)
+    assert remaining_square(np.array([0.3, 0.35, 0.5]), LOST) == pytest.approx(0.35)  # they rise
 
 
 def test_a_remainder_is_not_below_zero():
-    assert remainder(np.array([0.4, 0.3, 0.0]), LOST) >= 0
-    assert remainder(np.array([0.3]), np.array([0.5])) == pytest.approx(0.3)
+    assert remaining_square(np.array([0.4, 0.3, 0.0]), LOST) >= 0
+    assert remaining_square(np.array([0.3]), np.array([0.5])) == pytest.approx(0.3)
 
 
 def test_registrations_differ_along_their_normals_alone(tmp_path, monkeypatch):

@@ -97,7 +97,7 @@ def test_what_is_made_again_is_said_with_its_reason(tmp_path):
 
 
 class OneItem:
-    """A gate that lets one item through."""
+    """A monitor that lets one item through."""
 
     def __init__(self):
         self.seen = []
@@ -110,14 +110,14 @@ class OneItem:
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_a_closed_gate_leaves_items_that_the_next_run_makes(tmp_path, workers):
-    dataset, gate = make_dataset(tmp_path, ["a", "b", "c", "d", "e", "f"]), OneItem()
+def test_a_closed_monitor_leaves_items_that_the_next_run_makes(tmp_path, workers):
+    dataset, monitor = make_dataset(tmp_path, ["a", "b", "c", "d", "e", "f"]), OneItem()
     config = toy.ToyConfig(seconds=0.1)
     with Pool(workers) as pool:
-        summary = run_stage(toy.STAGE, dataset, config, pool=pool, progress=False, gate=gate)
+        summary = run_stage(toy.STAGE, dataset, config, pool=pool, progress=False, monitor=monitor)
     left = [o.item for o in summary.outcomes if o.status == "left"]
     assert 3 <= len(left) <= 5 and not summary.ok and f"{len(left)} left" in next(summary.lines())
-    assert len(gate.seen) + len(left) == 6 and all(r.core_seconds > 0 for r in gate.seen)
+    assert len(monitor.seen) + len(left) == 6 and all(r.core_seconds > 0 for r in monitor.seen)
     rest = run_stage(toy.STAGE, dataset, config, workers=0, progress=False)
     assert rest.ok and rest.count("done") == len(left)
 
