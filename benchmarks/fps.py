@@ -1,8 +1,8 @@
 """Measure GRMM's frame rate: ``python -m benchmarks.fps [--device cpu --n-g 128 --size 256]``.
 
 Decode, rasterise and refine, features and depth on, at the paper's size (N_g 512, 1024 x 1024) with
-random weights, which cost what trained ones do. Two ways: everything again for every picture, as the
-paper's 75 frames per second are counted; and with what a moving camera leaves alone kept (mesh,
+random weights, which cost what trained ones do. Two ways: everything again for every picture, as
+the paper's 75 frames per second are counted; and with what a moving camera leaves alone kept (mesh,
 transforms, opacity) and the picture drawn in the head's window. The last line is one JSON object;
 without a CUDA device, and none other asked for, its figures are ``n/a``.
 """
