@@ -183,7 +183,7 @@ def test_numbers_that_cannot_be_are_refused_at_once(arguments, capsys):
     assert "expected a whole number of" in capsys.readouterr().err
 
 
-def test_unseen_people_are_measured_where_it_is_asked(checkpoint, shards, tmp_path):
+def test_unseen_people_are_measured_in_the_views_that_are_named(checkpoint, shards, tmp_path):
     arguments = ["evaluate", str(checkpoint), str(shards), str(tmp_path), "--subjects=S002"]
     arguments += ["--fit-cameras=cam00", "--fit-expression=e0", "--cameras=cam02"]
     assert main([*arguments, "--expressions=e1"]) == 0

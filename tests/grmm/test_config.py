@@ -30,7 +30,7 @@ def test_paper_preset_has_the_papers_numbers():
 
 
 @pytest.mark.parametrize("name", ["paper-plus", "small", "demo"])
-def test_own_presets_have_what_we_add(name):
+def test_our_presets_have_what_we_add(name):
     tables = as_tables(resolve(name))
     for table, values in PLUS.items():
         assert values.items() <= tables[table].items()

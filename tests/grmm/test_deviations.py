@@ -18,7 +18,7 @@ def settings(lines):
     return {line.split("`")[1] for line in lines if line.startswith("| `")}
 
 
-def test_the_letter_differs_from_itself_in_no_setting():
+def test_the_paper_preset_has_no_deviation():
     assert not settings(paper_diff(resolve("paper")))
     held = resolve("paper", None, ['data.holdout_cameras=["cam01"]', "train.seed=3"])
     assert not settings(paper_diff(held))

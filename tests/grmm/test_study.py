@@ -200,7 +200,7 @@ def test_commands_make_and_table(folders, tmp_path, capsys):
     assert "already has answers" in capsys.readouterr().err
 
 
-def test_too_few_common_pictures_are_said(folders, tmp_path):
+def test_too_few_common_pictures_are_refused(folders, tmp_path):
     methods = (("a", folders["ours"]), ("b", folders["theirs"]))
     with pytest.raises(ConfigError, match="7 pictures"):
         make_study(tmp_path / "x", folders["reference"], methods, examples=8)

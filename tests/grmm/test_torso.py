@@ -75,7 +75,7 @@ def test_a_torso_before_the_neck_hides_it_and_beside_it_nothing():
     assert not behind_torso(head, head.template, view, ~torso & torso).any()
 
 
-def test_a_hidden_neck_neither_teaches_nor_counts():
+def test_a_hidden_neck_is_neither_trained_on_nor_scored():
     plain = HeadViews(Labelled(size=64), necked_head()).item(0)
     item = HeadViews(Labelled(size=64), necked_head(), DataConfig(skip_hidden_neck=True)).item(0)
     shirt = torch.from_numpy(Labelled(size=64).read(0).parts == TORSO)

@@ -141,7 +141,7 @@ def test_training_on_a_full_disk_stops_at_once(tmp_path, source, monkeypatch, ca
     assert "iteration 20" not in capsys.readouterr().err
 
 
-def test_files_of_metrics_are_tried_before_training(tmp_path, source):
+def test_files_of_metrics_are_checked_before_training(tmp_path, source):
     (tmp_path / "bad.pth").write_bytes(b"mistyped")
     config = tiny_config(metrics={"alexnet": str(tmp_path / "bad.pth")})
     with pytest.raises(ConfigError, match="metrics.alexnet"):
@@ -378,7 +378,7 @@ def test_metrics_tell_what_each_component_gains(tmp_path):
     assert after.keys() == before.keys() and all(torch.equal(before[k], after[k]) for k in after)
 
 
-def test_terms_of_ones_own_join_the_objective(tmp_path, source):
+def test_terms_of_the_caller_are_added_to_the_objective(tmp_path, source):
     def opaque(state, rendering, item):
         return {"opaque": 10 * (1 - rendering.gaussians.opacities).mean()}
 

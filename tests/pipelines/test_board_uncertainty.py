@@ -50,7 +50,7 @@ def test_stated_errors_grow_with_the_noise_and_with_missing_images() -> None:
     assert one["cam00"].mm == pytest.approx(1100 * one["cam00"].px / focal, rel=0.1)
 
 
-def test_a_lone_camera_states_nothing() -> None:
+def test_a_single_camera_has_no_stated_error() -> None:
     rig = make_rig(1)
     boards = board_motion(12, 3, span_deg=20)
     solution = solve_rig(observe(rig, boards, 0.05), POINTS, sizes_of(rig))
@@ -98,7 +98,7 @@ def test_cameras_in_step_are_left_as_they_are() -> None:
     assert all(found.late == 0 == found.readout for found in solution.timing.values())
 
 
-def test_a_board_that_jumps_says_nothing_of_time() -> None:
+def test_a_board_that_jumps_gives_no_timing() -> None:
     rig = make_rig(3, span_deg=80)
     corners = observe(rig, board_motion(30, 7), 0.1)
     assert np.mean(corner_motion(corners)[0].any(axis=1)) < 0.1

@@ -73,7 +73,7 @@ def test_cameras_that_share_too_little_keep_their_colours():
 
 
 @pytest.mark.parametrize("shape", [(0, 4, 3), (10, 1, 3), (0, 0, 3)])
-def test_nothing_in_common_tells_nothing(shape):
+def test_gains_without_common_points_are_unknown(shape):
     found, before, after = fit_gains(np.ones(shape))
     assert np.isnan(found).all() and before is None and after is None
 
@@ -156,7 +156,7 @@ def test_gains_of_a_subject_without_a_board_are_none(tmp_path):
     assert json.loads((tmp_path / "calibrate" / "S001" / "gains.json").read_text()) == {}
 
 
-def test_a_bad_board_beside_given_cameras_costs_the_colours_alone(tmp_path):
+def test_a_bad_board_beside_given_cameras_leaves_out_the_colours_only(tmp_path):
     root = tmp_path / "raw"
     rig = make_capture(root)
     table = {"squares_x": 7, "squares_y": 5, "square_length_m": 0.04, "marker_length_m": 0.03}

@@ -81,7 +81,7 @@ def test_disagreeing_patches_raise_bounds():
     assert bounds == sorted(bounds) and bounds[-1] > 1.2 * bounds[0]
 
 
-def test_confidence_gives_the_bound_back():
+def test_the_bound_can_be_computed_from_the_confidence():
     view = wall(np.full((SIDE, SIDE), 1.0))
     stored = np.rint(255 * view.confidence) / 255
     again = SURE_MM * (1 / stored[view.valid] - 1)

@@ -63,7 +63,7 @@ def test_a_lighter_strand_stays_lighter_than_its_neighbours():
 
 
 @pytest.mark.parametrize("alpha", [0, 255, 128])
-def test_nothing_solid_or_nothing_soft_leaves_the_frame(alpha):
+def test_a_frame_without_solid_or_without_soft_pixels_stays_as_it_is(alpha):
     frame = np.full((8, 8, 3), 90, np.uint8)
     assert (own_colours(frame, np.full((8, 8), alpha, np.uint8), None) == frame).all()
 

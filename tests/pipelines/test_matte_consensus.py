@@ -88,7 +88,7 @@ def test_a_spot_that_neighbours_lack_too_is_filled_where_the_rig_is_dense():
 
 
 @pytest.mark.parametrize("wrong", ["moved", "empty", "full", "upside down"])
-def test_one_wrong_camera_is_named_and_changes_nobody(wrong):
+def test_one_wrong_camera_is_named_and_other_mattes_stay(wrong):
     views = make_views()
     alpha = views[3].alpha
     shift = np.float32([[1, 0, 0.2 * SIZE], [0, 1, 0]])
@@ -113,7 +113,7 @@ def test_a_wrong_camera_does_not_hide_what_another_must_remove():
 
 @settings(max_examples=12, deadline=None)
 @given(st.integers(0, 11), st.floats(0, 1), st.floats(0, 1), st.floats(0.02, 0.3), st.booleans())
-def test_no_blob_in_one_camera_costs_anybody_any_of_the_head(k, x, y, radius, hole):
+def test_no_blob_in_one_camera_removes_any_of_the_head(k, x, y, radius, hole):
     views = make_views()
     alpha, blob = views[k].alpha, disc(x, y, radius)
     bad = np.where(blob, 0, alpha) if hole else np.maximum(alpha, blob)

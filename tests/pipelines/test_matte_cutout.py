@@ -122,7 +122,7 @@ def test_a_photograph_becomes_a_sample_of_shards_without_plate_or_weights(tmp_pa
     assert 0.5 < np.median(sample["depth"][known]) < 3.0
 
 
-def test_a_frame_without_a_face_costs_itself_alone(tmp_path: Path) -> None:
+def test_a_frame_without_a_face_fails_alone(tmp_path: Path) -> None:
     """Of a video whose second half shows a wall, the first half is matted."""
     face, wall = data.astronaut()[:256, 100:356], np.repeat(data.brick()[:256, :256, None], 3, 2)
     write_video(tmp_path / "eva.mp4", [np.ascontiguousarray(i) for i in [face] * 4 + [wall] * 4])

@@ -107,7 +107,7 @@ def test_a_wide_gap_in_the_subject_shows_the_plate() -> None:
     assert alpha[subject].mean() > 0.995
 
 
-def test_the_difference_of_mere_noise_is_one() -> None:
+def test_the_difference_is_one_where_only_noise_differs() -> None:
     rng = np.random.default_rng(9)
     true = clutter(rng, 200)
     plate, frame = (
@@ -266,7 +266,7 @@ def test_a_plate_of_another_room_explains_nothing() -> None:
 
 @pytest.mark.parametrize("shape", [(2, 2), (8, 300), (64, 64)])
 @pytest.mark.parametrize("level", [0, 255])
-def test_blank_and_tiny_plates_give_numbers(shape: tuple[int, int], level: int) -> None:
+def test_blank_and_tiny_plates_give_finite_mattes(shape: tuple[int, int], level: int) -> None:
     frame = np.random.default_rng(0).integers(0, 256, (*shape, 3), dtype=np.uint8)
     plate = np.full_like(frame, level)
     for valid in (np.ones(shape, bool), np.zeros(shape, bool)):

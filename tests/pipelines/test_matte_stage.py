@@ -142,7 +142,7 @@ def test_a_bad_network_fails_items_in_one_line_each(aligned, tmp_path, how, mess
         assert "matte.weights" in outcome.reason and message in outcome.reason
 
 
-def test_weights_that_are_not_there_are_said_once_and_cost_nothing(aligned, tmp_path) -> None:
+def test_missing_weights_are_reported_before_anything_is_run_again(aligned, tmp_path) -> None:
     assert run(aligned).count("done") == 2
     with pytest.raises(ConfigError, match="matte.weights .*no such file"):
         run(aligned, method="salient", weights=str(tmp_path / "net.pt"))

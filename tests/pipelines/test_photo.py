@@ -58,7 +58,7 @@ def test_a_bare_photograph_is_tracked(tracked: tuple[Path, dict]) -> None:
     assert 'focal_source = "guess"' in meta
 
 
-def test_its_head_is_a_head_from_the_side_too(tracked: tuple[Path, dict]) -> None:
+def test_the_head_has_the_dimensions_of_an_adults(tracked: tuple[Path, dict]) -> None:
     """No dimension of a head leaves what adults have, depth least of all."""
     with np.load(tracked[0] / "track/eva_1/track.npz") as track:
         head = (track["vertices"][0] - track["t"][0]) @ track["R"][0]
@@ -253,7 +253,7 @@ def test_a_video_is_tracked_in_every_frame(tmp_path: Path, astronaut: np.ndarray
 @pytest.mark.parametrize(
     "setting", ["head=flame.pkl", "landmarks=points.npz", "landmarks=fan:x.pt"]
 )
-def test_files_that_settings_name_are_missed_by_the_settings_name(
+def test_a_missing_file_is_reported_with_the_setting_that_names_it(
     tracked: tuple[Path, dict], tmp_path: Path, setting: str, capsys: pytest.CaptureFixture
 ) -> None:
     shutil.copytree(tracked[0], tmp_path / "out")

@@ -311,7 +311,7 @@ def test_what_stands_off_the_face_is_a_hand(off: float, is_hand: bool) -> None:
 
 
 @pytest.mark.parametrize(("rows", "left_out"), [(0, False), (2, False), (12, True)])
-def test_a_fringe_does_not_teach_the_skins_colours_and_brows_do(rows: int, left_out: bool) -> None:
+def test_a_fringe_is_left_out_of_skin_colours_and_brows_are_not(rows: int, left_out: bool) -> None:
     rng = np.random.default_rng(0)
     rgb = np.clip((205, 160, 140) + rng.normal(0, 6, (40, 40, 3)), 0, 255).astype(np.uint8)
     rgb[:rows] = (60, 40, 30)

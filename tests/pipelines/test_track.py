@@ -245,7 +245,7 @@ def test_fitted_rotations_stay_rotations() -> None:
     assert np.linalg.det(R) > 0
 
 
-def test_views_that_the_fit_contradicts_lose_their_say() -> None:
+def test_views_that_contradict_the_fit_lose_weight() -> None:
     scene = make_scene()
     targets, _ = targets_of(scene, make_views(scene.marks, 0.3))
     shifted = targets[0].observation.views[1]
@@ -362,7 +362,7 @@ def test_no_face_anywhere_is_a_clear_error(
         STAGE.run(dataset, "S001", TrackConfig(), tmp_path)
 
 
-def test_footage_that_is_gone_is_told_from_faces_that_are_not_there(
+def test_missing_footage_and_missing_faces_have_different_messages(
     tracked_dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from pipelines.track import STAGE, read_inputs

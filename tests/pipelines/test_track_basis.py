@@ -33,7 +33,7 @@ def coarse() -> np.ndarray:
     return offset_modes(ball_head(16), 100, SIGMA, LENGTH)
 
 
-def test_deviation_is_as_asked_and_does_not_depend_on_the_mesh(coarse) -> None:
+def test_the_deviation_is_the_one_set_on_every_mesh(coarse) -> None:
     fine = offset_modes(ball_head(32), 100, SIGMA, LENGTH)
     for heights in (coarse, fine):
         assert deviation(heights).mean() == pytest.approx(SIGMA, rel=0.1)
@@ -58,7 +58,7 @@ def test_deviation_and_scale_follow_their_settings(coarse) -> None:
     assert deviation(same).mean() == pytest.approx(deviation(coarse).mean(), rel=0.02)
 
 
-def test_the_same_in_every_run_and_broad_before_fine(coarse) -> None:
+def test_modes_are_the_same_in_every_run_and_broad_before_fine(coarse) -> None:
     np.testing.assert_array_equal(coarse, offset_modes(ball_head(16), 100, SIGMA, LENGTH))
     size = np.sort(np.linalg.norm(coarse, axis=0))[::-1]
     assert size[0] > 3 * size[-1]

@@ -138,7 +138,7 @@ def test_landmarks_seen_aside_pull_the_mesh_there(head, chart, monkeypatch) -> N
     np.testing.assert_allclose(far.sigma, slide.sigma, rtol=1e-4)
 
 
-def test_what_is_not_seen_says_nothing(head, chart, monkeypatch) -> None:
+def test_a_map_that_is_hardly_seen_gives_no_term(head, chart, monkeypatch) -> None:
     read_as(monkeypatch, mass=0.05)
     assert slide_term(head, chart, None, posed(head)) is None
 

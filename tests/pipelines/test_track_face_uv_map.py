@@ -93,7 +93,7 @@ def test_eyes_and_mouth_are_not_skin_and_a_head_without_regions_is_all_skin(head
     assert bare.skin.all() and len(bare.texels) == WIDTH * HEIGHT
 
 
-def test_where_nothing_is_off_nothing_is_to_be_moved(head, chart, monkeypatch) -> None:
+def test_a_mesh_in_its_true_place_is_not_moved(head, chart, monkeypatch) -> None:
     rng = np.random.default_rng(3)
 
     def right(*arguments):
@@ -263,7 +263,7 @@ def test_training_goes_on_where_it_was_stopped(tmp_path, monkeypatch, head) -> N
 
 
 @pytest.mark.parametrize("content", [None, b"no archive", "others", "shapes"])
-def test_weights_to_go_on_from_must_be_such(tmp_path, capsys, content) -> None:
+def test_training_starts_only_from_files_of_weights(tmp_path, capsys, content) -> None:
     path = tmp_path / "start.npz"
     if isinstance(content, bytes):
         path.write_bytes(content)

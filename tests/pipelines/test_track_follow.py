@@ -90,7 +90,7 @@ def test_a_clip_begins_where_its_peak_was() -> None:
     assert gone.look(marks(), [peak]) is not None and gone.searched == len(CAMERAS)
 
 
-def test_sources_that_know_no_place_are_asked_anew() -> None:
+def test_sources_that_cannot_follow_search_the_whole_picture() -> None:
     stage = Stage(marks())
     assert stage.look(marks(), follow=False) is not None
     assert stage.searched == len(CAMERAS) and stage.followed == 0
@@ -155,7 +155,7 @@ def test_nothing_to_follow_scores_low() -> None:
         assert found.score < 0.5 and np.isfinite(found.points).all()
 
 
-def test_condensed_evidence_has_the_cost_and_slope_it_stands_for() -> None:
+def test_condensed_evidence_has_the_cost_and_slope_of_the_full_one() -> None:
     from pipelines.track.fit import condensed, fit
     from pipelines.track.state import State
 

@@ -95,7 +95,7 @@ def test_eyes_shut_all_along_are_told_by_other_times():
     assert not shut_lids(clip, [])[0].shut
 
 
-def test_one_iris_by_chance_opens_no_eye():
+def test_one_iris_found_by_chance_does_not_open_an_eye():
     found = seen(len(RIG))
     found["wink_left"][1:, LEFT] = False
     observations = [observe(table, time) for time, table in found.items()]
@@ -109,7 +109,7 @@ def test_half_of_the_irises_are_an_open_eye():
     assert all(a is b for a, b in zip(shut_lids(observations), observations, strict=True))
 
 
-def test_cameras_that_never_find_an_iris_say_nothing():
+def test_cameras_that_never_find_an_iris_shut_no_lids():
     found = {time: np.zeros((len(RIG), 2), dtype=bool) for time in TIMES}
     observations = [observe(table, time) for time, table in found.items()]
     assert all(a is b for a, b in zip(shut_lids(observations), observations, strict=True))

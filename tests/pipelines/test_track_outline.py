@@ -42,7 +42,7 @@ def test_both_directions_of_a_shrunk_matte_keep_their_scale(axis: int) -> None:
 
 
 @pytest.mark.parametrize("fill", [0, 255])
-def test_a_matte_without_an_edge_says_nothing(fill: int) -> None:
+def test_a_matte_without_an_edge_has_no_distance(fill: int) -> None:
     assert signed_distance(np.full((40, 40), fill, np.uint8), make_camera(0.0, 40)) is None
 
 

@@ -88,7 +88,7 @@ def nothing(found, *rest) -> bool:
     return relief is None or len(relief.goals) < 0.02 * len(found.height)
 
 
-def test_bare_skin_tells_nothing() -> None:
+def test_skin_without_texture_gives_no_measurement() -> None:
     cameras = rig()
     lit = [picture(c, colour=lambda p: 0.6 + 2.0 * p).mean(2) for c in cameras]
     assert nothing(*search(cameras, lit))
@@ -98,12 +98,12 @@ def test_bare_skin_tells_nothing() -> None:
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0])
-def test_black_and_white_pictures_tell_nothing(value: float) -> None:
+def test_all_black_and_all_white_pictures_give_no_measurement(value: float) -> None:
     cameras = rig()
     assert nothing(*search(cameras, [np.full((256, 256), value, np.float32)] * 4))
 
 
-def test_one_view_two_of_the_same_and_none_tell_nothing(pictures) -> None:
+def test_one_view_or_the_same_view_twice_gives_no_measurement(pictures) -> None:
     cameras, images = pictures
     assert nothing(*search(cameras[:1], images[:1]))
     assert nothing(*search(cameras[:1] * 2, images[:1] * 2))
@@ -138,7 +138,7 @@ def test_few_samples_are_refused_rather_than_believed(pictures) -> None:
 
 
 @pytest.mark.parametrize("centre", [(1000.0, 0, 0), (-300.0, 1000.0, 700.0)])
-def test_far_from_the_origin_it_is_the_same(pictures, centre) -> None:
+def test_the_search_does_not_depend_on_the_origin(pictures, centre) -> None:
     here, *_ = search(*pictures)
     centre = np.array(centre)
     cameras = rig(centre=centre)

@@ -57,7 +57,7 @@ def test_texture_that_moved_pulls_the_mesh_after_it(uv_map, mesh, shift):
     assert (term.sigma > 0).all() and np.isfinite(term.goals).all()
 
 
-def test_what_is_flat_unseen_or_torn_away_says_nothing(uv_map, mesh):
+def test_flat_hidden_or_replaced_texture_gives_no_term(uv_map, mesh):
     still = SkinMap(textured(), everywhere())
     flat = SkinMap(np.full(SIZE, 128, np.uint8), everywhere())
     hidden = SkinMap(textured(), ~everywhere())
