@@ -151,47 +151,46 @@ def refine(
     model, found = basis.model, targets
     slides: list[SlideTerm | None] = [None] * len(targets)
     things = [np.zeros((0, 3)) for _ in targets]
-    hiding = list(things)  # and glasses
+    hiding = list(things)  # the things and glasses, by expression
     glasses: dict[int, np.ndarray] = {}  # by expression, found once
-    outlines = sum(len(one.distances) for one in evidence.pictures)
-    for number, one in enumerate(schedule):
+    outlines = sum(len(pictures.distances) for pictures in evidence.pictures)
+    for number, current in enumerate(schedule):
         meshes, turns, found = all_vertices(model, state), rotations(state), []
         clear = [without(*pair) for pair in zip(evidence.pictures, hiding, strict=True)]
-        flows = skin_flows(model, targets, evidence, clear, meshes) if one.follow_skin else {}
+        flows = skin_flows(model, targets, evidence, clear, meshes) if current.follow_skin else {}
         for index, (target, pictures) in enumerate(zip(targets, evidence.pictures, strict=True)):
             mesh, terms = meshes[index], [*target.terms]
             hidden = under_hair(model, evidence.skin, pictures, mesh)
-            if one.patch_reach_m and (number < SEARCHES or len(things[index])):
+            if current.patch_reach_m and (number < SEARCHES or len(things[index])):
                 things[index] = things_before(model, evidence.skin, pictures, mesh)
                 if index not in glasses:
                     glasses[index] = glasses_on(model, pictures, mesh, turns[index])
                 hiding[index] = np.concatenate([things[index], glasses[index]])
             pictures = without(pictures, hiding[index])
-            if one.outlines:
+            if current.outlines:
                 terms += outline_terms(
                     model, pictures.distances, mesh, outlines, evidence.bald, hidden, hiding[index]
                 )
-            if one.patch_reach_m:
-                reach, weight = one.patch_reach_m, one.patch_weight
+            if current.patch_reach_m:
+                reach, weight = current.patch_reach_m, current.patch_weight
                 terms += patch_terms(model, evidence.skin, pictures, mesh, reach, weight, hidden)
-            if one.read_uv and evidence.uv_map is not None:
+            if current.read_uv and evidence.uv_map is not None:
                 slides[index] = slide_term(model, evidence.uv_map, pictures, mesh)
             terms += flows.get(index, [])
-            seen = replace(
-                target, terms=tuple(terms), sigma=doubted(model, target, hidden, things[index])
-            )
-            seen = with_irises_and_jaw(model, seen, mesh, turns[index], evidence.eyes)
-            found.append(with_slide(seen, slides[index]))
-        if one.follow_skin:
+            sigma = doubted(model, target, hidden, things[index])
+            target = replace(target, terms=tuple(terms), sigma=sigma)
+            target = with_irises_and_jaw(model, target, mesh, turns[index], evidence.eyes)
+            found.append(with_slide(target, slides[index]))
+        if current.follow_skin:
             person = freeze_shape(basis, state.shape, state.bias)
             moved, _ = fit(person, found, State(np.zeros(0), state.poses), ROUND_STEPS)
             state = replace(state, poses=moved.poses)
-            continue
-        state, _ = fit(basis, found, state, ROUND_STEPS, free_modes(found))
+        else:
+            state, _ = fit(basis, found, state, ROUND_STEPS, free_modes(found))
     meshes, turns = all_vertices(model, state), rotations(state)
     worn = [glasses[index] for index in sorted(glasses)]  # of all expressions, or never looked for
-    for index, seen_on in enumerate(worn):
-        if len(seen_on):
+    for index, places in enumerate(worn):
+        if len(places):
             worn[index] = glasses_on(model, evidence.pictures[index], meshes[index], turns[index])
     return state, found, worn
 
