@@ -120,13 +120,21 @@ class Summary:
         for outcome in self.outcomes:
             if outcome.status == "failed":
                 yield f"  failed {outcome.item}: {outcome.reason}"
-            for part in outcome.dropped:
-                yield f"  dropped {part.what} of {outcome.item}: {part.why}"
-        doubtful = [(o.item, note) for o in self.outcomes for note in o.warnings]
-        for item, note in doubtful[:WARNINGS]:
-            yield f"  warning {item}: {note.what}: {note.why}"
+            for what, why in _joined(outcome.dropped):
+                yield f"  dropped {what} of {outcome.item}: {why}"
+        doubtful = [(o.item, *note) for o in self.outcomes for note in _joined(o.warnings)]
+        for item, what, why in doubtful[:WARNINGS]:
+            yield f"  warning {item}: {what}: {why}"
         if len(doubtful) > WARNINGS:
             yield f"  and {len(doubtful) - WARNINGS} more warnings: see the items' metrics.json"
+
+
+def _joined(notes: Sequence[Note]) -> list[tuple[str, str]]:
+    """Return the parts and the reason of notes, those with one reason in one line."""
+    parts: dict[str, list[str]] = {}
+    for note in notes:
+        parts.setdefault(note.why, []).append(note.what)
+    return [(", ".join(what), why) for why, what in parts.items()]
 
 
 def select_items(stage: Stage, dataset: Dataset, pattern: str) -> list[str]:

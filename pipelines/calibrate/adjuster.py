@@ -375,4 +375,5 @@ def eliminate(
 def _sum_by(rows: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
     """Sum (count, ...) of rows (N, ...) by their group (N,)."""
     table = csr_array((np.ones(len(rows)), (group, np.arange(len(rows)))), (count, len(rows)))
-    return (table @ rows.reshape(len(rows), -1)).reshape(count, *rows.shape[1:])
+    flat = rows.reshape(len(rows), int(np.prod(rows.shape[1:])))
+    return (table @ flat).reshape(count, *rows.shape[1:])

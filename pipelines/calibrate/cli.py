@@ -144,7 +144,10 @@ def _report(
     say(f"footage: {footage.points} points{error}")
     for name, why in footage.unchecked.items():
         say(f"warning: {name} cannot be checked: {why}")
-    for name, move in footage.moved.items():
+    for name, why in footage.mirrored.items():
+        say(f"mirrored: {name}: {why}")
+    for name in sorted(set(footage.moved) - set(footage.mirrored)):
+        move = footage.moved[name]
         say(
             f"moved: {name}: its picture is {move.shift_px:.1f} px off, as if turned by"
             f" {move.turn_deg:.2f} deg and shifted by {move.move_mm:.1f} mm; calibrate it again"

@@ -36,6 +36,7 @@ from pipelines.calibrate.tracks import (
     PointTracks,
     candidate_matches,
     join_tracks,
+    mirrored_cameras,
 )
 from pipelines.calibrate.uncertainty import HeadError, footage_uncertainty, head_error_of
 
@@ -124,6 +125,10 @@ def solve_footage(
         frame: replace(points, landmarks=[(n, p, s * wider) for n, p, s in points.landmarks])
         for frame, points in seen.items()
     }
+    widths = {name: size[0] for name, size in sizes.items()}
+    mirrored = mirrored_cameras(seen, widths, combinations(sorted(sizes), 2))
+    seen = {frame: points.without(mirrored) for frame, points in seen.items()}
+    sizes = {name: size for name, size in sizes.items() if name not in mirrored}
     share = focal_at(distance_m, seen, sizes, head)
     guesses = {n: focals.get(n, share * max(size)) for n, size in sizes.items()}
     lens = "SIMPLE_RADIAL" if model == AUTO else model
@@ -156,7 +161,8 @@ def solve_footage(
         tracks=tracks,
         errors=adjusted.errors,
         inliers=tracks.features() & (sigmas < OUTLIER),
-        dropped={n: LONE if n in faces else BLIND for n in sorted(sizes) if n not in metric},
+        dropped=mirrored
+        | {n: LONE if n in faces else BLIND for n in sorted(sizes) if n not in metric},
         weak=_weak(tracks),
         uncertainty={n: head_error_of(metric[n], px**2, away[n]) for n, px in expected.items()},
         eyes=eyes,

@@ -23,7 +23,14 @@ from pipelines.calibrate.adjuster import (
     triangulate_tracks,
 )
 from pipelines.calibrate.footage import at_footage_size, reduced_camera
-from pipelines.calibrate.tracks import LEAST_POINTS, FrameSetPoints, PointTracks, join_tracks
+from pipelines.calibrate.tracks import (
+    LEAST_POINTS,
+    FrameSetPoints,
+    PointTracks,
+    join_tracks,
+    mirrored_cameras,
+    neighbours,
+)
 
 MOVE_BANDS = ((0.1, 0.015), (0.02, 0.003))
 """Two passes, bumps of degrees first: largest distance of matches from epipolar lines, and least
@@ -60,13 +67,15 @@ class FootageCheck:
     """The result of checking cameras against `points` that two or more of them see.
 
     `error_px` is the median reprojection error, None without points. `moved` lists the surest
-    first; `cameras` have the corrected poses. `unchecked` gives a reason per camera.
+    first; `cameras` have the corrected poses. `unchecked` gives a reason per camera, and `mirrored`
+    the reason to believe that a camera's pictures are.
     """
 
     points: int
     error_px: float | None
     moved: dict[str, CameraMove]
     unchecked: dict[str, str]
+    mirrored: dict[str, str]
     cameras: dict[str, Camera]
 
 
@@ -100,6 +109,7 @@ def check_footage(
         )
         for name in moved
     }
+    widths = {name: camera.width for name, camera in now.items()}
     return FootageCheck(
         points=len(fit.points),
         error_px=float(np.median(errors)) if len(errors) else None,
@@ -109,6 +119,7 @@ def check_footage(
             for name, count in zip(tracks.names, tracks.shared_points(), strict=True)
             if count < LEAST_POINTS
         },
+        mirrored=mirrored_cameras(seen, widths, neighbours(cameras)),
         cameras=corrected,
     )
 

@@ -106,15 +106,13 @@ def _write(rig: CalibratedRig, check: FootageCheck | None, out: Path) -> Result:
             "squares": rig.gains.squares,
             "unjudged": [name for name in names if name not in gains],
         }
-    moved = [
-        Note(
-            name,
-            f"seems to have moved since it was calibrated: its picture is off by"
-            f" {move.shift_px:.1f} px (turned {move.turn_deg:.2f} degrees, moved"
-            f" {move.move_mm:.1f} mm); calibrate the rig again, or leave the camera out",
-        )
-        for name, move in (check.moved if check else {}).items()
-    ]
+    moved = {
+        name: f"seems to have moved since it was calibrated: its picture is off by"
+        f" {move.shift_px:.1f} px (turned {move.turn_deg:.2f} degrees, moved"
+        f" {move.move_mm:.1f} mm); calibrate the rig again, or leave the camera out"
+        for name, move in (check.moved.items() if check else ())
+    }
+    moved |= check.mirrored if check else {}
     figures["footage"] = check and {
         "points": check.points,
         "error_px": _rounded(check.error_px, 4),
@@ -127,7 +125,7 @@ def _write(rig: CalibratedRig, check: FootageCheck | None, out: Path) -> Result:
         "models": {name: rig.cameras[name].model for name in names},
         **figures,
     }
-    return Result(metrics, rig.dropped, (*rig.warnings, *moved), rig.expected)
+    return Result(metrics, rig.dropped, (*rig.warnings, *_notes(moved)), rig.expected)
 
 
 def _rounded(value: float | None, digits: int) -> float | None:
@@ -245,7 +243,7 @@ def _out_of_step(timing: Mapping[str, CameraTiming]) -> dict[str, str]:
         ways = []
         if camera.late:
             side = "late" if camera.late > 0 else "early"
-            ways.append(f"its pictures are {abs(camera.late):.2f} of a frame {side}")
+            ways.append(f"its pictures are {abs(camera.late):.2f} frames {side}")
         if camera.readout:
             rows = f"its last row {abs(camera.readout):.2f} of a frame from its first"
             ways.append(f"{rows} (rolling shutter)")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TypeAlias
@@ -26,6 +26,7 @@ FEATURE_SIGMA_PX = 0.7
 NEIGHBOURS, WIDEST_DEG = 6, 45.0
 """Features are compared between each camera and this many neighbours, if their axes differ by less
 than the angle: beyond it features no longer look alike."""
+LEAST_MIRRORED = 100  # matches; faces that are their own mirror image give up to 46
 LEAST_POINTS = 20  # that a camera must share with two others to be judged by them
 
 
@@ -79,6 +80,11 @@ class FrameSetPoints:
     landmarks: list[tuple[str, np.ndarray, np.ndarray]]
     features: dict[str, Features]
 
+    def without(self, names: Container[str]) -> FrameSetPoints:
+        """Leave out what some cameras saw."""
+        views = [view for view in self.landmarks if view[0] not in names]
+        return FrameSetPoints(views, {n: f for n, f in self.features.items() if n not in names})
+
 
 def join_tracks(
     cameras: Mapping[str, Camera],
@@ -100,7 +106,7 @@ def join_tracks(
     ideal = {f: {n: _undistorted(cameras[n], p.features[n]) for n in names if n in p.features}
              for f, p in seen.items()}  # fmt: skip
     matches: dict[int, list[tuple[str, str, np.ndarray]]] = {frame: [] for frame in seen}
-    for a, b in _neighbours(cameras):
+    for a, b in neighbours(cameras):
         both = {f: (views[a], views[b]) for f, views in ideal.items() if a in views and b in views}
         rig, reach = (cameras[a], cameras[b]), band * np.hypot(cameras[b].width, cameras[b].height)
         found = (
@@ -150,7 +156,7 @@ def _undistorted(camera: Camera, features: Features) -> Features:
     return np.where(valid, xy, 0) * K[[0, 1], [0, 1]] + K[:2, 2], described * valid
 
 
-def _neighbours(cameras: Mapping[str, Camera]) -> list[tuple[str, str]]:
+def neighbours(cameras: Mapping[str, Camera]) -> list[tuple[str, str]]:
     """List the pairs of cameras, in order of name, of which one is among the other's nearest."""
     names = sorted(cameras)
     axes = np.stack([cameras[name].cam_from_world[2, :3] for name in names])
@@ -231,6 +237,44 @@ def candidate_matches(features: Mapping[int, Mapping[str, Features]]) -> PairMat
         }
         for a, b in combinations(names, 2)
     }
+
+
+def mirrored_cameras(
+    seen: Mapping[int, FrameSetPoints],
+    widths: Mapping[str, int],
+    pairs: Iterable[tuple[str, str]],
+) -> dict[str, str]:
+    """Return which cameras record mirrored pictures, with the reason to believe it.
+
+    In the fullest frame set their features match those of other cameras only if mirrored. `pairs`
+    of cameras are compared. Where they stand far apart nothing is found: a face is nearly its own
+    mirror image.
+    """
+    frame = max(sorted(seen), key=lambda number: len(seen[number].features))
+    features = seen[frame].features
+    counts = {name: [0, 0] for name in features}
+    for a, b in (pair for pair in pairs if set(pair) <= set(features)):
+        for i, mine in enumerate((features[a], _mirrored(features[a], widths[a]))):
+            matches = verified_pairs({frame: (mine, features[b])})
+            for name in (a, b):
+                counts[name][i] += len(matches.get(frame, ()))
+    return {
+        name: f"{turned} features of its pictures match other cameras if mirrored, {straight} as"
+        " recorded: switch mirroring off where they are recorded, or mirror the files"
+        for name, (straight, turned) in counts.items()
+        if turned > 2 * straight + LEAST_MIRRORED
+    }
+
+
+def _mirrored(features: Features, width: int) -> Features:
+    """Return features as the mirrored picture has them.
+
+    A SIFT descriptor has four rows of four cells with eight directions each. Rows and directions
+    change sides.
+    """
+    pixels, described = features
+    cells = described.reshape(-1, 4, 4, 8)[:, ::-1, :, -np.arange(8) % 8]
+    return pixels * [-1, 1] + [width, 0], cells.reshape(-1, 128)
 
 
 def verified_pairs(

@@ -12,7 +12,7 @@ Source: mrcal's projection uncertainty (Kogan, https://mrcal.secretsauce.net/unc
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -53,10 +53,12 @@ class HeadError:
 def state_uncertainty(solution: BoardSolution, points: np.ndarray) -> dict[str, HeadError]:
     """Estimate each camera's error in the head's place; empty for a lone camera.
 
+    Cameras that have this place behind them are left out, as they see nothing of it.
     `points` (P, 3) are corners on the board. Where rigs of two halves of the board images differ by
     more than the covariance predicts, the variance is multiplied by the mean of 1 and the squared
     ratio.
     """
+    solution = _facing(solution)
     names = sorted(solution.cameras)
     if len(names) < 2:
         return {}
@@ -80,6 +82,17 @@ def state_uncertainty(solution: BoardSolution, points: np.ndarray) -> dict[str, 
             squared[name] *= max(1.0, (1 + off**2 / sum(half[name] for half in variance)) / 2)
     depth = {name: solution.cameras[name].cam_from_world[2, 3] for name in names}
     return {n: head_error_of(solution.cameras[n], squared[n], depth[n]) for n in names}
+
+
+def _facing(solution: BoardSolution) -> BoardSolution:
+    """Leave out the cameras that do not have the whole head's place before them."""
+    cameras = {n: c for n, c in solution.cameras.items() if c.cam_from_world[2, 3] > HEAD_RADIUS_M}
+    facing = np.array([name in cameras for name in solution.corners.cameras])
+    keep = facing[solution.corners.camera]
+    return replace(
+        solution, cameras=cameras, corners=solution.corners.select(keep),
+        errors=solution.errors[keep],
+    )  # fmt: skip
 
 
 def head_error_of(camera: Camera, squared_px: float, distance_m: float) -> HeadError:

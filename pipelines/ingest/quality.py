@@ -29,6 +29,7 @@ START_COST = 7.0  # cost of being out of step from the start
 ALIKE = 0.35  # least correlation with the other cameras at which a camera is judged
 EARLY = 8  # a change of lag before this frame looks like one before the start
 LEAST_SPREAD = 0.15  # of curves of unit variance, between different views
+MOVING = 1.5  # ratio of quick to slow movement; noise alone has less than 1.2
 STILL = 0.05  # share of a camera's usual movement below which a frame repeats the one before
 
 CELLS = 16
@@ -95,6 +96,12 @@ def check_quality(
         words += [blurred[name]] if name in blurred else []
         if words:
             warnings[f"camera {name}"] = "; ".join(words)
+    if len(unjudged) == len(seen) and all_move(moves, clips):
+        warnings["sync"] = (
+            "all cameras see movement, but no two the same: they are out of step by more than"
+            f" {sync_frames} frames, or show different things; cut their footage so that all begin"
+            " at the same moment"
+        )
     figures = {
         "sync": {
             "out_of_step": {k: [asdict(s) for s in v] for k, v in steps.items()},
@@ -113,6 +120,14 @@ class Step:
 
     frame: int
     lag: int
+
+
+def all_move(moves: Mapping[str, np.ndarray], clips: Sequence[int]) -> bool:
+    """Return whether enough cameras see something move for long enough to be compared."""
+    if len(moves) < FEWEST_CAMERAS or max(clips) < FEWEST_FRAMES:
+        return False
+    slow, fast = np.percentile(np.stack(list(moves.values()))[:, 1:], (10, 90), axis=1)
+    return bool((fast > MOVING * slow).all())
 
 
 def small_grey(image: np.ndarray) -> np.ndarray:

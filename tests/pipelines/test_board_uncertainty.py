@@ -113,5 +113,5 @@ def test_late_and_rolling_cameras_are_named() -> None:
     }
     found = _out_of_step(timing)
     assert sorted(found) == ["a", "b"]
-    assert "0.25 of a frame late" in found["a"] and "rolling shutter" not in found["a"]
-    assert "0.10 of a frame early" in found["b"] and "rolling shutter" in found["b"]
+    assert "0.25 frames late" in found["a"] and "rolling shutter" not in found["a"]
+    assert "0.10 frames early" in found["b"] and "rolling shutter" in found["b"]
