@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from express50.cli.main import main
+from express50.__main__ import main
 from express50.errors import CalibrationError
 from express50.files.calibration import write_cameras
 from express50.files.images import read_image, write_image
