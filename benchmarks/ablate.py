@@ -12,13 +12,13 @@ takes a smaller twin and shorter trainings. The last line is one JSON object.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 from pathlib import Path
 
 import torch
 
+from benchmarks.common import make_parser
 from benchmarks.grmm import held_out, make_shards
 from express50.files.atomic import write_json
 from grmm.ablate import GROUPS, Ablation, ablate
@@ -79,7 +79,7 @@ def measure(shards: Path, out: Path, changes: list[str], seeds: int, images: int
 
 def main() -> None:
     """Parse, measure, print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser("ablate", __doc__)
     parser.add_argument("out", type=Path, nargs="?", default=Path("build/benchmark_ablate"))
     parser.add_argument("--quick", action="store_true", help="smaller twin, shorter trainings")
     parser.add_argument("--seeds", type=int, default=3, help="trainings of every row")

@@ -11,7 +11,6 @@ last line printed is one JSON object.
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 import sys
@@ -27,17 +26,21 @@ from annotations import align, observe
 from annotations.labels import append_label, make_mark
 from annotations.observe.stage import STABLE, cue_frames, read_observations, similarity_2d
 from annotations.suggestions import read_suggestions, reference_subject
-from benchmarks.document import replace_section
+from benchmarks.common import (
+    add_twin_options,
+    check_twin_options,
+    make_parser,
+    replace_section,
+    run_or_stop,
+)
 from benchmarks.replay import measure_steps, replay
 from express50.capture.expressions import NEUTRAL
 from express50.capture.frames import read_proxy
 from express50.capture.index import Cue, read_index
-from express50.contract.config import PRESETS, build_config
+from express50.contract.config import PRESETS
 from express50.contract.layout import Dataset
-from express50.contract.stage import Stage
 from express50.files.images import write_image
 from express50.files.text import markdown_table
-from express50.runner.runner import run_stage
 from express50.twin.config import TwinConfig
 from express50.twin.record import record
 from express50.twin.truth import Truth
@@ -52,16 +55,14 @@ SOURCE = (2160, 3840)
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure, print a table and the JSON line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.align", description=__doc__)
-    parser.add_argument("--dataset", type=Path, help="an ingested dataset of twin captures")
-    parser.add_argument("--truth", type=Path, help="truth folder of the recording")
+    parser = make_parser("align", __doc__)
+    add_twin_options(parser)
     parser.add_argument("--subjects", type=int, default=6)
     parser.add_argument("--frames", type=int, default=12, help="frames an expression")
     parser.add_argument("--preset", default="standard", choices=PRESETS)
     parser.add_argument("--doc", type=Path, help="write the acceptance table into this document")
     options = parser.parse_args(arguments)
-    if (options.dataset is None) != (options.truth is None):
-        parser.error("give both --dataset and --truth, or neither")
+    check_twin_options(parser, options)
     with tempfile.TemporaryDirectory() as scratch:
         dataset = Dataset(Path(scratch) / "dataset")
         if options.dataset is None:
@@ -83,8 +84,8 @@ def measure(dataset: Dataset, truth: Truth, preset: str) -> dict:
     """Return all figures but the steps' time."""
     subjects = dataset.subjects()
     began = time.perf_counter()
-    run(observe.STAGE, dataset, preset)
-    run(align.STAGE, dataset, preset, match=False)
+    run_or_stop(observe.STAGE, dataset, preset)
+    run_or_stop(align.STAGE, dataset, preset, match=False)
     seconds = time.perf_counter() - began
     peaks = peak_errors(dataset, truth)
     farthest = [
@@ -118,14 +119,6 @@ def within(errors: list[int], frames: int) -> float:
     return round(float(np.mean(np.array(errors) <= frames)), 4)
 
 
-def run(stage: Stage, dataset: Dataset, preset: str, **values: object) -> None:
-    """Run a stage in this process; stops the benchmark when an item fails."""
-    config = build_config(stage, {**stage.presets.get(preset, {}), **values})
-    summary = run_stage(stage, dataset, config, workers=0, progress=False)
-    if not summary.ok:
-        sys.exit("\n".join(summary.lines()))
-
-
 def peak_errors(dataset: Dataset, truth: Truth) -> list[int]:
     """Count the frames off the true peak of every suggestion but the neutral one's."""
     return [
@@ -145,7 +138,7 @@ def match_errors(
     """
     reference = reference_subject(dataset)
     levels = label_reference(dataset, truth, reference, off_apex)
-    run(align.STAGE, dataset, preset)
+    run_or_stop(align.STAGE, dataset, preset)
     errors, confidences = [], []
     for subject in dataset.subjects():
         for expression, found in read_suggestions(dataset, subject).items():
@@ -253,7 +246,7 @@ def record_subjects(scratch: Path, dataset: Dataset, subjects: int, frames: int)
     )  # fmt: skip
     record(config, scratch / "twin")
     register(dataset, sorted((scratch / "twin" / "captures").iterdir()))
-    run(ingest.STAGE, dataset, "standard")
+    run_or_stop(ingest.STAGE, dataset, "standard")
     return Truth(scratch / "twin" / "truth")
 
 
@@ -280,7 +273,7 @@ def record_4k(scratch: Path, dataset: Dataset, cameras: int = 24, frames: int = 
     (capture / "cues.csv").write_text("expression_id,start_frame,end_frame\n" + cues)
     big = Dataset(scratch / "big_dataset")
     register(big, [capture])
-    run(ingest.STAGE, big, "standard")
+    run_or_stop(ingest.STAGE, big, "standard")
     return big
 
 

@@ -12,7 +12,6 @@ of its time, and keeps no promise. The last line printed is one JSON object.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import shutil
@@ -24,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.common import make_parser
 from benchmarks.demo import EXPRESSIONS, record_twin
 from benchmarks.intervals_collect import peak_samples, row_samples
 from express50.contract.config import PRESETS
@@ -64,7 +64,7 @@ class Run:
 
 def main() -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser("budget", __doc__)
     parser.add_argument("out", type=Path, nargs="?", default=Path("build/budget"))
     parser.add_argument("--captures", type=Path, nargs="+", help="footage without truth")
     parser.add_argument("--quick", action="store_true")

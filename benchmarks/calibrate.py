@@ -16,12 +16,11 @@ head's place. ``colour_gain_error_percent`` is of linear light a channel;
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,6 +28,14 @@ import cv2
 import numpy as np
 
 from benchmarks.calibrate_footage import refine_figures, see_capture, sfm_figures
+from benchmarks.common import (
+    add_twin_options,
+    check_twin_options,
+    make_parser,
+    recorded,
+    rms,
+    rounded,
+)
 from express50.capture.index import Index, read_index
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
@@ -41,12 +48,9 @@ from express50.geometry.transforms import (
     matrix_to_axis_angle,
 )
 from express50.rigs.world_frame import meeting_point
-from express50.runner.runner import run_stage
 from express50.twin.config import TwinConfig
-from express50.twin.record import print_progress, record
 from express50.twin.rig import make_rig, make_sensor
 from express50.twin.truth import Truth, align_worlds
-from pipelines import ingest
 from pipelines.calibrate import STAGE
 from pipelines.calibrate.board import (
     BoardCorners,
@@ -93,17 +97,15 @@ SCENES = {"twin_six_expressions": replace(APART, cameras=24), "twin_40_degrees_a
 
 def main() -> int:
     """Run and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--dataset", type=Path, help="a twin dataset (default: one is recorded)")
-    parser.add_argument("--truth", type=Path, help="its truth")
+    parser = make_parser("calibrate", __doc__)
+    add_twin_options(parser)
     parser.add_argument("--recording", type=Path, default=Path("build/bench-rig"))
     parser.add_argument("--bumps", type=int, default=3, help="cameras bumped, one after another")
     parser.add_argument("--preset", default="standard")
     parser.add_argument("--set", dest="assignments", action="append", default=[])
     args = parser.parse_args()
+    check_twin_options(parser, args)
     cv2.setNumThreads(1)
-    if (args.dataset is None) != (args.truth is None):
-        sys.exit("name both --dataset and --truth, or neither")
     if args.dataset is None:
         dataset, truth = recorded(RIG, args.recording)
     else:
@@ -191,43 +193,6 @@ def footage_figures(
     return {"sfm": sfm, "refine": refine}
 
 
-def add_data_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that name a twin dataset and its truth."""
-    parser.add_argument("--dataset", type=Path, default=Path("build/demo/data/demo"))
-    parser.add_argument("--truth", type=Path, default=Path("build/demo/twin/truth"))
-    parser.add_argument("--small", type=Path, default=Path("build/bench-twin"))
-
-
-def dataset_and_truth(args: argparse.Namespace) -> tuple[Dataset, Truth]:
-    """Return the named dataset, or a small one recorded for the purpose."""
-    dataset = Dataset(args.dataset)
-    if dataset.captures_file.is_file():
-        return dataset, Truth(args.truth)
-    print(f"{dataset.root}: not there; recording a small twin in {args.small}", file=sys.stderr)
-    config = TwinConfig(
-        subjects=2,
-        cameras=6,
-        width=384,
-        height=384,
-        expressions=("neutral", "jaw_open"),
-        frames_per_expression=4,
-    )
-    return recorded(config, args.small)
-
-
-def recorded(config: TwinConfig, folder: Path) -> tuple[Dataset, Truth]:
-    """Return a twin recording, made where it is not there, and ingested."""
-    record(config, folder, report=print_progress())
-    dataset = Dataset(folder / "data")
-    ingest.register(dataset, sorted((folder / "captures").iterdir()))
-    ingested = run_stage(
-        ingest.STAGE, dataset, resolve_config(ingest.STAGE, "draft"), workers=0, progress=False
-    )
-    if not ingested.ok:
-        sys.exit(f"{dataset.root}: ingest failed; run 'express50 ingest' on {folder}")
-    return dataset, Truth(folder / "truth")
-
-
 def bump_figures(
     cameras: Mapping[str, Camera], index: Index, bumps: int, frame_sets: int = 2
 ) -> dict[str, object]:
@@ -297,11 +262,6 @@ def head_error(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> f
     return rms(camera_errors(estimated, true, points).values())
 
 
-def rms(values: Iterable[float]) -> float:
-    """Return the root mean square."""
-    return float(np.sqrt(np.mean(np.square(list(values)))))
-
-
 def stated_figures(
     observations: BoardCorners,
     points: np.ndarray,
@@ -365,11 +325,6 @@ def chained(
     boards = rig_from_boards(placed, lone, views, poses)
     cameras = {name: replace(lone[name], cam_from_world=pose) for name, pose in placed.items()}
     return BoardRig(cameras, boards)
-
-
-def rounded(row: Mapping[str, object]) -> dict[str, object]:
-    """Return the row with floats to five significant digits."""
-    return {k: float(f"{v:.5g}") if isinstance(v, float) else v for k, v in row.items()}
 
 
 if __name__ == "__main__":

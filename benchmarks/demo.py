@@ -8,7 +8,6 @@ one JSON object, also written to ``summary.json``.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import shutil
@@ -22,6 +21,7 @@ from pathlib import Path
 
 import psutil
 
+from benchmarks.common import make_parser
 from express50.contract.layout import Dataset
 
 # Without `register`: nothing that the demo measures uses its meshes.
@@ -223,7 +223,7 @@ def summarise(dataset: Path, truth: Path | None, steps: list[Step]) -> dict:
 
 def main() -> None:
     """Run the demo."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser("demo", __doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--captures", type=Path, nargs="+", help="raw captures instead of the twin")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)

@@ -17,18 +17,23 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import resource
 import sys
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from benchmarks.common import (
+    add_twin_options,
+    check_twin_options,
+    in_own_process,
+    make_parser,
+    run_or_stop,
+)
 from benchmarks.depth_fusion import fuse
 from benchmarks.depth_score import Mesh, score, summary
 from benchmarks.depth_sweep import sweep
@@ -41,7 +46,6 @@ from express50.dataset.tracks import read_track
 from express50.geometry.cameras import Camera
 from express50.geometry.raycast import camera_rays, mesh_scene
 from express50.head.load import load_head
-from express50.runner.runner import run_stage
 from express50.twin.truth import Truth
 from pipelines import track
 from pipelines.depth import STAGE
@@ -69,7 +73,10 @@ def main(arguments: list[str] | None = None) -> int:
             return 0
         result: dict = {"benchmark": "depth", "items": items}
         for name in (*options.presets.split(","), *BASELINES):
-            rows = [alone(options.dataset, options.truth, item, name) for item in items]
+            rows = [
+                in_own_process(measure, options.dataset, options.truth, item, name)
+                for item in items
+            ]
             result[name] = summary([row for row in rows if row])
             print(name, json.dumps(result[name]), file=sys.stderr, flush=True)
     medians = [result[name].get("abs_error_mm_median") for name in BASELINES if name in result]
@@ -83,9 +90,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
     """Parse the command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.depth", description=__doc__)
-    parser.add_argument("--dataset", type=Path, help="dataset with mattes (and tracks)")
-    parser.add_argument("--truth", type=Path, help="truth folder of the recording")
+    parser = make_parser("depth", __doc__)
+    add_twin_options(parser)
     parser.add_argument("--presets", default=",".join(PRESETS))
     parser.add_argument("--items", type=int, default=0, help="only so many; 0: all")
     parser.add_argument("--cameras", type=int, default=26, help="recorded; two are not used")
@@ -94,8 +100,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--axes", help="settings to sweep, of views,pixels,voxel")
     parser.add_argument("--doc", type=Path, help="document whose section the sweep replaces")
     options = parser.parse_args(arguments)
-    if (options.dataset is None) != (options.truth is None):
-        parser.error("give both --dataset and --truth, or neither")
+    check_twin_options(parser, options)
     if not set(options.presets.split(",")) <= set(PRESETS):
         parser.error(f"--presets {options.presets!r}, expected some of {','.join(PRESETS)}")
     return options
@@ -106,14 +111,8 @@ def record(options: argparse.Namespace, folder: Path) -> tuple[Path, Path]:
     twin = twin_config(1, options.cameras, options.side)
     twin = replace(twin, first_subject=43, expressions=("neutral", "smile"))
     dataset, truth, _ = prepare(twin, folder)
-    run_stage(track.STAGE, dataset, build_config(track.STAGE, {}), workers=0, progress=False)
+    run_or_stop(track.STAGE, dataset)
     return dataset.root, truth.root
-
-
-def alone(dataset: Path, truth: Path, item: str, name: str) -> dict | None:
-    """Run :func:`measure` in a process of its own, so that its memory can be measured."""
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(measure, dataset, truth, item, name).result()
 
 
 def measure(dataset_root: Path, truth_root: Path, item: str, name: str) -> dict | None:
@@ -133,10 +132,10 @@ def measure(dataset_root: Path, truth_root: Path, item: str, name: str) -> dict 
         names = ("voxels_allocated", "voxels_dense", "grid_bytes", "voxel_mm")
         found |= {key: surface.figures[key] for key in names}
     else:
-        made = baseline(name, dataset, subject, expression, views)
-        if made is None:
+        found_mesh = baseline(name, dataset, subject, expression, views)
+        if found_mesh is None:
             return None
-        mesh = made
+        mesh = found_mesh
     found["s"] = None if name == "tracked_mesh" else time.process_time() - start
     found["gib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     sure = None

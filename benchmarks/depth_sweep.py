@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from benchmarks.common import evenly, in_own_process, replace_section
 from benchmarks.depth_score import score
-from benchmarks.document import replace_section
 from express50.capture.index import read_peaks
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
@@ -40,9 +38,8 @@ def sweep(options: argparse.Namespace, item: str) -> dict:
     rows = []
     for axis in chosen:
         for value in AXES[axis][1]:
-            with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-                task = pool.submit(measure, options.dataset, options.truth, item, axis, value)
-                rows.append(task.result())
+            source = options.dataset, options.truth, item
+            rows.append(in_own_process(measure, *source, axis, value))
             print(rows[-1], file=sys.stderr, flush=True)
     if options.doc is not None:
         replace_section(options.doc, SECTION, as_markdown(rows, item))
@@ -60,8 +57,7 @@ def measure(dataset_root: Path, truth_root: Path, item: str, axis: str, value: f
         config = replace(config, **{AXES[axis][0]: value})
     views, pictures, _ = read_views(dataset, item, config.image_side)
     if axis == "views":
-        count = min(int(value), len(views))
-        views = [views[k] for k in np.linspace(0, len(views) - 1, count).round().astype(int)]
+        views = evenly(views, int(value))
     start = time.process_time()
     solid, _ = read_tracked(dataset, item, views)
     surface = reconstruct(views, solid, config.voxel_mm, config.voxel_px, config.noise)

@@ -9,7 +9,6 @@ renames are late, ``FAULT_CLOCK`` seconds by which the clock is wrong, ``FAULT_H
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import os
 import subprocess
@@ -19,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks.common import make_parser
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Result, Stage
@@ -133,7 +133,7 @@ STAGE = Stage(
 
 def main() -> int:
     """Run the stage once."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.fault_stage", description=__doc__)
+    parser = make_parser("fault_stage", __doc__)
     parser.add_argument("root", type=Path)
     parser.add_argument("notes")
     parser.add_argument("--workers", type=int, default=0)

@@ -12,7 +12,6 @@ item, is in `restart_seconds_median`. The last line printed is one JSON object.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import itertools
 import json
@@ -29,6 +28,7 @@ from pathlib import Path
 
 import psutil
 
+from benchmarks.common import make_parser
 from benchmarks.fault_case import (
     LONGEST,
     PATIENCE,
@@ -68,7 +68,7 @@ ITERATIONS = 12
 
 def main(arguments: list[str] | None = None) -> int:
     """Hurt and count."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.faults", description=__doc__)
+    parser = make_parser("faults", __doc__)
     parser.add_argument("--hours", type=float, default=1 / 60, help="how long (a minute)")
     parser.add_argument("--seed", type=int, help="run this case alone")
     parser.add_argument("--folder", type=Path, help="keep cases here, and go on with them")

@@ -9,7 +9,6 @@ without a CUDA device, and none other asked for, its figures are ``n/a``.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import time
@@ -19,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from benchmarks.common import make_parser
 from express50.geometry.transforms import look_at
 from express50.head.load import load_head
 from grmm.config import resolve
@@ -108,7 +108,7 @@ def measure(device: torch.device, n_g: int, size: int, seconds: float) -> dict[s
 
 def main() -> None:
     """Parse, measure, print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser("fps", __doc__)
     parser.add_argument("--device", help="cuda where there is one")
     parser.add_argument("--n-g", type=int, default=512)
     parser.add_argument("--size", type=int, default=1024)

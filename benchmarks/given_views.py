@@ -11,12 +11,12 @@ dataset: what a fit draws comes from the given views, what it is compared with f
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+from benchmarks.common import make_parser
 from express50.__main__ import main as express50
 from express50.capture.frames import read_cameras_of, read_peak_frame, read_plate_image
 from express50.contract.layout import Dataset
@@ -108,7 +108,7 @@ def given_shards(
 
 def main() -> None:
     """Track from the given views, and say where the shards are."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser("given_views", __doc__)
     parser.add_argument("dataset", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--subject", required=True)

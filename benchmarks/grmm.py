@@ -12,7 +12,6 @@ The last line is one JSON object.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
 import os
@@ -23,6 +22,7 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.common import make_parser
 from benchmarks.demo import record_twin, run_stages, subject_of
 from benchmarks.given_views import given_shards
 from express50.contract.layout import Dataset
@@ -209,7 +209,7 @@ def measure(shards: Path, out: Path, iterations: int, images: int) -> dict:
 
 def main() -> None:
     """Parse, measure, print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser("grmm", __doc__)
     parser.add_argument("out", type=Path, nargs="?", default=Path("build/benchmark_grmm"))
     parser.add_argument("--shards", type=Path, help="packed shards instead of twin captures")
     parser.add_argument("--people", type=int, default=0, help="the first so many of the twin's 8")

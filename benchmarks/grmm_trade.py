@@ -10,7 +10,6 @@ camera at the shards' own size. Writes the table into docs/TRADEOFFS.md with ``-
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
@@ -22,7 +21,7 @@ import cv2
 import numpy as np
 import torch
 
-from benchmarks.document import replace_section
+from benchmarks.common import make_parser, replace_section
 from benchmarks.grmm import held_out
 from express50.files.atomic import write_json
 from express50.files.text import markdown_table
@@ -172,7 +171,7 @@ def choices(rows: list[dict]) -> list[dict]:
 
 def main() -> None:
     """Parse, measure, print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser("grmm_trade", __doc__)
     parser.add_argument("shards", type=Path)
     parser.add_argument("--budgets", type=float, nargs="+", default=[60.0, 240.0])
     parser.add_argument("--settings", nargs="+", default=list(SETTINGS), choices=list(SETTINGS))

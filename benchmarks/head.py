@@ -11,7 +11,6 @@ sampled built-in heads from three sides with ICT's beside. The last line printed
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
@@ -22,6 +21,7 @@ import numpy as np
 import open3d as o3d
 import torch
 
+from benchmarks.common import make_parser
 from express50.geometry.raycast import mesh_scene
 from express50.geometry.transforms import axis_angle_to_matrix, rigid_fit
 from express50.head.load import load_builtin, load_head
@@ -44,7 +44,7 @@ MEASURES = {
 
 def main(arguments: list[str] | None = None) -> int:
     """Fit unseen people, measure sampled ones, and print the figures."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.head", description=__doc__)
+    parser = make_parser("head", __doc__)
     parser.add_argument("--ict", help="ICT-FaceKit: a checkout or an .npz of its arrays")
     parser.add_argument("--people", type=int, default=8, help="identities to fit")
     parser.add_argument("--seed", type=int, default=2026)

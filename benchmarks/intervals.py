@@ -30,6 +30,7 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
+from benchmarks.common import make_parser
 from benchmarks.intervals_collect import (
     Sample,
     half_shares,
@@ -84,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parse the command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.intervals", description=__doc__)
+    parser = make_parser("intervals", __doc__)
     parser.add_argument("--work", type=Path, default=Path("build/intervals"))
     names = [one.name for one in CONDITIONS]
     parser.add_argument("--conditions", nargs="*", choices=names, metavar="NAME",

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from annotations import align, observe
-from benchmarks.align import run as run_stage_or_stop
+from benchmarks.common import run_or_stop
 from benchmarks.track import write_peaks
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
@@ -194,5 +194,5 @@ def make_peaks(noise: float, numbers: Sequence[int], root: Path) -> None:
     dataset = Dataset(folder / "dataset")
     take_in(dataset, sorted((folder / "twin" / "captures").iterdir()))
     for stage in (ingest.STAGE, observe.STAGE):
-        run_stage_or_stop(stage, dataset, "standard")
-    run_stage_or_stop(align.STAGE, dataset, "standard", match=False)
+        run_or_stop(stage, dataset, "standard")
+    run_or_stop(align.STAGE, dataset, "standard", match=False)

@@ -16,7 +16,6 @@ is one JSON object.
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 import xml.etree.ElementTree as ElementTree
@@ -28,6 +27,7 @@ import cv2
 import numpy as np
 import torch
 
+from benchmarks.common import make_parser
 from express50.head.load import load_head
 from express50.landmarks import WEIGHTS
 from express50.landmarks.detector import detect, detect_many
@@ -57,7 +57,7 @@ class Frame:
 
 def main(arguments: list[str] | None = None) -> int:
     """Print the errors of the shipped weights, and of others beside them."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.landmarks", description=__doc__)
+    parser = make_parser("landmarks", __doc__)
     parser.add_argument("--real", type=Path, help="folder of photographs with dlib's XML")
     parser.add_argument("--ict", help="ICT-FaceKit checkout or .npz, rendered as well")
     parser.add_argument("--before", type=Path, help="other weights, measured beside the shipped")

@@ -26,18 +26,16 @@ import sys
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 
-from benchmarks.calibrate import add_data_arguments, dataset_and_truth, rounded
+from benchmarks.common import evenly, make_parser, recorded, rounded, true_pictures
 from benchmarks.matte_scenes import make_scenes
-from express50.capture.frames import read_frame, read_recorded_plate
-from express50.capture.index import read_index
 from express50.contract.layout import Dataset
 from express50.files.images import srgb_to_linear
-from express50.geometry.cameras import pinhole
-from express50.geometry.sampling import undistort_image, undistorted_mask
+from express50.twin.config import TwinConfig
 from express50.twin.truth import Truth
 from pipelines.matte.config import MatteConfig
 from pipelines.matte.key import dilated, eroded, key_alpha
@@ -47,6 +45,10 @@ from pipelines.pack.crop import own_colours
 HARD = (4.0, 6.0, 10.0, 16.0, 24.0, 40.0)  # 8-bit steps
 LOW, HIGH = (2.0, 4.0, 8.0, 16.0, 32.0), (12.0, 25.0, 40.0, 60.0, 90.0)  # noise deviations
 RIM = 8.0  # pixels
+SMALL = TwinConfig(
+    subjects=2, cameras=6, width=384, height=384, expressions=("neutral", "jaw_open"),
+    frames_per_expression=4,
+)  # fmt: skip
 Rows = dict[str, list[dict[str, float]]]
 
 
@@ -67,10 +69,10 @@ class Picture:
 
 def main() -> int:
     """Run and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    add_data_arguments(parser)
+    parser = make_parser("matte", __doc__)
+    parser.add_argument("--dataset", type=Path, default=Path("build/demo/data/demo"))
+    parser.add_argument("--truth", type=Path, default=Path("build/demo/twin/truth"))
+    parser.add_argument("--small", type=Path, default=Path("build/bench-twin"))
     parser.add_argument("--size", type=int, default=640, help="pixels of a scene's side")
     parser.add_argument("--twin", action="store_true", help="measure on the twin too")
     parser.add_argument("--pictures", type=int, default=24, help="of the twin, at most")
@@ -155,22 +157,18 @@ def pictures(dataset: Dataset, truth: Truth, limit: int) -> Iterator[Picture]:
         for camera in truth.cameras(subject).values()
         for frame in truth.peaks(subject).values()
     ]
-    for i in np.unique(np.linspace(0, len(every) - 1, min(limit, len(every))).round().astype(int)):
-        subject, camera, frame = every[i]
-        index = read_index(dataset, subject)
-        if camera.id not in index.plates:
-            sys.exit(f"{dataset.root}: {subject}/{camera.id} has no plate; name another --dataset")
-        plate = read_recorded_plate(index, camera.id)
-        image = read_frame(dataset, subject, camera.id, frame, undistort=False)
-        valid = undistorted_mask(camera)
-        valid = cv2.erode(valid.astype(np.uint8), np.ones((3, 3))) > 0
-        yield Picture(
-            name=f"{subject} {camera.id} {frame}",
-            frame=undistort_image(image, camera),
-            plate=undistort_image(plate, camera),
-            valid=valid,
-            true=truth.render_alpha(subject, frame, pinhole(camera)) * valid,
-        )
+    for subject, camera, frame in evenly(every, limit):
+        name = f"{subject} {camera.id} {frame}"
+        yield Picture(name=name, **true_pictures(dataset, truth, subject, camera, frame))
+
+
+def dataset_and_truth(args: argparse.Namespace) -> tuple[Dataset, Truth]:
+    """Return the named dataset, or a small one recorded for the purpose."""
+    dataset = Dataset(args.dataset)
+    if dataset.captures_file.is_file():
+        return dataset, Truth(args.truth)
+    print(f"{dataset.root}: not there; recording a small twin in {args.small}", file=sys.stderr)
+    return recorded(SMALL, args.small)
 
 
 def baselines(picture: Picture, textbook: bool) -> Iterator[tuple[str, np.ndarray, float]]:

@@ -40,17 +40,22 @@ from typing import Any
 import cv2
 import numpy as np
 
-from benchmarks.calibrate import recorded, rounded
+from benchmarks.common import (
+    add_twin_options,
+    check_twin_options,
+    evenly,
+    make_parser,
+    recorded,
+    rounded,
+    true_pictures,
+)
 from benchmarks.matte import errors
 from benchmarks.matte_disturbances import DISTURBANCES, Shot, other_plates, walls
-from express50.capture.frames import read_frame, read_recorded_plate
-from express50.capture.index import read_index
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.errors import NoFaceError
 from express50.files.images import contact_sheet, write_image
 from express50.geometry.cameras import pinhole
-from express50.geometry.sampling import undistort_image, undistorted_mask
 from express50.twin.config import TwinConfig
 from express50.twin.truth import Truth
 from pipelines.matte import STAGE
@@ -69,9 +74,9 @@ RIG = TwinConfig(
     cameras=24,
     width=384,
     height=384,
+    footage="jpg",
     expressions=("neutral", "jaw_open"),
     frames_per_expression=4,
-    footage="jpg",
     board_frames=0,
     give_calibration=True,
 )
@@ -88,11 +93,8 @@ class Keyed:
 
 def main() -> int:
     """Run and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--dataset", type=Path, help="a twin dataset (default: one is recorded)")
-    parser.add_argument("--truth", type=Path, help="its truth")
+    parser = make_parser("matte_views", __doc__)
+    add_twin_options(parser)
     parser.add_argument("--subject", type=int, default=RIG.first_subject, help="of the twin")
     parser.add_argument("--recording", type=Path, default=Path("build/bench-views"))
     parser.add_argument("--peaks", type=int, default=2, help="moments, at most")
@@ -100,9 +102,8 @@ def main() -> int:
     parser.add_argument("--pictures", type=Path, help="folder for pictures of the standard preset")
     parser.add_argument("--plates-only", action="store_true", help="leave out no_plate")
     args = parser.parse_args()
+    check_twin_options(parser, args)
     cv2.setNumThreads(1)
-    if (args.dataset is None) != (args.truth is None):
-        sys.exit("name both --dataset and --truth, or neither")
     if args.dataset is None:
         dataset, truth = recorded(replace(RIG, first_subject=args.subject), args.recording)
     else:
@@ -121,8 +122,15 @@ def main() -> int:
                 for preset, config in configs.items():
                     row = measure(keyed[::step], config, sheet_of(args, preset, scene, step, frame))
                     rows.setdefault((len(keyed[::step]), preset, scene), []).append(row)
-                    print(subject, frame, scene, preset, len(keyed[::step]), rounded(row),
-                          file=sys.stderr)  # fmt: skip
+                    print(
+                        subject,
+                        frame,
+                        scene,
+                        preset,
+                        len(keyed[::step]),
+                        rounded(row),
+                        file=sys.stderr,
+                    )
         if not args.plates_only:
             for scene, shots in {"recorded": clean, **walls(clean)}.items():
                 for step in (1, 3):
@@ -156,32 +164,19 @@ def main() -> int:
 def moments(dataset: Dataset, truth: Truth, limit: int) -> list[tuple[str, int]]:
     """Return (subject, frame) of an even choice of the peaks."""
     every = [(s, frame) for s in dataset.subjects() for frame in truth.peaks(s).values()]
-    picks = np.linspace(0, len(every) - 1, min(limit, len(every))).round().astype(int)
-    return [every[i] for i in np.unique(picks)]
+    return evenly(every, limit)
 
 
 def shots_of(dataset: Dataset, truth: Truth, subject: str, frame: int) -> list[Shot]:
     """Return undistorted frames and plates of a moment with their true alpha and depth."""
-    shots = []
-    for camera in truth.cameras(subject).values():
-        index = read_index(dataset, subject)
-        if camera.id not in index.plates:
-            sys.exit(f"{dataset.root}: {subject}/{camera.id} has no plate; name another --dataset")
-        plate = read_recorded_plate(index, camera.id)
-        image = read_frame(dataset, subject, camera.id, frame, undistort=False)
-        valid = cv2.erode(undistorted_mask(camera).astype(np.uint8), np.ones((3, 3))) > 0
-        ideal = pinhole(camera)
-        shots.append(
-            Shot(
-                camera=camera,
-                frame=undistort_image(image, camera),
-                plate=undistort_image(plate, camera),
-                valid=valid,
-                true=truth.render_alpha(subject, frame, ideal) * valid,
-                depth=truth.render_depth(subject, frame, ideal)[0],
-            )
+    return [
+        Shot(
+            camera=camera,
+            depth=truth.render_depth(subject, frame, pinhole(camera))[0],
+            **true_pictures(dataset, truth, subject, camera, frame),
         )
-    return shots
+        for camera in truth.cameras(subject).values()
+    ]
 
 
 def key(shot: Shot) -> Keyed:
@@ -233,10 +228,12 @@ def without_plates(shots: list[Shot], sheet: Path | None) -> Figures:
         for found in (alphas, keyed, alone)
     )
     return {
-        "sad": float(sad.mean()), "sad_plate": float(sad_plate.mean()),
-        "sad_alone": float(sad_alone.mean()), "worst_ratio": float((sad / sad_plate).max()),
+        "sad": float(sad.mean()),
+        "sad_plate": float(sad_plate.mean()),
+        "sad_alone": float(sad_alone.mean()),
+        "worst_ratio": float((sad / sad_plate).max()),
         "seconds_per_view": seconds / len(shots),
-    }  # fmt: skip
+    }
 
 
 def _alone(shot: Shot, view: CutView) -> np.ndarray:
@@ -256,8 +253,10 @@ def with_plates(wrong: list[Shot], right: list[Shot]) -> Figures:
             refused += 1
             continue
         for name, plate in (
-            ("sad", matched.plate), ("sad_untouched", shot.plate), ("sad_right", good.plate)
-        ):  # fmt: skip
+            ("sad", matched.plate),
+            ("sad_untouched", shot.plate),
+            ("sad_right", good.plate),
+        ):
             kept[name].append(errors(key(replace(shot, plate=plate)).alpha / 255, shot.true)["sad"])
     means = {name: float(np.mean(values)) for name, values in kept.items() if values}
     return means | {"refused": refused / len(wrong)}
@@ -278,10 +277,12 @@ def bare_summary(rows: dict[tuple[int, str], list[Figures]]) -> dict[str, Any]:
     }
     if every:
         total, plates = (sum(means[name] for means in every) for name in ("sad", "sad_plate"))
-        result |= rounded({
-            "sad_ratio_to_plate": total / plates,
-            "worst_ratio": max(means["worst_ratio"] for means in every),
-        })  # fmt: skip
+        result |= rounded(
+            {
+                "sad_ratio_to_plate": total / plates,
+                "worst_ratio": max(means["worst_ratio"] for means in every),
+            }
+        )
     return result
 
 

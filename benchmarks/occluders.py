@@ -16,7 +16,6 @@ is one JSON object.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
@@ -29,20 +28,18 @@ from unittest.mock import patch
 import numpy as np
 
 from benchmarks.accuracy import true_world_cameras
+from benchmarks.common import make_parser, rms, run_or_stop
 from benchmarks.regions_truth import true_labels
 from benchmarks.track import prepare
-from benchmarks.track_truth import rms
 from benchmarks.track_views import face_of
 from express50.capture.frames import read_cameras_of
 from express50.capture.index import read_peaks
-from express50.contract.config import build_config
 from express50.contract.layout import Dataset
 from express50.contract.segmentation_labels import label_mask
 from express50.dataset.depth_files import depth_file, read_depth
 from express50.dataset.tracks import read_track
 from express50.files.images import read_image
 from express50.geometry.raycast import visible_faces
-from express50.runner.runner import run_stage
 from express50.twin.config import TwinConfig
 from express50.twin.truth import Truth, align_worlds
 from pipelines import depth, regions, track
@@ -65,10 +62,7 @@ Row = dict[str, float]
 
 def main(arguments: list[str] | None = None) -> int:
     """Record, run the stages, and print the figures."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.occluders", description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
+    parser = make_parser("occluders", __doc__)
     parser.add_argument("--recording", type=Path, default=Path("build/bench-occluders"))
     parser.add_argument("--subject", type=int, default=71, help="of the twin")
     parser.add_argument("--cameras", type=int, default=14, help="of these 2 are left out")
@@ -123,9 +117,7 @@ def measured(dataset: Dataset, truth: Truth, way: str, label: str) -> Row:
             stack.enter_context(patch(target, other))
         began = time.process_time()
         for stage in STAGES:
-            done = run_stage(stage, own, build_config(stage, {}), workers=0, progress=False)
-            if not done.ok:
-                sys.exit(f"{dataset.root}: {stage.name} failed")
+            run_or_stop(stage, own)
         seconds = time.process_time() - began
         return figures_of(own, truth, seconds, label)
 

@@ -8,7 +8,6 @@ all). The last line is one JSON object; without Chromium ``frames_per_second`` i
 
 from __future__ import annotations
 
-import argparse
 import base64
 import json
 import os
@@ -25,6 +24,7 @@ from typing import Any
 import psutil
 from websockets.sync.client import ClientConnection, connect
 
+from benchmarks.common import make_parser
 from grmm.checkpoint import load_checkpoint
 from grmm.edit import trained_head
 from grmm.player import export_player
@@ -143,7 +143,7 @@ def speed(page: Page, seconds: float = 8.0) -> dict[str, float]:
 
 def main() -> None:
     """Export, play, print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser("player", __doc__)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("shards", type=Path)
     parser.add_argument("--subject", help="default: the first")

@@ -9,7 +9,6 @@ distances of neighbours are from the side of a square. The last line is one JSON
 
 from __future__ import annotations
 
-import argparse
 import csv
 import json
 import sys
@@ -22,7 +21,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from benchmarks.calibrate import rounded
+from benchmarks.common import make_parser, rounded
 from express50.files.images import write_image
 from express50.files.video import iterate_video
 from express50.geometry.cameras import Camera, project, triangulate
@@ -36,7 +35,7 @@ RIG4 = ("cameras_dropped", "reprojection_rms_px", "square_error_mm")
 
 def main() -> int:
     """Run and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser("real", __doc__)
     parser.add_argument("--rig4", type=Path, help="the folder of caliscope's session")
     args = parser.parse_args()
     cv2.setNumThreads(1)

@@ -11,7 +11,6 @@ reading included. The last line is one JSON object.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
@@ -22,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.accuracy import true_world_cameras
+from benchmarks.common import evenly, make_parser
 from benchmarks.regions_truth import iou_figures, true_head_alpha, true_labels, view_row
 from express50.capture.frames import read_cameras_of
 from express50.capture.index import read_peaks
@@ -46,7 +46,7 @@ Pair = tuple[np.ndarray, np.ndarray]
 
 def main() -> int:
     """Run and print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser("regions", __doc__)
     parser.add_argument("--dataset", type=Path, default=Path("build/demo/data/demo"))
     parser.add_argument("--truth", type=Path, default=Path("build/demo/twin/truth"))
     parser.add_argument("--presets", nargs="+", default=list(PRESETS), choices=PRESETS)
@@ -58,7 +58,7 @@ def main() -> int:
     if not items:
         sys.exit(f"{args.dataset}: no depth maps; run 'make demo' or name --dataset and --truth")
     if args.items:
-        items = [items[k] for k in np.unique(np.linspace(0, len(items) - 1, args.items, dtype=int))]
+        items = evenly(items, args.items)
     configs = {p: resolve_config(STAGE, p, None, args.assignments) for p in args.presets}
     rows: dict[str, list[dict]] = {}
     for item in items:

@@ -15,7 +15,6 @@ stage per expression. The last line printed is one JSON object.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
@@ -27,18 +26,16 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 
+from benchmarks.common import make_parser, rms, run_or_stop
 from benchmarks.track import EXPRESSIONS, prepare, twin_config
-from benchmarks.track_truth import rms
 from benchmarks.track_views import face_of
 from express50.capture.frames import read_cameras_of
-from express50.contract.config import build_config
 from express50.contract.layout import Dataset
 from express50.dataset.tracks import read_registration, read_track
 from express50.geometry.cameras import pinhole
 from express50.geometry.raycast import join_rays, mesh_scene
 from express50.head.load import load_head
 from express50.head.model import HeadModel
-from express50.runner.runner import run_stage
 from express50.twin.truth import Truth, align_worlds
 from pipelines import depth, track
 from pipelines.register import STAGE
@@ -63,7 +60,7 @@ class Case:
 
 def main(arguments: list[str] | None = None) -> int:
     """Record, run the stages, and print the errors."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.register", description=__doc__)
+    parser = make_parser("register", __doc__)
     parser.add_argument("--subjects", type=int, default=2)
     parser.add_argument("--cameras", type=int, default=18, help="of these 2 are held out")
     parser.add_argument("--side", type=int, default=512, help="pixels of the recorded footage")
@@ -86,7 +83,7 @@ def benchmark(dataset: Dataset, truth: Truth) -> dict[str, Figures]:
     """Run the stages from track on and measure all expressions."""
     for stage in (track.STAGE, depth.STAGE, STAGE):
         began = time.process_time()
-        run_stage(stage, dataset, build_config(stage, {}), workers=0, progress=False)
+        run_or_stop(stage, dataset)
         seconds = time.process_time() - began
     rows: dict[str, list[Figures]] = {"tracked": [], "standard": [], "scan": []}
     true: list[float] = []

@@ -13,7 +13,6 @@ against what the items took.
 
 from __future__ import annotations
 
-import argparse
 import json
 import multiprocessing
 import shutil
@@ -22,6 +21,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 from benchmarks.accuracy import measure_dataset
+from benchmarks.common import make_parser
 from benchmarks.demo import record_twin
 from express50.cli.plan import estimate, measure, measure_sizes
 from express50.contract.config import resolve_config
@@ -96,7 +96,7 @@ def compare_plan(large: Dataset, smaller: list[Dataset]) -> dict:
 
 def main(arguments: list[str] | None = None) -> int:
     """Record, measure and print."""
-    parser = argparse.ArgumentParser(prog="benchmarks.scale", description=__doc__)
+    parser = make_parser("scale", __doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--cameras", type=int, default=24)
     parser.add_argument("--size", default="3840x2160", help="WIDTHxHEIGHT")

@@ -10,7 +10,6 @@ with the reason. The last line printed is one JSON object.
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import json
 import os
@@ -28,6 +27,7 @@ import cv2
 import numpy as np
 from skimage.data import astronaut
 
+from benchmarks.common import make_parser
 from express50.files.images import resize_area
 from express50.runner.worker import cap_threads
 from express50.shards.codecs import (
@@ -50,7 +50,7 @@ Passes = dict[str, Callable[[], Iterator[Members]]]
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser("shards", __doc__)
     parser.add_argument("--samples", type=int, default=2000)
     parser.add_argument("--side", type=int, default=512)
     options = parser.parse_args(arguments)

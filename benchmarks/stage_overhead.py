@@ -7,7 +7,6 @@ the runner has them, and once more when all is current. The last line printed is
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
@@ -17,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import express50.runner.executor
+from benchmarks.common import make_parser
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Result, Stage
@@ -56,9 +56,7 @@ STAGE = Stage(
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.stage_overhead", description=__doc__
-    )
+    parser = make_parser("stage_overhead", __doc__)
     parser.add_argument("--items", type=int, default=500)
     count = parser.parse_args(arguments).items
     with tempfile.TemporaryDirectory(dir=Path.cwd()) as scratch:

@@ -26,6 +26,7 @@ from unittest.mock import patch
 
 import numpy as np
 
+from benchmarks.common import add_twin_options, check_twin_options, make_parser, run_or_stop
 from benchmarks.track_truth import Errors, clip_errors, compare, mean, pooled, summary
 from benchmarks.track_views import held_out_views
 from express50.capture.frames import read_cameras_of
@@ -34,7 +35,6 @@ from express50.contract.config import build_config
 from express50.contract.layout import Dataset
 from express50.files.calibration import read_cameras, write_cameras
 from express50.head.load import load_head
-from express50.runner.runner import run_stage
 from express50.twin.config import TwinConfig
 from express50.twin.record import record
 from express50.twin.truth import Truth
@@ -77,9 +77,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
     """Return the command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.track", description=__doc__)
-    parser.add_argument("--dataset", type=Path, help="dataset with ingest, calibrate and mattes")
-    parser.add_argument("--truth", type=Path, help="truth folder of the recording")
+    parser = make_parser("track", __doc__)
+    add_twin_options(parser)
     parser.add_argument("--captures", type=Path, help="its captures, with the held-out cameras")
     parser.add_argument("--presets", default="draft,standard,reference", type=preset_names)
     parser.add_argument("--subjects", type=int, default=2)
@@ -90,8 +89,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--frames", type=int, default=4, help="of a recorded clip")
     parser.add_argument("--scaling", action="store_true", help="also over views and pixels")
     options = parser.parse_args(arguments)
-    if (options.dataset is None) != (options.truth is None):
-        parser.error("give both --dataset and --truth, or neither")
+    check_twin_options(parser, options)
     if options.captures is not None and options.dataset is None:
         parser.error("--captures goes with --dataset and --truth")
     least = {"subjects": 1, "cameras": HELD_OUT + 2, "side": 64, "frames": 4}
@@ -127,11 +125,11 @@ def prepare(config: TwinConfig, folder: Path) -> Reference:
     dataset, truth = Dataset(folder / "dataset"), Truth(folder / "truth")
     register(dataset, sorted(seen.iterdir()))
     for stage in (ingest.STAGE, calibrate.STAGE):
-        run_stage(stage, dataset, build_config(stage, {}), workers=0, progress=False)
+        run_or_stop(stage, dataset)
     for subject in dataset.subjects():
         write_peaks(dataset, subject, truth.peaks(subject))
     for stage in (frames.STAGE, matte.STAGE):
-        run_stage(stage, dataset, build_config(stage, {}), workers=0, progress=False)
+        run_or_stop(stage, dataset)
     return dataset, truth, folder / "captures"
 
 

@@ -8,13 +8,12 @@ last line printed is one JSON object.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks.document import replace_section
+from benchmarks.common import make_parser, replace_section
 from benchmarks.track import narrowed, prepare, track, twin_config
 from benchmarks.track_truth import summary
 from benchmarks.track_views import held_out_views
@@ -46,7 +45,7 @@ KNOBS: tuple[tuple[str, dict[str, object]], ...] = (
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the sweep and write its table."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.track_sweep", description=__doc__)
+    parser = make_parser("track_sweep", __doc__)
     parser.add_argument("--dataset", type=Path)
     parser.add_argument("--truth", type=Path)
     parser.add_argument("--captures", type=Path)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks.common import rms
 from benchmarks.track_views import HeldOut, face_of, mask_of, psnr_db
 from express50.capture.frames import read_cameras_of
 from express50.contract.layout import Dataset
@@ -249,8 +250,3 @@ def clip_meshes(model: HeadModel, track: Track, rows: Mapping[str, np.ndarray]) 
     with torch.inference_mode():
         head = pose(model, shape, expression, offsets=offsets, **own).numpy()
     return np.einsum("fij,fvj->fvi", rows["R"], head) + rows["t"][:, None]
-
-
-def rms(values: np.ndarray) -> float:
-    """Return the root mean square."""
-    return float(np.sqrt(np.mean(np.asarray(values) ** 2)))

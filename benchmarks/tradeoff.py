@@ -6,7 +6,6 @@ is run with each preset over the same upstream outputs, and measured against the
 
 from __future__ import annotations
 
-import argparse
 import csv
 import json
 import resource
@@ -15,7 +14,7 @@ import sys
 from pathlib import Path
 
 from benchmarks import accuracy
-from benchmarks.document import replace_section
+from benchmarks.common import make_parser, replace_section
 from express50.contract.config import PRESETS
 from express50.contract.layout import Dataset
 from express50.contract.stage import with_required
@@ -35,7 +34,7 @@ MEASURES = {
 
 def main() -> None:
     """Run the sweep."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser("tradeoff", __doc__)
     parser.add_argument("--base", type=Path, default=Path("build/demo"))
     parser.add_argument("--out", type=Path, default=Path("build/tradeoff"))
     parser.add_argument("--doc", type=Path, default=Path("docs/TRADEOFFS.md"))

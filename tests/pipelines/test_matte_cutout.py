@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.calibrate import recorded
+from benchmarks.common import recorded
 from express50.__main__ import main
 from express50.capture.frames import read_cameras_of
 from express50.capture.index import read_index

@@ -1,0 +1,120 @@
+"""Share what most benchmarks need: options, twin recordings, runs of stages, figures, documents."""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any, TypeVar
+
+import cv2
+import numpy as np
+
+from express50.capture.frames import read_frame, read_recorded_plate
+from express50.capture.index import read_index
+from express50.contract.config import build_config
+from express50.contract.layout import Dataset
+from express50.contract.stage import Stage
+from express50.geometry.cameras import Camera, pinhole
+from express50.geometry.sampling import undistort_image, undistorted_mask
+from express50.runner.runner import run_stage
+from express50.twin.config import TwinConfig
+from express50.twin.record import print_progress, record
+from express50.twin.truth import Truth
+from pipelines import ingest
+
+TITLE = "# Speed against accuracy\n"
+T = TypeVar("T")
+
+
+def make_parser(name: str, doc: str | None) -> argparse.ArgumentParser:
+    """Return the parser of ``python -m benchmarks.<name>``, described by the module's words."""
+    return argparse.ArgumentParser(
+        prog=f"python -m benchmarks.{name}",
+        description=doc,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def add_twin_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that name a dataset of twin captures and its truth, both or neither."""
+    parser.add_argument("--dataset", type=Path, help="a twin dataset (default: one is recorded)")
+    parser.add_argument("--truth", type=Path, help="its truth")
+
+
+def check_twin_options(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Stop unless both options of `add_twin_options` are given, or neither."""
+    if (options.dataset is None) != (options.truth is None):
+        parser.error("give both --dataset and --truth, or neither")
+
+
+def recorded(config: TwinConfig, folder: Path) -> tuple[Dataset, Truth]:
+    """Return a twin recording, made where it is not there, and ingested."""
+    record(config, folder, report=print_progress())
+    dataset = Dataset(folder / "data")
+    ingest.register(dataset, sorted((folder / "captures").iterdir()))
+    run_or_stop(ingest.STAGE, dataset, "draft")
+    return dataset, Truth(folder / "truth")
+
+
+def run_or_stop(stage: Stage, dataset: Dataset, preset: str = "standard", **values: Any) -> None:
+    """Run a stage in this process; stop the benchmark when an item fails."""
+    config = build_config(stage, {**stage.presets.get(preset, {}), **values})
+    summary = run_stage(stage, dataset, config, workers=0, progress=False)
+    if not summary.ok:
+        sys.exit("\n".join(summary.lines()))
+
+
+def in_own_process(function: Callable[..., T], *arguments: object) -> T:
+    """Call a function in a new process, so that its memory can be measured."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(function, *arguments).result()
+
+
+def evenly(rows: Sequence[T], count: int) -> list[T]:
+    """Return an even choice of at most ``count`` rows, the first and the last among them."""
+    places = np.linspace(0, len(rows) - 1, min(count, len(rows))).round().astype(int)
+    return [rows[k] for k in np.unique(places)]
+
+
+def true_pictures(
+    dataset: Dataset, truth: Truth, subject: str, camera: Camera, frame: int
+) -> dict[str, np.ndarray]:
+    """Return undistorted frame and plate, pixels with footage and true alpha of a camera's frame.
+
+    The true camera undistorts them, so that no calibration counts.
+    """
+    index = read_index(dataset, subject)
+    if camera.id not in index.plates:
+        sys.exit(f"{dataset.root}: {subject}/{camera.id} has no plate; name another --dataset")
+    valid = cv2.erode(undistorted_mask(camera).astype(np.uint8), np.ones((3, 3))) > 0
+    image = read_frame(dataset, subject, camera.id, frame, undistort=False)
+    return {
+        "frame": undistort_image(image, camera),
+        "plate": undistort_image(read_recorded_plate(index, camera.id), camera),
+        "valid": valid,
+        "true": truth.render_alpha(subject, frame, pinhole(camera)) * valid,
+    }
+
+
+def rms(values: Iterable[Any]) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(np.square(np.asarray([*values])))))
+
+
+def rounded(row: Mapping[str, object]) -> dict[str, object]:
+    """Return the row with floats to five significant digits."""
+    return {k: float(f"{v:.5g}") if isinstance(v, float) else v for k, v in row.items()}
+
+
+def replace_section(path: Path, heading: str, lines: list[str]) -> None:
+    """Write a section of second level into a document; the others stay, a new one comes last."""
+    text = path.read_text(encoding="utf-8") if path.is_file() else TITLE
+    front, *parts = text.split("\n## ")
+    sections = dict(part.split("\n", 1) for part in parts)
+    sections[heading] = "\n" + "\n".join(lines).strip() + "\n"
+    whole = [front.rstrip() + "\n", *(f"## {name}\n{body}" for name, body in sections.items())]
+    path.write_text("\n".join(whole), encoding="utf-8")
