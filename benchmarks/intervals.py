@@ -32,14 +32,15 @@ from scipy import stats
 
 from benchmarks.common import make_parser
 from benchmarks.intervals_collect import (
+    Figures,
     Sample,
     half_shares,
     peak_samples,
     row_samples,
+    sampled,
     with_tracked,
 )
 from benchmarks.intervals_fit import ause, fit_model
-from benchmarks.intervals_rigs import rig_samples
 from benchmarks.intervals_rows import (
     ALIGN_NOISE,
     CONDITIONS,
@@ -50,8 +51,13 @@ from benchmarks.intervals_rows import (
 from express50.contract.layout import Dataset
 from express50.contract.stage import Unit
 from express50.error_model import FILE, NOMINAL, ErrorModel, error_bounds, error_models, item_error
+from express50.errors import CalibrationError
 from express50.files.atomic import dump_json
+from express50.rigs.world_frame import meeting_point
 from express50.twin.truth import Truth
+from pipelines.calibrate.board_rig import solve_rig
+from pipelines.calibrate.uncertainty import camera_errors, head_points, state_uncertainty
+from tests.pipelines.board_rigs import POINTS, board_motion, make_rig, observe, sizes_of
 
 UNITS: dict[str, Unit] = {
     "calibrate": "mm",
@@ -66,6 +72,17 @@ FIT_RIGS, TEST_RIGS = range(10), range(100, 110)  # seeds of simulated rigs
 FIT_PEAKS, TEST_PEAKS = ((81, 82), (83,)), ((91, 92), (93,))  # subjects per noise of ALIGN_NOISE
 BAR = 88.0, 92.0  # percent
 HALVES_PEAKS = {"neutral": 2, "smile": 9}  # frames of the foreign captures
+# Cameras, focal length in pixels, distance in metres, noise of corners in pixels.
+RIGS: dict[str, tuple[int, float, float, float]] = {
+    "2 views": (2, 900.0, 1.1, 0.1),
+    "4 views": (4, 900.0, 1.1, 0.1),
+    "8 views": (8, 900.0, 1.1, 0.1),
+    "noise": (4, 900.0, 1.1, 0.6),
+    "focal length 400 px": (4, 400.0, 0.6, 0.1),
+    "focal length 2,500 px": (4, 2500.0, 3.1, 0.1),
+    "focal length 20,000 px": (4, 20000.0, 24.0, 0.1),
+}
+BOARDS = 24
 Row = tuple[str, Sample]
 
 
@@ -298,6 +315,29 @@ def _rounded(row: dict) -> dict:
 def mean(values: Sequence[float]) -> float | None:
     """Return the mean to four digits; None of nothing."""
     return float(f"{np.mean(values):.4g}") if len(values) else None
+
+
+def rig_samples(seeds: range) -> Iterator[tuple[str, Sample]]:
+    """Yield the condition and the sample of every simulated rig; one that fails is left out."""
+    for name, (count, focal, distance, noise) in RIGS.items():
+        span = 150.0 if count > 2 else 40.0
+        rig = make_rig(count, focal, distance=distance, span_deg=span)
+        for seed in seeds:
+            corners = observe(rig, board_motion(BOARDS, seed, span), noise, seed)
+            try:
+                solution = solve_rig(corners, POINTS, sizes_of(rig), "OPENCV")
+            except CalibrationError:
+                continue
+            stated = state_uncertainty(solution, POINTS)
+            if not stated:
+                continue
+            true = {n: rig[n] for n in solution.cameras}
+            off = camera_errors(solution.cameras, true, head_points() + meeting_point(true))
+            names = sorted(stated)
+            figures: Figures = {"stated_mm": np.array([stated[n].mm for n in names])}
+            scale = np.array([stated[n].mm / stated[n].px for n in names])
+            errors = scale * [off[n] for n in names]
+            yield name, sampled("calibrate", f"{name} {seed}", [figures], [errors])
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.depth_trace import trace
+from benchmarks.depth import trace
 from express50.geometry.cameras import Camera, rays
 from express50.geometry.raycast import mesh_scene
 from pipelines.depth.blocks import LevelSet, build, combined, largest_body
