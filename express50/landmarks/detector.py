@@ -235,10 +235,10 @@ def _agreed(place: _Place, looks: list[_Place]) -> _Place:
         float(np.mean([look.score for look in looks])),
     )
     differ = np.median(spread) / (DIFFER_SHARE * max(face_box(mean)[1], 1e-6))
-    sure = together.score >= KEEP_SHARE * place.score
+    good_mean = together.score >= KEEP_SHARE * place.score
     # Where they agree their mean is the better place, even if a profile's score is less so near.
-    kept = together if differ < 1.0 or sure else place
-    score = together.score if sure else place.score
+    kept = together if differ < 1.0 or good_mean else place
+    score = together.score if good_mean else place.score
     return replace(kept, score=float(score / (1.0 + differ**4)))
 
 

@@ -31,7 +31,7 @@ SHUT, OPEN = 0.1, 0.2
 # half of the confidence. Shut lids stay under the first.
 LEAST_CONTRAST, CONTRAST = 0.12, 0.08
 LEAST_COVER, LEAST_CONFIDENCE = 0.35, 0.2
-# Standard deviation of a sure centre, in eye widths.
+# Standard deviation of a centre of confidence 1, in eye widths.
 SIGMA = 0.04
 
 
@@ -67,10 +67,10 @@ def _find(
     across = np.array([-along[1], along[0]]) / width
     lids = points[list(lower)].mean(0) - points[list(upper)].mean(0)
     opening = abs(float(lids @ across)) / width
-    surely = float(np.clip((opening - SHUT) / (OPEN - SHUT), 0.0, 1.0))
+    openness = float(np.clip((opening - SHUT) / (OPEN - SHUT), 0.0, 1.0))
     trust = float(np.median(seen.confidence[[first, *upper, last, *lower]]))
     size = np.array([image.shape[1], image.shape[0]])
-    if surely * trust <= 0.0 or (middle < 0).any() or (middle >= size).any():
+    if openness * trust <= 0.0 or (middle < 0).any() or (middle >= size).any():
         return nothing
     window = place_level_crop(middle, SPAN * along / SIDE, SIDE)
     crop = cut_crop(image, window, SIDE).astype(np.float32)
@@ -83,7 +83,7 @@ def _find(
     grow = 2 * round(SLACK * SIDE / SPAN) + 1
     mask = cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (grow, grow)))
     place, contrast, cover = _disc(light, mask.astype(np.float32))
-    confidence = trust * surely * cover * contrast / (contrast + CONTRAST)
+    confidence = trust * openness * cover * contrast / (contrast + CONTRAST)
     if contrast < LEAST_CONTRAST or cover < LEAST_COVER or confidence < LEAST_CONFIDENCE:
         return nothing
     centre = window[:, :2] @ place + window[:, 2]

@@ -119,8 +119,8 @@ def open_source(
 def given_detection(rows: np.ndarray) -> Detection:
     """Make a detection of given rows (68, 3): pixels x, y, NaN where unknown, confidence 0..1.
 
-    Unknown points stand at the middle of the known ones, with an infinite sigma. A sure point is
-    taken to be right within 0.6 % of the face's size, one of confidence c within that over c.
+    Unknown points stand at the middle of the known ones, with an infinite sigma. A point of
+    confidence c is taken to be right within 0.6 % of the face's size over c.
     """
     known = np.isfinite(rows[:, :2]).all(1) & (rows[:, 2] > 0)
     if not known.any():

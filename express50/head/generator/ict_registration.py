@@ -49,7 +49,7 @@ NORMAL_MM = 6.0  # millimetres that a unit of difference between normals counts 
 
 
 @dataclass(frozen=True)
-class Pulls:
+class RimTargets:
     """Places that vertices must come to: ids (N,), goals (N, 3), weights (N,)."""
 
     ids: Array
@@ -100,7 +100,7 @@ def normals_of(points: Array, faces: Array) -> Array:
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
 
-def rim_pulls(mesh: WholeMesh, skin: IctSkin) -> Pulls:
+def rim_targets(mesh: WholeMesh, skin: IctSkin) -> RimTargets:
     """Return where lids, lips and ears, both sides, belong along ICT's."""
     marks = skin.marks
     rows = [
@@ -114,7 +114,7 @@ def rim_pulls(mesh: WholeMesh, skin: IctSkin) -> Pulls:
     ]
     ids = np.concatenate([np.concatenate([row, mesh.mirror[row]]) for row, _, _ in rows])
     goals = np.concatenate([np.concatenate([goal, goal * FLIP]) for _, goal, _ in rows])
-    return Pulls(ids, goals, np.concatenate([np.full(2 * len(r), w) for r, _, w in rows]))
+    return RimTargets(ids, goals, np.concatenate([np.full(2 * len(r), w) for r, _, w in rows]))
 
 
 def _lid_margin(ring: Array, marks: Array) -> Array:
@@ -175,7 +175,7 @@ def _ear_rim(mesh: WholeMesh, skin: IctSkin) -> tuple[Array, Array]:
 
 def warp_between(mesh: WholeMesh, skin: IctSkin) -> RBFInterpolator:
     """Return a smooth warp of space from the generator's head to ICT's, by landmarks and rims."""
-    pulls = rim_pulls(mesh, skin)
+    targets = rim_targets(mesh, skin)
     faces, weights = embed_landmarks(mesh)
     own = (mesh.vertices[mesh.faces[faces]] * weights[..., None]).sum(1)
     marks = _free_marks()
@@ -186,8 +186,8 @@ def warp_between(mesh: WholeMesh, skin: IctSkin) -> RBFInterpolator:
             (skin.points[np.unique(skin.faces)], skin.marks[8, 1]),
         )
     )
-    here = np.concatenate([mesh.vertices[pulls.ids], own[marks], body])
-    there = np.concatenate([pulls.goals, skin.marks[marks], other])
+    here = np.concatenate([mesh.vertices[targets.ids], own[marks], body])
+    there = np.concatenate([targets.goals, skin.marks[marks], other])
     once = np.unique(here.round(3), axis=0, return_index=True)[1]
     return RBFInterpolator(here[once], there[once], kernel="thin_plate_spline", smoothing=5.0)
 
@@ -227,7 +227,7 @@ def register_skin(mesh: WholeMesh, skin: IctSkin, own: Array, warp: RBFInterpola
     index[own] = np.arange(len(own))
     faces = index[mesh.faces[is_skin(mesh)]]
     mirror = index[mesh.mirror[own]]
-    pulls, marks = rim_pulls(mesh, skin), _free_marks()
+    targets, marks = rim_targets(mesh, skin), _free_marks()
     sample = sample_skin(skin)
     tree = cKDTree(np.concatenate([sample.places, NORMAL_MM * sample.normals], axis=1))
     seen = ~np.isin(own, hidden_vertices(mesh))
@@ -236,7 +236,7 @@ def register_skin(mesh: WholeMesh, skin: IctSkin, own: Array, warp: RBFInterpola
     at_marks = sparse.csr_matrix((mark_weights[marks].ravel(), rows), (len(marks), len(own)))
     mark_trust = np.where(np.array(marks) < 17, 2.0, 6.0)
     held = np.zeros(len(own))
-    np.add.at(held, index[pulls.ids], 20.0 * pulls.weights)
+    np.add.at(held, index[targets.ids], 20.0 * targets.weights)
     fixed = at_marks.T @ sparse.diags(mark_trust) @ at_marks + sparse.diags(held + 1e-3)
     # The folds of the two ears differ: ears keep the generator's.
     firm = np.where(np.isin(own, mesh.tag("ear")), EAR_FIRMNESS, 1.0)
@@ -259,8 +259,8 @@ def register_skin(mesh: WholeMesh, skin: IctSkin, own: Array, warp: RBFInterpola
         right -= memory * stiffness * (bending @ (points - start))
         right += at_marks.T @ (mark_trust[:, None] * (skin.marks[marks] - at_marks @ points))
         pulled = np.zeros_like(points)
-        weight = 20.0 * pulls.weights[:, None]
-        np.add.at(pulled, index[pulls.ids], weight * (pulls.goals - points[index[pulls.ids]]))
+        weight = 20.0 * targets.weights[:, None]
+        np.add.at(pulled, index[targets.ids], weight * (targets.goals - points[index[targets.ids]]))
         smooth = (stiffness * bending + fixed + sparse.diags(0.05 * trust)).tocsc()
         points = points + _solve(smooth, trust, normals, right + pulled)
         points = 0.5 * (points + points[mirror] * FLIP)

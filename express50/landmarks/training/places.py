@@ -52,8 +52,8 @@ def place_points(
     return (mesh[model.faces.numpy()[places[0]]] * places[1][..., None]).sum(1)
 
 
-def laid_on(source: HeadModel, model: HeadModel, points: np.ndarray) -> np.ndarray:
-    """Move points (N, 3) of a source at rest with it, so that its landmarks lie on a model's."""
+def moved_onto(source: HeadModel, model: HeadModel, points: np.ndarray) -> np.ndarray:
+    """Move points (N, 3) on a source at rest by the fit of its landmarks to a model's."""
     marks = [landmarks(one, one.template[None])[0].double().numpy() for one in (source, model)]
     s, R, t = similarity_fit(*marks)
     return s * points @ R.T + t
@@ -76,7 +76,7 @@ class FaceFront:
         rest = model.template.double().numpy()
         marks = landmarks(model, model.template[None])[0].double().numpy()
         if model.name != builtin.name:
-            faces, weights = closest_places(builtin, laid_on(model, builtin, rest))
+            faces, weights = closest_places(builtin, moved_onto(model, builtin, rest))
             inside = (front[builtin.faces.numpy()[faces]] * weights).sum(1) > 0.5
             front = inside & model.regions["face"].numpy()
         all_faces = model.faces.numpy()
