@@ -39,7 +39,7 @@ from pipelines.depth.maps import picture_of, surface_maps
 from pipelines.depth.prior import close_mesh
 from pipelines.depth.surface import HeadSurface
 from pipelines.matte.config import MatteConfig
-from pipelines.matte.stage import rim_figures, rim_of
+from pipelines.matte.stage import rim_figures, rim_of, wall_noise
 from pipelines.register.lay import LaidMesh, mesh_normals
 from pipelines.register.stage import error_figures as laid_figures
 from pipelines.register.stage import lone_sigma
@@ -155,9 +155,10 @@ def _matte(peak: _Peak) -> Iterator[Sample]:
     facts = json.loads(file.read_text())
     parts, errors = [], []
     for name in facts["coverage"]:
-        alpha, rgb = peak.alpha(name), shrink(peak.frame_of(name), MatteConfig().side)
-        plated = name not in facts["without_plate"]
-        parts.append(rim_figures(alpha, rgb, plated, len(facts["coverage"])))
+        alpha, frame = peak.alpha(name), peak.frame_of(name)
+        plated, noise = name not in facts["without_plate"], wall_noise(alpha, frame)
+        rgb = shrink(frame, MatteConfig().side)
+        parts.append(rim_figures(alpha, rgb, noise, plated, len(facts["coverage"])))
         true = peak.truth.render_alpha(peak.subject, peak.frame, peak.true_camera(name))
         errors.append(np.abs(alpha / 255 - true)[rim_of(alpha)])
     yield sampled("matte", peak.name, parts, errors)

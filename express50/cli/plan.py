@@ -31,9 +31,13 @@ SIZES = ("subjects", "expressions", "cameras", "frames_per_expression")
 # Campaigns of the papers: EXPRESS-50, and RenderMe-360 as it was used beside it (280 of its people,
 # 12 expressions, 60 cameras). Clips are as long as the measured dataset's.
 TARGETS: dict[str, dict[str, float]] = {
-    "express-50": {"subjects": 50, "expressions": 60, "views": 24, "pixels": 3840 * 2160},
-    "renderme-360": {"subjects": 280, "expressions": 12, "views": 60, "pixels": 2448 * 2048},
-}
+    "express-50": {
+        "subjects": 50, "expressions": 60, "views": 24, "pixels": 3840 * 2160, "shape": 9 / 16
+    },
+    "renderme-360": {
+        "subjects": 280, "expressions": 12, "views": 60, "pixels": 2448 * 2048, "shape": 2048 / 2448
+    },
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,6 +109,7 @@ def run_plan(args: argparse.Namespace) -> int:
                 f"--size {args.size!r}: expected WIDTHxHEIGHT, such as 3840x2160"
             ) from None
         sizes["pixels"] = width * height
+        sizes["shape"] = min(width, height) / max(width, height, 1)
     dataset = Dataset(args.dataset)
     with stdout_to_stderr():
         known = list(stages().values())
@@ -238,7 +243,8 @@ def target_of(name: str | None, sizes: Mapping[str, float], measured: Footage) -
     if bad := {key: value for key, value in sizes.items() if not value > 0}:
         given = ", ".join(f"{key} is {value}" for key, value in bad.items())
         raise ConfigError(f"target: {given}; expected more than 0")
-    values = {key: getattr(measured, key) for key in ("subjects", "expressions", "views", "pixels")}
+    kept = ("subjects", "expressions", "views", "pixels", "shape")
+    values = {key: getattr(measured, key) for key in kept}
     values |= TARGETS.get(name or "", {}) | dict(sizes)
     each = measured.frames / max(measured.expressions, 1)
     each = values.pop("frames_per_expression", each)

@@ -14,7 +14,7 @@ from express50.contract.stage import Growth, stages
 from express50.errors import FormatError, StageError
 from express50.files.text import read_json_table, read_toml
 
-SHORT_SIDE = 0.75  # of a picture over its long side; cameras have 0.56 to 1
+SHORT_SIDE = 0.75  # of a picture over its long side if its shape is not known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,6 +22,7 @@ class Footage:
     """Holds the size of a campaign; means over subjects where it was measured.
 
     ``side`` is the length, pixels, to which the longer side of peak frames is reduced; 0: not.
+    ``shape`` is their shorter side over the longer one.
     """
 
     subjects: float
@@ -30,11 +31,12 @@ class Footage:
     pixels: float
     frames: float
     side: float = 0.0
+    shape: float = SHORT_SIDE
 
     @property
     def picture(self) -> float:
         """Return the pixels of a peak frame."""
-        return min(self.pixels, SHORT_SIDE * self.side**2) if self.side else self.pixels
+        return min(self.pixels, self.shape * self.side**2) if self.side else self.pixels
 
     def work(self, factors: Sequence[str]) -> float:
         """Return the product of the named sizes."""
@@ -57,6 +59,7 @@ def footage_of(dataset: Dataset) -> Footage:
     if not indices:
         raise StageError(f"{dataset.root}: nothing is ingested, so nothing was measured")
     cameras = [camera for index in indices for camera in index.cameras.values()]
+    sizes = [(camera.width, camera.height) for camera in cameras]
     side = 0.0  # to which the settings of the last run reduced pictures
     for name, stage in stages().items():
         path = dataset.config_file(name)
@@ -67,9 +70,10 @@ def footage_of(dataset: Dataset) -> Footage:
         subjects=len(indices),
         expressions=sum(len(index.cues) for index in indices) / len(indices),
         views=len(cameras) / len(indices),
-        pixels=sum(camera.width * camera.height for camera in cameras) / len(cameras),
+        pixels=sum(width * height for width, height in sizes) / len(sizes),
         frames=sum(camera.frames for camera in cameras) / len(cameras),
         side=side,
+        shape=sum(min(size) / max(size) for size in sizes) / len(sizes),
     )
 
 

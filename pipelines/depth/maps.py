@@ -23,6 +23,7 @@ from express50.geometry.sampling import bilinear
 from pipelines.depth.prior import TrackedSolid
 from pipelines.depth.surface import HeadSurface
 from pipelines.depth.views import INSIDE, project_fast, reduced
+from pipelines.ingest.quality import edge_width
 
 SURE_MM = 2.0  # bound at which confidence is a half
 COMPARED_SIDE = 512  # longest side, pixels, at which views are compared through the depth
@@ -44,12 +45,14 @@ class Picture:
         camera: pinhole, of the full size.
         small: camera, frame (h, w, 3) and matte (h, w), uint8, as they are compared.
         grains: (N,) `grain` at some pixels of the matte.
+        edge_px: width of its sharpest edges at the small size, NaN with too few: how blurred it is.
         read: returns frame (H, W, 3) and matte (H, W), uint8.
     """
 
     camera: Camera
     small: tuple[Camera, np.ndarray, np.ndarray]
     grains: np.ndarray
+    edge_px: float
     read: Callable[[], tuple[np.ndarray, np.ndarray]]
 
 
@@ -59,7 +62,11 @@ def picture_of(
 ) -> Picture:  # fmt: skip
     """Describe a frame (H, W, 3) and a matte (H, W), uint8, that `read` returns again."""
     grains = grain(rgb, alpha > 255 * INSIDE)[::GRAINS]
-    return Picture(camera, reduced(camera, rgb, alpha, COMPARED_SIDE), grains, read)
+    small = reduced(camera, rgb, alpha, COMPARED_SIDE)
+    x, y, width, height = cv2.boundingRect((small[2] > 255 * INSIDE).astype(np.uint8))
+    part = np.ascontiguousarray(small[1][y : y + height, x : x + width])
+    edge = edge_width(part) if part.size else None
+    return Picture(camera, small, grains, np.nan if edge is None else edge, read)
 
 
 @dataclass(frozen=True)
@@ -169,12 +176,14 @@ def common_figures(
     pixels = [np.linalg.norm(c.center - middle) / c.K[0, 0] for c in cameras]
     known = np.concatenate([one.errors[np.isfinite(one.errors)] for one in photo])
     every = np.concatenate([picture.grains for picture in pictures])
+    edges = [picture.edge_px for picture in pictures if np.isfinite(picture.edge_px)]
     return {
         "voxel_mm": surface.figures["voxel_mm"],
         "pixel_mm": 1e3 * float(np.median(pixels)),
         "views": float(len(pictures)),
         "photo_all": float(np.median(known)) if len(known) else np.inf,
         "grain_all": float(np.median(every)) if len(every) else np.inf,
+        "edge_px": 0.5 + float(np.median(edges)) if edges else np.inf,
     }
 
 

@@ -40,6 +40,7 @@ EMPTY = 0.003  # share of the image below which a matte counts as empty
 MOST_CONTACT = 0.02
 RIM = 0.008  # share of the longer side: so far from the outline a matte can be wrong by a part
 WINDOW = 5  # pixels, odd
+NEARBY = 0.04  # share of the longer side: width of the neighbourhood that describes an outline
 
 Matter = Callable[[np.ndarray, Any, np.ndarray], np.ndarray]
 """Frame (H, W, 3) uint8, plate or None and valid pixels (H, W) to opacity (H, W) float32."""
@@ -47,10 +48,14 @@ Matter = Callable[[np.ndarray, Any, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class CameraMatte:
-    """The matte of one camera alone: alpha (H, W) uint8, and its frame reduced to `matte.side`."""
+    """The matte of one camera alone: alpha (H, W) uint8, and its frame reduced to `matte.side`.
+
+    `noise` is that of the full frame, see `wall_noise`.
+    """
 
     alpha: np.ndarray
     rgb: np.ndarray
+    noise: float
     plated: bool = True
 
 
@@ -102,7 +107,7 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
     doubt = {}
     for name, alpha in final.items():
         own = mattes[name]
-        rim = rim_figures(alpha, own.rgb, own.plated, len(mattes))
+        rim = rim_figures(alpha, own.rgb, own.noise, own.plated, len(mattes))
         doubt[name] = error_bounds("matte", rim)
     figures["expected"] = {name: asdict(e) for name, d in doubt.items() if (e := d.expected)}
     expected = expect(error_models()["matte"], np.concatenate([d.typical for d in doubt.values()]))
@@ -131,7 +136,8 @@ def camera_mattes(
             plate, why = _plate(dataset, subject, name, frame, valid, config)
             if plate is not None or config.method in NETWORKS:
                 alpha = eight_bit(matter(frame, plate, valid), valid)
-                found[name] = CameraMatte(alpha, shrink(frame, config.side))
+                noise = wall_noise(alpha, frame)
+                found[name] = CameraMatte(alpha, shrink(frame, config.side), noise)
         except (CaptureError, StageError) as error:
             dropped.append(Note(name, str(error)))
             continue
@@ -146,7 +152,8 @@ def camera_mattes(
     for name in unplated:
         frame, valid = read(name), valid_pixels(cameras[name])
         alpha = eight_bit(soft_alpha(frame, valid, cuts[name]), valid)
-        found[name] = CameraMatte(alpha, shrink(frame, config.side), plated=False)
+        noise = wall_noise(alpha, frame)
+        found[name] = CameraMatte(alpha, shrink(frame, config.side), noise, plated=False)
     return {name: found[name] for name in cameras if name in found}, dropped, warnings
 
 
@@ -255,28 +262,61 @@ def rim_of(alpha: np.ndarray) -> np.ndarray:
 
 
 def rim_figures(
-    alpha: np.ndarray, rgb: np.ndarray, plated: bool, views: int
+    alpha: np.ndarray, rgb: np.ndarray, noise: float, plated: bool, views: int
 ) -> dict[str, np.ndarray | float]:
     """Describe the N pixels of the rim of an alpha (H, W) uint8.
 
-    The frame (h, w, 3) uint8 may be reduced; its grain outside the subject measures noise.
+    The frame (h, w, 3) uint8 may be reduced; `noise` is that of the full one. Keying may miss a
+    subject that differs from the wall by little more than noise, and leaves a ragged outline.
     """
     rim, share = rim_of(alpha), alpha.astype(np.float32) / 255
     open_part = share * (1 - share)
     inside = (share > 0.5).astype(np.uint8)
-    edge = int((inside - cv2.erode(inside, np.ones((3, 3)))).sum())
-    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    behind = cv2.resize(cv2.dilate(alpha, np.ones((5, 5))), grey.shape[::-1]) < 3
-    grain = np.abs(cv2.Laplacian(grey, cv2.CV_32F))[behind]
+    edge = inside - cv2.erode(inside, np.ones((3, 3)))
+    contrast = cv2.resize(outline_contrast(alpha, rgb), alpha.shape[::-1])[rim]
     return {
         "soft": 0.05 + 4 * open_part[rim],
         "spread": 0.01 + deviation(share)[rim],
-        "noise": 0.2 + float(np.median(grain)) if grain.size else np.inf,
-        "width": 0.1 + float(open_part.sum()) / max(edge, 1),
+        # Edges nearby, in lengths of a straight one.
+        "ragged": 0.1 + _nearby(edge.astype(np.float32))[rim] * _reach(alpha),
+        "faint": (0.5 + noise) / (2 + contrast),
+        "noise": 0.5 + noise,
+        "width": 0.1 + float(open_part.sum()) / max(int(edge.sum()), 1),
         "side": float(max(alpha.shape)),
         "plated": 1.0 if plated else 2.0,
         "views": float(views),
     }
+
+
+def wall_noise(alpha: np.ndarray, rgb: np.ndarray) -> float:
+    """Measure a frame's (H, W, 3) uint8 noise off its subject, 8-bit steps; inf if all is subject.
+
+    It is the mean Laplacian, capped where the wall has edges.
+    """
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    behind = cv2.dilate(alpha, np.ones((5, 5))) < 3
+    grain = np.abs(cv2.Laplacian(grey, cv2.CV_16S)[behind])
+    return float(np.minimum(grain, 4 + 4 * np.median(grain)).mean()) if grain.size else np.inf
+
+
+def outline_contrast(alpha: np.ndarray, rgb: np.ndarray) -> np.ndarray:
+    """Measure how far (h, w) mean colours of subject and surroundings are apart, 8-bit steps."""
+    inside = cv2.resize(alpha, rgb.shape[1::-1], interpolation=cv2.INTER_AREA) / np.float32(255)
+    smooth = cv2.GaussianBlur(rgb.astype(np.float32), (0, 0), 1)
+    one, other = (
+        _nearby(smooth * part[..., None]) / (_nearby(part)[..., None] + 1e-3)
+        for part in (inside, 1 - inside)
+    )
+    return np.linalg.norm(one - other, axis=-1)
+
+
+def _reach(values: np.ndarray) -> int:
+    return max(3, 2 * round(NEARBY * max(values.shape[:2]) / 2) + 1)
+
+
+def _nearby(values: np.ndarray) -> np.ndarray:
+    """Average values (H, W[, C]) over the neighbourhood."""
+    return cv2.blur(values, (_reach(values), _reach(values)))
 
 
 def deviation(values: np.ndarray) -> np.ndarray:

@@ -89,6 +89,6 @@ def test_mattes_of_any_content_give_an_interval_or_nothing(shape, fill):
     rgb = rng.integers(0, 256, (max(shape[0] // 2, 1), max(shape[1] // 2, 1), 3), np.uint8)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found = error_bounds("matte", rim_figures(alpha, rgb, plated=True, views=1))
+        found = error_bounds("matte", rim_figures(alpha, rgb, 1.0, plated=True, views=1))
     assert found.bound.shape == (rim_of(alpha).sum(),) and np.isfinite(found.bound).all()
     assert (found.expected is None) == (not found.bound.size)

@@ -22,6 +22,7 @@ SIDE = 40
 KNOWN = {
     "apart_mm": 4.0, "voxel_mm": 2.8, "pixel_mm": 1.6, "views": 8.0,
     "photo": 3.0, "photo_wide": 3.0, "photo_all": 2.0, "grain": 0.06, "grain_all": 0.06,
+    "edge_px": 1.5,
 }  # fmt: skip
 
 
@@ -67,6 +68,8 @@ def test_units_and_focal_lengths_do_not_count(scale):
         ("photo_wide", 1.0, np.nan),
         ("apart_mm", 1.0, 40.0),
         ("grain", 0.02, 1.0),
+        ("edge_px", 1.4, 2.4),  # blurred pictures
+        ("voxel_mm", 2.5, 4.0),
     ],
 )
 def test_what_contradicts_the_depth_raises_its_bounds(name, good, bad):

@@ -18,12 +18,14 @@ from express50.capture.frames import (
 )
 from express50.capture.index import read_index
 from express50.contract.layout import Dataset
+from express50.error_model import error_bounds
 from express50.errors import ConfigError
 from express50.files.images import read_image, write_image
 from express50.runner.runner import Summary, run_stage
 from pipelines import calibrate, ingest
 from pipelines.matte import STAGE
 from pipelines.matte.config import MatteConfig
+from pipelines.matte.stage import rim_figures, wall_noise
 from tests.pipelines.bump_dataset import make_dataset as bump_dataset
 from tests.pipelines.matte_rig import SIZE, disc
 from tests.pipelines.matte_scenes import make_scene
@@ -213,3 +215,28 @@ def test_what_one_camera_alone_shows_is_removed(shaded) -> None:
     own = read_image(shaded.matte_file("S001", "smile", "cam02"))
     patch = disc(0.12, 0.3, 0.07)
     assert own[patch].mean() > 200 and corrected[patch].mean() < 20
+
+
+def test_bounds_are_wider_where_the_subject_differs_little_from_the_wall():
+    rng = np.random.default_rng(0)
+    alpha = np.zeros((128, 128), np.uint8)
+    alpha[40:, 40:90] = 255
+    bounds = []
+    for contrast, noise in ((90, 1), (90, 6), (12, 6)):
+        frame = 100 + contrast * (alpha[..., None] > 0) + rng.normal(0, noise, (128, 128, 3))
+        frame = frame.astype(np.uint8)
+        figures = rim_figures(alpha, frame, wall_noise(alpha, frame), plated=True, views=8)
+        bounds.append(float(np.median(error_bounds("matte", figures).bound)))
+    assert bounds[0] < bounds[1] < bounds[2]
+
+
+def test_noise_of_the_wall_is_not_that_of_its_edges_or_of_the_subject():
+    rng = np.random.default_rng(0)
+    alpha = np.zeros((128, 128), np.uint8)
+    alpha[40:, 40:90] = 255
+    frame = np.full((128, 128, 3), 100, np.uint8)
+    assert wall_noise(alpha, frame) == 0.0
+    frame[alpha > 0] = rng.integers(0, 256, (int((alpha > 0).sum()), 3))
+    frame[:, 110:] = 180
+    assert wall_noise(alpha, frame) < 0.2
+    assert wall_noise(np.full_like(alpha, 255), frame) == np.inf

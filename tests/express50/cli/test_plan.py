@@ -35,7 +35,9 @@ def cost(seconds, size=1e6, memory=1e9, preset="draft"):
 
 def test_express_50_is_scaled_linearly_from_one_dataset():
     target = target_of("express-50", {}, SMALL)
-    assert target == Footage(subjects=50, expressions=60, views=24, pixels=8294400, frames=360)
+    assert target == Footage(
+        subjects=50, expressions=60, views=24, pixels=8294400, frames=360, shape=0.5625
+    )
     (row,) = estimate([stages()["matte"]], target, [(SMALL, {"matte": cost(2.0)})], workers=10)
     ratio = 24 * 8294400 / (8 * 1e5)
     assert row.items == 3000 and row.seconds == pytest.approx(2 * ratio)
@@ -104,15 +106,26 @@ def test_figures_are_those_of_the_receipts(tmp_path, capsys):
     assert found.memory == max(r.peak_memory for r in receipts) and found.preset == "draft"
     files = [p for p in dataset.stage_dir("ingest").rglob("*") if p.is_file()]
     assert found.bytes == sum(p.stat().st_size for p in files) / 2
-    assert footage_of(dataset) == Footage(subjects=2, expressions=2, views=2, pixels=4096, frames=4)
+    size = {"pixels": 4096, "shape": 1.0}
+    assert footage_of(dataset) == Footage(subjects=2, expressions=2, views=2, frames=4, **size)
     capsys.readouterr()
     assert main(["plan", str(root), "--size", "128x64", "--subjects", "10", "--json"]) == 0
     first = json.loads(capsys.readouterr().out)["stages"][0]
     assert first["items"] == 10 and first["seconds"] == pytest.approx(2 * sum(found.seconds) / 2)
+    for size in ("0x0", "-64x-64"):
+        assert main(["plan", str(root), "--size", size]) == 2
     assert main(["plan", str(root), "--target", "renderme-360"]) == 0
     said = capsys.readouterr().out
     assert "was not run" in said and "not measured: calibrate" in said
     assert main(["plan", str(root), "--size", "big"]) == 2
+
+
+def test_reduced_pictures_keep_the_shape_of_the_footage():
+    sides = {"pixels": 3840 * 2160.0, "side": 1280.0}
+    assert replace(SMALL, **sides, shape=9 / 16).picture == 1280 * 720
+    assert replace(SMALL, **sides, shape=1.0).picture == 1280 * 1280
+    wide = {"pixels": 3840 * 2160, "shape": 9 / 16}
+    assert target_of(None, wide, replace(SMALL, side=1280.0)).picture == 1280 * 720
 
 
 def test_two_sizes_tell_what_does_not_grow_and_the_interval_holds_a_third():
