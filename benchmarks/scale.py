@@ -20,8 +20,6 @@ import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-from benchmarks.common import make_parser
-from benchmarks.demo import record_twin
 from express50.cli.plan import estimate, measure, measure_sizes
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
@@ -30,6 +28,8 @@ from express50.dial.figures import footage_of
 from express50.runner.runner import run_stage
 from express50.runner.worker import core_seconds, peak_memory, reset_peak_memory
 
+# Each stage's process imports this module, so it imports heavy benchmarks only where it uses them:
+# their libraries would count for every stage.
 PRESETS = ("draft", "standard")
 EXPRESSIONS = ("neutral",)
 SMALLER = "8x320x320,24x910x512"  # the demo's cameras; all cameras at 512 px
@@ -37,6 +37,8 @@ SMALLER = "8x320x320,24x910x512"  # the demo's cameras; all cameras at 512 px
 
 def record(out: Path, cameras: int, width: int, height: int) -> tuple[list[Path], Path]:
     """Record one moment unless it is there; returns captures and truth."""
+    from benchmarks.demo import record_twin
+
     twin = {
         "subjects": 1, "cameras": cameras, "width": width, "height": height,
         "frames-per-expression": 4, "board-frames": 0,
@@ -60,7 +62,6 @@ def run_alone(name: str, root: Path, preset: str) -> dict[str, float]:
 
 def measure_preset(captures: list[Path], truth: Path, root: Path, preset: str) -> dict:
     """Run every stage of the chain with a preset; returns costs by stage, their sums, errors."""
-    # Each stage's process imports this module; the stages' libraries would count for all of them.
     from benchmarks.accuracy import measure_dataset
 
     shutil.rmtree(root, ignore_errors=True)
@@ -98,6 +99,8 @@ def compare_plan(large: Dataset, smaller: list[Dataset]) -> dict:
 
 def main(arguments: list[str] | None = None) -> int:
     """Record, measure and print."""
+    from benchmarks.common import make_parser
+
     parser = make_parser("scale", __doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--cameras", type=int, default=24)
