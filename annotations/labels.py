@@ -95,6 +95,11 @@ def make_mark(
     source = index.cameras[camera]
     end = min(cue.end_frame, source.frames - 1)
     low, high = cue.start_frame if first is None else first, end if last is None else last
+    if not cue.start_frame <= frame <= end:
+        raise AnnotationError(
+            f"{index.subject} {expression}: frame {frame} is outside its cue window; "
+            f"expected {cue.start_frame} to {end}"
+        )
     if not cue.start_frame <= low <= frame <= high <= end:
         raise AnnotationError(
             f"{index.subject} {expression}: plateau {low} to {high} with peak frame {frame};"

@@ -158,7 +158,12 @@ def _cells(row: Row) -> list[str]:
 
 
 def _hours(value: float | None, low: float | None, high: float | None) -> str:
-    return f"{value:.3g} ({low:.2g} to {high:.2g})"
+    return f"{_figure(value or 0, 3)} ({_figure(low or 0, 2)} to {_figure(high or 0, 2)})"
+
+
+def _figure(value: float, digits: int) -> str:
+    """Round to significant digits, without the exponent that ``g`` gives large numbers."""
+    return f"{value:.0f}" if value >= 10**digits - 0.5 else f"{value:.{digits}g}"
 
 
 def _words(footage: Footage) -> str:
@@ -293,7 +298,7 @@ def estimate(
                 disk=items * disk,
                 memory=max(c.memory for _, c in alike),
                 preset=cost.preset,
-                how=f"{' x '.join(growth.time)} = {ratio:.4g}",
+                how=f"{' x '.join(growth.time) or 'constant'} = {_figure(ratio, 4)}",
             )
         )
     return rows

@@ -196,9 +196,8 @@ def existing_dataset(path: Path) -> Dataset:
     """Open the dataset of a folder that has a ledger; ConfigError if it has none."""
     dataset = Dataset(path)
     if not dataset.ledger.is_file():
-        raise ConfigError(
-            f"{path}: not a dataset (no ledger.sqlite); run 'express50 ingest {path} CAPTURE'"
-        )
+        what = "not a dataset (no ledger.sqlite)" if path.is_dir() else "no such dataset"
+        raise ConfigError(f"{path}: {what}; run 'express50 ingest {path} CAPTURE'")
     return dataset
 
 

@@ -377,7 +377,8 @@ def read_weights(path: Path, kind: Kind, where: str, what: str, fix: str = AGAIN
     import torch
 
     if not Path(path).is_file():
-        raise kind(f"{where}: no such file; {fix}")
+        what_is_there = "is a folder, expected a file" if Path(path).is_dir() else "no such file"
+        raise kind(f"{where}: {what_is_there}; {fix}")
     try:
         with warnings.catch_warnings(action="ignore"):  # about pickles that are refused
             return torch.load(path, map_location="cpu", weights_only=True)

@@ -33,7 +33,8 @@ def showing(stage: str, total: int, enabled: bool) -> Iterator[Callable[[Receipt
     task, settled = bar.add_task(stage, total=total), itertools.count(1)
 
     def show(receipt: Receipt) -> None:
-        how = f"{receipt.status} {receipt.seconds:.1f} s" if receipt.attempts else "restored"
+        restored = receipt.status == "done" and not receipt.attempts
+        how = "restored" if restored else f"{receipt.status} {receipt.seconds:.1f} s"
         line = f"{receipt.stage} {next(settled)}/{total} {receipt.item} {how}"
         line += f": {receipt.reason}" if receipt.reason else ""
         bar.advance(task)

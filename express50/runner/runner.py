@@ -187,7 +187,8 @@ def run_stage(
     dataset = Dataset(dataset.root.resolve())
     chosen = list(stage.items(dataset) if items is None else items)
     if not chosen:
-        before = "name a CAPTURE" if stage.prepare else "run the stages before it first"
+        status = f"'express50 status {dataset.root}' shows which stage before it must run first"
+        before = "name a CAPTURE" if stage.prepare else status
         raise StageError(f"{dataset.root}: {stage.name} has nothing to do; {before}")
     shared = nullcontext(pool) if pool else Pool(workers, scheduler)
     with shared as workers_pool, stage_lock(dataset, stage.name), Ledger(dataset.ledger) as ledger:

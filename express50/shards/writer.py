@@ -294,7 +294,10 @@ def _manifest_digests(root: Path) -> dict[str, str]:
     """
     path = root / "manifest.json"
     if not path.exists():
-        raise FormatError(f"{path}: the manifest is missing; rerun 'express50 pack'")
+        raise FormatError(
+            f"{path}: the manifest is missing; name the folder of shards (DATASET/pack/shards), "
+            "or rerun 'express50 pack'"
+        )
     files = read_json(path, FormatError)
     try:
         return {name: str(row["sha256"]) for name, row in files["files"].items()}

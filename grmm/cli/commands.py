@@ -45,7 +45,8 @@ def train(args: argparse.Namespace) -> int:
     resume = not args.overwrite and (args.out / "checkpoint.pt").exists()
     metrics = train(source, load_head(source.head), args.out, config, resume=resume)
     names = ("psnr_heldout_view_db", "psnr_train_db", "ssim", "iterations", "gaussians")
-    lines = [f"{name}: {metrics.get(name)}" for name in names]
+    values = {name: metrics.get(name) for name in names}
+    lines = [f"{name}: {'n/a' if value is None else value}" for name, value in values.items()]
     return answer(args, metrics, *lines, f"wrote {args.out / 'checkpoint.pt'}")
 
 

@@ -115,7 +115,8 @@ def run_remove(args: argparse.Namespace) -> int:
     dataset = existing_dataset(args.dataset)
     with stage_lock(dataset, args.stage):
         gone = remove_imports(dataset, args.stage, lambda i: fnmatch.fnmatchcase(i, args.items))
-    line = f"{args.stage}: {len(gone)} imported items removed; express50 {args.stage} remakes them"
+    line = f"{args.stage}: {len(gone)} imported items removed"
+    line += f"; express50 {args.stage} remakes them" if gone else f"; none matches {args.items!r}"
     return answer(args, {"stage": args.stage, "removed": gone}, line)
 
 

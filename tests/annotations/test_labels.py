@@ -50,7 +50,11 @@ def test_mark_stores_the_frame_identity(tmp_path):
 
 @pytest.mark.parametrize(
     ("expression", "frame", "camera", "named"),
-    [("frown", 4, "a", "frown"), ("smile", 7, "a", "2 to 6"), ("smile", 4, "z", "'z'")],
+    [
+        ("frown", 4, "a", "frown"),
+        ("smile", 7, "a", "frame 7 is outside its cue window; expected 2 to 6"),
+        ("smile", 4, "z", "'z'"),
+    ],
 )
 def test_mark_outside_footage_or_cue_is_refused(tmp_path, expression, frame, camera, named):
     with pytest.raises((AnnotationError, UnknownNameError), match=named):

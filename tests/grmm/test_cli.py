@@ -67,7 +67,7 @@ def test_train_sees_the_training_split_only(checkpoint):
 def test_training_again_goes_on_and_refuses_what_differs(shards, tmp_path, capsys):
     train = ["train", str(shards), str(tmp_path), *TINY]
     assert main(train) == 0
-    capsys.readouterr()
+    assert "psnr_heldout_view_db: n/a\n" in capsys.readouterr().out
 
     assert main(train) == 0
     assert "has all of its 3 iterations; to train on, raise" in capsys.readouterr().err
@@ -155,6 +155,7 @@ def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
          "the shards have S000, S001, S002"),
         (["config", "trian"], 2, "'trian'"),
         (["render", "{out}/absent.pt", "{out}"], 1, "absent.pt: no such file"),
+        (["render", "{shards}", "{out}"], 1, "is a folder, expected a file"),
         (["render", "{checkpoint}", "{out}", "--subject=S9"], 2, "has no subject S9"),
         (["export", "{checkpoint}", "{out}/head.obj"], 2, "expected one of .html, .ply, .spz"),
         (["export", "{checkpoint}", "{out}/head.ply", "--control=jaw=3"], 2,

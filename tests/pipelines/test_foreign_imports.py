@@ -248,6 +248,8 @@ def test_runs_keep_an_import_until_its_cameras_change(original, dataset, capsys)
         assert not path.exists()
     assert (dataset.stale_dir / "track/S001/track.npz").read_bytes() == before
     assert main(["import", "remove", str(dataset.root), "track"]) == 0
+    assert main(["import", "remove", str(dataset.root), "track"]) == 0
+    assert "0 imported items removed; none matches '*'" in capsys.readouterr().out
     with Ledger(dataset.ledger) as ledger:
         assert ledger.read("track") == {}
 

@@ -268,6 +268,10 @@ def test_nothing_fits_is_one_error_that_names_the_layouts(tmp_path):
     (tmp_path / "notes.txt").write_text("x")
     with pytest.raises(CaptureError, match="notes.txt.*renderme360.*nersemble.*colmap"):
         detect(tmp_path)
+    (tmp_path / "S001").mkdir()
+    (tmp_path / "S001/capture.toml").touch()
+    with pytest.raises(CaptureError, match="a folder of captures, .* name .*/[*]"):
+        detect(tmp_path)
     with pytest.raises(CaptureError, match="'avi'.*express50"):
         detect(tmp_path, "avi")
 

@@ -117,6 +117,7 @@ def test_figures_are_those_of_the_receipts(tmp_path, capsys):
     assert main(["plan", str(root), "--target", "renderme-360"]) == 0
     said = capsys.readouterr().out
     assert "was not run" in said and "not measured: calibrate" in said
+    assert "e+" not in said
     assert main(["plan", str(root), "--size", "big"]) == 2
 
 

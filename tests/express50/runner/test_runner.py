@@ -292,6 +292,15 @@ def test_items_that_never_were_made_may_all_fail(tmp_path):
     assert set(statuses(run_toy(dataset, files=-1)).values()) == {"failed"}
 
 
+def test_an_item_whose_input_is_missing_is_shown_as_failed(tmp_path, capsys):
+    def without(dataset, item, config):
+        raise StageError("not calibrated")
+
+    waiting = dataclasses.replace(toy.STAGE, inputs=without)
+    run_stage(waiting, make_dataset(tmp_path / "data", ["a"]), toy.ToyConfig(), workers=0)
+    assert "toy 1/1 a failed 0.0 s: StageError: not calibrated" in capsys.readouterr().err
+
+
 def test_outputs_of_vanished_items_are_set_aside_only_by_a_full_run(tmp_path):
     dataset = make_dataset(tmp_path / "data", ["a", "b"])
     run_toy(dataset)
@@ -357,7 +366,7 @@ def test_resolved_config_is_saved_and_can_be_given_back(tmp_path):
 
 def test_stage_without_items_and_unmatched_pattern_are_errors(tmp_path):
     dataset = make_dataset(tmp_path / "data", [])
-    with pytest.raises(StageError, match="nothing to do"):
+    with pytest.raises(StageError, match="nothing to do; 'express50 status .*' shows which"):
         run_toy(dataset)
     dataset = make_dataset(tmp_path / "other", ["S001", "S002"])
     assert select_items(toy.STAGE, dataset, "*2") == ["S002"]
