@@ -17,7 +17,7 @@ import numpy as np
 import pycolmap
 
 from express50.errors import CalibrationError
-from express50.geometry.cameras import Camera
+from express50.geometry.cameras import Camera, project, triangulate
 from express50.geometry.transforms import matrix_to_axis_angle, similarity_fit
 from express50.rigs.camera_builder import in_metres
 from express50.rigs.world_frame import meeting_point
@@ -69,13 +69,18 @@ def sfm_figures(
 
 
 def stated_to_true(solved: FootageSolution, true: Mapping[str, Camera]) -> float | None:
-    """Return stated over true error at the head, rms over cameras, after a similarity."""
+    """Return stated over true error at the head, rms over cameras.
+
+    Worlds are laid on each other by a similarity of the head's points, as the stated error assumes.
+    """
     names, middle = sorted(solved.cameras), meeting_point(true)
     if len(names) < 3 or middle is None:
         return None
-    centers = [np.stack([rig[n].center for n in names]) for rig in (solved.cameras, true)]
-    scaled = in_metres(solved.cameras, similarity_fit(*centers)[0])
-    off = camera_errors(scaled, {n: true[n] for n in names}, head_points() + middle)
+    points = head_points() + middle
+    pixels = np.stack([project(true[name], points)[0] for name in names])
+    found = triangulate([solved.cameras[name] for name in names], pixels)
+    scaled = in_metres(solved.cameras, 1 / similarity_fit(points, found)[0])
+    off = camera_errors(scaled, {n: true[n] for n in names}, points)
     squares = [
         np.mean([solved.uncertainty[n].px ** 2 for n in names]),
         np.mean(np.square(list(off.values()))),

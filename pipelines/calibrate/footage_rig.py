@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from express50.errors import CalibrationError
-from express50.geometry.cameras import Camera, triangulate
+from express50.geometry.cameras import Camera, pinhole, project, triangulate
 from express50.geometry.transforms import invert_transform, make_transform, rigid_fit
 from express50.rigs.camera_builder import in_metres
 from express50.rigs.world_frame import canonical_from_rig, move_cameras
@@ -217,17 +217,36 @@ def _adjust(
     refused = set[str]()
     while others := {n: c for n, c in start.items() if n not in fit.cameras and n not in refused}:
         more = place_by_features(fit, tracks, others, seen, candidates)
-        if not more:
+        if not (more := _facing(more, fit.cameras, seen)):
             break
         wider, wide = with_features(fit.cameras | more, BANDS[:1])
         expected = _expected(wide, wider, seen, priors)
-        most = {n: LOOSE * float(np.hypot(start[n].width, start[n].height)) for n in more}
-        loose = {n for n in more if not expected.get(n, np.inf) < most[n]}
-        refused |= loose
-        if set(more) - loose:
-            held = {n: c for n, c in wide.cameras.items() if n not in loose}
-            tracks, fit = with_features(held, BANDS)
+        held = set(_facing(wide.cameras, wide.cameras, seen)) - set(_weak(wider))
+        loose = {
+            n: expected[n] / float(np.hypot(start[n].width, start[n].height))
+            if n in held
+            else np.inf
+            for n in more
+        }
+        worst = max(loose, key=lambda n: (loose[n], n))
+        if loose[worst] < LOOSE:
+            tracks, fit = with_features(wide.cameras, BANDS)
+        else:  # it may be what makes the others loose: they are tried again
+            refused.add(worst)
     return tracks, fit, _expected(fit, tracks, seen, priors)
+
+
+def _facing(
+    found: Mapping[str, Camera], rig: Mapping[str, Camera], seen: Mapping[int, FrameSetPoints]
+) -> dict[str, Camera]:
+    """Return the cameras whose pictures show the middle of the head that a rig sees."""
+    middle = np.median(_landmark_points(rig, seen), axis=(0, 1))
+    pixels = {name: project(pinhole(camera), middle[None])[0][0] for name, camera in found.items()}
+    return {
+        name: camera
+        for name, camera in found.items()
+        if ((pixels[name] > 0) & (pixels[name] < (camera.width, camera.height))).all()
+    }
 
 
 def _expected(

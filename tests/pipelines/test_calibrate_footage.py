@@ -15,11 +15,21 @@ from express50.contract.layout import Dataset
 from express50.errors import CalibrationError, ConfigError
 from express50.files.calibration import camera_rows
 from express50.files.images import write_image
-from express50.geometry.transforms import similarity_fit
+from express50.geometry.transforms import (
+    axis_angle_to_matrix,
+    make_transform,
+    similarity_fit,
+)
 from express50.rigs.camera_builder import in_metres
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.footage import has_one_lens
-from pipelines.calibrate.footage_rig import pose_of_face, resect, solve_footage, start_camera
+from pipelines.calibrate.footage_rig import (
+    _facing,
+    pose_of_face,
+    resect,
+    solve_footage,
+    start_camera,
+)
 from pipelines.calibrate.given_rig import refine_by_footage
 from pipelines.calibrate.tracks import FrameSetPoints
 from pipelines.calibrate.uncertainty import camera_errors, head_points
@@ -226,3 +236,11 @@ def test_degenerate_faces_and_matches_give_no_pose():
     once = np.array([[10.0, 20.0, 1, 1, 1]] * 40)
     assert resect(same, camera.K) is None and resect(once, camera.K) is None
     assert resect(np.zeros((0, 5)), camera.K) is None
+
+
+def test_a_camera_that_looks_away_from_the_head_is_not_placed():
+    rig = face_cameras()
+    turned = make_transform(axis_angle_to_matrix(np.array([0.0, np.pi, 0.0])), np.zeros(3))
+    away = replace(rig["cam02"], cam_from_world=turned @ rig["cam02"].cam_from_world)
+    assert set(_facing(rig, rig, see(rig))) == set(rig)
+    assert set(_facing({**rig, "cam02": away}, rig, see(rig))) == set(rig) - {"cam02"}
