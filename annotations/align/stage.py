@@ -24,6 +24,7 @@ from annotations.labels import (
     make_event,
     make_mark,
     read_labels,
+    unreadable_lines,
 )
 from annotations.observe.stage import cue_frames, read_observations
 from annotations.suggestions import Suggested, reference_subject
@@ -63,7 +64,12 @@ def run(dataset: Dataset, item: str, out: Path, *, accept: float, match: bool) -
         "confidence_median": round(float(np.median(sure)), 4) if sure else None,
     }
     taken = [s for e, s in found.items() if e in peaks and peaks[e].annotator == AUTOMATIC]
-    return Result(metrics, dropped, expected_error=expected_error(taken))
+    name = dataset.labels_file(index.subject).name
+    warnings = [
+        Note("labels", f"line {number} of {name} cannot be read; label its expression again")
+        for number in unreadable_lines(dataset, index.subject)
+    ]
+    return Result(metrics, dropped, warnings, expected_error=expected_error(taken))
 
 
 def expected_error(taken: Sequence[Suggested]) -> ExpectedError | None:

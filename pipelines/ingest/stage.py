@@ -239,7 +239,9 @@ def split_cues(cues: tuple[Cue, ...], frames: int) -> tuple[tuple[Cue, ...], dic
 
 
 def odd_cues(cues: tuple[Cue, ...]) -> dict[str, str]:
-    """Return which expressions share frames with one before them, by expression."""
+    """Return which expressions share frames with one before them; say so if there are none."""
+    if not cues:
+        return {"expressions": "cues.csv names none; later stages have nothing to do without them"}
     found = {}
     for a, b in combinations(cues, 2):
         first, last = max(a.start_frame, b.start_frame), min(a.end_frame, b.end_frame)

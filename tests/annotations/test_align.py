@@ -64,6 +64,15 @@ def watched(dataset):
     return dataset
 
 
+def test_a_damaged_line_of_labels_is_a_warning(watched):
+    path = watched.labels_file("S001")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text('{"cut off\n')
+    assert run(watched, ["S001"]).ok
+    found = json.loads((watched.item_dir("align", "S001") / "metrics.json").read_text())
+    assert "line 1 of S001" in found["warnings"][0]["why"]
+
+
 def test_peaks_are_found_and_other_subjects_match_the_reference(watched):
     assert run(watched).ok
     for subject in ("S001", "S002"):

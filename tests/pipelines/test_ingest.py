@@ -164,6 +164,12 @@ def test_different_frame_counts_are_reported_and_short_cameras_dropped(dataset):
     assert "has 5 frames, the cues need 8" in dropped["why"]
 
 
+def test_a_capture_without_cues_is_ingested_with_a_warning(dataset):
+    (dataset.captures()["S001"] / "cues.csv").unlink()
+    assert run(dataset).ok
+    assert [w["what"] for w in metrics(dataset)["warnings"]] == ["expressions"]
+
+
 def test_cues_outside_the_footage_are_dropped_and_reported(dataset):
     cues = dataset.captures()["S001"] / "cues.csv"
     cues.write_text("expression_id,start_frame,end_frame\nneutral,0,7\nsmile,6,8\nanger,90,95\n")
