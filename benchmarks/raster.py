@@ -26,7 +26,7 @@ from torch import Tensor
 
 from express50 import native
 from express50.geometry.conventions import cell_to_corner, corner_to_cell
-from grmm.rasterize import RenderBuffers, RenderOutput, rasterize
+from grmm.rasterize import RenderOutput, rasterize
 from grmm.rasterize.projection import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -57,11 +57,9 @@ def measure(scene: dict[str, Tensor], run: Run) -> tuple[float, float]:
     return forward, forward + time.process_time() - start
 
 
-def native_images(
-    leaves: dict[str, Tensor], size: int, buffers: RenderBuffers
-) -> tuple[Tensor, ...]:
+def native_images(leaves: dict[str, Tensor], size: int) -> tuple[Tensor, ...]:
     """Return colours, depth and alpha of the native kernel."""
-    out = rasterize(**leaves, width=size, height=size, backend="cpu", buffers=buffers)
+    out = rasterize(**leaves, width=size, height=size, backend="cpu")
     return out.colors, out.depth, out.alpha
 
 
@@ -96,8 +94,7 @@ def case(
     n: int, size: int, channels: int, pairs: tuple[Tensor, Tensor], repeats: int
 ) -> dict[str, object]:
     """Measure one row of the table."""
-    scene, buffers = head(n, size, channels), RenderBuffers()
-    run = partial(native_images, size=size, buffers=buffers)
+    scene, run = head(n, size, channels), partial(native_images, size=size)
     runs = [measure(scene, run) for _ in range(repeats + 1)][1:]
     forward, both = min(f for f, _ in runs), min(b for _, b in runs)
     hits = len(pairs[0])

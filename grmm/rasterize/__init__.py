@@ -17,7 +17,6 @@ from express50.geometry.shapes import PIXEL_LIMIT
 from grmm.rasterize.projection import (
     NotFiniteTensorError,
     Pinhole,
-    RenderBuffers,
     RenderOptions,
     RenderOutput,
     Splats,
@@ -27,7 +26,6 @@ from grmm.rasterize.projection import (
 __all__ = [
     "BACKENDS",
     "NotFiniteTensorError",
-    "RenderBuffers",
     "RenderOutput",
     "rasterize",
     "resolve_backend",
@@ -53,7 +51,6 @@ def rasterize(
     median_depth: bool = False,
     normals: bool = False,
     backend: str = "auto",
-    buffers: RenderBuffers | None = None,
 ) -> RenderOutput:
     """Render Gaussians into one pinhole image; differentiable in every tensor argument.
 
@@ -74,7 +71,6 @@ def rasterize(
         normals: also give blended normals.
         backend: ``auto`` takes gsplat for CUDA tensors, else the native kernel if it was built,
             else the reference.
-        buffers: memory that the native backend reuses for its images.
 
     Raises:
         NotFiniteTensorError: an argument holds NaN or Inf.
@@ -89,7 +85,7 @@ def rasterize(
     if name == "cpu":  # a backend is imported when it is used: gsplat may start a long build
         from grmm.rasterize.cpu import rasterize_cpu
 
-        return rasterize_cpu(splats, camera, background, options, buffers)
+        return rasterize_cpu(splats, camera, background, options)
     if name == "gsplat":
         from grmm.rasterize.gsplat_backend import rasterize_gsplat
 

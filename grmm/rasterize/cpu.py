@@ -2,7 +2,7 @@
 
 Images and gradients are the same to the last bit for any number of threads, which is
 ``torch.get_num_threads()``. Large outputs ask for huge pages: mapping small ones takes a third of
-the time of a large image with many channels. ``RenderBuffers`` need neither.
+the time of a large image with many channels.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from grmm.rasterize.projection import (
     DILATION_PX2,
     NEAR_M,
     Pinhole,
-    RenderBuffers,
     RenderOptions,
     RenderOutput,
     Splats,
@@ -58,7 +57,6 @@ def rasterize_cpu(
     camera: Pinhole,
     background: Tensor | None,
     options: RenderOptions,
-    buffers: RenderBuffers | None = None,
 ) -> RenderOutput:
     """Render; see ``grmm.rasterize``."""
     device = scene.means.device
@@ -71,7 +69,6 @@ def rasterize_cpu(
         background,
         (camera.width, camera.height),
         options,
-        buffers,
     )
     channels = scene.colors.shape[1]
     return RenderOutput(
@@ -99,7 +96,6 @@ class _Rasterize(torch.autograd.Function):
         background: Tensor | None,
         size: tuple[int, int],
         options: RenderOptions,
-        buffers: RenderBuffers | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         ctx.set_materialize_grads(False)
         # The kernel reads raw memory, so tensors must be contiguous.
@@ -113,10 +109,9 @@ class _Rasterize(torch.autograd.Function):
         used = torch.empty(starts.numel() - 1, dtype=torch.int32)
         blended = (splats, boxes, colors, background, starts, ids, used)
         shape, dtype = (camera.height, camera.width), means.dtype
-        take = buffers.take if buffers else lambda _, *new: _empty(*new)
-        image = take("image", (*shape, colors.shape[1]), dtype)
-        weighted, alpha = take("weighted", shape, dtype), take("alpha", shape, dtype)
-        median = take("median", shape, dtype) if options.median_depth else None
+        image = _empty((*shape, colors.shape[1]), dtype)
+        weighted, alpha = _empty(shape, dtype), _empty(shape, dtype)
+        median = _empty(shape, dtype) if options.median_depth else None
         _call("forward", dtype, camera, colors.shape[1], *blended, image, weighted, alpha, median)
         ctx.camera = camera
         ctx.save_for_backward(*geometry, *blended, alpha, K, cam_from_world)
@@ -147,7 +142,7 @@ class _Rasterize(torch.autograd.Function):
             d_background = torch.einsum("hwc,hw->c", d_images[0][..., :asked], 1.0 - alpha)
         grads[4] = grads[4][:, :asked]
         d_camera_inputs = d_K.to(K.dtype), d_pose.to(cam_from_world.dtype)
-        return *grads, *d_camera_inputs, d_background, None, None, None
+        return *grads, *d_camera_inputs, d_background, None, None
 
 
 def _bin(

@@ -86,28 +86,6 @@ class RenderOutput:
     normals: Tensor | None = None
 
 
-class RenderBuffers:
-    """Memory of the native backend's images that is used again, call after call.
-
-    At 1024 px and 38 channels, fresh pages cost as much as a third of the blending. The images of
-    a call are valid until the next call with the same buffers: copy what must live longer. Where
-    autograd still needs an image that was overwritten, its backward raises RuntimeError.
-    """
-
-    def __init__(self) -> None:
-        """Start without memory."""
-        self._flat: dict[str, Tensor] = {}
-
-    def take(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-        """Return an uninitialised tensor in the memory that ``name`` had, grown if needed."""
-        size = torch.Size(shape).numel()
-        flat = self._flat.get(name)
-        if flat is None or flat.dtype != dtype or flat.numel() < size:
-            flat = self._flat[name] = torch.empty(size, dtype=dtype)
-        torch.autograd.graph.increment_version(flat)
-        return flat[:size].view(shape).detach()  # no view for autograd, but one version with it
-
-
 @dataclass(frozen=True)
 class Projection:
     """Gaussians in one image; rows of Gaussians that are not ``visible`` are finite but arbitrary.

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from express50 import native
-from grmm.rasterize import BACKENDS, RenderBuffers, cpu, rasterize, resolve_backend
+from grmm.rasterize import BACKENDS, cpu, rasterize, resolve_backend
 from tests.grmm.gaussian_scenes import GRADIENTS, Scene, random_scene, relative_error, render
 
 CPU_BACKENDS = ["reference", "cpu"]
@@ -283,28 +283,6 @@ def test_median_depth_and_normals_come_only_when_asked():
     assert plain.median_depth is None and plain.normals is None
     both = rasterize(**scene, width=61, height=47, median_depth=True, normals=True)
     assert torch.equal(plain.colors, both.colors) and torch.equal(plain.depth, both.depth)
-
-
-def test_buffers_are_used_again_and_change_nothing():
-    buffers = RenderBuffers()
-    places = set()
-    for seed, size in ((0, 40), (1, 40), (2, 30)):
-        scene = random_scene(30, 9, size, size, seed).tensors
-        expected = rasterize(**scene, width=size, height=size, backend="cpu")
-        got = rasterize(**scene, width=size, height=size, backend="cpu", buffers=buffers)
-        assert torch.equal(expected.colors, got.colors) and torch.equal(expected.depth, got.depth)
-        places.add(got.colors.data_ptr())
-    assert len(places) == 1
-
-
-def test_backward_through_an_overwritten_buffer_is_refused():
-    scene = {k: v.requires_grad_() for k, v in random_scene(20, 9).tensors.items()}
-    buffers = RenderBuffers()
-    out = rasterize(**scene, width=61, height=47, backend="cpu", buffers=buffers)
-    loss = out.colors.square().sum()
-    rasterize(**scene, width=61, height=47, backend="cpu", buffers=buffers)
-    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-        loss.backward()
 
 
 @pytest.mark.parametrize("backend", CPU_BACKENDS)
