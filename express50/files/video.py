@@ -7,8 +7,10 @@ make a container's own frame count wrong. Writing the same pictures gives the sa
 from __future__ import annotations
 
 import os
+from bisect import bisect_left
 from collections.abc import Iterator
 from fractions import Fraction
+from itertools import chain
 from pathlib import Path
 from types import TracebackType
 
@@ -20,8 +22,8 @@ from express50.files.images import encode_jpeg, encode_png
 from express50.files.text import reason
 from express50.geometry.shapes import PIXEL_LIMIT
 
-# A seek aims this many frames before the wanted one. An H.264 or H.265 picture may be displayed up
-# to 16 pictures away from its position in the stream, so a nearer key frame may come after it.
+# An H.264 or H.265 picture may be displayed up to 16 pictures away from its position in the stream,
+# so the key frame nearest to a wanted picture may be displayed after it.
 REORDER = 16
 # Accepted containers. FFmpeg goes by content: a playlist named video.mp4 would make it read other
 # files.
@@ -188,7 +190,7 @@ class VideoReader:
         self.path = path
         self.pts = pts
         self._container, self._stream = _open(path)
-        self._frames = _decode(path, self._container, self._stream)
+        self._frames: Iterator[av.VideoFrame] = _decode(path, self._container, self._stream)
         self._next = 0  # decode index of the frame that _frames yields next
 
     def read(self, frame: int) -> np.ndarray:
@@ -226,17 +228,25 @@ class VideoReader:
         self._container.close()
 
     def _seek(self, frame: int) -> None:
-        target = max(0, frame - REORDER)
-        if target == 0:
-            self.restart()
-            return
-        try:
-            self._container.seek(self.pts[target], stream=self._stream, backward=True)
-        except DAMAGE:  # no index to seek with: start from the first frame
-            self.restart()
-            return
-        self._frames = _decode(self.path, self._container, self._stream)
-        self._next = target
+        """Go to a key frame before a frame: to the nearest, or with an allowance for reordering."""
+        for target in (frame, frame - REORDER):
+            if target <= 0:
+                break
+            try:
+                self._container.seek(self.pts[target], stream=self._stream, backward=True)
+                frames = _decode(self.path, self._container, self._stream)
+                first = next(frames, None)
+            except DAMAGE:  # no index to seek with
+                break
+            except CaptureError:  # what came first lacks what it refers to
+                continue
+            # What is displayed after a key frame needs nothing from before it. A later key frame,
+            # or a picture that lacks what it refers to, comes first if the nearest was too near.
+            near = first is not None and first.key_frame and first.pts <= self.pts[frame]
+            if first is not None and (near or target < frame):
+                self._frames, self._next = chain([first], frames), bisect_left(self.pts, first.pts)
+                return
+        self.restart()
 
     def _decode_until(self, frame: int) -> np.ndarray | None:
         """Decode forward to the frame; return None if the stream is already past it or ends."""

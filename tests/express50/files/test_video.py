@@ -6,6 +6,7 @@ import pytest
 
 from express50.capture.frames import dhash
 from express50.errors import CaptureError
+from express50.files import video as video_module
 from express50.files.video import VideoReader, check_whole, iterate_video
 from tests.synth import noise_video_images, write_video
 
@@ -38,6 +39,26 @@ def test_random_reads_give_the_sequential_frames(video):
     for frame in [0, FRAMES - 1, 1, *order]:
         assert np.array_equal(reader.read(int(frame)), sequential[frame][1]), frame
     reader.close()
+
+
+def test_a_read_decodes_from_the_nearest_key_frame(tmp_path, monkeypatch):
+    path, decoded = tmp_path / "video.mp4", []
+    write_video(path, noise_video_images(FRAMES), gop=12, b_frames=2)
+    pts = tuple(stamp for stamp, _ in iterate_video(path))
+    reader, decode = VideoReader(path, pts), video_module._decode
+
+    def counted(*arguments):
+        for frame in decode(*arguments):
+            decoded.append(frame.pts)
+            yield frame
+
+    monkeypatch.setattr(video_module, "_decode", counted)
+    reader.read(50)
+    reader.close()
+    with av.open(str(path)) as container:
+        keys = [frame.pts for frame in container.decode(video=0) if frame.key_frame]
+    nearest = max(key for key in keys if key <= pts[50])
+    assert decoded == [stamp for stamp in pts if nearest <= stamp <= pts[50]]
 
 
 def test_forward_reads_do_not_seek(video, monkeypatch):
