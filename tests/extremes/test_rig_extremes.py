@@ -91,6 +91,8 @@ def test_all_footage_is_out_of_step(clips, tmp_path, capsys) -> None:
     for i, (name, images) in enumerate(sorted(clips.items())):
         write_frames(tmp_path / "capture" / "cameras" / name / "frames", images[9 * i :][:50])
     (tmp_path / "capture" / "capture.toml").write_text('subject = "S001"\nfps = 24\n')
+    cues = "expression_id,start_frame,end_frame\nneutral,0,20\n"
+    (tmp_path / "capture" / "cues.csv").write_text(cues)
     command = ["ingest", str(tmp_path / "data"), str(tmp_path / "capture"), "--workers", "0"]
     assert main(command) == 0
     (line,) = [row for row in capsys.readouterr().out.splitlines() if "warning" in row]

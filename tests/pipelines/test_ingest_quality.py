@@ -159,7 +159,7 @@ def test_ingest_warns_of_all_faults_and_writes_their_figures(footage, tmp_path):
     folder = dataset.item_dir("ingest", "S001")
     rows = json.loads((folder / "metrics.json").read_text())["warnings"]
     said = {row["what"]: row["why"] for row in rows}
-    assert sorted(said) == ["camera cam00", "camera cam01", "camera cam02"]
+    assert sorted(said) == ["camera cam00", "camera cam01", "camera cam02", "expressions"]
     assert "exposure changes by 0.5" in said["camera cam00"]
     assert "out of focus: its sharpest edges are" in said["camera cam01"]
     assert "loses 2 frames at about frame" in said["camera cam02"]
