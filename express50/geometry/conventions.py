@@ -25,9 +25,14 @@ def corner_to_opencv_pixels(pixels: np.ndarray) -> np.ndarray:
     return np.asarray(pixels, dtype=np.float64) - 0.5
 
 
+def mirror_pixels(pixels: np.ndarray, width: int) -> np.ndarray:
+    """Return the pixels (N, 2) of an image flipped left to right, `width` pixels wide."""
+    return np.stack([width - pixels[:, 0], pixels[:, 1]], axis=1)
+
+
 def mirror_opencv_pixels(pixels: np.ndarray, width: int) -> np.ndarray:
-    """Return OpenCV's pixels (N, 2) of an image flipped left to right, `width` pixels wide."""
-    return np.stack([width - 1 - pixels[:, 0], pixels[:, 1]], axis=1)
+    """Return OpenCV's pixels (N, 2) of such an image."""
+    return corner_to_opencv_pixels(mirror_pixels(opencv_pixels_to_corner(pixels), width))
 
 
 def K_to_opencv(K: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from express50.geometry.cameras import Camera, normalised
+from express50.geometry.conventions import mirror_pixels
 
 Features: TypeAlias = tuple[np.ndarray, np.ndarray]
 """Recorded pixels (N, 2) and descriptors (N, 128) of length one."""
@@ -254,7 +255,7 @@ def mirrored_cameras(
     features = seen[frame].features
     counts = {name: [0, 0] for name in features}
     for a, b in (pair for pair in pairs if set(pair) <= set(features)):
-        for i, mine in enumerate((features[a], _mirrored(features[a], widths[a]))):
+        for i, mine in enumerate((features[a], mirror_features(features[a], widths[a]))):
             matches = verified_pairs({frame: (mine, features[b])})
             for name in (a, b):
                 counts[name][i] += len(matches.get(frame, ()))
@@ -266,7 +267,7 @@ def mirrored_cameras(
     }
 
 
-def _mirrored(features: Features, width: int) -> Features:
+def mirror_features(features: Features, width: int) -> Features:
     """Return features as the mirrored picture has them.
 
     A SIFT descriptor has four rows of four cells with eight directions each. Rows and directions
@@ -274,7 +275,7 @@ def _mirrored(features: Features, width: int) -> Features:
     """
     pixels, described = features
     cells = described.reshape(-1, 4, 4, 8)[:, ::-1, :, -np.arange(8) % 8]
-    return pixels * [-1, 1] + [width, 0], cells.reshape(-1, 128)
+    return mirror_pixels(pixels, width), cells.reshape(-1, 128)
 
 
 def verified_pairs(
