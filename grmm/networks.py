@@ -210,10 +210,12 @@ class Refinement(nn.Module):
     def forward(self, maps: Tensor) -> Tensor:
         """Refine (inputs, H, W) to colours (3, H, W)."""
         height, width = maps.shape[1:]
-        pad, x = (0, -width % self.stride, 0, -height % self.stride), maps[None]
-        # Both would copy the images even if there is nothing to pad or to fold.
-        x = nn.functional.pad(x, pad) if any(pad) else x
-        x = nn.functional.pixel_unshuffle(x, self.unshuffle) if self.unshuffle > 1 else x
+        right, below = -width % self.stride, -height % self.stride
+        x = maps[None]
+        if right or below:  # otherwise padding and folding would only copy the images
+            x = nn.functional.pad(x, (0, right, 0, below))
+        if self.unshuffle > 1:
+            x = nn.functional.pixel_unshuffle(x, self.unshuffle)
         x = x.contiguous(memory_format=torch.channels_last)
         levels = [self.enter(x)]
         for block in self.down:
