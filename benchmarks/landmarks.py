@@ -8,10 +8,9 @@ points that count are those of the published mark-up, the outline in place of th
 
 `rendered` shows heads that training never saw, of the built-in model and of that of ``--ict``, in
 percent of the square root of the area of the landmarks' box: landmarks and outline, by the head's
-turn, and how far errors are from the stated scale (1.0: a Laplace distribution of
-that scale has such a mean). `seconds_per_view` is processor time of one core for views of 512 px.
-`before` says the same of the weights of ``--before``. The last line printed
-is one JSON object.
+turn, and how far errors are from the stated scale (1.0: a Laplace distribution of that scale has
+such a mean). `seconds_per_view` is processor time of one core for views of 512 px. `before` has the
+same figures for the weights of ``--before``. The last line printed is one JSON object.
 """
 
 from __future__ import annotations
