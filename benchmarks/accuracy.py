@@ -7,6 +7,7 @@ a subject, fitted to the cameras; what is left of calibration error stays in eve
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -28,7 +29,8 @@ from express50.files.images import contact_sheet, read_image, write_image
 from express50.geometry.cameras import Camera, pinhole, transform_camera
 from express50.twin.truth import Truth, align_worlds
 
-VIEWS_A_PEAK = 2  # views measured of every peak; they walk around the rig from peak to peak
+VIEWS_PER_PEAK = 2  # views measured of every peak; they walk around the rig from peak to peak
+VIEWS_PER_SUBJECT = 8  # at least: a rig's first cameras may all look at the back of the head
 SHEET_ROWS = 7
 ERROR_RANGE_MM = 8.0  # full colour in the error pictures
 ERROR_RANGE_DEG = 45.0  # white in those of normals
@@ -103,10 +105,13 @@ def sampled_views(dataset: Dataset, truth: Truth) -> Iterator[tuple[str, str, in
     turn = 0
     for subject in dataset.subjects():
         cameras = list(true_world_cameras(dataset, truth, subject).values())
-        for expression, frame in read_peaks(dataset, subject).items():
-            for _ in range(min(VIEWS_A_PEAK, len(cameras))):
-                yield subject, expression, frame, cameras[turn % len(cameras)]
-                turn += 3 if len(cameras) % 3 else 1
+        walk = [camera for start in range(3) for camera in cameras[start::3]]
+        peaks = read_peaks(dataset, subject)
+        views = max(VIEWS_PER_PEAK, math.ceil(VIEWS_PER_SUBJECT / max(1, len(peaks))))
+        for expression, frame in peaks.items():
+            for _ in range(min(views, len(walk))):
+                yield subject, expression, frame, walk[turn % len(walk)]
+                turn += 1
 
 
 def enlarged(image: np.ndarray, camera: Camera, how: int = cv2.INTER_LINEAR) -> np.ndarray:
