@@ -44,9 +44,17 @@ class Parser(argparse.ArgumentParser):
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:
             known = [str(choice) for choice in action.choices]
-            near = nearest(str(value), known, 0.6)
+            near = nearest(str(value), known)
             words = f"unknown {value!r}{near}; expected {', '.join(known)}"
             raise argparse.ArgumentError(action, words)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse a command's arguments; refuse those left over here, where its options are known."""
+        found, left = super().parse_known_args(args, namespace)
+        if left:
+            near = nearest(left[0].partition("=")[0], self._option_string_actions)
+            self.error(f"unexpected argument {left[0]!r}{near}")
+        return found, left
 
 
 def run_handler(

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Collection, Iterable
 
 FEW = 8  # names that a message lists before it says how many more there are
+LIKENESS = 0.75  # of a word and a name that is worth suggesting; 'train' and 'twin' have 0.67
 LONGEST = 1200  # characters; text from a hostile file must not fill a terminal
 
 
@@ -91,8 +93,18 @@ def check_known(
             raise kind(f"{where}: no {what} {name!r}{near}; expected one of {listed}")
 
 
-def nearest(word: str, known: Iterable[str], likeness: float = 0.5) -> str:
-    """Return ``, did you mean 'x'?`` if a known name is similar, else an empty string."""
-    names = list(known)
-    close = difflib.get_close_matches(word, names, n=1, cutoff=likeness)
-    return f", did you mean {close[0]!r}?" if close else ""
+def nearest(word: str, known: Iterable[str]) -> str:
+    """Return `` (did you mean 'x'?)`` if a word is a likely slip of a known name, else nothing."""
+    best = max(known, key=lambda name: _likeness(word, name), default="")
+    return f" (did you mean {best!r}?)" if _likeness(word, best) >= LIKENESS else ""
+
+
+def _likeness(word: str, name: str) -> float:
+    """Return how alike a word and a name, or a part of it, are, 0 to 1."""
+    if re.findall(r"\d+", word) != re.findall(r"\d+", name):  # S009 is not a slip of S008
+        return 0.0
+    word, name = word.casefold(), name.casefold()
+    parts = [name, *re.split(r"[_/.-]+", name)]
+    if any(part and sorted(word) == sorted(part) for part in parts):  # letters swapped
+        return 1.0
+    return max(difflib.SequenceMatcher(None, word, part).ratio() for part in parts)

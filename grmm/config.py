@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from express50.contract.config import build_dataclass, check_ranges, known_assignments, read_tables
-from express50.errors import ConfigError
+from express50.errors import ConfigError, nearest
 
 FRAMES = ("head", "tangent")
 NOT_NEGATIVE = (0, math.inf)
@@ -320,7 +320,8 @@ def resolve(
     """
     if name not in PRESETS:
         raise ConfigError(
-            f"preset is {name!r}, expected one of {', '.join(PRESETS)} (of 'grmm train': or auto)"
+            f"unknown preset {name!r}{nearest(name, PRESETS)}; expected one of {', '.join(PRESETS)}"
+            " (of 'grmm train': or auto)"
         )
     tables = as_tables(Config())
     for layer in (PRESETS[name], changes or {}, read_tables(file, list(TABLES)) if file else {}):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 import tomllib
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
 
-from express50.errors import FormatError
+from express50.errors import FormatError, nearest
 
 NEUTRAL = "neutral"  # the resting face, which has no peak
 
@@ -50,15 +49,15 @@ def select(ids: list[str] | tuple[str, ...] | None = None) -> tuple[Expression, 
     """Return the script's entries with these ids, in their order; all of them for None.
 
     Raises:
-        FormatError: an id is not in the script; the message suggests the nearest one.
+        FormatError: an id is not in the script; the message suggests a similar one.
     """
     script = {expression.id: expression for expression in load_script()}
     if ids is None:
         return tuple(script.values())
     for wanted in ids:
         if wanted not in script:
-            near = difflib.get_close_matches(wanted, script, 1, cutoff=0.0)
             raise FormatError(
-                f"expression {wanted!r} is not in the script; did you mean {near[0]!r}?"
+                f"expression {wanted!r} is not in the script{nearest(wanted, script)}; "
+                f"expected ids such as {', '.join(list(script)[:3])}"
             )
     return tuple(script[wanted] for wanted in ids)

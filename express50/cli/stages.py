@@ -12,7 +12,7 @@ from express50.console import FAILED, OK, USAGE, add_command, log, say, say_json
 from express50.contract.config import PRESETS, config_toml, resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage, stages, with_required
-from express50.errors import ConfigError
+from express50.errors import ConfigError, nearest
 
 
 def add_commands(subparsers: Any) -> None:
@@ -235,7 +235,10 @@ def show_config(args: argparse.Namespace) -> int:
     names = args.stage or list(stages())
     for name in names:
         if name not in stages():
-            raise ConfigError(f"unknown stage {name!r}; expected one of {', '.join(stages())}")
+            near = nearest(name, stages())
+            raise ConfigError(
+                f"unknown stage {name!r}{near}; expected one of {', '.join(stages())}"
+            )
     tables = [config_toml(name, config_of(stages()[name], args)) for name in names]
     say("\n".join(tables).rstrip())
     return OK

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from express50.console import OK, answer, log, say
 from express50.contract.config import config_toml, known_assignments
-from express50.errors import ConfigError
+from express50.errors import ConfigError, nearest
 from express50.files.atomic import write_bytes, write_json
 from grmm.config import TABLES, Config, as_tables, choose, from_tables, resolve
 from grmm.deviations import paper_diff
@@ -93,7 +93,8 @@ def config(args: argparse.Namespace) -> int:
         return OK
     for table in args.table or TABLES:
         if table not in TABLES:
-            raise ConfigError(f"unknown table {table!r}; expected one of {', '.join(TABLES)}")
+            near = nearest(table, TABLES)
+            raise ConfigError(f"unknown table {table!r}{near}; expected one of {', '.join(TABLES)}")
         say(config_toml(table, getattr(resolved, table)))
     return OK
 

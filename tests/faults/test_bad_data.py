@@ -61,5 +61,5 @@ def test_fixed_captures_complete_the_dataset(tmp_path, capsys):
 def test_unknown_key_stops_before_anything_is_written(tmp_path, captures, capsys):
     data = tmp_path / "data"
     assert main(["ingest", str(data), str(captures / "good"), "--set", "ingest.proxi=1"]) == 2
-    assert "unknown key ingest.proxi, did you mean 'proxy_" in capsys.readouterr().err
+    assert "unknown key ingest.proxi (did you mean 'proxy_" in capsys.readouterr().err
     assert not data.exists()

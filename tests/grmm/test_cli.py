@@ -291,7 +291,7 @@ def test_a_head_is_driven_by_tracked_clips(checkpoint, tmp_path, capsys):
     ("arguments", "message"),
     [
         (["train", "a", "b", "--budget", "-4m"], "'-4m' is not a time, expected for example 60s"),
-        (["trian"], "unknown 'trian', did you mean 'train'?"),
+        (["trian"], "unknown 'trian' (did you mean 'train'?)"),
     ],
 )
 def test_wrong_usage_is_said_with_what_was_given(arguments, message, capsys):

@@ -15,7 +15,7 @@ from express50.contract.config import (
     resolve_config,
 )
 from express50.contract.stage import Result, Stage
-from express50.errors import ConfigError
+from express50.errors import ConfigError, nearest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,13 +81,13 @@ def test_values_are_typed(assignment, key, value):
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [
-        ("track.iteratons=5", "unknown key track.iteratons, did you mean 'iterations'"),
-        ("trak.iterations=5", "no stage 'trak' in this command, did you mean 'track'"),
+        ("track.iteratons=5", "unknown key track.iteratons .did you mean 'iterations'"),
+        ("trak.iterations=5", "no stage 'trak' in this command .did you mean 'track'"),
         ("track.iterations=2.5", "got 2.5 .float., expected int"),
         ("track.iterations=true", "got True .bool., expected int"),
         ("track.refine=1", "got 1 .int., expected bool"),
         ("track.rate=nan", "got NaN"),
-        ("track.mode=fas", "got 'fas', did you mean 'fast'.; expected one of 'fast', 'slow'"),
+        ("track.mode=fas", "got 'fas' .did you mean 'fast'.{2}; expected one of 'fast', 'slow'"),
         ("track.sizes=3", "expected a list"),
         ("track.sizes=[1, 'x']", r"track.sizes\[1\]: got 'x'"),
         ("track.iterations=0", "track: iterations is 0, expected at least 1"),
@@ -103,9 +103,9 @@ def test_wrong_assignments_say_what_is_wrong(assignment, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[trak]\n", r"unknown table \[trak\], did you mean 'track'"),
+        ("[trak]\n", r"unknown table \[trak\] .did you mean 'track'"),
         ("track = 3\n", "track is a value, expected a table"),
-        ("[track]\nrefin = true\n", "unknown key track.refin, did you mean 'refine'"),
+        ("[track]\nrefin = true\n", "unknown key track.refin .did you mean 'refine'"),
         ("[track\n", "not TOML"),
     ],
 )
@@ -119,7 +119,7 @@ def test_wrong_files_say_what_is_wrong(tmp_path, text, message):
 def test_missing_file_and_unknown_preset(tmp_path):
     with pytest.raises(ConfigError, match="no such file"):
         resolve(file=tmp_path / "absent.toml")
-    with pytest.raises(ConfigError, match="unknown preset 'drat', did you mean 'draft'"):
+    with pytest.raises(ConfigError, match="unknown preset 'drat' .did you mean 'draft'"):
         resolve(preset="drat")
 
 
@@ -157,3 +157,26 @@ def test_saved_toml_reads_back_as_the_same_config(
 def test_assignment_keeps_equal_signs_and_dots():
     assert parse_assignment("a.b=x=y") == ("a", "b", "x=y")
     assert parse_assignment("a.b=/c.d/e=f") == ("a", "b", "/c.d/e=f")
+
+
+@pytest.mark.parametrize(
+    ("word", "known", "found"),
+    [
+        ("drat", "draft standard reference", "draft"),
+        ("Standard", "draft standard reference", "standard"),
+        ("default", "draft standard reference", None),
+        ("train", "tune twin track", None),
+        ("list", "ingest pack", None),
+        ("clean", "plan prune", None),
+        ("stats", "status tune", "status"),
+        ("size", "noise image_side", "image_side"),
+        ("blur", "proxy_quality blur_ratio", "blur_ratio"),
+        ("jwa", "jaw neck", "jaw"),
+        ("S009", "S007 S008 S010", None),
+        ("s002", "S001 S002", "S002"),
+        ("anything", "", None),
+        ("", "a b", None),
+    ],
+)
+def test_only_likely_slips_are_suggested(word, known, found):
+    assert nearest(word, known.split()) == (f" (did you mean {found!r}?)" if found else "")

@@ -114,7 +114,7 @@ def test_options_of_a_file_and_of_one_line(tmp_path):
         ("memory=16G", "no time; .*partition=cpu,time=4:00:00"),
         ("time=4h,memory=16G", "time is '4h', .*4:00:00"),
         ("time=4,memory=16", "memory is '16', .*16G"),
-        ("time=4,memory=16G,core=2", "unknown key slurm.core, did you mean 'cores'"),
+        ("time=4,memory=16G,core=2", "unknown key slurm.core .did you mean 'cores'"),
         ("time=4,memory=16G,cores=two", r"slurm.cores: got 'two' \(str\), expected int"),
         ("time=4,memory=16G,gpus=2", "gpus is 2, expected 0 or 1; ask for more jobs"),
         ("time=4,memory=16G,jobs=0", "jobs 0: expected at least 1"),
@@ -130,7 +130,7 @@ def test_wrong_options_are_one_error(text, words):
 def test_unknown_stage_in_a_file_is_one_error(tmp_path):
     file = tmp_path / "jobs.toml"
     file.write_text('time = "4"\nmemory = "1G"\n[dept]\ngpus = 1\n')
-    with pytest.raises(ConfigError, match=r"unknown table \[dept\], did you mean 'depth'"):
+    with pytest.raises(ConfigError, match=r"unknown table \[dept\] .did you mean 'depth'"):
         read_slurm(str(file), STAGES)
 
 
