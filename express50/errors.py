@@ -101,8 +101,8 @@ def nearest(word: str, known: Iterable[str]) -> str:
 
 def _likeness(word: str, name: str) -> float:
     """Return how alike a word and a name, or a part of it, are, 0 to 1."""
-    if re.findall(r"\d+", word) != re.findall(r"\d+", name):  # S009 is not a slip of S008
-        return 0.0
+    if re.findall(r"0*(\d+)", word) != re.findall(r"0*(\d+)", name):
+        return 0.0  # S009 is not a slip of S008, S01 may be one of S001
     word, name = word.casefold(), name.casefold()
     parts = [name, *re.split(r"[_/.-]+", name)]
     if any(part and sorted(word) == sorted(part) for part in parts):  # letters swapped

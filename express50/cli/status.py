@@ -40,9 +40,11 @@ class StageStatus:
     # ``not run``
     state: str
     done: int  # number of finished items
-    failed: tuple[Receipt, ...]  # receipts of items whose last attempt failed
+    # receipts of items whose last attempt failed, unless they are running again
+    failed: tuple[Receipt, ...]
     running: dict[str, float]  # start of each item in progress, seconds since 1970
-    missing: int  # number of items of the last run that are waiting, or were not reached
+    # number of items of the last run that are waiting, or were not reached, and had not failed
+    missing: int
     rate: float  # recent items per second; 0 before the first has finished
     left_s: float | None  # estimated seconds until the run ends; None if unknown
     seconds: float  # total seconds of all items
@@ -172,8 +174,8 @@ def read_status(
 
 def _stage(name: str, table: dict[str, Receipt], run: Run | None, now: float) -> StageStatus:
     receipts = tuple(table.values())
-    failed = tuple(r for r in receipts if r.reason)
-    alive, open_items, former, rate = False, 0, 0, 0.0
+    failed = {r.item: r for r in receipts if r.reason}
+    alive, open_items, former, missing, rate = False, 0, 0, 0, 0.0
     running: dict[str, float] = {}
     if run is not None:
         alive = not run.ended and now - run.seen < SILENT_SECONDS
@@ -186,9 +188,12 @@ def _stage(name: str, table: dict[str, Receipt], run: Run | None, now: float) ->
         ends = [run.begun, *sorted(settled)][-RECENT - 1 :]
         until = now if alive else run.ended or run.seen
         rate = (len(ends) - 1) / max(until - ends[0], 1e-3)
-        # Items waiting to be made again still have their old receipts.
-        older = sum(r.status == "done" and r.time < run.begun for r in receipts)
-        former = min(open_items, max(0, older - run.current))
+        # Items waiting to be made again still have their old receipts: failed ones count as that,
+        # the others as missing. (A run of some items may not include all that failed before.)
+        old = [r for r in receipts if r.time < run.begun]
+        fresh = max(0, open_items - sum(bool(r.reason) for r in old))
+        former = min(fresh, max(0, sum(not r.reason for r in old) - run.current))
+        missing = max(0, fresh - len(running.keys() - failed.keys()))
     if alive:
         state = "running"
     elif open_items or (run is not None and not run.ended):
@@ -199,9 +204,9 @@ def _stage(name: str, table: dict[str, Receipt], run: Run | None, now: float) ->
         stage=name,
         state=state,
         done=len(receipts) - len(failed) - former,
-        failed=failed,
+        failed=tuple(r for item, r in failed.items() if item not in running),
         running=running,
-        missing=max(0, open_items - len(running)),
+        missing=missing,
         rate=rate,
         left_s=open_items / rate if alive and rate > 0 else None,
         seconds=sum(r.seconds for r in receipts),

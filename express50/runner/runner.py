@@ -60,7 +60,7 @@ class RunMonitor(Protocol):
 class Outcome:
     """The result of one item: ``done``, ``skipped`` (was current), ``failed`` or ``left``.
 
-    ``again`` says why an item was made that a former run had made already; it was ``restored``
+    ``again`` says why an item was run that a former run had made already; it was ``restored``
     where the same output had been made before and was replaced since.
     """
 
@@ -112,7 +112,8 @@ class Summary:
         said = ("done", "skipped", "failed", *(("left",) if self.count("left") else ()))
         counts = " + ".join(f"{self.count(status)} {status}" for status in said)
         yield f"{self.stage}: read {len(self.outcomes)} = {counts} in {self.seconds:.1f} s"
-        again = Counter((o.restored, o.again) for o in self.outcomes if o.again or o.restored)
+        made = [o for o in self.outcomes if o.status == "done"]
+        again = Counter((o.restored, o.again) for o in made if o.again or o.restored)
         for (restored, why), count in again.most_common():
             yield f"  {'restored' if restored else 'made again'} {count}: {why or 'same as before'}"
         if imported := sum(o.reason == KEPT for o in self.outcomes):

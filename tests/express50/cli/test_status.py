@@ -10,6 +10,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -66,6 +67,22 @@ def test_an_item_that_has_ended_since_the_last_sign_is_not_running(tmp_path):
     run = Run(stage="toy", items=2, begun=100.0, seen=110.0, running={"a": 105.0, "b": 105.0})
     row = of(tmp_path, run, [receipt("a", 111.0)], 112.0)
     assert (list(row.running), row.done, row.missing) == (["b"], 1, 0)
+
+
+def test_items_that_failed_before_are_counted_once_while_they_wait(tmp_path):
+    run = Run(stage="toy", items=6, current=1, begun=100.0, seen=119.0, running={"bad": 115.0})
+    old = [receipt("bad", 50.0, "failed"), receipt("worse", 50.0, "failed"), receipt("ok", 50.0)]
+    row = of(tmp_path, run, [*old, receipt("new", 110.0)], 120.0)
+    # Two have no receipt yet.
+    assert row.counts() == {"done": 2, "failed": 1, "running": 1, "missing": 2}
+    assert [r.item for r in row.failed] == ["worse"]
+
+
+def test_an_output_that_stood_when_its_item_failed_is_counted_once(tmp_path):
+    stood = replace(receipt("a", 50.0), reason="CaptureError: no such folder")
+    run = Run(stage="toy", items=2, begun=100.0, seen=119.0)
+    row = of(tmp_path, run, [stood, receipt("b", 50.0)], 120.0)
+    assert row.counts() == {"done": 0, "failed": 1, "running": 0, "missing": 1}
 
 
 def test_the_rate_is_that_of_late_and_sinks_while_nothing_ends(tmp_path):

@@ -174,6 +174,7 @@ def test_assignment_keeps_equal_signs_and_dots():
         ("jwa", "jaw neck", "jaw"),
         ("S009", "S007 S008 S010", None),
         ("s002", "S001 S002", "S002"),
+        ("S01", "S001 S011", "S001"),
         ("anything", "", None),
         ("", "a b", None),
     ],

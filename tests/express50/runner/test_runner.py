@@ -129,6 +129,16 @@ def test_touched_input_with_the_same_content_is_skipped(tmp_path):
     assert statuses(run_toy(dataset)) == {"a": "skipped"}
 
 
+def test_what_failed_is_not_said_to_be_made_again(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["a", "bad"])
+    (dataset.root / "in" / "bad.txt").write_text("repaired")
+    assert run_toy(dataset).ok
+    (dataset.root / "in" / "bad.txt").write_text("other")
+    lines = list(run_toy(dataset, word="c").lines())
+    assert "1 done + 0 skipped + 1 failed" in lines[0]
+    assert [line.split(":")[0] for line in lines[1:]] == ["  made again 1", "  failed bad"]
+
+
 def test_lost_output_is_made_again(tmp_path):
     dataset = make_dataset(tmp_path / "data", ["a"])
     run_toy(dataset)
