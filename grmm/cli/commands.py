@@ -40,8 +40,9 @@ def train(args: argparse.Namespace) -> int:
     from grmm.train import train
 
     _no_file(args.out)
-    config = train_config(args)
+    # First, because most wrong commands name a wrong folder, and no budget helps against that.
     source = open_shards([args.shards, *args.also], "train")
+    config = train_config(args)
     resume = not args.overwrite and (args.out / "checkpoint.pt").exists()
     metrics = train(source, load_head(source.head), args.out, config, resume=resume)
     names = ("psnr_heldout_view_db", "psnr_train_db", "ssim", "iterations", "gaussians")
