@@ -1,6 +1,8 @@
-"""Undistort and sample images; evaluate a smooth step and spherical harmonics."""
+"""Undistort and sample images, measure their blur; a smooth step and spherical harmonics."""
 
 from __future__ import annotations
+
+import math
 
 import cv2
 import numpy as np
@@ -12,6 +14,12 @@ from express50.geometry.conventions import K_to_opencv, cell_centres, corner_to_
 _COLUMNS, _ROWS = 4096, 2048
 COARSE = 64  # points across an image that are tested for a fold of the lens
 OUTSIDE = -10.0  # pixels; too far outside for an interpolation to reach the image
+
+REACH = 8  # pixels on either side of an edge within which its two levels are looked for
+SMOOTH = 0.8  # deviation, pixels, of the filter against noise; subtracted from the width again
+LEAST_HEIGHT = 30.0  # grey levels between the sides of an edge, so that noise is not an edge
+FEWEST_EDGES = 12
+SHARPEST = 20  # percentile of the widths: lashes and hair are sharp, a face is not
 
 
 def undistort_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -105,6 +113,29 @@ def bilinear_slope(image: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, n
     top, low = a + (b - a) * fx, c + (d - c) * fx
     slope = np.stack([(b - a) * (1 - fy) + (d - c) * fy, low - top], axis=2)
     return top + (low - top) * fy, slope
+
+
+def edge_width(image: np.ndarray) -> float | None:
+    """Measure the width of the sharpest edges of an image (H, W, 3) uint8; None with too few.
+
+    The width is the standard deviation, pixels, of the Gaussian that would blur a step as much: a
+    step of height h, blurred by s, rises by at most h / (s sqrt(2 pi)) per pixel.
+    """
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    grey = cv2.GaussianBlur(grey, (0, 0), SMOOTH)
+    slope = np.hypot(
+        cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=1) / 2,
+        cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=1) / 2,
+    )
+    window = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
+    height = cv2.dilate(grey, window) - cv2.erode(grey, window)
+    steepest = slope == cv2.dilate(slope, np.ones((REACH + 1, REACH + 1), np.uint8))
+    edges = steepest & (height > LEAST_HEIGHT) & (slope > 0)
+    if edges.sum() < FEWEST_EDGES:
+        return None
+    widths = height[edges] / (slope[edges] * math.sqrt(2 * math.pi))
+    width = float(np.percentile(widths, SHARPEST))
+    return math.sqrt(max(width**2 - SMOOTH**2, 0.0))
 
 
 def smoothstep(x: np.ndarray, low: float, high: float) -> np.ndarray:

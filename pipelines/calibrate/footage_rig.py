@@ -217,11 +217,11 @@ def _adjust(
     refused = set[str]()
     while others := {n: c for n, c in start.items() if n not in fit.cameras and n not in refused}:
         more = place_by_features(fit, tracks, others, seen, candidates)
-        if not (more := _facing(more, fit.cameras, seen)):
+        if not (more := _showing_head(more, fit.cameras, seen)):
             break
         wider, wide = with_features(fit.cameras | more, BANDS[:1])
         expected = _expected(wide, wider, seen, priors)
-        held = set(_facing(wide.cameras, wide.cameras, seen)) - set(_weak(wider))
+        held = set(_showing_head(wide.cameras, wide.cameras, seen)) - set(_weak(wider))
         loose = {
             n: expected[n] / float(np.hypot(start[n].width, start[n].height))
             if n in held
@@ -236,7 +236,7 @@ def _adjust(
     return tracks, fit, _expected(fit, tracks, seen, priors)
 
 
-def _facing(
+def _showing_head(
     found: Mapping[str, Camera], rig: Mapping[str, Camera], seen: Mapping[int, FrameSetPoints]
 ) -> dict[str, Camera]:
     """Return the cameras whose pictures show the middle of the head that a rig sees."""

@@ -19,11 +19,10 @@ import open3d as o3d
 from express50.error_model import PEOPLE_DIFFER, Bounds, error_bounds
 from express50.geometry.cameras import Camera, crop_camera, rays
 from express50.geometry.raycast import barycentrics, camera_rays, mesh_scene
-from express50.geometry.sampling import bilinear
+from express50.geometry.sampling import bilinear, edge_width
 from pipelines.depth.prior import TrackedSolid
 from pipelines.depth.surface import HeadSurface
 from pipelines.depth.views import INSIDE, project_fast, reduced
-from pipelines.ingest.quality import edge_width
 
 SURE_MM = 2.0  # bound at which confidence is a half
 COMPARED_SIDE = 512  # longest side, pixels, at which views are compared through the depth

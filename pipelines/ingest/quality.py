@@ -10,7 +10,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
@@ -39,12 +38,6 @@ FEWEST_CELLS = 12
 FEWEST_DRIFT_FRAMES = 12  # with fewer, a movement looks like a drift
 EXPOSURE_DRIFT, COLOUR_DRIFT = 0.15, 0.06  # stops over the capture from which on it is a warning
 _CURVE = srgb_to_linear(np.arange(256, dtype=np.float32) / 255.0).astype(np.float32)
-
-REACH = 8  # pixels on either side of an edge within which its two levels are looked for
-SMOOTH = 0.8  # deviation, pixels, of the filter against noise; subtracted from the width again
-LEAST_HEIGHT = 30.0  # grey levels between the sides of an edge, so that noise is not an edge
-FEWEST_EDGES = 12
-SHARPEST = 20  # percentile of the widths: lashes and hair are sharp, a face is not
 
 
 @dataclass(frozen=True)
@@ -339,29 +332,6 @@ def describe_drift(drift: Drift | None) -> list[str]:
         words = " and ".join(f"{name} by {value:.2f} stops" for name, value in colours)
         wrong.append(f"white balance changes, {words} against green")
     return wrong
-
-
-def edge_width(image: np.ndarray) -> float | None:
-    """Measure the width of the sharpest edges of an image (H, W, 3) uint8; None with too few.
-
-    The width is the standard deviation, pixels, of the Gaussian that would blur a step as much: a
-    step of height h, blurred by s, rises by at most h / (s sqrt(2 pi)) per pixel.
-    """
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    grey = cv2.GaussianBlur(grey, (0, 0), SMOOTH)
-    slope = np.hypot(
-        cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=1) / 2,
-        cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=1) / 2,
-    )
-    window = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
-    height = cv2.dilate(grey, window) - cv2.erode(grey, window)
-    steepest = slope == cv2.dilate(slope, np.ones((REACH + 1, REACH + 1), np.uint8))
-    edges = steepest & (height > LEAST_HEIGHT) & (slope > 0)
-    if edges.sum() < FEWEST_EDGES:
-        return None
-    widths = height[edges] / (slope[edges] * math.sqrt(2 * math.pi))
-    width = float(np.percentile(widths, SHARPEST))
-    return math.sqrt(max(width**2 - SMOOTH**2, 0.0))
 
 
 def judge_focus(

@@ -21,7 +21,8 @@ from express50.files.containers import WITHIN, inside, read_picture
 from express50.files.digests import file_sha256, text_digest
 from express50.files.images import encode_jpeg, has_alpha, shrink, upright
 from express50.files.video import iterate_video, video_fps
-from pipelines.ingest.quality import Seen, edge_width, light_cells, movement, small_grey
+from express50.geometry.sampling import edge_width
+from pipelines.ingest.quality import Seen, light_cells, movement, small_grey
 
 FPS_SLACK = 0.02  # of the rate: less than from 24 to 25 frames per second
 UNEVEN = 0.1  # share of the steps that differ; a lost frame now and then is counted as a gap

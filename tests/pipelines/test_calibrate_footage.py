@@ -24,7 +24,7 @@ from express50.rigs.camera_builder import in_metres
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.footage import has_one_lens
 from pipelines.calibrate.footage_rig import (
-    _facing,
+    _showing_head,
     pose_of_face,
     resect,
     solve_footage,
@@ -242,5 +242,5 @@ def test_a_camera_that_looks_away_from_the_head_is_not_placed():
     rig = face_cameras()
     turned = make_transform(axis_angle_to_matrix(np.array([0.0, np.pi, 0.0])), np.zeros(3))
     away = replace(rig["cam02"], cam_from_world=turned @ rig["cam02"].cam_from_world)
-    assert set(_facing(rig, rig, see(rig))) == set(rig)
-    assert set(_facing({**rig, "cam02": away}, rig, see(rig))) == set(rig) - {"cam02"}
+    assert set(_showing_head(rig, rig, see(rig))) == set(rig)
+    assert set(_showing_head({**rig, "cam02": away}, rig, see(rig))) == set(rig) - {"cam02"}

@@ -13,7 +13,6 @@ from express50.runner.runner import run_stage
 from pipelines import ingest
 from pipelines.ingest.quality import (
     describe_steps,
-    edge_width,
     find_repeats,
     find_steps,
     light_cells,
@@ -126,18 +125,6 @@ def test_drift_of_light_is_measured_in_stops(footage, gain, exposure, red, blue)
     assert drift.blue == pytest.approx(blue, abs=0.03)
     steady = measure_drift(np.stack([light_cells(image) for image in footage["cam02"]]))
     assert max(steady.exposure, steady.red, steady.blue) < 0.02
-
-
-@pytest.mark.parametrize("sigma", [1.0, 2.0, 4.0])
-def test_blur_is_measured_in_pixels_whatever_the_noise(sigma):
-    rng = np.random.default_rng(1)
-    cells = rng.integers(20, 236, (12, 12, 1)).astype(np.uint8)
-    sharp = cv2.resize(np.repeat(cells, 3, axis=2), (480, 480), interpolation=cv2.INTER_NEAREST)
-    blurred = cv2.GaussianBlur(sharp.astype(np.float32), (0, 0), sigma)
-    noisy = np.clip(np.rint(blurred + rng.normal(0, 2, blurred.shape)), 0, 255).astype(np.uint8)
-    width = edge_width(noisy)
-    assert width == pytest.approx(sigma, rel=0.35)
-    assert edge_width(np.full((64, 64, 3), 90, np.uint8)) is None
 
 
 def test_ingest_warns_of_all_faults_and_writes_their_figures(footage, tmp_path):

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
-from express50.geometry.sampling import bilinear, bilinear_slope, sh_polynomials
+from express50.geometry.sampling import bilinear, bilinear_slope, edge_width, sh_polynomials
 
 PLANE = np.fromfunction(lambda y, x: 3 * (x + 0.5) - 2 * (y + 0.5) + 7, (20, 30))
 POINTS = np.random.default_rng(0).uniform([0.5, 0.5], [29.4, 19.4], (9000, 2))
@@ -55,3 +56,15 @@ def test_harmonics_are_orthonormal() -> None:
     Y = sh_polynomials(directions) * norms
     area = np.repeat(weights, 16) * 2 * np.pi / 16
     assert np.allclose(Y.T @ (area[:, None] * Y), np.eye(9), atol=1e-12)
+
+
+@pytest.mark.parametrize("sigma", [1.0, 2.0, 4.0])
+def test_blur_is_measured_in_pixels_whatever_the_noise(sigma: float) -> None:
+    rng = np.random.default_rng(1)
+    cells = rng.integers(20, 236, (12, 12, 1)).astype(np.uint8)
+    sharp = cv2.resize(np.repeat(cells, 3, axis=2), (480, 480), interpolation=cv2.INTER_NEAREST)
+    blurred = cv2.GaussianBlur(sharp.astype(np.float32), (0, 0), sigma)
+    noisy = np.clip(np.rint(blurred + rng.normal(0, 2, blurred.shape)), 0, 255).astype(np.uint8)
+    width = edge_width(noisy)
+    assert width == pytest.approx(sigma, rel=0.35)
+    assert edge_width(np.full((64, 64, 3), 90, np.uint8)) is None
