@@ -18,7 +18,7 @@ import open3d as o3d
 
 from express50.error_model import PEOPLE_DIFFER, Bounds, error_bounds
 from express50.geometry.cameras import Camera, crop_camera, rays
-from express50.geometry.raycast import barycentrics, camera_rays, mesh_scene
+from express50.geometry.raycast import barycentrics, camera_rays, join_rays, mesh_scene
 from express50.geometry.sampling import bilinear, edge_width
 from pipelines.depth.prior import TrackedSolid
 from pipelines.depth.surface import HeadSurface
@@ -227,48 +227,40 @@ def cast_maps(
 
     `apart_mm` (V,) are the vertices' distances to the tracked head.
     """
-    hits = scene.cast_rays(camera_rays(camera), nthreads=1)
+    origin, ways = rays(camera)
+    hits = scene.cast_rays(join_rays(origin, ways), nthreads=1)
     depth = hits["t_hit"].numpy()
-    hit = np.isfinite(depth)
-    faces = surface.faces[hits["primitive_ids"].numpy()[hit]]
-    corners = barycentrics(hits, hit)
-
-    def mixed(values: np.ndarray, beyond: float = 0.0) -> np.ndarray:
-        found = np.full((*depth.shape, *values.shape[1:]), beyond, np.float32)
-        found[hit] = np.einsum("nk,nk...->n...", corners, values.astype(np.float32)[faces])
-        return found
-
-    maps = make_maps(camera, alpha, depth, mixed(surface.normals), mixed(surface.confidence))
-    if apart_mm is None:
-        apart = np.full(depth.shape, np.nan)
-    else:
-        apart = mixed(1 + apart_mm, np.nan)
-    return replace(maps, figures={**maps.figures, "apart_mm": apart[maps.valid]})
+    valid = _inside(depth, alpha)
+    faces = surface.faces[hits["primitive_ids"].numpy()[valid]]
+    apart = np.full(len(surface.vertices), np.nan) if apart_mm is None else 1 + apart_mm
+    of_vertices = np.column_stack([surface.normals, surface.confidence, apart]).astype(np.float32)
+    seen = np.einsum("nk,nkc->nc", barycentrics(hits, valid), of_vertices[faces])
+    return make_maps(camera, alpha, depth, ways, seen[:, :3], seen[:, 3], seen[:, 4])
 
 
 def make_maps(
     camera: Camera,
     alpha: np.ndarray,
     depth: np.ndarray,
+    ways: np.ndarray,
     normals: np.ndarray,
     agreement: np.ndarray,
+    apart_mm: np.ndarray | float,
 ) -> DepthMaps:
     """Keep what is hit inside the matte (H, W), and describe how well it is known.
 
-    `depth` (H, W) is not finite where nothing is hit; `normals` (H, W, 3) are the world's; the
-    patches' `agreement` (H, W) is in [0, 1].
+    `depth` (H, W) is not finite where nothing is hit; `ways` (H, W, 3) are the rays' directions.
+    Of the N pixels that are kept, `normals` (N, 3) are the world's, the patches' `agreement` (N,)
+    is in [0, 1], and `apart_mm` (N,) is the distance to the tracked head.
     """
-    hit = np.isfinite(depth) & (depth > 0)
-    inside = alpha > INSIDE
-    valid = hit & inside
-    known = normals[valid]
-    known = known / np.maximum(np.sqrt(np.einsum("ni,ni->n", known, known)), 1e-9)[:, None]
-    way = rays(camera)[1][valid]
-    length = np.sqrt(np.einsum("ni,ni->n", way, way))
-    cosine = -np.einsum("ni,ni->n", known, way) / length
+    valid = _inside(depth, alpha)
+    inside, hit = alpha > INSIDE, np.isfinite(depth) & (depth > 0)
+    known = normals / np.maximum(_lengths(normals), 1e-9)[:, None]
+    way = ways[valid].astype(np.float32)
+    cosine = -np.einsum("ni,ni->n", known, way) / _lengths(way)
     depth = np.where(valid, depth, 0).astype(np.float32)
     turned = np.zeros((*depth.shape, 3), np.float32)
-    turned[valid] = known @ camera.cam_from_world[:3, :3].T
+    turned[valid] = known @ camera.cam_from_world[:3, :3].T.astype(np.float32)
     return DepthMaps(
         depth=depth,
         valid=valid,
@@ -276,19 +268,31 @@ def make_maps(
         covered=float(valid.sum() / max(int(inside.sum()), 1)),
         spill=float((hit & ~inside).sum() / max(int(hit.sum()), 1)),
         figures={
-            "disagreement": 1.05 - np.clip(agreement[valid], 0, 1),
+            "disagreement": 1.05 - np.clip(agreement, 0, 1),
             "slant": 1 / np.clip(cosine, 0.05, 1),
             "jump": np.minimum(jumps(camera, depth)[valid], 1e3),
             "rough": roughness(turned)[valid],
             "soft": 1.05 - np.clip(alpha[valid], 0, 1),
+            "apart_mm": apart_mm,
         },
     )
 
 
+def _inside(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Mark the pixels (H, W) whose ray hits the surface and that lie inside the matte."""
+    return np.isfinite(depth) & (depth > 0) & (alpha > INSIDE)
+
+
+def _lengths(vectors: np.ndarray) -> np.ndarray:
+    """Return the lengths (N,) of vectors (N, 3); faster than `np.linalg.norm`."""
+    return np.sqrt(np.einsum("ni,ni->n", vectors, vectors))
+
+
 def roughness(normals: np.ndarray) -> np.ndarray:
     """Measure (H, W) how much unit normals (H, W, 3; 0: none) differ within a window: 0 to 1."""
-    count = cv2.blur((np.abs(normals).sum(-1) > 0).astype(np.float32), (WINDOW, WINDOW))
-    mean = np.linalg.norm(cv2.blur(normals, (WINDOW, WINDOW)), axis=-1)
+    count = cv2.blur(normals.any(-1).astype(np.float32), (WINDOW, WINDOW))
+    mean = cv2.blur(normals, (WINDOW, WINDOW))
+    mean = np.sqrt(np.einsum("hwi,hwi->hw", mean, mean))
     return 1.001 - np.minimum(mean / np.maximum(count, 1e-6), 1)
 
 

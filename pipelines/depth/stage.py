@@ -153,8 +153,7 @@ def write_maps(out: Path, camera_id: str, maps: DepthMaps) -> None:
         raise StageError(f"{camera_id}: {error}") from None
     confidence = np.rint(maps.confidence * 255).astype(np.uint8)
     write_image(out / f"{camera_id}_confidence.png", confidence)
-    known = maps.valid.copy()
-    known[known] = np.linalg.norm(maps.normals[known], axis=-1) > 0.5
+    known = np.any(maps.normals, axis=-1)  # the surface has no normal where its triangles fold back
     write_normals(out / f"{camera_id}_normals.png", maps.normals, known)
 
 

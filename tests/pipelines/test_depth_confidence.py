@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from express50.error_model import error_bounds
-from express50.geometry.cameras import Camera
+from express50.geometry.cameras import Camera, rays
 from pipelines.depth.maps import (
     SURE_MM,
     DepthMaps,
@@ -33,9 +33,9 @@ def camera(focal: float = 50.0) -> Camera:
 
 def wall(depth: np.ndarray, agreement: float = 0.6, **further: object) -> DepthMaps:
     """A wall seen straight on, on which patches agree, with bounds."""
-    towards = np.broadcast_to([0.0, 0.0, -1.0], (SIDE, SIDE, 3))
-    ones = np.ones((SIDE, SIDE))
-    maps = make_maps(camera(), ones, depth, towards, agreement * ones)
+    ones, number = np.ones((SIDE, SIDE)), int(np.isfinite(depth).sum())
+    towards, agreements = np.tile([0.0, 0.0, -1.0], (number, 1)), np.full(number, agreement)
+    maps = make_maps(camera(), ones, depth, rays(camera())[1], towards, agreements, 4.0)
     figures = {**maps.figures, **KNOWN, **further}
     return DepthMaps(**{**vars(maps), "bounds": error_bounds("depth", figures)})
 
