@@ -21,6 +21,7 @@ from express50.capture.frames import decode_proxy
 from express50.capture.index import TRANSLATED, CameraSource, Cue, Index, index_to_json
 from express50.capture.raw import RawCapture, check_calibrated_sizes, check_focals
 from express50.capture.readers.read import OURS, read_any, subject_of, watched
+from express50.console import log
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
 from express50.dataset.withdraw import withdrawn
@@ -43,7 +44,7 @@ def register(dataset: Dataset, captures: list[Path]) -> list[str]:
 
     Raises:
         CaptureError: a folder is not a capture, two captures claim one subject, or the subject
-            was withdrawn, or differs from another only in letter case.
+            was withdrawn, has another capture already, or differs from another only in letter case.
     """
     table = {subject: str(path) for subject, path in dataset.captures().items()}
     added: dict[str, str] = {}
@@ -59,6 +60,16 @@ def register(dataset: Dataset, captures: list[Path]) -> list[str]:
                 f"{root}: subject {subject} is also that of {added[subject]}; "
                 "give each capture its own subject id (subject in capture.toml)"
             )
+        known = Path(table.get(subject, root))
+        if known.exists() and not known.samefile(root):
+            raise CaptureError(
+                f"{root}: subject {subject} of {dataset.root} has the capture {known}; if {root} is"
+                " another person or session, give it another subject id (subject in capture.toml);"
+                f" to use it in place of {known}, delete {subject} from {dataset.captures_file} and"
+                " run the same command again"
+            )
+        if not known.exists():
+            log(f"{subject}: {known} is gone, its footage is now read from {root}")
         for other in table.keys() | added.keys():
             if subject not in table and other != subject and other.lower() == subject.lower():
                 raise CaptureError(

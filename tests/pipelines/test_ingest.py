@@ -206,8 +206,28 @@ def test_register_checks_before_it_writes(dataset, tmp_path):
         ingest.register(dataset, [dataset.captures()["S001"], tmp_path / "other"])
     with pytest.raises(CaptureError, match="no such folder"):
         ingest.register(dataset, [tmp_path / "absent"])
-    assert ingest.register(dataset, [tmp_path / "other"]) == ["S001"]  # moved
-    assert dataset.captures()["S001"] == (tmp_path / "other").resolve()
+
+
+def test_another_capture_of_a_known_subject_is_refused_until_its_entry_is_deleted(
+    dataset, tmp_path, capsys
+):
+    known, other = tmp_path / "S001", tmp_path / "other"
+    make_capture(other, subject="S001", cameras=1)
+    before = dataset.captures_file.read_bytes()
+    with pytest.raises(CaptureError) as error:
+        ingest.register(dataset, [other])
+    named = (known, other, dataset.captures_file)
+    assert all(str(path) in str(error.value) for path in named)
+    assert dataset.captures_file.read_bytes() == before
+    (tmp_path / "link").symlink_to(known)
+    assert ingest.register(dataset, [tmp_path / "link"]) == ["S001"]  # the same folder
+
+    dataset.captures_file.write_text("{}")  # as the error says
+    assert ingest.register(dataset, [other]) == ["S001"]
+    assert dataset.captures()["S001"] == other
+    other.rename(known.with_name("moved"))  # no choice is left, so none is asked for
+    assert ingest.register(dataset, [known.with_name("moved")]) == ["S001"]
+    assert f"S001: {other} is gone" in capsys.readouterr().err
 
 
 def test_a_moved_capture_or_a_changed_subject_fails_its_item_only(dataset, tmp_path):
