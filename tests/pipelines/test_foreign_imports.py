@@ -302,6 +302,28 @@ def test_masks_of_recorded_or_reduced_size_fit_reduced_pictures(dataset, tmp_pat
         run_stage(MATTE, dataset, MATTE.config(), workers=0, progress=False)
 
 
+def test_tracks_and_depth_of_the_recorded_size_fit_reduced_pictures(
+    original, dataset, tmp_path
+) -> None:
+    pattern = depths_of(dataset, tmp_path / "depth", as_exr)
+    track = read_track(dataset.track_file("S001"))
+    assert run_stage(FRAMES, dataset, FRAMES.config(image_side=48), workers=0, progress=False).ok
+    assert take("track", dataset, original[1], f"--head={original[2]}") == 0
+    found = read_track(dataset.track_file("S001"))
+    np.testing.assert_allclose(found.vertices, track.vertices, atol=1e-5)
+    for expression in ("neutral", "smile"):
+        shutil.rmtree(dataset.item_dir("matte", f"S001/{expression}"))
+    assert take("depth", dataset, pattern, "--unit=m") == 0
+    camera = read_cameras_of(dataset, "S001")["cam02"]
+    _, alpha, true = render(camera)
+    depth, valid = read_depth(dataset.item_dir("depth", "S001/smile") / "cam02.png")
+    assert depth.shape == (camera.height, camera.width) == (48, 48)
+    inside = valid & (alpha == 1)
+    assert inside.sum() > 0.9 * (alpha == 1).sum()
+    assert np.median(np.abs(depth - true)[inside]) < 3e-4, "pixels of 7 mm"
+    assert abs(np.median((depth - true)[:, :24][inside[:, :24]])) < 1e-4, "not shifted"
+
+
 def test_masks_that_do_not_fit_are_named(dataset, tmp_path, capsys) -> None:
     pattern = masks_of(dataset, tmp_path / "masks", write_image)
     folder = tmp_path / "masks" / "smile"

@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from express50.capture.frames import FrameReader
+from express50.capture.frames import FrameReader, make_picture, read_cameras_of
 from express50.capture.index import Cue
 from express50.dataset.tracks import SEQUENCE_SCHEMA
 from express50.errors import StageError
+from express50.files.atomic import write_json
+from express50.files.images import shrunk_size
 from express50.geometry.cameras import project
 from express50.geometry.transforms import axis_angle_to_matrix
 from express50.landmarks.detector import Detection
@@ -199,9 +201,15 @@ def test_frames_without_a_face_are_left_out_and_said(tmp_path: Path) -> None:
         )  # fmt: skip
 
 
-def test_a_clip_is_decoded_once_and_its_crops_are_of_its_frames(ingested, monkeypatch) -> None:
-    rig = make_rig()
-    write_calibration(ingested, rig)
+@pytest.mark.parametrize("side", [0, 40])
+def test_a_clip_is_decoded_once_and_its_crops_are_of_its_pictures(
+    ingested, monkeypatch, side
+) -> None:
+    recorded = make_rig()
+    write_calibration(ingested, recorded)
+    sizes = {n: shrunk_size(c.width, c.height, side or c.width) for n, c in recorded.items()}
+    write_json(ingested.picture_sizes_file("S001"), sizes)
+    rig = read_cameras_of(ingested, "S001")
     places = 0.05 * np.random.default_rng(0).normal(size=(68, 3))
     decoded: Counter[tuple[str, int]] = Counter()
     original = FrameReader.read
@@ -211,6 +219,7 @@ def test_a_clip_is_decoded_once_and_its_crops_are_of_its_frames(ingested, monkey
         return original(self, frame)
 
     def find(image, camera_id: str, frame: int) -> Marked:
+        assert image.shape == (rig[camera_id].height, rig[camera_id].width, 3)
         points = project(rig[camera_id], places)[0]
         face = Detection(points, np.ones(68), np.ones(68), 0.9 if frame != 2 else 0.0)
         return Marked(face, Irises(np.zeros((2, 2)), np.full(2, np.inf), np.zeros(2)), True)
@@ -222,7 +231,8 @@ def test_a_clip_is_decoded_once_and_its_crops_are_of_its_frames(ingested, monkey
         assert seen is None if frame == 2 else seen.frame == frame
         for crop in cut_crops(places).crops:
             row, column = np.array(crop.camera.K[:2, 2] - rig[crop.camera.id].K[:2, 2]).astype(int)
-            whole = render_ball(rig[crop.camera.id], frame)
+            camera = recorded[crop.camera.id]
+            whole = make_picture(render_ball(camera, frame), camera, sizes[camera.id])
             height, width = crop.image.shape[:2]
             assert np.array_equal(crop.image, whole[-column:, -row:][:height, :width])
     assert decoded == {(camera, frame): 1 for camera in rig for frame in (1, 2, 4)}
