@@ -1,8 +1,8 @@
-"""Encode and decode the pictures of a shard, by profile and by a member's name.
+"""Encode and decode the pictures of a shard.
 
-``compact`` and ``lossless`` hold what every image library reads (JPEG, PNG). ``fast`` holds what
-decodes in the least time: alpha and parts as zstd over their bytes, depth as LERC without loss
-(Esri's limited error raster compression, version 2, at error 0); both through imagecodecs.
+The profiles ``compact`` and ``lossless`` use JPEG and PNG, which every image library reads.
+``fast`` uses what imagecodecs decodes fastest: alpha and parts as zstd of their bytes, depth as
+lossless LERC (Esri's limited error raster compression, version 2, at error 0).
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from express50.errors import FormatError
 from express50.files.images import decode_image, encode_jpeg, encode_png, image_size
 from express50.geometry.shapes import PIXEL_LIMIT
 
+AGAIN = "rerun 'express50 pack'"
 PROFILES = ("compact", "fast", "lossless")
 RGB = ("rgb.jpg", "rgb.png")
 ALPHA = ("alpha.png", "alpha.zst")
@@ -30,7 +31,7 @@ LERC_HEADER = struct.Struct("<6siIiiiiii")
 def encode_pictures(
     rgb: np.ndarray, alpha: np.ndarray, depth: np.ndarray, parts: np.ndarray | None, profile: str
 ) -> dict[str, bytes]:
-    """Encode the pictures of a sample as members by name.
+    """Encode the pictures of a sample; return the members by name.
 
     Args:
         rgb: (H, W, 3) uint8 sRGB.
@@ -56,62 +57,56 @@ def encode_pictures(
 
 
 def decode_picture(name: str, data: bytes, width: int, height: int, where: str) -> np.ndarray:
-    """Decode a member: (H, W, 3) uint8, (H, W) uint8 or, of depth, (H, W) uint16.
+    """Decode a member: RGB (H, W, 3) uint8, alpha and parts (H, W) uint8, depth (H, W) uint16.
 
-    A header is checked before a pixel is decoded: no member makes more memory than its size says.
+    The header is checked before any pixel is decoded, so that a wrong member cannot fill the
+    memory.
 
     Raises:
         FormatError: the bytes are damaged, or of another size or kind than expected.
     """
+    if name not in (*RGB, *ALPHA, *PARTS, *DEPTH):
+        raise FormatError(f"{where}: {name} is not a picture of a sample; {AGAIN}")
     size = (width, height)
     if not name.endswith(".zst"):
         size = lerc_size(data, where) if name.endswith(".lerc") else image_size(data, where)
     if size[0] * size[1] > PIXEL_LIMIT:
-        raise FormatError(f"{where}: {size[0]}x{size[1]} pixels, over the limit {PIXEL_LIMIT}")
+        raise FormatError(
+            f"{where}: {size[0]}x{size[1]} pixels, expected at most {PIXEL_LIMIT}; {AGAIN}"
+        )
     if size != (width, height):
         raise FormatError(
-            f"{where}: {size[0]}x{size[1]} pixels, expected the meta's {width}x{height};"
-            " rerun 'express50 pack'"
+            f"{where}: {size[0]}x{size[1]} pixels, expected the meta's {width}x{height}; {AGAIN}"
         )
-    if name.endswith(".zst"):
-        return _unzstd(data, width, height, where)
     try:
-        if name not in (*RGB, *ALPHA, *PARTS, *DEPTH):
-            raise ValueError(f"{name} is not a picture of a sample")
-        if name.endswith(".png"):
+        if name.endswith(".zst"):
+            bytes_out = bytearray(width * height + 1)  # one more, to notice contents too long
+            count = len(imagecodecs.zstd_decode(data, out=bytes_out))
+            image = np.frombuffer(bytes_out, np.uint8, count).reshape(height, width)
+        elif name.endswith(".png"):
             image = decode_image(data, where)
         else:
             lerc = name.endswith(".lerc")
             image = (imagecodecs.lerc_decode if lerc else imagecodecs.jpeg8_decode)(data)
     except (RuntimeError, ValueError) as error:  # imagecodecs' errors are RuntimeErrors
-        raise FormatError(f"{where}: cannot be decoded ({error})") from None
-    kind = np.uint16 if name in DEPTH else np.uint8
-    if image.dtype != kind or image.shape != (height, width, 3)[: 3 if name in RGB else 2]:
-        raise FormatError(f"{where}: {image.dtype} {image.shape}, expected {np.dtype(kind)}")
+        raise FormatError(f"{where}: cannot be decoded ({error}); {AGAIN}") from None
+    shape = (height, width, 3) if name in RGB else (height, width)
+    kind = np.dtype(np.uint16 if name in DEPTH else np.uint8)
+    if image.dtype != kind or image.shape != shape:
+        raise FormatError(f"{where}: {image.dtype} {image.shape}, expected {kind} {shape}; {AGAIN}")
     return image
-
-
-def _unzstd(data: bytes, width: int, height: int, where: str) -> np.ndarray:
-    image = bytearray(width * height + 1)  # one more, so that a longer content shows
-    try:
-        count = len(imagecodecs.zstd_decode(data, out=image))
-    except (RuntimeError, ValueError) as error:
-        raise FormatError(f"{where}: cannot be decoded ({error})") from None
-    if count != width * height:
-        raise FormatError(f"{where}: {count} bytes or more, expected {width}x{height}")
-    return np.frombuffer(image, np.uint8, count).reshape(height, width)
 
 
 def lerc_size(data: bytes, where: str) -> tuple[int, int]:
     """Read width and height from the header of a LERC blob.
 
     Raises:
-        FormatError: the bytes are not such a blob.
+        FormatError: the bytes are not one LERC blob of one channel.
     """
     if len(data) >= LERC_HEADER.size:
         name, version, _, rows, columns, depth, _, _, size = LERC_HEADER.unpack_from(data)
-        # A second blob behind the first would be a second channel of the whole size.
+        # A second blob after the first would decode as a second channel of the same size.
         alone = size == len(data) and depth == 1 and min(rows, columns) > 0
         if name == b"Lerc2 " and 4 <= version <= 6 and alone:
             return columns, rows
-    raise FormatError(f"{where}: {len(data)} bytes are not a LERC image of one channel")
+    raise FormatError(f"{where}: {len(data)} bytes are not a LERC image of one channel; {AGAIN}")

@@ -1,16 +1,16 @@
-"""Read packed samples at random from USTAR tar shards in WebDataset's conventions.
+"""Read packed samples in any order from USTAR tar shards in WebDataset's conventions.
 
-A folder of shards holds ``<split>-000000.tar`` ..., ``index.json`` (where every member lies, with
-its CRC-32), ``manifest.json`` (SHA-256 of every file). Members of a sample are adjacent; their key
-has no dot, so that ``tar``, ``webdataset`` and Hugging Face ``datasets`` read the shards as they
-are. The writer is in :mod:`express50.shards.writer`.
+A folder of shards holds ``<split>-000000.tar`` ..., ``index.json`` (the place and CRC-32 of every
+member) and ``manifest.json`` (the SHA-256 of every file). The members of a sample are adjacent.
+Their key has no dot, so that ``tar``, ``webdataset`` and Hugging Face ``datasets`` read the shards
+as they are. The writer is in :mod:`express50.shards.writer`.
 
 ``meta.json`` of a sample: ids ``subject expression camera``, ``frame``, ``fps``; ``K``,
 ``cam_from_world``, ``width``, ``height`` of the picture as packed; ``depth_scale_m``; ``head`` and
 ``track`` {shape offsets registered expression neck jaw eyes R t}, the head model and its
-parameters, with world = R @ head + t in the cameras' world (``offsets`` says whether
-``<subject>.offsets.npy`` beside the shards is to be added to the rest shape, ``registered`` whether
-``<subject>.registered.npz`` has the expression's mesh on the surface); ``label`` (who chose the
+parameters, with world = R @ head + t in the cameras' world (``offsets``: whether
+``<subject>.offsets.npy`` beside the shards is to be added to the rest shape; ``registered``:
+whether ``<subject>.registered.npz`` has the expression's mesh); ``label`` (who chose the
 frame), ``torso`` (removed or kept in alpha and depth), ``parts`` (whether there are labels),
 ``occluded`` (share of the face that each of hand and apparel hides), ``crop``, ``source_size``
 (of the peak frame that was cropped) and, if that was reduced, ``recorded_size``; ``consent``,
@@ -33,12 +33,11 @@ from express50.files.arrays import read_arrays, read_npy
 from express50.files.images import contact_sheet
 from express50.files.text import parse_json, read_json
 from express50.geometry.shapes import check_finite, check_shape
-from express50.shards.codecs import ALPHA, DEPTH, PARTS, RGB, crc32, decode_picture
+from express50.shards.codecs import AGAIN, ALPHA, DEPTH, PARTS, RGB, crc32, decode_picture
 
 SCHEMA = "express50.shards/1"
-_AGAIN = "rerun 'express50 pack'"
-_COPY_AGAIN = f"copy the shards again or {_AGAIN}"
-SUBJECT_FILES = ("offsets.npy", "registered.npz")  # beside the shards, where `track` says so
+_COPY_AGAIN = f"copy the shards again or {AGAIN}"
+SUBJECT_FILES = ("offsets.npy", "registered.npz")  # beside the shards, if `track` in meta says so
 KEY = re.compile(r"[A-Za-z0-9_-]{1,80}")
 SHARD_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*-[0-9]{6}\.tar")
 
@@ -59,11 +58,11 @@ class Entry:
 class ShardReader:
     """Gives random access to the samples of a folder of shards; safe to fork and to pickle.
 
-    State: one open file per shard, opened when first used.
+    State: one open file per shard, opened at its first use.
     """
 
     def __init__(self, root: Path, entries: tuple[Entry, ...] | None = None) -> None:
-        """Read the index of ``root``, or take the given part of it.
+        """Read the index of ``root``, or use the given part of it.
 
         Raises:
             FormatError: the index is missing, malformed, or does not fit the shards.
@@ -74,16 +73,16 @@ class ShardReader:
         self._owner = os.getpid()
 
     def __del__(self) -> None:
-        """Close what this process opened."""
+        """Close the files that this process opened."""
         if getattr(self, "_owner", None) == os.getpid():
             self.close()
 
     def __len__(self) -> int:
-        """Number of samples."""
+        """Return the number of samples."""
         return len(self.entries)
 
     def __getstate__(self) -> dict:
-        """Open files stay in the process that opened them."""
+        """Leave open files out: they stay in the process that opened them."""
         return self.__dict__ | {"_files": {}}
 
     @property
@@ -105,10 +104,10 @@ class ShardReader:
         cameras: Collection[str] | None = None,
         split: str | None = None,
     ) -> ShardReader:
-        """Return a reader of the samples that match all the given ids; None matches all.
+        """Return a reader of the samples that match all the given ids; None matches any.
 
         Raises:
-            UnknownNameError: an id or a split is unknown (the known ones are named).
+            UnknownNameError: an id or a split is unknown; the error lists the known ones.
         """
         wanted = {"subject": subjects, "expression": expressions, "camera": cameras}
         wanted["split"] = None if split is None else [split]
@@ -128,20 +127,19 @@ class ShardReader:
             FormatError: the member is missing, or its bytes are damaged.
         """
         entry = self.entries[number]
-        if self._owner != os.getpid():  # a fork shares descriptors; leave the parent's alone
+        if self._owner != os.getpid():  # after a fork, leave the parent's descriptors alone
             self._files, self._owner = {}, os.getpid()
         if entry.shard not in self._files:
             self._files[entry.shard] = os.open(self.root / entry.shard, os.O_RDONLY)
         file, found = self._files[entry.shard], {}
         for name in entry.members if names is None else names:
             offset, size, crc = self._place(entry, name)
-            # One read per member copies once; one read per sample and slices take a third longer.
+            # Reading the whole sample and slicing it would copy twice: a third slower.
             data = os.pread(file, size, offset)
             if len(data) != size or crc32(data) != crc:
                 raise FormatError(
                     f"{self.root / entry.shard}: {entry.key}.{name}: damaged, CRC-32"
-                    f" {crc32(data):08x}, expected {crc:08x}; copy the shard again or rerun"
-                    " 'express50 pack'"
+                    f" {crc32(data):08x}, expected {crc:08x}; {_COPY_AGAIN}"
                 )
             found[name] = data
         return found
@@ -149,24 +147,25 @@ class ShardReader:
     def _place(self, entry: Entry, name: str) -> tuple[int, int, int]:
         if name not in entry.members:
             where = f"{self.root / entry.shard}: {entry.key}"
-            raise FormatError(f"{where}: has no {name}; it has {', '.join(entry.members)}")
+            has = ", ".join(entry.members)
+            raise FormatError(f"{where}: has no {name}, it has {has}; {AGAIN}")
         return entry.members[name]
 
     def meta(self, number: int) -> dict:
         """Return the sample's meta.json.
 
         Raises:
-            FormatError: it is missing, damaged, or does not say what a step of depth is.
+            FormatError: it is missing, damaged, or lacks ``depth_scale_m``.
         """
         return self._meta(number, self.members(number, ["meta.json"])["meta.json"])
 
     def _meta(self, number: int, data: bytes) -> dict:
         entry = self.entries[number]
         where = f"{self.root / entry.shard}: {entry.key}: meta"
-        meta = parse_json(data, where, FormatError, _AGAIN)
+        meta = parse_json(data, where, FormatError, AGAIN)
         scale = meta.get("depth_scale_m") if isinstance(meta, dict) else None
         if not isinstance(scale, float) or not 0 < scale < 1:
-            raise FormatError(f"{where}: depth_scale_m is {scale!r}, expected metres; {_AGAIN}")
+            raise FormatError(f"{where}: depth_scale_m is {scale!r}, expected metres; {AGAIN}")
         return meta
 
     def sample(self, number: int) -> dict:
@@ -175,10 +174,10 @@ class ShardReader:
         Returns:
             key; rgb (H, W, 3) uint8 sRGB; alpha (H, W) float32 in [0, 1]; depth (H, W) float32
             metres, 0 where not valid; valid (H, W) bool; parts (H, W) uint8 of
-            ``segmentation_labels.LABELS``, or None where it was packed without; meta dict.
+            ``segmentation_labels.LABELS``, or None if it was packed without; meta dict.
 
         Raises:
-            FormatError: a member is damaged or does not have the size that the meta says.
+            FormatError: a member is damaged, or its size is not the one in meta.
         """
         entry, members = self.entries[number], self.members(number)
         meta = self._meta(number, members.get("meta.json", b""))
@@ -195,7 +194,9 @@ class ShardReader:
         }
 
     def offsets(self, subject: str) -> np.ndarray:
-        """Read the offsets (V, 3) float32, metres, of a subject's rest shape, if meta says so.
+        """Read the offsets (V, 3) float32, metres, of a subject's rest shape.
+
+        Only subjects whose meta says so have them.
 
         Raises:
             FormatError: the file is missing, damaged, or holds something else.
@@ -211,12 +212,12 @@ class ShardReader:
         return array
 
     def registered(self, subject: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Read a subject's registered meshes by expression, of those whose meta says so.
+        """Read a subject's registered meshes by expression; only those whose meta says so exist.
 
         Returns:
-            offsets (V, 3) float32, metres, of the rest shape of the tracked parameters and offsets
-            (joints stay those of that shape), and the standard deviation (V,) float32, metres, of
-            the vertices along their normals.
+            offsets (V, 3) float32, metres, to add to the rest shape of the track, whose joints
+            stay; and the standard deviation (V,) float32, metres, of the vertices along their
+            normals.
 
         Raises:
             FormatError: the file is missing, damaged, or holds something else.
@@ -253,34 +254,32 @@ class ShardReader:
         where = f"{self.root / entry.shard}: {entry.key}.{name}"
         width, height = meta.get("width"), meta.get("height")
         if not (isinstance(width, int) and isinstance(height, int) and min(width, height) > 0):
-            raise FormatError(f"{where}: meta gives {width!r} x {height!r} pixels")
+            raise FormatError(f"{where}: meta gives {width!r} x {height!r} pixels; {AGAIN}")
         return decode_picture(name, members[name], width, height, where)
 
 
 def read_entries(root: Path) -> tuple[Entry, ...]:
-    """Check and read ``index.json``.
+    """Read and check ``index.json``.
 
     Raises:
-        FormatError: it is missing or malformed, a shard's name would leave the folder, or a
+        FormatError: it is missing or malformed, a shard's name could lead out of the folder, or a
             member lies outside its shard.
     """
     path = root / "index.json"
     if not path.exists():
         raise FormatError(f"{path}: the index is missing; name the folder that 'pack' wrote")
-    table = read_json(path, FormatError, _AGAIN)
+    table = read_json(path, FormatError, AGAIN)
     if not isinstance(table, dict) or table.get("schema") != SCHEMA:
         got = table.get("schema") if isinstance(table, dict) else type(table).__name__
-        raise FormatError(f"{path}: schema {got!r}, expected {SCHEMA!r}")
+        raise FormatError(f"{path}: schema {got!r}, expected {SCHEMA!r}; {AGAIN}")
     entries: list[Entry] = []
     try:
         for shard in table["shards"]:
             entries += _shard_entries(root, shard)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise FormatError(
-            f"{path}: malformed ({type(error).__name__}: {error}); rerun 'express50 pack'"
-        ) from None
+        raise FormatError(f"{path}: malformed ({type(error).__name__}: {error}); {AGAIN}") from None
     if len({entry.key for entry in entries}) != len(entries):
-        raise FormatError(f"{path}: a key appears twice; rerun 'express50 pack'")
+        raise FormatError(f"{path}: a key appears twice; {AGAIN}")
     return tuple(entries)
 
 
@@ -296,18 +295,16 @@ def _shard_entries(root: Path, shard: dict) -> Iterator[Entry]:
     for row in shard["samples"]:
         members = {str(k): (int(a), int(b), int(c)) for k, (a, b, c) in row["members"].items()}
         if any(a < 0 or b < 0 or a + b > size for a, b, _ in members.values()):
-            raise FormatError(
-                f"{path}: {row['key']} lies outside the shard; rerun 'express50 pack'"
-            )
+            raise FormatError(f"{path}: {row['key']} lies outside the shard; {AGAIN}")
         ids = {name: row[name] for name in ("key", "subject", "expression", "camera")}
         for kind, text in (*ids.items(), ("split", shard["split"])):
-            if not KEY.fullmatch(text):  # they become names of files
+            if not KEY.fullmatch(text):  # files are named after them
                 raise FormatError(f"{path}: {kind} {text!r}, expected letters, digits, _ and -")
         yield Entry(**ids, split=shard["split"], shard=name, members=members)
 
 
 def sample_panels(sample: dict) -> list[np.ndarray]:
-    """Draw RGB, alpha, depth (near is bright) and labels, black where there are none, uint8."""
+    """Draw RGB, alpha, depth (near is bright) and labels (black if there are none), uint8."""
     depth, valid = sample["depth"], sample["valid"]
     low, high = np.percentile(depth[valid], [1, 99]) if valid.any() else (0.0, 1.0)
     near = np.clip((high - depth) / max(float(high - low), 1e-6), 0, 1)
@@ -327,7 +324,7 @@ def subject_file(root: Path, subject: str, name: str) -> Path:
     """Return the path of one of a subject's SUBJECT_FILES.
 
     Raises:
-        FormatError: the subject's id has other characters than a key may have.
+        FormatError: the subject's id has characters that a key may not have.
     """
     if not KEY.fullmatch(subject):
         raise FormatError(f"subject id {subject!r}: expected letters, digits, _ and -")
@@ -343,7 +340,10 @@ def write_offsets(root: Path, subject: str, offsets: np.ndarray) -> None:
 def write_registered(
     root: Path, subject: str, meshes: Mapping[str, tuple[np.ndarray, np.ndarray]]
 ) -> None:
-    """Write what `ShardReader.registered` reads, as float16: within 0.004 mm up to 15 mm."""
+    """Write a subject's registered meshes by expression, see `ShardReader.registered`.
+
+    They are stored as float16, which rounds moves of up to 15 mm by at most 0.004 mm.
+    """
     offsets, sigma = (
         np.stack([mesh[part] for mesh in meshes.values()]).astype(np.float16) for part in (0, 1)
     )
