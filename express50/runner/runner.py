@@ -111,7 +111,8 @@ class Summary:
         """Yield the account for people, then what was made again, dropped or failed, and why."""
         said = ("done", "skipped", "failed", *(("left",) if self.count("left") else ()))
         counts = " + ".join(f"{self.count(status)} {status}" for status in said)
-        yield f"{self.stage}: read {len(self.outcomes)} = {counts} in {self.seconds:.1f} s"
+        items = "1 item" if len(self.outcomes) == 1 else f"{len(self.outcomes)} items"
+        yield f"{self.stage}: {items} = {counts} in {self.seconds:.1f} s"
         made = [o for o in self.outcomes if o.status == "done"]
         again = Counter((o.restored, o.again) for o in made if o.again or o.restored)
         for (restored, why), count in again.most_common():
@@ -213,7 +214,7 @@ def run_stage(
     missing = set(chosen) - set(outcomes)
     if monitor is not None and monitor.closed():
         outcomes |= {item: Outcome(item, "left") for item in missing}
-    elif missing:  # read = done + skipped + failed + left
+    elif missing:  # items = done + skipped + failed + left
         raise StageError(f"{stage.name}: no account of {', '.join(sorted(missing))}; run it again")
     seconds = time.perf_counter() - started
     return Summary(stage.name, tuple(outcomes[item] for item in chosen), seconds)

@@ -136,7 +136,8 @@ def run_import(args: argparse.Namespace) -> int:
                     "warnings": found.get("warnings", []), "checks": found.get("imported", {}),
                 })  # fmt: skip
     failed = [row for row in rows if row["reason"]]
-    lines = [f"import {stage.name}: read {len(rows)} = {len(rows) - len(failed)} done"
+    items = "1 item" if len(rows) == 1 else f"{len(rows)} items"
+    lines = [f"import {stage.name}: {items} = {len(rows) - len(failed)} done"
              f" + {len(failed)} failed"]  # fmt: skip
     lines += [f"  failed {row['item']}: {row['reason']}" for row in failed]
     lines += [

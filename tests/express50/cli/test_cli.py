@@ -47,7 +47,7 @@ def data(tmp_path):
 def test_ingest_then_skip_then_status(run, data, capture):
     code, out, err = run("ingest", data, capture)
     assert code == 0
-    assert out.startswith("ingest: read 1 = 1 done + 0 skipped + 0 failed in ")
+    assert out.startswith("ingest: 1 item = 1 done + 0 skipped + 0 failed in ")
     assert err.startswith("ingest 1/1 S001 done ")
     code, out, err = run("ingest", data)
     assert (code, err) == (0, "")
@@ -113,11 +113,11 @@ def test_bad_item_gives_exit_code_1_and_is_named(run, data, capture, tmp_path):
     (tmp_path / "S002/cues.csv").write_text("nonsense\n")
     code, out, _ = run("ingest", data, capture, tmp_path / "S002", "--workers", 0)
     assert code == 1
-    assert "read 2 = 1 done + 0 skipped + 1 failed" in out
+    assert "2 items = 1 done + 0 skipped + 1 failed" in out
     assert "failed S002: CaptureError: " in out
     assert run("status", data)[0] == 1
     code, out, _ = run("ingest", data, "--items", "S001")
-    assert (code, "read 1 = 0 done + 1 skipped + 0 failed" in out) == (0, True)
+    assert (code, "1 item = 0 done + 1 skipped + 0 failed" in out) == (0, True)
 
 
 @pytest.mark.parametrize(

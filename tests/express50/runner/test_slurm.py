@@ -137,7 +137,7 @@ def test_unknown_stage_in_a_file_is_one_error(tmp_path):
 def test_a_stage_runs_in_jobs_from_the_command_line(cluster, tmp_path, capture, capsys):
     line = "time=10,memory=1G,jobs=1,interface=lo"
     assert main(["ingest", str(tmp_path / "data"), str(capture), "--slurm", line]) == 0
-    assert "ingest: read 1 = 1 done + 0 skipped + 0 failed" in capsys.readouterr().out
+    assert "ingest: 1 item = 1 done + 0 skipped + 0 failed" in capsys.readouterr().out
     (script,) = cluster.glob("*.sh")
     assert f"#SBATCH --chdir={Path.cwd()}\n" in script.read_text()
     (log,) = (tmp_path / "data" / "logs" / "slurm").iterdir()
