@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections.abc import Callable
@@ -49,6 +50,15 @@ def parse_budget(text: str) -> Budget:
             " 40ch"
         )
     return Budget(text, seconds, cores)
+
+
+def budget_text(seconds: float, cores: bool) -> str:
+    """Write seconds as a budget, rounded up."""
+    if cores:
+        return f"{math.ceil(seconds / 36) / 100:g}ch"
+    if seconds < 120:
+        return f"{math.ceil(seconds)}s"
+    return f"{math.ceil(seconds / 60)}m" if seconds < 36000 else f"{math.ceil(seconds / 3600)}h"
 
 
 def parse_goal(text: str) -> Goal:

@@ -1,4 +1,4 @@
-"""Choose settings: predict time and errors of the whole chain from a pilot, and find the front.
+"""Choose settings: predict time and errors of the whole chain from a pilot, and say why.
 
 A cheaper setting of one stage is assumed to change a result independently of the other stages:
 squared differences add up, on top of the error that remains at the most expensive settings. What
@@ -9,14 +9,15 @@ are known.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from express50.console import count, format_seconds, format_table
 from express50.contract.stage import Stage
-from express50.dial.budget import Goal
+from express50.dial.budget import Budget, Goal
 from express50.dial.figures import Cost, Footage, PilotFigures, Trial
 from express50.dial.laws import MeasuredSize, typical_seconds
 from express50.dial.pilot import Ladder, standard_of
@@ -217,6 +218,7 @@ class _State(NamedTuple):
 def front(load: Workload) -> list[Point]:
     """Return the choices that no other beats in time and error, the quickest first."""
     scale = scales(load)
+    reducing = [stage.name for stage in load.stages if stage.growth.reduces]
     states = [_State({}, {}, dict.fromkeys(scale, 0.0), True)]
     for stage in load.stages:
         there, share = load.done.get(stage.name, ("", 0.0))
@@ -231,7 +233,7 @@ def front(load: Workload) -> list[Point]:
                 lost = {r: value + more.get(r, 0.0) ** 2 for r, value in state.lost.items()}
                 each = {**state.each, stage.name: rest if kept else whole}
                 grown.append(_State({**state.settings, stage.name: label}, each, lost, kept))
-        states = _best(grown, scale)
+        states = _best(grown, scale, reducing)
     points = []
     for state in states:
         errors, seconds = expected_errors(load, state.lost), sum(state.each.values())
@@ -264,13 +266,20 @@ def scales(load: Workload) -> dict[str, float]:
     return found
 
 
-def _best(states: list[_State], scale: Mapping[str, float]) -> list[_State]:
-    """Drop partial choices that another one beats in time and in every result."""
+def _best(
+    states: list[_State], scale: Mapping[str, float], reducing: Sequence[str]
+) -> list[_State]:
+    """Drop partial choices that another one beats in time and in every result.
+
+    Only choices of one size of pictures are compared: smaller ones save time in later stages.
+    """
     states.sort(key=lambda s: (sum(s.each.values()), sum(s.lost[r] / scale[r] ** 2 for r in scale)))
     kept: list[_State] = []
     for state in states:
         beaten = any(
-            (other.kept or not state.kept) and all(other.lost[r] <= state.lost[r] for r in scale)
+            (other.kept or not state.kept)
+            and all(other.lost[r] <= state.lost[r] for r in scale)
+            and all(other.settings.get(n) == state.settings.get(n) for n in reducing)
             for other in kept
         )
         if not beaten:
@@ -310,3 +319,78 @@ def choose(points: Sequence[Point], seconds: float, goal: tuple[str, float] | No
         if reaching:
             return reaching[0]
     return fitting[-1]
+
+
+def error_text(name: str, error: Expected) -> str:
+    """Write an expected error for people."""
+    if not error.stated:
+        return f"{name} {error.value:.2g} {error.unit}"
+    return f"{name} {error.value:.2g} {error.unit} ({error.low:.2g} to {error.high:.2g})"
+
+
+def expected_lines(point: Point) -> Iterator[str]:
+    """Yield the errors to expect: those that stages state, and mere differences."""
+    texts = {name: error_text(name, error) for name, error in point.errors.items()}
+    stated = [text for name, text in texts.items() if point.errors[name].stated]
+    others = [text for name, text in texts.items() if not point.errors[name].stated]
+    if stated:
+        yield f"expected error: {', '.join(stated)}"
+    if others:
+        words = "no stage states these errors; difference from the most expensive settings"
+        yield f"{words}: {', '.join(others)}"
+
+
+def choice_lines(
+    load: Workload, point: Point, budget: Budget | None, spent: float
+) -> Iterator[str]:
+    """Yield what is expected of a choice, and why each setting was chosen."""
+    kind = "core time" if load.cores else count(load.width, "worker")
+    whole = f"budget {budget.text}" if budget else "no budget"
+    yield f"{whole}, {kind}: {format_seconds(spent)} spent on measuring"
+    yield from expected_lines(point)
+    yield f"done in {format_seconds(spent + point.seconds)}, measuring included"
+    rows = []
+    for stage in load.stages:
+        label = point.settings[stage.name]
+        rows.append(
+            [stage.name, label, format_seconds(point.each[stage.name]), _why(load, stage, point)]
+        )
+    yield from format_table(["stage", "setting", "time", "why"], rows)
+
+
+def _why(load: Workload, stage: Stage, point: Point) -> str:
+    """Say what the neighbouring settings of a stage would cost or gain."""
+    name, label = stage.name, point.settings[stage.name]
+    ladder = list(load.ladders[name])
+    if len(ladder) == 1:
+        return "has one setting"
+    if name not in load.measured.losses:
+        return "no measured error depends on it: standard"
+    if cost_at(load, name, label) is None:
+        why = next((t.failed[name] for t in load.measured.trials if name in t.failed), "no time")
+        return f"not measured: {why}"
+    here, tried = ladder.index(label), labels_of(load, name)
+    words, untried = [], [other for other in ladder if other not in tried]
+    for other in (*reversed(ladder[:here]), *ladder[here + 1 :]):
+        if other in tried:
+            seconds = stage_seconds(load, stage, other) - stage_seconds(load, stage, label)
+            seconds *= size_factor(load, stage, point.settings)
+            time = f"{format_seconds(abs(seconds))} {'more' if seconds > 0 else 'less'}"
+            words.append(f"{other}: {time}, {_change(load, name, label, other, point)}")
+    if untried:
+        words.append(f"{', '.join(untried)}: not tried")
+    return "; ".join(words)
+
+
+def _change(load: Workload, name: str, label: str, other: str, point: Point) -> str:
+    """Say how another setting of a stage changes the result that it changes most."""
+    losses, sizes = load.measured.losses[name], scales(load)
+    most, words = 0.005, "same errors"
+    for result, error in point.errors.items():
+        squares = [losses.get(one, {}).get(result, 0.0) ** 2 for one in (label, other)]
+        changed = math.sqrt(max(0.0, error.value**2 - squares[0] + squares[1]))
+        share = abs(changed - error.value) / sizes.get(result, math.inf)
+        if share > most:
+            most = share
+            words = f"{result} {changed - error.value:+.2g} {error.unit}"
+    return words

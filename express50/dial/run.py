@@ -13,22 +13,21 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from express50.console import count, format_seconds, format_table
+from express50.console import count, format_seconds
 from express50.contract.config import made_with
 from express50.contract.layout import exclusion_reason
 from express50.contract.stage import Stage
-from express50.dial.budget import Budget, Clock, Goal
+from express50.dial.budget import Budget, Clock, Goal, budget_text
 from express50.dial.choice import (
-    Expected,
     Point,
     Workload,
+    choice_lines,
     choose,
-    cost_at,
+    error_text,
     front,
     goal_result,
     item_seconds,
     labels_of,
-    scales,
     size_factor,
     stage_seconds,
 )
@@ -288,15 +287,6 @@ def _first_choice(run: _Run, load: Workload, goal: Goal | None) -> Point:
     return point
 
 
-def budget_text(seconds: float, cores: bool) -> str:
-    """Write seconds as a budget, rounded up."""
-    if cores:
-        return f"{math.ceil(seconds / 36) / 100:g}ch"
-    if seconds < 120:
-        return f"{math.ceil(seconds)}s"
-    return f"{math.ceil(seconds / 60)}m" if seconds < 36000 else f"{math.ceil(seconds / 3600)}h"
-
-
 def _choose_rest(run: _Run, stage: Stage) -> None:
     """Begin a stage; choose its and later settings again if the time left requires it."""
     state, points = run.state, front(run.workload())
@@ -352,81 +342,6 @@ def reserved(own: float, rest: float, left: float, budget: float) -> float:
     """
     short = own + rest - left
     return rest - short if 0 < short <= GRACE * budget else rest
-
-
-def error_text(name: str, error: Expected) -> str:
-    """Write an expected error for people."""
-    if not error.stated:
-        return f"{name} {error.value:.2g} {error.unit}"
-    return f"{name} {error.value:.2g} {error.unit} ({error.low:.2g} to {error.high:.2g})"
-
-
-def expected_lines(point: Point) -> Iterator[str]:
-    """Yield the errors to expect: those that stages state, and mere differences."""
-    texts = {name: error_text(name, error) for name, error in point.errors.items()}
-    stated = [text for name, text in texts.items() if point.errors[name].stated]
-    others = [text for name, text in texts.items() if not point.errors[name].stated]
-    if stated:
-        yield f"expected error: {', '.join(stated)}"
-    if others:
-        words = "no stage states these errors; difference from the most expensive settings"
-        yield f"{words}: {', '.join(others)}"
-
-
-def choice_lines(
-    load: Workload, point: Point, budget: Budget | None, spent: float
-) -> Iterator[str]:
-    """Yield what is expected of a choice, and why each setting was chosen."""
-    kind = "core time" if load.cores else count(load.width, "worker")
-    whole = f"budget {budget.text}" if budget else "no budget"
-    yield f"{whole}, {kind}: {format_seconds(spent)} spent on measuring"
-    yield from expected_lines(point)
-    yield f"done in {format_seconds(spent + point.seconds)}, measuring included"
-    rows = []
-    for stage in load.stages:
-        label = point.settings[stage.name]
-        rows.append(
-            [stage.name, label, format_seconds(point.each[stage.name]), _why(load, stage, point)]
-        )
-    yield from format_table(["stage", "setting", "time", "why"], rows)
-
-
-def _why(load: Workload, stage: Stage, point: Point) -> str:
-    """Say what the neighbouring settings of a stage would cost or gain."""
-    name, label = stage.name, point.settings[stage.name]
-    ladder = list(load.ladders[name])
-    if len(ladder) == 1:
-        return "has one setting"
-    if name not in load.measured.losses:
-        return "no measured error depends on it: standard"
-    if cost_at(load, name, label) is None:
-        why = next((t.failed[name] for t in load.measured.trials if name in t.failed), "no time")
-        return f"not measured: {why}"
-    here, tried = ladder.index(label), labels_of(load, name)
-    words, untried = [], [other for other in ladder if other not in tried]
-    for other in (*reversed(ladder[:here]), *ladder[here + 1 :]):
-        if other in tried:
-            seconds = stage_seconds(load, stage, other) - stage_seconds(load, stage, label)
-            seconds *= size_factor(load, stage, point.settings)
-            time = f"{format_seconds(abs(seconds))} {'more' if seconds > 0 else 'less'}"
-            words.append(f"{other}: {time}, {_change(load, name, label, other, point)}")
-    if untried:
-        words.append(f"{', '.join(untried)}: not tried")
-    return "; ".join(words)
-
-
-def _change(load: Workload, name: str, label: str, other: str, point: Point) -> str:
-    """Say how another setting of a stage changes the result that it changes most."""
-    losses, sizes = load.measured.losses[name], scales(load)
-    most, words = 0.005, "same errors"
-    for result, error in point.errors.items():
-        squares = [losses.get(one, {}).get(result, 0.0) ** 2 for one in (label, other)]
-        changed = math.sqrt(max(0.0, error.value**2 - squares[0] + squares[1]))
-        share = abs(changed - error.value) / sizes.get(result, math.inf)
-        if share > most:
-            most = share
-            words = f"{result} {changed - error.value:+.2g} {error.unit}"
-    return words
 
 
 def closing_lines(state: RunState, summaries: Sequence[Summary]) -> Iterator[str]:

@@ -13,10 +13,10 @@ from typing import Any
 from express50.console import format_seconds, format_table
 from express50.contract.config import PRESETS
 from express50.dial.budget import Clock
-from express50.dial.choice import Point, Workload, front, labels_of, point_of
+from express50.dial.choice import Point, Workload, error_text, front, labels_of, point_of
 from express50.dial.figures import dial_dir
 from express50.dial.pilot import Chain, pilot_dir, standard_of
-from express50.dial.run import error_text, measured_figures, workload
+from express50.dial.run import measured_figures, workload
 from express50.files.atomic import write_bytes, write_json
 
 

@@ -9,7 +9,7 @@ import pytest
 from benchmarks.budget import Run, figures, quick_budgets
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, NoSettings, Stage
-from express50.dial.choice import Workload, remaining_square, size_factor
+from express50.dial.choice import Workload, front, remaining_square, size_factor
 from express50.dial.figures import Cost, Footage, PilotFigures, Trial
 from express50.dial.results import RESULTS
 from express50.head.load import load_head
@@ -125,7 +125,8 @@ def test_the_quick_form_asks_for_what_should_be_as_good_as_the_best_preset():
     assert len(quick_budgets(table | {"front": points[-1:]})) == 1
 
 
-def test_stages_after_smaller_pictures_cost_what_trials_measured():
+def reducing_chain(cut_draft):
+    """A chain that may cut pictures in ``cut_draft`` seconds; whole ones take 3 s there."""
     stages = [
         Stage(name=name, version=1, config=NoSettings, items=None, inputs=None, run=None,
               growth=Growth(reduces="side" if name == "cut" else ""))
@@ -143,13 +144,25 @@ def test_stages_after_smaller_pictures_cost_what_trials_measured():
             scripted=1, costs=costs, errors={}, failed={}, folder="",
         )  # fmt: skip
 
-    trials = [trial("draft", (5.0, 1.0, 2.0)), trial("standard", (5.0, 3.0, 14.0))]
-    load = Workload(
-        stages=stages, ladders={}, measured=PilotFigures(key="", trials=trials, losses={}),
+    trials = [trial("draft", (5.0, cut_draft, 2.0)), trial("standard", (5.0, 3.0, 14.0))]
+    losses = {"cut": {"draft": {"mesh": 1.0}, "standard": {}}}
+    return Workload(
+        stages=stages, ladders={s.name: dict.fromkeys(("draft", "standard")) for s in stages},
+        measured=PilotFigures(key="", trials=trials, losses=losses),
         footage=trials[0].footage, width=1, cores=True,
     )  # fmt: skip
+
+
+def test_stages_after_smaller_pictures_cost_what_trials_measured():
+    load = reducing_chain(1.0)
     factors = [
-        [size_factor(load, stage, {"cut": label}) for stage in stages]
+        [size_factor(load, stage, {"cut": label}) for stage in load.stages]
         for label in ("draft", "standard")
     ]
     assert factors == [[1.0, 1.0, 1.0], [1.0, 1.0, 7.0]]
+
+
+def test_smaller_pictures_that_take_longer_to_make_stay_a_choice_for_what_they_save_later():
+    points = front(reducing_chain(4.0))
+    found = [(point.settings["cut"], point.seconds) for point in points]
+    assert found == [("draft", 5 + 4 + 2), ("standard", 5 + 3 + 14)]
