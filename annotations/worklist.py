@@ -67,20 +67,21 @@ def worklist(
         return []
     reference = reference_subject(dataset)
     chosen = sorted(subjects or known, key=lambda s: (s != reference, s))
-    tasks = []
+    tasks, places = [], dict[str, int]()  # places of expressions: subjects may lack some
     for subject in chosen:
         done = {} if everything else labels_of(read_labels(dataset, subject), annotator)
         suggestions = read_suggestions(dataset, subject)
         doubts = {name: 1.0 - found.confidence for name, found in suggestions.items()}
-        for position, cue in enumerate(read_index(dataset, subject).cues):
+        for cue in read_index(dataset, subject).cues:
             name = cue.expression_id
+            places.setdefault(name, len(places))
             if name not in done and (expressions is None or name in expressions):
-                tasks.append((LabelTask(subject, name, doubts.get(name, 1.0)), position))
+                tasks.append(LabelTask(subject, name, doubts.get(name, 1.0)))
     if order == "doubt":
-        tasks.sort(key=lambda row: (row[0].subject != reference, -row[0].doubt))
+        tasks.sort(key=lambda task: (task.subject != reference, -task.doubt))
     elif order == "expression":
-        tasks.sort(key=lambda row: row[1])
-    return [task for task, _ in tasks]
+        tasks.sort(key=lambda task: places[task.expression])
+    return tasks
 
 
 def coverage(dataset: Dataset) -> dict[str, dict]:

@@ -1,5 +1,7 @@
 """The reference identity and the order of the work."""
 
+import json
+
 import pytest
 
 from annotations.labels import AUTOMATIC, Label, append_label, make_flag, make_mark
@@ -74,6 +76,18 @@ def test_worklist_orders(tmp_path):
     assert by_expression[:3] == [("neutral", "S002"), ("neutral", "S001"), ("neutral", "S003")]
     by_subject = [t.subject for t in worklist(dataset, "a", order="subject")]
     assert by_subject == ["S002"] * 3 + ["S001"] * 3 + ["S003"] * 3
+
+
+def test_expressions_stay_together_when_a_subject_lacks_one(tmp_path):
+    dataset = make_dataset(tmp_path)
+    path = dataset.index_file("S002")
+    index = json.loads(path.read_text())
+    path.write_text(json.dumps(index | {"cues": index["cues"][1:]}))  # without neutral
+    order = [(t.expression, t.subject) for t in worklist(dataset, "ann", order="expression")]
+    assert order == [
+        ("neutral", "S001"), ("smile", "S001"), ("smile", "S002"), ("wink_left", "S001"),
+        ("wink_left", "S002"),
+    ]  # fmt: skip
 
 
 def test_only_labels_of_the_annotator_count_as_done(tmp_path):
