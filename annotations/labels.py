@@ -184,7 +184,7 @@ def append_label(dataset: Dataset, label: Label) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     row = {k: v for k, v in asdict(label).items() if v is not None}
     line = (json.dumps(row, sort_keys=True) + "\n").encode()
-    handle = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
+    handle = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX)
         size = os.fstat(handle).st_size

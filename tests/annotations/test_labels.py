@@ -1,6 +1,7 @@
 """The label store: nothing is lost, people stand above suggestions, undo is a record."""
 
 import json
+import os
 import time
 from dataclasses import replace
 
@@ -129,3 +130,13 @@ def test_a_flag_needs_a_reason_and_an_expression(tmp_path):
         make_flag(index, "smile", " ", "ann")
     with pytest.raises(UnknownNameError, match="frown"):
         make_flag(index, "frown", "failed", "ann")
+
+
+def test_the_umask_decides_who_else_may_label(tmp_path):
+    dataset = Dataset(tmp_path)
+    before = os.umask(0o002)  # as in folders that a group of annotators shares
+    try:
+        append_label(dataset, make_flag(_index(tmp_path), "smile", "failed", "ann"))
+    finally:
+        os.umask(before)
+    assert dataset.labels_file("S1").stat().st_mode & 0o777 == 0o664
