@@ -10,6 +10,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -72,9 +73,11 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
             argument("expression", metavar="EXPRESSION")
         if "annotator" in shared:
             words = "annotator's name (default: your login)"
+            login = _login()
             argument(
-                "--annotator", type=person, default=getpass.getuser(), metavar="NAME", help=words
-            )
+                "--annotator", type=person, default=login, required=login is None, metavar="NAME",
+                help=words,
+            )  # fmt: skip
         return argument
 
     _add_labelling_verbs(add)
@@ -93,6 +96,13 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
     argument("file", type=Path, metavar="FILE")
     words = "add events from a .csv or .json; known ones are skipped"
     add("import", run_import, words)("file", type=Path, metavar="FILE")
+
+
+def _login() -> str | None:
+    """Return the user's login name; None where the system has none, as in some containers."""
+    with suppress(KeyError, OSError):
+        return getpass.getuser()
+    return None
 
 
 def _add_labelling_verbs(add: Callable[..., Callable]) -> None:

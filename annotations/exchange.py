@@ -76,8 +76,9 @@ def import_labels(dataset: Dataset, path: Path) -> tuple[int, int]:
         where = f"{path}: row {number}"
         check_known(where, "subject", [label.subject], dataset.subjects(), AnnotationError)
         index = read_index(dataset, label.subject)
+        named = [label.expression] if label.expression else []  # an exclusion names none
         cues = [cue.expression_id for cue in index.cues]
-        check_known(where, "expression", [label.expression or cues[0]], cues, AnnotationError)
+        check_known(where, "expression", named, cues, AnnotationError)
         check_texts(label)
         for kind, what in footage_problems(index, label):
             if kind != "window":

@@ -6,7 +6,6 @@ no notice of an ``sbatch`` that refuses, nor of jobs of several workers that hav
 
 from __future__ import annotations
 
-import getpass
 import os
 import re
 import shlex
@@ -205,7 +204,7 @@ class SlurmWorkers(RemoteWorkers):
         here = {str(worker["name"]) for worker in self.table()}
         here |= {name.rpartition("-")[0] for name in here}  # dask numbers the workers of one job
         self._seen |= {number for number, name in self._names.items() if name in here}
-        queue = _call("squeue", "--noheader", "--format=%A", f"--user={getpass.getuser()}")
+        queue = _call("squeue", "--noheader", "--format=%A", f"--user={os.getuid()}")
         there = queue.stdout.split() if queue.returncode == 0 else self._names  # else no answer
         for number in sorted(set(self._names) - set(there)):
             del self._names[number]

@@ -221,6 +221,27 @@ def test_import_refuses_invalid_events(annotate, dataset, tmp_path, capsys, chan
     assert dataset.labels_file("S001").read_bytes() == before
 
 
+def test_an_exclusion_is_imported_though_the_subject_has_no_cues(annotate, dataset, tmp_path):
+    path = dataset.index_file("S001")
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"cues": []}))
+    annotate("exclude", "S001", "no script", "--annotator", "ann")
+    annotate("export", str(tmp_path / "labels.csv"))
+    dataset.labels_file("S001").unlink()
+    assert annotate("import", str(tmp_path / "labels.csv"))["new"] == 1
+    assert included_subjects(dataset) == ["S002"]
+
+
+def test_without_a_login_name_the_annotator_must_be_given(annotate, dataset, monkeypatch, capsys):
+    def nobody():
+        raise KeyError("getpwuid(): uid not found: 54321")  # as in a container of another user
+
+    monkeypatch.setattr("getpass.getuser", nobody)
+    assert annotate("flag", "S001", "smile", "failed", "--annotator", "ann")["annotator"] == "ann"
+    assert main(["annotate", "flag", str(dataset.root), "S001", "smile", "failed"]) == 2
+    assert "--annotator" in capsys.readouterr().err
+    assert annotate("status")["annotators"]["ann"]["labels"] == 1
+
+
 def test_reference_is_the_first_unless_chosen(annotate):
     assert annotate("reference") == {"reference": "S001"}
     assert annotate("reference", "S002") == {"reference": "S002"}
