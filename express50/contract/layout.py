@@ -131,7 +131,7 @@ class Dataset:
 
     def frame_file(self, subject: str, expression: str, camera: str) -> Path:
         """Return the path of a camera's undistorted, colour-corrected frame at a peak."""
-        return self.item_dir("frames", f"{subject}/{expression}") / f"{camera}.jxl"
+        return self.item_dir("frames", f"{subject}/{expression}") / f"{camera}.tif"
 
     def plate_file(self, subject: str, camera: str) -> Path:
         """Return the path of a camera's undistorted, colour-corrected clean plate."""

@@ -36,7 +36,7 @@ Read = Callable[[str], np.ndarray]
 
 
 def run(dataset: Dataset, item: str, out: Path, side: int) -> Result:
-    """Write `<camera>.jxl` per calibrated camera; a camera that cannot be read is dropped.
+    """Write `<camera>.tif` per calibrated camera; a camera that cannot be read is dropped.
 
     The item is `subject/expression`, or `subject/_plates`, which also holds the pictures' sizes.
     `side` is their longer side, pixels; 0: as recorded.
@@ -66,7 +66,7 @@ def run(dataset: Dataset, item: str, out: Path, side: int) -> Result:
         except CaptureError as error:
             dropped.append(Note(name, str(error)))
             continue
-        write_frame(out / f"{name}.jxl", image)
+        write_frame(out / f"{name}.tif", image)
         if (share := pictured_share(camera)) < 1:
             warnings.append(Note(name, FOLDS.format(1 - share)))
         tiles[name] = shrink(image, TILE)

@@ -144,9 +144,9 @@ def test_footage_of_16_bits_is_written_with_8(tmp_path):
 def test_the_same_image_gives_the_same_bytes(tmp_path):
     image = np.random.default_rng(1).integers(0, 65536, (40, 60, 3), dtype=np.uint16)
     for name in "ab":
-        write_frame(tmp_path / f"{name}.jxl", image)
-    assert (tmp_path / "a.jxl").read_bytes() == (tmp_path / "b.jxl").read_bytes()
-    assert np.array_equal(read_image(tmp_path / "a.jxl"), image)
+        write_frame(tmp_path / f"{name}.tif", image)
+    assert (tmp_path / "a.tif").read_bytes() == (tmp_path / "b.tif").read_bytes()
+    assert np.array_equal(read_image(tmp_path / "a.tif"), image)
 
 
 @pytest.mark.parametrize("cut", [0, 10, 300, -3])
@@ -155,7 +155,7 @@ def test_a_damaged_peak_frame_is_one_clear_line(tmp_path, cut):
     dataset = make_dataset(tmp_path, [tmp_path / "raw"])
     path = dataset.frame_file("S001", "smile", "cam00")
     path.write_bytes(path.read_bytes()[:cut])
-    with pytest.raises(CaptureError, match=r"cam00\.jxl: truncated or damaged.*again"):
+    with pytest.raises(CaptureError, match=r"cam00\.tif: truncated or damaged.*again"):
         read_peak_frame(dataset, "S001", "smile", "cam00")
 
 
@@ -200,7 +200,7 @@ def test_cameras_follow_their_pictures_exactly(dataset):
 
 def test_a_side_longer_than_the_footage_changes_nothing(dataset):
     cameras = frames_module.read_cameras_of(dataset, "S001")
-    files = sorted(dataset.stage_dir("frames").rglob("*.jxl"))
+    files = sorted(dataset.stage_dir("frames").rglob("*.tif"))
     before = [path.read_bytes() for path in files]
     assert run(dataset, image_side=4000).ok
     assert [path.read_bytes() for path in files] == before
@@ -214,7 +214,7 @@ def test_a_frame_left_at_another_size_is_named(dataset):
     old = dataset.frame_file("S001", "smile", "cam00").read_bytes()
     assert run(dataset, image_side=32).ok
     dataset.frame_file("S001", "smile", "cam00").write_bytes(old)
-    with pytest.raises(CaptureError, match=r"cam00\.jxl: \d+x\d+, expected 32x.*image_side"):
+    with pytest.raises(CaptureError, match=r"cam00\.tif: \d+x\d+, expected 32x.*image_side"):
         read_peak_frame(dataset, "S001", "smile", "cam00")
 
 

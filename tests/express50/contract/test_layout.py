@@ -10,7 +10,7 @@ def test_places_follow_the_documented_layout(tmp_path):
     dataset = Dataset(tmp_path)
     relative = {
         dataset.item_dir("track", "S001"): "track/S001",
-        dataset.frame_file("S001", "smile", "cam03"): "frames/S001/smile/cam03.jxl",
+        dataset.frame_file("S001", "smile", "cam03"): "frames/S001/smile/cam03.tif",
         dataset.matte_file("S001", "smile", "cam03"): "matte/S001/smile/cam03.png",
         dataset.captures_file: "captures.json",
         dataset.labels_file("S001"): "labels/S001.jsonl",
