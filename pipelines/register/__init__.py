@@ -10,7 +10,7 @@ from express50.contract.stage import Growth, NoSettings, Result, Stage
 
 
 def inputs(dataset: Dataset, item: str, config: NoSettings) -> dict[str, Path | str]:
-    """List the cameras, the track and the expression's surface."""
+    """Name the cameras, the track and the expression's surface."""
     from express50.dataset.tracks import existing_track
 
     subject, expression = item.split("/")
@@ -36,7 +36,7 @@ STAGE = Stage(
     inputs=inputs,
     run=run,
     help="lay the tracked mesh onto the reconstructed surface",
-    purpose="Each vertex moves along its normal to the surface; hair and what no view shows are"
-    " left out. Every vertex gets a residual, a standard deviation and an error bound.",
+    purpose="Each vertex moves along its normal to the surface, except under hair and where no view"
+    " shows skin. Every vertex gets a residual, a standard deviation and an error bound.",
     growth=Growth(items=("subjects", "expressions")),
 )

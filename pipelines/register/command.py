@@ -1,4 +1,4 @@
-"""The options of ``express50 register`` that make it register given scans."""
+"""Add the options of ``express50 register`` that make it register scans."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from express50.contract.stage import Command
 
 def add_options(parser: Any) -> None:
     """Add the options to the parser of the stage's command."""
-    words = "register this scan (.obj, .ply, .glb, .stl), or all of a folder, instead of a dataset;"
-    words += " landmarks beside it are used; DATASET is the folder to write to; may be repeated"
+    words = "register this scan (.obj, .ply, .glb, .stl), or all in a folder, instead of a dataset;"
+    words += " uses landmarks beside it; DATASET is the folder to write to; may be repeated"
     parser.add_argument("--scan", type=Path, action="append", metavar="FILE", help=words)
     words = "with --scan: the head model to fit, as track.head takes it [procedural]"
     parser.add_argument("--head", default="procedural", metavar="MODEL", help=words)
@@ -29,4 +29,4 @@ def run(args: Any) -> int:
     return run_one(args)
 
 
-COMMAND = Command("register given scans", add_options)
+COMMAND = Command("register scans", add_options)

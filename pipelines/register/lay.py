@@ -1,10 +1,10 @@
 """Lay a tracked mesh onto a surface: match along normals, then bend the mesh as little as needed.
 
-The surface is searched for along every vertex' normal. A thin plate is fitted to the heights found
-and carries them to where none are; a weak spring keeps the rest in place. Samples of the plate's
-posterior give the uncertainty. Vertices move along normals only, because tracking, which sees the
-skin's texture, knows better where along the skin they are. Colours and confidence of the surface
-separate skin from hair and cloth.
+Each vertex searches for the surface along its normal. A thin plate is fitted to the heights that
+are found, and interpolates them where none are; weak springs hold the rest in place. Samples of
+the plate's posterior give the uncertainty. Vertices move along normals only: tracking sees the
+skin's texture, so it knows better where along the skin they belong. The surface's colours and
+confidence tell skin from hair and cloth.
 """
 
 from __future__ import annotations
@@ -25,39 +25,41 @@ from express50.head.model import HeadModel, vertex_normals
 from pipelines.register.untangle import untangled
 from pipelines.track.basis import in_regions, movable_vertices
 
-# Per round: how far to either side the surface is searched for, metres, and the finest wavelength
-# that the mesh follows, in multiples of the last. Broad differences are taken first.
+# Per round: search distance to either side, metres, and the finest wavelength that the mesh
+# follows, in multiples of the last round's. Broad differences come first.
 ROUNDS = ((0.010, 2.0), (0.008, 1.25), (0.006, 1.0), (0.004, 1.0), (0.003, 1.0), (0.002, 1.0))
 AGREE = 0.6  # least cosine between the normals of mesh and surface
-OUTLIER = 0.3  # share of the reach: heights so far from the plate get a quarter of the weight
-BELIEF_STEPS = 2
+OUTLIER = 0.3  # share of the search distance; heights this far off the plate keep a quarter weight
+REWEIGHTINGS = 2
 NOISE_M = 0.0003  # standard deviation of a height that is fully trusted
-# Heights err together, as neighbouring patches of a surface do: set on three synthetic people so
-# that 90 % intervals hold there (docs/LOG.md, Registration).
+# Errors that neighbouring heights share. Set on three synthetic people so that 90 % intervals hold
+# there (docs/LOG.md, Registration).
 SURFACE_M = 0.0004
 STAY_M = 0.003  # standard deviation of the tracked mesh where no surface is found
 FOLD_M = 0.03  # a vertex that faces the mesh itself nearer than this lies in a fold
 SAMPLES = 64  # of the posterior; their standard deviation is known to 9 %
-# Trust where the surface is not skin or is coarser than tracking; an ear consists of folds.
+# Trust in regions where the surface is not skin or is coarser than tracking; ears consist of folds.
 TRUST = {
     "scalp": 0.0, "mouth_interior": 0.0, "boundary": 0.0, "neck": 0.0, "left_ear": 0.0,
     "right_ear": 0.0, "lips": 0.5, "left_eye_region": 0.1, "right_eye_region": 0.1,
 }  # fmt: skip
-FACE = ("face", "nose")  # without these, it is bare skin in nearly everyone:
+FACE = ("face", "nose")  # except for NOT_BARE it is bare skin on nearly everybody
 NOT_BARE = (
     "lips", "left_eye_region", "right_eye_region", "mouth_interior", "forehead", "boundary",
 )  # fmt: skip
-NEAR_M, LIPS_M = 0.004, 0.01  # surfaces nearer to the mesh are its skin; its lips
-LEAST = 100  # vertices of bare skin, to know its colour
-SPREADS = (0.05, 0.05, 0.2)  # least standard deviations: red and blue over green, brightness; logs
-ODD = 3.0  # standard deviations at which a colour is half believed
-SURE = (0.5, 1.0)  # confidence, over that of bare skin: of nothing and of full trust
-AROUND_M, NEIGHBOURS, EVERY = 0.008, 12, 14  # neighbours must be trusted: the rim of hair is hair
+NEAR_M, LIPS_M = 0.004, 0.01  # a surface this near to the mesh is its skin; this near to lips, lips
+LEAST = 100  # fewest vertices of bare skin that show its colour
+# Least standard deviations of the logarithms of red over green, blue over green, brightness.
+SPREADS = (0.05, 0.05, 0.2)
+ODD = 3.0  # standard deviations off skin's colour at which trust is halved
+SURE = (0.5, 1.0)  # confidence, as a share of bare skin's, that gives no trust and full trust
+# The rim of hair has colours of skin, so a vertex is trusted only as far as those around it.
+AROUND_M, NEIGHBOURS, EVERY = 0.008, 12, 14
 
 
 @dataclass(frozen=True)
 class GivenSurface:
-    """A surface to lie on: vertices (N, 3), metres, faces (F, 3), and trust (N,) from 0 to 1."""
+    """A surface: vertices (N, 3), metres, faces (F, 3), trust (N,) from 0 to 1."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -69,9 +71,9 @@ class LaidMesh:
     """A mesh that was laid onto a surface.
 
     Attributes:
-        vertices: (V, 3), of the world, metres.
+        vertices: (V, 3), world, metres.
         seen: (V,) bool, where the surface was found and trusted.
-        residual: (V,) height of the surface over the mesh there, metres; 0 elsewhere.
+        residual: (V,) height of the surface above the mesh there, metres; 0 elsewhere.
         sigma: (V,) standard deviation of the vertices along their normals, metres.
     """
 
@@ -82,9 +84,9 @@ class LaidMesh:
 
 
 def lay(model: HeadModel, start: np.ndarray, surface: GivenSurface, detail: float) -> LaidMesh:
-    """Lay a head model's mesh onto a surface in the same world, from ``start`` (V, 3), metres, on.
+    """Lay a head model's mesh, which starts at ``start`` (V, 3), onto a surface; metres.
 
-    ``detail`` is the wavelength of the finest detail that is followed, metres.
+    ``detail`` is the finest wavelength that the mesh follows, metres.
     """
     search, trusted = SurfaceSearch(surface), trusted_vertices(model)
     faces, free = model.faces.numpy(), movable_vertices(model)
@@ -97,7 +99,7 @@ def lay(model: HeadModel, start: np.ndarray, surface: GivenSurface, detail: floa
         trust = trust * trusted * ~folded(mesh, normals, faces)
         moved = ((mesh - start) * normals).sum(1)
         weight = trust / NOISE_M**2
-        for _ in range(BELIEF_STEPS):
+        for _ in range(REWEIGHTINGS):
             rise = plate.factor(weight).solve(weight * height - moved * plate.stay)
             off = (height - rise) / (OUTLIER * reach)
             weight = trust / NOISE_M**2 / (1.0 + off**2) ** 2  # Geman and McClure 1985
@@ -106,16 +108,16 @@ def lay(model: HeadModel, start: np.ndarray, surface: GivenSurface, detail: floa
     normals = mesh_normals(mesh, model.faces)
     residual, trust = search.heights(mesh, normals, ROUNDS[-1][0])
     seen = trust * trusted * ~folded(mesh, normals, faces) > 0.05
-    # Tracked vertices err together, so that springs between them know less than they seem to.
+    # Tracked vertices share their errors, so the springs between them underestimate these.
     sigma = np.hypot(plate.sigma(weight), np.where(seen, SURFACE_M, STAY_M))
     return LaidMesh(mesh, seen, np.where(seen, residual, 0.0), sigma)
 
 
 class SurfaceSearch:
-    """Search of one surface along normals; the ray tree is built once."""
+    """Searches a surface along normals; the ray tree is built once."""
 
     def __init__(self, surface: GivenSurface) -> None:
-        # Far from the origin float32 rays are too coarse: all is cast about the surface's centre.
+        # Far from the origin float32 rays are too coarse, so rays are cast about the centre.
         self.centre = surface.vertices.mean(0)
         self.surface = surface
         self.scene = mesh_scene(surface.vertices - self.centre, surface.faces)
@@ -125,9 +127,9 @@ class SurfaceSearch:
     def heights(
         self, places: np.ndarray, normals: np.ndarray, reach: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Find heights (S,) of the surface over places (S, 3), and trust (S,).
+        """Find heights (S,) of the surface above places (S, 3), and trust (S,).
 
-        Both are 0 where the surface is beyond reach, or faces elsewhere than the place's normal.
+        Both are 0 where the surface is further than `reach` or its normal does not agree.
         """
         height, trust = np.zeros(len(places)), np.zeros(len(places))
         nearest = np.full(len(places), np.inf)
@@ -144,28 +146,28 @@ class SurfaceSearch:
 
 
 class Plate:
-    """A thin plate on springs over a mesh, given by the stiffness (V, V) and mass (V,) of its skin.
+    """A thin plate over a mesh of stiffness (V, V) and mass (V,), held in place by weak springs.
 
-    Only `free` vertices (V,) leave it. It follows heights whose wavelength is over `detail` metres.
+    Only `free` vertices (V,) bool move. It follows heights of wavelengths over `detail` metres.
     """
 
     def __init__(
         self, stiffness: sparse.csr_matrix, mass: np.ndarray, free: np.ndarray, detail: float
     ) -> None:
-        # A wave of amplitude NOISE and that wavelength costs as much as missing it does.
+        # Bending to a wave of this length and amplitude NOISE_M costs as much as missing it.
         scale = (detail / (2 * np.pi)) ** 2 / (NOISE_M * np.sqrt(np.median(mass)))
         self.bend = sparse.diags(scale * mass**-0.5) @ stiffness
         self.stay = np.where(free, STAY_M, 1e-6) ** -2.0
 
     def factor(self, weight: np.ndarray) -> SuperLU:
-        """Factor the normal equations with data of weights (V,), inverse square metres."""
+        """Factor the normal equations for heights of weights (V,), 1 / square metres."""
         matrix = self.bend.T @ self.bend + sparse.diags(weight + self.stay)
         return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
 
     def sigma(self, weight: np.ndarray) -> np.ndarray:
-        """Estimate standard deviations (V,) of heights under data of weights (V,).
+        """Estimate standard deviations (V,), metres, of the plate from samples of its posterior.
 
-        They are the spread of samples of the heights' posterior.
+        The heights that it was fitted to have weights (V,), 1 / square metres.
         """
         random = np.random.default_rng(0)
         pull = self.bend.T @ random.normal(size=(len(weight), SAMPLES))
@@ -174,7 +176,7 @@ class Plate:
 
 
 def trusted_vertices(model: HeadModel) -> np.ndarray:
-    """Weigh by region (V,) how likely a surface near a vertex is its skin."""
+    """Return the trust (V,), by region, that a surface near a vertex is its skin."""
     trust = movable_vertices(model).astype(np.float64)
     for name, share in TRUST.items():
         trust = np.where(in_regions(model, (name,)), np.minimum(trust, share), trust)
@@ -182,7 +184,7 @@ def trusted_vertices(model: HeadModel) -> np.ndarray:
 
 
 def folded(mesh: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Mark vertices (V,) that face another part of the mesh, as in nostrils and between lips."""
+    """Mark vertices (V,) that face another part of the mesh, as in nostrils or between lips."""
     centred = mesh - mesh.mean(0)
     hit = mesh_scene(centred, faces).cast_rays(join_rays(centred + 2e-4 * normals, normals))
     return hit["t_hit"].numpy() < FOLD_M
@@ -197,7 +199,7 @@ def mesh_normals(vertices: np.ndarray, faces: torch.Tensor) -> np.ndarray:
 def smoothed(
     normals: np.ndarray, stiffness: sparse.csr_matrix, mass: np.ndarray, wavelength: float
 ) -> np.ndarray:
-    """Return a mesh's normals (V, 3), averaged over a wavelength in metres and of unit length.
+    """Return a mesh's unit normals (V, 3), averaged over a wavelength in metres.
 
     Stiffness (V, V) and mass (V,) are those of `cotangent_laplacian`.
     """
@@ -212,10 +214,10 @@ def skin_trust(
     colors: np.ndarray,
     confidence: np.ndarray,
 ) -> np.ndarray:
-    """Weigh a surface's vertices (N,) from 0 to 1: how likely they are skin, and well placed.
+    """Return the trust (N,), 0 to 1, that a surface's vertices (N, 3) are skin and well placed.
 
-    Bare skin is what lies near the middle of the tracked face, the mesh (V, 3); its colours (N, 3),
-    uint8 sRGB, and its confidence (N,), 0 to 1, are the measure. Places are in metres.
+    The reference is the surface near bare skin of the tracked mesh (V, 3): how much other colours
+    (N, 3), uint8 sRGB, and confidence (N,), 0 to 1, differ from those there. Places are in metres.
     """
     bare = in_regions(model, FACE) & ~in_regions(model, NOT_BARE)
     distance, nearest = cKDTree(vertices).query(mesh[bare])
@@ -227,7 +229,7 @@ def skin_trust(
     odd[np.r_[in_regions(model, ("lips",)), False][owner]] = 0.0
     sure = confidence / max(float(np.median(confidence[reference])), 1e-6)
     trust = np.clip((sure - SURE[0]) / (SURE[1] - SURE[0]), 0.0, 1.0) / (1.0 + (odd / ODD) ** 4)
-    # A vertex among untrusted ones is not trusted either; a sample of its neighbours is enough.
+    # A vertex among untrusted ones is not trusted either; every 14th neighbour is enough.
     some = np.arange(0, len(vertices), EVERY)
     distance, nearest = cKDTree(vertices[some]).query(vertices, min(NEIGHBOURS, len(some)))
     near = distance < AROUND_M
@@ -236,7 +238,7 @@ def skin_trust(
 
 
 def _oddness(colors: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Measure how many standard deviations colours (N, 3) are off those of a reference."""
+    """Return how many standard deviations (N,) colours (N, 3) are off those of a reference."""
     log = np.log(srgb_to_linear(colors / 255.0) + 0.01)
     axes = np.stack([log[:, 0] - log[:, 1], log[:, 2] - log[:, 1], log.mean(1)], axis=1)
     middle = np.median(axes[reference], axis=0)

@@ -1,8 +1,8 @@
-"""Register a given scan: find its face, fit a head model to it, and lay the mesh onto it.
+"""Register a scan: find its face, fit a head model to it, and lay the mesh onto it.
 
-Neither a pose nor landmarks nor a texture is needed. The scan is drawn from all sides, the landmark
-detector finds the face in these pictures, and the cameras that drew them triangulate it. Landmarks
-that are given replace the detector's, and say where to look.
+No pose, landmarks or texture are needed. The scan is drawn from all sides, the landmark detector
+finds the face in these pictures, and its points are triangulated. Given landmarks replace the
+detector's and show where the face is.
 """
 
 from __future__ import annotations
@@ -40,21 +40,21 @@ from pipelines.track.stage import fit_landmarks
 from pipelines.track.state import INNER, MIN_TRIANGULATED, State, Target, all_vertices
 from pipelines.track.terms import MeshPlaces, NormalTerm, PointTerm, landmark_anchors
 
-REACHES = (0.015, 0.010, 0.006, 0.004)  # of the search, per round of the fit of parameters; metres
+REACHES = (0.015, 0.010, 0.006, 0.004)  # search distance per round of the parameters' fit, metres
 ROUND_STEPS, SIGMA_M = 4, 0.0012
-DETAIL_M = 0.008  # wavelength of the finest detail that is followed: scans have few errors
-SIDE, AWAY_M, SPAN_M = 400, 1.2, 0.34  # of the pictures: pixels, distance, width of the view
+DETAIL_M = 0.008  # finest wavelength that the mesh follows; fine, because scans have little noise
+SIDE, AWAY_M, SPAN_M = 400, 1.2, 0.34  # of a picture: pixels, camera's distance, width of the view
 YAWS, PITCHES = (-50.0, -25.0, 0.0, 25.0, 50.0), (-15.0, 15.0)
 LEAST_SCORE = 0.2
 CHIN, NOSE_BRIDGE = 8, 27
 HALF_HEAD_M = 0.06
-OFF_SCAN_M = 0.02  # given landmarks must lie nearer than this, also on hair or at the rim of a hole
+OFF_SCAN_M = 0.02  # given landmarks must lie this near, even on hair or at the rim of a hole
 INWARDS = (
     "its triangles face inwards: it is inside out, or mirrored; flip its triangles, or mirror it"
     " back"
 )
-Frame = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Middle of a face, its way up and its way ahead, each (3,)."""
+FacePose = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Middle of a face, its direction up and the direction it looks in, each (3,)."""
 
 
 @dataclass(frozen=True)
@@ -69,17 +69,17 @@ class FittedScan:
 
 
 def fit_scan(scan: Scan, head: str, given: np.ndarray | None = None) -> FittedScan:
-    """Fit a head model to a scan, with the help of given landmarks (68, 3), NaN where unknown.
+    """Fit a head model to a scan, helped by given landmarks (68, 3), NaN where unknown.
 
     Raises:
-        StageError: no face is found, or landmarks are not of this scan.
+        StageError: no face is found, or the landmarks do not belong to the scan.
         HeadModelError: the head model cannot be loaded.
     """
     torch.set_num_threads(1)
     basis = make_basis(load_head(head))
     template = landmarks(basis.model, basis.model.template[None])[0].numpy()
     given = np.full((68, 3), np.nan) if given is None else given
-    observation = look(scan, template, given)
+    observation = find_landmarks(scan, template, given)
     check_face(observation.points, template, "the face that is seen")
     terms = given_terms(basis.model, given)
     # The scan may show any expression: none counts as neutral.
@@ -103,7 +103,7 @@ def fit_scan(scan: Scan, head: str, given: np.ndarray | None = None) -> FittedSc
 
 
 def given_terms(model: HeadModel, given: np.ndarray) -> tuple[PointTerm, ...]:
-    """Make the terms that pull landmarks to given ones (68, 3), NaN where there are none."""
+    """Make the terms that pull landmarks to given ones (68, 3), NaN where unknown."""
     known, anchors = np.flatnonzero(np.isfinite(given[:, 0])), landmark_anchors(model)
     rows = (known[known > 16], GIVEN_M), (known[known < 17], GIVEN_M / JAW_LINE_WEIGHT)
     return tuple(PointTerm(anchors.some(ids), given[ids], sigma) for ids, sigma in rows if len(ids))
@@ -112,7 +112,7 @@ def given_terms(model: HeadModel, given: np.ndarray) -> tuple[PointTerm, ...]:
 def surface_term(
     model: HeadModel, search: SurfaceSearch, mesh: np.ndarray, reach: float
 ) -> NormalTerm:
-    """Make the term that pulls a mesh's (V, 3) vertices to the scan where it is found."""
+    """Make the term that pulls a mesh's vertices (V, 3) to the scan within `reach` metres."""
     normals = mesh_normals(mesh, model.faces)
     height, trust = search.heights(mesh, normals, reach)
     trust = trust * trusted_vertices(model) * ~folded(mesh, normals, model.faces.numpy())
@@ -122,23 +122,24 @@ def surface_term(
     return NormalTerm(MeshPlaces.of_vertices(ids), goals, normals[ids], sigma, 0.5 * reach)
 
 
-def look(scan: Scan, template: np.ndarray, given: np.ndarray) -> Observation:
+def find_landmarks(scan: Scan, template: np.ndarray, given: np.ndarray) -> Observation:
     """Find the landmarks of a scan's face in pictures of it.
 
-    Landmarks (68, 3) of a head model's template say how a face is made; given ones (68, 3), NaN
-    where there is none, replace those that are found.
+    Given landmarks (68, 3), NaN where unknown, replace those that are found; they are checked
+    against those (68, 3) of a head model's template.
 
     Raises:
-        StageError: no picture shows a face, or given landmarks are not of this scan.
+        StageError: no picture shows a face, or the given landmarks do not belong to the scan.
     """
     source, painter, known = open_source(EMBEDDED, {}), ScanPainter(scan), np.isfinite(given[:, 0])
     if known.any():
         painter.check_near(given)
         check_face(given, template, "the given landmarks")
-    frame = place_face(given, template) if known.any() else find_face(source, painter)
-    if painter.picture(place_camera(frame[0], frame[2], frame[1], SPAN_M))[1] > 0.5:
+    pose = pose_of_given(given, template) if known.any() else find_face(source, painter)
+    middle, up, ahead = pose
+    if painter.picture(place_camera(middle, ahead, up, SPAN_M))[1] > 0.5:
         raise StageError(INWARDS)
-    views = look_around(source, painter, *frame)
+    views = face_views(source, painter, pose)
     if len(views) >= 2:
         found = agree("scan", 0, views)[0]
     elif known[INNER].sum() >= MIN_TRIANGULATED:
@@ -157,8 +158,8 @@ def look(scan: Scan, template: np.ndarray, given: np.ndarray) -> Observation:
     )
 
 
-def find_face(source: Source, painter: ScanPainter) -> Frame:
-    """Find a face in pictures from all sides; StageError if no picture shows a face."""
+def find_face(source: Source, painter: ScanPainter) -> FacePose:
+    """Find a face in pictures from all sides; StageError if no picture shows one."""
     low, high = painter.scan.vertices.min(0), painter.scan.vertices.max(0)
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
     best, found, turned = None, -1.0, []
@@ -168,29 +169,28 @@ def find_face(source: Source, painter: ScanPainter) -> Frame:
             picture, inwards = painter.picture(camera)
             turned.append(inwards)
             face = source(picture, camera.id, 0).face
-            if inwards < 0.5 and face.score > found:  # not a mask from behind
+            if inwards < 0.5 and face.score > found:  # not the inside of a face, from behind
                 best, found = (camera, face), face.score
     if best is None or found < LEAST_SCORE:
         unseen = "no side of the scan shows a face; is it a head, its triangles facing out?"
         raise StageError(INWARDS if np.mean(turned) > 0.5 else unseen)
-    # The way that the face looks is known to 45 degrees, its top by the landmarks.
+    # The face looks towards this camera, within 45 degrees; the landmarks show which way is up.
     camera, face = best
     axes = camera.cam_from_world[:3, :3]
     rise = face.points[NOSE_BRIDGE] - face.points[CHIN]
     return painter.middle_of(camera, face.points), rise @ axes[:2] / np.linalg.norm(rise), -axes[2]
 
 
-def place_face(given: np.ndarray, template: np.ndarray) -> Frame:
-    """Find a face by given landmarks (68, 3), NaN where there is none."""
+def pose_of_given(given: np.ndarray, template: np.ndarray) -> FacePose:
+    """Return the pose of a face from given landmarks (68, 3), NaN where unknown."""
     known = np.isfinite(given).all(1)
     turn, shift = rigid_fit(template[known], given[known])
     return turn @ (template.mean(0) - [0.0, 0.0, HALF_HEAD_M]) + shift, turn[:, 1], turn[:, 2]
 
 
-def look_around(
-    source: Source, painter: ScanPainter, middle: np.ndarray, up: np.ndarray, ahead: np.ndarray
-) -> list[LandmarkView]:
-    """Draw a scan from ways around that in which its face looks; return the views that show it."""
+def face_views(source: Source, painter: ScanPainter, pose: FacePose) -> list[LandmarkView]:
+    """Draw a scan from in front of its face and around; return the views that show the face."""
+    middle, up, ahead = pose
     right = np.cross(up, ahead)
     views: list[LandmarkView] = []
     for yaw in np.radians(YAWS):
@@ -207,7 +207,7 @@ def look_around(
 def place_camera(
     middle: np.ndarray, way: np.ndarray, up: np.ndarray, span: float, name: str = "view"
 ) -> Camera:
-    """Place a camera that looks at `middle` (3,) from `way` (3,) and sees `span` metres across."""
+    """Place a camera in the direction `way` (3,) of `middle` (3,); it sees `span` metres across."""
     away = max(AWAY_M, 2.0 * span)
     focal = SIDE * away / span
     K = np.array([[focal, 0, SIDE / 2], [0, focal, SIDE / 2], [0, 0, 1.0]])
@@ -218,7 +218,7 @@ def place_camera(
 class ScanPainter:
     """Draws a scan by ray casting, lit from beside the camera; the ray tree is built once.
 
-    Triangles are lit on both sides, as a scan may have some that are turned.
+    Triangles are lit on both sides, because some of a scan's may be turned over.
     """
 
     def __init__(self, scan: Scan) -> None:
@@ -227,7 +227,7 @@ class ScanPainter:
         self.normals = mesh_normals(scan.vertices, torch.from_numpy(scan.faces))
 
     def picture(self, camera: Camera) -> tuple[np.ndarray, float]:
-        """Draw a picture (H, W, 3) uint8 sRGB; return it and the share of it that faces away."""
+        """Draw a picture (H, W, 3) uint8 sRGB; return it and the share of hits that face away."""
         origin, directions = rays(camera)
         hit = self.scene.cast_rays(join_rays(origin - self.centre, directions))
         seen = np.isfinite(hit["t_hit"].numpy())
@@ -245,7 +245,7 @@ class ScanPainter:
         return shown, float(away.mean()) if seen.any() else 0.0
 
     def check_near(self, given: np.ndarray) -> None:
-        """Raise StageError if landmarks (68, 3), NaN where unknown, are far off the scan."""
+        """Raise StageError if landmarks (68, 3), NaN where unknown, are far from the scan."""
         known = np.flatnonzero(np.isfinite(given).all(1))
         at = o3d.core.Tensor((given[known] - self.centre).astype(np.float32))
         away = self.scene.compute_distance(at).numpy()
@@ -253,11 +253,11 @@ class ScanPainter:
             raise StageError(
                 f"the given landmarks: {(away > OFF_SCAN_M).sum()} of {len(known)} are off the scan"
                 f", point {known[away.argmax()]} by {1e3 * away.max():.0f} mm, expected at most"
-                f" {1e3 * OFF_SCAN_M:.0f}; give them in the unit and axes of the scan's file"
+                f" {1e3 * OFF_SCAN_M:.0f} mm; give them in the unit and axes of the scan's file"
             )
 
     def middle_of(self, camera: Camera, points: np.ndarray) -> np.ndarray:
-        """Return the middle (3,) of the scan's places at pixels (N, 2), half a head behind."""
+        """Return a head's middle (3,): half a head behind what the pixels (N, 2) show."""
         origin, directions = rays(camera)
         column, row = np.clip(points, 0, SIDE - 1).astype(np.int64).T
         hit = self.scene.cast_rays(join_rays(origin - self.centre, directions[row, column]))

@@ -1,4 +1,4 @@
-"""``express50 register --scan FILE OUT`` registers scans: a folder per scan, and an index."""
+"""Register scan files (``express50 register --scan FILE OUT``): a folder per scan, and an index."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from pipelines.register.scan_input import (
 from pipelines.register.stage import LEAST_SEEN, write_registration
 from pipelines.track.stage import write_track
 
-VERSION = 5  # raise it when the same scan gives other files
+VERSION = 5  # raise it when a change gives other files for the same scan
 INDEX = "index.csv"
 COLUMNS = (
     "name", "scan", "parameters", "mesh", "parameters_mm_median", "parameters_mm_p95",
@@ -41,15 +41,17 @@ COLUMNS = (
     "warnings", "error",
 )  # fmt: skip
 PICTURES, FAR_MM = len(YAWS) * len(PITCHES), 10.0
-OF_DATASETS = ("set", "config", "items", "scheduler", "slurm", "print_job")
+DATASET_OPTIONS = ("set", "config", "items", "scheduler", "slurm", "print_job")
 
 
 def run_scans(args: argparse.Namespace) -> int:
     """Register the scans of a command line; one that fails does not stop the others."""
-    ignored = [name for name in OF_DATASETS if getattr(args, name)]
-    if ignored:
-        raise ConfigError(f"--{ignored[0].replace('_', '-')} goes with a dataset, not with --scan")
-    load_head(args.head)  # a wrong name is an error before the work
+    for name in DATASET_OPTIONS:
+        if getattr(args, name):
+            raise ConfigError(
+                f"--{name.replace('_', '-')} is for datasets and has no effect with --scan; omit it"
+            )
+    load_head(args.head)  # refuse a wrong name before any work
     out, accounts = args.dataset, []
     scans, former = scans_of(args.scan), read_index(out / INDEX)
     try:
@@ -75,10 +77,10 @@ def run_scans(args: argparse.Namespace) -> int:
 
 
 def read_index(path: Path) -> dict[str, dict[str, str]]:
-    """Read the rows of an index by the names of their scans; there are none without a file.
+    """Read the rows of an index by scan name; without the file there are none.
 
     Raises:
-        FormatError: it is another file.
+        FormatError: the file is not an index.
     """
     if not path.exists():
         return {}
@@ -89,7 +91,7 @@ def read_index(path: Path) -> dict[str, dict[str, str]]:
 
 
 def write_index(path: Path, former: dict[str, dict[str, str]], accounts: list[dict]) -> None:
-    """Write what was made and what failed; former rows stay while their files are there."""
+    """Write a row per scan, made or failed; former rows stay as long as their files exist."""
     rows: dict[str, dict] = {
         name: row
         for name, row in former.items()
@@ -109,20 +111,17 @@ def write_index(path: Path, former: dict[str, dict[str, str]], accounts: list[di
 
 
 def scans_of(paths: list[Path]) -> dict[str, Path]:
-    """List scans by the names of their folders; of a folder all scans in it.
+    """List scan files, and those in folders, by the names of the folders to write.
 
     Raises:
-        ConfigError: one is missing, two have one name, or one cannot be a folder's name.
+        ConfigError: a scan is missing, two have the same name, or a name cannot be a folder's.
     """
-    files = [
-        file
-        for path in paths
-        for file in (
-            sorted(f for f in path.iterdir() if f.suffix.lower() in KINDS)
-            if path.is_dir()
-            else [path]
+    files: list[Path] = []
+    for path in paths:
+        folder = path.is_dir()
+        files += (
+            sorted(f for f in path.iterdir() if f.suffix.lower() in KINDS) if folder else [path]
         )
-    ]
     missing = next((file for file in files if not file.is_file()), None)
     if missing is not None or not files:
         raise ConfigError(
@@ -134,19 +133,20 @@ def scans_of(paths: list[Path]) -> dict[str, Path]:
         if not ID.fullmatch(file.stem) or file.stem in found:
             raise ConfigError(
                 f"--scan {file}: its name becomes a folder's; expected letters, digits, _ and -,"
-                " and no name twice: rename it"
+                " and every name once; rename the file"
             )
         found[file.stem] = file
     return found
 
 
 def register_scan(path: Path, head: str, folder: Path) -> dict:
-    """Register a scan into a folder, unless it holds the result already; returns the metrics.
+    """Register a scan into a folder, unless the result is there already; return the metrics.
 
     Raises:
         Express50Error: scan or landmarks cannot be read, or the scan shows no face.
     """
-    files = [path, Path(head).expanduser(), landmarks_beside(path)]
+    points = landmarks_beside(path)
+    files = [path, Path(head).expanduser(), points]
     digests = [file_sha256(file) if file and file.is_file() else str(file) for file in files]
     identity = value_digest([VERSION, *digests])
     if folder.exists():
@@ -156,8 +156,8 @@ def register_scan(path: Path, head: str, folder: Path) -> dict:
         if former.get("identity") == identity:
             return former | {"skipped": True}
     scan, given = read_scan(path), np.full((68, 3), np.nan)
-    if files[2] is not None:
-        given = UNITS[scan.unit] * read_landmarks(files[2])
+    if points is not None:
+        given = UNITS[scan.unit] * read_landmarks(points)
     fitted = fit_scan(scan, head, given)
     with folder_in_one_step(folder.with_name(f".{folder.name}.part"), folder) as out:
         file = out / "track.npz"
@@ -174,9 +174,9 @@ def register_scan(path: Path, head: str, folder: Path) -> dict:
 
 
 def figures_of_landmarks(fitted: FittedScan, given: np.ndarray) -> dict:
-    """Count the views that show the face and the given landmarks (68, 3), and how far these are.
+    """Count the views of the face and the given landmarks (68, 3); measure how far these are off.
 
-    Distances are from the fitted parameters' landmarks, those of the jaw line left out.
+    Distances are to the landmarks of the fitted parameters, without those of the jaw line.
     """
     marks = landmarks(fitted.basis.model, torch.from_numpy(fitted.start)[None])[0].numpy()
     known = np.isfinite(given[:, 0])
@@ -190,18 +190,18 @@ def figures_of_landmarks(fitted: FittedScan, given: np.ndarray) -> dict:
 
 
 def warnings_of(metrics: dict) -> list[str]:
-    """List the warnings about a registered scan."""
+    """Return the warnings about a registered scan."""
     seen, views, away = (metrics[k] for k in ("seen_share", "views", "landmarks_mm_largest"))
     found = {
         f"the scan was found at only {seen:.0%} of the face's vertices": seen < LEAST_SEEN,
         f"only {views} of {PICTURES} pictures of the scan show a face": views < PICTURES / 2,
-        f"a given landmark is {away} mm from the fitted one": away and away > FAR_MM,
+        f"a given landmark is {away} mm from the fitted one": away is not None and away > FAR_MM,
     }
     return [words for words, holds in found.items() if holds]
 
 
 def distances(scan: Scan, fitted: FittedScan) -> dict[str, float | None]:
-    """Measure how far the seen vertices lie from the scan, before and after the mesh was laid."""
+    """Measure how far the seen vertices are from the scan, before and after laying the mesh."""
     middle, seen = scan.vertices.mean(0), fitted.laid.seen
     scene = mesh_scene(scan.vertices - middle, scan.faces)
     found: dict[str, float | None] = {}
@@ -216,7 +216,7 @@ def distances(scan: Scan, fitted: FittedScan) -> dict[str, float | None]:
 
 
 def line_of(account: dict) -> str:
-    """Describe a registered scan in a line."""
+    """Describe a registered scan in one line."""
     return (
         f"{account['unit']}, {'coloured' if account['textured'] else 'no colours'},"
         f" {account['landmarks']} landmarks given;"

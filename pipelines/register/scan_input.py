@@ -1,4 +1,4 @@
-"""Read a scan and the landmarks given with it; refuse points that are on no human face."""
+"""Read a scan and its landmarks; refuse points that cannot be a human face's."""
 
 from __future__ import annotations
 
@@ -19,20 +19,21 @@ from express50.geometry.transforms import similarity_fit
 KINDS = (".obj", ".ply", ".glb", ".stl")
 UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001}
 NOT_UNITS = {"kilometres": 1e3, "decimetres": 0.1, "micrometres": 1e-6}  # recognised and refused
-SMALLEST_M, LARGEST_M = 0.12, 1.2  # longest side of a scan of a face, or of a head with shoulders
+SMALLEST_M, LARGEST_M = 0.12, 1.2  # longest side of a scan: a face, or a head with shoulders
 LEAST_FACES = 500
 GREY = 0.5  # of scans without colours, linear light
 
 # Landmarks.
-BESIDE = ("", "_landmarks", "_picked_points")  # added to a scan's name; the last one by MeshLab
+BESIDE = ("", "_landmarks", "_picked_points")  # added to a scan's name, the last by MeshLab
 LANDMARK_KINDS = (".pp", ".json", ".csv", ".txt")
 LIMIT = 1 << 20  # bytes
 GIVEN_M = 0.002  # standard deviation of a given point
-COUNTS = (68, 51)  # of points that are known by their order; 51 are without the jaw line
-LEAST, LEAST_SPREAD_M = 4, 0.01  # points, and how far they stray from a line
+COUNTS = (68, 51)  # of points without names, in iBUG's order; 51 are without the jaw line
+LEAST, LEAST_SPREAD_M = 4, 0.01  # points, and their distance from a line
 SIZES = (0.5, 2.0)  # of a face, times the head model's
-MISFIT_M = 0.03  # rms: 0.023 for a jaw that is wide open, 0.032 if each takes its neighbour's place
-MIRRORED = 0.9  # of the misfit that a mirrored face may leave; faces leave it over 1.27 times
+MISFIT_M = 0.03  # rms: a wide open jaw has 0.023, points that are all shifted by one have 0.032
+# A face is mirrored if its mirror image's misfit is under this times its own; faces have over 1.27.
+MIRRORED = 0.9
 NAMES = {
     "chin": 8, "gnathion": 8, "nasion": 27, "nose_tip": 30, "pronasale": 30, "subnasale": 33,
     "right_eye_outer": 36, "right_exocanthion": 36, "right_eye_inner": 39, "right_endocanthion": 39,
@@ -58,10 +59,10 @@ class Scan:
 
 
 def read_scan(path: Path) -> Scan:
-    """Read a scan; its unit is recognised by its size.
+    """Read a scan; its unit is guessed from its size.
 
     Raises:
-        FormatError: it is not a mesh, is damaged, too coarse, or of no size that a head has.
+        FormatError: it is not a mesh, is damaged, is too coarse, or has no size that a head has.
     """
     import trimesh
 
@@ -72,7 +73,7 @@ def read_scan(path: Path) -> Scan:
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
         check_faces(faces, len(vertices))
         shades = read_colours(mesh)
-    except Exception as error:  # noqa: BLE001  # trimesh raises what the damage leads to
+    except Exception as error:  # noqa: BLE001  # on damage trimesh may raise anything
         raise FormatError(f"{path}: cannot be read as a mesh ({error}); export it again") from None
     if len(faces) < LEAST_FACES:
         raise FormatError(
@@ -99,7 +100,7 @@ def read_scan(path: Path) -> Scan:
 
 
 def read_colours(mesh: Any) -> np.ndarray | None:
-    """Return colours (N, 3), 0 to 255 sRGB, of a trimesh mesh's vertices; None if it has none."""
+    """Return the vertex colours (N, 3), 0 to 255 sRGB, of a trimesh mesh; None if it has none."""
     visual, colours = mesh.visual, None
     if visual.kind == "vertex":
         colours = visual.vertex_colors
@@ -116,7 +117,7 @@ def read_colours(mesh: Any) -> np.ndarray | None:
 
 
 def landmarks_beside(scan: Path) -> Path | None:
-    """Return the file of landmarks beside a scan, if there is one; FormatError if there are two."""
+    """Return the landmark file beside a scan, None without; FormatError if there are two."""
     names = [scan.stem + mark + kind for mark in BESIDE for kind in LANDMARK_KINDS]
     found = [path for name in names if (path := scan.with_name(name)).is_file()]
     if len(found) > 1:
@@ -125,7 +126,7 @@ def landmarks_beside(scan: Path) -> Path | None:
 
 
 def read_landmarks(path: Path) -> np.ndarray:
-    """Read landmarks (68, 3), iBUG-68 order, in the scan's unit and axes; NaN where none is given.
+    """Read landmarks (68, 3), iBUG-68 order, in the scan's unit and axes; NaN where unknown.
 
     Raises:
         FormatError: the layout, the number of points, a name or a coordinate is wrong.
@@ -135,8 +136,10 @@ def read_landmarks(path: Path) -> np.ndarray:
         points = np.full((68, 3), np.nan)
         for place, (name, xyz) in zip(_places([name for name, _ in rows]), rows, strict=True):
             if len(xyz) != 3 or not np.isfinite(xyz).all():
-                words = f"point {name or place} is {xyz}, expected 3 finite numbers"
-                raise ValueError(words + "; name the points and omit unknown ones")
+                raise ValueError(
+                    f"point {name or place} is {xyz}, expected 3 finite numbers; name the points"
+                    " and omit unknown ones"
+                )
             if np.isfinite(points[place]).all():
                 raise ValueError(f"point {name} appears twice")
             points[place] = xyz
@@ -148,7 +151,7 @@ def read_landmarks(path: Path) -> np.ndarray:
 
 
 def _places(names: list[str]) -> list[int]:
-    """Return the places among the 68 of points with such names, none of them named or all."""
+    """Return the indices among the 68 of points with these names; either all have one, or none."""
     count = len(names)
     numbered = [str(k) for k in range(count)], [str(k + 1) for k in range(count)]
     if count in COUNTS and (names in numbered or not any(names)):
@@ -159,15 +162,16 @@ def _places(names: list[str]) -> list[int]:
     places = [int(name) if name.isdecimal() else NAMES.get(name, 68) for name in plain]
     wrong = [name for name, place in zip(names, places, strict=True) if place > 67]
     if wrong:
-        words = f"point {wrong[0]!r}, expected a number from 0 to 67 or one of {', '.join(NAMES)}"
-        raise ValueError(words)
+        raise ValueError(
+            f"point {wrong[0]!r}, expected a number from 0 to 67 or one of {', '.join(NAMES)}"
+        )
     return places
 
 
 def _read_rows(path: Path) -> list[tuple[str, tuple[float, ...]]]:
-    """Read names, empty where there are none, and coordinates from MeshLab's XML, JSON or text.
+    """Read names (empty if there are none) and coordinates from MeshLab's XML, JSON or text.
 
-    A line of text is x, y, z, perhaps after a name or a number; a head that ends in z is skipped.
+    A line of text is x, y, z, perhaps after a name or a number; a header that ends in z is skipped.
     """
     if path.suffix == ".pp":
         points = ElementTree.fromstring(read_text(path, FormatError, LIMIT)).iter("point")
@@ -186,7 +190,9 @@ def _read_rows(path: Path) -> list[tuple[str, tuple[float, ...]]]:
 
 
 def check_face(points: np.ndarray, template: np.ndarray, what: str) -> None:
-    """Refuse points (68, 3), metres, NaN where unknown, that no face like the template's has.
+    """Refuse points (68, 3), metres, NaN where unknown, that do not form a face.
+
+    The template's landmarks (68, 3) are the reference; errors call the points `what`.
 
     Raises:
         StageError: they are too few, on a line, of another size, mirrored or in another order.
@@ -209,8 +215,8 @@ def check_face(points: np.ndarray, template: np.ndarray, what: str) -> None:
     off, mirrored = _misfit(ours, theirs), _misfit(ours * [-1, 1, 1], theirs)
     if mirrored < MIRRORED * off:
         raise StageError(
-            f"{what}: they are those of a mirrored face; mirror the scan back, flip its triangles,"
-            " or swap left and right of landmarks that you gave"
+            f"{what}: they form a mirrored face; mirror the scan back, flip its triangles, or swap"
+            " left and right in your landmarks"
         )
     if off > MISFIT_M:
         raise StageError(

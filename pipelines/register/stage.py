@@ -26,8 +26,8 @@ from pipelines.register.lay import GivenSurface, LaidMesh, lay, mesh_normals, sk
 from pipelines.register.untangle import crossings
 from pipelines.track.sequence import write_npz
 
-# Wavelength of the finest detail that is followed: depth's own errors are finer. 12 mm measure the
-# same on footage of 512 px.
+# Finest wavelength that the mesh follows; finer detail of depth is mostly error. At 512 px,
+# 12 mm gives the same results.
 DETAIL_M = 0.016
 LEAST_SEEN = 0.1  # share of the face under which the surface is not this head's
 YAWS = (0.0, 60.0)  # of the pictures, degrees
@@ -67,7 +67,7 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
 
 
 def lone_sigma(laid: LaidMesh, cameras: Sequence[Camera], model: HeadModel) -> np.ndarray:
-    """Return `single_camera_sigma` (V,) along the mesh's normals."""
+    """Return the part along the mesh's normals of `single_camera_sigma` (V,), metres."""
     along = single_camera_sigma(cameras, laid.vertices)
     ray = laid.vertices - cameras[0].center
     cosine = (mesh_normals(laid.vertices, model.faces) * ray).sum(1) / np.linalg.norm(ray, axis=1)
@@ -75,7 +75,7 @@ def lone_sigma(laid: LaidMesh, cameras: Sequence[Camera], model: HeadModel) -> n
 
 
 def error_figures(laid: LaidMesh, track: Track, row: int) -> dict[str, np.ndarray | float]:
-    """Describe how well the vertices (V,) are known along their normals, for `error_bounds`."""
+    """Return the figures (V,) from which `error_bounds` predicts errors along normals."""
     moved = np.linalg.norm(laid.vertices - track.vertices[row], axis=1)
     return {
         "laid_sigma_mm": 1e3 * laid.sigma,
@@ -90,10 +90,10 @@ def write_registration(
     out: Path, path: Path, track: Track, row: int, laid: LaidMesh, start_name: str = "tracked",
     bound: np.ndarray | None = None,
 ) -> dict:  # fmt: skip
-    """Write registration.npz and a picture of a track's row; returns the metrics.
+    """Write registration.npz and a picture for a row of a track; return the metrics.
 
-    `path` is the track's file; the picture calls the track's mesh `start_name`. `bound` (V,) are
-    metres.
+    `path` is the track's file, `start_name` the picture's title for the track's mesh, `bound` (V,)
+    is in metres.
     """
     model, start = load_head(track.head), track.vertices[row].astype(np.float64)
     numbers = {
@@ -111,10 +111,9 @@ def write_registration(
 
 
 def rest_offsets(model: HeadModel, track: Track, row: int, moved: np.ndarray) -> np.ndarray:
-    """Turn moves (V, 3) of posed vertices, world, into offsets (V, 3) of the head at rest.
+    """Return the offsets (V, 3) at rest that move posed vertices by `moved` (V, 3) in the world.
 
-    Added to the rest shape of the tracked parameters, they give the moved vertices: joints stay
-    those of the tracked shape.
+    They are added to the rest shape of the tracked parameters; its joints stay.
     """
     neck, jaw, eyes = (
         torch.from_numpy(part[row])[None] for part in (track.neck, track.jaw, track.eyes)
@@ -127,7 +126,7 @@ def rest_offsets(model: HeadModel, track: Track, row: int, moved: np.ndarray) ->
 
 
 def figures_of(model: HeadModel, start: np.ndarray, laid: LaidMesh) -> dict:
-    """Collect the item's metrics: of the face, rounded so that the last bit does not matter."""
+    """Return the metrics of the face, rounded so that the last bits do not matter."""
     face = model.regions["face"].numpy() if "face" in model.regions else np.ones(len(start), bool)
     seen = face & laid.seen
     residual = np.abs(laid.residual[seen])
@@ -148,7 +147,7 @@ def figures_of(model: HeadModel, start: np.ndarray, laid: LaidMesh) -> dict:
 def write_picture(
     out: Path, model: HeadModel, track: Track, row: int, laid: LaidMesh, start_name: str
 ) -> None:
-    """Write a sheet: the track's mesh above, the registered one below, from two sides."""
+    """Draw the track's mesh above the registered one, each from two sides."""
     (out / "qc").mkdir(exist_ok=True)
     rows = [
         [

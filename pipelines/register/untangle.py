@@ -1,9 +1,9 @@
-"""Part lips and lids that pass through each other, with small and smooth displacements.
+"""Separate lips and lids that pass through each other, by small and smooth displacements.
 
 Intersecting faces are pushed apart until a plane separates them; a thin plate spreads the push over
-the skin around. Steps add up, so parted faces do not spring back, and closed lips still touch.
-Where skin is crumpled, neighbouring faces intersect: their corners take the mean move of the
-vertices around them. Eyeballs and teeth do not move.
+the skin around. Each step starts from the one before, so separated faces do not spring back, and
+closed lips still touch. Where skin is crumpled, neighbouring faces intersect: their corners move
+as the vertices around them do on average. Eyeballs and teeth do not move.
 """
 
 from __future__ import annotations
@@ -28,19 +28,21 @@ PATCH_M = 0.015  # skin within this distance of a crossing gives way
 WAVE_M = 0.008  # a push spreads over about this wavelength
 PUSH = 30.0  # weight of a push against the springs that hold the skin
 STEPS = 40
-# Of the way to the plane that faces go in the first step, and further per step: more than needed
-# would leave lips that were closed apart.
-SHARE, FURTHER = 0.4, 0.05
-OPPOSED, AGREE = -0.3, 0.3  # cosines: of normals that face each other; with the way at rest
-BACK_STEPS = 8  # in these, faces that face each other go back into their own flesh
-FLAT = 16  # from this step on, crumpled skin is made flat
-PUSHED_ONLY, EVERY = 3, 4  # crumpled faces are pushed in these first steps, and then in each 4th
+# Share of the way to the plane that faces move in the first step, and its growth per step: a larger
+# push would open lips that were closed.
+SHARE, GROWTH = 0.4, 0.05
+# Faces oppose if the cosine of their normals is under the first; their direction agrees with that
+# at rest if the cosine is over the second.
+OPPOSED, AGREE = -0.3, 0.3
+BACK_STEPS = 8  # in these first steps, opposed faces move back against their normals
+FLAT = 16  # from this step on, crumpled skin is flattened
+PUSHED_ONLY, EVERY = 3, 4  # crumpled faces are pushed in these first steps, then in every fourth
 
 
 def crossing_pairs(model: HeadModel, mesh: np.ndarray) -> np.ndarray:
-    """List the pairs (P, 2) of faces of lips and lids that pass through each other.
+    """Return the pairs (P, 2) of faces of lips and lids that intersect on a mesh (V, 3), metres.
 
-    Faces with a common vertex do not count. `mesh` is (V, 3), metres.
+    Faces that share a vertex do not count.
     """
     faces = model.faces.numpy()
     rims = np.flatnonzero(in_regions(model, RIMS)[faces].any(1))
@@ -55,14 +57,14 @@ def crossing_pairs(model: HeadModel, mesh: np.ndarray) -> np.ndarray:
 
 
 def crossings(model: HeadModel, mesh: np.ndarray) -> np.ndarray:
-    """List the faces of lips and lids that pass through each other on a mesh (V, 3)."""
+    """Return the faces of lips and lids that intersect others of them on a mesh (V, 3)."""
     return np.unique(crossing_pairs(model, mesh))
 
 
 def untangled(model: HeadModel, mesh: np.ndarray) -> np.ndarray:
-    """Return a mesh (V, 3) whose lips and lids do not pass through each other.
+    """Return a mesh (V, 3) with lips and lids separated that pass through each other.
 
-    Where STEPS do not suffice, it is the mesh with the fewest crossings among them.
+    If STEPS do not suffice, it is the one with the fewest intersecting pairs.
     """
     pairs = crossing_pairs(model, mesh)
     if not len(pairs):
@@ -92,7 +94,7 @@ class Pushes:
 
 
 class Skin:
-    """A mesh (V, 3) that can be pushed, with its model at rest, turned as the mesh is."""
+    """A mesh (V, 3) that can be pushed, and its model at rest, aligned with it."""
 
     def __init__(self, model: HeadModel, mesh: np.ndarray) -> None:
         self.faces, self.free = model.faces.numpy(), ~in_regions(model, FIXED)
@@ -117,10 +119,10 @@ class Skin:
         return np.any(found, axis=0)
 
     def evened(self, mesh: np.ndarray, pairs: np.ndarray, step: int) -> np.ndarray:
-        """Return the mesh with the pairs' corners half way to where their neighbours have them."""
+        """Return the mesh with the pairs' corners moved half way to their neighbours' mean."""
         some = np.unique(self.faces[pairs])
         some = some[self.free[some]]
-        # The model itself may be crumpled there: then the skin is made flat.
+        # The model itself may be crumpled there: later steps leave its shape out.
         rest = self.rest * (step < FLAT)
         moved, around = mesh - rest, self.edges[some]
         mean = (around @ moved) / np.asarray(around.sum(1)).reshape(-1, 1)
@@ -129,7 +131,7 @@ class Skin:
         return result
 
     def parting(self, mesh: np.ndarray, pairs: np.ndarray, step: int) -> np.ndarray:
-        """Return moves (V, 3) that part the pairs further in a step, counted from 0."""
+        """Return moves (V, 3) that separate the pairs further; steps count from 0."""
         push = self.pushes(mesh, pairs, step)
         near, _ = cKDTree(mesh[np.unique(self.faces[pairs])]).query(
             mesh, distance_upper_bound=PATCH_M
@@ -151,10 +153,10 @@ class Skin:
         return moves
 
     def pushes(self, mesh: np.ndarray, pairs: np.ndarray, step: int) -> Pushes:
-        """List what must move for a plane to lie between the faces of every pair.
+        """Return the moves after which a plane lies between the faces of every pair.
 
-        They go back into their own flesh if they face each other, else, and in later steps, the
-        way that they lie at rest.
+        In the first steps opposed faces move back against their normals; all others move in the
+        direction in which they lie apart at rest.
         """
         corners = mesh[self.faces[pairs]]  # (P, 2, 3, 3)
         edges = corners[:, :, 1:] - corners[:, :, :1]
@@ -164,7 +166,7 @@ class Skin:
         facing = (normals[:, 0] * normals[:, 1]).sum(1) < OPPOSED
         facing &= (inwards * way).sum(1) > AGREE
         way = np.where(facing[:, None] & (step < BACK_STEPS), inwards, way)
-        share = min(1.0, SHARE + FURTHER * step)
+        share = min(1.0, SHARE + GROWTH * step)
         height = np.einsum("pkvc,pc->pkv", corners, way)
         middle = (height[:, 0].min(1) + height[:, 1].max(1))[:, None] / 2
         moves = np.stack(

@@ -13,7 +13,7 @@ from express50.errors import FormatError, StageError
 from express50.geometry.transforms import axis_angle_to_matrix
 from express50.head.load import load_builtin
 from express50.head.model import landmarks, pose
-from pipelines.register.scan import look
+from pipelines.register.scan import find_landmarks
 from pipelines.register.scan_input import GREY, UNITS, Scan, check_face, read_scan
 
 NONE = np.full((68, 3), np.nan)
@@ -45,7 +45,7 @@ def off_mm(found, marks: np.ndarray) -> float:
 def test_a_face_is_found_in_any_axes(head, turn):
     scan, marks, _ = head
     R = axis_angle_to_matrix(np.array(turn))
-    assert off_mm(look(turned(scan, R), marks, NONE), marks @ R.T) < 5
+    assert off_mm(find_landmarks(turned(scan, R), marks, NONE), marks @ R.T) < 5
 
 
 def test_holes_a_missing_half_and_doubled_triangles_do_no_harm(head):
@@ -57,7 +57,7 @@ def test_holes_a_missing_half_and_doubled_triangles_do_no_harm(head):
     kept = np.concatenate(
         [kept, kept[:500, ::-1], kept[rng.integers(0, len(kept), 500), :1][:, [0] * 3]]
     )
-    assert off_mm(look(replace(scan, faces=kept), marks, NONE), marks) < 5
+    assert off_mm(find_landmarks(replace(scan, faces=kept), marks, NONE), marks) < 5
 
 
 @pytest.mark.parametrize(
@@ -72,9 +72,9 @@ def test_inside_out_and_mirrored_scans_are_refused(head, axes, order):
         faces=np.ascontiguousarray(scan.faces[:, ::order]),
     )
     with pytest.raises(StageError, match="inside out, or mirrored"):
-        look(wrong, marks, NONE)
+        find_landmarks(wrong, marks, NONE)
     with pytest.raises(StageError, match="mirrored"):
-        look(wrong, marks, marks * axes)
+        find_landmarks(wrong, marks, marks * axes)
 
 
 def test_a_mask_that_is_inside_out_is_refused(head):
@@ -82,14 +82,14 @@ def test_a_mask_that_is_inside_out_is_refused(head):
     mask = scan.faces[middles[:, 2] > marks[8, 2] - 0.06]
     with pytest.raises(StageError, match="mirrored"):
         hollow = replace(scan, faces=np.ascontiguousarray(mask[:, ::-1]))
-        check_face(look(hollow, marks, NONE).points, marks, "seen")
+        check_face(find_landmarks(hollow, marks, NONE).points, marks, "seen")
 
 
 def test_few_landmarks_say_where_to_look_and_replace_what_is_found(head):
     scan, marks, _ = head
     few, ids = NONE.copy(), [30, 36, 45, 48, 54]
     few[ids] = marks[ids]
-    found = look(scan, marks, few)
+    found = find_landmarks(scan, marks, few)
     np.testing.assert_array_equal(found.points[ids], marks[ids])
     assert not found.inliers[:, ids].any() and off_mm(found, marks) < 5
 
@@ -121,7 +121,7 @@ def test_a_mouth_that_is_wide_open_is_a_face(head):
 def test_landmarks_far_off_the_scan_are_refused(head):
     scan, marks, _ = head
     with pytest.raises(StageError, match="off the scan"):
-        look(scan, marks, marks + [0.0, 0.0, 0.05])
+        find_landmarks(scan, marks, marks + [0.0, 0.0, 0.05])
 
 
 @pytest.mark.parametrize("unit", [*UNITS, "kilometres", "decimetres"])
