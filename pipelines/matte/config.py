@@ -18,17 +18,17 @@ class MatteConfig:
     """Set how each camera is matted, and whether the cameras of a peak correct each other."""
 
     method: Literal["key", "grabcut", "bgmv2", "salient"] = "key"
-    """key: against the plate; cameras without one are cut by colours and by what the other cameras
-    see. grabcut: cut all cameras that way. bgmv2, salient: run a network."""
+    """key: compare with the plate; cameras without one are cut out by colours and by what the
+    other cameras see. grabcut: cut out all cameras that way. bgmv2, salient: run a network."""
     weights: str = ""
-    """File of the network's weights, TorchScript or ONNX; such a file is a program, so trust its
-    origin."""
+    """File of the network's weights, TorchScript or ONNX; such a file is a program, so use only
+    those you trust."""
     device: Literal["auto", "cuda"] = "auto"
     """Run the network on CUDA if available (auto), or only on CUDA."""
     tile: int = 2048
     """Longest side, pixels, of a tile that bgmv2 sees; larger frames are cut into tiles."""
     shadow: float = 0.25
-    """Broad darkening of the plate up to this share is a shadow; 0 turns this off."""
+    """Broad darkening of the plate by up to this share is a shadow; 0 turns this off."""
     agree: bool = True
     """Let the cameras correct each other; false keeps every camera's own matte."""
     side: int = 192

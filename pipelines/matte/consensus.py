@@ -1,8 +1,9 @@
 """Compare the mattes of one frame set, and find what each camera must remove and fill.
 
 A camera removes what the other views rule out (moving shadows, things that only some cameras see).
-It fills what they see as solid and it could not separate from its background. A camera whose matte
-fits the others neither where it is opaque nor where it is clear is reported and outvoted.
+It fills what the others see as solid but it could not separate from its background. A camera whose
+matte disagrees with the others both where it is opaque and where it is clear is reported and
+ignored.
 """
 
 from __future__ import annotations
@@ -27,21 +28,21 @@ from pipelines.matte.visual_hull import (
 
 FEWEST = 4  # views; of three, two with the same error would overrule a correct one
 EMPTY, FULL = 0.003, 0.98  # shares of the image
-# Share of a matte elsewhere than the others' subject, and of that which it lacks: together they
-# mean another place. Lacking this much more is enough by itself.
+# A matte is wrong as a whole if over STRAY of it lies off the others' subject and it lacks over
+# LACKING of that subject, or if it lacks over MOST_LACKING.
 STRAY, LACKING, MOST_LACKING = 0.03, 0.07, 0.3
 
 
 @dataclass(frozen=True)
 class Misfit:
-    """Share of a matte that lies outside the others' hull, and of their solid that it lacks."""
+    """Shares of a matte outside the others' hull, and of their solid subject that it lacks."""
 
     stray: float
     lacking: float
 
     @property
     def size(self) -> float:
-        """Return the size of the error; above 1 the entire matte is wrong."""
+        """Return the size of the error; over 1 the entire matte is wrong."""
         elsewhere = min(self.stray / STRAY, self.lacking / LACKING)
         return max(elsewhere, self.lacking / MOST_LACKING)
 
@@ -57,11 +58,11 @@ class Misfit:
 
 @dataclass(frozen=True)
 class Agreement:
-    """The corrections that the views of one frame set make in each other.
+    """The corrections that the views of one frame set make to each other.
 
     Attributes:
         removed, filled: (h, w) bool for each camera whose matte is corrected.
-        warnings: cameras that were left as they were, and why.
+        warnings: cameras whose mattes were not changed, and why.
         unchanged: why nothing was compared; empty if mattes were compared.
     """
 
@@ -72,8 +73,8 @@ class Agreement:
 
 
 def agree(views: Sequence[MatteView], cells: int) -> Agreement:
-    """Compare the views of one frame set."""
-    doubted = {view.name: why for view in views if (why := _useless(view))}
+    """Compare the views of one frame set, on `cells` cells along each side of space."""
+    doubted = {view.name: why for view in views if (why := _why_useless(view))}
     while True:
         used = [view for view in views if view.name not in doubted]
         if len(used) < FEWEST:
@@ -91,9 +92,9 @@ def _named(doubted: dict[str, str]) -> list[Note]:
     return [Note(name, why) for name, why in sorted(doubted.items())]
 
 
-def _useless(view: MatteView) -> str:
-    """Explain why a view cannot judge the other mattes; empty if it can."""
-    if view.projection[2, 3] <= 1:  # radii from the ball's centre, along its axis
+def _why_useless(view: MatteView) -> str:
+    """Return why a view cannot judge the other mattes; empty if it can."""
+    if view.projection[2, 3] <= 1:  # depth of the ball's centre, in radii
         return "it stands inside what the others look at, or faces away; its matte was not changed"
     share = float((view.alpha[view.valid] > INSIDE).mean()) if view.valid.any() else 0.0
     if share < EMPTY:
@@ -104,7 +105,7 @@ def _useless(view: MatteView) -> str:
 def _compare(
     views: Sequence[MatteView], cells: int
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, Misfit]]:
-    """Find what to remove and to fill in each view, and how badly it fits the others."""
+    """Return what to remove and to fill in each view, and how badly it fits the others."""
     longest = max(max(view.alpha.shape) for view in views)
     space = make_space(views, cells, max(1.5, MARGIN * longest))
     place = subject_place(space)

@@ -1,15 +1,15 @@
-"""Cut a person out of all cameras of a moment at once, without plates or weights.
+"""Cut a person out of all pictures of a frame set at once, without plates or weights.
 
-The faces that the cameras see place one head in the world, and with it roughly where skull, hair
-and shoulders are in every picture, those from behind included. GrabCut (Rother, Kolmogorov and
-Blake 2004) finds by colours where they end. Then the cameras overrule each other: nothing lies
-where the others see past the person, and nothing is missing where they all see it; colours
-decide again. A single camera has colours only.
+The faces that the cameras see place a head in the world, and so show roughly where skull, hair and
+shoulders are in every picture, even from behind. GrabCut (Rother, Kolmogorov and Blake 2004) finds
+their outlines by colours. Then the cameras correct each other: the person is nowhere that others
+see past them, and everywhere that all others see them; GrabCut runs again within these limits. A
+single camera has its colours only.
 
 Around an outline, alpha is the posterior mean of a mixture (Bayesian matting, Chuang et al. 2001)
-of two colours: the person's nearby, and the wall's. The wall behind is filled in from what is seen
-beside the person, and how wrong that is, is measured where it is seen. Before a bland wall that is
-as good as a plate; before a cluttered one colours prove little and the outline decides.
+of two colours, the person's nearby and the wall's. The wall behind the person is interpolated from
+what is seen beside them, and the error of that is measured where the wall is seen. In front of a
+plain wall this is as good as a plate; in front of a cluttered one the outline decides.
 """
 
 from __future__ import annotations
@@ -39,34 +39,35 @@ from pipelines.matte.visual_hull import (
 )
 
 FACE_SCORE = 0.3  # heads from behind score up to 0.2, profiles from 0.33 on
-SEARCH = 0.08  # smallest windows searched for the face, of the longer side
-SIDE = 512  # pixels of the pictures in which faces are looked for
-PIXEL_M = 0.0015  # on the head, in the reduced pictures that are cut; edges are solved later
-SURE, LIKELY, HAIR = 0.7, 1.3, 1.6  # skulls: no background in the first, no hair past the last
-LEAST_POINTS = 12  # landmarks on which cameras agree, to place a head by
-LEAST_DEPTH = 0.05  # metres before the camera
+SEARCH = 0.08  # smallest windows searched for the face, as a share of the longer side
+SIDE = 512  # pixels of the pictures in which faces are searched
+PIXEL_M = 0.0015  # size on the head of a pixel of the pictures that GrabCut sees
+SURE, LIKELY, HAIR = 0.7, 1.3, 1.6  # skull sizes: no wall inside the first, no hair past the last
+LEAST_POINTS = 12  # fewest landmarks, agreed between cameras, that place a head
+LEAST_DEPTH = 0.05  # metres in front of the camera
 HOLE_M2 = 1.5e-3  # larger gaps show the background
-CUTS = 6  # of GrabCut, each time
-FEWEST = 4  # cameras that can overrule each other
-SLACK_PX = (3.0, 1.5)  # distance from an outline that proves nothing, per round
-COLOURS, RARE = 32, 1e-5  # cells of colour along each axis of Lab; share of a cell never seen
-UNSEEN = 2 / COLOURS**3  # share that the person does not have
+CUTS = 6  # GrabCut's iterations
+FEWEST = 4  # cameras that can correct each other
+SLACK_PX = (3.0, 1.5)  # distance from an outline within which it proves nothing, per round
+COLOURS, RARE = 32, 1e-5  # colour cells along each axis of Lab; share of a cell that is never seen
+UNSEEN = 2 / COLOURS**3  # the person does not have colours of a smaller share
 CELLS = 96  # cells along each side of the cube in which cameras are compared
 
 # Lengths on the head, metres.
-OUTER_M, INNER_M = 0.014, 0.010  # alpha is soft so far outside and inside the outline
+OUTER_M, INNER_M = 0.014, 0.010  # alpha is solved this far outside and inside the outline
 RIM_M = (0.004, 0.015)  # the person's colours are sampled this deep inside the outline
-REACH_M, WALL_M, RING_M = 0.006, 0.004, 0.014  # nearest colours: of person, wall, and its error
-DOUBT_M = 0.0035  # an outline is wrong by about this
+REACH_M, WALL_M = 0.006, 0.004  # nearest distance from which colours of person and wall are taken
+RING_M = 0.014  # width of the ring in which the wall's error is measured
+DOUBT_M = 0.0035  # standard error of an outline
 SPREAD = 0.15  # share by which hair may be brighter or darker than visible hair nearby
 NOISE = 1.5  # standard deviation of a pixel, 8-bit steps
 OPACITIES = np.linspace(0.0, 1.0, 9)
-MIXED, ODD = 0.2, 0.02  # probability of a soft pixel on the outline, and of a wrong one far from it
+MIXED, ODD = 0.2, 0.02  # probability of a soft pixel on the outline, of a wrong one far from it
 
 
 @dataclass(frozen=True)
 class Cut:
-    """A person's outline in one camera: mask (h, w) bool, and pixels of it per metre of head."""
+    """A person's outline in one camera: mask (h, w) bool, and its pixels per metre of the head."""
 
     mask: np.ndarray
     density: float
@@ -80,7 +81,7 @@ class CutView:
         camera: pinhole, of the reduced picture.
         rgb: (h, w, 3) uint8.
         valid: (h, w) bool, pixels with footage.
-        known: (h, w) bool, the person's outline where it is known, as from a plate.
+        known: (h, w) bool, the person's mask if it is known, as from a plate.
     """
 
     camera: Camera
@@ -96,7 +97,7 @@ class CutView:
 
 @dataclass(frozen=True)
 class PersonGuess:
-    """The area of a person: GrabCut's labels (h, w) uint8, and pixels per metre of the head."""
+    """A person's likely place: GrabCut labels (h, w) uint8, and pixels per metre of the head."""
 
     labels: np.ndarray
     density: float
@@ -116,7 +117,7 @@ class HeadPlace:
         return float(camera.K[0, 0] * self.scale / max(depth, LEAST_DEPTH * self.scale))
 
     def pixels(self, points: np.ndarray, camera: Camera) -> np.ndarray:
-        """Project points (N, 3) of head space, those before the camera, to pixels (M, 2)."""
+        """Project the points (N, 3), head space, in front of a camera to its pixels (M, 2)."""
         world = self.scale * points @ self.rotation.T + self.shift
         seen = world @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
         seen = seen[seen[:, 2] > LEAST_DEPTH * self.scale] @ camera.K.T
@@ -134,7 +135,7 @@ def make_cut_view(
 
 
 def cut_out(views: Sequence[CutView], ball: Ball | None) -> dict[str, Cut]:
-    """Find the person's outline in all cameras of a moment.
+    """Find the person's outline in all cameras of a frame set.
 
     `ball` is the volume that the cameras look at; None if they share none.
 
@@ -150,7 +151,7 @@ def cut_out(views: Sequence[CutView], ball: Ball | None) -> dict[str, Cut]:
     ]
     if ball is not None and len(views) >= FEWEST:
         for slack in SLACK_PX:
-            masks = _overruled(small, guesses, masks, ball, slack)
+            masks = _corrected(small, guesses, masks, ball, slack)
     return {
         view.name: Cut(mask, guess.density)
         for view, mask, guess in zip(small, masks, guesses, strict=True)
@@ -158,8 +159,8 @@ def cut_out(views: Sequence[CutView], ball: Ball | None) -> dict[str, Cut]:
 
 
 def _place_head(views: Sequence[CutView]) -> HeadPlace:
-    """Place the mean head by all faces found, or by the best one."""
-    # Imported here: cameras with plates need no network, and torch takes seconds to import.
+    """Place the mean head by all faces that are found, or by the best one."""
+    # Imported here, because cameras with plates need no network and torch takes seconds to import.
     from express50.landmarks.detector import detect_many
     from express50.landmarks.network import load_network
     from pipelines.calibrate.footage_rig import INNER, mean_landmarks, pose_of_face
@@ -183,14 +184,14 @@ def _place_head(views: Sequence[CutView]) -> HeadPlace:
             return HeadPlace(1.0, world[:3, :3], world[:3, 3])
     best = max((face.score for face in faces), default=0.0)
     raise NoFaceError(
-        f"no face found (score {best:.2f}, expected {FACE_SCORE} or more), and without a plate a"
-        " person is found by the face; set matte.method to salient and matte.weights, or give"
+        f"no face found (score {best:.2f}, expected {FACE_SCORE} or more), and without plates the"
+        " face shows where a person is; set matte.method to salient and matte.weights, or add"
         " plates"
     )
 
 
 def _at_scale(view: CutView, factor: float) -> CutView:
-    """Reduce a view's picture by a factor of at most 1; the known outline with it."""
+    """Reduce a view by a factor of at most 1."""
     width, height = (max(8, round(n * min(factor, 1.0))) for n in view.rgb.shape[1::-1])
 
     def mask(values: np.ndarray) -> np.ndarray:
@@ -207,7 +208,7 @@ def _at_scale(view: CutView, factor: float) -> CutView:
 
 @cache
 def _parts() -> dict[int, tuple[np.ndarray, ...]]:
-    """Make convex parts (N, 3) of a person in head space, metres, by GrabCut's label."""
+    """Return convex parts (N, 3) of a person, head space, metres, by GrabCut label."""
     from express50.head.load import load_head
     from pipelines.calibrate.footage_rig import mean_landmarks
 
@@ -222,7 +223,7 @@ def _parts() -> dict[int, tuple[np.ndarray, ...]]:
     hair = _slab((0.16, 0.18), (middle[1], bottom - 0.1), back, 0.12)
     wide = _slab((0.18, 0.3, 0.34), (chin, bottom - 0.05, bottom - 0.9), back, 0.25)
     sure, likely, reach = (middle + k * (skull - middle) for k in (SURE, LIKELY, HAIR))
-    for part in (likely, reach):  # no hair grows before a face
+    for part in (likely, reach):  # no hair grows in front of a face
         part[:, 2] = np.minimum(part[:, 2], skull[:, 2].max())
     return {
         cv2.GC_PR_BGD: (reach, hair, wide),
@@ -234,7 +235,7 @@ def _parts() -> dict[int, tuple[np.ndarray, ...]]:
 def _slab(
     half_widths: tuple[float, ...], heights: tuple[float, ...], back: float, thick: float
 ) -> np.ndarray:
-    """Return corners (N, 3) of a body with these half widths at these heights, about a depth."""
+    """Return the corners (N, 3) of a slab around depth `back`, with half widths at heights."""
     return np.array([
         (side * width, height, back + face * thick)
         for width, height in zip(half_widths, heights, strict=True)
@@ -249,7 +250,7 @@ def _guess(view: CutView, place: HeadPlace) -> PersonGuess:
         for points in parts:
             pixels = place.pixels(points, view.camera)
             if len(pixels) > 2:
-                far = 4 * max(labels.shape)  # OpenCV's polygons are of 16-bit integers
+                far = 4 * max(labels.shape)  # OpenCV stores polygons as 16-bit integers
                 cells = corner_to_cell(np.clip(pixels, -far, far))
                 hull = cv2.convexHull(cells.astype(np.float32))
                 cv2.fillConvexPoly(labels, hull.round().astype(np.int32), value)
@@ -257,16 +258,16 @@ def _guess(view: CutView, place: HeadPlace) -> PersonGuess:
 
 
 def _cut(view: CutView, labels: np.ndarray, guess: PersonGuess) -> np.ndarray:
-    """Run GrabCut from labels (h, w); return the person's mask (h, w), small holes filled.
+    """Run GrabCut from labels (h, w); return the person's mask (h, w), with small holes filled.
 
-    Parts that do not touch where the person surely is, by the `guess`, are left out.
+    Parts that are not connected to where the `guess` is certain are left out.
     """
     sure = guess.labels == cv2.GC_FGD
     if not sure.any():  # the person is out of view
         return np.zeros(labels.shape, bool)
     if not np.isin(labels, (cv2.GC_BGD, cv2.GC_PR_BGD)).any():
         return view.valid.copy()  # the face fills the picture
-    cv2.setRNGSeed(0)  # its clusters start at random
+    cv2.setRNGSeed(0)  # GrabCut's clusters start at random
     found, _, _ = cv2.grabCut(
         np.ascontiguousarray(view.rgb[..., ::-1]), labels.copy(), None, np.zeros((1, 65)),
         np.zeros((1, 65)), CUTS, cv2.GC_INIT_WITH_MASK,
@@ -279,14 +280,14 @@ def _cut(view: CutView, labels: np.ndarray, guess: PersonGuess) -> np.ndarray:
     return person | (holes & (stats[:, cv2.CC_STAT_AREA] < HOLE_M2 * guess.density**2)[parts])
 
 
-def _overruled(
+def _corrected(
     views: Sequence[CutView],
     guesses: Sequence[PersonGuess],
     masks: Sequence[np.ndarray],
     ball: Ball,
     slack: float,
 ) -> list[np.ndarray]:
-    """Cut all views again, within what the others leave possible; `slack` is in pixels."""
+    """Cut all views again, within what the other views leave possible; `slack` is in pixels."""
     mattes = [
         MatteView(
             view.name, projection_of(view.camera, ball),
@@ -318,10 +319,10 @@ def _overruled(
 def _labels(
     view: MatteView, evidence: Evidence, guess: np.ndarray, foreign: np.ndarray
 ) -> np.ndarray:
-    """Return GrabCut's labels (h, w) by a view's mask, what the others say, and the guess.
+    """Return GrabCut labels (h, w) from a view's mask, the other views' evidence, and the guess.
 
-    The person's colours are learnt where no other view sees the wall and nothing is `foreign`
-    (h, w); large foreign patches are wall.
+    GrabCut learns the person's colours where no other view sees the wall and no pixel is `foreign`
+    (h, w). Large foreign patches are labelled wall.
     """
     inside = ((view.alpha > 0) & evidence.likely & ~foreign) | evidence.solid
     labels = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
@@ -334,11 +335,11 @@ def _labels(
 
 
 def _foreign(views: Sequence[MatteView], sure: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return for each view the pixels (h, w) bool whose colours the person does not have.
+    """Return for each view the pixels (h, w) bool of colours that the person does not have.
 
-    The person's colours are those of what the other views cut out, without the view in which a
-    colour is most common, as a cut may hold a piece of its wall; and, since cameras differ, those
-    of the pixels (h, w) of the view itself that are `sure`.
+    The person's colours come from what the other views cut out. For each colour, the view that has
+    most of it is left out, because its cut may include some wall. As cameras differ, colours of
+    the view's own `sure` pixels (h, w) count too.
     """
     cells = [_colour_cells(view.rgb) for view in views]
     person = np.array(
@@ -354,7 +355,7 @@ def _foreign(views: Sequence[MatteView], sure: Sequence[np.ndarray]) -> list[np.
 
 
 def _colour_cells(rgb: np.ndarray) -> np.ndarray:
-    """Find the cell of Lab colour (h, w) of pixels (h, w, 3) uint8."""
+    """Return the cell of Lab colour (h, w) of pixels (h, w, 3) uint8."""
     lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB).astype(np.int64) // (256 // COLOURS)
     return (lab[..., 0] * COLOURS + lab[..., 1]) * COLOURS + lab[..., 2]
 
@@ -367,9 +368,9 @@ def _shares(cells: np.ndarray) -> np.ndarray:
 
 
 def soft_alpha(frame: np.ndarray, valid: np.ndarray, cut: Cut) -> np.ndarray:
-    """Solve opacity (H, W) float32 about an outline that was cut in a reduced picture.
+    """Solve opacity (H, W) float32 around an outline that was cut in a reduced picture.
 
-    The frame is (H, W, 3) uint8, without lens distortion; what is not ``valid`` (H, W) gets 0.
+    The frame is (H, W, 3) uint8, undistorted; pixels outside ``valid`` (H, W) get 0.
     """
     height, width = valid.shape
     mask = cv2.resize(cut.mask.astype(np.float32), (width, height)) > 0.5
@@ -388,7 +389,7 @@ def soft_alpha(frame: np.ndarray, valid: np.ndarray, cut: Cut) -> np.ndarray:
 def _posterior(
     image: np.ndarray, valid: np.ndarray, depth: np.ndarray, band: np.ndarray, density: float
 ) -> np.ndarray:
-    """Return the mean opacity (N,) of the pixels of a band (H, W), given person and wall."""
+    """Return the posterior mean opacity (N,) of a band's pixels (H, W), from person and wall."""
     wall, wall_error = _wall(image, valid & (depth <= -OUTER_M), depth, density)
     light, behind = to_light(image), to_light(wall)[band]
     rim = (valid & (depth > RIM_M[0]) & (depth < RIM_M[1])).astype(np.float32)
@@ -413,7 +414,7 @@ def _posterior(
 def _log_density(off: np.ndarray, covariance: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """Return log densities (N,) of normal errors (N, 3), up to a constant.
 
-    Their covariance is `covariance` (N, 3, 3) and on its diagonal `variance` (N, 3) more. By
+    The covariance is `covariance` (N, 3, 3) plus `variance` (N, 3) on its diagonal. Solved with
     cofactors: NumPy's solver takes ten times as long for this many small matrices.
     """
     a, b, c = (covariance[:, k, k] + variance[:, k] + 1e-8 for k in range(3))
@@ -429,9 +430,9 @@ def _log_density(off: np.ndarray, covariance: np.ndarray, variance: np.ndarray) 
 def _wall(
     image: np.ndarray, seen: np.ndarray, depth: np.ndarray, density: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fill in the wall (H, W, 3) behind the person, and how wrong that is (H, W, 3).
+    """Return the wall (H, W, 3), interpolated behind the person, and its error (H, W, 3).
 
-    The error is measured in a ring where the wall is `seen` (H, W), filled in from further out.
+    The error is measured in a ring where the wall is `seen` (H, W), by filling that from outside.
     """
     ring = seen & (depth > -OUTER_M - RING_M)
     further, ring_weight = (mask.astype(np.float32) for mask in (seen & ~ring, ring))
@@ -442,7 +443,7 @@ def _wall(
 
 
 def _filled(image: np.ndarray, weight: np.ndarray, reach: float) -> np.ndarray:
-    """Average an image (H, W, 3) by weights (H, W) over the nearest reach, pixels, that has any."""
+    """Average an image (H, W, 3) by weights (H, W) over the nearest distance that has any."""
     total, mass = np.zeros_like(image), np.full(weight.shape, 1e-12, np.float32)
     for octave in range(6):
         share = np.float32(1e-2**octave)

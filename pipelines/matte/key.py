@@ -1,9 +1,9 @@
 """Key a frame against its plate: find what differs from the plate, and solve its alpha.
 
-What differs from the plate by more than noise, in parts of some size, is the subject's region. The
-solid inside is found by shape and is 1; around it alpha is solved from the plate and the subject's
+Large parts that differ from the plate by more than noise are the subject's region. Its solid inside
+is found by shape and has alpha 1. Around it, alpha is solved from the plate and the subject's
 colours nearby (`pipelines.matte.plates`), so that a strand of fair hair over a fair plate is as
-opaque as a dark one. Measured against plain keys and textbook matting in benchmarks/matte.py.
+opaque as a dark one. benchmarks/matte.py compares it with plain keys and textbook matting.
 """
 
 from __future__ import annotations
@@ -26,18 +26,19 @@ from pipelines.matte.plates import (
     to_light,
 )
 
+# Deviations are standard deviations of noise, radii and distances shares of the longer side.
 LEAST_PART = 0.02  # a part of the subject smaller than this share of the largest is clutter
-LARGEST_HOLE = 0.05  # share of the image that a plate-coloured hole in the subject may have
-REACH = 0.012  # share of the longer side: least distance from which colours are taken
-SURE = 2.0  # deviations by which a pixel of the solid must be open to count as a gap
+LARGEST_HOLE = 0.05  # share of the image under which a hole in the subject may be filled
+REACH = 0.012  # least distance from which colours are taken
+SURE = 2.0  # deviations of alpha by which it must be under 1 in the solid to count as a gap
 SPREAD = 0.2  # share by which hair may be brighter or darker than visible hair nearby
-LOW = 1.2  # deviations of noise: as likely noise as subject; alpha is 0 below it
-HIGH = 6.0  # deviations of noise that prove foreground; weaker pixels must touch such ones
-FIRM = 0.5  # share of the local foreground's difference that may belong to the solid inside
+LOW = 1.2  # deviations at which noise and subject are equally likely; alpha is 0 below
+HIGH = 6.0  # deviations that prove foreground; weaker pixels must be connected to such ones
+FIRM = 0.5  # share of the nearby subject's difference over which a pixel looks opaque
 CORE = 0.018  # radius of the disc that must fit inside a part of the subject for it to be solid
-OPEN = 1.5  # deviations of noise: an area that differs by less shows the plate
+OPEN = 1.5  # deviations: an area that differs by less shows the plate
 BLACK, WHITE = 24, 250  # grey levels beyond which two surfaces may look the same
-FILL = 0.012  # spots and gaps in the solid subject are filled this far from its edge
+FILL = 0.012  # distance from the solid's edge from which its spots and gaps are filled
 WIDE = 0.01  # radius of a disc that is wider than strands and soft edges
 _LUMA = np.array([[0.299, 0.587, 0.114]], dtype=np.float32)
 
@@ -48,14 +49,14 @@ Erode = Callable[[np.ndarray, int], np.ndarray]
 
 @dataclass(frozen=True)
 class Support:
-    """The pixels that show the subject: `core` (H, W) surely, `near` (H, W) perhaps."""
+    """The pixels (H, W) bool that show the subject: `core` for certain, `near` perhaps."""
 
     core: np.ndarray
     near: np.ndarray
 
 
 def key_alpha(frame: np.ndarray, plate: np.ndarray, valid: np.ndarray, shadow: float) -> np.ndarray:
-    """Key a frame (H, W, 3) uint8 against its plate: opacity (H, W) float32 in [0, 1].
+    """Return the opacity (H, W) float32 in [0, 1] of a frame (H, W, 3) uint8 against its plate.
 
     Pixels outside `valid` (H, W) get 0. Darkening of the plate by up to `shadow` is a shadow.
     """
@@ -77,7 +78,7 @@ def key_alpha(frame: np.ndarray, plate: np.ndarray, valid: np.ndarray, shadow: f
     frame, image, dark = frame[window], image[window], dark[window]
     difference, region = difference[window], region[window]
     clear = clear_plate(unshaded[window], part, length)
-    # The first solid only provides the colours nearby.
+    # The first support only says which colours the subject has nearby.
     support = find_support(difference > 2 * LOW, region, clear, length, eroded_about)
     if support.core.any():
         firm = firm_pixels(image, difference, support.core, part, length)
@@ -97,11 +98,11 @@ def _opacity(
 ) -> np.ndarray:
     """Solve alpha (H, W) float32: 1 deep in the core and 0 off the support.
 
-    `dark` (H, W) is the broad shadow's factor on the plate's values, 0 where there is none.
+    `dark` (H, W) is the factor of a broad shadow on the plate's values, 0 where there is none.
     """
     core = support.core
     alpha = core.astype(np.float32)
-    # Between strands the solid looks closed from a distance; near its edge it is measured.
+    # Near its edge the core may have gaps between strands, so alpha is solved there too.
     todo = support.near | (core & ~eroded_about(core, _pixels(FILL, length)))
     if not todo.any():
         return alpha
@@ -117,7 +118,7 @@ def _opacity(
     noise = light_noise(plate, model.sigma[todo], model.whiten)
     behind = to_light(plate)
     value, deviation, at_zero = solve_opacity(light[todo], behind, mean, covariance, noise)
-    # Unsure pixels count as solid in the core, and as plate outside it.
+    # Doubtful pixels count as solid in the core and as plate outside it.
     solid = 1 - shrunk(1 - value, SURE * deviation)
     strand = shrunk(value, LOW * at_zero)
     alpha[todo] = np.clip(np.where(core[todo], solid, strand), 0, 1)
@@ -131,11 +132,11 @@ def _pixels(share: float, length: int) -> int:
 def eroded(mask: np.ndarray, radius: float) -> np.ndarray:
     """Return the pixels (H, W) bool further than `radius` from any pixel outside the mask.
 
-    The image's border counts as inside. By distances, so that time does not grow with the disc.
+    The mask continues beyond the image's border. Distances take the same time for any radius.
     """
     if mask.all():
         return mask > 0
-    if radius <= 2:  # small discs are faster by dilation than by distances
+    if radius <= 2:  # eroding with small discs is faster
         side = np.arange(-radius, radius + 1)
         disc = (side[:, None] ** 2 + side**2 <= radius**2).astype(np.uint8)
         return cv2.erode(mask.astype(np.uint8), disc) > 0
@@ -143,10 +144,7 @@ def eroded(mask: np.ndarray, radius: float) -> np.ndarray:
 
 
 def eroded_about(mask: np.ndarray, radius: int) -> np.ndarray:
-    """Return `eroded` of a mask, of a radius that is right to a tenth if it is 32 pixels or more.
-
-    Such discs are laid down at a reduced size.
-    """
+    """Return `eroded` of a mask; from 32 pixels on at reduced size, the radius within a tenth."""
     step = radius // 16
     if step < 2:
         return eroded(mask, radius)
@@ -166,12 +164,12 @@ def dilated(mask: np.ndarray, radius: float) -> np.ndarray:
 
 
 def opened(mask: np.ndarray, radius: int, erode: Erode = eroded) -> np.ndarray:
-    """Keep of a mask (H, W) what discs of a radius cover that lie wholly inside it."""
+    """Return the part of a mask (H, W) that discs cover which lie wholly inside it."""
     return (mask > 0) & ~erode(~erode(mask, radius), radius)
 
 
 def _length(error: np.ndarray, model: PlateModel) -> np.ndarray:
-    """Return root mean square (H, W) of whitened errors (H, W, 3), 1 on average for mere noise."""
+    """Return the root mean square (H, W) of errors (H, W, 3), whitened: 1 on average for noise."""
     white = cv2.transform(error / model.sigma, model.whiten)
     return np.sqrt(np.einsum("...i,...i->...", white, white) / 3.0)
 
@@ -181,12 +179,12 @@ def plate_difference(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Measure the difference (H, W) of an image (H, W, 3) from the plate, in noise deviations.
 
-    Where an entire neighbourhood is the plate darkened (at most by `shadow`), the difference
-    is taken from the darkened plate. A dark strand also darkens, but not an entire neighbourhood.
+    Where a whole neighbourhood is darker than the plate, by at most `shadow`, the difference is
+    from the darkened plate. A dark strand is darker too, but not its whole neighbourhood.
 
     Returns:
-        The darkening's factor (H, W) on sRGB values there, 0 elsewhere; the difference; and the
-        difference from the plate as it is.
+        The shadow's factor (H, W) on sRGB values, 0 where there is none; the difference; and the
+        difference from the plate without shadow.
     """
     off = image - model.plate
     difference = _length(off, model)
@@ -197,21 +195,21 @@ def plate_difference(
     dark = np.clip(lumas[0] / np.maximum(lumas[1], 1.0), (1 - shadow) ** (1 / 2.2), 1.0)
     off += model.plate * (1 - dark)[..., None]
     shaded = _length(off, model)
-    # Opening keeps broad areas only.
+    # Opening drops narrow areas.
     broad = opened(shaded < 3.0, _pixels(WIDE, length), eroded_about)
     return dark * broad, np.where(broad, np.minimum(difference, shaded), difference), difference
 
 
 def shade_of_plate(dark: np.ndarray, clear: np.ndarray, length: int) -> np.ndarray:
-    """Measure the shadow's factor (H, W) on the plate, seen as `dark` where `clear` (H, W)."""
+    """Interpolate the shadow's factor (H, W) from `dark` (H, W) where the plate is `clear`."""
     weight = ((dark > 0) & clear).astype(np.float32)
     reach = REACH * length
-    # Without plate in reach a shadow cannot be measured; assume none.
+    # With no plate in reach there is no measurement, so no shadow is assumed.
     return (blurred(dark * weight, reach) + 1e-3) / (blurred(weight, reach) + 1e-3)
 
 
 def subject_region(difference: np.ndarray) -> np.ndarray:
-    """Return the pixels (H, W) of large connected parts that differ, each with a sure pixel."""
+    """Return the pixels (H, W) of large connected parts that differ, each with a certain pixel."""
     smooth = np.sqrt(cv2.blur(difference**2, (3, 3)))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(
         (smooth > 2.2).astype(np.uint8), connectivity=8
@@ -222,17 +220,17 @@ def subject_region(difference: np.ndarray) -> np.ndarray:
     if not sure.any():
         return np.zeros(difference.shape, bool)
     area = stats[:, cv2.CC_STAT_AREA]
-    # A few isolated pixels are not a subject, however bright.
+    # A few isolated pixels are not a subject, however much they differ.
     least = max(LEAST_PART * area[sure].max(), 2e-4 * difference.size)
     return (sure & (area >= least))[labels]
 
 
 def clear_plate(difference: np.ndarray, model: PlateModel, length: int) -> np.ndarray:
-    """Return the pixels (H, W) of wide areas whose difference from the plate is mere noise.
+    """Return the pixels (H, W) of wide areas whose difference from the plate is only noise.
 
-    The wall shows between a hand and the face. A shirt of the wall's colour has folds, darker and
-    brighter. Black hair before a black wall may have none, and neither has skin in front of a lamp
-    where both are white.
+    There the wall shows, as between a hand and the face. A shirt of the wall's colour differs by
+    its folds. Black hair in front of a black wall may not differ, nor skin in front of a lamp, so
+    black and white plates do not count.
     """
     smooth = np.sqrt(cv2.blur(difference**2, (3, 3)))
     exposed = (model.plate.max(axis=-1) > BLACK) & (model.plate.min(axis=-1) < WHITE)
@@ -242,14 +240,14 @@ def clear_plate(difference: np.ndarray, model: PlateModel, length: int) -> np.nd
 def find_support(
     firm: np.ndarray, region: np.ndarray, clear: np.ndarray, length: int, erode: Erode = eroded
 ) -> Support:
-    """Split the region (H, W) into the solid inside and the rest, where alpha is to be measured.
+    """Split the region (H, W) into the solid inside and the rest, where alpha is to be solved.
 
-    `firm` (H, W) marks pixels that look opaque one by one; where they leave no gap that a strand
-    could make, and deep inside the outline, the subject is solid. `clear` (H, W) is outside.
+    `firm` (H, W) marks pixels that look opaque by themselves. The subject is solid where these
+    leave no gaps as strands do, and deep inside the outline, but not where it is `clear` (H, W).
     """
     solid = (firm & region).astype(np.uint8)
     radius, edge = _pixels(CORE, length), _pixels(FILL, length)
-    # The image's border cuts the subject off; the subject continues behind it.
+    # The subject continues beyond the image's border.
     pad = 4 * radius + edge + 2
     solid = cv2.copyMakeBorder(solid, pad, pad, pad, pad, cv2.BORDER_REPLICATE)
     thick = opened(solid, _pixels(0.006, length), erode)
@@ -263,7 +261,7 @@ def find_support(
     wall = cv2.copyMakeBorder(clear.astype(np.uint8), pad, pad, pad, pad, cv2.BORDER_REPLICATE)
     hull = (closed | fill[labels]) & (wall == 0)
     core = opened((solid > 0) | eroded_about(hull, 2 * edge), radius, erode)
-    # The outermost pixels of the solid are mixed with plate by lens and sampling.
+    # Lens and sampling mix the outermost pixels of the solid with plate.
     core = eroded(core, 2 if length >= 256 else 1)[pad:-pad, pad:-pad]
     return Support(core, dilated(region, 1) & ~core)
 
@@ -277,8 +275,8 @@ def firm_pixels(
 ) -> np.ndarray:
     """Return the pixels (H, W) bool that look opaque, given the colours of a first core.
 
-    Thin hair differs from the plate by less than hair itself does. Skin under dark hair may too,
-    but it is not a mixture of hair and plate: colours off the line between them are subject too.
+    Thin hair differs less from the plate than dense hair. Skin under dark hair may differ little
+    too, but is not a mixture of hair and plate: colours off the line between these are subject.
     """
     off = image - model.plate
     own = subject_colour(image, core, length) - model.plate
@@ -288,14 +286,14 @@ def firm_pixels(
     along = np.einsum("...i,...i->...", cv2.transform(off / model.sigma, model.whiten), white)
     share = np.clip(along / (3 * np.maximum(reach, 1e-3) ** 2), 0, 1)
     misfit = _length(off - share[..., None] * own, model)
-    # Half of the difference at least: light mixes along a curve in 8-bit steps.
+    # At least half of the difference, because in 8-bit steps mixtures lie on a curve.
     return firm | (core & (misfit > np.maximum(2 * LOW, 0.5 * difference)))
 
 
 def subject_colour(image: np.ndarray, core: np.ndarray, length: int) -> np.ndarray:
-    """Return the subject's colour (H, W, 3) nearby: of the core's rim, in the nearest reach."""
+    """Return the mean colour (H, W, 3) of the core's rim, over the nearest reach that has any."""
     weight = _rim(core, length).astype(np.float32)
-    factor = max(1, int(REACH * length / 3))  # a blur this wide has no detail
+    factor = max(1, int(REACH * length / 3))  # the blur leaves no finer detail
     height, width = core.shape
     size = max(1, width // factor), max(1, height // factor)
     colours, weight = (
@@ -312,7 +310,7 @@ def subject_colour(image: np.ndarray, core: np.ndarray, length: int) -> np.ndarr
 
 
 def _rim(core: np.ndarray, length: int) -> np.ndarray:
-    """Return pixels (H, W) of core near its edge, except those that may be mixed with plate."""
+    """Return the core's pixels (H, W) near its edge, except those that may be mixed with plate."""
     inner = eroded(core, 2)
     inner = inner if inner.any() else core
     return inner & ~eroded_about(inner, 2 * _pixels(REACH, length))

@@ -1,10 +1,10 @@
 """Run the user's matting network.
 
-- ``bgmv2``: BackgroundMattingV2 (Lin et al. 2021) sees frame and clean plate, ``src`` and ``bgr``,
-  RGB in [0, 1], sides multiples of 4; it gives ``pha`` first (its ``doc/model_usage.md``).
-- ``salient``: RMBG-2.0 and BiRefNet (Zheng et al. 2024) see the frame alone, squeezed to their own
-  square, less ImageNet's mean and over its deviation; RMBG-2.0's ONNX file takes ``pixel_values``
-  and gives ``alphas``; others end before the sigmoid, which the range of their values shows.
+- ``bgmv2``: BackgroundMattingV2 (Lin et al. 2021) takes frame and clean plate, ``src`` and ``bgr``,
+  RGB in [0, 1], sides multiples of 4; its first output is ``pha`` (its ``doc/model_usage.md``).
+- ``salient``: RMBG-2.0 and BiRefNet (Zheng et al. 2024) take the frame alone, resized to their own
+  square and normalised with ImageNet's mean and deviation. RMBG-2.0's ONNX file takes
+  ``pixel_values`` and gives ``alphas``; files that end before the sigmoid give logits.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ SALIENT = Role(
 )
 MULTIPLE = 4  # BackgroundMattingV2 refines patches of 4 x 4 pixels
 LEAST_SIDE = 64  # smaller inputs leave its encoder no pixels
-OVERLAP = 256  # pixels; half of it is context that a tile sees and does not write
-SIDE = 1024  # of the salient networks, where the file does not say
+OVERLAP = 256  # pixels; half of it is context that a tile sees but does not write
+SIDE = 1024  # of the salient networks, if the file does not say
 MEAN = np.array([0.485, 0.456, 0.406], np.float32)  # ImageNet's
 DEVIATION = np.array([0.229, 0.224, 0.225], np.float32)
-# Weight of the enlarged alpha against smoothness along colours: small, as it knows no detail.
+# Weight of the enlarged alpha against smoothness along colours; small, because it has no detail.
 ENLARGED_WEIGHT = 0.01
 REFINE_TILE, REFINE_OVERLAP = 1024, 64
 FLAT = 1e-5  # variance of colour (of 1) that counts as flat, so that noise is not an edge
@@ -40,11 +40,11 @@ def background_alpha(
 ) -> np.ndarray:
     """Return opacity (H, W) float32 of a frame and its plate (H, W, 3), both in 8-bit steps.
 
-    Frames over `tile` pixels are tiled. The network pools over its entire input, so tiles differ a
-    little from the full frame; if memory allows, make `tile` as large as the frame.
+    Frames over `tile` pixels are tiled. The network pools over its whole input, so tiles give a
+    slightly different alpha; if memory allows, make `tile` as large as the frame.
 
     Raises:
-        StageError: the network failed, or gave another size or numbers that are not finite.
+        StageError: the network failed, or its answer has another size or is not finite.
     """
 
     def compute(rows: slice, columns: slice) -> np.ndarray:
@@ -60,11 +60,11 @@ def background_alpha(
 def salient_alpha(network: Network, frame: np.ndarray) -> np.ndarray:
     """Return the opacity (H, W) float32 of the salient subject in a frame (H, W, 3) uint8.
 
-    The network sees the frame at its own size; where that is smaller, the enlarged alpha follows
-    the frame's colours in the uncertain band.
+    The network sees the frame at its own size. If that is smaller, alpha is enlarged, and follows
+    the frame's colours where it is uncertain.
 
     Raises:
-        StageError: the network failed, or gave another size or numbers that are not finite.
+        StageError: the network failed, or its answer has another size or is not finite.
     """
     height, width = network.size or (SIDE, SIDE)
     small = resize_area(frame, width, height).astype(np.float32)
@@ -78,10 +78,7 @@ def salient_alpha(network: Network, frame: np.ndarray) -> np.ndarray:
 
 
 def as_opacity(values: np.ndarray) -> np.ndarray:
-    """Return opacities of values that may be logits.
-
-    Those leave [0, 1], what a sigmoid gave does not.
-    """
+    """Return the opacities of values that are logits if some of them lie outside [0, 1]."""
     if values.min() >= -1e-3 and values.max() <= 1 + 1e-3:
         return np.clip(values, 0, 1)
     return (1 / (1 + np.exp(-np.clip(values, -60, 60)))).astype(np.float32)
@@ -103,14 +100,14 @@ def refined(frame: np.ndarray, alpha: np.ndarray, factor: float) -> np.ndarray:
 
 
 def _padded(image: np.ndarray) -> np.ndarray:
-    """Repeat an image's (H, W, 3) last row and column up to a size that the network takes."""
+    """Repeat the last row and column of an image (H, W, 3) up to a size that the network takes."""
     height, width = (max(LEAST_SIDE, n + -n % MULTIPLE) for n in image.shape[:2])
     down, right = height - image.shape[0], width - image.shape[1]
     return cv2.copyMakeBorder(image, 0, down, 0, right, cv2.BORDER_REPLICATE)
 
 
 def _check_shape(network: Network, answer: np.ndarray, size: tuple[int, ...]) -> None:
-    """Raise StageError unless an answer is one channel of a size (height, width)."""
+    """Raise StageError unless an answer is one channel of this size (height, width)."""
     if answer.shape != (1, *size):
         raise network.error(
             f"gave shape {answer.shape}, expected {(1, *size)}; does matte.method fit the file?"
@@ -118,7 +115,7 @@ def _check_shape(network: Network, answer: np.ndarray, size: tuple[int, ...]) ->
 
 
 def smooth_alpha(image: np.ndarray, alpha: np.ndarray, band: np.ndarray) -> np.ndarray:
-    """Smooth alpha (H, W) in `band` (H, W) by an image (H, W, 3) in 8-bit steps; the rest stays.
+    """Smooth alpha (H, W) in `band` (H, W) along the colours of an image (H, W, 3), 8-bit steps.
 
     Minimises a' L a + ENLARGED_WEIGHT |a - alpha|^2 over the band by conjugate gradients.
     """
@@ -135,7 +132,7 @@ def smooth_alpha(image: np.ndarray, alpha: np.ndarray, band: np.ndarray) -> np.n
     key = alpha[band].astype(np.float64)
     fixed = np.where(band, 0.0, alpha)
     right = ENLARGED_WEIGHT * key - laplacian.product(fixed)[band]
-    # Preconditioned by its diagonal: windows at image borders and flat ones differ in scale.
+    # Preconditioned by the diagonal: flat windows and those at image borders differ in scale.
     inverse = 1.0 / (laplacian.diagonal()[band] + ENLARGED_WEIGHT)
     solved, _ = cg(
         LinearOperator((count, count), product, dtype=np.float64),
@@ -154,23 +151,23 @@ class MattingLaplacian:
     """The matting Laplacian of the 3 x 3 windows that touch a band, as an operator on images."""
 
     def __init__(self, image: np.ndarray, band: np.ndarray) -> None:
-        """Prepare for an image (H, W, 3) with colours in [0, 1] and a band (H, W) bool."""
+        """Prepare the windows of an image (H, W, 3), colours in [0, 1], and a band (H, W) bool."""
         self.image = np.ascontiguousarray(image, dtype=np.float64)
         windows = cv2.dilate(band.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        # Only windows that lie wholly inside the image.
+        # Windows must lie wholly inside the image.
         windows[[0, -1]] = windows[:, [0, -1]] = False
         self.windows = windows
-        mean = _mean(self.image)[windows]  # (M, 3)
+        mean = _window_mean(self.image)[windows]  # (M, 3)
         squares = self.image[..., :, None] * self.image[..., None, :]
-        products = _mean(squares.reshape(*band.shape, 9))[windows].reshape(-1, 3, 3)
+        products = _window_mean(squares.reshape(*band.shape, 9))[windows].reshape(-1, 3, 3)
         covariance = products - mean[:, :, None] * mean[:, None, :]
         self.inverse = np.linalg.inv(covariance + FLAT / 9 * np.eye(3))
         self.mean = mean
 
     def product(self, values: np.ndarray) -> np.ndarray:
-        """Return L @ values, both (H, W); right where the band is."""
-        average = _mean(values)[self.windows]
-        together = _mean(self.image * values[..., None])[self.windows]
+        """Return L @ values, both (H, W); valid in the band only."""
+        average = _window_mean(values)[self.windows]
+        together = _window_mean(self.image * values[..., None])[self.windows]
         slope = np.einsum("mij,mj->mi", self.inverse, together - self.mean * average[:, None])
         offset = average - np.einsum("mi,mi->m", slope, self.mean)
         slopes = self._summed(slope)
@@ -179,7 +176,7 @@ class MattingLaplacian:
         return rest[..., 1] * values - fitted
 
     def diagonal(self) -> np.ndarray:
-        """Return the diagonal (H, W) of L; right where the band is."""
+        """Return the diagonal (H, W) of L; valid in the band only."""
         pulled = np.einsum("mij,mj->mi", self.inverse, self.mean)
         constant = np.einsum("mi,mi->m", pulled, self.mean)
         inverse = self._summed(self.inverse.reshape(-1, 9)).reshape(*self.windows.shape, 3, 3)
@@ -189,17 +186,13 @@ class MattingLaplacian:
         return rest[..., 4] - (rest[..., 4] + form + rest[..., 3]) / 9
 
     def _summed(self, values: np.ndarray) -> np.ndarray:
-        """Sum (H, W, C) over the windows that hold each pixel of values (M, C), one per window."""
+        """Return per pixel the sum (H, W, C) of the values (M, C) of windows that contain it."""
         spread = np.zeros((*self.windows.shape, values.shape[1]))
         spread[self.windows] = values
-        return _box(spread, normalize=False)
+        return _window_mean(spread, normalize=False)
 
 
-def _mean(image: np.ndarray) -> np.ndarray:
-    return _box(image, normalize=True)
-
-
-def _box(image: np.ndarray, normalize: bool) -> np.ndarray:
+def _window_mean(image: np.ndarray, normalize: bool = True) -> np.ndarray:
     return cv2.boxFilter(
         image, cv2.CV_64F, (3, 3), normalize=normalize, borderType=cv2.BORDER_CONSTANT
     )
@@ -211,18 +204,18 @@ def in_tiles(
     overlap: int,
     compute: Callable[[slice, slice], np.ndarray],
 ) -> np.ndarray:
-    """Call ``compute(rows, columns)`` for tiles of an image, and join them to (H, W) float32.
+    """Call ``compute(rows, columns)`` for tiles of an image, and join the results (H, W) float32.
 
-    In an overlap the outer quarter of each tile, whose surroundings it did not see, is not used,
-    and the half between fades from one tile to the other; where the two agree the result is
-    exactly theirs.
+    Of an overlap, each tile's outer quarter is not used, because the tile does not see what
+    surrounds it. In the half between, one tile fades into the other; where they agree, the result
+    is exactly theirs.
 
     Args:
         shape: (H, W) of the image.
         tile: longest side of a tile, pixels; a multiple of 64, so that networks that halve the
-            picture stay in phase.
+            picture several times sample all tiles alike.
         overlap: pixels that neighbours share; a multiple of 64, less than ``tile``.
-        compute: gives (rows, columns) values of one tile.
+        compute: returns the values (rows, columns) of one tile.
     """
     whole = np.zeros(shape, np.float32)
     row_end = 0
@@ -238,7 +231,7 @@ def in_tiles(
 
 
 def spans(length: int, tile: int, overlap: int) -> list[slice]:
-    """Return slices that cover a length; neighbours share ``overlap``."""
+    """Return slices of at most ``tile`` that cover a length; neighbours share ``overlap``."""
     starts = [0]
     while starts[-1] + tile < length:
         starts.append(starts[-1] + tile - overlap)
@@ -246,7 +239,7 @@ def spans(length: int, tile: int, overlap: int) -> list[slice]:
 
 
 def _join(whole: np.ndarray, piece: np.ndarray, start: int, end: int) -> None:
-    """Put a piece into the columns from ``start``; those before ``end`` exist and fade."""
+    """Write a piece into the columns from ``start``; it fades in over those before ``end``."""
     shared = end - start
     if shared > 0:
         place = np.arange(shared) + 0.5

@@ -1,14 +1,14 @@
 """Model the plate of a camera, and solve alpha where plate and subject mix.
 
-The noise around the plate decides how large a difference is significant. It is measured on the
-frame itself, where that shows plate: it grows with brightness and, through compression and
-resampling, with the plate's own contrast, and its channels are correlated.
+Noise decides which difference from the plate is significant. It is measured in the frame itself,
+where that shows plate. It grows with brightness and, through compression and resampling, with the
+plate's own contrast; its channels are correlated.
 
-A pixel is ``alpha * F + (1 - alpha) * B`` in linear light, which is what a lens averages. B, the
-plate, is known up to noise; F has the mean and the covariance of the subject's colours nearby.
-The likeliest alpha under both is the Bayesian matting of Chuang et al. 2001 with B given: the
-covariance lets a strand be lighter or darker than its neighbours without being called more or
-less opaque. The deviation of alpha is large where F and B are alike.
+A pixel is ``alpha * F + (1 - alpha) * B`` in linear light, which lenses average. B, the plate, is
+known up to noise; F has the mean and the covariance of the subject's colours nearby. The most
+likely alpha is the Bayesian matting of Chuang et al. 2001 with B given. Thanks to the covariance, a
+strand may be lighter or darker than its neighbours and still be as opaque. The deviation of alpha
+is large where F and B are alike.
 """
 
 from __future__ import annotations
@@ -30,30 +30,29 @@ from express50.geometry.conventions import affine_from_opencv, affine_to_opencv
 LEVELS = np.linspace(16.0, 240.0, 8)  # 8-bit intensities at which noise is tabulated
 MOST_NOISE = 14.0  # 8-bit steps; larger differences are not noise, whatever the camera
 NOISE_FLOOR = 1.0  # least noise assumed, in 8-bit steps
-# With less than this share of plate in view, noise and exposure cannot be measured.
-LEAST_PLATE = 0.05
-# Largest changes of exposure, natural logarithms: a few tenths of a stop as a rule, else two stops.
+LEAST_PLATE = 0.05  # with a smaller share of plate in view, noise and exposure cannot be measured
+# Largest changes of exposure that are tried, natural logarithms: 0.7 stops, then two stops.
 GAINS = (0.51, 1.41)
-# A plate that explains less than GOOD_SHARE of a frame's rim is moved and evened.
+# A plate that explains less than GOOD_SHARE of a frame's rim is moved and its light is evened.
 RIM, ODD_STEPS, GOOD_SHARE, LEAST_GAIN = 0.06, 12.0, 0.97, 0.01
-WIDE_RIM = 0.15  # by which it is aligned
-MOST_MOVED = 0.03  # share of the longer side; an alignment that moves the plate further is rejected
-LEAST_SHARE = 0.9  # a plate that explains less belongs to another set
+WIDE_RIM = 0.15  # width of the rim by which a plate is aligned
+MOST_MOVED = 0.03  # share of the longer side; alignments that move the plate further are rejected
+LEAST_SHARE = 0.9  # a plate that explains less shows another set
 ALIGN_SIDE = 1024  # pixels of the pictures that are aligned
-ROUNDS = 3  # the covariance a pixel sees depends on its alpha; settled to 0.01 after two
-OCTAVES = 4  # of reach, in which colours are looked for
-TINT = 0.1  # share of the spread in brightness by which colour spreads too
-CHUNK = 1 << 18  # pixels solved at once, so that memory is bounded
+ROUNDS = 3  # of solving, since a pixel's covariance depends on its alpha; 0.01 off after two
+OCTAVES = 4  # of distance, in which colours are searched
+TINT = 0.1  # spread in colour, as a share of that in brightness
+CHUNK = 1 << 18  # pixels solved at once, to bound memory
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _MATRIX = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
 @dataclass(frozen=True)
 class PlateModel:
-    """Plate (H, W, 3) float32 in 8-bit steps, in the frame's exposure, and the noise around it.
+    """Plate (H, W, 3) float32, 8-bit steps in the frame's exposure, and the noise around it.
 
-    `sigma` (H, W, 3) is the deviation per channel; `whiten` (3, 3) makes the squared length of
-    `whiten @ ((frame - plate) / sigma)` three on average where a frame shows plate.
+    `sigma` (H, W, 3) is the deviation per channel. With `whiten` (3, 3), the squared length of
+    `whiten @ ((frame - plate) / sigma)` is three on average where the frame shows plate.
     """
 
     plate: np.ndarray
@@ -64,9 +63,9 @@ class PlateModel:
 def exposure_gain(frame: np.ndarray, plate: np.ndarray) -> np.ndarray:
     """Estimate the gain (3,) of linear light from plate to frame, (H, W, 3) uint8 sRGB each.
 
-    The plate's pixels form the sharpest peak of the ratios' histogram, whatever the subject
-    does; 1 if there is no clear peak (the subject fills the frame). A larger one is accepted only
-    if there is no peak near the plate's own exposure.
+    Pixels that show the plate form the sharpest peak in the histogram of ratios, whatever the
+    subject looks like. The gain is 1 if there is no clear peak, as when the subject fills the
+    frame. A large gain is accepted only if there is no peak at small ones.
     """
     gains = np.ones(3)
     step = max(1, round(np.sqrt(frame.shape[0] * frame.shape[1] / 5e5)))
@@ -89,7 +88,7 @@ def exposure_gain(frame: np.ndarray, plate: np.ndarray) -> np.ndarray:
 
 def exposed(plate: np.ndarray, gain: np.ndarray) -> np.ndarray:
     """Return a plate (H, W, 3) uint8 in the frame's exposure: float32, 8-bit steps."""
-    if np.abs(gain - 1.0).max() < 0.004:  # within half a step everywhere
+    if np.abs(gain - 1.0).max() < 0.004:  # less than half a step everywhere
         return plate.astype(np.float32)
     table = scaled_levels(gain).astype(np.float32)
     return np.stack([table[plate[..., c], c] for c in range(3)], axis=-1)
@@ -97,13 +96,13 @@ def exposed(plate: np.ndarray, gain: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MatchedPlate:
-    """A plate (H, W, 3) uint8 brought to a frame.
+    """A plate (H, W, 3) uint8 that was matched to a frame.
 
     Attributes:
-        plate: moved and evened, if that helps; else unchanged.
-        moved_px: how far its corners moved at most.
-        evened: largest change of light, a share; 0 if none was needed.
-        share: of the frame's top and sides that it explains.
+        plate: moved and its light evened, if that helps; else unchanged.
+        moved_px: the largest distance that a corner moved.
+        evened: largest change of light, as a share; 0 if none was needed.
+        share: of the frame's top and sides that the plate explains.
     """
 
     plate: np.ndarray
@@ -113,10 +112,10 @@ class MatchedPlate:
 
 
 def match_plate(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> MatchedPlate:
-    """Bring a plate to a frame that a camera took from a little further on, or in other light.
+    """Match a plate to a frame that the camera took after it moved a little, or in other light.
 
-    Both are (H, W, 3) uint8, ``valid`` (H, W) bool marks the pixels with footage. The person fills
-    the middle of a frame as a rule: what counts are its top and its sides.
+    Both are (H, W, 3) uint8, ``valid`` (H, W) bool marks the pixels with footage. The person
+    usually fills the middle of a frame, so its top and sides are compared.
     """
     rim = valid & _rim(valid.shape, RIM)
     as_it_is = MatchedPlate(plate, 0.0, 0.0, _explained(plate, frame, rim))
@@ -133,7 +132,7 @@ def match_plate(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> Matc
 
 
 def _rim(shape: tuple[int, ...], share: float) -> np.ndarray:
-    """Mark the top and the upper sides (H, W) of an image, a share of its longer side wide."""
+    """Mark the top and the upper sides (H, W) of an image; `share` of the longer side wide."""
     height, width = shape
     edge = max(2, round(share * max(shape)))
     rim = np.zeros(shape, bool)
@@ -143,7 +142,7 @@ def _rim(shape: tuple[int, ...], share: float) -> np.ndarray:
 
 
 def _explained(plate: np.ndarray, frame: np.ndarray, rim: np.ndarray) -> float:
-    """Return the share of a rim (H, W) where plate and frame differ by less than noise does."""
+    """Return the share of a rim (H, W) where plate and frame differ by less than ODD_STEPS."""
     plate, frame = shrink(plate, ALIGN_SIDE), shrink(frame, ALIGN_SIDE)
     rim = shrink(rim.astype(np.uint8) * 255, ALIGN_SIDE) == 255
     if not rim.any():  # nothing speaks against the plate
@@ -153,7 +152,7 @@ def _explained(plate: np.ndarray, frame: np.ndarray, rim: np.ndarray) -> float:
 
 
 def _moved(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, float]:
-    """Move a plate onto a frame by an affine motion; also returns how far its corners move."""
+    """Align a plate with a frame by an affine motion; also return how far its corners move."""
     scale = min(1.0, ALIGN_SIDE / max(valid.shape))
     grey = [
         cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None, fx=scale, fy=scale,
@@ -166,11 +165,11 @@ def _moved(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> tuple[np.
     motion = np.eye(2, 3, dtype=np.float32)
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
     try:
-        for blur in (15, 5):  # the motion of broad things first
+        for blur in (15, 5):  # coarse to fine
             _, motion = cv2.findTransformECC(
                 *grey, motion, cv2.MOTION_AFFINE, stop, inputMask=mask, gaussFiltSize=blur
             )
-    except cv2.error:  # nothing to see, or no motion explains it
+    except cv2.error:  # the rim has no structure, or no motion explains it
         return plate, 0.0
     motion = affine_from_opencv(motion)
     motion[:, 2] /= scale
@@ -187,10 +186,10 @@ def _moved(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> tuple[np.
 
 
 def _evened(plate: np.ndarray, frame: np.ndarray, rim: np.ndarray) -> tuple[np.ndarray, float]:
-    """Even a plate's light to a frame's; also returns the largest change, a share.
+    """Change a plate's light to a frame's; also return the largest change, as a share.
 
-    The change is a gain per channel that grows evenly across the image, so that it is known where
-    the person hides the plate too.
+    The change is a gain per channel whose logarithm is linear across the image, so that it is also
+    known where the person hides the plate.
     """
     height, width = rim.shape
     weight = rim.astype(np.float32)
@@ -240,7 +239,7 @@ def fit_plate(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> PlateM
     scaled = error / np.sqrt(by_level**2 + (share * contrast) ** 2)
     inside = scaled[np.abs(scaled).max(axis=1) < 4.0]
     covariance = inside.T @ inside / max(len(inside), 1)
-    # A tenth of independent noise keeps a direction that only looked quiet from ruling the key.
+    # A tenth of independent noise, so that no direction that happens to be quiet dominates.
     values, vectors = np.linalg.eigh(covariance + 0.1 * np.eye(3))
     whiten = (vectors / np.sqrt(np.maximum(values, 0.1))) @ vectors.T
     return PlateModel(shown, sigma, whiten.astype(np.float32))
@@ -264,10 +263,10 @@ def _noise_table(error: np.ndarray, level: np.ndarray) -> np.ndarray:
 
 
 def _robust_deviation(size: np.ndarray) -> float:
-    """Return the deviation from absolute errors, trimmed of subject pixels that slipped in.
+    """Return the standard deviation from absolute errors, robust to some pixels of the subject.
 
-    The median finds the scale; the mean square inside three of it does not step as the median of
-    integers does. A normal variable cut at three deviations keeps 0.9866 of its deviation.
+    It starts from the median, and takes the mean square within three deviations, because a median
+    of integers moves in steps. Normal errors cut at three deviations keep 0.9866 of theirs.
     """
     deviation = 1.4826 * float(np.median(size))
     for _ in range(3):
@@ -284,7 +283,7 @@ def _by_level(table: np.ndarray) -> np.ndarray:
 
 
 def _contrast_share(error: np.ndarray, by_level: np.ndarray, contrast: np.ndarray) -> float:
-    """Return share of plate's gradient that shows up as error (misregistration, compression)."""
+    """Return the share of the plate's gradient that appears as error (shifts, compression)."""
     steep = contrast > max(float(np.percentile(contrast, 90)), 2.0)
     if steep.sum() < 100:
         return 0.0
@@ -316,17 +315,17 @@ def local_colours(
         light: (H, W, 3) colours.
         weight: (H, W), which of them count.
         where: (H, W) bool, N of them true.
-        reach: pixels; the nearest of OCTAVES reaches that holds any colour decides.
+        reach: pixels; up to OCTAVES doublings of it are searched, the nearest colours count most.
         spread: share by which brightness may differ from the colours nearby.
     """
-    # A blur this wide has no detail, so sums are kept small; one channel at a time, for memory.
+    # A wide blur has no detail, so it is computed at reduced size; by channel, to save memory.
     factor = max(1, int(reach / 3))
     height, width = weight.shape
     size = (max(1, width // factor), max(1, height // factor))
 
     def nearby(values: np.ndarray) -> np.ndarray:
         small = cv2.resize(values * weight, size, interpolation=cv2.INTER_AREA)
-        total = np.full_like(small, 1e-3 * 1e-2**OCTAVES * small.mean())  # if none is in reach
+        total = np.full_like(small, 1e-3 * 1e-2**OCTAVES * small.mean())  # counts if none is near
         for octave in range(OCTAVES):
             total += 1e-2**octave * blurred(small, reach / factor * 2**octave)
         return cv2.resize(total, (width, height), interpolation=cv2.INTER_LINEAR)[where]
@@ -342,7 +341,7 @@ def local_colours(
 
 
 def blurred(image: np.ndarray, sigma: float) -> np.ndarray:
-    """Blur an image (H, W[, C]) by a Gaussian, at reduced size where that is wide."""
+    """Blur an image (H, W[, C]) by a Gaussian, at reduced size if that is wide."""
     factor = max(1, int(sigma / 3))
     height, width = image.shape[:2]
     size = (max(1, width // factor), max(1, height // factor))
@@ -358,7 +357,7 @@ def solve_opacity(
     covariance: np.ndarray,
     noise: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Solve the likeliest alpha (N,), not clipped, its deviation (N,), and that near alpha 0.
+    """Return the most likely alpha (N,), not clipped, its deviation (N,), and that at alpha 0.
 
     Args:
         seen: (N, 3) light of the pixels.
@@ -384,9 +383,9 @@ def solve_opacity(
 
 
 def _precision(covariance: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``C^-1 r`` (N, 3) and ``r' C^-1 r`` (N,), the weights and precision on r.
+    """Return ``C^-1 r`` (N, 3) and ``r' C^-1 r`` (N,): the weights and precision along r.
 
-    By cofactors, in a quarter of a general solver's time.
+    Solved with cofactors, in a quarter of a general solver's time.
     """
     a, b, c, d, e, f = (covariance[:, i, j] for i, j in _PAIRS)
     x, y, z = reach.T.astype(np.float64)
@@ -407,9 +406,9 @@ def _precision(covariance: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, n
 
 
 def shrunk(values: np.ndarray, doubt: np.ndarray) -> np.ndarray:
-    """Shrink values (N,) by their doubt (N,): to 0 within it, and little far above it.
+    """Shrink values (N,) to 0 if they are under their doubt (N,), and little if far above it.
 
-    This is the non-negative garrote (Breiman 1995): unlike a ramp it keeps large values.
+    This is the non-negative garrote (Breiman 1995); unlike a ramp, it keeps large values.
     """
     kept = 1 - (doubt / np.maximum(values, 1e-9)) ** 2
     return np.where(values > 0, values * np.clip(kept, 0, 1), 0.0)

@@ -38,19 +38,19 @@ RED, GREEN = (235, 50, 40), (50, 220, 80)
 EMPTY = 0.003  # share of the image below which a matte counts as empty
 # Share of the image's top or of a side that the subject may cover before it counts as cut off.
 MOST_CONTACT = 0.02
-RIM = 0.008  # share of the longer side: so far from the outline a matte can be wrong by a part
-WINDOW = 5  # pixels, odd
+RIM = 0.008  # share of the longer side: distance from the outline in which errors are predicted
+WINDOW = 5  # pixels, odd: side of the window in which alpha's spread is measured
 NEARBY = 0.04  # share of the longer side: width of the neighbourhood that describes an outline
 
 Matter = Callable[[np.ndarray, Any, np.ndarray], np.ndarray]
-"""Frame (H, W, 3) uint8, plate or None and valid pixels (H, W) to opacity (H, W) float32."""
+"""Of a frame (H, W, 3) uint8, its plate or None, and valid pixels: opacity (H, W) float32."""
 
 
 @dataclass(frozen=True)
 class CameraMatte:
-    """The matte of one camera alone: alpha (H, W) uint8, and its frame reduced to `matte.side`.
+    """The matte of one camera alone: alpha (H, W) uint8, and the frame reduced to `matte.side`.
 
-    `noise` is that of the full frame, see `wall_noise`.
+    `noise` is the `wall_noise` of the full frame.
     """
 
     alpha: np.ndarray
@@ -73,7 +73,7 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
     if not mattes:
         raise StageError(f"{item}: {dropped[0].why if dropped else 'no camera is calibrated'}")
     alphas = {name: matte.alpha for name, matte in mattes.items()}
-    # If the cameras share no place, a view only serves the contact sheet.
+    # If the cameras share no place, views are for the contact sheet only.
     place = ball or Ball(np.zeros(3), 1.0)
     views = [
         make_view(cameras[name], place, matte.rgb, matte.alpha, config.side)
@@ -118,10 +118,10 @@ def camera_mattes(
     dataset: Dataset, item: str, config: MatteConfig, cameras: Mapping[str, Camera],
     ball: Ball | None,
 ) -> tuple[dict[str, CameraMatte], list[Note], list[Note]]:  # fmt: skip
-    """Matte each camera of a peak, those without a plate together.
+    """Matte each camera of a peak; those without a plate are cut out together.
 
-    One camera's full images are held at a time. `ball` is what the cameras look at; None if
-    they share none. Also returns the cameras without a matte, and warnings.
+    Only one camera's full images are in memory at a time. `ball` is the volume that the cameras
+    look at, None if they share none. Also returns the cameras without a matte, and warnings.
     """
     subject, expression = item.split("/")
     read = partial(read_peak_frame, dataset, subject, expression)
@@ -161,7 +161,7 @@ def _plate(
     dataset: Dataset, subject: str, camera: str, frame: np.ndarray, valid: np.ndarray,
     config: MatteConfig,
 ) -> tuple[np.ndarray | None, str]:  # fmt: skip
-    """Read a plate and bring it to the frame; also returns a warning, empty if all is well."""
+    """Read a plate and match it to the frame; also returns a warning, empty if all is well."""
     if config.method in WITHOUT_PLATE:
         return None, ""
     plate = read_plate_image(dataset, subject, camera)
@@ -184,17 +184,17 @@ def _plate(
 
 
 def valid_pixels(camera: Camera) -> np.ndarray:
-    """Return pixels (H, W) bool with footage, without the outermost, which resampling mixes."""
+    """Return the pixels (H, W) bool with footage, except the outermost, which resampling mixes."""
     return cv2.erode(undistorted_mask(camera).astype(np.uint8), np.ones((3, 3))) > 0
 
 
 def eight_bit(alpha: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Return opacity (H, W) as uint8, 0 where no pixel is valid."""
+    """Return opacity (H, W) as uint8, 0 where a pixel is not valid."""
     return np.rint(np.where(valid, alpha, np.float32(0)) * 255).astype(np.uint8)
 
 
 def _matter(config: MatteConfig) -> Matter:
-    """Make the function that mattes one frame. Networks are imported here: torch is slow to."""
+    """Return the function that mattes one frame; torch is imported for networks only."""
     if config.method in ("key", "grabcut"):
         return lambda frame, plate, valid: key_alpha(frame, plate, valid, config.shadow)
     from pipelines.matte.learned import BGMV2, SALIENT, background_alpha, salient_alpha
@@ -211,7 +211,7 @@ def _matter(config: MatteConfig) -> Matter:
 def make_view(
     camera: Camera, ball: Ball, image: np.ndarray, alpha: np.ndarray, side: int
 ) -> MatteView:
-    """Reduce an undistorted image (H, W, 3) and alpha (H, W), uint8, of a recorded camera."""
+    """Reduce a recorded camera with its undistorted image (H, W, 3) and alpha (H, W), uint8."""
     rgb = shrink(image, side)
     small = resized(camera, rgb.shape[1], rgb.shape[0])
     return MatteView(
@@ -227,7 +227,7 @@ def make_view(
 def corrected(
     alpha: np.ndarray, removed: np.ndarray | None, filled: np.ndarray | None
 ) -> np.ndarray:
-    """Remove and fill pixels (h, w) bool of an alpha (H, W) uint8, softly at their edges.
+    """Clear and fill pixels (h, w) bool of an alpha (H, W) uint8, with soft edges.
 
     All other pixels keep their exact values.
     """
@@ -244,13 +244,13 @@ def corrected(
 
 
 def _share(more: np.ndarray, less: np.ndarray) -> float:
-    """Return share of the image, by opacity, by which one alpha (H, W) uint8 exceeds another."""
+    """Return the share of the image's opacity by which one alpha (H, W) uint8 exceeds another."""
     excess = np.maximum(more.astype(np.int64) - less, 0).sum()
     return round(float(excess) / 255 / more.size, 6)
 
 
 def border_contact(alpha: np.ndarray) -> dict[str, float]:
-    """Return share of each side of image that an alpha (H, W) uint8 covers: where it is cut off."""
+    """Return the share of each side of the image that an alpha (H, W) uint8 covers."""
     sides = {"top": alpha[0], "right": alpha[:, -1], "bottom": alpha[-1], "left": alpha[:, 0]}
     return {side: round(float((line > 127).mean()), 4) for side, line in sides.items()}
 
@@ -264,10 +264,10 @@ def rim_of(alpha: np.ndarray) -> np.ndarray:
 def rim_figures(
     alpha: np.ndarray, rgb: np.ndarray, noise: float, plated: bool, views: int
 ) -> dict[str, np.ndarray | float]:
-    """Describe the N pixels of the rim of an alpha (H, W) uint8.
+    """Return figures of the N rim pixels of an alpha (H, W) uint8 that predict its errors.
 
-    The frame (h, w, 3) uint8 may be reduced; `noise` is that of the full one. Keying may miss a
-    subject that differs from the wall by little more than noise, and leaves a ragged outline.
+    The frame (h, w, 3) uint8 may be reduced; `noise` is that of the full one. If a subject differs
+    from the wall by little more than noise, keying may miss parts and leave a ragged outline.
     """
     rim, share = rim_of(alpha), alpha.astype(np.float32) / 255
     open_part = share * (1 - share)
@@ -277,8 +277,8 @@ def rim_figures(
     return {
         "soft": 0.05 + 4 * open_part[rim],
         "spread": 0.01 + deviation(share)[rim],
-        # Edges nearby, in lengths of a straight one.
-        "ragged": 0.1 + _nearby(edge.astype(np.float32))[rim] * _reach(alpha),
+        # Length of the outline nearby, as a multiple of a straight one's.
+        "ragged": 0.1 + _nearby(edge.astype(np.float32))[rim] * _nearby_side(alpha),
         "faint": (0.5 + noise) / (2 + contrast),
         "noise": 0.5 + noise,
         "width": 0.1 + float(open_part.sum()) / max(int(edge.sum()), 1),
@@ -289,9 +289,9 @@ def rim_figures(
 
 
 def wall_noise(alpha: np.ndarray, rgb: np.ndarray) -> float:
-    """Measure a frame's (H, W, 3) uint8 noise off its subject, 8-bit steps; inf if all is subject.
+    """Measure the noise (8-bit steps) of a frame's wall, (H, W, 3) uint8; inf if no wall shows.
 
-    It is the mean Laplacian, capped where the wall has edges; every fourth row is enough.
+    It is the mean absolute Laplacian, capped where the wall has edges; every fourth row is enough.
     """
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     behind = cv2.dilate(alpha, np.ones((5, 5)))[::4] < 3
@@ -300,7 +300,7 @@ def wall_noise(alpha: np.ndarray, rgb: np.ndarray) -> float:
 
 
 def outline_contrast(alpha: np.ndarray, rgb: np.ndarray) -> np.ndarray:
-    """Measure how far (h, w) mean colours of subject and surroundings are apart, 8-bit steps."""
+    """Return how far apart (h, w) the mean colours of subject and wall nearby are, 8-bit steps."""
     inside = cv2.resize(alpha, rgb.shape[1::-1], interpolation=cv2.INTER_AREA) / np.float32(255)
     smooth = cv2.GaussianBlur(rgb.astype(np.float32), (0, 0), 1)
     one, other = (
@@ -310,13 +310,13 @@ def outline_contrast(alpha: np.ndarray, rgb: np.ndarray) -> np.ndarray:
     return np.linalg.norm(one - other, axis=-1)
 
 
-def _reach(values: np.ndarray) -> int:
+def _nearby_side(values: np.ndarray) -> int:
     return max(3, 2 * round(NEARBY * max(values.shape[:2]) / 2) + 1)
 
 
 def _nearby(values: np.ndarray) -> np.ndarray:
     """Average values (H, W[, C]) over the neighbourhood."""
-    return cv2.blur(values, (_reach(values), _reach(values)))
+    return cv2.blur(values, (_nearby_side(values), _nearby_side(values)))
 
 
 def deviation(values: np.ndarray) -> np.ndarray:
@@ -326,12 +326,12 @@ def deviation(values: np.ndarray) -> np.ndarray:
 
 
 def matte_warnings(alphas: dict[str, np.ndarray]) -> list[Note]:
-    """Name the cameras whose matte is empty or whose subject is cut off at the top or a side."""
+    """Warn of cameras whose matte is empty or whose subject is cut off at the top or a side."""
     notes = []
     for name, alpha in alphas.items():
         share = float(alpha.mean()) / 255
         if share < EMPTY:
-            notes.append(Note(name, f"its matte covers {share:.2%} of the image: empty"))
+            notes.append(Note(name, f"its matte is empty ({share:.2%} of the image)"))
             continue
         contact = border_contact(alpha)
         cut = [side for side in ("top", "right", "left") if contact[side] > MOST_CONTACT]

@@ -1,10 +1,10 @@
 """Carve the space that the cameras of a frame set share, and find what each sees in it.
 
-Space is a cube of cells around the point that the cameras look at, in units of the rig's own, so
-that neither metres nor the world's origin matter. A ball in it is in view of most cameras; there
-every camera's silhouette counts (visual hull, Laurentini 1994, but by votes: a place is empty
-where several cameras see clear background). Outside the ball few cameras see anything: only what
-continues the subject out of it, such as the shoulders, is possible there.
+Space is a cube of cells around the point that the cameras look at, in the rig's own units, so that
+neither metres nor the world's origin matter. Most cameras see a ball in it completely; there every
+camera's silhouette counts (visual hull, Laurentini 1994, but by votes: a place is empty if several
+cameras see clear background). Outside the ball few cameras see anything: only places where the
+subject continues out of the ball, such as the shoulders, are possible there.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from express50.geometry.conventions import cell_centres, opencv_pixels_to_corner
 from express50.rigs.world_frame import meeting_point
 
 CUBE = 1.6  # half side of the cube, in radii of the ball
-BODY = 0.8  # radii that the subject may reach on from where it leaves the ball
+BODY = 0.8  # radii that the subject may extend beyond where it leaves the ball
 FAINT = 0.03  # alpha below this is clear background
-STRAND = 0.03  # share of the longer side that hair may reach beyond the other cameras' hull
+STRAND = 0.03  # share of the longer side that hair may extend beyond the other cameras' hull
 INSIDE = 0.5  # alpha from which a pixel shows the subject
 OUT, CLEAR, RIM, SOLID = range(4)  # what a view says of a cell
 
 
 @dataclass(frozen=True)
 class Ball:
-    """Centre (3,) and radius, world units, of the unit ball that views are compared in."""
+    """Centre (3,) and radius, world units, of the ball in which views are compared."""
 
     center: np.ndarray
     radius: float
@@ -59,12 +59,13 @@ class MatteView:
 
 @dataclass(frozen=True)
 class Space:
-    """Counts (n, n, n) uint16 of the views that see a cell, see it clear, see the subject there.
+    """What all views say of each cell of space.
 
     Attributes:
         axis: (n,) float32 coordinates of the cells, the same along x, y and z.
-        seen, clear, solid: the counts.
-        labels: what each view says of each pixel, (h * w + 1,) uint8, the last for "not in view".
+        seen, clear, solid: (n, n, n) uint16 counts of the views that see the cell, see clear
+            background there, see the subject there.
+        labels: each view's pixel labels (h * w + 1,) uint8, the last for cells out of view.
     """
 
     axis: np.ndarray
@@ -75,7 +76,7 @@ class Space:
 
 
 def ball_of(cameras: Mapping[str, Camera]) -> Ball | None:
-    """Return the ball around the point the cameras look at, the largest that most see completely.
+    """Return the largest ball around the point the cameras look at that most see completely.
 
     None if the optical axes are parallel or most cameras do not look at their intersection.
     """
@@ -91,7 +92,7 @@ def ball_of(cameras: Mapping[str, Camera]) -> Ball | None:
 
 
 def projection_of(camera: Camera, ball: Ball) -> np.ndarray:
-    """Return projection (3, 4) float32 of the ball's coordinates into a pinhole camera's image."""
+    """Return the projection (3, 4) float32 of ball coordinates into a pinhole camera's image."""
     R, t = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
     # Over the radius, so that depths are in its units too and float32 suffices.
     offset = (R @ ball.center + t) / ball.radius
@@ -99,14 +100,14 @@ def projection_of(camera: Camera, ball: Ball) -> np.ndarray:
 
 
 def label_pixels(view: MatteView, margin: float) -> np.ndarray:
-    """Label a view's pixels (h * w + 1,) uint8; clear is further than `margin` pixels."""
+    """Label a view's pixels (h * w + 1,) uint8; clear ones are `margin` pixels off its subject."""
     opaque = view.alpha > FAINT
     labels = np.full(opaque.shape, CLEAR, np.uint8)
     if opaque.any():
         distance = cv2.distanceTransform((~opaque).astype(np.uint8), cv2.DIST_L2, 5)
         labels[distance <= margin] = RIM
     labels[view.alpha > INSIDE] = SOLID
-    # What the image cuts off continues behind its border: nothing is clear next to missing footage.
+    # The subject continues beyond the image's border: nothing is clear next to missing footage.
     beyond = cv2.dilate((~view.valid).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     labels[beyond & (labels == CLEAR)] = OUT
     labels[~view.valid] = OUT
@@ -114,7 +115,7 @@ def label_pixels(view: MatteView, margin: float) -> np.ndarray:
 
 
 def cells_in(view: MatteView, axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return each cell's pixel, h * w where out of view, and its depth; (n, n, n) each."""
+    """Return each cell's pixel, h * w if out of view, and its depth; (n, n, n) each."""
     height, width = view.alpha.shape
     P = view.projection
     x, y, z = (
@@ -130,7 +131,7 @@ def cells_in(view: MatteView, axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def make_space(views: Sequence[MatteView], cells: int, margin: float) -> Space:
-    """Count what every view says of every cell; `margin` is in pixels."""
+    """Count what the views say of every cell; `margin` is that of `label_pixels`."""
     axis = (CUBE * (cell_centres(cells) / cells * 2 - 1)).astype(np.float32)
     seen, clear, solid = (np.zeros((cells,) * 3, np.uint16) for _ in range(3))
     labels = {}
@@ -144,7 +145,7 @@ def make_space(views: Sequence[MatteView], cells: int, margin: float) -> Space:
 
 
 def subject_place(space: Space) -> np.ndarray:
-    """Mark cells (n, n, n) where the subject may be: the ball, and where it leaves the ball."""
+    """Mark the cells (n, n, n) where the subject may be: the ball, and around where it leaves."""
     a = space.axis
     square = a[:, None, None] ** 2 + a[:, None] ** 2 + a**2
     ball = square <= 1
@@ -161,24 +162,24 @@ def subject_place(space: Space) -> np.ndarray:
 
 
 def splat(shape: tuple[int, int], pixels: np.ndarray, spread: int) -> np.ndarray:
-    """Return pixels (h, w) bool that cells fall on (N,), each `spread` pixels around."""
+    """Return the pixels (h, w) bool within `spread` of those that cells fall on (N,)."""
     hit = np.zeros(shape[0] * shape[1] + 1, np.uint8)
     hit[pixels] = 1
     side = 2 * spread + 1
     return cv2.dilate(hit[:-1].reshape(shape), np.ones((side, side), np.uint8)) > 0
 
 
-VOTES = 2  # other cameras that must see clear background before a place counts as empty
-MARGIN = 0.01  # distance from a silhouette, a share of the longer side, that proves nothing
-COLOUR = 0.1  # largest difference, of full scale, of one surface in neighbouring cameras
-MOST = 0.75  # share of the other views that must see a place to call it solid
+VOTES = 2  # other cameras that must see clear background for a place to be empty
+MARGIN = 0.01  # share of the longer side: distance from a silhouette that proves nothing
+COLOUR = 0.1  # share of full scale by which one surface may differ between neighbouring cameras
+MOST = 0.75  # share of the other views that must see a place for it to be solid
 ERRING = 8  # one in this many views may miss the same spot
-THICK = 0.5  # share of the usual length of a ray in the hull that does not graze a corner
-NEIGHBOURS = 4  # cameras that are asked for the colour of a surface
+THICK = 0.5  # share of a ray's median length in the hull under which it only grazes a corner
+NEIGHBOURS = 4  # cameras in which a surface's colour is looked up
 WIDEST = 0.2  # cosine of the largest angle to them
-SEARCH = (-0.3, 0.1, 17)  # radii before and behind the others' hull in which the surface may lie
-SMALLEST = 5e-4  # share of the image that a filled spot has at least
-LARGEST = 0.4  # share of the subject from which on a matte is wrong rather than holed
+SEARCH = (-0.3, 0.1, 17)  # radii in front of and behind the others' hull where a surface may be
+SMALLEST = 5e-4  # share of the image: filled spots are at least this large
+LARGEST = 0.4  # share of the subject: if more lacks, the matte is wrong rather than holed
 
 
 @dataclass(frozen=True)
@@ -186,11 +187,11 @@ class Evidence:
     """The evidence of other views about a view's pixels, each (h, w).
 
     Attributes:
-        known: whose rays cross the space that is compared.
-        possible: whose rays pass a place that the others do not rule out.
-        likely: whose rays pass a place that none of them rules out.
-        solid: whose rays pass a place where nearly all others that see it see the subject.
-        front: depth of the nearest such place, in radii; infinite where there is none.
+        known: pixels whose rays cross the space.
+        possible: those whose rays pass a place that the others do not rule out.
+        likely: those whose rays pass a place that none of the others rules out.
+        solid: those whose rays pass a place where nearly all others that see it see the subject.
+        front: depth of the nearest such place, in radii; infinite without one.
     """
 
     known: np.ndarray
@@ -201,7 +202,7 @@ class Evidence:
 
 
 def evidence_of(view: MatteView, space: Space, place: np.ndarray) -> Evidence:
-    """Return evidence of all views but `view`; `place` (n, n, n) is where the subject may be."""
+    """Return the evidence of all views but `view`; `place` is that of `subject_place`."""
     shape = view.alpha.shape
     pixels, depth = cells_in(view, space.axis)
     own = space.labels[view.name][pixels]
@@ -211,14 +212,14 @@ def evidence_of(view: MatteView, space: Space, place: np.ndarray) -> Evidence:
     sure = (space.solid - (own == SOLID) >= seen - seen // ERRING) & (
         seen >= max(3.0, MOST * (len(space.labels) - 1))
     )
-    # Pixels around a cell's own within which its neighbours fall: splats then leave no gap.
+    # Neighbouring cells fall within this many pixels, so splats of this size leave no gaps.
     step = float(np.linalg.norm(view.projection[0, :3])) * float(space.axis[1] - space.axis[0])
     spread = max(1, int(np.ceil(step / float(view.projection[2, 3]) / 2)))
     front = np.full(shape[0] * shape[1] + 1, np.inf, np.float32)
     np.minimum.at(front, pixels[sure], depth[sure])
     disc = np.ones((2 * spread + 1,) * 2, np.uint8)
     front = cv2.erode(front[:-1].reshape(shape), disc)
-    # As much as the cells were widened, so that no rim of them is taken for solid.
+    # By as much as the splats widened it, so that the rim does not count as solid.
     solid = cv2.erode(np.isfinite(front).astype(np.uint8), disc) > 0
     solid &= _thick(view, np.bincount(pixels[sure], minlength=front.size + 1)[:-1])
     return Evidence(
@@ -231,10 +232,10 @@ def evidence_of(view: MatteView, space: Space, place: np.ndarray) -> Evidence:
 
 
 def _thick(view: MatteView, cells: np.ndarray) -> np.ndarray:
-    """Return pixels (h, w) bool whose rays pass as many of the solid `cells` (h * w,) as most do.
+    """Return the pixels (h, w) bool whose rays pass enough of the solid `cells` (h * w,).
 
-    Between the tangents of few cameras the hull has corners that protrude from the subject; they
-    are thin along the rays that pass the subject.
+    Between the silhouettes of few cameras the hull has corners that stand out from the subject.
+    Rays that miss the subject pass only a few cells of these corners.
     """
     chord = cv2.blur(cells.reshape(view.alpha.shape).astype(np.float32), (5, 5))
     opaque = (view.alpha > INSIDE) & (chord > 0)
@@ -242,9 +243,9 @@ def _thick(view: MatteView, cells: np.ndarray) -> np.ndarray:
 
 
 def ruled_out(view: MatteView, evidence: Evidence) -> np.ndarray:
-    """Return pixels (h, w) bool of matte that show nothing which the other views leave possible.
+    """Return the pixels (h, w) bool of a matte that the other views rule out.
 
-    They are whole connected parts that reach further from the possible pixels than hair does.
+    They are whole connected parts that extend further from the possible pixels than hair does.
     """
     loose = (view.alpha > FAINT) & ~evidence.possible
     if not loose.any() or not evidence.possible.any():
@@ -258,11 +259,11 @@ def ruled_out(view: MatteView, evidence: Evidence) -> np.ndarray:
     far = (reach > STRAND * max(loose.shape)) & (known > 0.5 * area)
     far[0] = False
     wrong = far[parts]
-    # For pixels connected to it one view's evidence is enough, up to the hull of all views.
+    # For pixels connected to these, the evidence of one view is enough.
     doubtful = (view.alpha > FAINT) & ~evidence.likely
     _, parts = cv2.connectedComponents(doubtful.astype(np.uint8), connectivity=8)
     bad = doubtful & np.isin(parts, np.unique(parts[wrong]))
-    # One pixel more, for the fainter pixels around it.
+    # One pixel more, for the faint pixels around.
     return (cv2.dilate(bad.astype(np.uint8), np.ones((3, 3))) > 0) & ~evidence.likely
 
 
@@ -270,10 +271,11 @@ def shows_surface(
     view: MatteView, evidence: Evidence, todo: np.ndarray, others: Sequence[MatteView],
     subject: dict[str, np.ndarray],
 ) -> np.ndarray:  # fmt: skip
-    """Return pixels (h, w) bool of `todo` (h, w) coloured like a surface that others see there.
+    """Return the pixels (h, w) bool of `todo` (h, w) coloured like a surface that others see there.
 
-    Somewhere about the front of the others' hull two neighbours at least must see this colour on
-    the `subject` ({name: (h, w) bool}): then this camera cannot separate it from its background.
+    Somewhere near the front of the others' hull, at least two neighbours must see the pixel's
+    colour on their `subject` ({name: (h, w) bool}). Then this camera sees the subject too, in front
+    of a background of the same colour.
     """
     rows, columns = np.nonzero(todo)
     near = sorted((o for o in others if o.name != view.name), key=lambda o: -_cosine(view, o))
@@ -301,10 +303,10 @@ def shows_surface(
 
 
 def subject_of(view: MatteView, evidence: Evidence) -> np.ndarray:
-    """Return pixels (h, w) bool of the subject: by the matte, or by the others in its holes."""
+    """Return the subject's pixels (h, w) bool: by the matte, and in its holes by the others."""
     opaque = view.alpha > INSIDE
     _, parts = cv2.connectedComponents((~opaque).astype(np.uint8), connectivity=4)
-    # The bottom counts as closed: there the body goes on.
+    # The bottom counts as closed, because the body continues there.
     outside = np.unique(np.concatenate([parts[0], parts[:, 0], parts[:, -1]]))
     return opaque | (evidence.solid & ~np.isin(parts, outside))
 
@@ -320,7 +322,7 @@ def _cosine(a: MatteView, b: MatteView) -> float:
 
 
 def _pixels_of(view: MatteView, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return columns, rows and whether in view (N,) of points (3, N) in the ball's coordinates."""
+    """Return columns, rows and whether in view (N,) of points (3, N), ball coordinates."""
     height, width = view.alpha.shape
     x, y, z = view.projection[:, :3] @ points + view.projection[:, 3, None]
     ahead = z > 1e-6
@@ -333,11 +335,11 @@ def missed(
     view: MatteView, evidence: Evidence, others: Sequence[MatteView],
     subject: dict[str, np.ndarray],
 ) -> tuple[np.ndarray, float]:  # fmt: skip
-    """Return pixels (h, w) bool to fill and the share of what the others see that then still lacks.
+    """Return the pixels (h, w) bool to fill, and the share of the others' solid left unfilled.
 
-    Filled are connected spots that lack alpha where the others see something solid, some of it
-    well inside, and whose colour is that of the surface. Spots that the matte does not enclose
-    count only if deeper in the hull than its corners may protrude.
+    Filled are connected spots without alpha where the others see the subject, partly well inside
+    it, and whose colour is the surface's. Spots that the matte does not enclose must lie deeper in
+    the hull than its corners stand out.
     """
     lacking = evidence.solid & (view.alpha < INSIDE) & view.valid
     depth = _depth(evidence.solid)
@@ -358,16 +360,16 @@ def missed(
 
 
 def _depth(mask: np.ndarray) -> np.ndarray:
-    """Return the distance (h, w) of a mask's pixels to its edge; the image's border is not one."""
+    """Return the distance (h, w) of a mask's pixels to its edge; image borders are not edges."""
     if mask.all():
         return np.full(mask.shape, float(max(mask.shape)), np.float32)
     return cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
 
 
 def _corner(view: MatteView, others: Sequence[MatteView]) -> float:
-    """Estimate how far the hull of the others exceeds a round subject here, in its radii.
+    """Estimate how far the others' hull stands out from a round subject here, in its radii.
 
-    The tangents of cameras an angle away to either side meet at 1 / cos(angle) radii.
+    The tangents of two cameras, each at an angle to this one, meet at 1 / cos(angle) radii.
     """
     cosines = sorted((_cosine(view, o) for o in others if o.name != view.name), reverse=True)
     return 1 / cosines[1] - 1 if len(cosines) > 1 and cosines[1] > WIDEST else 1.0
