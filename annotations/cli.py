@@ -42,7 +42,7 @@ from annotations.validate import (
 from annotations.worklist import ORDERS, coverage, effort, progress, worklist
 from express50.capture.index import Index, read_index
 from express50.console import FAILED, OK, answer, count, format_table
-from express50.contract.layout import Dataset, included_subjects
+from express50.contract.layout import Dataset, exclusion_reason, included_subjects
 from express50.errors import AnnotationError, UnknownNameError, check_known
 
 _FIGURES = ("clips", "within_1", "within_2", "within_4", "median_frames", "slip_rate", "alpha")
@@ -165,11 +165,11 @@ def table(names: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> list[str]:
 
 def dataset_folder(text: str) -> Dataset:
     """Parse the folder of an existing dataset."""
-    if not Path(text).is_dir():
-        raise argparse.ArgumentTypeError(
-            f"{text}: no such dataset; run 'express50 ingest {text} CAPTURE'"
-        )
-    return Dataset(Path(text))
+    dataset = Dataset(Path(text))
+    if not dataset.captures_file.is_file():
+        what = "not a dataset (no captures.json)" if dataset.root.is_dir() else "no such dataset"
+        raise argparse.ArgumentTypeError(f"{text}: {what}; run 'express50 ingest {text} CAPTURE'")
+    return dataset
 
 
 def person(text: str) -> str:
@@ -193,9 +193,9 @@ def run_ui(args: argparse.Namespace) -> int:
     from annotations.ui.session import Session
 
     dataset = args.dataset
-    subjects = _matching(included_subjects(dataset), args.subjects, "subject")
+    subjects = _matching(included_subjects(dataset), args.subjects, "included subject")
     if not subjects:
-        raise AnnotationError(f"{dataset.root}: no subject; run 'express50 ingest' first")
+        raise AnnotationError(f"{dataset.root}: no subject is ingested and not excluded")
     names = dict.fromkeys(c.expression_id for s in subjects for c in read_index(dataset, s).cues)
     session = Session(
         dataset,
@@ -439,6 +439,8 @@ def run_exclusion(args: argparse.Namespace) -> int:
     """Append an exclusion, or include the subject again."""
     chosen_subjects(args.dataset, [args.subject])
     reason = args.reason.strip() if args.verb == "exclude" else None
+    if args.verb == "include" and exclusion_reason(args.dataset, args.subject) is None:
+        raise AnnotationError(f"{args.subject} is not excluded")
     if reason == "":
         raise AnnotationError(f"{args.subject}: give a reason for it, such as 'heavy makeup'")
     event = Label(

@@ -267,12 +267,16 @@ def _first_choice(run: _Run, load: Workload, goal: Goal | None) -> Point:
     if clock.closed() or points[0].seconds > left:
         least = clock.now() + points[0].seconds
         words = "core time" if load.cores else f"with {count(load.width, 'worker')}"
-        known = "more than" if clock.closed() else "about"  # measuring did not end
+        asked = f"--budget {clock.budget.text if clock.budget else ''}"
+        if clock.closed():
+            raise ConfigError(
+                f"{asked}: the time ended while settings were measured, which is kept; the cheapest"
+                f" need more than {format_seconds(least)} {words}; give several times as much"
+            )
         raise ConfigError(
-            f"--budget {clock.budget.text if clock.budget else ''}: the cheapest settings need "
-            f"{known} {format_seconds(least)} {words}, {format_seconds(clock.now())} of them for "
-            f"measuring, which is kept; give --budget {budget_text(1.1 * least, load.cores)} or"
-            " more"
+            f"{asked}: the cheapest settings need about {format_seconds(least)} {words},"
+            f" {format_seconds(clock.now())} of them for measuring, which is kept; give --budget"
+            f" {budget_text(1.1 * least, load.cores)} or more"
         )
     point = choose(points, left * SAFETY, wanted)
     if goal is not None and wanted is not None and point.errors[wanted[0]].value > goal.value:

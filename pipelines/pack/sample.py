@@ -91,6 +91,7 @@ def read_subject(dataset: Dataset, name: str) -> PackedSubject:
         FormatError: one of these files is malformed.
     """
     index = read_index(dataset, name)
+    peaks = read_peaks(dataset, name)
     peak_rows = read_json_table(dataset.peaks_file(name), FormatError)
     track = read_track(existing_track(dataset, name))
     registered, notes = _read_registered(dataset, name, track)
@@ -99,7 +100,7 @@ def read_subject(dataset: Dataset, name: str) -> PackedSubject:
         cameras=read_cameras_of(dataset, name),
         recorded={c.id: [c.width, c.height] for c in read_recorded_cameras(dataset, name).values()},
         gains=read_gains(dataset, name),
-        peaks=read_peaks(dataset, name),
+        peaks=peaks,
         labels={expression: nameless(row) for expression, row in peak_rows.items()},
         track=track,
         registered=registered,

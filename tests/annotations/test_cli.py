@@ -179,6 +179,7 @@ def test_validate_counts_unreadable_lines(annotate, dataset):
         (["flag", "S001", "smile", "a\rb"], repr("a\rb")),
         (["mark", "S001", "smile", "14", "--annotator", "a\x1b[31m"], repr("a\x1b[31m")),
         (["exclude", "S001", " "], "S001"),
+        (["include", "S001"], "S001 is not excluded"),
     ],
 )
 def test_invalid_input_prints_one_line_naming_it(annotate, dataset, capsys, words, named):
@@ -266,6 +267,18 @@ def test_verbs_print_tables(annotate, dataset, capsys, verb, rows):
     assert main(["annotate", verb, str(dataset.root), *words]) == 0
     printed = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert [row for row in rows if row not in printed] == []
+
+
+def test_a_folder_that_is_not_a_dataset_is_refused(tmp_path, capsys):
+    assert main(["annotate", "status", str(tmp_path)]) == 2
+    assert f"{tmp_path}: not a dataset" in capsys.readouterr().err
+
+
+def test_the_terminal_does_not_open_without_included_subjects(annotate, dataset, capsys):
+    for subject in ("S001", "S002"):
+        annotate("exclude", subject, "large glasses")
+    assert main(["annotate", "ui", str(dataset.root)]) == 1
+    assert "no subject is ingested and not excluded" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["auto", "rule:last-frame", " "])

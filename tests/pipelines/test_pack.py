@@ -29,7 +29,7 @@ from pipelines.pack import STAGE as PACK
 from pipelines.pack.card import people_lines, split_subjects
 from pipelines.pack.config import EncodeConfig, PackConfig
 from pipelines.pack.crop import Crop, crop_pinhole, cut_depth, cut_image, cut_labels, head_crop
-from pipelines.pack.sample import nameless, occluded
+from pipelines.pack.sample import nameless, occluded, read_subject
 from pipelines.pack.stage import warn_of_gaps
 from tests.pipelines.bump_dataset import make_dataset, published
 
@@ -241,6 +241,11 @@ def test_samples_of_two_cameras_agree_on_the_surface(packed):
     assert first["alpha"][first["valid"]].mean() > 0.9
     assert first["meta"]["track"]["R"] == np.eye(3).tolist()
     assert first["meta"]["label"]["annotator"] == "person" and first["meta"]["fps"] == 24
+
+
+def test_a_subject_without_peak_frames_is_told_to_align_first(ingested):
+    with pytest.raises(StageError, match="not aligned; run 'express50 align"):
+        read_subject(ingested, "S001")
 
 
 def test_packing_twice_gives_the_same_bytes(dataset, packed, tmp_path):
