@@ -28,7 +28,7 @@ from pipelines.matte.plates import (
 
 # Deviations are standard deviations of noise, radii and distances shares of the longer side.
 LEAST_PART = 0.02  # a part of the subject smaller than this share of the largest is clutter
-LARGEST_HOLE = 0.05  # share of the image under which a hole in the subject may be filled
+LARGEST_HOLE = 0.06  # share of the window under which a hole in the subject may be filled
 REACH = 0.012  # least distance from which colours are taken
 SURE = 2.0  # deviations of alpha by which it must be under 1 in the solid to count as a gap
 SPREAD = 0.2  # share by which hair may be brighter or darker than visible hair nearby
@@ -70,7 +70,7 @@ def key_alpha(frame: np.ndarray, plate: np.ndarray, valid: np.ndarray, shadow: f
         return alpha
     # The remaining steps work around the subject only.
     x, y, width, height = cv2.boundingRect(region.astype(np.uint8))
-    margin = 4 * _pixels(CORE, length)
+    margin = 2 * _pixels(CORE, length) + 2  # beyond every disc, and three deviations of the blurs
     window = np.s_[
         max(0, y - margin) : y + height + margin, max(0, x - margin) : x + width + margin
     ]
@@ -171,7 +171,7 @@ def opened(mask: np.ndarray, radius: int, erode: Erode = eroded) -> np.ndarray:
 def _length(error: np.ndarray, model: PlateModel) -> np.ndarray:
     """Return the root mean square (H, W) of errors (H, W, 3), whitened: 1 on average for noise."""
     white = cv2.transform(error / model.sigma, model.whiten)
-    return np.sqrt(np.einsum("...i,...i->...", white, white) / 3.0)
+    return cv2.sqrt(cv2.transform(cv2.multiply(white, white), np.full((1, 3), 1 / 3)))
 
 
 def plate_difference(
@@ -233,7 +233,10 @@ def clear_plate(difference: np.ndarray, model: PlateModel, length: int) -> np.nd
     black and white plates do not count.
     """
     smooth = np.sqrt(cv2.blur(difference**2, (3, 3)))
-    exposed = (model.plate.max(axis=-1) > BLACK) & (model.plate.min(axis=-1) < WHITE)
+    red, green, blue = cv2.split(model.plate)
+    exposed = (cv2.max(cv2.max(red, green), blue) > BLACK) & (
+        cv2.min(cv2.min(red, green), blue) < WHITE
+    )
     return opened((smooth < OPEN) & exposed, _pixels(WIDE, length), eroded_about)
 
 
@@ -247,9 +250,9 @@ def find_support(
     """
     solid = (firm & region).astype(np.uint8)
     radius, edge = _pixels(CORE, length), _pixels(FILL, length)
-    # The subject continues beyond the image's border.
-    pad = 4 * radius + edge + 2
-    solid = cv2.copyMakeBorder(solid, pad, pad, pad, pad, cv2.BORDER_REPLICATE)
+    # The image's border cuts the subject off; the subject continues behind it.
+    pad = [4 * radius + edge + 2 if space < 3 * edge else 0 for space in _space_around(solid)]
+    solid = cv2.copyMakeBorder(solid, *pad, cv2.BORDER_REPLICATE)
     thick = opened(solid, _pixels(0.006, length), erode)
     closed = thick | eroded_about(~eroded_about(~thick, 2 * edge), 2 * edge)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(
@@ -258,12 +261,19 @@ def find_support(
     fill = stats[:, cv2.CC_STAT_AREA] < LARGEST_HOLE * firm.size
     fill[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = False
     fill[0] = False  # the closed part itself
-    wall = cv2.copyMakeBorder(clear.astype(np.uint8), pad, pad, pad, pad, cv2.BORDER_REPLICATE)
+    wall = cv2.copyMakeBorder(clear.astype(np.uint8), *pad, cv2.BORDER_REPLICATE)
     hull = (closed | fill[labels]) & (wall == 0)
     core = opened((solid > 0) | eroded_about(hull, 2 * edge), radius, erode)
-    # Lens and sampling mix the outermost pixels of the solid with plate.
-    core = eroded(core, 2 if length >= 256 else 1)[pad:-pad, pad:-pad]
+    # The outermost pixels of the solid are mixed with plate by lens and sampling.
+    core = eroded(core, 2 if length >= 256 else 1)
+    core = core[pad[0] : core.shape[0] - pad[1], pad[2] : core.shape[1] - pad[3]]
     return Support(core, dilated(region, 1) & ~core)
+
+
+def _space_around(mask: np.ndarray) -> tuple[int, int, int, int]:
+    """Return how many rows and columns are empty above, below, left and right of a mask (H, W)."""
+    x, y, width, height = cv2.boundingRect(mask)
+    return y, mask.shape[0] - y - height, x, mask.shape[1] - x - width
 
 
 def firm_pixels(

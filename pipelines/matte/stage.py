@@ -258,7 +258,15 @@ def border_contact(alpha: np.ndarray) -> dict[str, float]:
 def rim_of(alpha: np.ndarray) -> np.ndarray:
     """Return the pixels (H, W) bool about the outline of an alpha (H, W) uint8."""
     reach = max(1, round(RIM * max(alpha.shape)))
-    return dilated(alpha > 12, reach) & dilated(alpha < 243, reach)
+    rim = np.zeros(alpha.shape, bool)
+    x, y, width, height = cv2.boundingRect((alpha > 12).astype(np.uint8))
+    if width:
+        window = np.s_[
+            max(0, y - reach) : y + height + reach, max(0, x - reach) : x + width + reach
+        ]
+        part = alpha[window]
+        rim[window] = dilated(part > 12, reach) & dilated(part < 243, reach)
+    return rim
 
 
 def rim_figures(
