@@ -1,12 +1,12 @@
 """Find the 68 landmarks of the one head in a frame, without knowing where it is.
 
-A coarse pass looks at the whole frame (then at turned and ever smaller windows, only where those
-before show no face); crops about the points found so far are then refined, levelled by the line of
-the eyes. The last look is taken in several crops at once: where these do not agree there is no
-face.
-Points are the projections of the 3D landmarks, also where the head hides them: views of several
-cameras can be triangulated. Points that the head or something before it hides come with a low
-confidence. Beside them is the outline of the face, as published marks have the points 0 to 16.
+A coarse pass looks at the whole frame and, while no face is found, at turned and ever smaller
+windows. Crops around the points found so far, with the eyes level, then refine them. The last look
+is taken in several crops at once: if these do not agree, there is no face.
+
+Points are projections of 3D landmarks, even if the head hides them, so that views of several
+cameras can be triangulated. Hidden points have a low confidence. The outline of the face is given
+too, as published marks have it as points 0 to 16.
 """
 
 from __future__ import annotations
@@ -33,23 +33,20 @@ from express50.landmarks.network import (
 
 # A point whose error scale is this share of the face box has half the confidence.
 HALF_CONFIDENCE_SHARE = 0.025
-# Points outside a face are vague: at this share the score is halved.
-VAGUE_SHARE = 0.06
-# Where no face scores as much the search continues.
-FOUND_SCORE = 0.5
-# The network sees a face whose box is 0.5 to 1.4 of the one it was trained on, up to a quarter of
-# the window off its middle: the next windows are smaller by SHRINK, and STEP of their side apart.
+VAGUE_SHARE = 0.06  # of the face box: median error scale that halves the score; no face is vague
+FOUND_SCORE = 0.5  # the search continues until a face has this score
+# The network finds faces of 0.5 to 1.4 times the trained size, up to a quarter of the window off
+# its middle: windows shrink by SHRINK, and are STEP of their side apart.
 SHRINK, STEP = 0.55, 0.5
 SMALLEST = 0.25
 BATCH = 32  # windows at a time
-KEEP_SHARE = 0.8
-# The last look is taken in several crops, in shares of the trained one, some mirrored. On a face,
-# profiles too, they differ by less than DIFFER_SHARE of the face box (median point), on walls,
-# coins and backs of heads by more: there the score falls.
+KEEP_SHARE = 0.8  # of a place's score that a nearer look must have to replace it
+# Sizes of the crops of the last look, relative to the trained one, and whether they are mirrored.
+# On faces, even in profile, their median points differ by less than DIFFER_SHARE of the face box;
+# on walls, coins and backs of heads they differ by more, so there the score falls.
 LAST = ((0.75, False), (1.0, True), (1.0, False), (1.25, True))
 DIFFER_SHARE = 0.013
-# A close-up of the mouth is trusted where most of it is as likely in sight: not in profile.
-MOUTH_SEEN = 0.75
+MOUTH_SEEN = 0.75  # least median visibility of a mouth that is looked at closely: not in profile
 
 
 @dataclass(frozen=True)
@@ -59,12 +56,11 @@ class Detection:
     Attributes:
         points: (68, 2) pixels, corner origin, iBUG-68 order.
         sigma: (68,) expected error in pixels (the scale of a Laplace distribution).
-        confidence: (68,) in 0..1: the score, times how surely the point is seen, lowered where
-            sigma is large.
-        score: in 0..1, how surely a face looks towards the camera: the network's probability,
-            lowered where the points are vague or other crops give other points. Low for backs of
-            heads and where no head is visible.
-        outline: (17, 2) pixels, the edge of the face from ear to ear; None where it is not known.
+        confidence: (68,) in 0..1: score times the point's visibility, lowered if sigma is large.
+        score: in 0..1, how likely a face looks towards the camera: the network's probability,
+            lowered if the points are vague or other crops give other points. Low for backs of
+            heads and if no head is visible.
+        outline: (17, 2) pixels, the edge of the face from ear to ear; None if it is unknown.
     """
 
     points: np.ndarray
@@ -74,14 +70,14 @@ class Detection:
     outline: np.ndarray | None = None
 
     def marks(self) -> np.ndarray:
-        """Return points (68, 2) as published marks have them: 0 to 16 lie on the outline."""
+        """Return points (68, 2) as in published marks, where 0 to 16 lie on the outline."""
         if self.outline is None:
             return self.points
         return np.concatenate([self.outline, self.points[len(self.outline) :]])
 
 
 class Look(NamedTuple):
-    """A crop to be seen: the pyramid of an image and a placed crop (2, 3)."""
+    """A crop for the network: the pyramid of an image and a placed crop (2, 3)."""
 
     pyramid: list[np.ndarray]
     window: np.ndarray
@@ -109,11 +105,11 @@ def detect(
     Args:
         net: From `load_network`.
         image: (H, W, 3) uint8 RGB; any size.
-        refinements: Looks in sequence after the coarse pass; the last is taken in several crops,
-            some of them mirrored.
-        smallest: Side of the smallest windows searched, of the image's longer side. A face is
-            found in windows of up to three times its width; each further size, SHRINK of the one
-            before, costs about three times as much where no face is.
+        refinements: Looks after the coarse pass; the last is taken in several crops, some of
+            them mirrored.
+        smallest: Side of the smallest windows searched, as a share of the image's longer side. A
+            face is found in windows of up to three times its width. If there is no face, each
+            smaller size costs about three times as much as the one before.
 
     Raises:
         ValueError: another shape or type.
@@ -127,7 +123,7 @@ def detect_many(
     refinements: int = 2,
     smallest: float = SMALLEST,
 ) -> list[Detection]:
-    """Detect as `detect` does in each of several images, of a frame set or clip, for less time.
+    """Detect as `detect` does in several images, such as a frame set, in less time.
 
     Raises:
         ValueError: an image of another shape or type.
@@ -166,10 +162,10 @@ def _detection(place: _Place) -> Detection:
 
 
 def _searches(width: int, height: int, smallest: float) -> Iterator[list[np.ndarray]]:
-    """Yield windows to look in: the whole frame, it turned and smaller ones, smaller ones yet.
+    """Yield windows to look in: the whole frame, then turned and smaller ones, then smaller yet.
 
-    At last, where smaller windows than usual are asked for, those of the first size turned: a
-    photograph may lie on its side, the footage of a rig is known to do so or not.
+    If smaller windows than usual are allowed, turned ones of the second size come last, because a
+    photograph may lie on its side; of a rig's footage this is known.
     """
     longer = float(max(width, height))
     turned = [np.pi / 2, np.pi, 1.5 * np.pi]
@@ -197,7 +193,7 @@ def _windows(width: int, height: int, side: float, turn: float) -> list[np.ndarr
 def _refined(
     net: LandmarkNet, pyramids: list[list[np.ndarray]], places: list[_Place], refinements: int
 ) -> list[_Place]:
-    """Refine a place per image by nearer crops, and judge it by whether the last ones agree."""
+    """Refine a place per image by nearer crops; its score falls if the last ones do not agree."""
     places = list(places)
     straying = set[int]()
     for _ in range(refinements - 1):
@@ -205,7 +201,7 @@ def _refined(
         looks = [Look(pyramids[one], window_about(places[one].points)) for one in going]
         for one, refined in zip(going, _run(net, looks), strict=True):
             if refined.score < KEEP_SHARE * places[one].score:
-                # The crop went astray, as it may on a profile: the wider view knew better.
+                # The crop may miss a profile; then the wider view was better.
                 straying.add(one)
             else:
                 places[one] = refined
@@ -223,7 +219,7 @@ def _refined(
 
 
 def _agreed(place: _Place, looks: list[_Place]) -> _Place:
-    """Join the last looks at a place; the score falls where these do not agree."""
+    """Average the last looks at a place; the score falls if these do not agree."""
     points = np.stack([look.points for look in looks])
     mean = points.mean(0)
     spread = np.linalg.norm(points - mean, axis=2).mean(0)
@@ -236,7 +232,7 @@ def _agreed(place: _Place, looks: list[_Place]) -> _Place:
     )
     differ = np.median(spread) / (DIFFER_SHARE * max(face_box(mean)[1], 1e-6))
     good_mean = together.score >= KEEP_SHARE * place.score
-    # Where they agree their mean is the better place, even if a profile's score is less so near.
+    # If they agree, their mean is the better place, even if a profile scores less from so near.
     kept = together if differ < 1.0 or good_mean else place
     score = together.score if good_mean else place.score
     return replace(kept, score=float(score / (1.0 + differ**4)))
@@ -244,13 +240,11 @@ def _agreed(place: _Place, looks: list[_Place]) -> _Place:
 
 def place_window(centre: np.ndarray, side: float, angle: float) -> np.ndarray:
     """Place the network's crop: affine (2, 3) from crop pixels to image pixels, corner origin."""
-    scale = side / CROP
-    turn = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    return place_crop(centre, turn, CROP)
+    return place_level_crop(centre, side / CROP * np.array([np.cos(angle), np.sin(angle)]), CROP)
 
 
 def place_crop(centre: np.ndarray, turn: np.ndarray, size: int) -> np.ndarray:
-    """Place a square crop about a point of an image.
+    """Place a square crop around a point of an image.
 
     Args:
         centre: (2,) pixels of the image, corner origin.
@@ -264,13 +258,13 @@ def place_crop(centre: np.ndarray, turn: np.ndarray, size: int) -> np.ndarray:
 
 
 def place_level_crop(centre: np.ndarray, right: np.ndarray, size: int) -> np.ndarray:
-    """Place a crop whose rows run along a direction of the image; ``right`` (2,) is one pixel."""
+    """Place a crop whose rows run along ``right`` (2,), the step of one of its pixels."""
     turn = np.array([[right[0], -right[1]], [right[1], right[0]]])
     return place_crop(centre, turn, size)
 
 
 def cut_crop(image: np.ndarray, window: np.ndarray, size: int) -> np.ndarray:
-    """Cut a placed crop (size, size, 3) out of an image; its outermost pixels repeat."""
+    """Cut a placed crop (size, size, 3) out of an image, whose outermost pixels repeat."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     border = cv2.BORDER_REPLICATE
     return cv2.warpAffine(
@@ -285,10 +279,10 @@ def points_in_crop(window: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def window_about(points: np.ndarray) -> np.ndarray:
-    """Place the crop that the network was trained on about landmarks (68, 2), the eyes level."""
+    """Place a crop as in training around landmarks (68, 2), with the eyes level."""
     eyes = points[42:48].mean(0) - points[36:42].mean(0)
     down = points[8] - points[27]
-    # The face's own down direction also holds in profile, where the eyes coincide.
+    # In profile the eyes coincide, so the direction from nose to chin counts too.
     axis = eyes + np.array([down[1], -down[0]])
     angle = float(np.arctan2(axis[1], axis[0]))
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
@@ -307,7 +301,7 @@ def close_window(
 def _with_close_ups(
     net: LandmarkNet, pyramids: list[list[np.ndarray]], places: list[_Place]
 ) -> list[_Place]:
-    """Look at eyes and mouth again; a point stays where that is less sure of it."""
+    """Look closely at eyes and mouth; points are replaced by those with a smaller sigma."""
     found = []
     for pyramid, place in zip(pyramids, places, strict=True):
         if net.eyes is not None:
@@ -325,7 +319,7 @@ def _looked_closer(
     place: _Place,
     looks: tuple[tuple[np.ndarray, bool], ...],
 ) -> _Place:
-    """Look at some landmarks of a face, by their ids and whether the close-up is flipped."""
+    """Look at landmarks of a face again; a look has their ids, and whether it is mirrored."""
     points, sigma = place.points.copy(), place.sigma.copy()
     windows = [close_window(net, place.points, *look) for look in looks]
     crops = np.stack([sample_window(pyramid, window, net.crop) for window in windows])
@@ -366,7 +360,7 @@ def _run(net: LandmarkNet, looks: Sequence[Look]) -> list[_Place]:
     for start in range(0, len(looks), BATCH):
         part = looks[start : start + BATCH]
         crops = np.stack([sample_window(look.pyramid, look.window) for look in part])
-        # (N, H, W, 3) seen as (N, 3, H, W) lies in memory as channels-last already.
+        # Permuted to (N, 3, H, W), the crops are in channels-last memory format already.
         with torch.inference_mode():
             output = net(torch.from_numpy(crops).permute(0, 3, 1, 2).float() / 255.0)
         scales = output.log_scale.double().exp().numpy()
@@ -388,7 +382,7 @@ def _placed(
     seen: np.ndarray,
     score: float,
 ) -> _Place:
-    """Return what a crop showed in pixels of its image."""
+    """Return the face that a crop showed, in pixels of its image."""
     points, outline = (part @ window[:, :2].T + window[:, 2] for part in (found, edge))
     determinant = np.linalg.det(window[:, :2])
     sigma = sigma * np.sqrt(abs(determinant))
@@ -400,20 +394,20 @@ def _placed(
 
 
 def follow(net: LandmarkNet, image: np.ndarray, window: np.ndarray) -> Detection:
-    """Look once where a face is expected, as in a video's next frame.
+    """Find a face near where it is expected, as in a video's next frame, with one look.
 
     Args:
         net: From `load_network`.
-        image: (H, W, 3) uint8 RGB; only what lies about the window is read.
-        window: Affine (2, 3) from crop pixels to image pixels, as of `window_about`; the face may
-            lie a quarter of its side off the middle.
+        image: (H, W, 3) uint8 RGB; only the window and some pixels around are read.
+        window: Affine (2, 3) from crop pixels to image pixels, from `window_about`; the face may
+            be up to a quarter of its side off the middle.
 
     Returns:
-        The face, of a low score where there is none. `detect` is surer: it takes several looks.
+        The face, with a low score if there is none. `detect` takes several looks, so it is surer.
     """
     corners = window @ np.array([[0, CROP, 0, CROP], [0, 0, CROP, CROP], [1, 1, 1, 1]])
     size = np.array([image.shape[1], image.shape[0]])
-    # A window beside the image still shows its outermost pixels.
+    # A window outside the image still shows the outermost pixels.
     low = np.clip(np.floor(corners.min(1)) - 1, 0, size - 1).astype(int)
     high = np.clip(np.ceil(corners.max(1)) + 1, low + 1, size).astype(int)
     part = np.ascontiguousarray(image[low[1] : high[1], low[0] : high[0]])

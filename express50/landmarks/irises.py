@@ -1,8 +1,9 @@
-"""Find irises in the pixels.
+"""Find the irises of a face in the pixels.
 
-Every eye is brought to one size by its corners. A disc and the ring around it, both cut by the
-opening, are compared at every place and a few radii: iris and pupil are darker than the white
-around them (Daugman 1993 has the difference across a circle). Shut eyes say nothing.
+Every eye is scaled to one size by its corners. A disc and the ring around it, both limited to the
+opening between the lids, are compared at every place and with a few radii: iris and pupil are
+darker than the white around them (Daugman 1993 uses the difference across a circle). Shut eyes
+give nothing.
 """
 
 from __future__ import annotations
@@ -15,37 +16,34 @@ import numpy as np
 from express50.geometry.conventions import cell_to_corner
 from express50.landmarks.detector import Detection, cut_crop, place_level_crop, points_in_crop
 
-# Subject's left eye first, as the model's joints have it: corners, then the points of each lid.
+# Landmarks of the subject's left eye, then the right one: corners, upper lid, lower lid.
 EYES = ((42, 45, (43, 44), (47, 46)), (36, 39, (37, 38), (41, 40)))
 SIDE = 64
-# The crop spans this many eye widths; an iris is a fifth of an eye's width in radius, more where
-# the head is turned and the width foreshortened.
-SPAN = 1.5
+SPAN = 1.5  # width of the crop, in eye widths
+# In eye widths: an iris has a fifth, more if the head is turned and the width foreshortened.
 RADII = (0.17, 0.2, 0.235, 0.275)
-RING = 1.55
-# Landmarks may cut an opening by this share of its width.
-SLACK = 0.1
+RING = 1.55  # outer radius of the ring, in radii of the disc
+SLACK = 0.1  # share of the eye width by which landmarks may make the opening too small
 LEAST_WIDTH_PX = 6.0
-SHUT, OPEN = 0.1, 0.2
-# Contrast between disc and ring, of a crop whose mean light is a half: least, and that which gives
-# half of the confidence. Shut lids stay under the first.
+SHUT, OPEN = 0.1, 0.2  # heights of the opening, in eye widths, that give no and full confidence
+# Contrast between disc and ring, of a crop whose mean light is a half: the least, which shut lids
+# do not have, and the one that gives half of the confidence.
 LEAST_CONTRAST, CONTRAST = 0.12, 0.08
 LEAST_COVER, LEAST_CONFIDENCE = 0.35, 0.2
-# Standard deviation of a centre of confidence 1, in eye widths.
-SIGMA = 0.04
+SIGMA = 0.04  # standard deviation of a centre with confidence 1, in eye widths
 
 
 @dataclass(frozen=True)
 class Irises:
     """Iris centres of one image, the subject's left eye first."""
 
-    centres: np.ndarray  # (2, 2) pixels, corner origin; where the confidence is 0 the eye's middle
-    sigma: np.ndarray  # (2,) expected error in pixels; infinite where the confidence is 0
+    centres: np.ndarray  # (2, 2) pixels, corner origin; the eye's middle if the confidence is 0
+    sigma: np.ndarray  # (2,) expected error in pixels; infinite if the confidence is 0
     confidence: np.ndarray  # (2,) in 0..1; 0 for shut, hidden and tiny eyes
 
 
 def find_irises(image: np.ndarray, seen: Detection) -> Irises:
-    """Find both irises of a face whose landmarks were seen in an image (H, W, 3) uint8 RGB."""
+    """Find both irises of a face that was detected in an image (H, W, 3) uint8 RGB."""
     found = [_find(image, seen, eye) for eye in EYES]
     centres, sigma, confidence = (np.array(part) for part in zip(*found, strict=True))
     return Irises(centres, sigma, confidence)
@@ -74,10 +72,10 @@ def _find(
         return nothing
     window = place_level_crop(middle, SPAN * along / SIDE, SIDE)
     crop = cut_crop(image, window, SIDE).astype(np.float32)
-    # Red counts most, as blue irises are dark in it; the mean light is 0.5.
+    # Red counts most, because blue irises are dark in it; the mean light becomes 0.5.
     light = 0.6 * crop[..., 0] + 0.4 * crop[..., 1]
     light = light * (0.5 / max(float(light.mean()), 10.0))
-    # The opening between the lids, a little widened.
+    # The opening between the lids, slightly enlarged.
     inside = np.round(points_in_crop(window, ring)).astype(np.int32)
     mask = cv2.fillPoly(np.zeros((SIDE, SIDE), np.uint8), [inside], 1)
     grow = 2 * round(SLACK * SIDE / SPAN) + 1
@@ -91,7 +89,7 @@ def _find(
 
 
 def _disc(crop: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Find the best place (2,) in crop pixels, its contrast and the disc's share in the opening."""
+    """Find the best disc: centre (2,) in crop pixels, contrast, and share inside the opening."""
     best = (-np.inf, np.full(2, SIDE / 2), 0.0, 0.0)
     for radius in RADII:
         pixels = radius * SIDE / SPAN
@@ -118,7 +116,7 @@ def _disc(crop: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, float, float]
 
 
 def _peak(score: np.ndarray, row: int, column: int) -> np.ndarray:
-    """Return the offset (2,) x, y of a parabola's top through the best place and its neighbours."""
+    """Return the offset (2,) x, y from the best pixel to the top of a parabola around it."""
     offset = np.zeros(2)
     for axis, (line, at) in enumerate(((score[row], column), (score[:, column], row))):
         if not 0 < at < SIDE - 1:

@@ -1,17 +1,16 @@
 """Define the landmark network: a small encoder-decoder with one heat map per point.
 
-Points come from the expectation over softmax heat maps (integral regression, Sun et al. 2018), so
-they are continuous and have gradients everywhere. A small perceptron that sees all of them at once
-then corrects what does not look like a face, as where a heat map was fooled by an occluder, and
-says of each point how far off it may be (the scale of a two-dimensional Laplace distribution) and
-whether it can be seen.
+Points are expectations over softmax heat maps (integral regression, Sun et al. 2018), so they are
+continuous and have gradients everywhere. A small perceptron that sees all of them at once then
+corrects what does not look like a face, for example where an occluder misled a heat map. For each
+point it also estimates the error (the scale of a two-dimensional Laplace distribution) and whether
+it is visible.
 
-Eyes and mouth are looked at once more, at about twice the resolution: small networks of their own
-find their points, as the first one hardly tells half shut lids from open ones, or shows of teeth
-from shut lips.
+Small networks look at eyes and mouth again, at about twice the resolution, because the first one
+hardly distinguishes half shut lids from open ones, or bared teeth from shut lips.
 
-The landmarks are fixed places of a head. The outline, 17 points on the visible edge of the face, is
-what published marks have in place of the jaw line's. It is found in the same way and corrected by a
+Landmarks are fixed places of a head. The outline, 17 points on the visible edge of the face, is
+what published marks have instead of the jaw line. It is found in the same way, and corrected by a
 perceptron that sees it and the landmarks.
 """
 
@@ -34,27 +33,22 @@ from express50.landmarks import WEIGHTS
 
 CROP = 128
 POINTS, OUTLINE = 68, 17
-# Points may lie a little outside the crop: the grid of the heat maps is stretched about its middle.
-STRETCH = 1.15
-# Side of a crop over the longer side of the box of its landmarks.
-CROP_MARGIN = 1.55
-# Partner of each iBUG-68 point in the mirror image; below, of the 68 + 17 with the outline.
+STRETCH = 1.15  # of the heat maps about the crop's middle: points may lie a little outside the crop
+CROP_MARGIN = 1.55  # side of a crop over the longer side of its landmarks' box
+# Partner of each iBUG-68 point in the mirror image, then of the 68 + 17 with the outline.
 MIRROR = np.array(
     [*range(16, -1, -1), *range(26, 16, -1), 27, 28, 29, 30, 35, 34, 33, 32, 31,
      45, 44, 43, 42, 47, 46, 39, 38, 37, 36, 41, 40,
      54, 53, 52, 51, 50, 49, 48, 59, 58, 57, 56, 55, 64, 63, 62, 61, 60, 67, 66, 65]
 )  # fmt: skip
 MIRROR_WITH_OUTLINE = np.concatenate([MIRROR, np.arange(POINTS, POINTS + OUTLINE)[::-1]])
-# The landmarks of the subject's left eye and of the mouth.
 LEFT_EYE, MOUTH = np.arange(42, 48), np.arange(48, 68)
-# Those of the inner lips that meet, the upper ones first.
-INNER_LIPS = ((61, 62, 63), (67, 66, 65))
-# Suffix of buffers that are not stored: batch normalisation counts its batches.
-COUNTERS = "num_batches_tracked"
+INNER_LIPS = ((61, 62, 63), (67, 66, 65))  # those that meet, the upper ones first
+COUNTERS = "num_batches_tracked"  # suffix of batch normalisation's buffers that are not stored
 
 
 def face_box(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return centre (2,) and side of the square that the detector crops about landmarks (68, 2)."""
+    """Return centre (2,) and side of the square that is cropped around landmarks (68, 2)."""
     low, high = points.min(0), points.max(0)
     return 0.5 * (low + high), CROP_MARGIN * float((high - low).max())
 
@@ -65,11 +59,11 @@ class Output(NamedTuple):
     Attributes:
         points: (B, 68, 2) crop pixels.
         log_scale: (B, 68) natural logarithm of the Laplace scale in crop pixels.
-        seen: (B, 68) logit of whether nothing hides the point.
+        seen: (B, 68) logit of whether the point is visible.
         logit: (B,) logit of whether a face looks towards the camera.
         heat: (B, 68, H / 4, W / 4) heat maps before the softmax.
-        outline: (B, 17, 2) crop pixels; the landmarks 0 to 16 of a network that does not find it.
-        outline_log_scale, outline_heat: as of the landmarks.
+        outline: (B, 17, 2) crop pixels; landmarks 0 to 16 if the network does not find it.
+        outline_log_scale, outline_heat: as for the landmarks.
     """
 
     points: torch.Tensor
@@ -83,7 +77,7 @@ class Output(NamedTuple):
 
 
 class Residual(nn.Module):
-    """Two 3x3 convolutions with a skip."""
+    """Two 3x3 convolutions with a skip connection."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -95,7 +89,7 @@ class Residual(nn.Module):
 
 
 class ShapeHead(nn.Module):
-    """Looks at all points of a face together: corrections, error scales, visibility."""
+    """Corrects all points of a face together; estimates error scales and visibility."""
 
     def __init__(self, features: int, width: int = 192) -> None:
         super().__init__()
@@ -119,7 +113,7 @@ class ShapeHead(nn.Module):
 
 
 class OutlinePart(nn.Module):
-    """Finds the outline on maps of the trunk; see `Output`."""
+    """Finds the outline from the trunk's maps; see `Output`."""
 
     def __init__(self, maps: int, features: int, width: int = 160) -> None:
         super().__init__()
@@ -152,7 +146,7 @@ class CloseNet(nn.Module):
 
     Attributes:
         crop: side of the close-ups, a multiple of 8.
-        zoom: size of one of their pixels, in pixels of the face's crop.
+        zoom: size of a pixel of the close-ups, in pixels of the face's crop.
     """
 
     def __init__(self, count: int, crop: int, zoom: float) -> None:
@@ -164,7 +158,7 @@ class CloseNet(nn.Module):
         self.first, self.second = nn.Linear(48 * (crop // 8) ** 2, 64), nn.Linear(64, 3 * count)
 
     def forward(self, crops: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return points (B, N, 2) in crop pixels and log scales (B, N), as of the landmarks."""
+        """Return points (B, N, 2) in crop pixels and log scales (B, N), as for the landmarks."""
         x = functional.relu(self.stem(_normalised(crops)))
         x = functional.relu(self.down12(self.block24(x)))
         x = self.block6(functional.relu(self.down6(self.block12(x))))
@@ -174,7 +168,7 @@ class CloseNet(nn.Module):
 
 
 def eye_net() -> CloseNet:
-    """Return a network for the subject's left eye, or the right one mirrored."""
+    """Return a network for the subject's left eye, or the mirrored right one."""
     return CloseNet(len(LEFT_EYE), 48, 0.6)
 
 
@@ -186,11 +180,10 @@ def mouth_net() -> CloseNet:
 class LandmarkNet(nn.Module):
     """Maps crops (B, 3, 128, 128) in [0, 1] to landmarks; see `Output`.
 
-    Crops of half the size (64, 64) are understood as well; points are in pixels of 128 all the
-    same. Training begins with them, for a quarter of the time.
+    Crops of half the size (64, 64) work too, with points in pixels of 128. Training begins with
+    them, in a quarter of the time.
 
-    A network for other pictures than of `whole` heads finds no outline and has neither `eyes` nor
-    `mouth`.
+    Only a network for pictures of `whole` heads finds the outline, and has `eyes` and `mouth`.
     """
 
     def __init__(self, whole: bool = False, mouth: bool = True) -> None:
@@ -212,7 +205,7 @@ class LandmarkNet(nn.Module):
 
     def forward(self, crops: torch.Tensor) -> Output:
         """Run the network; exposure and contrast are normalised."""
-        # Places need single precision, whatever training has the convolutions done in.
+        # Positions need single precision, whatever precision training uses for convolutions.
         maps, features = (part.float() for part in self.trunk(crops))
         with torch.autocast("cpu", enabled=False):
             heat = self.heat(maps)
@@ -265,7 +258,7 @@ def expectation(heat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 def heat_loss(heat: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
     """Return the cross entropy (B, P) of heat maps and points (B, P, 2) spread over four cells.
 
-    Its gradient is strong from the first step, where that of the expectation is still faint.
+    Its gradient is strong from the first step on, unlike that of the expectation.
     """
     size = heat.shape[-1]
     cells = corner_to_cell(((points / CROP - 0.5) / STRETCH + 0.5) * size)
@@ -286,7 +279,7 @@ def heat_loss(heat: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
 
 
 def save_network(net: LandmarkNet, path: Path) -> None:
-    """Write the weights as float16 (counters of batch normalisation are left out)."""
+    """Write the weights as float16, without batch normalisation's counters."""
     state = {
         key: (value.half() if value.is_floating_point() else value).detach().cpu().numpy()
         for key, value in net.state_dict().items()
@@ -297,7 +290,7 @@ def save_network(net: LandmarkNet, path: Path) -> None:
 
 
 def load_network(path: Path = WEIGHTS) -> LandmarkNet:
-    """Read weights written by `save_network`; the network is ready for evaluation only.
+    """Read weights written by `save_network`, for evaluation only.
 
     Batch normalisations are folded into the convolutions before them.
     """
@@ -307,7 +300,7 @@ def load_network(path: Path = WEIGHTS) -> LandmarkNet:
 
 
 def trainable_network(path: Path = WEIGHTS) -> LandmarkNet:
-    """Read weights written by `save_network`, to train on from them.
+    """Read weights written by `save_network`, to continue training.
 
     Raises:
         FormatError: the file is missing, damaged or holds something else.
@@ -325,7 +318,7 @@ def trainable_network(path: Path = WEIGHTS) -> LandmarkNet:
 
 
 def fold(module: nn.Module) -> None:
-    """Fold batch normalisations into convolutions, in place; the result computes the same."""
+    """Fold batch normalisations into convolutions, in place; results stay the same."""
     for name, child in module.named_children():
         if isinstance(child, nn.Sequential) and isinstance(child[1], nn.BatchNorm2d):
             setattr(module, name, fuse_conv_bn_eval(child[0], child[1]))

@@ -4,8 +4,8 @@ FAN is the face alignment network (Bulat and Tzimiropoulos 2017). Its published 
 TorchScript files (2DFAN4, 3DFAN4) that map crops (B, 3, 256, 256) in [0, 1] to heat maps (B, 68,
 64, 64). The embedded network finds the face, FAN its points; nothing is downloaded.
 
-A source is called with an image, its camera's id and its frame, and answers with a `Marked` face:
-the frozen `Detection` that all share, the irises, and which convention its jaw line follows.
+A source is called with an image, its camera's id and its frame. It returns a `Marked` face: its
+`Detection`, its irises, and which convention its jaw line follows.
 """
 
 from __future__ import annotations
@@ -30,9 +30,8 @@ from express50.landmarks.network import load_network
 SCHEMA = "express50.landmarks/1"
 NAMES = ("schema", "cameras", "frames", "points")
 POINTS, IRISES = 68, 2
-# Points may lie this share of the image outside of it: a chin below the frame is still a chin.
-OUTSIDE = 0.5
-UNSURE = 1e-9  # a confidence below it says nothing
+OUTSIDE = 0.5  # share of the image's size that points may lie outside it, as a chin may
+UNSURE = 1e-9  # least confidence assumed, so that sigma is finite
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ def _existing_files(landmarks: str) -> dict[str, Path]:
 
 
 def try_source(landmarks: str) -> None:
-    """Read the files of a source as far as possible without cameras; raises as `open_source`."""
+    """Read a source's files as far as possible without cameras; raise as `open_source` does."""
     files = _existing_files(landmarks)
     if "landmarks" in files:
         _read_raw(files["landmarks"])
@@ -74,15 +73,15 @@ def open_source(
     smallest: float = SMALLEST,
     pictures: Mapping[str, Camera] | None = None,
 ) -> Source:
-    """Make a source ready.
+    """Return a source that is ready to be called.
 
     Args:
         landmarks: `embedded`, `fan:PATH` (TorchScript weights) or the path of a file of points
             (.npz or .json, see docs/FORMAT.md).
         cameras: as recorded, by id; points of a file are undistorted with them.
         refinements: looks of the embedded network.
-        smallest: windows that it searches, see `detect`.
-        pictures: pinhole cameras of the images that are looked at, by id; by default as recorded.
+        smallest: smallest windows that it searches, see `detect`.
+        pictures: pinhole cameras of the images, by id; by default of the recorded size.
 
     Raises:
         ConfigError: the file is missing, or is not of the expected kind.
@@ -117,10 +116,10 @@ def open_source(
 
 
 def given_detection(rows: np.ndarray) -> Detection:
-    """Make a detection of given rows (68, 3): pixels x, y, NaN where unknown, confidence 0..1.
+    """Make a detection from rows (68, 3): pixels x, y, NaN where unknown, and confidence 0..1.
 
-    Unknown points stand at the middle of the known ones, with an infinite sigma. A point of
-    confidence c is taken to be right within 0.6 % of the face's size over c.
+    Unknown points are put at the mean of the known ones, with an infinite sigma. The sigma of a
+    point of confidence c is 0.6 % of the face's size over c.
     """
     known = np.isfinite(rows[:, :2]).all(1) & (rows[:, 2] > 0)
     if not known.any():
@@ -133,7 +132,7 @@ def given_detection(rows: np.ndarray) -> Detection:
 
 
 def given_irises(rows: np.ndarray, face: Detection) -> Irises:
-    """Make irises of given points (70, 3): the subject's left one, then the right."""
+    """Make irises from the last of given points (70, 3): the subject's left one, then the right."""
     found = rows[POINTS : POINTS + IRISES]
     known = np.isfinite(found[:, :2]).all(1) & (found[:, 2] > 0)
     width = [np.linalg.norm(face.points[a] - face.points[b]) for a, b in ((45, 42), (39, 36))]
@@ -153,12 +152,12 @@ def read_points(
 
     Args:
         path: .npz or .json.
-        cameras: as recorded, by id; cameras of the file that are not among them are left out.
+        cameras: as recorded, by id; other cameras of the file are left out.
         pictures: pinhole cameras of the undistorted images; by default of the recorded size.
 
     Returns:
-        (68 or 70, 3) rows x, y in pixels of the undistorted image and confidence 0..1; x and y are
-        NaN where a point is unknown.
+        Rows (68 or 70, 3) of x, y in pixels of the undistorted image, NaN where a point is unknown,
+        and confidence 0..1.
 
     Raises:
         FormatError: another format, shape, an infinite number, a confidence out of range, or points
@@ -225,7 +224,7 @@ def _read_json(path: Path) -> Table:
 
 
 def _checked(rows: np.ndarray, camera: Camera, path: Path, key: tuple[str, int]) -> np.ndarray:
-    """Return the rows, or raise FormatError if they cannot be used."""
+    """Return the rows, or raise FormatError if they are not usable."""
     where = f"{path}: camera {key[0]}, frame {key[1]}"
     if rows.ndim != 2 or rows.shape[0] not in (POINTS, POINTS + IRISES) or rows.shape[1] != 3:
         raise FormatError(
@@ -252,17 +251,17 @@ def _checked(rows: np.ndarray, camera: Camera, path: Path, key: tuple[str, int])
 
 
 FAN_CROP, HEAT = 256, 64
-# A crop spans 200 / 195 times the sum of the sides of the face box that FAN was trained with, whose
-# middle lies an eighth of its height above; that box goes from above the brows to the chin.
+# FAN's crop spans 200 / 195 times the sum of the sides of a box that reaches from above the brows
+# (by BROW of the points' height) to the chin, about a centre RAISE of the box's height higher.
 SPAN, RAISE, BROW = 200.0 / 195.0, 0.12, 0.12
-REACH = 3
+REACH = 3  # cells around a heat map's peak that give its place
 
 
 def load_fan(path: Path) -> torch.jit.ScriptModule:
     """Read TorchScript weights.
 
     Raises:
-        ConfigError: not a TorchScript file, or one that maps crops to something else.
+        ConfigError: the file is not TorchScript, or does not map crops to heat maps.
     """
     wanted = f"expected FAN's TorchScript weights, (1, 3, {FAN_CROP}, {FAN_CROP}) to 68 heat maps"
     try:
@@ -270,7 +269,7 @@ def load_fan(path: Path) -> torch.jit.ScriptModule:
         with torch.inference_mode():
             output = _heat(fan, torch.zeros(1, 3, FAN_CROP, FAN_CROP))
     except (*DAMAGE, torch.jit.Error) as error:
-        # PyTorch's own words are a page, and guess at what happened to the file.
+        # PyTorch's message is a page long and guesses what happened to the file.
         raise ConfigError(f"landmarks: {path} cannot be loaded or called; {wanted}") from error
     if tuple(output.shape) != (1, POINTS, HEAT, HEAT):
         raise ConfigError(f"landmarks: {path} gives {tuple(output.shape)}; {wanted}")
@@ -278,9 +277,9 @@ def load_fan(path: Path) -> torch.jit.ScriptModule:
 
 
 def find_with_fan(fan: torch.jit.ScriptModule, image: np.ndarray, face: Detection) -> Detection:
-    """Find a detected face's points with FAN; its score is kept.
+    """Find the points of a detected face with FAN; the face keeps its score.
 
-    Confidence is the height of a point's heat map; sigma is its spread, a pixel of it at the least.
+    A point's confidence is its heat map's peak times the score; sigma comes from the peak's spread.
     The image is (H, W, 3) uint8 RGB.
     """
     window = fan_window(face.points)
@@ -289,7 +288,7 @@ def find_with_fan(fan: torch.jit.ScriptModule, image: np.ndarray, face: Detectio
         batch = torch.from_numpy(crop).permute(2, 0, 1)[None].float() / 255.0
         heat = _heat(fan, batch)[0].double().numpy()
     if not np.isfinite(heat).all():
-        raise ConfigError("landmarks: FAN's weights give NaN or infinite heat; use others")
+        raise ConfigError("landmarks: FAN's weights give NaN or infinite heat maps; use others")
     found = [_peak(one) for one in heat]
     cells, spread, height = (np.array(part) for part in zip(*found, strict=True))
     step = FAN_CROP / HEAT
@@ -301,7 +300,7 @@ def find_with_fan(fan: torch.jit.ScriptModule, image: np.ndarray, face: Detectio
 
 
 def fan_window(points: np.ndarray) -> np.ndarray:
-    """Place an upright crop about landmarks (68, 2): affine (2, 3) from crop to image pixels."""
+    """Place an upright crop around landmarks (68, 2): affine (2, 3) from crop to image pixels."""
     low, high = points.min(0), points.max(0)
     low = low - [0.0, BROW * (high[1] - low[1])]
     centre = 0.5 * (low + high) - [0.0, RAISE * (high[1] - low[1])]
@@ -310,13 +309,13 @@ def fan_window(points: np.ndarray) -> np.ndarray:
 
 
 def _heat(fan: torch.jit.ScriptModule, batch: torch.Tensor) -> torch.Tensor:
-    """Run FAN; a stack of several hourglasses answers with a list, whose last heat maps count."""
+    """Run FAN; a stack of hourglasses returns a list, whose last heat maps count."""
     output = fan(batch)
     return output[-1] if isinstance(output, list | tuple) else output
 
 
 def _peak(heat: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Find the place (2,) in cells, corner origin, spread in cells and height of a map's peak."""
+    """Find a heat map's peak: place (2,) in cells, corner origin, spread in cells, and height."""
     row, column = np.unravel_index(int(np.argmax(heat)), heat.shape)
     rows = slice(max(row - REACH, 0), row + REACH + 1)
     columns = slice(max(column - REACH, 0), column + REACH + 1)

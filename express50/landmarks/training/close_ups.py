@@ -1,6 +1,6 @@
-"""Train the networks of `weights.npz` for eyes and mouth on close-ups of rendered heads.
+"""Train the networks for eyes and mouth of `weights.npz` on close-ups of rendered heads.
 
-Most of the eyes blink. Most mouths are shut, a little open, or show their teeth.
+Most eyes blink. Most mouths are shut, slightly open, or show their teeth.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from express50.landmarks.network import (
 from express50.landmarks.training.descent import descend
 from express50.landmarks.training.random_heads import BLINKS, random_head
 from express50.landmarks.training.scene import HeadScene
-from express50.landmarks.training.views import composite, made_once, make_backgrounds, spoil
+from express50.landmarks.training.views import composite, degrade, made_once, make_backgrounds
 
 SIDE = 112  # pixels of a close-up
 YAW = np.radians(75.0)
 FILE_HEADS = 100
-# The crop is off by what the face's landmarks may be: shares of its side, factor, radians.
+# Random errors of the crop, as landmarks have: share of its side, logarithm of its size, radians.
 SHIFT, GROWTH, TURN = 0.05, 0.12, 0.08
 RATE = 2e-3
 Rng = np.random.Generator
@@ -40,17 +40,17 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True)
 class Part:
-    """A part of the face that is looked at closely.
+    """A part of the face for which there are close-ups.
 
     Attributes:
-        name: of its files.
-        make: return its network, untrained.
-        sides: the landmarks of its close-ups, one close-up each; the second's is mirrored.
-        frame_m: metres that a rendered view shows.
-        blinks, mouths: shares of the heads that `random_head` is asked for.
-        views: of each close-up of a head.
-        files: of `FILE_HEADS` heads, per head model.
-        steps, batch: batches in all, and their size.
+        name: used in file names.
+        make: returns its untrained network.
+        sides: the landmarks of each close-up; the second close-up is mirrored.
+        frame_m: width of a rendered view, metres.
+        blinks, mouths: arguments of `random_head`.
+        views: number per close-up of a head.
+        files: number per head model, of `FILE_HEADS` heads each.
+        steps, batch: number of batches, and their size.
     """
 
     name: str
@@ -77,7 +77,7 @@ class CloseView:
 
     image: np.ndarray  # (SIDE, SIDE, 3) uint8
     points: np.ndarray  # (68, 2) float32 pixels, corner origin, most of them outside
-    side: np.int64  # of its part
+    side: np.int64  # index into the part's sides
 
 
 def draw_close_ups(part: Part, model: HeadModel, heads: int, rng: Rng) -> list[CloseView]:
@@ -98,7 +98,7 @@ def draw_close_ups(part: Part, model: HeadModel, heads: int, rng: Rng) -> list[C
 def close_crop(
     part: Part, net: CloseNet, view: CloseView, rng: Rng
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Cut a crop (S, S, 3) uint8 as the detector does, spoiled; points (N, 2) in it."""
+    """Cut a degraded crop (S, S, 3) uint8 as the detector does; also return its points (N, 2)."""
     ids, flipped = part.sides[view.side], bool(view.side)
     if len(part.sides) == 1 and rng.random() < 0.5:
         ids, flipped = MIRROR[ids], True
@@ -110,11 +110,11 @@ def close_crop(
     middle = middle + turn @ (rng.normal(size=2) * SHIFT * net.crop)
     window = np.column_stack([turn, middle - turn @ np.full(2, net.crop / 2)])
     points = (view.points[ids] - window[:, 2]) @ np.linalg.inv(turn).T
-    return spoil(cut_crop(view.image, window, net.crop), rng), points.astype(np.float32)
+    return degrade(cut_crop(view.image, window, net.crop), rng), points.astype(np.float32)
 
 
 def train_part(part: Part, models: list[HeadModel], folder: Path, seed: int) -> CloseNet:
-    """Train on close-ups of the head models; these and the run's state are kept in a folder."""
+    """Train a part's network on close-ups of head models; the folder keeps these and the state."""
     torch.manual_seed(seed)
     views: list[CloseView] = []
     for model in models:
@@ -131,7 +131,7 @@ def train_part(part: Part, models: list[HeadModel], folder: Path, seed: int) -> 
         crops, points = zip(*(close_crop(part, net, views[k], rng) for k in picks), strict=True)
         images = torch.from_numpy(np.stack(crops)).permute(0, 3, 1, 2).float() / 255.0
         found, log_scale = net(images)
-        # The slope at zero distance is bounded by the added 0.01 px^2.
+        # The added 0.01 px^2 bounds the slope at zero distance.
         distance = (found - torch.from_numpy(np.stack(points))).square().sum(-1).add(0.01).sqrt()
         return (0.2 * distance + 2 * log_scale + distance * torch.exp(-log_scale)).mean()
 

@@ -1,4 +1,4 @@
-"""Minimise a loss, step by step, so that an interrupted run goes on to the same result."""
+"""Minimise a loss step by step; an interrupted run continues to the same result."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from express50.errors import TrainError
 from express50.files.arrays import read_weights
 
 WARM_UP = 100
-# The rate stays high until this share of the run, then falls in a straight line.
-HIGH_SHARE = 0.65
+HIGH_SHARE = 0.65  # of the run; then the learning rate falls linearly
 KEEP_EVERY = 100
 Net = TypeVar("Net", bound=torch.nn.Module)
 
@@ -23,13 +22,13 @@ Net = TypeVar("Net", bound=torch.nn.Module)
 def descend(
     net: Net, steps: int, rate: float, state: Path, loss_at: Callable[[int], torch.Tensor]
 ) -> Net:
-    """Minimise the loss of every step; an interrupted run goes on from its `state`, a file.
+    """Minimise the loss of every step; an interrupted run continues from the file `state`.
 
-    Parameters that require no gradient stay as they are.
+    Parameters that require no gradient do not change.
     """
     trained = [part for part in net.parameters() if part.requires_grad]
     optimiser = torch.optim.AdamW(trained, lr=rate, weight_decay=1e-3)
-    first = take_up(state, net, optimiser)
+    first = load_state(state, net, optimiser)
     began, losses = time.monotonic(), []
     for step in range(first, steps):
         fall = (steps - step) / (steps * (1.0 - HIGH_SHARE))
@@ -44,22 +43,22 @@ def descend(
             seconds = (time.monotonic() - began) / (step + 1 - first)
             recent = np.mean(losses[-KEEP_EVERY:])
             print(f"step {step + 1}: loss {recent:.3f}, {seconds:.2f} s", flush=True)
-            keep_state(state, net, optimiser, step + 1)
+            save_state(state, net, optimiser, step + 1)
     return net.eval()
 
 
-def keep_state(path: Path, net: Net, optimiser: torch.optim.Optimizer, step: int) -> None:
-    """Write a run's state, from which `take_up` goes on."""
+def save_state(path: Path, net: Net, optimiser: torch.optim.Optimizer, step: int) -> None:
+    """Write the state of a run before its step of this number."""
     part = path.with_suffix(".part")
     torch.save({"net": net.state_dict(), "optimiser": optimiser.state_dict(), "step": step}, part)
     part.replace(path)
 
 
-def take_up(path: Path, net: Net, optimiser: torch.optim.Optimizer) -> int:
-    """Read a state that `keep_state` wrote, if there is one; the step to go on with."""
+def load_state(path: Path, net: Net, optimiser: torch.optim.Optimizer) -> int:
+    """Read a state of `save_state` if there is one; return the next step."""
     if not path.exists():
         return 0
-    state = read_weights(path, TrainError, str(path), "a state of training", "delete it")
+    state = read_weights(path, TrainError, str(path), "a training state", "delete it")
     net.load_state_dict(state["net"])
     optimiser.load_state_dict(state["optimiser"])
     print(f"continuing from step {state['step']} ({path}; delete it to start over)")

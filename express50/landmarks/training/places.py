@@ -1,9 +1,9 @@
 """Find places on a head model by closest point, and the outline of the face in a view.
 
 The outline is points 0 to 16 of the published mark-up of 68. People who mark photographs
-(Multi-PIE, 300-W) put them on the visible edge of the face: from before the ear at the height of
-the eyes (0 and 16) down to the lowest edge of the chin (8), evenly spaced. The jaw's landmarks of a
-head model are fixed places instead.
+(Multi-PIE, 300-W) space them evenly along the visible edge of the face: from in front of the ears
+at eye height (0 and 16) down to the lowest edge of the chin (8). A head model's landmarks of the
+jaw are fixed places instead.
 """
 
 from __future__ import annotations
@@ -47,29 +47,29 @@ def closest_places(model: HeadModel, points: np.ndarray) -> Places:
 def place_points(
     model: HeadModel, places: Places, vertices: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the points (D, 3) at places of a head model, at rest or with vertices (V, 3)."""
+    """Return the points (D, 3) at places of a head model with vertices (V, 3), or at rest."""
     mesh = model.template.double().numpy() if vertices is None else vertices
     return (mesh[model.faces.numpy()[places[0]]] * places[1][..., None]).sum(1)
 
 
 def moved_onto(source: HeadModel, model: HeadModel, points: np.ndarray) -> np.ndarray:
-    """Move points (N, 3) on a source at rest by the fit of its landmarks to a model's."""
+    """Map points (N, 3) of a source at rest to a model, by a similarity fit of their landmarks."""
     marks = [landmarks(one, one.template[None])[0].double().numpy() for one in (source, model)]
     s, R, t = similarity_fit(*marks)
     return s * points @ R.T + t
 
 
-EYE_BAND_M, CHIN_BAND_M = 0.005, 0.004  # about the height of the eye corners; about the middle
-MASK_SIDE, MASK_SHARE = 512, 0.9  # pixels of the face's mask, and the face's share of them
-SMOOTHING = 6  # pixels of the mask: models mark out the face triangle by triangle
+EYE_BAND_M, CHIN_BAND_M = 0.005, 0.004  # around the height of the eye corners; around the middle
+MASK_SIDE, MASK_SHARE = 512, 0.9  # side of the face's mask, pixels, and the face's share of it
+SMOOTHING = 6  # pixels of the mask, because the face ends along triangles
 HALF = 8  # steps from an ear to the chin
 
 
 class FaceFront:
-    """The part of a head model whose edge is marked: the face down to the jaw's lower edge."""
+    """The part of a head model whose edge is the outline: the face down to the jaw's lower edge."""
 
     def __init__(self, model: HeadModel) -> None:
-        """Find the part; where it ends is said by the built-in head."""
+        """Find the part; other head models take its limits from the built-in one."""
         builtin = load_head("procedural")
         region = {name: mask.numpy() for name, mask in builtin.regions.items()}
         front = region["face"] & ~region["nose"] & ~region["lips"]
@@ -88,12 +88,7 @@ class FaceFront:
         self.chin = ids[low]
 
     def outline(self, pixels: np.ndarray, marks: np.ndarray) -> np.ndarray:
-        """Return points 0 to 16 (17, 2) of a view.
-
-        Args:
-            pixels: (V, 2) where the view shows the head's vertices.
-            marks: (68, 2) where it shows the landmarks.
-        """
+        """Return points 0 to 16 (17, 2) of a view with vertices (V, 2) and landmarks (68, 2)."""
         down = marks[8] - marks[27]
         across = np.array([down[1], -down[0]])  # towards the subject's left
         ends = (
@@ -107,7 +102,7 @@ class FaceFront:
         )
         edge = np.roll(edge, -first, axis=0)
         middle, last = (middle - first) % len(edge), (last - first) % len(edge)
-        if middle > last:  # the way over the chin is the other one
+        if middle > last:  # the edge runs the other way round
             edge = np.roll(edge[::-1], 1, axis=0)
             middle, last = len(edge) - middle, len(edge) - last
         halves = _spaced(edge[: middle + 1]), _spaced(edge[middle : last + 1])
@@ -133,12 +128,12 @@ class FaceFront:
 
 @lru_cache(maxsize=4)
 def face_front(model: HeadModel) -> FaceFront:
-    """Return the marked part of a head model."""
+    """Return the part of a head model that has the outline."""
     return FaceFront(model)
 
 
 def _spaced(line: np.ndarray) -> np.ndarray:
-    """Return HALF + 1 points at even distances along a line (n, 2), its ends included."""
+    """Return HALF + 1 evenly spaced points of a line (n, 2), including its ends."""
     steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
     way = np.concatenate([[0.0], np.cumsum(steps)])
     even = np.linspace(0.0, way[-1], HALF + 1)

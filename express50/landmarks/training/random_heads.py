@@ -1,10 +1,9 @@
 """Make random heads to train the landmark detector on: shape, expression, pose, skin, hair.
 
-Shapes, skins, hair and light are drawn far beyond what is usual on purpose, so that the detector
-learns where things are on a face and not how one renderer or one head model paints them. Most
-skins are people's all the same: what photographs show is in the middle of what is drawn. Most heads
-play entries of the 60-expression script, weaker, stronger, lopsided or two at once; the others move
-random muscles, so that unscripted expressions occur as well.
+Shapes, skins, hair and light vary far more than in reality, so that the detector learns where
+things are on a face and not how one renderer or head model draws them. Most skins are still
+realistic. Most heads show entries of the 60-expression script, weaker, stronger, lopsided or two
+at once; the others move random muscles, so that unscripted expressions occur too.
 """
 
 from __future__ import annotations
@@ -20,18 +19,18 @@ from express50.landmarks.network import INNER_LIPS
 from express50.landmarks.training.places import Places, closest_places, place_points
 
 BROWS = slice(17, 27)
-SCRIPTED_SHARE = 0.6  # of the heads play entries of the script
+SCRIPTED_SHARE = 0.6  # share of the heads that show entries of the script
 LASHES = "eyelashes"
-BLINKS = 0.22  # share of the heads that close an eye, or both
-SHUT, TEETH = 0.3, 0.75  # shares of drawn mouths that are shut, and that are so or show teeth
+BLINKS = 0.22  # share of the heads that close one eye or both
+SHUT, TEETH = 0.3, 0.75  # of drawn mouths: share that is shut; share that is shut or shows teeth
 Rng = np.random.Generator
 
 
 @dataclass(frozen=True)
 class RandomHead:
-    """One random head: vertices, normals (V, 3), the same without hair `skin` (V, 3), landmarks.
+    """One random head: vertices, normals, vertices without hair `skin` (V, 3 each), landmarks.
 
-    `look` is the seed of the paint on its canvas: places are painted where a view sees them.
+    `look` is the seed of its colours, which are painted on the canvas where a view sees it.
     """
 
     vertices: np.ndarray
@@ -45,13 +44,15 @@ class RandomHead:
 
 @dataclass(frozen=True)
 class Canvas:
-    """Places to paint."""
+    """Places on a head that `paint` colours."""
 
     rest: np.ndarray  # (N, 3) metres, on the head at rest
-    region: dict[str, np.ndarray]  # names and which of the places are in it, (N,) bool
+    region: dict[str, np.ndarray]  # by name, which of the places are in it, (N,) bool
     marks: np.ndarray  # (68, 3) landmarks of the head at rest
-    top: float | None = None  # height of the crown; None: of the highest of the places
-    eyes: dict[str, np.ndarray] | None = None  # centres of the eyeballs; None: of their places
+    top: float | None = None  # height of the crown; None: of the highest place
+    eyes: dict[str, np.ndarray] | None = (
+        None  # centres of the eyeballs; None: means of their places
+    )
 
     @classmethod
     def of(cls, model: HeadModel) -> Canvas:
@@ -63,10 +64,10 @@ class Canvas:
         return cls(rest, region, marks, float(rest[:, 1].max()), eyes)
 
     def at(self, faces: np.ndarray, weights: np.ndarray) -> Canvas:
-        """Return places on faces (N, 3) at barycentric weights (N, 3) of a canvas of vertices."""
+        """Return the places at weights (N, 3) of faces (N, 3), for a canvas of vertices."""
         nearest = np.take_along_axis(faces, weights.argmax(1)[:, None], 1)[:, 0]
         region = {name: mask[nearest] for name, mask in self.region.items()}
-        # The rim of the lips is smooth, not as the mesh has it.
+        # Interpolated, so that the rim of the lips is smoother than the triangles.
         lips = (self.region["lips"][faces] * weights).sum(1) > 0.5
         region["face"] = (region["face"] | region["lips"]) & ~lips
         region["lips"] = lips
@@ -79,8 +80,8 @@ def random_head(
 ) -> RandomHead:
     """Draw shape, expression, pose, smooth deformation, hair and colours.
 
-    The share `blinks` of the heads close an eye or both; the lids then stop anywhere. A share
-    `mouths` shut their lips, part them a little or show their teeth.
+    A share `blinks` of the heads close one eye or both, more or less far. A share `mouths` shut
+    their lips, part them a little or show their teeth.
     """
     draw = random_parameters(model, rng, blinks, mouths)
     with torch.no_grad():
@@ -102,9 +103,9 @@ def random_head(
 
 
 def _move_brows(model: HeadModel, canvas: Canvas, rng: Rng) -> tuple[Canvas, Places]:
-    """Move the brows of a canvas, and return where their landmarks are: on the hairs.
+    """Move the brows of a canvas; also return the places of their landmarks, on the hairs.
 
-    Else the bone would say enough, and the brows of people differ in where they are on it.
+    People's brows lie differently on the bone, so the detector must learn to see the hairs.
     """
     brows = canvas.marks[BROWS].copy()
     outwards = np.sign(brows[:, 0])
@@ -119,7 +120,7 @@ def _move_brows(model: HeadModel, canvas: Canvas, rng: Rng) -> tuple[Canvas, Pla
 
 
 def _meet_lips(points: np.ndarray) -> None:
-    """Put inner lips (of points (68, 3)) that passed through each other where they meet."""
+    """Put inner lips of points (68, 3) that passed through each other where they meet, in place."""
     upper, lower = (list(ids) for ids in INNER_LIPS)
     through = (points[upper] - points[lower]) @ (points[27] - points[8]) < 0
     middle = 0.5 * (points[upper] + points[lower])
@@ -128,13 +129,13 @@ def _meet_lips(points: np.ndarray) -> None:
 
 
 def waves(points: np.ndarray, rng: Rng, count: int, low: float, high: float) -> np.ndarray:
-    """Draw a smooth field (N,) of about unit variance; wave numbers low..high radians per metre."""
+    """Draw a smooth field (N,), about unit variance, wave numbers low..high radians per metre."""
     directions = rng.normal(size=(count, 3))
     directions *= (np.exp(rng.uniform(np.log(low), np.log(high), count)))[:, None] / (
         np.linalg.norm(directions, axis=1, keepdims=True)
     )
     phases = rng.uniform(0, 2 * np.pi, count).astype(np.float32)
-    # Single precision: sines of doubles cost eighty times as much.
+    # In single precision, because sines of doubles take eighty times as long.
     angles = points.astype(np.float32) @ directions.T.astype(np.float32) + phases
     return np.sin(angles).sum(1) * np.float32(np.sqrt(2.0 / count))
 
@@ -149,11 +150,11 @@ def deform(vertices: np.ndarray, rng: Rng) -> np.ndarray:
 
 
 def paint(canvas: Canvas, rng: Rng) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return colours (N, 3) in [0, 1] and hair thickness (N,) metres or None."""
+    """Draw colours (N, 3) in [0, 1], and the thickness (N,), metres, of hair or None."""
     rest, region, marks = canvas.rest, canvas.region, canvas.marks
     skin = _skin_color(rng)
     colors = np.tile(skin, (len(rest), 1))
-    # Lashes, and what is in no region, a small part behind the lids, are dark.
+    # Lashes and what is in no region, a small part behind the lids, become dark.
     nothing = ~np.any([mask for name, mask in region.items() if name != LASHES], axis=0)
     for most, count, low, high in ((0.15, 12, 20.0, 150.0), (0.12, 24, 150.0, 900.0)):
         spots = most * rng.beta(1.0, 3.0) * waves(rest, rng, count, low, high)
@@ -170,7 +171,7 @@ def paint(canvas: Canvas, rng: Rng) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def _skin_color(rng: Rng) -> np.ndarray:
-    """Draw a person's skin from dark over tan to pale; any colour in some draws."""
+    """Draw a skin colour (3,) from dark to pale; in some draws any colour."""
     if rng.random() < 0.1:
         return rng.uniform(0.15, 0.95, 3)
     tones = np.array(
@@ -193,11 +194,11 @@ def _tint_features(colors: np.ndarray, canvas: Canvas, tone: np.ndarray, rng: Rn
     brow_color = rng.uniform(0.0, 0.5) * np.array([1.0, rng.uniform(0.5, 1), rng.uniform(0.3, 1)])
     brow_color = np.minimum(brow_color, rng.uniform(0.1, 0.7) * tone)
     skin = np.flatnonzero(region["face"])
-    width = rng.uniform(0.0035, 0.0075)  # the line runs a little below the skin
+    width = rng.uniform(0.0035, 0.0075)  # the line through the marks is slightly below the skin
     taper = rng.uniform(0.0, 0.6)
     strength = rng.choice([0.0, rng.uniform(0.45, 1.0)], p=[0.05, 0.95])
     for line in (marks[17:22], marks[26:21:-1]):
-        # Distance of each place to the polyline, from the outer end on: hairs end at the marks.
+        # The polyline from the outer end; it is shortened so that hairs end at the marks.
         line = line.copy()
         for end, beside in ((0, 1), (-1, -2)):
             inwards = line[beside] - line[end]
@@ -219,7 +220,7 @@ def _tint_features(colors: np.ndarray, canvas: Canvas, tone: np.ndarray, rng: Rn
 
 
 def _grow_hair(colors: np.ndarray, canvas: Canvas, rng: Rng) -> np.ndarray | None:
-    """Paint a hair cap above a tilted plane, in place; returns its thickness or None for bald."""
+    """Paint hair above a tilted plane, in place; return its thickness (N,), None if bald."""
     if rng.random() < 0.3:
         return None
     rest, region, marks = canvas.rest, canvas.region, canvas.marks
@@ -280,7 +281,7 @@ def _color_eyes_and_mouth(colors: np.ndarray, canvas: Canvas, rng: Rng) -> None:
 def random_parameters(
     model: HeadModel, rng: Rng, blinks: float = BLINKS, mouths: float = 0.0
 ) -> dict[str, torch.Tensor]:
-    """Draw arguments for `express50.head.model.pose`, a batch of one."""
+    """Draw the arguments of `express50.head.model.pose` for a batch of one."""
     shape = rng.normal(size=len(model.shape_names)) * rng.uniform(0.5, 1.4)
     jaw = rng.normal(size=3) * np.array([0.03, 0.03, 0.02])
     neck = rng.normal(size=3) * 0.15
@@ -313,7 +314,7 @@ def random_parameters(
 
 
 def _lopsided(entry: Expression, model: HeadModel, rng: Rng) -> np.ndarray:
-    """Return coefficients (X,) of a script entry; in some draws one side of the face does less."""
+    """Return coefficients (X,) of a script entry; in some draws one side of the face is weaker."""
     sides = {"_L": 1.0, "_R": 1.0}
     if rng.random() < 0.3:
         sides[("_L", "_R")[rng.integers(2)]] = rng.uniform(0.0, 1.0)
@@ -327,7 +328,7 @@ def _lopsided(entry: Expression, model: HeadModel, rng: Rng) -> np.ndarray:
 
 
 def _close_eyes(expression: np.ndarray, model: HeadModel, rng: Rng, share: float) -> None:
-    """Blink in some draws, wink in others, in place."""
+    """Close both eyes in some draws, one in others, in place."""
     kind = rng.random()
     if kind > share:
         return

@@ -1,6 +1,6 @@
-"""Render random heads: painted pixel by pixel, lit as in rooms, streets and by flashes, in glasses.
+"""Render random heads, painted per pixel, in the light of rooms, streets and flashes, with glasses.
 
-Most light is what photographs show: from above or the camera, soft, with shadows; the rest comes
+Most light is as in photographs: from above or from the camera, soft, with shadows. The rest comes
 from anywhere in any colour.
 """
 
@@ -13,18 +13,16 @@ import numpy as np
 import open3d as o3d
 
 from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
-from express50.geometry.transforms import make_transform
+from express50.geometry.transforms import make_transform, unit
 from express50.head.model import HeadModel
 from express50.landmarks.training.places import face_front
 from express50.landmarks.training.random_heads import LASHES, Canvas, RandomHead, paint, waves
 
 FRAME_SIDE_M = 0.38
-# A landmark counts as seen if nothing lies further than this in front of it.
-HIDING_M = 0.005
-# Rays per vertex that measure how open it lies to the light of the surroundings, and their length.
-OPEN_RAYS, OPEN_M = 4, 0.08
+HIDING_M = 0.005  # what lies this far or less in front of a landmark does not hide it
+OPEN_RAYS, OPEN_M = 4, 0.08  # rays per vertex that measure the ambient light, and their length
 GLASSES_SHARE, NATURAL_SHARE = 0.25, 0.75
-LASHES_SHARE = 0.3  # of the heads that have them: opaque ones are far heavier than people's
+LASHES_SHARE = 0.3  # of the heads that have lashes keep them: opaque ones are denser than real ones
 RING = 24  # corners of a lens
 Rng = np.random.Generator
 
@@ -35,13 +33,13 @@ class TrainingView:
 
     rgba: np.ndarray  # (S, S, 4) uint8, black where empty
     points: np.ndarray  # (68 + 17, 2) float32 pixels, corner origin: landmarks, outline
-    visible: np.ndarray  # (68,) bool, nothing of the head or its glasses is before the landmark
-    facing: np.float32  # cosine between the ways that the face looks and to the camera
+    visible: np.ndarray  # (68,) bool, neither the head nor its glasses hide the landmark
+    facing: np.float32  # cosine between the face's direction and that to the camera
 
 
 @dataclass(frozen=True)
 class _Hits:
-    """Places that rays see first: points, normals, directions (N, 3); which pixels, (S, S) bool."""
+    """First hits of rays: points, normals, directions to the camera (N, 3); pixels (S, S) bool."""
 
     points: np.ndarray
     normals: np.ndarray
@@ -51,7 +49,7 @@ class _Hits:
 
 
 class HeadScene:
-    """A random head in a ray caster, to be seen from many sides."""
+    """A random head in a ray caster, which renders views of it."""
 
     def __init__(self, model: HeadModel, head: RandomHead) -> None:
         """Compile a head."""
@@ -65,7 +63,7 @@ class HeadScene:
         self.openness = self._measure_openness(np.random.default_rng(head.look))
 
     def _measure_openness(self, rng: Rng) -> np.ndarray:
-        """Return the share (V,) of the surroundings that light each vertex."""
+        """Return the share (V,) of the ambient light that reaches each vertex."""
         starts = self.head.vertices + 6e-4 * self.head.normals
         free = np.zeros(len(starts), np.float32)
         for _ in range(OPEN_RAYS):
@@ -79,7 +77,7 @@ class HeadScene:
     ) -> TrainingView:
         """Render (side, side) pixels from a yaw in radians, 0 in front; the rest is random.
 
-        The whole head, or `close`, a point (3,) and how many metres about it.
+        Shows the whole head, or `close`: a point (3,) and the metres around it.
         """
         marks = self.head.landmarks
         target, frame_m = close or (marks.mean(0) + np.array([0.0, 0.02, -0.06]), FRAME_SIDE_M)
@@ -96,23 +94,24 @@ class HeadScene:
         # Right eye to left eye is +x, brow to chin is -y: (-y) x (+x) = +z.
         forward = unit(np.cross(marks[8] - marks[27], marks[45] - marks[36]))
         facing = np.float32(forward @ unit(eye - marks[30]))
-        pixels = project(K, cam_from_world, marks)
+        projection = K @ cam_from_world[:3]
+        pixels = project(projection, marks)
         if rng.random() < GLASSES_SHARE and facing > -0.1:
-            for outline in self._wear_glasses(rgba, eye, K @ cam_from_world[:3], rng):
+            for outline in self._wear_glasses(rgba, eye, projection, rng):
                 ring = np.round(outline).astype(np.float32)
                 visible &= [cv2.pointPolygonTest(ring, tuple(xy), False) <= 0 for xy in pixels]
-        edge = self.front.outline(project(K, cam_from_world, self.head.skin), pixels)
+        edge = self.front.outline(project(projection, self.head.skin), pixels)
         points = np.concatenate([pixels, edge]).astype(np.float32)
         return TrainingView(rgba, points, visible, facing)
 
     def _seen(self, eye: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Return which points (N, 3) the head does not hide from an eye (3,)."""
+        """Mark the points (N, 3) that the head does not hide from an eye (3,)."""
         towards = points - eye
         share = self.scene.cast_rays(join_rays(eye, towards))["t_hit"].numpy()
         return (1.0 - share) * np.linalg.norm(towards, axis=1) < HIDING_M
 
     def _shade(self, rays: o3d.core.Tensor, rng: Rng) -> np.ndarray:
-        """Cast rays, paint and light the hits: rgba (side, side, 4) uint8."""
+        """Cast rays, paint and light the hits; return rgba (side, side, 4) uint8."""
         cast = self.scene.cast_rays(rays)
         distance = cast["t_hit"].numpy()
         hit = np.isfinite(distance)
@@ -127,7 +126,7 @@ class HeadScene:
         openness = (self.openness[face] * bary).sum(1)
         diffuse, shine = self._light(_Hits(points, normals, -unit(ahead), openness, hit), rng)
         color = albedo * diffuse + shine
-        # A camera exposes for what it sees, more or less.
+        # Exposed for what the camera sees, with some error.
         bright = np.percentile(color.mean(1), 90) if len(color) else 1.0
         color *= rng.uniform(0.5, 1.05) / max(bright, 0.02)
         image = np.zeros((*hit.shape, 4), np.uint8)
@@ -136,7 +135,7 @@ class HeadScene:
         return image
 
     def _light(self, hits: _Hits, rng: Rng) -> tuple[np.ndarray, np.ndarray]:
-        """Draw ambient light and one to three lamps: diffuse and specular light (N, 3) each."""
+        """Draw ambient light and one to three lamps; return diffuse and specular light (N, 3)."""
         natural = rng.random() < NATURAL_SHARE
         above = unit(np.array([0.0, 1.0, 0.0]) + rng.normal(size=3) * (0.3 if natural else 2.0))
         sky = 0.5 + 0.5 * hits.normals @ above
@@ -158,7 +157,7 @@ class HeadScene:
         return diffuse, specular
 
     def _shadow(self, hits: _Hits, direction: np.ndarray, rng: Rng) -> np.ndarray:
-        """Return the share (N,) of a lamp that the head does not block: hard or soft edges."""
+        """Return the share (N,) of a lamp that the head does not block, with hard or soft edges."""
         size, softness = rng.uniform(0.0, 0.25), rng.uniform(0.0, 0.6)
         jitter = size * rng.normal(size=hits.points.shape)
         rays = join_rays(hits.points + 1e-3 * hits.normals, unit(direction + jitter))
@@ -166,7 +165,7 @@ class HeadScene:
         mask = hits.pixels.astype(np.float32)
         image = np.zeros_like(mask)
         image[hits.pixels] = free
-        # Rays of neighbouring pixels, jittered, together sample a lamp of some size.
+        # The jittered rays of neighbouring pixels together sample a lamp of some size.
         sigma = 0.5 + 8.0 * size
         image, mask = (cv2.GaussianBlur(one, (0, 0), sigma) for one in (image, mask))
         return (image / np.maximum(mask, 1e-6))[hits.pixels]
@@ -174,13 +173,13 @@ class HeadScene:
     def _wear_glasses(
         self, rgba: np.ndarray, eye: np.ndarray, projection: np.ndarray, rng: Rng
     ) -> list[np.ndarray]:
-        """Draw glasses, in place; returns outlines (RING, 2) of lenses that hide the eyes."""
+        """Draw glasses, in place; return the outlines (RING, 2) of lenses that hide the eyes."""
         size = rng.uniform([0.021, 0.015], [0.029, 0.025])
         square, lift = rng.uniform(0.5, 1.0), rng.uniform(0.012, 0.02)
         rings, bridge, temples = glasses_lines(self.head.landmarks, size, square, lift)
         color = (*(float(c) for c in rng.uniform(0, 255 if rng.random() < 0.4 else 70, 3)), 255.0)
         dark, opaque = rng.random() < 0.25, []
-        rings_2d = [_flat(projection, ring) for ring in rings]
+        rings_2d = [project(projection, ring) for ring in rings]
         for ring in rings_2d:
             strength = rng.uniform(0.5, 1.0) if dark else rng.uniform(0.0, 0.2)
             _blend(rgba, ring, rng.uniform(0, 90 if dark else 255, 3), strength)
@@ -208,7 +207,7 @@ class HeadScene:
         thick: int,
     ) -> None:
         """Draw the parts of a line (N, 3) that the head does not hide, in place."""
-        seen, flat = self._seen(eye, line), _flat(projection, line)
+        seen, flat = self._seen(eye, line), project(projection, line)
         for k in range(len(line) - 1 + closed):
             j = (k + 1) % len(line)
             if seen[k] and seen[j]:
@@ -219,11 +218,11 @@ class HeadScene:
 def glasses_lines(
     marks: np.ndarray, size: np.ndarray, square: float, lift: float
 ) -> tuple[list[np.ndarray], np.ndarray, list[np.ndarray]]:
-    """Place glasses before landmarks (68, 3), ``lift`` metres off the eyes.
+    """Place glasses in front of landmarks (68, 3), ``lift`` metres off the eyes.
 
     Returns:
-        rings (RING, 3) around the lenses, of half-axes ``size`` (2,) metres and corners the sharper
-        the smaller ``square`` is; the bridge (3, 3); the temples (12, 3).
+        rings (RING, 3) around the lenses, with half-axes ``size`` (2,), metres, and sharper corners
+        for a smaller ``square``; the bridge (3, 3); the temples (12, 3).
     """
     across = unit(marks[45] - marks[36])
     up = unit(marks[27] - marks[8] - across * (across @ (marks[27] - marks[8])))
@@ -239,17 +238,8 @@ def glasses_lines(
     return rings, bridge, temples
 
 
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Scale vectors (..., 3) to length 1; zero stays zero."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
-
-
-def project(K: np.ndarray, cam_from_world: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return pixels (N, 2) of points (N, 3)."""
-    return _flat(K @ cam_from_world[:3], points)
-
-
-def _flat(projection: np.ndarray, points: np.ndarray) -> np.ndarray:
+def project(projection: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the pixels (N, 2) of points (N, 3) under a projection (3, 4)."""
     pixels = points @ projection[:, :3].T + projection[:, 3]
     return pixels[:, :2] / pixels[:, 2:]
 
@@ -264,7 +254,7 @@ def _lamp(camera: np.ndarray, natural: bool, rng: Rng) -> np.ndarray:
 
 
 def _roughen(normals: np.ndarray, canvas: Canvas, rng: Rng) -> np.ndarray:
-    """Bend normals (N, 3) as pores and, on old faces, wrinkles do."""
+    """Return normals (N, 3) bent by pores and, on old faces, wrinkles."""
     skin = canvas.region["face"] | canvas.region["neck"]
     bend = np.zeros_like(normals)
     for low, high, most, flat in ((400.0, 2500.0, 0.12, 1.0), (150.0, 700.0, 0.35, 0.25)):
@@ -276,7 +266,7 @@ def _roughen(normals: np.ndarray, canvas: Canvas, rng: Rng) -> np.ndarray:
 
 
 def _blend(rgba: np.ndarray, outline: np.ndarray, color: np.ndarray, strength: float) -> None:
-    """Lay a colour over what is inside an outline (N, 2) of an image, in place."""
+    """Blend a colour into the inside of an outline (N, 2) of an image, in place."""
     mask = np.zeros(rgba.shape[:2], np.uint8)
     cv2.fillPoly(mask, [np.round(outline * 8).astype(np.int32)], 255, cv2.LINE_AA, 3)
     share = (strength / 255) * mask[..., None].astype(np.float32)

@@ -1,13 +1,13 @@
-"""Make `weights.npz`.
+"""Train the networks of `weights.npz`.
 
     python -m express50.landmarks.training.train --views DIR [--ict PATH] [--start WEIGHTS]
 
-Trains on renders of random heads only: the procedural head and, where a path is given,
-ICT-FaceKit; the shipped file used both, in several runs that each went on from the one before
-(`--start`). docs/LOG.md has their commands. `--parts` trains these parts of given weights alone:
-all else, batch normalisations included, is held as it is. No photograph of a person is used. The
-result depends on the arguments alone, up to how the machine rounds. A run that was interrupted goes
-on from its last state, which is kept in DIR, to the same result.
+Trains on renders of random heads: of the procedural head and, if a path is given, of ICT-FaceKit.
+No photograph of a person is used. The shipped file comes from both heads and several runs, each
+with the weights of the one before as `--start`; docs/LOG.md has the commands. `--parts` trains only
+these parts of given weights; all others, including batch normalisations, do not change. The result
+depends on the arguments alone, up to rounding. An interrupted run continues from its last state in
+DIR to the same result.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ from express50.landmarks.training.views import (
 )
 
 BATCH = 32
-RATE, RATE_ON = 2e-3, 1e-3  # from nothing, from given weights
+RATE, RATE_ON = 2e-3, 1e-3  # from random weights, from given ones
 FIRST_FILES = 6
 STEPS_PER_FILE = 300
 HELD_OUT = 0
-# Of the network: those that find points and faces, close-ups, and what these (not close-ups) share.
+# The trunk, what finds points and faces with it, and the close-ups, which do not use it.
 PARTS = ("trunk", "heat", "shape", "face", "outline", *CLOSE_UPS)
-SMALL_EVERY = 4  # after the small steps one in so many stays small, so that blurred faces are kept
+SMALL_EVERY = 4  # after the small steps, one in this many stays small, for blurred faces
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,17 +64,17 @@ class TrainingPlan:
     """Settings of a training run."""
 
     steps: int = 6000
-    "Batches of 32 crops in all."
+    "Number of batches of 32 crops."
     small_steps: int = 3000
-    "Of these, the first that are at half resolution."
+    "The first of these are at half resolution."
     files: int = 30
     "Files of views per head model."
     seed: int = 0
-    "Of everything random."
+    "Seed of everything random."
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Render missing views, train, save and report the error on held-out heads."""
+    """Render missing views, train, save, and print the errors on held-out heads."""
     parser = argparse.ArgumentParser(
         prog="python -m express50.landmarks.training.train", description=__doc__
     )
@@ -84,14 +84,14 @@ def main(arguments: list[str] | None = None) -> int:
     for name, value in vars(TrainingPlan()).items():
         flag = f"--{name.replace('_', '-')}"
         parser.add_argument(flag, type=int, default=value, help=words[name])
-    parser.add_argument("--start", type=Path, help="weights to go on from")
+    parser.add_argument("--start", type=Path, help="weights to start from")
     parser.add_argument(
         "--parts", nargs="+", choices=PARTS, default=PARTS, help="what to train; all by default"
     )
     parser.add_argument("--out", type=Path, default=WEIGHTS)
     options = parser.parse_args(arguments)
     if options.start is None and set(options.parts) != set(PARTS):
-        parser.error("--parts needs --start: weights that have the other parts")
+        parser.error("--parts needs --start, the weights of the other parts")
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     models = [load_head(spec) for spec in ("procedural", options.ict) if spec]
@@ -108,7 +108,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def start_network(start: Path | None, parts: Sequence[str] = PARTS) -> LandmarkNet:
-    """Return a network with what given weights hold of it, ready to train some of its parts."""
+    """Return a network with the given weights, ready to train some of its parts."""
     net = LandmarkNet(whole=True)
     if start is not None:
         net.load_state_dict(trainable_network(start).state_dict(), strict=False)
@@ -125,7 +125,7 @@ def train(
     start: Path | None = None,
     parts: Sequence[str] = PARTS,
 ) -> LandmarkNet:
-    """Train on views of the head models; views and the run's state are kept in a folder."""
+    """Train on views of the head models; the folder keeps the views and the run's state."""
     torch.manual_seed(plan.seed)
     backgrounds = make_backgrounds(400, np.random.default_rng([plan.seed, 1]))
     net = start_network(start, parts)
@@ -136,12 +136,12 @@ def train(
     sets: list[list[TrainingView]] = []
 
     def loss_at(step: int) -> torch.Tensor:
-        # Few files at first, so that training can begin soon.
+        # Few files at first, so that training starts early.
         files = min(plan.files, FIRST_FILES + step // STEPS_PER_FILE)
         while len(sets) < len(models) * files:
             number = HELD_OUT + 1 + len(sets) // len(models)
             sets.append(open_views(folder, models[len(sets) % len(models)], number, plan.seed))
-        # Seeded by the step, so that a run taken up again draws what it would have drawn.
+        # Seeded by the step, so that a continued run draws the same crops.
         rng = np.random.default_rng([plan.seed, 2, step])
         small = step < plan.small_steps or step % SMALL_EVERY == 0
         size = CROP // 2 if small else CROP
@@ -182,9 +182,9 @@ def crop_batch(crops: list[TrainingCrop]) -> LandmarkBatch:
 def point_loss(
     output: Output, points: torch.Tensor, first: int = 0
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return losses and distances (B, N) of the landmarks from `first` on, at points (B, N, 2).
+    """Return losses and distances (B, N) of the landmarks from `first` on to points (B, N, 2).
 
-    The loss sums distance, likelihood and entropy; distances are crop pixels.
+    The loss sums distance, likelihood and cross entropy; distances are in crop pixels.
     """
     found = output.points[:, first:], output.log_scale[:, first:], output.heat[:, first:]
     return place_loss(*found, points)
@@ -194,14 +194,14 @@ def place_loss(
     found: torch.Tensor, log_scale: torch.Tensor, heat: torch.Tensor, points: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return losses and distances (B, N) of found points (B, N, 2), see `point_loss`."""
-    # The square root's slope at zero distance is bounded by the added 0.01 px^2.
+    # The added 0.01 px^2 bounds the slope at zero distance.
     distance = ((found - points).square().sum(-1) + 0.01).sqrt()
     likelihood = 2 * log_scale + distance * torch.exp(-log_scale)
     return 0.2 * distance + likelihood + heat_loss(heat, points), distance
 
 
 def crop_loss(net: LandmarkNet, crops: list[TrainingCrop]) -> torch.Tensor:
-    """Return the points' distance and likelihood, and entropies of heat maps and answers."""
+    """Return the loss of a batch: that of points and outline, and entropies of both logits."""
     batch = crop_batch(crops)
     with torch.autocast("cpu", torch.bfloat16):
         output: Output = net(batch.images)
@@ -216,7 +216,7 @@ def crop_loss(net: LandmarkNet, crops: list[TrainingCrop]) -> torch.Tensor:
 
 @torch.inference_mode()
 def validate(net: LandmarkNet, views: list[TrainingView], seed: int) -> str:
-    """Return errors in crop pixels by the head's turn, and how often the answers are right."""
+    """Describe the errors by the head's yaw, and how often visibility and score are right."""
     rng = np.random.default_rng([seed, 3])
     backgrounds = make_backgrounds(50, rng)
     errors, seen, right = [], [], []

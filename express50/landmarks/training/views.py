@@ -1,4 +1,4 @@
-"""Cut training crops of rendered heads on random backgrounds, spoiled as cameras do.
+"""Cut training crops of rendered heads on random backgrounds, degraded as by cameras.
 
 A file of views is made once; it depends on the seed, the head model and its number alone.
 """
@@ -32,13 +32,13 @@ Rng = np.random.Generator
 Record = TypeVar("Record")
 SIDE = 192
 FILE_VIEWS = 300
-# Each head is seen from every fifth of the range in which a face can be made out, and from behind.
+# Each head is seen once from each fifth of the yaws at which its face is visible, and from behind.
 FACE_YAW = np.radians(100.0)
 VIEWS_PER_HEAD = 6
 
 
 def draw_yaws(rng: np.random.Generator) -> np.ndarray:
-    """Draw yaws (VIEWS_PER_HEAD,) of a head, radians: even in front, the last from behind."""
+    """Draw the yaws (VIEWS_PER_HEAD,) of a head, radians: stratified in front, the last behind."""
     strata = VIEWS_PER_HEAD - 1
     front = ((np.arange(strata) + rng.random(strata)) * 2 / strata - 1) * FACE_YAW
     return np.append(front, rng.uniform(FACE_YAW, 2 * np.pi - FACE_YAW))
@@ -55,9 +55,9 @@ def draw_views(model: HeadModel, count: int, rng: np.random.Generator) -> list[T
 
 
 def open_views(folder: Path, model: HeadModel, number: int, seed: int) -> list[TrainingView]:
-    """Read one file of `FILE_VIEWS` views, which is rendered if it is not there yet."""
+    """Read one file of `FILE_VIEWS` views; render it if it does not exist."""
     rng = np.random.default_rng([seed, number, *model.name.encode()])
-    # Other heads or landmarks make other files.
+    # The name changes with the head and its landmarks.
     parts = (model.template, model.landmark_faces, model.landmark_bary)
     made_of = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
     digest = hashlib.sha256(made_of).hexdigest()[:8]
@@ -66,13 +66,13 @@ def open_views(folder: Path, model: HeadModel, number: int, seed: int) -> list[T
 
 
 def made_once(path: Path, kind: type[Record], make: Callable[[], list[Record]]) -> list[Record]:
-    """Read a file of records, dataclasses of arrays, which are made if it is not there yet."""
+    """Read a file of records, dataclasses of arrays; make it if it does not exist."""
     names = kind.__annotations__
     if not path.exists():
         records = make()
         arrays: Any = {name: np.stack([getattr(one, name) for one in records]) for name in names}
         path.parent.mkdir(parents=True, exist_ok=True)
-        # Two processes that happen to make the same file write the same bytes.
+        # If two processes make the same file, they write the same bytes.
         part = path.with_suffix(f".{os.getpid()}.part")
         with part.open("wb") as file:
             np.savez(file, **arrays)
@@ -141,11 +141,11 @@ def random_crop(
     shown = (column >= 0) & (row >= 0) & (column < size) & (row < size)
     shown[shown] = covered[row[shown], column[shown]] == 0
     visible = (visible & shown).astype(np.float32)
-    return TrainingCrop(spoil(image, rng), points.astype(np.float32), visible, score, weight)
+    return TrainingCrop(degrade(image, rng), points.astype(np.float32), visible, score, weight)
 
 
 def composite(rgba: np.ndarray, matrix: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """Warp a view (black where empty) into the crop over a background; uint8."""
+    """Warp a view, black where empty, into the crop over a background; return it as uint8."""
     scale = float(np.sqrt(abs(np.linalg.det(matrix[:, :2]))))
     if scale < 0.8:
         rgba = cv2.GaussianBlur(rgba, (0, 0), 0.45 / scale)
@@ -165,7 +165,7 @@ def _random_color(rng: Rng) -> tuple[float, ...]:
 
 
 def _shoulders(image: np.ndarray, points: np.ndarray, rng: Rng) -> None:
-    """Paint a body of one colour below the chin, in place: not all below a head is backdrop."""
+    """Paint a body of one colour below the chin, in place, in half of the draws."""
     if rng.random() < 0.5:
         return
     height, down = _size_and_down(points)
@@ -177,11 +177,11 @@ def _shoulders(image: np.ndarray, points: np.ndarray, rng: Rng) -> None:
 
 
 def _hair_locks(image: np.ndarray, mask: np.ndarray, points: np.ndarray, rng: Rng) -> None:
-    """Paint strands of one colour that fall over a part of the face, in place."""
+    """Paint strands of one colour over a part of the face, in place."""
     height, down = _size_and_down(points)
     across = np.array([down[1], -down[0]])
     count = int(rng.integers(8, 120))
-    # A fringe, or hair that hangs beside the face.
+    # A fringe, or hair beside the face.
     side = rng.uniform(-0.6, 0.6) if rng.random() < 0.5 else rng.choice([-0.6, 0.6])
     begin = points[27] - height * down * rng.uniform(0.3, 0.7)
     start = begin + height * (side + rng.normal(size=(count, 1)) * 0.12) * across
@@ -234,8 +234,8 @@ def _whole(values: np.ndarray) -> tuple[int, int]:
     return int(values[0]), int(values[1])
 
 
-def spoil(image: np.ndarray, rng: Rng) -> np.ndarray:
-    """Apply gain, white balance, gamma, haze, blur, low resolution, noise and JPEG; uint8 out."""
+def degrade(image: np.ndarray, rng: Rng) -> np.ndarray:
+    """Apply random gain, white balance, gamma, haze, blur, low resolution, noise and JPEG."""
     ramp = np.arange(256)[:, None] / 255.0
     curve = (ramp * rng.uniform(0.8, 1.25, 3)) ** rng.uniform(0.65, 1.5) * rng.uniform(0.6, 1.3)
     table = np.clip(255 * curve + rng.uniform(-20, 30), 0, 255).astype(np.uint8)
@@ -244,7 +244,7 @@ def spoil(image: np.ndarray, rng: Rng) -> np.ndarray:
         image = cv2.merge([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)] * 3)
     size = full = len(image)
     if rng.random() < 0.45:
-        # A small or distant face: what follows happened to its few pixels.
+        # A small or distant face: what follows applies to its few pixels.
         size = int(full * rng.uniform(0.22, 0.9))
         image = cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA)
     if rng.random() < 0.35:
@@ -264,7 +264,7 @@ def spoil(image: np.ndarray, rng: Rng) -> np.ndarray:
 
 
 def _motion(length: float, rng: Rng) -> np.ndarray:
-    """Return the kernel of a straight motion of some pixels."""
+    """Return the kernel of a straight motion over a length in pixels."""
     side = 2 * int(np.ceil(length / 2)) + 1
     kernel, angle = np.zeros((side, side), np.float32), rng.uniform(0, np.pi)
     step = 0.5 * length * np.array([np.cos(angle), np.sin(angle)])
@@ -274,7 +274,7 @@ def _motion(length: float, rng: Rng) -> np.ndarray:
 
 
 def make_backgrounds(count: int, rng: Rng) -> np.ndarray:
-    """Draw backgrounds (count, 2 CROP, 2 CROP, 3) uint8: noise at many scales, strokes."""
+    """Draw backgrounds (count, 2 CROP, 2 CROP, 3) uint8: noise at many scales, lines, ellipses."""
     side = 2 * CROP
     pool = np.zeros((count, side, side, 3), np.uint8)
     for index in range(count):

@@ -19,7 +19,7 @@ from express50.geometry.cameras import Camera
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.raycast import join_rays, mesh_scene
 from express50.geometry.sampling import bilinear
-from express50.geometry.transforms import make_transform
+from express50.geometry.transforms import make_transform, unit
 from express50.head.model import HeadModel, pose, vertex_normals
 from express50.landmarks.training.random_heads import (
     Canvas,
@@ -28,7 +28,6 @@ from express50.landmarks.training.random_heads import (
     random_parameters,
     waves,
 )
-from express50.landmarks.training.scene import unit
 from pipelines.track.face_uv import HEIGHT, WIDTH, FaceUvMap
 from pipelines.track.surface import Visibility, sample_normals
 from pipelines.track.terms import MeshPlaces
