@@ -10,7 +10,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -189,7 +189,10 @@ def _ledger_finding(dataset: Dataset, fix: bool, read_only: bool) -> Finding | N
 def _person_findings(dataset: Dataset, checkpoints: Sequence[Path]) -> Iterator[Finding]:
     if not (digests := withdrawn(dataset)):
         return
-    test = names_any_of(digests)
+    there = set(dataset.subjects())
+    with suppress(FormatError):  # which is a finding of its own
+        there |= dataset.captures().keys()
+    test = names_any_of(digests, there)
     for path in [*files_that(test, dataset.root), *(p for p in checkpoints if says(p, test))]:
         inside = path.is_relative_to(dataset.root)
         yield Finding(

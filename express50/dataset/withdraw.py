@@ -5,7 +5,8 @@ running its command makes it again without the person; others' outputs that name
 A checkpoint loses the person's codes and frames; only retraining removes what its other weights
 learned. The raw capture lies outside the dataset: deleting it is up to its owner.
 
-Ids match as whole words: with letters or digits next to it, it is a different id. Archives, arrays
+Ids match as whole words: with letters or digits next to it, it is a different id, and so is a part
+of another subject's id (S001 of S001_2). Archives, arrays
 of text and the ledger are searched; pixels and points are not, as they may contain any four bytes
 by chance.
 """
@@ -74,10 +75,11 @@ def plan(dataset: Dataset, subject: str) -> list[Path]:
     # Reject all other names: '', '..' or 'shards' would name folders that are not a person's.
     if not (subject in known or labelled or text_digest(subject) in withdrawn(dataset)):
         check_known(str(dataset.root), "subject", [subject], sorted(known))
-    paths = sorted(_own_paths(dataset, subject)) + sorted(_mixed_paths(dataset))
+    found_paths = [*sorted(_own_paths(dataset, subject)), *sorted(_mixed_paths(dataset))]
+    paths = list(dict.fromkeys(found_paths))  # what came back of a person who was withdrawn is both
     # Other subjects' outputs that name this one, such as peaks matched to the reference person's.
     gone, naming = set(paths), []
-    for path in files_that(names(subject), dataset.root):
+    for path in files_that(names_in(dataset, subject), dataset.root):
         parts = path.relative_to(dataset.root).parts
         items = [dataset.root.joinpath(*parts[:depth]) for depth in (3, 2)]
         found = next((item for item in items if (item / "metrics.json").is_file()), None)
@@ -97,7 +99,7 @@ def _own_paths(dataset: Dataset, subject: str) -> Iterator[Path]:
         with suppress(FormatError):
             if subject in map(str, read_json_table(reference, FormatError).values()):
                 yield reference  # the next subject becomes the reference
-    test = names(subject)
+    test = names_in(dataset, subject)
     # Settings such as pack.test_subjects; the stage's next run writes its own.
     yield from (p for p in (dataset.root / "config").glob("*.toml") if says(p, test))
     for path in (dataset.root / "logs").glob("*/*.txt"):
@@ -138,6 +140,7 @@ def withdraw(
         StageError: a stage is running.
         FormatError: the ledger is damaged; nothing was removed.
     """
+    test = names_in(dataset, subject)
     with hold_stages(dataset, sorted(p.stem for p in (dataset.root / "config").glob("*.toml"))):
         paths = plan(dataset, subject)
         if dataset.ledger.is_file():
@@ -159,13 +162,12 @@ def withdraw(
         write_json(dataset.captures_file, {name: str(path) for name, path in captures.items()})
         if dataset.ledger.is_file():
             with Ledger(dataset.ledger) as ledger:
-                ledger.erase(subject, dataset.root, paths, names(subject))
+                ledger.erase(subject, dataset.root, paths, test)
         changed, own = [], sorted((dataset.root / "grmm").rglob("*.pt"))
         for path in [*own, *(path for path in checkpoints if path.is_file())]:
             with suppress(FormatError):  # not a GRMM checkpoint; it is searched for the id below
                 if redact(path, subject):
                     changed.append(path)
-    test = names(subject)
     remaining = [
         *files_that(test, dataset.root),
         *(path for path in checkpoints if path.is_file() and says(path, test)),
@@ -199,26 +201,47 @@ def _digest(row: Any) -> Any:
     return row.get("id_sha256") if isinstance(row, dict) else row
 
 
-def names(subject: str) -> Test:
-    """Make a test of whether a text names a subject."""
-    word = re.compile(rb"(?<![A-Za-z0-9])" + re.escape(subject.encode()) + rb"(?![A-Za-z0-9])")
-    return lambda text: word.search(text) is not None
+def names_in(dataset: Dataset, subject: str) -> Test:
+    """Make a test of whether a text of a dataset names a subject."""
+    return names(subject, {*dataset.captures(), *dataset.subjects()} - {subject})
 
 
-def names_any_of(digests: Collection[str]) -> Test:
-    """Make a test of whether a text holds an id whose SHA-256 is among the given ones."""
+def names(subject: str, others: Collection[str] = ()) -> Test:
+    """Make a test of whether a text names a subject, and not just ``others`` with longer ids."""
+    longer = sorted((other for other in others if subject in other), key=len, reverse=True)
+    word = _words([*longer, subject])
+    return lambda text: any(m[0] == subject.encode() for m in word.finditer(text))
+
+
+def _words(ids: Sequence[str]) -> re.Pattern[bytes]:
+    """Make a pattern that matches the first fitting id where it stands as a word."""
+    choice = "|".join(map(re.escape, ids)) or "(?!)"
+    return re.compile(rf"(?<![A-Za-z0-9])(?:{choice})(?![A-Za-z0-9])".encode())
+
+
+def names_any_of(digests: Collection[str], others: Collection[str] = ()) -> Test:
+    """Make a test of whether a text holds an id whose SHA-256 is among the given ones.
+
+    Ids of ``others``, who were not withdrawn, may have such an id as a part.
+    """
     seen: dict[bytes, bool] = {}
 
-    def hit(run: bytes) -> bool:
+    def says_one(run: bytes) -> bool:
         # Any part, and any run of adjacent parts, may be an id: ``S001_smile`` names S001.
+        spans = [match.span() for match in PART.finditer(run)]
+        words = (
+            run[first:last]
+            for number, (first, _) in enumerate(spans)
+            for _, last in spans[number : number + LONGEST_ID]
+        )
+        return any(text_digest(word.decode()) in digests for word in (run, *words))
+
+    there = (other for other in others if text_digest(other) not in digests)
+    longer = _words(sorted((o for o in there if says_one(o.encode())), key=len, reverse=True))
+
+    def hit(run: bytes) -> bool:
         if run not in seen:
-            spans = [match.span() for match in PART.finditer(run)]
-            words = (
-                run[first:last]
-                for number, (first, _) in enumerate(spans)
-                for _, last in spans[number : number + LONGEST_ID]
-            )
-            seen[run] = any(text_digest(word.decode()) in digests for word in (run, *words))
+            seen[run] = any(map(says_one, longer.sub(b" ", run).split()))
         return seen[run]
 
     return lambda text: any(hit(run) for run in set(RUN.findall(text)))

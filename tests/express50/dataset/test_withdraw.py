@@ -247,6 +247,36 @@ def test_check_proves_a_withdrawal_and_finds_what_comes_back(dataset, capsys):
     assert "export/a.json: names a person who was withdrawn" in capsys.readouterr().out
 
 
+def test_another_subject_whose_id_holds_the_persons_keeps_everything(dataset, tmp_path, capsys):
+    make_capture(tmp_path / "raw" / "S001_2", subject="S001_2", cameras=2, frames=4)
+    capture = str(tmp_path / "raw" / "S001_2")
+    assert main(["ingest", str(dataset.root), capture, "--workers", "0"]) == 0
+    shutil.rmtree(dataset.stage_dir("matte"))  # outputs without receipts, made by the fixture
+    for subject in dataset.subjects():
+        dataset.labels_file(subject).write_text("")
+    before = tree(dataset.item_dir("ingest", "S001_2"))
+    assert main(["subject", "withdraw", str(dataset.root), "S001", "--yes"]) == 0
+    assert tree(dataset.item_dir("ingest", "S001_2")) == before
+    assert main(["check", str(dataset.root)]) == 0
+    assert main(["subject", "withdraw", str(dataset.root), "S002", "--yes"]) == 0
+    (dataset.root / "notes.txt").write_text("S001_2_smile and S002-b, then S001_smile")
+    capsys.readouterr()
+    assert main(["check", str(dataset.root)]) == 1
+    assert "notes.txt: names a person" in capsys.readouterr().out
+    # The other way round: the longer id is withdrawn, the shorter one stays.
+    assert names("S1_b", {"S1"})(b"S1_b_smile") and not names("S1_b", {"S1"})(b"S1_smile")
+    test = names_any_of({text_digest("S1_b")}, {"S1"})
+    assert test(b"S1_b_smile") and not test(b"S1_smile")
+
+
+def test_what_came_back_is_withdrawn_again(dataset):
+    withdraw(dataset, "S001")
+    with publishing(dataset, "track", "S001") as out:  # from a backup
+        (out / "metrics.json").write_text("{}")
+    assert withdraw(dataset, "S001").removed == (dataset.item_dir("track", "S001"),)
+    assert list(files_that(names("S001"), dataset.root)) == []
+
+
 PERSON = 'name = "Jane Roe"\nage = 4711e-2\ngender = "feminine"\nconsent_id = "C-77"\n'
 
 
