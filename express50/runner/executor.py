@@ -145,7 +145,8 @@ class Pool:
                     batch = [waiting.popleft() for _ in range(min(size, fair))]
                     for task in batch:
                         begin(task)
-                    key = f"{name}-{batch[0].item}-{batch[0].fingerprint[:16]}-{attempt}"
+                    # The run's folder: others' runs on this scheduler may have the same items.
+                    key = f"{name}-{batch[0].item}-{batch[0].folder.name}-{attempt}"
                     future = workers.client.submit(
                         run_tasks, batch, pure=False, key=key, resources=resources
                     )
