@@ -53,9 +53,9 @@ def publish_import(
     An item whose receipt has a reason was not published; the previous output stays.
     """
     inputs = import_inputs(dataset, item)
-    former = ledger.read(stage.name).get(item)
+    former = ledger.read(stage.name, item).get(item)
     if former is not None:
-        former = replace(former, made=ledger.made(stage.name).get(item))
+        former = replace(former, made=ledger.made(stage.name, item).get(item))
     writer = replace(stage, run=lambda *given: write(given[-1]), needs_gpu=lambda config: False)
     # Every import counts as new: a replaced output of an earlier import must not come back.
     fingerprint = IMPORTED + value_digest([inputs, time.time_ns()])

@@ -236,8 +236,8 @@ class Ledger:
                 (last.reason, last.time, last.stage, last.item),
             )
 
-    def read(self, stage: str) -> dict[str, Receipt]:
-        """Read the receipts of a stage by item, sorted.
+    def read(self, stage: str, item: str | None = None) -> dict[str, Receipt]:
+        """Read the receipts of a stage by item, sorted, or that of one item.
 
         Raises:
             FormatError: a row is damaged.
@@ -245,7 +245,7 @@ class Ledger:
         found = {}
         older = self._columns() or COLUMNS  # no table, where nothing was made yet
         columns = tuple(name for name in COLUMNS if name in older)
-        for values in self._rows(columns, "receipts WHERE stage = ? ORDER BY item", stage):
+        for values in self._rows(columns, *_of("receipts", stage, item)):
             values["metrics"] = self._parsed(values["metrics"], stage)
             receipt = Receipt(**values)
             if any(type(getattr(receipt, k)) is not kind for k, kind in KINDS.items()):
@@ -259,17 +259,17 @@ class Ledger:
         with self._damage():
             return {row[1] for row in self._database.execute("PRAGMA table_info(receipts)")}
 
-    def made(self, stage: str) -> dict[str, Made]:
-        """Read what a stage's items were made from and with, and their files, sorted.
+    def made(self, stage: str, item: str | None = None) -> dict[str, Made]:
+        """Read what a stage's items, or one, were made from and with, and their files, sorted.
 
         Raises:
             FormatError: a row is damaged.
         """
         found = {}
-        kept = self._rows(("item", "version", "settings"), "settings WHERE stage = ?", stage)
+        kept = self._rows(("item", "version", "settings"), *_of("settings", stage, item))
         settings = {k["item"]: (self._parsed(k["settings"], stage), k["version"]) for k in kept}
         columns = ("item", "inputs", "files")
-        for row in self._rows(columns, "made WHERE stage = ? ORDER BY item", stage):
+        for row in self._rows(columns, *_of("made", stage, item)):
             inputs, files = (self._parsed(row[name], stage) for name in columns[1:])
             with self._damage():
                 marks = {name: FileMark(*mark) for name, mark in files.items()}
@@ -392,6 +392,13 @@ class Ledger:
                 "INSERT OR REPLACE INTO digests VALUES (?, ?, ?, ?, ?)", self._fresh.values()
             )
         self._fresh.clear()
+
+
+def _of(table: str, stage: str, item: str | None) -> tuple[str, ...]:
+    """Return what selects a stage's rows of a table, sorted, or one item's, and its values."""
+    if item is None:
+        return f"{table} WHERE stage = ? ORDER BY item", stage
+    return f"{table} WHERE stage = ? AND item = ?", stage, item
 
 
 def _open_to_read(path: Path) -> sqlite3.Connection:
