@@ -275,7 +275,8 @@ def _sort_items(
             work.tasks.append(task)
     ledger.keep_digests()
     reasons = {receipt.reason for receipt in work.unreadable}
-    if len(work.unreadable) == len(chosen) > 1 and len(reasons) == 1:
+    made_here = not any(receipt.imported for receipt in work.unreadable)  # imports have no settings
+    if len(work.unreadable) == len(chosen) > 1 and len(reasons) == 1 and made_here:
         # A setting is wrong rather than all items: former outputs stay.
         raise StageError(f"{stage.name}: no item can be made: {reasons.pop()}")
     return work
@@ -413,9 +414,9 @@ def _retire(dataset: Dataset, ledger: Ledger, stage: str, item: str) -> None:
     """Set an output aside that no later stage may read; kept in case it becomes valid again."""
     if not dataset.item_dir(stage, item).exists():
         return
-    former = ledger.read(stage).get(item)
+    former = ledger.read(stage, item).get(item)
     if former is not None and not former.imported:
-        keep = keeping(dataset, replace(former, made=ledger.made(stage).get(item)))
+        keep = keeping(dataset, replace(former, made=ledger.made(stage, item).get(item)))
     else:  # the store may be emptied, and an import cannot be made again
         keep = None
     set_aside(dataset, stage, item, keep)

@@ -19,7 +19,7 @@ from express50.console import FAILED, OK, add_command, answer
 from express50.contract.layout import Dataset, existing_dataset, included_subjects
 from express50.contract.stage import Note, Result, stages
 from express50.dataset.depth_files import write_depth
-from express50.errors import ConfigError, StageError
+from express50.errors import ConfigError, Express50Error, StageError
 from express50.files.images import read_alpha, write_image
 from express50.geometry.cameras import Camera
 from express50.head.load import load_head
@@ -121,14 +121,20 @@ def run_remove(args: argparse.Namespace) -> int:
 
 
 def run_import(args: argparse.Namespace) -> int:
-    """Import every item of the chosen subjects; a wrong one is named, and the others continue."""
+    """Import every item of the chosen subjects; what is wrong is named, the others continue."""
     dataset, stage = existing_dataset(args.dataset.resolve()), stages()[args.action]
-    subjects, rows = _subjects(dataset, args), []
+    subjects, rows = _subjects(dataset, args), list[dict[str, Any]]()
     with stage_lock(dataset, stage.name), Ledger(dataset.ledger) as ledger:
         clean_leftovers(dataset, stage.name)
         for subject in subjects:
-            peaks = peak_frames(dataset, subject)
-            for item, write in _PLANS[args.action](dataset, subject, peaks, args).items():
+            try:
+                peaks = peak_frames(dataset, subject)
+                plan = _PLANS[args.action](dataset, subject, peaks, args)
+            except Express50Error as error:
+                reason = f"{type(error).__name__}: {error}"
+                rows.append({"item": subject, "reason": reason, "warnings": [], "checks": {}})
+                continue
+            for item, write in plan.items():
                 receipt = publish_import(dataset, stage, item, write, ledger)
                 found = receipt.metrics
                 rows.append({

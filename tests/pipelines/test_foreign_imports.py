@@ -298,8 +298,24 @@ def test_masks_of_recorded_or_reduced_size_fit_reduced_pictures(dataset, tmp_pat
     np.testing.assert_array_equal(found, shrink(true, 48))
     assert read_alpha(dataset.matte_file("S001", "smile", "cam02")).shape == (48, 48)
     assert run_stage(FRAMES, dataset, FRAMES.config(), workers=0, progress=False).ok
-    with pytest.raises(StageError, match="imported for another size of pictures"):
-        run_stage(MATTE, dataset, MATTE.config(), workers=0, progress=False)
+    failed = run_stage(MATTE, dataset, MATTE.config(), workers=0, progress=False)
+    assert failed.count("failed") == 2
+    for outcome in failed.outcomes:  # no later stage may read a matte of other pictures
+        assert "imported for another size of pictures" in outcome.reason
+        assert not dataset.item_dir("matte", outcome.item).exists()
+
+
+def test_a_subject_without_masks_does_not_stop_the_others(tmp_path, capsys) -> None:
+    dataset = make_dataset(tmp_path, subjects=("S001", "S002"), cameras=CAMERAS, size=SIZE)
+    pattern = masks_of(dataset, tmp_path / "masks" / "S002", write_image)
+    pattern = pattern.replace("/S002/", "/{subject}/")
+    capsys.readouterr()
+    assert take("matte", dataset, pattern) == 1
+    said = capsys.readouterr().out
+    assert "= 2 done + 1 failed" in said
+    assert "failed S001: StageError: S001: 12 of 12 files are missing" in said
+    done = run_stage(MATTE, dataset, MATTE.config(), ["S002/smile"], workers=0, progress=False)
+    assert any("kept 1 imported" in line for line in done.lines())
 
 
 def test_tracks_and_depth_of_the_recorded_size_fit_reduced_pictures(

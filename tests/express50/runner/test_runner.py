@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import json
 import logging
 import os
@@ -10,6 +11,7 @@ import shutil
 import subprocess
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from logging.handlers import BufferingHandler
 from pathlib import Path
 from unittest.mock import Mock
@@ -322,6 +324,25 @@ def test_outputs_of_vanished_items_are_set_aside_only_by_a_full_run(tmp_path):
     assert list(receipts(dataset)) == ["a"]
 
 
+def test_items_that_vanish_cost_their_own_rows_alone(tmp_path, monkeypatch):
+    parsed, counts = Ledger._parsed, [0]
+
+    def counted(*arguments):
+        counts[-1] += 1
+        return parsed(*arguments)
+
+    monkeypatch.setattr(Ledger, "_parsed", counted)
+    for size in (10, 40):
+        dataset = make_dataset(tmp_path / str(size), [f"a{n:02d}" for n in range(size)])
+        run_toy(dataset)
+        for path in sorted((dataset.root / "in").iterdir())[1:]:
+            path.unlink()
+        counts.append(0)
+        run_toy(dataset)
+        assert sorted(receipts(dataset)) == ["a00"]
+    assert counts[-1] < 5 * counts[-2]
+
+
 def test_workers_give_the_same_bytes_as_inline(tmp_path):
     names = [f"item{n}" for n in range(5)] + ["bad1", "bug1"]
     inline, spread = (make_dataset(tmp_path / n, names) for n in ("inline", "spread"))
@@ -413,6 +434,21 @@ def test_given_scheduler_is_used_and_left_running(tmp_path):
         with Client(cluster) as client:
             assert len(client.nthreads()) == 1
     assert summary.count("done") == 3
+
+
+def test_two_runs_of_one_item_on_one_scheduler_both_make_it(tmp_path):
+    from distributed import LocalCluster
+
+    datasets = [make_dataset(tmp_path / name, ["a", "b"]) for name in ("one", "two")]
+    config, options = toy.ToyConfig(seconds=0.1), {"dashboard_address": None, "protocol": "tcp://"}
+    with LocalCluster(n_workers=2, threads_per_worker=1, **options) as cluster:
+        go = functools.partial(
+            run_stage, toy.STAGE, config=config, scheduler=cluster.scheduler_address, progress=False
+        )
+        with ThreadPoolExecutor(2) as pool:
+            assert all(summary.count("done") == 2 for summary in pool.map(go, datasets))
+    for dataset in datasets:
+        assert all(dataset.item_dir("toy", item).is_dir() for item in ("a", "b"))
 
 
 def test_lost_scheduler_is_one_error_and_what_is_done_is_kept(tmp_path):
