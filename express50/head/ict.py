@@ -1,8 +1,8 @@
 """Load ICT-FaceKit's light face model (USC Institute for Creative Technologies, MIT licence).
 
 Reads a checkout of the public repository (`FaceXModel/*.obj`) or the same arrays in one `.npz`.
-The model has blend shapes but no skeleton: joints and skinning are made here, the jaw's from the
-model's own `jawOpen` shape. Regions come from the vertex ranges and landmarks of its README.
+The model has blend shapes but no skeleton: joints and skinning are made here, those of the jaw from
+the model's `jawOpen` shape. Regions come from the vertex ranges and landmarks of its README.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from express50.head.model import PARENTS, HeadModel, check_head
 
 VERTEX_COUNT = 26719
 METRES_PER_UNIT = 0.01
-# ICT-FaceKit's own, except for the brows (17 to 26), which its README has up to 8 mm above where
-# published marks have them, and 56, 58, 61, 63, 65 and 67 of the lips, nearer to their middle.
+# ICT-FaceKit's own, except for the brows (17 to 26), which its README has up to 8 mm above
+# published marks, and 56, 58, 61, 63, 65 and 67 of the lips, which are nearer to the middle here.
 LANDMARKS = (
     1225, 1888, 1052, 367, 1719, 1722, 2199, 1447, 966, 3661, 4390, 3927, 3924, 2608, 3272, 4088,
     3443, 270, 495, 1916, 2037, 2003, 4203, 4233, 4116, 2736, 2511, 978, 4527, 4942, 4857, 1140,
@@ -33,7 +33,7 @@ LANDMARKS = (
     5708, 5695, 2081, 0, 4275, 6200, 6213, 6346, 6480, 5518, 5976, 5841, 5702, 5736, 5533, 6241,
     6207, 6485, 5517, 5981,
 )  # fmt: skip
-# First and one past the last vertex of each part (README, "Face Model Topology" and below it).
+# First vertex of each part and the one after its last (README, "Face Model Topology").
 RANGES = {
     "face_area": (0, 9409),
     "narrow_face": (0, 6706),
@@ -48,7 +48,7 @@ RANGES = {
     "right_eyeball": (23021, 24591),
     "eyelashes": (25351, 26719),
 }
-# Shells that only a game engine's transparent shaders can show: as opaque faces they hide the eyes.
+# Shells for transparent shaders of game engines; as opaque faces they would hide the eyes.
 _HIDDEN_MATERIALS = ("M_EyeBlend", "M_EyeOcclusion", "M_LacrimalFluid")
 _NPZ_KEYS = (
     "v_template", "shapedirs", "exprdirs", "expression_names", "faces", "uv", "uv_faces",
@@ -74,17 +74,17 @@ def load_ict(path: str | Path) -> HeadModel:
     """Load ICT-FaceKit from a checkout (or its FaceXModel folder) or from an .npz of its arrays.
 
     Raises:
-        HeadModelError: missing files, another topology, damaged numbers.
+        HeadModelError: a file is missing or damaged, or the model has another topology.
     """
     path = Path(path)
     arrays = read_ict_npz(path) if path.suffix == ".npz" else read_ict_checkout(path)
     if arrays.template.shape != (VERTEX_COUNT, 3):
         raise HeadModelError(
-            f"{path}: template has shape {arrays.template.shape}, expected ({VERTEX_COUNT}, 3), "
-            "the topology of ICT-FaceKit's light model"
+            f"{path}: template has shape {arrays.template.shape}, expected ({VERTEX_COUNT}, 3); "
+            "give ICT-FaceKit's light model"
         )
     if "jawOpen" not in arrays.expression_names:
-        raise HeadModelError(f"{path}: no jawOpen expression; the jaw joint is derived from it")
+        raise HeadModelError(f"{path}: no expression jawOpen, expected for the jaw; copy it again")
     try:
         _check_mesh(arrays.template, arrays.faces)
         _check_mesh(arrays.uv, arrays.uv_faces)
@@ -94,7 +94,7 @@ def load_ict(path: str | Path) -> HeadModel:
 
 
 def read_ict_npz(path: Path) -> IctArrays:
-    """Read the arrays from one .npz (no pickled objects are accepted)."""
+    """Read the arrays from one .npz; pickled objects are refused."""
     data = read_arrays(path, HeadModelError, "an ICT .npz", _NPZ_KEYS)
     try:
         return IctArrays(
@@ -108,7 +108,7 @@ def read_ict_npz(path: Path) -> IctArrays:
             face_material=data["materials"].astype(str)[data["face_material"]],
         )
     except (ValueError, TypeError, IndexError) as error:
-        raise HeadModelError(f"{path}: not a readable ICT .npz: {error}") from error
+        raise HeadModelError(f"{path}: not a readable ICT .npz ({error}); copy it again") from error
 
 
 def read_ict_checkout(path: Path) -> IctArrays:
@@ -117,7 +117,7 @@ def read_ict_checkout(path: Path) -> IctArrays:
     neutral = folder / "generic_neutral_mesh.obj"
     if not neutral.is_file():
         raise HeadModelError(
-            f"{path}: no FaceXModel/generic_neutral_mesh.obj; expected a checkout of ICT-FaceKit"
+            f"{path}: no FaceXModel/generic_neutral_mesh.obj; give a checkout of ICT-FaceKit"
         )
     template, uv, faces, uv_faces, material = read_obj(neutral)
     others = sorted(file for file in folder.glob("*.obj") if file != neutral)
@@ -125,8 +125,8 @@ def read_ict_checkout(path: Path) -> IctArrays:
     expressions = [file for file in others if not file.stem.startswith("identity")]
     if not identities or not expressions:
         raise HeadModelError(
-            f"{folder}: {len(identities)} identity and {len(expressions)} expression OBJ files; "
-            "expected identity000.obj ... and browDown_L.obj ..."
+            f"{folder}: {len(identities)} identity and {len(expressions)} expression OBJ files,"
+            " expected identity000.obj ... and browDown_L.obj ...; check ICT-FaceKit out again"
         )
     return IctArrays(
         template=template,
@@ -145,7 +145,7 @@ def read_obj(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Read vertices (V,3), texture coordinates (T,2), faces (F,3), their uv (F,3), material (F,).
 
-    Polygons are cut into fans. Faces without texture coordinates get coordinate 0.
+    Polygons are split into fans. Faces without texture coordinates get coordinate 0.
     """
     vertices: list[list[str]] = []
     uv: list[list[str]] = []
@@ -177,12 +177,12 @@ def read_obj(
         _check_mesh(points, faces)
         _check_mesh(coordinates, uv_faces)
     except (OSError, ValueError, IndexError, OverflowError) as error:
-        raise HeadModelError(f"{path}: not a readable OBJ file: {error}") from error
+        raise HeadModelError(f"{path}: not an OBJ file ({error}); copy it again") from error
     return points, coordinates, faces, uv_faces, np.array(materials)
 
 
 def _check_mesh(points: np.ndarray, faces: np.ndarray) -> None:
-    """Raise ValueError where a number is not finite or a face names a point that is not there."""
+    """Raise ValueError if a coordinate is not finite or a face refers to a missing point."""
     if not np.isfinite(points).all():
         raise ValueError("a coordinate is NaN or infinite")
     if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
@@ -192,7 +192,7 @@ def _check_mesh(points: np.ndarray, faces: np.ndarray) -> None:
 
 
 def build_ict_head(arrays: IctArrays) -> HeadModel:
-    """Turn the arrays into a HeadModel in metres with joints, skinning, landmarks and regions."""
+    """Build a head model, in metres, from the arrays; add joints, skinning, landmarks, regions."""
     template = arrays.template * METRES_PER_UNIT
     regions = ict_regions(template, arrays.faces, arrays.uv_faces)
     jaw_open = arrays.expression_names.index("jawOpen")
@@ -200,7 +200,7 @@ def build_ict_head(arrays: IctArrays) -> HeadModel:
     joints, skinning = _rig(template, opened, regions)
     shown = ~np.isin(arrays.face_material, _HIDDEN_MATERIALS)
     faces = arrays.faces[shown]
-    # A landmark is a corner of the first face that has its vertex.
+    # Each landmark is put on the first face that has its vertex.
     face, corner = np.array([np.argwhere(faces == vertex)[0] for vertex in LANDMARKS]).T
     return HeadModel(
         name="ict",
@@ -234,10 +234,11 @@ def _offsets(files: list[Path], template: np.ndarray) -> np.ndarray:
         try:
             rows = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], float)
         except ValueError as error:
-            raise HeadModelError(f"{file}: not a readable OBJ file: {error}") from error
+            raise HeadModelError(f"{file}: not an OBJ file ({error}); copy it again") from error
         if rows.shape != template.shape:
             raise HeadModelError(
-                f"{file}: {rows.shape[0]} vertices, expected {template.shape[0]} as in the neutral"
+                f"{file}: {rows.shape[0]} vertices, expected the neutral's {template.shape[0]};"
+                " copy it again"
             )
         columns.append((rows - template).astype(np.float32))
     return np.stack(columns, axis=2)
@@ -256,7 +257,7 @@ def _rig(
     centre = template[neck_ring].mean(0) if neck_ring.any() else np.array([0.0, chin[1], 0.0])
     neck_joint = np.array([0.0, chin[1], centre[2]])
     root_joint = np.array([0.0, 0.5 * (floor + chin[1]), centre[2]])
-    # The neck's weight falls along a plane that rises to the nape, as a skull sits on a spine.
+    # Level sets of the neck's weight rise towards the nape, as a skull sits on a spine.
     level = (height - 0.25 * (template[:, 2] - centre[2]) - floor) / (chin[1] - floor)
     head = smoothstep((level - 0.25) / 0.85, 0.0, 1.0)
     head = np.where(regions["face"] | regions["mouth_interior"] | regions["teeth"], 1.0, head)
@@ -275,20 +276,22 @@ def _rig(
 def _jaw_rig(
     template: np.ndarray, opened: np.ndarray, lower_teeth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return jaw hinge (3,) and weights (V,) that repeat what the jawOpen shape does.
+    """Return the jaw's hinge (3,) and weights (V,) that reproduce the jawOpen shape.
 
-    The lower teeth are rigid: their motion in the y-z plane is a turn by some angle about a point
-    that stays in place: d = (R - I)(p - c). A vertex's weight is its own
-    motion over the motion of a rigid jaw at that place.
+    The lower teeth are rigid, so their motion in the y-z plane is a rotation about a fixed point c:
+    d = (R - I)(p - c). A vertex's weight is its motion over that of a rigid jaw at its place.
+
+    Raises:
+        ValueError: the shape does not turn the lower teeth.
     """
     points, motion = template[lower_teeth][:, 1:], opened[lower_teeth][:, 1:]
     centred = points - points.mean(0)
     moved = centred + motion - motion.mean(0)
     overlap = centred.T @ moved
-    # The rotation that best turns one planar point set into another (Procrustes in two dimensions).
+    # The rotation that best aligns two planar point sets (Procrustes in two dimensions).
     angle = np.arctan2(overlap[0, 1] - overlap[1, 0], overlap[0, 0] + overlap[1, 1])
     if abs(angle) < 1e-4:
-        raise HeadModelError("ICT: jawOpen does not turn the lower teeth; cannot derive the jaw")
+        raise ValueError("jawOpen does not turn the lower teeth, so the jaw's hinge is unknown")
     rotation = np.array([[np.cos(angle) - 1, -np.sin(angle)], [np.sin(angle), np.cos(angle) - 1]])
     hinge = points.mean(0) - np.linalg.solve(rotation, motion.mean(0))
     rigid = np.linalg.norm((template[:, 1:] - hinge) @ rotation.T, axis=1)
@@ -300,7 +303,7 @@ def _jaw_rig(
 def _regressor(
     template: np.ndarray, joints: np.ndarray, regions: dict[str, np.ndarray]
 ) -> np.ndarray:
-    """Return the joint regressor (5, V): smallest-norm weights over vertices near each joint."""
+    """Return the joint regressor (5, V): least-norm weights of the vertices near each joint."""
     rows = np.zeros((5, template.shape[0]))
     skin = ~(regions["teeth"] | regions["mouth_interior"] | regions["tongue"])
     for row, joint in enumerate(joints):
@@ -315,7 +318,7 @@ def _regressor(
 
 
 def _pack_udim(uv: np.ndarray) -> np.ndarray:
-    """Fold UDIM tiles into [0, 1]: tile 0 (the face) takes 3/4 of the side, others 1/4 each."""
+    """Pack UDIM tiles into [0, 1]: tile 0 (the face) gets 3/4 of the side, the others 1/4."""
     packed = np.clip(uv, 0.0, None)
     tile = np.minimum(np.floor(packed[:, 0]).astype(int), 7)
     packed = packed - np.stack([tile, np.zeros_like(tile)], axis=1)
@@ -328,7 +331,7 @@ def _pack_udim(uv: np.ndarray) -> np.ndarray:
 def ict_regions(
     template: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return masks (V,) by region of the template (V, 3) in metres with all triangles (F, 3)."""
+    """Return masks (V,) bool by region, of a template (V, 3), metres, with all faces (F, 3)."""
     number = np.arange(len(template))
     part = {name: (number >= first) & (number < end) for name, (first, end) in RANGES.items()}
     marks, (x, y, z) = template[list(LANDMARKS)], template.T
@@ -336,13 +339,13 @@ def ict_regions(
     ears = part["face_area"] & (np.abs(x) > 0.069) & (z < 0.031) & (y > -0.024) & (y < 0.044)
     brow_top = marks[17:27, 1].max() + 0.0095
     face = part["narrow_face"] & ~ears & (y > marks[8, 1] - 0.03)
-    # The hair line of the nape: behind the ears the scalp reaches down to the mouth's height.
+    # Behind the ears the scalp extends down to the height of the mouth.
     scalp = skin & ~face & ~ears & (y > np.where(z < 0.0, -0.035, 0.01))
     nose, margin = marks[27:36, :2], np.array([0.006, 0.004])
     near_nose = (template[:, :2] > nose.min(0) - margin) & (template[:, :2] < nose.max(0) + margin)
     lips = marks[48:60, :2]
     lips = lips.mean(0) + 1.04 * (lips - lips.mean(0))
-    # The neck is open below: its last edges are used by one face only.
+    # The neck's lower end is open: its edges have one face only.
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     edges, uses = np.unique(edges, axis=0, return_counts=True)
     regions = {
@@ -379,7 +382,7 @@ def _tongue(
 ) -> np.ndarray:
     """Find the tongue (V,) bool: the two large texture islands within 2 cm of the middle.
 
-    Gums and tongue are one piece of mesh, but they are cut apart in the texture map.
+    Gums and tongue are connected in the mesh, but not in the texture map.
     """
     inside = gums[faces].all(1)
     corners = uv_faces[inside]

@@ -15,7 +15,7 @@ from express50.files.arrays import read_arrays
 from express50.head.model import HeadModel, check_head
 
 BUILTIN = Path(__file__).with_name("builtin.npz")
-# Arrays with the names and shapes of HeadModel's fields; the names of directions are texts.
+# Arrays with the names and shapes of HeadModel's fields.
 FIELDS = (
     "template", "shape_dirs", "expression_dirs", "pose_dirs", "joint_regressor", "skinning",
     "faces", "uv", "uv_faces", "landmark_faces", "landmark_bary", "shape_names",
@@ -28,16 +28,15 @@ _KINDS = (
 
 
 def load_head(spec: str | Path) -> HeadModel:
-    """Load a head model.
+    """Load a head model by name or path.
 
     Args:
         spec: "procedural" for the built-in head, else a path: `*.pkl` is the user's FLAME model
-            (its landmark embedding and masks are looked for beside it), a folder is a checkout of
-            ICT-FaceKit, `*.npz` holds ICT-FaceKit's arrays or a head model of your own
-            (docs/RECIPES.md).
+            (with its other files beside it), a folder is a checkout of ICT-FaceKit, `*.npz` holds
+            ICT-FaceKit's arrays or a head model of your own (docs/RECIPES.md).
 
     Raises:
-        HeadModelError: unknown name, missing file or damaged content.
+        HeadModelError: the name is unknown, or a file is missing or damaged.
     """
     if str(spec) == "procedural":
         return load_builtin()
@@ -67,9 +66,9 @@ def load_stored(path: Path, name: str) -> HeadModel:
     """Load a head model from its arrays; docs/RECIPES.md shows how to write them.
 
     Args:
-        path: .npz with the arrays of `FIELDS`; optionally `regions` (R, V) bool with
-            `region_names` (R,), and the 17 lists of jaw line candidates, concatenated in `contour`
-            with their lengths in `contour_counts`; `unit_expressions`, False where coefficients
+        path: .npz with the arrays of `FIELDS`. Optional are `regions` (R, V) bool with
+            `region_names` (R,); the 17 lists of jaw line candidates, concatenated in `contour`,
+            with their lengths in `contour_counts`; and `unit_expressions`, False if coefficients
             are standard deviations.
         name: of the model.
 
@@ -101,7 +100,7 @@ def load_stored(path: Path, name: str) -> HeadModel:
 
 
 def is_stored(path: Path) -> bool:
-    """Return True if a file holds the arrays of a head model under our names."""
+    """Return whether a file holds a head model's arrays by the names of `FIELDS`."""
     if not zipfile.is_zipfile(path):
         return False
     with zipfile.ZipFile(path) as archive:

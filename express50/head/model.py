@@ -1,4 +1,4 @@
-"""Define the head model that all share: a linear shape space posed by linear blend skinning.
+"""Define the type of all head models: a linear shape space posed by linear blend skinning.
 
 The layout is FLAME's (Li et al. 2017, "Learning a model of facial shape and expression from 4D
 scans"): five joints (root, neck, jaw, left eye, right eye), joints regressed from the shaped
@@ -28,11 +28,11 @@ REGIONS = (
 class HeadModel:
     """Arrays of a head model. V vertices, F faces, S shape and X expression directions, J joints.
 
-    All float tensors share one dtype and device; `to` moves them. Shapes are checked on
-    construction (HeadModelError), values by `check_head`, which the loaders call.
+    All tensors share one device, all float tensors one dtype; `to` changes them. Shapes are checked
+    on construction (HeadModelError), values by `check_head`, which the loaders call.
     """
 
-    name: str  # Where the model came from ("procedural", "flame2023", ...)
+    name: str  # "procedural", "flame2023", ...
     template: torch.Tensor  # (V, 3) metres
     shape_dirs: torch.Tensor  # (V, 3, S) metres per unit coefficient
     expression_dirs: torch.Tensor  # (V, 3, X) metres per unit coefficient
@@ -46,11 +46,11 @@ class HeadModel:
     landmark_bary: torch.Tensor  # (68, 3)
     shape_names: tuple[str, ...]  # S names
     expression_names: tuple[str, ...]  # X names
-    # for landmarks 0..16 the vertices that may form the visible jaw line, or None
+    # per landmark 0..16 the vertices that may form the visible jaw line, or None
     contour: tuple[torch.Tensor, ...] | None = None
     regions: dict[str, torch.Tensor] = field(default_factory=dict)  # region name -> (V,) bool
-    # True where coefficients are activations in 0..1 (procedural, ICT), False where they are
-    # standard deviations (FLAME)
+    # True if coefficients are activations in 0..1 (procedural, ICT), False if they are standard
+    # deviations (FLAME)
     unit_expressions: bool = True
 
     def __post_init__(self) -> None:
@@ -110,12 +110,12 @@ class HeadModel:
 def check_head(model: HeadModel) -> HeadModel:
     """Return the model if its values are usable, else raise HeadModelError.
 
-    Checks finite arrays, index ranges, skinning and regressor rows summing to one.
+    Arrays must be finite, indices in range, and rows of skinning and regressor sum to one.
     """
     where = f"head model {model.name!r}"
     for item in fields(model):
         value = getattr(model, item.name)
-        # whole-number tensors are always finite
+        # True of all integers and booleans, so no dtype is left out.
         if isinstance(value, torch.Tensor) and not bool(torch.isfinite(value).all()):
             raise HeadModelError(f"{where}: {item.name} holds NaN or infinite values")
     vertices = model.template.shape[0]
@@ -133,7 +133,9 @@ def check_head(model: HeadModel) -> HeadModel:
     for key, rows in {"skinning": model.skinning, "joint_regressor": model.joint_regressor}.items():
         error = float((rows.sum(1) - 1).abs().max())
         if error > 1e-2:
-            raise HeadModelError(f"{where}: rows of {key} sum to 1 only within {error:.3g}")
+            raise HeadModelError(
+                f"{where}: rows of {key} sum to 1 within {error:.3g}, expected 0.01"
+            )
     return model
 
 
@@ -148,7 +150,7 @@ def pose(
     translation: torch.Tensor | None = None,
     offsets: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Pose the head. Missing arguments are zero; too few coefficients are padded with zeros.
+    """Pose the head. Missing arguments and coefficients are zero.
 
     Args:
         model: The head model.
@@ -159,13 +161,13 @@ def pose(
         eyes: (B, 6) axis-angle of the left, then the right eye.
         root: (B, 3) axis-angle about the root joint (not about the origin, as in FLAME).
         translation: (B, 3) metres, added last.
-        offsets: (B, V, 3) or (1, V, 3) metres, added to the rest shape; they move the joints too.
+        offsets: (B, V, 3) or (1, V, 3) metres, added to the rest shape, which also moves joints.
 
     Returns:
         (B, V, 3) vertices, metres.
 
     Raises:
-        ValueError: where a shape does not fit.
+        ValueError: a tensor's shape does not fit.
     """
     rest = rest_vertices(model, shape, expression, offsets)
     joints = torch.einsum("jv,bvc->bjc", model.joint_regressor, rest)
@@ -192,7 +194,7 @@ def rest_vertices(
             )
     if shape.shape[0] != expression.shape[0] and 1 not in (shape.shape[0], expression.shape[0]):
         raise ValueError(
-            f"expression has {expression.shape[0]} rows, expected {shape.shape[0]} as shape has"
+            f"expression has {expression.shape[0]} rows, expected {shape.shape[0]}, those of shape"
         )
     rest = (
         model.template
@@ -215,7 +217,7 @@ def joint_angles(
     jaw: torch.Tensor | None,
     eyes: torch.Tensor | None,
 ) -> torch.Tensor:
-    """Return axis-angles (B, 5, 3) in joint order from the optional parts; B, dtype from `like`."""
+    """Return axis-angles (B, 5, 3) in joint order from optional parts; B and dtype are `like`'s."""
     batch = like.shape[0]
     blocks = []
     for name, part, width in (
@@ -241,7 +243,7 @@ def skin(
 ) -> torch.Tensor:
     """Apply linear blend skinning and pose correctives (SMPL, Loper et al. 2015, equations 2 to 4).
 
-    Works on any subset of vertices, so that a landmark fit poses only what it needs.
+    Works on any subset of vertices, so that a landmark fit poses only those it needs.
 
     Args:
         rest: (B, N, 3) shaped vertices.
@@ -265,7 +267,7 @@ def skin(
 def joint_transforms(
     joints: torch.Tensor, rotations: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return each joint's turn (B, J, 3, 3) and shift (B, J, 3): rest x goes to turn @ x + shift.
+    """Return each joint's turn (B, J, 3, 3) and shift (B, J, 3): rest x moves to turn @ x + shift.
 
     The shift is linear in the rest joints (B, J, 3); rotations (B, J, 3, 3) are to the parents.
     """
@@ -286,13 +288,13 @@ def landmarks(model: HeadModel, vertices: torch.Tensor) -> torch.Tensor:
 
 
 def vertex_normals(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
-    """Return unit normals of vertices (B, V, 3), area weighted; 0 where no face has area."""
+    """Return unit normals (B, V, 3) of vertices, weighted by area; 0 where no face has area."""
     a, b, c = (vertices[:, faces[:, corner]] for corner in range(3))
     face_normals = torch.linalg.cross(b - a, c - a)
     normals = torch.zeros_like(vertices)
     for corner in range(3):
         normals = normals.index_add(1, faces[:, corner], face_normals)
-    # The largest entry first: squares of tiny normals (float32 faces of a few microns) underflow.
+    # Scaled by the largest entry: squares of tiny normals (faces of a few microns) would underflow.
     scale = normals.abs().amax(-1, keepdim=True)
     safe = torch.where(scale > 0, normals / scale.clamp_min(torch.finfo(scale.dtype).tiny), 0.0)
     length = torch.where(scale > 0, safe.square().sum(-1, keepdim=True), 1.0).sqrt()

@@ -1,11 +1,10 @@
 """Add teeth and the inside of the mouth to heads of FLAME's topology, which have neither.
 
-Facts of the topology: 5023 vertices; two rings of 15 vertices each round the lips, paired by
-index; an open loop of 32 vertices at the back of the lips. The order of the 120 tooth vertices, and
-where they stand, are those that VHAP and GaussianAvatars put behind the 5023, so that their
-parameters and ours give the same 5143 vertices; triangles, texture map and the pouch that closes
-the loop behind the teeth (65 vertices, after the teeth) are our own. GRMM's supplement asks for
-both, each with its own part of the texture map.
+FLAME has 5023 vertices, two rings of 15 vertices around the lips, paired by index, and an open loop
+of 32 vertices at the back of the lips. The 120 tooth vertices have the order and places that VHAP
+and GaussianAvatars use, so that their parameters and ours give the same first 5143 vertices.
+Triangles, texture map and the pouch that closes the loop behind the teeth (65 more vertices) are
+our own. GRMM's supplement asks for teeth and pouch, each with its own part of the texture map.
 """
 
 from __future__ import annotations
@@ -30,28 +29,28 @@ LOWER_RING = (
 )  # fmt: skip
 CORNERS = (1594, 2730)  # of the loop at the back of the lips
 LOOP_SIZE = 32
-# Rows of 15 tooth vertices in their order: jaw (0 upper, 1 lower), whether root, whether back.
+# The rows of 15 tooth vertices, in order: jaw (0 upper, 1 lower), whether root, whether back.
 _ROWS = ((0, 1, 0), (1, 1, 0), (0, 0, 0), (1, 0, 0), (0, 1, 1), (0, 0, 1), (1, 1, 1), (1, 0, 1))
-# Each jaw's rows round the outside: front root, front edge, back edge, back root.
+# Each jaw's rows as a strip: front root, front edge, back edge, back root.
 _AROUND = ((0, 2, 5, 4), (1, 3, 7, 6))
-# Heights and depths in units of the mean distance of the rings.
+# Heights and depths in units of the mean distance between the rings.
 _INSET, _GAP, _ROOT, _OVERJET, _THICK = 1.5, 0.1, 2.0, 0.4, 1.0
-_LIPS = (0.002, 0.03)  # metres the rings may be apart on average: 7.7 mm on FLAME's template
-# The pouch: rings of the loop drawn together to its middle and set back, then one end vertex.
+_LIPS = (0.002, 0.03)  # mean distances between the rings, metres; FLAME's template has 7.7 mm
+# The pouch: copies of the loop, shrunk to its middle and set back, then one end vertex.
 _POUCH = ((1.0, 0.012), (0.7, 0.026), (0.0, 0.034))  # share of the loop's width, metres behind it
-_STRIP_V = (0.0, 0.4, 0.6, 1.0)  # rows of a jaw in its chart, by their lengths
-# Charts (width, height) of pouch, upper and lower teeth: no larger than that on the unit square.
+_STRIP_V = (0.0, 0.4, 0.6, 1.0)  # heights of a jaw's rows in its chart
+# Largest charts (width, height), on the unit square, of pouch, upper and lower teeth.
 _CHARTS = ((0.18, 0.18), (0.2, 0.12), (0.2, 0.12))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Part:
-    """Vertices to append to a model, which take their directions from the model's own."""
+    """Vertices to append to a model; their directions are means of the model's own."""
 
     places: torch.Tensor  # (N, 3) metres, in the template
     shape_from: torch.Tensor  # (N, V) weights of the model's vertices, rows sum to 1
-    motion_from: torch.Tensor  # the same for expression, pose and skinning; 0 for rigid parts
-    skinning: torch.Tensor  # (N, J) of rigid parts, else 0
+    motion_from: torch.Tensor  # the same for expression, pose, skinning; 0 if the part is rigid
+    skinning: torch.Tensor  # (N, J) if the part is rigid, else 0
     faces: torch.Tensor  # (F, 3) into the whole model
     uv: torch.Tensor  # (T, 2)
     uv_faces: torch.Tensor  # (F, 3), from 0
@@ -60,8 +59,8 @@ class _Part:
 def add_mouth(model: HeadModel) -> HeadModel:
     """Add teeth and a pouch behind them to a model of FLAME's vertices; old ids and joints stay.
 
-    Upper teeth follow the neck joint, lower teeth the jaw, both keep still in expressions and move
-    with the identity as the lips before them do. The pouch follows the loop it hangs on.
+    Upper teeth follow the neck joint, lower teeth the jaw. Both do not move in expressions, and
+    change with the identity as the lips in front do. The pouch follows the loop it hangs on.
 
     Raises:
         HeadModelError: the model's lips are not FLAME's, or its texture map has no room.
@@ -92,7 +91,7 @@ def _teeth(model: HeadModel, charts: tuple[np.ndarray, ...]) -> _Part:
     if not _LIPS[0] < unit < _LIPS[1]:
         raise HeadModelError(
             f"head model {model.name!r}: its lips' rings are {1e3 * unit:.3g} mm apart, expected"
-            f" {1e3 * _LIPS[0]:g} to {1e3 * _LIPS[1]:g}; are its vertices FLAME's, in metres?"
+            f" {1e3 * _LIPS[0]:g} to {1e3 * _LIPS[1]:g}; give FLAME's vertices in metres"
         )
     middle = 0.5 * (upper + lower)
     middle[:, 1] = middle[:, 1].mean()
@@ -109,7 +108,7 @@ def _teeth(model: HeadModel, charts: tuple[np.ndarray, ...]) -> _Part:
         shape_from[torch.arange(15), list(ring)] += 0.5
     bone = torch.tensor([JOINTS.index("jaw" if jaw else "neck") for jaw, _, _ in _ROWS])
     skinning = torch.nn.functional.one_hot(bone, len(JOINTS)).repeat_interleave(15, 0)
-    # Seen from before, columns from the subject's left go from right to left.
+    # Seen from the front, columns that start at the subject's left run from right to left.
     from_left = bool(upper[0, 0] > upper[-1, 0])
     strips, uv_strips, uv = [], [], []
     for jaw, rows in enumerate(_AROUND):
@@ -133,7 +132,7 @@ def _teeth(model: HeadModel, charts: tuple[np.ndarray, ...]) -> _Part:
 
 
 def _strip(rows: tuple[int, ...] | range, flip: bool) -> np.ndarray:
-    """Return triangles (84, 3) between consecutive rows of 15 vertices, seen from outside."""
+    """Return the triangles (84, 3) between consecutive rows of 15 vertices."""
     grid = 15 * np.asarray(rows)[:, None] + np.arange(15)
     a, b, c, d = grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]
     faces = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], 2).reshape(-1, 3)
@@ -141,7 +140,7 @@ def _strip(rows: tuple[int, ...] | range, flip: bool) -> np.ndarray:
 
 
 def _pouch(model: HeadModel, chart: np.ndarray) -> _Part:
-    """Make rings behind the loop at the back of the lips, ending in one vertex."""
+    """Make the rings behind the loop at the back of the lips, and one end vertex."""
     loop = torch.from_numpy(mouth_loop(model.faces.numpy(), model.name))
     size, first = len(loop), len(model.template) + TOOTH_VERTICES
     own = torch.nn.functional.one_hot(loop, len(model.template)).double()
@@ -158,7 +157,7 @@ def _pouch(model: HeadModel, chart: np.ndarray) -> _Part:
     steps = np.concatenate([np.arange(size), np.arange(2 * size + 1) + size])
     ids = np.concatenate([loop.numpy(), first + np.arange(2 * size + 1)])
     faces = _funnel(size)
-    # The texture has concentric rings in the chart.
+    # In the chart the rings are concentric circles.
     angle = 2 * np.pi * np.arange(size) / size
     circle = np.stack([np.cos(angle), np.sin(angle)], -1)
     rings = np.concatenate([circle, circle * 2 / 3, circle / 3, np.zeros((1, 2))])
@@ -175,7 +174,7 @@ def _pouch(model: HeadModel, chart: np.ndarray) -> _Part:
 
 
 def _funnel(size: int) -> np.ndarray:
-    """Return triangles (5 size, 3) of three rings and an end vertex, numbered in that order."""
+    """Return the triangles (5 size, 3) of three rings and an end vertex, numbered in that order."""
     k = np.arange(size)
     after = (k + 1) % size
     faces = []
@@ -187,7 +186,7 @@ def _funnel(size: int) -> np.ndarray:
 
 
 def mouth_loop(faces: np.ndarray, name: str) -> np.ndarray:
-    """Return ids (32,) of the open loop behind the lips, in the order new faces run along it.
+    """Return the ids (32,) of the open loop behind the lips, in the order of new faces along it.
 
     It starts at the first of CORNERS.
 
@@ -198,7 +197,7 @@ def mouth_loop(faces: np.ndarray, name: str) -> np.ndarray:
     count = int(faces.max()) + 1
     keys, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
     open_edges = edges[~np.isin(keys, back)]
-    # A neighbour across an edge runs along it the other way round.
+    # The face on the other side of an edge runs along it in the opposite direction.
     following = {int(b): int(a) for a, b in open_edges}
     loop = [CORNERS[0]]
     while len(loop) <= LOOP_SIZE and (after := following.get(loop[-1])) not in (None, loop[0]):
@@ -206,15 +205,15 @@ def mouth_loop(faces: np.ndarray, name: str) -> np.ndarray:
     if len(loop) != LOOP_SIZE or CORNERS[1] not in loop:
         raise HeadModelError(
             f"head model {name!r}: no open loop of {LOOP_SIZE} vertices through {CORNERS[0]} and"
-            f" {CORNERS[1]} behind the lips, expected FLAME's topology"
+            f" {CORNERS[1]} behind the lips, expected FLAME's topology; give FLAME's own faces"
         )
     return np.array(loop)
 
 
 def _appended(model: HeadModel, part: _Part) -> HeadModel:
-    """Append a part's vertices, faces and chart to a model's own."""
+    """Return the model with a part's vertices, faces and chart appended."""
     count, added = len(model.template), len(part.places)
-    # Parts are made for the bare head; vertices that came in between lend them nothing.
+    # Parts are made for the bare head: vertices appended since then have no weight.
     room = count - part.shape_from.shape[1]
     shape_from, motion_from = (
         torch.nn.functional.pad(weights, (0, room)).to(model.dtype)
@@ -240,13 +239,13 @@ def _appended(model: HeadModel, part: _Part) -> HeadModel:
 
 
 def _extended(directions: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
-    """Return directions (V, 3, K) and those of appended vertices, weighted means of the old."""
+    """Return directions (V, 3, K) with those of appended vertices, weighted means of the old."""
     return torch.cat([directions, torch.einsum("nv,vck->nck", weights, directions)])
 
 
 GRID = 512  # cells per side of the search
 GUTTER = 3  # cells kept free around a chart, so that neighbours do not bleed into each other
-SHRINK, LEAST = 0.9, 0.15  # of the wanted size: factor between tries, and the smallest accepted
+SHRINK, LEAST = 0.9, 0.15  # factor between tries, and the least accepted share of a wanted size
 
 
 def place_charts(
@@ -254,13 +253,13 @@ def place_charts(
 ) -> tuple[np.ndarray, ...]:
     """Find free rectangles (left, bottom, right, top), one per wanted (width, height).
 
-    The most important comes first. Each is shrunk until it fits; the first free place from the top
-    of the map is taken. The map is ``uv`` (T, 2), v up, of ``uv_faces`` (F, 3).
+    Earlier ones get more room. Each is shrunk until it fits, and takes the first free place from
+    the top of the map, which is ``uv`` (T, 2), v up, of ``uv_faces`` (F, 3).
 
     Raises:
         HeadModelError: a chart does not fit even at LEAST of its size.
     """
-    # Cells that triangles cover or touch; the first row is at v = 1.
+    # Cells that triangles touch; the first row is at v = 1.
     cells = np.zeros((GRID, GRID), np.uint8)
     places = np.stack([uv[:, 0], 1 - uv[:, 1]], -1) * GRID
     for triangle in np.floor(places).clip(0, GRID - 1).astype(np.int32)[uv_faces]:
@@ -285,7 +284,7 @@ def place_charts(
 
 
 def _first_free(taken: np.ndarray, width: float, height: float) -> tuple[int, int, int, int] | None:
-    """Find the largest free rectangle that is tried: row, column, rows and columns."""
+    """Find the largest free rectangle among the tried sizes: row, column, rows and columns."""
     scale = 1.0
     while scale >= LEAST:
         rows, columns = max(2, round(height * scale)), max(2, round(width * scale))

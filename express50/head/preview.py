@@ -16,7 +16,7 @@ from express50.head.model import HeadModel, pose, vertex_normals
 Array = np.ndarray
 
 _SKIN = (0.58, 0.37, 0.28)
-# Region -> linear base colour; later entries paint over earlier ones.
+# Linear base colour by region; later entries paint over earlier ones.
 _COLORS = {
     "scalp": (0.54, 0.35, 0.27), "lips": (0.47, 0.20, 0.18), "mouth_interior": (0.16, 0.04, 0.04),
     "gums": (0.42, 0.16, 0.15), "tongue": (0.45, 0.15, 0.15), "teeth": (0.85, 0.80, 0.68),
@@ -25,7 +25,7 @@ _COLORS = {
     "left_pupil": (0.01, 0.01, 0.01), "right_pupil": (0.01, 0.01, 0.01),
 }  # fmt: skip
 _BACKGROUND = (0.11, 0.12, 0.14)
-# Metres: the point looked at, what is seen across it, and the camera's distance from it.
+# Metres: the point looked at, the width seen there, and the camera's distance.
 _CENTER, _SPAN, _AWAY = (0.0, -0.012, 0.0), 0.34, 1.2
 
 # Name -> (expression controls, jaw opening rad), for the contact sheet.
@@ -45,10 +45,10 @@ POSES: dict[str, tuple[dict[str, float], float]] = {
 
 
 def expression_vector(model: HeadModel, controls: Mapping[str, float]) -> torch.Tensor:
-    """Return coefficients (1,X) of named controls; a name without _L/_R sets both sides.
+    """Return the coefficients (1,X) of named controls; a name without _L or _R sets both sides.
 
     Raises:
-        HeadModelError: a name that the model does not have.
+        HeadModelError: the model does not have a name.
     """
     index = {name: i for i, name in enumerate(model.expression_names)}
     vector = torch.zeros(1, len(index), dtype=model.dtype)
@@ -66,7 +66,7 @@ def render_preview(
 ) -> Array:
     """Render posed vertices (V, 3), metres, as (size, size, 3) uint8 sRGB, four rays per pixel.
 
-    The camera goes round to the subject's left by ``yaw`` degrees.
+    The camera is moved around the head to the subject's left by ``yaw`` degrees.
     """
     points = np.asarray(vertices, np.float32)
     faces = model.faces.cpu().numpy()
@@ -95,7 +95,7 @@ def render_preview(
 
 
 def _camera(yaw: float, side: int) -> tuple[Array, Array, tuple[Array, Array, Array]]:
-    """Return the rays' origin and unit directions (side,side,3), and the axes right, up, back."""
+    """Return the rays' origin, their unit directions (side,side,3), and axes right, up, back."""
     a = np.radians(yaw)
     back, right = np.array([np.sin(a), 0.0, np.cos(a)]), np.array([np.cos(a), 0.0, -np.sin(a)])
     up = np.cross(back, right)
@@ -110,7 +110,7 @@ def _camera(yaw: float, side: int) -> tuple[Array, Array, tuple[Array, Array, Ar
 def _shade(
     scene: o3d.t.geometry.RaycastingScene, place: Array, n: Array, axes: tuple, view: Array
 ) -> Array:
-    """Return diffuse factor and gloss (N,2) of a shadowed key light, a fill light and a sky."""
+    """Return the diffuse factor and gloss (N,2) of a key light, a fill light and a sky."""
     right, up, back = axes
     total = 0.18 + 0.10 * (n @ up)
     gloss = np.zeros(len(n))
@@ -132,7 +132,7 @@ def _shade(
 def contact_sheet(
     model: HeadModel, yaws: tuple[float, ...] = (0.0, 40.0, 90.0), size: int = 256
 ) -> Array:
-    """Render one row per pose of POSES and one column per yaw: picture (H, W, 3) uint8."""
+    """Render a row per pose of POSES and a column per yaw as one picture (H, W, 3) uint8."""
     rows = []
     known = set(model.expression_names) | {name[:-2] for name in model.expression_names}
     for controls, opening in POSES.values():

@@ -50,9 +50,7 @@ class Canvas:
     region: dict[str, np.ndarray]  # by name, which of the places are in it, (N,) bool
     marks: np.ndarray  # (68, 3) landmarks of the head at rest
     top: float | None = None  # height of the crown; None: of the highest place
-    eyes: dict[str, np.ndarray] | None = (
-        None  # centres of the eyeballs; None: means of their places
-    )
+    eyes: dict[str, np.ndarray] | None = None  # the eyeballs' centres; None: of their places
 
     @classmethod
     def of(cls, model: HeadModel) -> Canvas:

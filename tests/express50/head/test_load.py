@@ -23,7 +23,7 @@ def test_unknown_endings_are_refused(tmp_path: Path) -> None:
 
 
 def test_an_empty_folder_is_no_checkout(tmp_path: Path) -> None:
-    with pytest.raises(HeadModelError, match="expected a checkout"):
+    with pytest.raises(HeadModelError, match="give a checkout"):
         load_head(tmp_path)
 
 
