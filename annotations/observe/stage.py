@@ -8,11 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
+from scipy.ndimage import gaussian_filter1d
 
 from express50.capture.expressions import NEUTRAL
 from express50.capture.frames import read_proxy
@@ -29,6 +32,7 @@ from express50.landmarks.network import CROP, MIRROR, LandmarkNet, face_box, loa
 SCHEMA = "express50.observations/1"
 SEEN_SCORE = 0.15  # least score of a frame that shows the face
 TRIES = 8  # number of other frames to search for a face if the frames at rest show none
+HELD = 256  # frames of a camera that stay in memory; of longer windows they are decoded twice
 RANKED_SHARE = 0.8  # share of the best camera's score: worse cameras add mostly noise
 
 
@@ -160,20 +164,38 @@ def _watch(
         windows in increasing order. Windows may overlap: a frame keeps what its last window saw.
     """
 
-    def read(numbers: np.ndarray) -> list[np.ndarray]:
-        return [read_proxy(dataset, subject, camera, int(n)) for n in numbers]
+    @lru_cache(maxsize=HELD)
+    def read(number: int) -> np.ndarray:
+        return read_proxy(dataset, subject, camera, number)
 
-    places, sure = find_points(net, read(rest), smallest)
+    places, sure = find_points(net, Frames(read, rest), smallest)
     neutral = np.median(places[sure >= min(SEEN_SCORE, sure.max())], axis=0)
     seen: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
     for window in windows:
-        images = read(window)
+        images = Frames(read, window)
         points, scores = find_points(net, images, smallest)
         faces = align_faces(images, points, neutral)
         seen |= dict(zip(window.tolist(), zip(points, scores, faces, strict=True), strict=True))
     rows = [seen[number] for number in sorted(seen)]
     points, scores, faces = (np.stack(part) for part in zip(*rows, strict=True))
     return points, scores, faces
+
+
+class Frames(Sequence[np.ndarray]):
+    """Reads frames by their place in a window: all of a long one may not fit in memory."""
+
+    def __init__(self, read: Callable[[int], np.ndarray], numbers: np.ndarray) -> None:
+        self._read, self._numbers = read, numbers.tolist()
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self._numbers)
+
+    def __getitem__(self, place: Any) -> Any:
+        """Read a frame (H, W, 3) uint8, or a list of them for a slice."""
+        if isinstance(place, slice):
+            return [self._read(number) for number in self._numbers[place]]
+        return self._read(self._numbers[place])
 
 
 FACE = 48  # side of the aligned face, pixels
@@ -209,10 +231,10 @@ def find_points(
         batch = slice(start, start + len(crops))
         points[batch] = 0.5 * (direct + mirrored) @ window[:, :2].T + window[:, 2]
         scores[batch] = torch.sigmoid(output.logit).double().numpy().reshape(2, -1).mean(0)
-    for row, image in enumerate(images):
+    for row in range(len(images)):
         away = np.linalg.norm(face_box(points[row])[0] - centre)
         if away > STRAY_SHARE * side or scores[row] < STRAY_SCORE * middle.score:
-            own = detect(net, image, smallest=smallest)
+            own = detect(net, images[row], smallest=smallest)
             points[row], scores[row] = own.points, own.score
     return points, scores
 
@@ -251,9 +273,10 @@ def similarity_2d(source: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 def steady(values: np.ndarray) -> np.ndarray:
     """Average values (T, ...) over neighbouring frames with Gaussian weights."""
-    numbers = np.arange(len(values))
-    weights = np.exp(-0.5 * ((numbers[:, None] - numbers) / STEADY_FRAMES) ** 2)
-    return np.tensordot(weights / weights.sum(1, keepdims=True), values, axes=1)
+    reach = {"sigma": STEADY_FRAMES, "axis": 0, "mode": "constant", "truncate": 8.0}
+    weights = gaussian_filter1d(np.ones(len(values)), **reach)  # below 1 near both ends
+    total = gaussian_filter1d(np.asarray(values, np.float64), **reach)
+    return total / weights.reshape(-1, *[1] * (values.ndim - 1))
 
 
 def _cut(image: np.ndarray, window: np.ndarray, size: int) -> np.ndarray:

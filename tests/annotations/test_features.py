@@ -1,5 +1,8 @@
 """Features of synthetic faces: head motion, light and unrest do not count; expressions do."""
 
+import tracemalloc
+import weakref
+
 import numpy as np
 import pytest
 
@@ -14,8 +17,10 @@ from annotations.align.features import (
     shared_columns,
 )
 from annotations.align.suggest import strongest_event
+from annotations.observe import stage
 from annotations.observe.stage import FACE, FaceObservations, face_side, find_points, steady
 from express50.capture.expressions import load_script
+from express50.landmarks.detector import SMALLEST
 from express50.landmarks.network import load_network
 
 FACE_POINTS = np.random.default_rng(0).uniform(0, 100, (68, 2))
@@ -148,3 +153,39 @@ def test_steady_keeps_constants_and_single_frames():
     np.testing.assert_allclose(steady(np.full((5, 2), 3.0)), 3.0)
     np.testing.assert_allclose(steady(np.array([[2.0]])), 2.0)
     assert face_side(np.array([[0.0, 0], [10, 4]])) == pytest.approx(11)
+
+
+def test_long_clips_need_memory_in_proportion_to_their_length():
+    values = np.sin(np.arange(20_000) / 50.0)[:, None] * np.ones(3)
+    tracemalloc.start()
+    try:
+        even = steady(values)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 20 * values.nbytes
+    np.testing.assert_allclose(even[5:-5], values[5:-5], atol=1e-3)
+
+
+def test_a_long_window_is_not_held_in_memory(dataset, monkeypatch):
+    read, pictures, alive = stage.read_proxy, [], []
+
+    def counted(*which):
+        image = read(*which)
+        pictures.append(weakref.ref(image))
+        alive.append(sum(one() is not None for one in pictures))
+        return image
+
+    def watch_one():
+        numbers = np.arange(12)
+        return stage._watch(
+            dataset, "S001", load_network(), "cam00", [numbers], numbers[:1], SMALLEST
+        )
+
+    whole = watch_one()
+    monkeypatch.setattr(stage, "read_proxy", counted)
+    monkeypatch.setattr(stage, "HELD", 2)
+    monkeypatch.setattr(stage, "BATCH", 2)
+    for one, other in zip(watch_one(), whole, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-3)
+    assert len(alive) > 12 and max(alive) <= 6
