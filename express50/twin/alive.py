@@ -1,9 +1,9 @@
-"""Give people faces of their own in motion: personal movements, wrinkles, skin that reddens.
+"""Give each person's face its own motion, wrinkles and reddening.
 
-The head model moves everybody's skin alike. Here each person's skin answers its expressions with a
-matrix of its own at every vertex, which is linear in the coefficients and yet outside the model's
-space. Folds darken and brighten where a muscle gathers the skin, and effort reddens or pales it.
-All of it grows with ``twin.personal``, and none is in the model that the stages fit.
+The head model moves everybody's skin alike. Here each person has a matrix per vertex that adds to
+this motion: linear in the coefficients, but outside the model's space. Folds darken and brighten
+where a muscle gathers the skin, and effort reddens or pales it. All of this grows with
+``twin.personal``, and the model that the stages fit has none of it.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from express50.geometry.sampling import smoothstep
 from express50.head.model import HeadModel, landmarks
 from express50.twin.surface import fractal, make_lattice, noise
 
-# Standard deviation of an entry at an amount of 1: two fifths of a motion are the person's own.
+# Standard deviation of a matrix entry if the amount is 1: the person adds two fifths of a motion.
 OWN_SHARE = 0.25
-WAVE_M = 0.045  # of the matrices over the skin
-DEPTH, FLUSH = 0.35, 0.2  # of folds' light, and of redness, at full effort
+WAVE_M = 0.045  # wavelength of the matrices over the skin
+DEPTH, FLUSH = 0.35, 0.2  # strength of folds and of redness at full effort
 EFFORT = 2.5  # sum of coefficients that is full effort
 # Folds by the muscles that make them, on the subject's left and right.
 MUSCLES = {
@@ -42,7 +42,7 @@ class LivingSkin:
     lattice: np.ndarray  # random values that make the person's folds irregular
 
     def factor(self, places: np.ndarray) -> np.ndarray:
-        """Return what multiplies the skin's colour (N, 3) at places (N, 3) of the mean head."""
+        """Return the factor (N, 3) on the skin's colour at places (N, 3) of the mean head."""
         light = np.ones(len(places), np.float32)
         for name, depth in self.folds.items():
             if depth > 0.01:
@@ -84,7 +84,7 @@ class LivingSkin:
         return 1.3 * front * faded * np.cos(np.clip(across / 0.004, -np.pi, np.pi))
 
     def _flushed(self, places: np.ndarray) -> np.ndarray:
-        """Return where (N,) blood shows: cheeks, nose, forehead and chin."""
+        """Return how much (N,) places redden: cheeks, nose, forehead and chin do."""
         marks = self.marks
         spots = [(0.5 * (marks[46] + marks[54]), 0.03, 1.0), (marks[30], 0.02, 0.7),
                  (0.5 * (marks[41] + marks[48]), 0.03, 1.0), (marks[8], 0.025, 0.4),
@@ -97,7 +97,7 @@ class LivingSkin:
 
 
 def _ripple(phase: np.ndarray) -> np.ndarray:
-    """Return valleys a period apart: 1 in them, slightly under 0 on the ridges."""
+    """Return 1 in valleys, one per period, and slightly under 0 on the ridges between."""
     return 1.2 * np.exp(-((((phase % 1.0) - 0.5) / 0.16) ** 2)) - 0.2
 
 
@@ -106,7 +106,7 @@ def _round(off: np.ndarray, radius: float) -> np.ndarray:
 
 
 def own_motion(model: HeadModel, number: int, seed: int, amount: float) -> np.ndarray:
-    """Draw the matrices (V, 3, 3) that turn the model's motion into what a person adds to it."""
+    """Draw the matrices (V, 3, 3) that map the model's motion to what a person adds to it."""
     template = model.template.double().numpy()
     rng = np.random.default_rng([seed, number, 15])
     field = np.empty((len(template), 3, 3))
@@ -118,7 +118,7 @@ def own_motion(model: HeadModel, number: int, seed: int, amount: float) -> np.nd
 
 
 def own_offsets(model: HeadModel, own: np.ndarray, expression: np.ndarray) -> np.ndarray:
-    """Return what a person's own motion (V, 3, 3) adds at rest (V, 3) to an expression (X,)."""
+    """Return the rest offsets (V, 3) that own motion (V, 3, 3) adds to an expression (X,)."""
     moved = model.expression_dirs.double().numpy() @ expression
     return np.einsum("vij,vj->vi", own, moved)
 
@@ -133,10 +133,10 @@ def living_skin(
     folds = {}
     for kind, muscles in MUSCLES.items():
         for side in SIDES:
-            # No face folds evenly on both sides.
+            # No face folds equally on both sides.
             depth, gain = sum(values.get(f"{m}_{side}", 0.0) for m in muscles), rng.uniform(0.6, 1)
             folds[f"{kind}_{side}"] = float(gain * lines * np.clip(depth, 0, 1))
-    # Two of three redden with effort, the others pale.
+    # Two people of three redden with effort, the others turn pale.
     temper = rng.uniform(0.6, 1.0) * (1 if rng.uniform() < 2 / 3 else -0.7)
     flush = amount * temper * np.tanh(np.abs(expression).sum() / EFFORT)
     marks = landmarks(model, model.template[None])[0].double().numpy()

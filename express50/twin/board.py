@@ -1,4 +1,4 @@
-"""Draw the calibration board, and the room behind the subject."""
+"""Render the calibration board, and the room behind the subject."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ dictionary = "{DICTIONARY}"
 """
 _TEXELS = 24  # a square's side in the pattern; a marker takes 18: six cells of three
 _MARGIN = 12  # white border, texels
-_RAYS = 17  # odd, or else pictures are shifted by half the distance of rays
+_RAYS = 17  # per pixel; odd, because an even number would shift the picture
 
 
 def charuco_board() -> cv2.aruco.CharucoBoard:
-    """Make OpenCV's description of the board; its space is metres, x right, y down, z into it."""
+    """Return OpenCV's description of the board; metres, x right, y down, z into the board."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARY))
     return cv2.aruco.CharucoBoard(SQUARES, SQUARE_M, MARKER_M, dictionary)
 
@@ -48,8 +48,8 @@ def charuco_board() -> cv2.aruco.CharucoBoard:
 def board_poses(count: int, seed: int) -> list[np.ndarray]:
     """Return ``world_from_board`` (4, 4) of every synchronised frame.
 
-    The board turns through the rig's arc twice in golden-section order, so that every camera sees
-    it several times and neighbours see it together, whatever the count.
+    The board turns through the rig's arc in golden-section order, so that for any count every
+    camera sees it several times, and neighbours see it together.
     """
     rng = np.random.default_rng([seed, 401])
     middle = np.array([*SQUARES, 0.0]) * 0.5 * SQUARE_M
@@ -76,9 +76,9 @@ def board_pattern() -> np.ndarray:
 
 
 def render_board(world_from_board: np.ndarray, camera: Camera, seed: int) -> np.ndarray:
-    """Render the linear picture (H, W, 3) float32 of the board in the studio.
+    """Render the board in the studio as a linear picture (H, W, 3) float32.
 
-    Every pixel averages the pattern over several rays; the pattern itself is exact at any scale.
+    Every pixel averages the pattern over several rays.
     """
     image = np.empty((camera.height, camera.width, 3), np.float32)
     normal = -world_from_board[:3, 2]
@@ -103,7 +103,7 @@ def render_board(world_from_board: np.ndarray, camera: Camera, seed: int) -> np.
 def _meet_board(
     world_from_board: np.ndarray, origin: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Intersect rays (h, w, 3) with the board: hit mask, and the pattern's tone there."""
+    """Intersect rays (h, w, 3) with the board; return hits (h, w) float32 and their tones."""
     R = world_from_board[:3, :3]
     start = R.T @ (origin - world_from_board[:3, 3])
     turned = directions @ R
@@ -119,12 +119,12 @@ def _meet_board(
 
 
 RADIUS_M = 2.6
-_HIGHEST = 0.95  # elevation up to which the wall is painted, radians; cameras see less
+_HIGHEST = 0.95  # largest elevation of the wall, radians; no camera sees further up or down
 
 
 def studio_bands(camera: Camera, seed: int) -> Iterator[tuple[RowBand, np.ndarray]]:
     """Yield a camera's bands, each with the empty studio's linear picture (h, w, 3) float32."""
-    # Texels around the room, which is out of focus.
+    # Texels around the room: few, because it is out of focus.
     width = int(np.clip(2 ** np.round(np.log2(2 * np.pi * camera.K[0, 0] * 0.35)), 2048, 4096))
     room = _room(seed, width)
     height = len(room)
@@ -142,7 +142,7 @@ def studio_bands(camera: Camera, seed: int) -> Iterator[tuple[RowBand, np.ndarra
 
 @cache
 def _room(seed: int, width: int) -> np.ndarray:
-    """Return the room's wall (H, W, 3) float32, by azimuth and elevation from its middle."""
+    """Paint the room's wall (H, W, 3) float32, by azimuth and elevation from its middle."""
     rng = np.random.default_rng([seed, 201])
     height = 2 * round(width * _HIGHEST / (2 * np.pi))
     az = (cell_centres(width) / width * 2 * np.pi - np.pi).astype(np.float32)
@@ -156,7 +156,7 @@ def _room(seed: int, width: int) -> np.ndarray:
     own = noise(np.stack([x, y, 0 * x], -1).reshape(-1, 3), make_lattice(rng)).reshape(x.shape)
     panels = (0.55 + 0.45 * seam_x * seam_y[:, None]) * (1 + 0.22 * own)
     shade = (1 + 0.35 * np.clip(el, -0.8, 0.8))[:, None] * panels
-    # The felt's blotches are smooth: half the size is enough.
+    # The felt's blotches are smooth, so half the size is enough.
     points = spherical_to_unit(*np.meshgrid(az[::2], el[::2])).reshape(-1, 3) * RADIUS_M
     felt = 1 + 0.16 * fractal(points, make_lattice(rng), 0.55, 4, 0.55)
     shade *= cv2.resize(felt.reshape(height // 2, width // 2), (width, height))
@@ -176,12 +176,12 @@ def _room(seed: int, width: int) -> np.ndarray:
 
 
 def _around(az: np.ndarray, centre: float | np.ndarray) -> np.ndarray:
-    """Return angle from a centre, wrapped to [-pi, pi)."""
+    """Return angles from a centre, wrapped to [-pi, pi)."""
     return (az - centre + np.pi) % (2 * np.pi) - np.pi
 
 
 def _pole(rng: np.random.Generator, wall: np.ndarray, az: np.ndarray, el: np.ndarray) -> None:
-    """Paint a steel stand with rounded shading; edits ``wall``."""
+    """Paint a steel stand with rounded shading into ``wall``."""
     centre, half = rng.uniform(-np.pi, np.pi), rng.uniform(0.006, 0.016)
     lean, metal, tint = rng.uniform(-0.08, 0.08), rng.uniform(0.05, 0.4), rng.uniform(0.9, 1.1, 3)
     near = np.flatnonzero(np.abs(_around(az, centre)) < 0.14 + 2 * half)
@@ -192,7 +192,7 @@ def _pole(rng: np.random.Generator, wall: np.ndarray, az: np.ndarray, el: np.nda
 
 
 def _lamp(rng: np.random.Generator, wall: np.ndarray, az: np.ndarray, el: np.ndarray) -> None:
-    """Paint a bright or dark box: a light, a camera housing; edits ``wall``."""
+    """Paint a bright or dark box, such as a light or a camera, into ``wall``."""
     centre, level = rng.uniform(-np.pi, np.pi), rng.uniform(-0.5, 0.6)
     w, h = rng.uniform(0.03, 0.09, 2)
     bright = rng.uniform(0.45, 0.75) if rng.uniform() < 0.4 else rng.uniform(0.03, 0.12)

@@ -1,4 +1,4 @@
-"""Assemble a subject's geometry, head model, hair and shoulders, posed for one frame."""
+"""Build a subject's geometry (head, hair, shoulders and what is worn), and pose it for a frame."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ class Extras:
     cloth_vertices: np.ndarray  # shoulders, rigid with the root
     cloth_faces: np.ndarray
     skull: np.ndarray  # (K,) head vertices that hair follows
-    skull_rest: np.ndarray  # (K, 3) where they rest
+    skull_rest: np.ndarray  # (K, 3) their positions at rest
     worn: WornMesh  # may be empty
-    hand: np.ndarray  # (F, 4, 4) rest head space from that of the hand, none without one
+    hand: np.ndarray  # (F, 4, 4) rest head space from hand space; empty without a hand
 
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
-    """One subject's static geometry."""
+    """One subject's geometry that is the same in all frames."""
 
     model: HeadModel
     subject: TwinSubject
@@ -59,22 +59,22 @@ def build_body(
     hair_detail: float = 1.0,
     kinds: tuple[str, ...] = (),
 ) -> Body:
-    """Build what no frame changes of a subject, and what it wears of the `config.KINDS`.
+    """Build the geometry of a subject, and what it wears of the `config.KINDS`.
 
-    A hair detail of 0 leaves the scalp bald.
+    With a hair detail of 0 the scalp is bald.
     """
     template = model.template.double().numpy()
     faces = model.faces.numpy().astype(np.int32)
     centre = head_centre(model)
     scalp = smooth_over_mesh(model.regions["scalp"].numpy().astype(np.float32), faces, 2)
     scalp = np.where(model.regions["scalp"].numpy(), np.clip(2.0 * scalp - 1.0, 0.0, 1.0), 0.0)
-    # Hair ends at the nape, wherever a model's scalp mask ends.
+    # Hair ends at the nape, even if a model's scalp mask extends further.
     chin = landmarks(model, model.template[None])[0, 8, 1].item()
     scalp = scalp * smoothstep(template[:, 1], chin - 0.005, chin + 0.025)
     rest = rest_vertices(model, subject)
     skin_faces = faces[model_materials(model)[faces].min(1) == Material.SKIN]
     cloth_vertices, cloth_faces = _shoulders(rest, skin_faces, model.regions["boundary"].numpy())
-    # Hair lies on skin and shirt alike.
+    # Hair lies on skin and on the shirt.
     star = StarMap(
         np.concatenate([rest, cloth_vertices]),
         np.concatenate([skin_faces, cloth_faces + len(rest)]),
@@ -82,7 +82,7 @@ def build_body(
     )
     rng = np.random.default_rng([seed, subject.number, 7])
     hair = grow_hair(rng, rest, faces, scalp, star, subject.look, hair_detail)
-    # Worn hair has random numbers of its own, so that the rest of the person stays the same.
+    # Worn hair has its own random numbers, so that it does not change the rest of the person.
     seeds = [seed, subject.number, 13]
     hair = join_hair(
         [hair, *grow_worn(kinds, model, rest, scalp, star, subject.look, hair_detail or 1.0, seeds)]
@@ -103,7 +103,7 @@ def rest_vertices(model: HeadModel, subject: TwinSubject) -> np.ndarray:
 
 
 def with_hand(body: Body, play: TwinPerformance, seed: int) -> Body:
-    """Hold the hand, if there is one, before another part of the face in every cue window."""
+    """Return the body with its hand, if any, in front of a part of the face per cue window."""
 
     def heads(frame: int) -> tuple[np.ndarray, np.ndarray]:
         _, _, own = _skull_at_rest(body, play, frame)
@@ -118,7 +118,7 @@ def with_hand(body: Body, play: TwinPerformance, seed: int) -> Body:
 def assemble(
     model: HeadModel, subject: TwinSubject, extras: Extras, scalp: np.ndarray, centre: np.ndarray
 ) -> Body:
-    """Join head, hair, shoulders and what is worn into one mesh."""
+    """Join head, hair, shoulders and what is worn into one body."""
     faces = model.faces.numpy().astype(np.int32)
     heads, hairs = len(model.template), len(extras.hair.vertices)
     labels = model_materials(model)
@@ -145,8 +145,8 @@ def assemble(
 
 
 def model_materials(model: HeadModel) -> np.ndarray:
-    """Return material (V,) uint8 of each head vertex, from the model's regions."""
-    # In no region: ICT-FaceKit's opaque lash cards and the sockets behind its eyes.
+    """Return the material (V,) uint8 of each head vertex, from the model's regions."""
+    # ICT-FaceKit's opaque lashes and the sockets behind its eyes are in no region.
     named = np.any([mask.numpy() for mask in model.regions.values()], axis=0)
     labels = np.where(named, Material.SKIN, Material.HIDDEN).astype(np.uint8)
     for region, material in (
@@ -161,7 +161,7 @@ def model_materials(model: HeadModel) -> np.ndarray:
 
 
 def head_centre(model: HeadModel) -> np.ndarray:
-    """Find a point (3,) inside the skull from which face, scalp and ears are all seen."""
+    """Return a point (3,) inside the skull from which face, scalp and ears are all visible."""
     template = model.template.double().numpy()
     head = template[(model.regions["face"] | model.regions["scalp"]).numpy()]
     joints = model.joint_regressor.double().numpy() @ template
@@ -236,7 +236,7 @@ def pose_body(body: Body, play: TwinPerformance, frame: int) -> Posed:
 def _skull_at_rest(
     body: Body, play: TwinPerformance, frame: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return how the skull moved, R (3, 3) and t (3,), and the head (V, 3) with that undone."""
+    """Return the skull's motion R (3, 3) and t (3,), and the head (V, 3) without it."""
     head = head_vertices(body.model, body.subject, play, frame)
     turn, shift = rigid_fit(body.extras.skull_rest, head[body.extras.skull])
     return turn, shift, (head - shift) @ turn
@@ -245,7 +245,7 @@ def _skull_at_rest(
 def _shoulders(
     rest: np.ndarray, skin_faces: np.ndarray, boundary: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Make a shirt (N, 3), faces (M, 3), that flares from a collar around the neck's end."""
+    """Make a shirt, vertices (N, 3) and faces (M, 3), that widens from a collar around the neck."""
     loop = rest[boundary]
     low, high = loop.min(0), loop.max(0)
     centre, half = 0.5 * (low + high), 0.5 * (high - low)
@@ -257,13 +257,13 @@ def _shoulders(
     # From an ellipse at the collar to a rounder box at the shoulders.
     power = 2.0 + 0.8 * flare
     scale = (np.abs(c) ** power + np.abs(z) ** power) ** (-1.0 / power)
-    # The collar follows the neck's open edge, or one could look into the neck.
+    # The collar follows the neck's open edge, so that nobody sees into the neck.
     bearing = np.arctan2(loop[:, 2] - centre[2], loop[:, 0] - centre[0])
     edge = np.interp(around, bearing % (2 * np.pi), loop[:, 1] - centre[1], period=2 * np.pi)
     drop = 0.012 + edge * (1 - flare) - 0.10 * flare**2.2 - 0.24 * s**3
     shirt = np.stack([width * scale * c, drop, -0.02 * flare + depth * scale * z], axis=-1)
     shirt = shirt.reshape(-1, 3) + centre
-    # It is pushed level away from the neck's axis until it clears the skin.
+    # It is pushed away from the neck's axis, horizontally, until it clears the skin.
     level = (shirt - centre) * (1.0, 0.0, 1.0)
     radius = np.linalg.norm(level, axis=1, keepdims=True)
     out = level / np.maximum(radius, 1e-6)

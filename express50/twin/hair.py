@@ -1,7 +1,7 @@
-"""Grow hair: thin ribbons that flow over the head and break its silhouette.
+"""Grow hair: thin ribbons that run over the head and make its silhouette irregular.
 
-Strands march over the head in a flow field (away from the crown, combed, falling), in layers
-above the skin. They hang on the skull rigidly; the mesh is made once per subject.
+Strands follow a flow field over the head (away from the crown, combed, falling), in layers above
+the skin. They are rigid with the skull; the mesh is made once per subject.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _STYLES = {
 class HairMesh:
     """Ribbons in rest head space: vertices, faces, unit tangents, outward normals, colours.
 
-    ``moves`` (N,) is the vertex of the head that each moves with, or -1: with the skull.
+    ``moves`` (N,) is the head vertex that each vertex moves with, or -1 for the skull.
     """
 
     vertices: np.ndarray
@@ -62,7 +62,7 @@ class HairMesh:
 
 
 def join_hair(meshes: list[HairMesh]) -> HairMesh:
-    """Join meshes of ribbons to one."""
+    """Join meshes of ribbons into one."""
     names = ("vertices", "tangents", "normals", "colours", "moves")
     counts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     faces = [mesh.faces + count for mesh, count in zip(meshes, counts, strict=True)]
@@ -83,17 +83,17 @@ def grow_hair(
     """Grow a subject's hair.
 
     Args:
-        rng: source of chance.
+        rng: random generator.
         vertices: (V, 3) the subject's neutral head, rest head space.
         faces: (F, 3).
         scalp: (V,) density of roots, 0 to 1.
         star: outer surface of the head.
         look: colour, style and length.
-        detail: more and thinner strands where above 1, fewer and thicker ones below, none at 0.
-        on_skull: strands move with the skull; otherwise with the skin at their roots.
+        detail: over 1 more and thinner strands, under 1 fewer and thicker ones, at 0 none.
+        on_skull: strands move with the skull; if False, with the skin at their roots.
     """
     style = _STYLES[look.hair_style]
-    # Roots are even over the scalp's area.
+    # Roots are spread evenly over the scalp's area.
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1) * scalp[faces].mean(1) ** 2
     count = round(style.strands * detail)
@@ -110,7 +110,7 @@ def grow_hair(
 def _march(
     rng: np.random.Generator, roots: np.ndarray, star: StarMap, style: HairStyle, length: float
 ) -> np.ndarray:
-    """Return strand points (N, steps + 1, 3) from the roots on."""
+    """Return the points (N, steps + 1, 3) of strands, which start at the roots."""
     count = len(roots)
     layer = style.lift * rng.uniform(0.08, 1.0, count) ** 1.2
     stray = rng.uniform(size=count) < 0.07
@@ -123,14 +123,14 @@ def _march(
         out = unit(at - star.centre)
         flow = _flow(at, out, star, style) + drift
         at = at + step[:, None] * unit(flow)
-        # Never nearer than the clearance, or chords of the ribbons dip into the skin.
+        # The clearance keeps chords of the ribbons out of the skin.
         rise = layer * (1.0 - np.exp(-6.6 * k / style.steps))
         height = np.maximum(rise, min(_CLEARANCE, 0.4 * style.lift))
         distance = np.linalg.norm(at - star.centre, axis=1)
         ray = (at - star.centre) / np.maximum(distance, 1e-9)[:, None]
         wanted = star.radius(ray) + height
-        # Where the shoulders begin, the surface is suddenly far out: hair that hangs yields to it
-        # in small steps, and only outwards.
+        # At the shoulders the surface jumps outwards: hanging hair moves out in small steps only,
+        # and never inwards.
         pushed = np.minimum(np.maximum(distance, wanted), distance + 0.004)
         at = star.centre + ray * np.where(ray[:, 1] < -0.25, pushed, wanted)[:, None]
         turn = phase + wobble + 2.4 * k
@@ -143,7 +143,7 @@ def _march(
 
 
 def _flow(at: np.ndarray, out: np.ndarray, star: StarMap, style: HairStyle) -> np.ndarray:
-    """Return direction (N, 3) in which hair runs at points (N, 3), along the surface."""
+    """Return the direction (N, 3) of hair at points (N, 3), along the surface."""
     crown = unit(np.array([0.0, 0.9, -0.45]))
     away = unit(out * (out @ crown)[:, None] - crown)
     flow = style.away * away
@@ -151,7 +151,7 @@ def _flow(at: np.ndarray, out: np.ndarray, star: StarMap, style: HairStyle) -> n
     flow = flow + style.back * front[:, None] * np.array([0.0, 0.35, -1.0])
     flow = flow + style.side * smoothstep(out[:, 1], 0.2, 0.8)[:, None] * np.array([1.0, 0.0, 0.0])
     if style.fall >= 1.0:
-        # A middle parting: hair leaves the face to both sides.
+        # A middle parting: hair runs off the face to both sides.
         sides = np.sign(at[:, :1]) * smoothstep(out[:, 2], -0.1, 0.5)[:, None]
         flow = flow + 2.2 * sides * np.array([1.0, 0.0, 0.0])
     flow = flow + style.fall * np.array([0.0, -1.0, 0.0])
@@ -168,7 +168,7 @@ def _ribbons(
     colour: np.ndarray,
     moves: np.ndarray,
 ) -> HairMesh:
-    """Make ribbons along strand points (N, P, 3), each rolled at random, thin at the tip."""
+    """Make a ribbon along each strand (N, P, 3), rolled at random and thin at the tip."""
     count, length = points.shape[:2]
     tangents = unit(np.gradient(points, axis=1))
     out = unit(points - centre)

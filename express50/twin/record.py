@@ -1,6 +1,6 @@
-"""``express50 twin record`` makes synthetic captures with known truth.
+"""Record synthetic captures with known truth (``express50 twin record``).
 
-The work is planned, filmed in processes, and published: a subject appears complete or not at all.
+Worker processes film the subjects; each is then published complete or not at all.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
 
 
 def record_command(args: argparse.Namespace) -> int:
-    """Record and say what was recorded."""
+    """Record the subjects, and print which were recorded."""
     ids, worn = (
         tuple(part.strip() for part in text.split(",") if part.strip())
         for text in (args.expressions or "", args.wear)
@@ -102,7 +102,7 @@ def record(
     workers: int = 2,
     report: Callable[[int, int], None] | None = None,
 ) -> list[str]:
-    """Record subjects that are not there yet; the rest is kept.
+    """Record the subjects that do not exist yet; others are kept.
 
     Writes ``out/captures/<subject>`` (raw capture layout) and ``out/truth/<subject>``.
 
@@ -110,7 +110,7 @@ def record(
         config: what to record.
         out: the folder.
         workers: processes.
-        report: called now and then with pictures done and pictures in all.
+        report: called regularly with the number of pictures done and of all pictures.
 
     Returns:
         Ids of the subjects recorded now.
@@ -127,8 +127,8 @@ def record(
     staging = out / ".recording"
     shutil.rmtree(staging, ignore_errors=True)
     staging.mkdir(parents=True)
-    # A task is a subject, or "" for the board, and some cameras. They share each frame's geometry,
-    # so subjects are split only where there are more workers.
+    # A task is a subject, or "" for the board, and some cameras. A subject's cameras share each
+    # frame's geometry, so they are split only if there are more workers than subjects.
     parts = min(config.cameras, max(1, -(-workers // len(missing))))
     groups = [list(range(k, config.cameras, parts)) for k in range(parts)]
     tasks = [(subject, group) for subject in missing for group in groups]
@@ -151,7 +151,7 @@ def _run(
     workers: int,
     report: Callable[[int], None],
 ) -> None:
-    """Film all tasks; the first failure stops the rest."""
+    """Film all tasks; the first failure stops the others."""
     context = multiprocessing.get_context("spawn")
     counter = context.Value("q", 0)
     if workers == 1:
@@ -187,7 +187,7 @@ def _tick() -> None:
 
 
 def _film(config: TwinConfig, task: Task, staging: Path) -> None:
-    # Imported here: the planning process needs neither torch nor Open3D.
+    # Imported here, because the main process needs neither torch nor Open3D.
     import torch
 
     from express50.twin.studio import film_board, film_subject
@@ -202,7 +202,7 @@ def _film(config: TwinConfig, task: Task, staging: Path) -> None:
 
 
 def _publish(config: TwinConfig, subject: str, staging: Path, out: Path) -> None:
-    """Add the files besides footage, then move a subject's truth and capture into place."""
+    """Add a subject's other files to its footage, then move truth and capture into place."""
     from express50.twin.board import BOARD_TOML
 
     capture, truth = staging / "captures" / subject, staging / "truth" / subject
@@ -218,7 +218,7 @@ def _publish(config: TwinConfig, subject: str, staging: Path, out: Path) -> None
     rows = [f"{name},{first},{last}\n" for name, first, last in about["cues"]]
     (capture / "cues.csv").write_text("expression_id,start_frame,end_frame\n" + "".join(rows))
     if config.board_frames:
-        # One rig, one board sequence: hard links spare the disk copies for every subject.
+        # All subjects have the same board pictures, so hard links save space.
         shutil.copytree(staging / "board", capture / "board", copy_function=os.link)
         (capture / "board" / "board.toml").write_text(BOARD_TOML)
     if config.give_calibration:
@@ -230,11 +230,11 @@ def _publish(config: TwinConfig, subject: str, staging: Path, out: Path) -> None
 
 
 def _check_settings(config: TwinConfig, out: Path) -> None:
-    """Remember the settings of a recording, so that it is never continued with others."""
+    """Store a recording's settings; raise CaptureError if it was begun with other ones."""
     path = out / "twin.json"
     settings = {k: v for k, v in asdict(config).items() if k not in ("subjects", "first_subject")}
     now = json.loads(dump_json(settings))
-    begun = any((out / "captures").glob("*"))  # otherwise nothing was recorded with these settings
+    begun = any((out / "captures").glob("*"))  # else nothing was recorded with the stored settings
     former = json.loads(path.read_bytes()) if begun and path.is_file() else now
     former = {"personal": 0.0} | former  # recordings from before that setting
     changed = sorted(k for k in now | former if former.get(k) != now.get(k))
@@ -247,7 +247,7 @@ def _check_settings(config: TwinConfig, out: Path) -> None:
 
 
 def print_progress() -> Callable[[int, int], None]:
-    """Make a reporter for `record` on standard error: one line that rewrites itself, or lines."""
+    """Return a reporter for `record` that prints to standard error, on a terminal in one line."""
     start = last = time.monotonic()
     live = sys.stderr.isatty()
 

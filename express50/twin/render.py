@@ -1,8 +1,8 @@
 """Render by ray casting: colour, alpha and depth of a frame in any camera.
 
-One ray per pixel finds where there is detail; only there further rays are cast: many where the
-silhouette or hair makes alpha fractional, a few inside. Images are made in bands of rows, so that
-memory does not grow with the image.
+One ray per pixel finds where there is detail. Only there more rays are cast: many where silhouette
+or hair make alpha fractional, a few inside. Images are made in bands of rows, so that memory does
+not grow with the image.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import scipy.spatial
 from express50.geometry.cameras import Camera, crop_camera, project, rays
 from express50.twin.surface import MISS, Caster, Material
 
-# Premultiplied colours and alpha (N, 4) for directions (N, 3), faces (N,), barycentrics (N, 2).
+# From directions (N, 3), faces (N,), barycentrics (N, 2) to premultiplied colours and alpha (N, 4).
 Shade = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 BAND_PIXELS = 1 << 18
 HALO = 4  # rows and columns beyond a band that the search for detail looks at
@@ -28,7 +28,7 @@ _DEPTH_STEP = 0.004  # metres between neighbours that count as an edge inside th
 class Sampling:
     """Rays per pixel: at silhouettes and loose hair, and at detail inside the silhouette.
 
-    Sparing rays, silhouette pixels where the first third agree get no more.
+    If `sparing`, silhouette pixels whose first third of rays agree get no more.
     """
 
     edge: int = 9
@@ -38,9 +38,9 @@ class Sampling:
 
 @dataclass(frozen=True, kw_only=True)
 class RowBand:
-    """Rays of some rows of a camera, halo included, in the world."""
+    """Rays of some rows of a camera, including a halo, in the world."""
 
-    top: int  # rows of the image, halo left out
+    top: int  # rows of the image, without the halo
     bottom: int
     rows: slice  # the same rows of the arrays
     origin: np.ndarray  # (3,) float32
@@ -57,7 +57,7 @@ def bands(camera: Camera) -> Iterator[RowBand]:
         start, end = max(0, top - HALO), min(camera.height, bottom + HALO)
         part = crop_camera(camera, -1, start - 1, camera.width + 2, end - start + 2)
         origin, grid = rays(part)
-        # Central differences; one more pixel on every side was cast for them.
+        # Central differences, for which the grid has one more pixel on every side.
         right = 0.5 * (grid[1:-1, 2:] - grid[1:-1, :-2])
         down = 0.5 * (grid[2:, 1:-1] - grid[:-2, 1:-1])
         yield RowBand(
@@ -76,14 +76,14 @@ def render_band(
     sampling: Sampling,
     shade: Shade | None,
 ) -> tuple[np.ndarray, np.ndarray, tuple[slice, slice]] | None:
-    """Render premultiplied colour and alpha of one band, where the subject may be.
+    """Render premultiplied colour and alpha of the part of a band where the subject may be.
 
-    Outside ``window``, columns and rows x0, y0, x1, y1 of the image, nothing is hit; ``shade`` is
-    None for alpha alone.
+    That is inside ``window``: columns and rows x0, y0, x1, y1 of the image. Without ``shade``,
+    colours are 0.
 
     Returns:
-        colour (h, w, 3) and alpha (h, w) float32 of the named rows and columns of the image; None
-        where the band does not meet the window.
+        colour (h, w, 3), alpha (h, w) float32, and their rows and columns in the image; None if
+        the band does not meet the window.
     """
     x0, x1 = window[0], window[2]
     y0, y1 = max(band.top, window[1]), min(band.bottom, window[3])
@@ -103,7 +103,7 @@ def render_band(
     keep[inner] = True
     colour = np.zeros((height * width, 3), np.float32)
     alpha = np.zeros(height * width, np.float32)
-    # The centre's ray is one of the samples of every pixel.
+    # The ray through the centre is one of each pixel's samples.
     seen = np.flatnonzero(keep.ravel() & (face != MISS))
     alpha[seen] = 1.0
     if shade is not None and seen.size:
@@ -123,12 +123,12 @@ def render_band(
 def _detail(
     distance: np.ndarray, face: np.ndarray, material: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find pixels (h, w) whose alpha may be fractional, and other pixels with detail."""
+    """Mark the pixels (h, w) whose alpha may be fractional, and other pixels with detail."""
     hit = face != MISS
     kind = np.where(hit, material[np.where(hit, face, 0)], 255).astype(np.uint8)
     box = np.ones((3, 3), np.uint8)
     covered = hit.astype(np.uint8)
-    # Strands thinner than a pixel hide between rays: look further around hair.
+    # Strands thinner than a pixel may lie between rays, so more pixels around hair count.
     wide = np.ones((5, 5), np.uint8)
     hair = cv2.dilate((kind == Material.HAIR).astype(np.uint8), wide)
     some, every = cv2.dilate(covered, box), cv2.erode(covered, box)
@@ -151,8 +151,8 @@ def _refined(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return colour (N, 3) and alpha (N,) of pixels (3, N, 3) as means of ``count`` samples.
 
-    ``samples`` are those of their centres. Sparing with rays, a third comes first; pixels where
-    those all hit, or all miss, end there.
+    ``samples`` are those of their centres. If ``sparing``, pixels get a third of the rays first,
+    and no more if these all hit or all miss.
     """
     places = np.stack(ray_pattern(count), axis=1)
     others = np.delete(np.arange(count), count // 2)
@@ -173,7 +173,7 @@ def _refined(
 def _cast_more(
     caster: Caster, origin: np.ndarray, grid: np.ndarray, places: np.ndarray, shade: Shade | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Cast rays at places (K, 2) in pixels; return sums of colour (N, 3) and hits (N,)."""
+    """Cast rays at places (K, 2) in each pixel; return sums of colour (N, 3) and alpha (N,)."""
     centre, right, down = grid
     u, v = places.T[:, :, None, None]
     directions = (centre + u * right + v * down).reshape(-1, 3)
@@ -193,9 +193,9 @@ def _split(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def ray_pattern(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return places (count,) in a pixel, from -0.5 up, even in x, in y and over the pixel.
+    """Return places x and y (count,) in a pixel, from -0.5 up, evenly spread.
 
-    Rank-1 lattice: every row and every column of a count x count grid holds one ray. Number
+    They are a rank-1 lattice: every row and column of a count x count grid holds one ray. Number
     ``count // 2`` is the centre.
     """
     half = count // 2
@@ -209,12 +209,12 @@ def ray_pattern(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def hull_of(vertices: np.ndarray) -> np.ndarray:
-    """Return corners (K, 3) of the convex hull of vertices (N, 3), not all in one plane."""
+    """Return the corners (K, 3) of the convex hull of vertices (N, 3), not all in one plane."""
     return vertices[scipy.spatial.ConvexHull(vertices).vertices]
 
 
 def window_of(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]:
-    """Return columns and rows x0, y0, x1, y1 that hold all of some vertices (N, 3), with a margin.
+    """Return columns and rows x0, y0, x1, y1 that contain all vertices (N, 3), with a margin.
 
     The corners of the convex hull (:func:`hull_of`) are enough.
     """
@@ -246,7 +246,7 @@ def render_alpha(
 
 
 def render_depth(caster: Caster, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Render camera z (H, W) float32, metres, 0 where nothing is hit; and where it is valid."""
+    """Render camera z (H, W) float32, metres, 0 where nothing is hit; and validity (H, W) bool."""
     depth = np.zeros((camera.height, camera.width), np.float32)
     for band in bands(camera):
         part = band.centre[band.rows]

@@ -1,6 +1,6 @@
-"""Place the rig's cameras, and make pictures of light as their sensors do.
+"""Place the rig's cameras, and turn light into pictures as their sensors do.
 
-N cameras stand on a sphere segment around the subject, denser at the front.
+The cameras stand on a part of a sphere around the subject, closer together at the front.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ _RINGS_DEG = (4.0, 21.0, -13.0, 11.0, 28.0, -4.0)
 def make_rig(count: int, width: int, height: int, seed: int) -> dict[str, Camera]:
     """Draw cameras cam00... by id, distorted (COLMAP's OPENCV model), in the true world.
 
-    The rig belongs to the seed alone: every subject is recorded by the same cameras. Camera 0 is
-    the leftmost as the subject sees it; the world's y is up and subjects look along +z.
+    The rig depends on the seed alone: the same cameras record every subject. Camera 0 is leftmost
+    as the subject sees it; the world's y is up and subjects look along +z.
     """
     rng = np.random.default_rng([seed, 101])
     cameras, short = {}, min(width, height)
     for index in range(count):
         camera_id = f"cam{index:02d}"
         place = 2.0 * (index + 0.5) / count - 1.0
-        # A slope below one in the middle packs the cameras at the front.
+        # The slope is under 1 in the middle, so cameras are closer at the front.
         azimuth = math.radians(0.5 * SPAN_DEG) * (0.8 * place + 0.2 * place**3)
         azimuth += math.radians(rng.uniform(-2.0, 2.0))
         elevation = math.radians(_RINGS_DEG[index % len(_RINGS_DEG)] + rng.uniform(-1.5, 1.5))
@@ -65,7 +65,7 @@ _CURVE_STEPS = 16384
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
-    """One camera's colour gain (3,) and how much its corners darken."""
+    """One camera's colour gain (3,), and how much darker its corners are."""
 
     gain: np.ndarray
     vignette: float
@@ -81,7 +81,7 @@ def make_sensor(camera_index: int, seed: int) -> Sensor:
 def expose(
     sensor: Sensor, linear: np.ndarray, rng: np.random.Generator, noise: float
 ) -> np.ndarray:
-    """Expose linear light (H, W, 3) float32 to the 8-bit sRGB picture (H, W, 3)."""
+    """Return the 8-bit sRGB picture (H, W, 3) of linear light (H, W, 3) float32."""
     height, width = linear.shape[:2]
     y = cell_centres(height).astype(np.float32) / height * 2 - 1
     x = cell_centres(width).astype(np.float32) / width * 2 - 1
@@ -94,8 +94,8 @@ def expose(
     return _CURVE[steps]
 
 
-# Linear light 0 to 2 in fine steps, one of which is at most half of one level. Above the knee it is
-# compressed softly, so that highlights do not clip hard.
+# 8-bit levels of linear light 0 to 2 in steps of at most half a level. Light over the knee is
+# compressed, so that highlights do not clip abruptly.
 _LIGHT = (np.arange(_CURVE_STEPS) + 0.5) * 2.0 / _CURVE_STEPS
 _OVER = 1.0 - np.exp(-np.maximum(_LIGHT - _KNEE, 0.0) / (1 - _KNEE))
 _CURVE = np.rint(255.0 * linear_to_srgb(np.minimum(_LIGHT, _KNEE) + (1 - _KNEE) * _OVER)).astype(

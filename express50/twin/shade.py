@@ -1,7 +1,7 @@
-"""Shade light and materials: the colour that a ray sees where it meets the subject.
+"""Shade materials in light: the colour that a ray sees where it hits the subject.
 
-Everything is linear light in float32. Lights are soft boxes far away; how much of each, and of the
-ambient light, reaches a vertex is found by casting rays once per frame and shared by all cameras.
+Everything is linear light in float32. Lights are distant soft boxes. How much of each, and of the
+ambient light, reaches a vertex is found by casting rays once per frame for all cameras.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from express50.twin.surface import (
 )
 from express50.twin.worn import WITH_HAND
 
-# How far light bleeds round the terminator in skin, per channel: red most (d'Eon et al. 2007).
+# How far light bleeds into the shadow in skin, per channel: red most (d'Eon et al. 2007).
 _BLEED = np.array([0.32, 0.12, 0.06], np.float32)
 _AMBIENT_RAYS, _SOFT_RAYS, _SMOOTHING = 6, 2, 4
-_INDEX, _SURFACES = 1.5, 6  # of lenses; more of their surfaces than this in a row end a ray
+_INDEX, _SURFACES = 1.5, 6  # lenses' refractive index; a ray ends after this many of their surfaces
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +45,7 @@ class Lighting:
 
 
 def make_lighting(number: int, seed: int) -> Lighting:
-    """Return the studio's lights on the day a subject was recorded; each day differs a little."""
+    """Draw the studio's lights for a subject; they differ a little between subjects."""
     rng = np.random.default_rng([seed, number, 9])
     towards = np.array(
         [[0.75, 0.65, 0.9], [-0.85, 0.35, 0.75], [-0.55, 0.55, -0.9], [0.8, 0.3, -0.7]]
@@ -79,7 +79,7 @@ def find_eyes(model: HeadModel) -> TwinEyes:
     for side in ("left", "right"):
         ball = template[model.regions[f"{side}_eyeball"].numpy()]
         iris = template[model.regions[f"{side}_iris"].numpy()]
-        # Across, the middle of the ball; in depth a radius behind its front, where the iris is.
+        # In x and y the middle of the ball; in z a radius behind its front, where the iris is.
         centre = 0.5 * (ball.min(0) + ball.max(0))
         centre[2] = ball[:, 2].max() - 0.5 * np.ptp(ball[:, :2], axis=0).mean()
         axis = unit(iris.mean(0) - centre)
@@ -96,8 +96,8 @@ def find_eyes(model: HeadModel) -> TwinEyes:
 class LitScene:
     """One frame ready for rays: compiled geometry and per-vertex attributes.
 
-    ``attributes`` (N, 9 + L) are normal, place or colour, diffuse light that arrives (RGB), and
-    how much of each soft box is seen.
+    ``attributes`` (N, 9 + L) are normal, place or colour, incoming diffuse light (RGB), and the
+    visible share of each soft box.
     """
 
     caster: Caster
@@ -120,7 +120,7 @@ def build_scene(
     seed: int,
     living: LivingSkin | None = None,
 ) -> LitScene:
-    """Compile one frame: Embree scene, then light at every vertex."""
+    """Build one frame's Embree scene, and the light at every vertex."""
     caster = Caster(posed.vertices, body.faces)
     heads = len(body.template)
     hairs, cloths = len(body.extras.hair.vertices), len(body.extras.cloth_vertices)
@@ -151,17 +151,17 @@ def build_scene(
 def _light_at(
     caster: Caster, points: np.ndarray, normals: np.ndarray, lighting: Lighting
 ) -> np.ndarray:
-    """Return share (N, 1 + L) of the ambient light and of each soft box that reaches points."""
+    """Return the shares (N, 1 + L) of ambient light and of each soft box that reach points."""
     count, starts = len(points), points + 6e-4 * normals
     out = np.zeros((count, 1 + len(lighting.directions)), np.float32)
     helper = np.where(np.abs(normals[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
     across = unit(np.cross(helper, normals))
     other = np.cross(normals, across)
-    # Every vertex turns the pattern by its own angle; smoothing then averages neighbours' rays.
+    # Every vertex rotates the pattern by a random angle; smoothing then averages neighbours' rays.
     spin = np.random.default_rng(0).uniform(0, 2 * np.pi, (count, 1))
     free = np.zeros(count, np.float32)
     for k in range(_AMBIENT_RAYS):
-        # Cosine-weighted spiral over the hemisphere.
+        # A cosine-weighted spiral over the hemisphere.
         radius, angle = np.sqrt((k + 0.5) / _AMBIENT_RAYS), 2.399963 * k + spin
         ray = radius * (np.cos(angle) * across + np.sin(angle) * other)
         free += ~caster.blocked(starts, ray + np.sqrt(1.0 - radius**2) * normals, 0.10)
@@ -182,14 +182,14 @@ def _light_at(
 def _diffuse(
     lighting: Lighting, normals: np.ndarray, reach: np.ndarray, skin: np.ndarray
 ) -> np.ndarray:
-    """Return diffuse light (N, 3) at vertices; over skin (N, 1) it bleeds round the terminator."""
+    """Return diffuse light (N, 3) at vertices; on skin (N, 1) it bleeds into the shadow."""
     up = 0.5 + 0.5 * normals[:, 1:2]
     total = (lighting.ground * (1 - up) + lighting.sky * up) * reach[:, :1]
     bleed = _BLEED * skin
     for k, towards in enumerate(lighting.directions):
         soft = np.maximum((normals @ towards)[:, None] + bleed, 0.0)
         seen = reach[:, 1 + k : 2 + k]
-        # Light that bled into shadow has crossed flesh, so shadows' edges are red as well.
+        # Light that bleeds into a shadow has passed through flesh, so the shadow's edge is red.
         share = seen * (1.0 + 1.5 * bleed * (1.0 - seen))
         total += (lighting.colours[k] / (1 + bleed)) * soft * share
     return total
@@ -198,7 +198,7 @@ def _diffuse(
 def shade(
     scene: LitScene, directions: np.ndarray, face: np.ndarray, bary: np.ndarray
 ) -> np.ndarray:
-    """Return premultiplied linear colour and alpha (N, 4) of rays' hits, of `Caster.cast`."""
+    """Return premultiplied linear colour and alpha (N, 4) of the hits of `Caster.cast`."""
     out = np.ones((len(face), 4), np.float32)
     glass = scene.body.material[face] == Material.LENS
     plain = ~glass
@@ -209,9 +209,9 @@ def shade(
 
 
 def _through(scene: LitScene, way: np.ndarray, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
-    """Refract rays of unit directions (N, 3) that hit lenses; the first surfaces mirror a little.
+    """Refract rays of unit directions (N, 3) that hit lenses; surfaces they enter reflect lights.
 
-    Returns premultiplied colour and alpha (N, 4): what is behind the subject shines through.
+    Returns premultiplied colour and alpha (N, 4); what is behind the subject shows through.
     """
     out = np.zeros((len(face), 4), np.float32)
     row, share = np.arange(len(face)), np.ones(len(face), np.float32)
@@ -228,7 +228,7 @@ def _through(scene: LitScene, way: np.ndarray, face: np.ndarray, bary: np.ndarra
         rest = 1 - ratio**2 * (1 - cosine**2)
         fresnel = (0.04 + 0.96 * (1 - cosine[:, 0]) ** 5) * entering[:, 0]
         mirror = way + 2 * cosine * normal
-        # Soft boxes are discs of even brightness before a dim room.
+        # Soft boxes appear as uniform discs in a dim room.
         off = np.arccos(np.clip(mirror @ lights.directions.T, -1, 1))
         boxes = smoothstep(off, 1.1 * lights.size, 0.9 * lights.size) / (np.pi * lights.size**2)
         glare = boxes @ lights.colours + 0.3 * lights.ground
@@ -274,7 +274,7 @@ def _opaque(
             out[chosen] = _hair(scene.lighting, n, v, m[:, 3:6], scene.posed.tangents[first])
             continue
         albedo, gloss, power = _surface(scene, kind, m[:, 3:6])
-        # The vertices' diffuse light, and Phong's highlight with Fresnel's rise.
+        # The vertices' diffuse light, and Phong's highlight, stronger at grazing angles (Fresnel).
         cosine = dot(n, v)
         lobes = np.clip((2.0 * cosine * n - v) @ scene.lighting.directions.T, 0.0, 1.0)
         highlight = (lobes ** np.float32(0.25 * power) * m[:, 9:]) @ scene.lighting.colours
@@ -311,7 +311,7 @@ def _surface(
 
 
 def _eye_albedo(scene: LitScene, place: np.ndarray) -> np.ndarray:
-    """Return iris, pupil and sclera (N, 3) by the angle from the optical axis."""
+    """Return the colours (N, 3) of iris, pupil and sclera by the angle from the optical axis."""
     eyes = scene.eyes
     side = (place[:, 0] < 0).astype(np.int32)  # the left eye is at +x
     out = unit(place - eyes.centres[side])
@@ -335,7 +335,7 @@ def _eye_albedo(scene: LitScene, place: np.ndarray) -> np.ndarray:
 def _hair(
     lighting: Lighting, n: np.ndarray, v: np.ndarray, albedo: np.ndarray, tangent: np.ndarray
 ) -> np.ndarray:
-    """Add a pale and a coloured highlight along the strand, and diffuse light (Kajiya 1989)."""
+    """Return a hair's colour (N, 3): diffuse light, a pale and a tinted highlight (Kajiya 1989)."""
     along, seen_along = tangent @ lighting.directions.T, dot(tangent, v)
     across = np.sqrt(np.clip(1.0 - along * along, 0.0, 1.0))
     shown = np.clip(0.35 + 0.75 * (n @ lighting.directions.T), 0.0, 1.0)

@@ -1,8 +1,8 @@
-"""Skin painted by procedure, as a texture over directions from the head's centre.
+"""Paint skin as a texture over directions from the head's centre.
 
-The texture knows nothing of the head model's UV map: a place on the mean head is looked up by its
-azimuth and elevation, so any head model can be painted. What folds behind (nostrils, the back of
-the ear) shares the colour of the surface in front of it.
+The texture does not use the head model's UV map: a place on the mean head is looked up by its
+azimuth and elevation, so any head model can be painted. Hidden places (nostrils, the back of the
+ear) have the colour of the surface in front of them.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ class SkinTexture:
 
 
 def texture_width(image_short_side: int) -> int:
-    """Return texels around the head so that one is about as wide as a pixel of the images."""
+    """Return the number of texels around the head, each about as wide as a pixel of the images."""
     wanted = 2 * np.pi * 0.1 / 0.43 * image_short_side * 1.2
     return int(np.clip(2 ** np.ceil(np.log2(wanted)), 256, 4096))
 
 
 def sample_skin(texture: SkinTexture, points: np.ndarray) -> np.ndarray:
-    """Return bilinear samples (N, 4) at places (N, 3) on the mean head."""
+    """Sample the texture (N, 4) bilinearly at places (N, 3) on the mean head."""
     height, width = texture.pixels.shape[:2]
     az, el = unit_to_spherical(points - texture.centre.astype(np.float32))
     x = (az * np.float32(0.5 / np.pi) + np.float32(0.5)) * width - np.float32(0.5)
@@ -54,7 +54,7 @@ def sample_skin(texture: SkinTexture, points: np.ndarray) -> np.ndarray:
 
 
 def paint_skin(body: Body, seed: int, width: int) -> SkinTexture:
-    """Paint the texture of one subject, ``width`` texels around."""
+    """Paint one subject's texture, ``width`` texels around."""
     height = width // 2
     step = max(1, 262_144 // width)
     bands = [
@@ -66,7 +66,7 @@ def paint_skin(body: Body, seed: int, width: int) -> SkinTexture:
 
 
 def _paint_rows(body: Body, seed: int, width: int, rows: range) -> np.ndarray:
-    """Return texels (N, 4) of some rows."""
+    """Paint the texels (N, 4) of some rows."""
     model, look = body.model, body.subject.look
     points, masks = _surface_at(body, width, rows)
     marks = landmarks(model, model.template[None])[0].double().numpy()
@@ -103,7 +103,7 @@ def _paint_rows(body: Body, seed: int, width: int, rows: range) -> np.ndarray:
 
 
 def _surface_at(body: Body, width: int, rows: range) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return places (N, 3) on the mean head under the texels of some rows, and masks there."""
+    """Return the places (N, 3) on the mean head of the texels of some rows, and masks there."""
     model = body.model
     az = cell_centres(width) / width * 2 * np.pi - np.pi
     el = cell_to_corner(np.array(rows)) / (width // 2) * np.pi - 0.5 * np.pi
@@ -111,7 +111,7 @@ def _surface_at(body: Body, width: int, rows: range) -> tuple[np.ndarray, dict[s
     faces = model.faces.numpy()
     faces = faces[model_materials(model)[faces].min(1) == Material.SKIN]
     distance, face, bary = Caster(body.template, faces).cast(body.centre + out, -out)
-    # Beyond the centre it has come in through the open neck and struck the skull from inside.
+    # A hit beyond the centre came in through the open neck and struck the skull from inside.
     hit = (face != MISS) & (distance < 1.0)
     corners = faces[np.where(hit, face, 0)]
     weights = np.column_stack([1 - bary.sum(1), bary])
@@ -133,7 +133,7 @@ def _bump(points: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
 
 
 def _flush(model: HeadModel, marks: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return redness (N,): cheeks, tip of the nose, chin, ears."""
+    """Return the redness (N,) of cheeks, tip of the nose, chin and ears."""
     left = 0.35 * marks[46] + 0.35 * marks[14] + 0.3 * marks[54]
     right = 0.35 * marks[41] + 0.35 * marks[2] + 0.3 * marks[48]
     spots = [(left, 0.026, 1.0), (right, 0.026, 1.0), (marks[30], 0.014, 0.9),
@@ -155,11 +155,11 @@ def _hairiness(
     masks: dict[str, np.ndarray],
     lattices: list[np.ndarray],
 ) -> np.ndarray:
-    """Return cover (N,) by short hair that has no geometry: brows, stubble, roots on the scalp."""
+    """Return the cover (N,) by short hair without geometry: brows, stubble, roots on the scalp."""
     look = body.subject.look
     cover = np.zeros(len(points), np.float32)
     for ids in (range(17, 22), range(22, 27)):
-        # Place along the brow, 0 to 1 and beyond its ends, and height off it, in the front view.
+        # Position along the brow, 0 to 1 and beyond its ends, and height above it, from the front.
         line = marks[list(ids)]
         x, first, last = points[:, 0], line[0, 0], line[-1, 0]
         beyond = (np.minimum(x - first, 0) + np.maximum(x - last, 0)) / (last - first)
@@ -184,7 +184,7 @@ def _hairiness(
 def _beard(
     marks: np.ndarray, points: np.ndarray, masks: dict[str, np.ndarray], lattices: list[np.ndarray]
 ) -> np.ndarray:
-    """Return density of stubble (N,), in dots."""
+    """Return the density of stubble (N,), as dots."""
     mouth, chin, nose = marks[[48, 54]].mean(0), marks[8], marks[33]
     below = smoothstep(points[:, 1], nose[1] - 0.001, nose[1] - 0.012)
     jaw = smoothstep(points[:, 1], chin[1] - 0.035, chin[1] - 0.005)

@@ -26,8 +26,8 @@ from express50.twin.skin import paint_skin, texture_width
 from express50.twin.subjects import TwinPerformance, make_subject, perform
 from express50.twin.truth import write_truth
 
-# Rays and plates of so many pixels are kept between frames (about 50 bytes each); beyond, every
-# band is made again for every frame.
+# Up to this many pixels, rays and plates are kept between frames (about 50 bytes per pixel);
+# above, every band is made again for every frame.
 _KEEP_PIXELS = 4_000_000
 
 # Loading a head model takes seconds, and a worker films several subjects.
@@ -39,7 +39,7 @@ def cast_subject(config: TwinConfig, subject_id: str) -> tuple[Body, TwinPerform
     # The number in the id, such as S001, seeds everything about the subject.
     model, number = _head(config.head), int(subject_id.removeprefix("S"))
     subject = make_subject(model, subject_id, number, config.seed, config.personal)
-    # Strands follow the pixels: thin enough to be finer than one, not finer than can be seen.
+    # Strands are thinner than a pixel, but not much, as that would not be visible.
     detail = float(np.clip(min(config.width, config.height) / 512, 0.6, 3.0))
     body = build_body(model, subject, config.seed, detail if config.hair else 0.0, config.wear)
     script = select(config.expressions)
@@ -49,7 +49,7 @@ def cast_subject(config: TwinConfig, subject_id: str) -> tuple[Body, TwinPerform
 
 @dataclass(frozen=True, kw_only=True)
 class StudioView:
-    """One camera with what every frame shares; ``bands`` are `studio_bands`, kept or made again."""
+    """One camera and what all its frames share; ``bands`` returns its `studio_bands`."""
 
     camera: Camera
     index: int
@@ -58,7 +58,7 @@ class StudioView:
 
 
 def make_view(camera: Camera, index: int, seed: int, keep: bool) -> StudioView:
-    """Make a view of the rig's camera of that index."""
+    """Make a view of the rig's camera of this index; `keep` its bands or make them every time."""
     make: Callable[[], Iterable[tuple[RowBand, np.ndarray]]] = partial(studio_bands, camera, seed)
     if keep:
         make = partial(list, list(make()))
@@ -75,8 +75,8 @@ def film_subject(
 ) -> None:
     """Record all frames of one subject in some cameras, and their plates.
 
-    Other processes may film the other cameras; the one that films camera 0 writes the truth.
-    ``tick`` is called after every picture.
+    Other processes may film the other cameras; the one with camera 0 writes the truth. ``tick`` is
+    called after every picture.
     """
     body, play = cast_subject(config, subject_id)
     number, seed = body.subject.number, config.seed
@@ -115,7 +115,7 @@ def film_subject(
 
 
 def skin_of(config: TwinConfig, body: Body, play: TwinPerformance, frame: int) -> LivingSkin | None:
-    """Return how the skin looks in a frame; None where `twin.personal` is 0."""
+    """Return how the skin looks in a frame; None if `twin.personal` is 0."""
     if not config.personal:
         return None
     who = body.subject.number, config.seed, body.subject.look.age
@@ -125,7 +125,7 @@ def skin_of(config: TwinConfig, body: Body, play: TwinPerformance, frame: int) -
 def render_view(scene: LitScene, view: StudioView, hull: np.ndarray) -> np.ndarray:
     """Render the linear picture (H, W, 3) of a frame in one camera, before the sensor.
 
-    ``hull`` holds the corners of the convex hull of the scene's vertices.
+    ``hull`` has the corners of the convex hull of the scene's vertices.
     """
     window = window_of(view.camera, hull)
     picture = np.empty((view.camera.height, view.camera.width, 3), np.float32)
@@ -144,7 +144,7 @@ def render_view(scene: LitScene, view: StudioView, hull: np.ndarray) -> np.ndarr
 def film_board(
     config: TwinConfig, camera_indices: list[int], folder: Path, tick: Callable[[], None]
 ) -> None:
-    """Write ``<folder>/<camera>/000000.png`` of every board pose in some cameras."""
+    """Write ``<folder>/<camera>/<number>.png`` of every board pose in some cameras."""
     rig = list(make_rig(config.cameras, config.width, config.height, config.seed).values())
     poses = board_poses(config.board_frames, config.seed)
     for index in camera_indices:
@@ -158,6 +158,6 @@ def film_board(
 
 
 def write_png(path: Path, image: np.ndarray) -> None:
-    """Write a PNG, making its folder."""
+    """Write a PNG; make its folder if needed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(encode_png(image))

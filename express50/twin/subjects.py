@@ -1,7 +1,7 @@
-"""Make up people: how they are shaped and look, and how they perform the script.
+"""Make up people: their shape, their look, and how they perform the script.
 
-A subject has coefficients of the head model, a displacement that the model cannot express, and an
-appearance. Its performance has a timing, strength, blinks and sway of its own.
+A subject has coefficients of the head model, displacements that the model cannot express, and a
+look. Its performance has its own timing, strength, blinks and sway.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _HAIR_LENGTHS = {
 
 @dataclass(frozen=True, kw_only=True)
 class PersonLook:
-    """Appearance of one subject; colours are linear light, the rest 0 to 1 unless it says so."""
+    """Appearance of one subject; colours are linear light, other numbers are factors."""
 
     skin: np.ndarray
     flush: float
@@ -65,17 +65,17 @@ class TwinSubject:
     """One made-up person on a head model."""
 
     id: str
-    number: int  # in the id; seeds the subject's random traits
+    number: int  # of the id; seeds the subject's random traits
     shape: np.ndarray  # (S,) coefficients
     offsets: np.ndarray  # (V, 3) metres, added at rest, orthogonal to the model's shape space
     look: PersonLook
-    own: np.ndarray | None = None  # (V, 3, 3) of `alive.own_motion`
+    own: np.ndarray | None = None  # (V, 3, 3) from `alive.own_motion`
 
 
 def make_subject(
     model: HeadModel, subject_id: str, number: int, seed: int, personal: float = 0.0
 ) -> TwinSubject:
-    """Draw one subject; it depends on the seed, the subject's number and `twin.personal` only."""
+    """Draw one subject, which depends only on the seed, its number and `twin.personal`."""
     rng = np.random.default_rng([seed, number, 1])
     shape = np.clip(rng.standard_normal(len(model.shape_names)), -2.5, 2.5)
     rng = np.random.default_rng([seed, number, 2])
@@ -86,7 +86,7 @@ def make_subject(
         broad = fractal(template, make_lattice(rng), 0.05, 1)
         fine = fractal(template, make_lattice(rng), 0.02, 1)
         field[:, axis] = weight * (broad + 0.35 * fine)
-    # What lies in the span of the shape directions is taken out, so that no tracker can find it.
+    # The part within the span of the shape directions is removed: no tracker can express the rest.
     basis = model.shape_dirs.double().numpy().reshape(-1, len(model.shape_names))
     gram = basis.T @ basis
     gram += 1e-9 * np.trace(gram) * np.eye(len(gram))
@@ -96,7 +96,7 @@ def make_subject(
     look = _make_look(np.random.default_rng([seed, number, 3]), number)
     own = None
     if personal:
-        # The inside of the mouth goes with the lips, or it would come through them.
+        # The inside of the mouth moves too, or it would come through the lips.
         moved = np.where(model.regions["mouth_interior"].numpy(), 1.0, weight)
         own = own_motion(model, number, seed, personal) * moved[:, None, None].astype(np.float32)
     return TwinSubject(
@@ -119,8 +119,8 @@ def soft_mask(model: HeadModel) -> np.ndarray:
 
 
 def _make_look(rng: np.random.Generator, number: int) -> PersonLook:
-    """Draw an appearance; neighbouring numbers get unlike skin and hair."""
-    # A step of 0.38 through [0, 1) visits it evenly, so that even four subjects are varied.
+    """Draw an appearance; skin and hair of consecutive numbers differ."""
+    # Steps of 0.38 through [0, 1) cover it evenly, so that even four subjects vary.
     tone = (0.15 + 0.381966 * number + rng.uniform(-0.08, 0.08)) % 1.0
     skin = _blend(_SKIN_TONES, tone) * rng.uniform(0.93, 1.07, 3)
     gender = "female" if (number + int(rng.integers(0, 2))) % 2 else "male"
@@ -163,7 +163,7 @@ class TwinPerformance:
 
     cues: tuple[tuple[str, int, int], ...]  # expression id, first and last frame of each window
     peaks: dict[str, int]  # expression id -> frame at which the expression is strongest
-    strength: np.ndarray  # (F,) how far the frame's expression is played, 0 to 1
+    strength: np.ndarray  # (F,) strength of the frame's expression, 0 to 1
     expression: np.ndarray  # (F, X) coefficients
     jaw: np.ndarray  # (F, 3) axis-angle, radians; so are neck (F, 3) and eyes (F, 6)
     neck: np.ndarray
@@ -173,11 +173,11 @@ class TwinPerformance:
 
     @property
     def frames(self) -> int:
-        """Number of frames."""
+        """Return the number of frames."""
         return len(self.strength)
 
 
-# What a face does that is not performing.
+# Controls that move a little between expressions.
 _FIDGETS = ("mouthPress_L", "mouthPress_R", "browInnerUp_L", "browDown_R", "mouthSmile_L")
 
 
@@ -189,7 +189,7 @@ def perform(
     number: int,
     seed: int,
 ) -> TwinPerformance:
-    """Play a script once: rest, onset, an apex anywhere in the window's middle, offset, rest.
+    """Perform a script once; each cue window has rest, onset, a peak near its middle, offset, rest.
 
     Raises:
         HeadModelError: the head model does not name the script's expression directions.
@@ -208,7 +208,7 @@ def perform(
     gaze, strength = np.zeros((count, 2)), np.zeros(count)
     cues, peaks = [], {}
     for order, entry in enumerate(script):
-        # Seeded by the id, so that leaving expressions out does not change the others.
+        # Seeded by the expression's id, so that leaving some out does not change the others.
         rng = np.random.default_rng([seed, number, 4, *entry.id.encode()])
         first = order * frames_per_expression
         peak, curve = _envelope(rng, frames_per_expression, fps)
@@ -243,10 +243,10 @@ def gaze_rotation(gaze: np.ndarray) -> np.ndarray:
 
 
 def _envelope(rng: np.random.Generator, count: int, fps: float) -> tuple[int, np.ndarray]:
-    """Draw a peak's index and strength (count,), 1 at the peak and less everywhere else."""
+    """Draw a peak's index and the strengths (count,), 1 at the peak and less elsewhere."""
     low, high = max(1, round(0.3 * count)), max(2, round(0.72 * count))
     peak = int(rng.integers(low, min(high, count - 2) + 1))
-    # Both ends of the window are near rest; a movement rarely takes over half a second.
+    # Both ends of the window are near rest; onset and offset take at most 0.7 seconds.
     onset = min(rng.uniform(0.2, 0.36) * count, peak + 0.9, 0.7 * fps)
     offset = min(rng.uniform(0.24, 0.42) * count, count - peak - 0.1, 0.7 * fps)
     hold = rng.uniform(0.1, 0.9) * min(0.06 * count, 0.5 * fps)
@@ -257,7 +257,7 @@ def _envelope(rng: np.random.Generator, count: int, fps: float) -> tuple[int, np
 
 
 def _played(rng: np.random.Generator, entry: Expression, names: dict[str, int]) -> np.ndarray:
-    """Return the coefficients (X,) of this subject's version of an expression at its peak."""
+    """Draw the coefficients (X,) of this subject's version of an expression at its peak."""
     out = np.zeros(len(names))
     strength = rng.uniform(0.78, 1.05)
     for name, value in entry.controls.items():
@@ -265,7 +265,7 @@ def _played(rng: np.random.Generator, entry: Expression, names: dict[str, int]) 
         if name in names:
             out[names[name]] = np.clip(strength * gain * value, -1.0, 1.1)
     if entry.controls:
-        # People rarely move one muscle alone: a few others join in a little.
+        # People rarely move one muscle alone: a few others move a little too.
         for column in rng.choice(len(names), size=min(3, len(names)), replace=False):
             if list(names)[column].startswith(("mouth", "brow", "cheek", "nose")):
                 out[column] += rng.uniform(0.0, 0.08)
@@ -275,7 +275,7 @@ def _played(rng: np.random.Generator, entry: Expression, names: dict[str, int]) 
 def _blink(
     rng: np.random.Generator, expression: np.ndarray, peak: int, names: dict[str, int]
 ) -> None:
-    """Blink in some windows, at least two frames away from the peak; edits ``expression``."""
+    """Add a blink in some windows, at least two frames off the peak; edits ``expression``."""
     count = len(expression)
     allowed = [f for f in range(count) if abs(f - peak) >= 2 + count // 24]
     if rng.uniform() > 0.35 or not allowed:
@@ -290,7 +290,7 @@ def _blink(
 
 
 def _wander(rng: np.random.Generator, count: int, fps: float) -> np.ndarray:
-    """Smooth motion (F,) of about unit size: a few slow sines."""
+    """Draw a smooth motion (F,) of about unit size, a sum of slow sines."""
     time = np.arange(count) / fps
     waves = [
         np.sin(2 * np.pi * (time / period + rng.uniform()))
@@ -302,7 +302,7 @@ def _wander(rng: np.random.Generator, count: int, fps: float) -> np.ndarray:
 def _sway(
     rng: np.random.Generator, model: HeadModel, count: int, fps: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Place the head in the world: turned about the neck joint, near the rig's target."""
+    """Draw the head's poses R (F, 3, 3) and t (F, 3): turned at the neck, near the rig's target."""
     template = model.template.double().numpy()
     head = (model.regions["face"] | model.regions["scalp"]).numpy()
     centre = 0.5 * (template[head].min(0) + template[head].max(0))

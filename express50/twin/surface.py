@@ -1,4 +1,4 @@
-"""Serve the twin with materials, ray casting (Embree), vectors, meshes and smooth random fields."""
+"""Provide materials, ray casting (Embree), vectors, meshes and smooth random fields."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Material(IntEnum):
 
 
 class Caster:
-    """A compiled triangle scene; one thread, so that processes do not fight over cores."""
+    """A compiled triangle scene; it uses one thread, as other processes use the other cores."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         self._scene = mesh_scene(vertices, faces)
@@ -43,7 +43,7 @@ class Caster:
 
         Args:
             origin: (3,) shared, or (N, 3).
-            directions: (N, 3), any length; distances are in units of it.
+            directions: (N, 3) of any length, in units of which distances are measured.
 
         Returns:
             distance (N,) float32, inf where nothing is hit; face (N,) uint32, ``MISS`` likewise;
@@ -55,7 +55,7 @@ class Caster:
         )  # fmt: skip
 
     def blocked(self, origins: np.ndarray, directions: np.ndarray, far: float) -> np.ndarray:
-        """Return (N,) True for rays of unit directions (N, 3) that hit within ``far`` metres."""
+        """Mark (N,) the rays of unit directions (N, 3) that hit something within ``far`` metres."""
         rays = join_rays(origins, directions)
         return self._scene.test_occlusions(rays, tnear=0.0, tfar=far, nthreads=1).numpy()
 
@@ -66,22 +66,22 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return products (..., 1) of vectors (..., 3); much quicker than a sum over the axis."""
+    """Return dot products (..., 1) of vectors (..., 3), much faster than a sum over the axis."""
     return np.einsum("...i,...i->...", a, b)[..., None]
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return unit normals (V, 3), area weighted."""
+    """Return unit vertex normals (V, 3), weighted by area."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     where = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
     ones = np.ones(faces.size, dtype=np.float32)
-    # Sums what the faces have at their vertices.
+    # A product with it sums values of faces at their vertices.
     incidence = scipy.sparse.csr_matrix((ones, where), shape=(len(vertices), len(faces)))
     return unit(incidence @ np.cross(b - a, c - a))
 
 
 def smooth_over_mesh(values: np.ndarray, faces: np.ndarray, rounds: int) -> np.ndarray:
-    """Average values (V,) or (V, C) with their neighbours' a number of times."""
+    """Average values (V,) or (V, C) with their neighbours', ``rounds`` times."""
     count = len(values)
     edges = faces[:, [0, 1, 1, 2, 2, 0, 1, 0, 2, 1, 0, 2]].reshape(-1, 2)
     matrix = scipy.sparse.coo_matrix(
@@ -108,7 +108,7 @@ def unit_to_spherical(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sample_panorama(panorama: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Interpolate a panorama (H, W, C), closed in x, at cells x and y < H - 1 (N,)."""
+    """Interpolate a panorama (H, W, C), periodic in x, at cells x and y < H - 1 (N,)."""
     height, width = panorama.shape[:2]
     left, top = np.floor(x), np.floor(y)
     fx, fy = (x - left)[:, None], (y - top)[:, None]
@@ -122,7 +122,7 @@ def sample_panorama(panorama: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.nd
 
 
 class StarMap:
-    """Distance of a head's outer surface from its centre, in every direction."""
+    """The distance of a head's outer surface from its centre, by direction."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, centre: np.ndarray) -> None:
         self.centre = np.asarray(centre, dtype=np.float64)
@@ -130,7 +130,7 @@ class StarMap:
         az = cell_centres(columns) / columns * 2 * np.pi - np.pi
         el = cell_centres(rows) / rows * np.pi - 0.5 * np.pi
         out = spherical_to_unit(*np.meshgrid(az, el)).reshape(-1, 3)
-        # From outside inwards: the outermost surface counts, not what lies below it.
+        # Rays come from outside, because the outermost surface counts.
         distance, _, _ = Caster(vertices, faces).cast(self.centre + 1.0 * out, -out)
         radius = np.where(distance < 1.0, 1.0 - distance, 0.0)
         self._radius = radius.reshape(rows, columns, 1)
@@ -180,7 +180,7 @@ def fractal(
     """Sum (N,) octaves of `noise` at points (N, 3); ``wavelength`` in their unit."""
     total = np.zeros(len(points), dtype=np.float32)
     for octave in range(octaves):
-        # The shift keeps lattice points of the octaves, where each is extremal, apart.
+        # The shift keeps the octaves' lattice points, where extremes are, apart.
         scaled = np.asarray(points) * (2.0**octave / wavelength) + 7.31 * octave
         total += gain**octave * noise(scaled, lattice)
     return total

@@ -1,6 +1,6 @@
-"""Keep the twin's truth apart from the capture, for benchmarks, tests and reports.
+"""Write and read the twin's ground truth, for benchmarks, tests and reports.
 
-Only parameters are stored; meshes, depth and alpha are made from them when they are asked for.
+Only parameters are stored; meshes, depth and alpha are made from them on demand.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from express50.twin.subjects import PersonLook, TwinPerformance, TwinSubject
 from express50.twin.surface import MISS, Caster
 from express50.twin.worn import WornMesh, bare
 
-SKIN_M = 0.5e-3  # hair roots stand on the skin; what lies this near to it is skin
+SKIN_M = 0.5e-3  # what is this near to the skin counts as skin, as roots of hair do
 _PLAY = ("strength", "expression", "jaw", "neck", "eyes", "R", "t")
 
 
@@ -36,7 +36,7 @@ def write_truth(
 ) -> None:
     """Write a subject's truth: cameras.json, peaks.json, subject.json, frames.npz, body.npz.
 
-    What it wears and holds is in worn.npz.
+    If needed, also its own motion in own.npz, and what it wears and holds in worn.npz.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_cameras(folder / "cameras.json", cameras)
@@ -77,7 +77,7 @@ class Truth:
         self._scene = lru_cache(maxsize=4)(self._compile)
 
     def subjects(self) -> list[str]:
-        """Return ids of the recorded subjects."""
+        """Return the ids of the recorded subjects."""
         return sorted(path.parent.name for path in self.root.glob("*/subject.json"))
 
     def cameras(self, subject: str) -> dict[str, Camera]:
@@ -99,33 +99,33 @@ class Truth:
         return {"shape": body.subject.shape, "offsets": body.subject.offsets} | values
 
     def vertices(self, subject: str, frame: int) -> np.ndarray:
-        """Return head-model vertices (V, 3) in the world."""
+        """Return the head model's vertices (V, 3) in the world."""
         body, play = self._play(subject, frame)
         return head_vertices(body.model, body.subject, play, frame)
 
     def mesh(self, subject: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return all geometry but lenses: vertices (N, 3) and faces (F, 3)."""
+        """Return the vertices (N, 3) and faces (F, 3) of all geometry except lenses."""
         body = self._subject(subject)[0]
         return self._scene(subject, frame)[1], body.faces[: body.solid]
 
     def render_depth(
         self, subject: str, frame: int, camera: Camera
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Render depth (H, W) float32, camera z in metres, 0 where empty; validity (H, W) bool.
+        """Render depth (H, W) float32, camera z in metres, 0 where empty; and validity (H, W) bool.
 
-        Lenses are looked through, here and where alpha and skin are asked for.
+        Lenses are invisible here, and in `render_alpha` and `skin`.
         """
         return render.render_depth(self._scene(subject, frame)[0], camera)
 
     def skin(self, subject: str, frame: int, camera: Camera) -> np.ndarray:
-        """Return pixels (H, W) bool where the head's own surface is what the camera sees first."""
+        """Mark the pixels (H, W) bool where nothing hides the head's own surface."""
         depth, valid = self.render_depth(subject, frame, camera)
         caster = Caster(self.vertices(subject, frame), self.head_model(subject).faces.numpy())
         bare, there = render.render_depth(caster, camera)
         return valid & there & (np.abs(bare - depth) < SKIN_M)
 
     def surface(self, subject: str, frame: int, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Intersect each pixel's centre ray with the scene.
+        """Intersect the ray through each pixel's centre with the scene.
 
         Returns:
             material (H, W) int16, a `Material`, -1 where nothing is; vertex (H, W) int64, the
@@ -145,7 +145,7 @@ class Truth:
         return material.reshape(directions.shape[:2]), vertex.reshape(directions.shape[:2])
 
     def hairiness(self, subject: str) -> np.ndarray:
-        """Return hair density per head vertex (V,), 0 to 1; 0 everywhere on bald subjects."""
+        """Return the density of hair (V,) per head vertex, 0 to 1; 0 on bald subjects."""
         body = self._subject(subject)[0]
         return body.scalp if len(body.extras.hair.faces) else np.zeros_like(body.scalp)
 
@@ -172,7 +172,8 @@ class Truth:
         folder = self.root / subject
         if not (folder / "subject.json").is_file():
             raise CaptureError(
-                f"{self.root}: no truth of subject {subject!r}; it has {', '.join(self.subjects())}"
+                f"{self.root}: no truth of subject {subject!r}, expected one of"
+                f" {', '.join(self.subjects())}"
             )
         about = json.loads((folder / "subject.json").read_text())
         peaks = json.loads((folder / "peaks.json").read_text())
@@ -193,7 +194,7 @@ class Truth:
             id=about["id"], number=about["number"], shape=data["shape"], offsets=data["offsets"],
             look=PersonLook(**look), own=own,
         )  # fmt: skip
-        # What only colours need is left empty.
+        # What is needed for colours alone stays empty.
         blank = np.zeros_like(data["hair_vertices"])
         hair = HairMesh(
             vertices=data["hair_vertices"], faces=data["hair_faces"], tangents=blank, normals=blank,
@@ -214,10 +215,10 @@ class Truth:
 
 
 def align_worlds(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> np.ndarray:
-    """Return ``world_true_from_estimated`` (4, 4), rigid, from cameras that both rigs have.
+    """Return ``world_true_from_estimated`` (4, 4), rigid, from the cameras that both rigs have.
 
-    Centres and viewing frames count together: each camera gives its centre and the ends of its
-    axes, a metre long, so that even two cameras, or cameras in one line, fix the rotation.
+    Each camera counts with its centre and the ends of its axes, a metre long, so that even two
+    cameras, or cameras in one line, determine the rotation.
 
     Raises:
         ValueError: no camera is in both.

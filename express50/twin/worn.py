@@ -1,7 +1,7 @@
 """Make what people wear and hold: glasses, a hand, beards, fringes, a microphone, a mask.
 
-Hair grows as on the scalp. Glasses and microphones are rigid with the skull, beards and masks
-follow the skin below them, and a hand is held before another part of the face in every cue window.
+Worn hair grows as on the scalp. Glasses and microphones are rigid with the skull, beards and masks
+follow the skin below them, and a hand is in front of another part of the face per cue window.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from express50.twin.surface import (
 
 HAIRY = ("beard", "moustache", "fringe")
 WITH_SKULL, WITH_HAND = -1, -2
-"""What a vertex moves with where it does not follow a vertex of the skin."""
+"""What a vertex moves with if it does not follow a vertex of the skin."""
 
-# A lens of -2.5 dioptres: radii of its surfaces, its thickness in the middle, metres.
+# A lens of -2.5 dioptres: radii of its surfaces, and its thickness in the middle, metres.
 FRONT_M, BACK_M, LENS_M = 0.090, 0.062, 0.0016
 HAND_CELL_M = 0.0025
-# Ends and radii of a right hand's bones, metres: fingers along +y, the palm faces -z. The thumb
-# comes last; the forearm leaves the picture.
+# Ends and radii of a right hand's bones, metres: fingers along +y, palm towards -z. The thumb comes
+# after the fingers, the forearm last.
 _BONES = np.array([
     *([x, -0.04, 0, 0.012, 1.15 * x, 0.042 - 6 * x * x, 0, 0.011] for x in (-.03, -.01, .01, .03)),
     *([1.15 * x, y0 - 6 * x * x, 0, 0.0098, 1.2 * x, y0 + a, b, 0.009]
@@ -56,18 +56,18 @@ _BONES = np.array([
 
 @dataclass(frozen=True, kw_only=True)
 class WornMesh:
-    """Things in rest head space, the hand in its own; lenses come last."""
+    """Things in rest head space, except for the hand, in its own space; lenses come last."""
 
     vertices: np.ndarray  # (N, 3) metres
     faces: np.ndarray  # (M, 3)
     material: np.ndarray  # (M,) uint8
     colours: np.ndarray  # (N, 3) linear light
-    # (N,) the vertex of the head that a vertex moves with, WITH_SKULL or WITH_HAND
+    # (N,) the head vertex that a vertex moves with, WITH_SKULL or WITH_HAND
     moves: np.ndarray
 
 
 def bare() -> WornMesh:
-    """Return nothing worn."""
+    """Return an empty mesh."""
     none = np.zeros((0, 3), np.float32)
     few = np.zeros(0, np.int32)
     return WornMesh(vertices=none, faces=none.astype(np.int32), material=few.astype(np.uint8),
@@ -75,7 +75,7 @@ def bare() -> WornMesh:
 
 
 def joined(meshes: list[WornMesh]) -> WornMesh:
-    """Join meshes to one, lenses last."""
+    """Join meshes into one, lenses last."""
     counts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     faces = [mesh.faces + count for mesh, count in zip(meshes, counts, strict=False)]
     names = ("vertices", "material", "colours", "moves")
@@ -89,7 +89,7 @@ def wear(
     kinds: tuple[str, ...], model: HeadModel, rest: np.ndarray, skin_faces: np.ndarray,
     look: PersonLook, rng: np.random.Generator,
 ) -> WornMesh:  # fmt: skip
-    """Make what a head with rest vertices (V, 3) wears and holds, hair left out."""
+    """Make what a head with rest vertices (V, 3) wears and holds, except for hair."""
     marks = landmarks(model, torch.from_numpy(rest[None]).to(model.template))[0].double().numpy()
     shade = rng.uniform(0.02, 0.35, 3)
     found = [bare()]
@@ -144,9 +144,9 @@ def hold(
     worn: WornMesh, heads: Callable[[int], tuple[np.ndarray, np.ndarray]], model: HeadModel,
     cues: tuple[tuple[str, int, int], ...], peaks: dict[str, int], count: int, seed: list[int],
 ) -> np.ndarray:  # fmt: skip
-    """Choose where the hand is in every frame: (F, 4, 4), rest head space from the hand's own.
+    """Draw the hand's pose in every frame: (F, 4, 4), rest head space from hand space.
 
-    ``heads`` returns the vertices and normals (V, 3) of a frame, the skull at rest.
+    ``heads`` returns the vertices and normals (V, 3) of a frame with the skull at rest.
     """
     poses = np.tile(np.eye(4), (count, 1, 1))
     own = worn.vertices[worn.moves == WITH_HAND].astype(float)
@@ -159,7 +159,7 @@ def hold(
         marks = landmarks(model, torch.from_numpy(vertices[None]).to(model.template))
         marks = marks[0].double().numpy()
         mirror = rng.choice([-1.0, 1.0])
-        side = 54 if mirror > 0 else 48  # corner of the mouth that is nearer to the hand
+        side = 54 if mirror > 0 else 48  # the corner of the mouth nearer to the hand
         target = marks[[[side, 33], [side, 8], [side, 57], [side, 27]][rng.integers(4)]].mean(0)
         near = np.argmin(((vertices - target) ** 2).sum(1) + 1e3 * ~skin)
         # The palm lies on the skin; fingers point up and across the face.
@@ -173,7 +173,7 @@ def hold(
         turn = np.stack([np.cross(along, out), along, out], axis=1)
         place = vertices[near] + 0.02 * out - 0.03 * along
         tree, clearance = cKDTree(vertices[skin]), rng.uniform(0.001, 0.012)
-        for _ in range(4):  # out of the skin, but not far
+        for _ in range(4):  # move it to the clearance off the skin
             gap, which = tree.query(own @ turn.T + place)
             above = ((own @ turn.T + place - vertices[skin][which]) * normals[skin][which]).sum(1)
             close = gap < 0.03
@@ -184,7 +184,7 @@ def hold(
 
 
 def _tube(path: np.ndarray, radius: np.ndarray | float, colour: np.ndarray, closed: bool = False):
-    """Make a tube (round rod) of apparel along points (n, 3)."""
+    """Make a round rod along points (n, 3)."""
     sides, count = 8, len(path)
     ahead = np.roll(path, -1, 0) - np.roll(path, 1, 0) if closed else np.gradient(path, axis=0)
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
@@ -200,7 +200,7 @@ def _tube(path: np.ndarray, radius: np.ndarray | float, colour: np.ndarray, clos
 def _sheet(
     grid: np.ndarray, colour: np.ndarray, material: Material, closed: tuple[bool, bool]
 ) -> WornMesh:
-    """Make a sheet of a grid (n, k, 3), closed along n and k where asked."""
+    """Make a sheet from a grid (n, k, 3), closed along n and k if asked."""
     n, k = grid.shape[:2]
     index = np.pad(np.arange(n * k).reshape(n, k), [(0, int(c)) for c in closed], mode="wrap")
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]
@@ -214,13 +214,13 @@ def _sheet(
 
 
 def _glasses(marks: np.ndarray, rng: np.random.Generator, colour: np.ndarray) -> list[WornMesh]:
-    """Make frames, and lenses between two spheres."""
+    """Make frames, and lenses, each between two spheres."""
     size = rng.uniform([0.022, 0.017], [0.027, 0.022])
     square, lift = rng.uniform(0.6, 1.0), rng.uniform(0.013, 0.017)
     rings, bridge, temples = glasses_lines(marks, size, square, lift)
     thick = rng.uniform(0.0013, 0.0024)
     found = [_tube(ring, thick, colour, closed=True) for ring in rings]
-    # Bars are sampled finely, or their ends would be bent.
+    # Bars need many points, or their ends would bend.
     found += [_tube(line, 0.8 * thick, colour) for line in (bridge, *temples)]
     for ring in rings:
         middle = ring.mean(0)
@@ -241,14 +241,14 @@ def _glasses(marks: np.ndarray, rng: np.random.Generator, colour: np.ndarray) ->
 
 
 def _sag(radius: float, square: np.ndarray) -> np.ndarray:
-    """Return how far a sphere falls back at squared distances from its axis, metres."""
+    """Return how far a sphere recedes at squared distances from its axis, metres."""
     return radius - np.sqrt(radius**2 - square)
 
 
 def _mask(
     marks: np.ndarray, rest: np.ndarray, skin_faces: np.ndarray, colour: np.ndarray
 ) -> WornMesh:
-    """Span a cloth over nose, mouth and chin; it follows the skin below."""
+    """Make a cloth over nose, mouth and chin, which follows the skin below."""
     middle = marks[[4, 12]].mean(0)
     heights = np.linspace(marks[28, 1], marks[8, 1] - 0.008, 24)
     bearing = np.linspace(-1.15, 1.15, 40)
@@ -257,7 +257,7 @@ def _mask(
     towards = np.broadcast_to(-out, start.shape).reshape(-1, 3)
     distance, _, _ = Caster(rest, skin_faces).cast(start.reshape(-1, 3), towards)
     radius = 0.3 - np.minimum(distance, 0.3).reshape(start.shape[:2])
-    # Cloth spans hollows and stands off the skin.
+    # Cloth spans hollows and keeps a distance from the skin.
     spanned = gaussian_filter(maximum_filter(radius, 7, mode="nearest"), 1.5, mode="nearest")
     grid = start + (np.maximum(spanned, radius) + 0.003 - 0.3)[..., None] * out
     mesh = _sheet(grid, colour, Material.APPAREL, (False, False))
@@ -267,7 +267,7 @@ def _mask(
 
 
 def _hand(skin: np.ndarray, rng: np.random.Generator) -> WornMesh:
-    """Make a hand and its arm: the zero level of rounded bones that melt into one another."""
+    """Make a hand and its arm, as a level set of rounded bones that merge smoothly."""
     ends = _BONES.reshape(-1, 4)[:, :3]
     low, high = ends.min(0) - 0.045, ends.max(0) + 0.045
     low[1] = -0.40
