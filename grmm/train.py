@@ -72,7 +72,7 @@ def train(
 
     ``source.head`` is how `load_head` finds ``head`` again. ``resume`` goes on from
     OUT/checkpoint.pt, whose settings must agree except for the budget. ``own_terms`` adds terms to
-    the objective. Returns what metrics.json holds.
+    the objective. Returns what metrics.json holds; nothing in other processes than the first.
 
     Raises:
         TrainError: nothing to train on, or the objective is not finite.

@@ -45,6 +45,8 @@ def train(args: argparse.Namespace) -> int:
     config = train_config(args)
     resume = not args.overwrite and (args.out / "checkpoint.pt").exists()
     metrics = train(source, load_head(source.head), args.out, config, resume=resume)
+    if not metrics:  # only the first process of torchrun reports
+        return OK
     names = ("psnr_heldout_view_db", "psnr_train_db", "ssim", "iterations", "gaussians")
     values = {name: metrics.get(name) for name in names}
     lines = [f"{name}: {'n/a' if value is None else value}" for name, value in values.items()]
@@ -272,7 +274,8 @@ def score(args: argparse.Namespace) -> int:
     from grmm.metrics import PerceptualMetrics
     from grmm.shard_source import ShardSource, select
 
-    data = DataConfig(background=args.background)
+    # `evaluate` leaves these pixels out too, of all presets but `paper`.
+    data = DataConfig(background=args.background, skip_hidden_neck=True)
     source = ShardSource(args.shards, "*")
     views = HeadViews(source, load_head(source.head), data)
     chosen = select(views.keys, args.subjects, args.expressions, args.cameras)

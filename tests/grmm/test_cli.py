@@ -299,3 +299,9 @@ def test_wrong_usage_is_said_with_what_was_given(arguments, message, capsys):
     with pytest.raises(SystemExit) as stop:
         main(arguments)
     assert stop.value.code == 2 and message in capsys.readouterr().err
+
+
+def test_only_the_first_process_reports(shards, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("grmm.train.train", lambda *unused, **also: {})
+    assert main(["train", str(shards), str(tmp_path), *TINY, "--json"]) == 0
+    assert capsys.readouterr().out == ""

@@ -1,13 +1,21 @@
+import json
 from dataclasses import replace
 
 import numpy as np
 import torch
 
 from express50.contract.segmentation_labels import TORSO
+from express50.files.images import encode_png, write_image
+from express50.head import load
+from express50.shards.writer import sample_key
+from grmm.cli import main
 from grmm.config import DataConfig
 from grmm.data import HeadViews
 from grmm.head_crop import behind_torso
 from grmm.model import PinholeView
+from grmm.render import to_uint8
+from grmm.shard_source import ShardSource
+from tests.grmm import packed
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head
 
 
@@ -86,3 +94,27 @@ def test_a_hidden_neck_is_neither_trained_on_nor_scored():
     shown = item.comparable(image)
     assert torch.equal(shown[:, item.hidden], item.target[:, item.hidden])
     assert torch.equal(shown[:, ~item.hidden], image[:, ~item.hidden])
+
+
+def test_other_methods_are_scored_on_the_same_pixels(tmp_path, monkeypatch):
+    monkeypatch.setattr(load, "load_head", lambda spec: necked_head())
+    without_parts = packed.packed
+
+    def with_parts(source, index):
+        sample, parts = without_parts(source, index), source.read(index).parts
+        meta = json.loads(sample.members["meta.json"]) | {"parts": True}
+        members = {"parts.png": encode_png(parts), "meta.json": json.dumps(meta).encode()}
+        return replace(sample, members=dict(sample.members) | members)
+
+    monkeypatch.setattr(packed, "packed", with_parts)
+    root = packed.write_shards(tmp_path / "shards", Labelled(size=64))
+    views = HeadViews(ShardSource(root), necked_head(), DataConfig(skip_hidden_neck=True))
+    for index, key in enumerate(views.keys):
+        item = views.item(index)
+        assert item.hidden.any()
+        wrong = torch.where(item.hidden, 1 - item.target, item.target)
+        (tmp_path / "made").mkdir(exist_ok=True)
+        write_image(tmp_path / "made" / f"{sample_key(**vars(key))}.png", to_uint8(wrong))
+    assert main(["score", str(tmp_path / "made"), str(root), str(tmp_path / "out")]) == 0
+    found = json.loads((tmp_path / "out" / "evaluation.json").read_text())
+    assert found["psnr_db"] > 50 and found["ssim"] > 0.999
