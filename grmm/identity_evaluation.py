@@ -26,7 +26,7 @@ class FitProtocol:
 
     Attributes:
         cameras: patterns of those to fit from; empty: the first by id.
-        expression: the one to fit; others are rendered with the codes of training.
+        expression: patterns of those to fit; others are rendered with the codes of training.
         images: the most to measure per person and kind, 0 = all.
     """
 
@@ -53,7 +53,7 @@ def evaluate_unseen(
     """
     given = given_views(views, subject, protocol)
     cameras = {views.keys[i].camera for i in given}
-    known = {protocol.expression, *loaded.model.expressions}
+    known = {*(views.keys[i].expression for i in given), *loaded.model.expressions}
     own = [
         i
         for i in (range(len(views.keys)) if among is None else among)

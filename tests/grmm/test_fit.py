@@ -10,9 +10,12 @@ import torch
 from express50.errors import TrainError
 from grmm import fit as fit_module
 from grmm.checkpoint import load_checkpoint
+from grmm.config import MetricsConfig
 from grmm.data import HeadViews
 from grmm.edit import trained_head
 from grmm.fit import fit, invert_codes, locality_loss, reconstruction, start, tune_decoders
+from grmm.identity_evaluation import NOVEL_VIEW, FitProtocol, evaluate_unseen
+from grmm.metrics import PerceptualMetrics
 from grmm.render import expression_grid, frontal, interpolation, turntable
 from grmm.train import train
 from grmm.warm_start import spread_change
@@ -161,3 +164,14 @@ def test_unseen_texels_change_like_their_mirror_images():
     torch.testing.assert_close(guess[1], torch.ones(3))  # mirror of the first
     torch.testing.assert_close(guess[3], torch.ones(3), atol=0.1, rtol=0)  # the first's colour
     assert torch.equal(spread_change(change, 0 * weight, colours, means), torch.zeros(4, 3))
+
+
+def test_every_expression_that_an_unseen_person_is_fitted_in_is_measured(tmp_path):
+    source = EllipsoidSource(expressions=1, size=32)
+    train(source, ellipsoid_head(), tmp_path, tiny_config(train={"iterations": 1}))
+    views = HeadViews(EllipsoidSource(subjects=3, expressions=3, size=32), ellipsoid_head())
+    protocol = FitProtocol(cameras=("cam00",), expression="e1,e2")
+    loaded, judge = load_checkpoint(tmp_path / "checkpoint.pt"), PerceptualMetrics(MetricsConfig())
+    rows, _ = evaluate_unseen(loaded, views, "S002", protocol, judge)
+    shown = sorted((row["expression"], row["camera"]) for row in rows if row["kind"] == NOVEL_VIEW)
+    assert shown == [(e, c) for e in ("e1", "e2") for c in ("cam01", "cam02")]
