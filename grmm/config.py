@@ -18,7 +18,7 @@ from express50.contract.config import build_dataclass, check_ranges, known_assig
 from express50.errors import ConfigError, nearest
 
 FRAMES = ("head", "tangent")
-NOT_NEGATIVE = (0, math.inf)
+NOT_NEGATIVE, COUNT = (0, math.inf), (1, math.inf)
 SCALE_RANGE_MM = (0.1, 10.0)  # of Gaussians, from the paper; its unit is G2's
 
 
@@ -81,7 +81,16 @@ class ModelConfig:
             )
         if self.frame not in FRAMES:
             raise ConfigError(f"model.frame is {self.frame!r}, expected one of {', '.join(FRAMES)}")
-        check_ranges("model", self, opacity_init=(0.01, 0.99))
+        check_ranges(
+            "model", self, opacity_init=(0.01, 0.99), scale_init=(1e-3, 1e3), z_id=COUNT,
+            z_exp=COUNT, features=NOT_NEGATIVE, film_width=COUNT, mesh_width=COUNT,
+            seed_channels=COUNT, identity_modes=NOT_NEGATIVE, refine_unshuffle=COUNT,
+        )  # fmt: skip
+        for name in ("shared_widths", "ladder", "refine_widths"):
+            if min(getattr(self, name), default=1) < 1:
+                raise ConfigError(
+                    f"model.{name} is {list(getattr(self, name))}, expected widths of 1 or more"
+                )
         if self.identity_modes > self.z_id:
             raise ConfigError(
                 f"model.identity_modes is {self.identity_modes}, "
@@ -172,7 +181,8 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         check_ranges(
-            "train", self, iterations=(1, math.inf), accumulate=(1, math.inf), lr=(1e-12, 1),
+            "train", self, iterations=COUNT, accumulate=COUNT, evaluate_images=COUNT,
+            seed=NOT_NEGATIVE, lr=(1e-12, 1),
             seconds=NOT_NEGATIVE, save_seconds=NOT_NEGATIVE, final_lr=NOT_NEGATIVE,
             code_lr_scale=NOT_NEGATIVE, texel_lr_scale=NOT_NEGATIVE, refine_lr_scale=NOT_NEGATIVE,
         )  # fmt: skip
@@ -203,7 +213,8 @@ class FitConfig:
     def __post_init__(self) -> None:
         check_ranges(
             "fit", self, seconds=NOT_NEGATIVE, locality=NOT_NEGATIVE, stage2_lr=(1e-12, 1),
-            shuffle_directions=(0, 1), locality_every=(1, math.inf),
+            shuffle_directions=(0, 1), locality_every=COUNT, stage1_iterations=NOT_NEGATIVE,
+            stage2_iterations=NOT_NEGATIVE,
         )  # fmt: skip
 
 

@@ -70,6 +70,13 @@ def test_assignments_stand_over_toml_over_preset(tmp_path):
         ("model.frame=tangant", "expected one of head, tangent"),
         ("train.lr=fast", "expected float"),
         ("model.identity_modes=99", "at most z_id"),
+        ("model.identity_modes=-1", "expected 0 or more"),
+        ("model.z_id=0", "expected 1 or more"),
+        ("model.refine_unshuffle=0", "expected 1 or more"),
+        ("model.refine_widths=[8, 0]", "expected widths of 1 or more"),
+        ("train.evaluate_images=0", "expected 1 or more"),
+        ("train.seed=-1", "expected 0 or more"),
+        ("fit.stage2_iterations=-1", "expected 0 or more"),
     ],
 )
 def test_bad_values_are_named(assignment, message):
