@@ -26,7 +26,7 @@ def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path |
     for expression in read_peaks(dataset, item):
         found |= frame_inputs(dataset, item, expression)
     mattes = dataset.item_dir("matte", item)
-    if (config.outline_rounds or config.patch_rounds) and mattes.is_dir():
+    if mattes.is_dir():  # texture and UV map read them even without rounds of outlines and patches
         found["mattes"] = mattes
     if config.uv_rounds:
         found["face_uv"] = UV_WEIGHTS

@@ -89,11 +89,7 @@ def make_windows(
 
 
 def track_window(tracker: ClipTracker, clip: Iterable[Observed]) -> dict[int, Pose]:
-    """Find the pose of every frame of one window, read in their order.
-
-    Raises:
-        StageError: a frame cannot be fitted.
-    """
+    """Find the pose of every frame of one window, read in their order; some may have none."""
     targets: list[Target] = []
     poses: list[Pose] = []
     marks, lost = None, True
@@ -103,7 +99,12 @@ def track_window(tracker: ClipTracker, clip: Iterable[Observed]) -> dict[int, Po
         lost = observation is None
         if observation is None:
             continue
-        target, pose = _track_frame(tracker, observation, cut_crops, poses[-1] if poses else None)
+        before = poses[-1] if poses else None
+        try:
+            target, pose = _track_frame(tracker, observation, cut_crops, before)
+        except StageError:  # its landmarks fit no head: one frame must not cost all of them
+            lost = True
+            continue
         targets.append(condensed(tracker.person, target, pose))
         poses.append(pose)
         marks = anchors.at(_mesh(tracker.person, pose))

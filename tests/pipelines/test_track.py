@@ -309,6 +309,18 @@ def tracked_dataset(tmp_path: Path, ingested, monkeypatch: pytest.MonkeyPatch):
     return ingested, scene
 
 
+def test_mattes_are_an_input_whatever_the_rounds(tracked_dataset) -> None:
+    """Without rounds of outlines and patches the texture and the UV map still read them."""
+    from pipelines.track import STAGE
+
+    dataset, _ = tracked_dataset
+    mattes = dataset.item_dir("matte", "S001")
+    mattes.mkdir(parents=True)
+    for rounds in (0, 1):
+        config = TrackConfig(outline_rounds=rounds, patch_rounds=rounds)
+        assert STAGE.inputs(dataset, "S001", config)["mattes"] == mattes
+
+
 def test_stage_writes_the_contracted_file(tracked_dataset, tmp_path: Path) -> None:
     from pipelines.track import STAGE
 

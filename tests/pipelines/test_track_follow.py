@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -129,6 +130,15 @@ def test_after_a_lost_frame_the_next_is_looked_for_everywhere() -> None:
     assert sorted(found) == [0, 1, 3, 4]
     assert [one is None for one in asked] == [True, False, False, True, False]
     assert np.linalg.norm(asked[4] - seen[3].points, axis=1).mean() < 0.004
+
+
+def test_a_frame_whose_landmarks_fit_no_head_costs_only_itself() -> None:
+    scene = make_scene()
+    person = freeze_shape(scene.basis, scene.shape, np.zeros((68, 3)))
+    seen = observations(scene, 0.2)[:5]
+    seen[2] = replace(seen[2], points=3 * seen[2].points)  # three times as large as a head
+    clip = [(lambda expected, one=one: one, unseen) for one in seen]
+    assert sorted(track_window(ClipTracker(person), clip)) == [0, 1, 3, 4]
 
 
 @pytest.mark.parametrize("shift", [(0, 0), (30, 0), (-20, 22), (3, -30)])
