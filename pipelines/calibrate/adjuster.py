@@ -347,7 +347,8 @@ def eliminate(
     V = _sum_by(by_group.transpose(0, 2, 1) @ by_group, group, total)
     V += damping * V * np.eye(size)
     V += 1e-9 * (1 + np.trace(V, axis1=1, axis2=2))[:, None, None] * np.eye(size)
-    root = np.linalg.cholesky(np.linalg.inv(V))
+    # In this order: the inverse of a matrix that is nearly singular may round to an indefinite one.
+    root = np.linalg.inv(np.linalg.cholesky(V)).transpose(0, 2, 1)
     mixed = by_camera.transpose(0, 2, 1) @ (by_group @ root[group])
     blocks = _sum_by(mixed, camera * total + group, total * cameras)
     blocks = blocks.reshape(cameras, total, each, size).transpose(0, 2, 1, 3)

@@ -16,6 +16,7 @@ from pipelines.calibrate.adjuster import (
     _moved,
     adjust_rig,
     cameras_covariance,
+    eliminate,
     move_pose,
     triangulate_tracks,
 )
@@ -159,3 +160,14 @@ def test_features_where_a_lens_diverges_are_not_matched_and_give_no_warning(bend
     assert np.isfinite(ideal).all()
     assert described[1].all() and np.isfinite(described).all()
     assert bend > 0 or not described[[0, 2]].any()
+
+
+def test_groups_that_are_hardly_held_are_eliminated():
+    rng, count = np.random.default_rng(0), 4000
+    way, size = rng.normal(size=(count, 1, 3)), 10 ** rng.uniform(-3, 6, (count, 1, 1))
+    by_group = size * rng.normal(size=(count, 2, 1)) * way  # both rows say the same of the group
+    camera, group = np.zeros(count, int), np.arange(count)
+    found = eliminate(
+        rng.normal(size=(count, 2, 1)), by_group, np.ones((count, 2)), camera, group, 1
+    )
+    assert np.isfinite(found.cameras).all() and np.isfinite(found.follow(np.ones(1))).all()
