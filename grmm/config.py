@@ -345,8 +345,9 @@ def resolve(
 
 def from_tables(tables: Mapping[str, Mapping[str, object]]) -> Config:
     """Make a configuration from plain tables, as a checkpoint holds them."""
+    hint = "; 'grmm config' lists all"
     return Config(
-        **{table: build_dataclass(table, TABLES[table], values) for table, values in tables.items()}
+        **{t: build_dataclass(t, TABLES[t], values, hint) for t, values in tables.items()}
     )
 
 

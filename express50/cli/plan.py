@@ -134,8 +134,8 @@ def run_plan(args: argparse.Namespace) -> int:
         f"target   {args.target or 'as given'}: {_words(target)}",
         *dict.fromkeys(f"measured {_words(size)}" for size, _ in measured),
         *format_table(columns, cells),
-        "core hours: with a 90 % interval; part of a stage's cost may be constant, which only a "
-        "second dataset of another size can show (--also DATASET)",
+        "core hours: with a 90 % interval; part of a stage's time or disk may be constant, which only "
+        "a second dataset of another size can show (--also DATASET)",
         "s per item: of one core; stages one after the other, no item split over workers",
         "peak memory: as measured; more footage may need more",
         f"disk: without replaced outputs ({decimal(replaced)} here); stages keep two per item "
@@ -266,7 +266,8 @@ def estimate(
 
     Workers are processes of one core each. Only datasets of the first one's preset count.
     """
-    from express50.dial.laws import MeasuredSize, forecast  # NumPy would slow every command
+    # Imported here, because NumPy would slow every command.
+    from express50.dial.laws import MeasuredSize, forecast, typical_seconds
 
     rows = []
     for stage in known:
@@ -284,7 +285,9 @@ def estimate(
         samples = [MeasuredSize(f.time(growth), c.seconds) for f, c in alike]
         item = forecast(samples, target.time(growth))
         ratio = target.time(growth) / footage.time(growth)
-        disk = cost.bytes * target.work(growth.disk) / footage.work(growth.disk)
+        kept = [MeasuredSize(f.work(growth.disk), [c.bytes]) for f, c in alike]
+        # The law of seconds holds for bytes too: a surface is as large whatever the pictures.
+        disk = typical_seconds(kept, target.work(growth.disk))
         rows.append(
             Row(
                 stage=stage.name,

@@ -267,7 +267,8 @@ def read_entries(root: Path) -> tuple[Entry, ...]:
     """
     path = root / "index.json"
     if not path.exists():
-        raise FormatError(f"{path}: the index is missing; name the folder that 'pack' wrote")
+        what = f"{path}: the index is missing" if root.is_dir() else f"{root}: no such folder"
+        raise FormatError(f"{what}; name the folder that 'pack' wrote, DATASET/pack/shards")
     table = read_json(path, FormatError, AGAIN)
     if not isinstance(table, dict) or table.get("schema") != SCHEMA:
         got = table.get("schema") if isinstance(table, dict) else type(table).__name__

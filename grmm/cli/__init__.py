@@ -80,7 +80,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "help": "set one value, such as train.lr=1e-3; overrides preset and file; may be repeated",
     },
     "--also": REPEATED | {"type": Path, "metavar": "SHARDS", "help": "more shards; repeatable"},
-    "--seconds": {"type": parse_seconds, "help": "stop after this long: 240, 4m, 2h"},
+    "--budget": {"type": parse_seconds, "dest": "seconds", "metavar": "TIME",
+                 "help": "stop after this long: 240, 4m, 2h"},
     "--holdout-cameras": {"default": "", "help": "camera ids to hold out for testing: cam02,cam05"},
     "--holdout-expressions": {
         "default": "", "metavar": "SUBJECT/EXPRESSION,..", "help": "expressions to test on",
@@ -166,11 +167,11 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--examples": {"type": int, "default": 15, "help": "examples per participant (15)"},
     "--participants": {"type": int, "default": 20},
 }  # fmt: skip
-ALIASES = {"--seconds": ["--budget"]}
+ALIASES = {"--budget": ["--seconds"]}
 
 METRICS = "--alexnet --inception"
 TRAINING = (
-    f"--preset --config --set --also --seconds --holdout-cameras --holdout-expressions {METRICS}"
+    f"--preset --config --set --also --budget --holdout-cameras --holdout-expressions {METRICS}"
 )
 CHOICE = "--subjects --expressions --cameras --images"
 PROTOCOL = "--fit-cameras --fit-expression --fit-budget"
@@ -206,7 +207,7 @@ COMMANDS = {
     ),
     "fit": GrmmCommand(
         handler=commands.fit,
-        options="checkpoint shards out --subject --expression --cameras --seconds --set "
+        options="checkpoint shards out --subject --expression --cameras --budget --set "
         f"--overwrite {METRICS} --json",
         help="fit an unseen subject",
         example="grmm fit run/checkpoint.pt shards out --subject S004 --expression neutral "

@@ -136,9 +136,12 @@ def test_two_sizes_tell_what_does_not_grow_and_the_interval_holds_a_third():
     def seconds(footage):  # 3 s whatever the footage
         return 3.0 + 2.0 * footage.pixels / SMALL.pixels
 
-    measured = [(f, {"matte": cost(seconds(f))}) for f in (SMALL, large)]
+    measured = [
+        (f, {"matte": replace(cost(seconds(f)), bytes=1e6 * seconds(f))}) for f in (SMALL, large)
+    ]
     (row,) = estimate([stage], unseen, measured, 1)
     assert row.sizes == 2 and row.seconds == pytest.approx(seconds(unseen))
+    assert row.disk == pytest.approx(row.items * 1e6 * seconds(unseen))
     assert row.core_hours_low < row.core_hours < row.core_hours_high < 1.3 * row.core_hours
     (alone,) = estimate([stage], unseen, measured[:1], 1)
     assert alone.sizes == 1 and alone.seconds == pytest.approx(20 * 5.0)
