@@ -134,8 +134,8 @@ def run_plan(args: argparse.Namespace) -> int:
         f"target   {args.target or 'as given'}: {_words(target)}",
         *dict.fromkeys(f"measured {_words(size)}" for size, _ in measured),
         *format_table(columns, cells),
-        "core hours: with a 90 % interval; part of a stage's time or disk may be constant, which only "
-        "a second dataset of another size can show (--also DATASET)",
+        "core hours: with a 90 % interval; part of a stage's time or disk may be constant, which "
+        "only a second dataset of another size can show (--also DATASET)",
         "s per item: of one core; stages one after the other, no item split over workers",
         "peak memory: as measured; more footage may need more",
         f"disk: without replaced outputs ({decimal(replaced)} here); stages keep two per item "

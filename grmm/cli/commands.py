@@ -81,9 +81,10 @@ def _machines_choice(seconds: float | None) -> tuple[str, dict[str, dict[str, An
             f"no GPU found; on a CPU --preset {AUTO} needs a time budget: --budget 1h"
         )
     choice = choose(seconds)
+    which = "longest measured time that fits" if choice.budget_s <= seconds else "shortest measured"
     log(
         f"auto: no GPU found; demo with {choice.setting}, which reached {choice.psnr_db:.1f} dB in "
-        f"{choice.budget_s:.0f} s of one core, the longest measured time that fits"
+        f"{choice.budget_s:.0f} s of one core, the {which}"
     )
     return "demo", choice.changes
 
