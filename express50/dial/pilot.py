@@ -92,8 +92,10 @@ class Pilot:
                 capture = str(given.captures()[self.subject].resolve())
                 root.mkdir(parents=True)
                 write_json(root / "captures.json", {self.subject: capture})
-                if (given.root / "labels").is_dir():  # those that people gave
-                    shutil.copytree(given.root / "labels", root / "labels")
+                labels = given.labels_file(self.subject)  # those that people gave
+                if labels.is_file():  # the reference may be somebody whom the trial lacks
+                    Dataset(root).labels_file(self.subject).parent.mkdir()
+                    shutil.copy2(labels, Dataset(root).labels_file(self.subject))
         else:
             shutil.rmtree(root, ignore_errors=True)
             shutil.copytree(source.folder, root, copy_function=_link)

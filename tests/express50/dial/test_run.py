@@ -3,9 +3,11 @@
 import itertools
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 
+from annotations.suggestions import reference_subject
 from express50.contract.layout import Dataset
 from express50.dial.budget import Clock, parse_budget, parse_goal
 from express50.dial.figures import Cost, Footage, Trial, dial_dir
@@ -13,6 +15,7 @@ from express50.dial.pilot import Pilot, pilot_dir, spare_seconds, trial_seconds
 from express50.dial.run import closing_lines, reserved, run_within
 from express50.dial.tune import tune
 from express50.errors import ConfigError, StageError
+from express50.files.atomic import write_json
 from express50.runner.runner import run_stage
 from tests.express50.dial.toy_chain import (
     FAILS,
@@ -213,6 +216,19 @@ def test_a_run_that_is_a_little_short_of_time_goes_on():
     assert reserved(own=5, rest=20, left=30, budget=40) == 20
     assert reserved(own=5, rest=20, left=22, budget=40) == 17  # late by 3 of 40
     assert reserved(own=5, rest=20, left=20, budget=40) == 20  # by 5: what is left is not begun
+
+
+def test_a_reference_that_the_trial_lacks_does_not_stop_it(tmp_path, captures):
+    said, root = [], tmp_path / "d"
+    chain = chain_of(root, captures, said)
+    write_json(root / "labels" / "reference.json", {"subject": "S1"})
+
+    def inputs(dataset, item, config):
+        return {"index": dataset.index_file(item), "reference": reference_subject(dataset)}
+
+    chain.stages = [replace(s, inputs=inputs) if s.name == "align" else s for s in chain.stages]
+    _, state = run_within(chain, parse_budget("5m"), None, lambda stage, summary: None)
+    assert state.finished and not any("cannot be measured" in line for line in said)
 
 
 def test_one_item_is_enough(tmp_path):
