@@ -104,7 +104,13 @@ def run_all(args: argparse.Namespace) -> int:
     last = names.index(args.last) if args.last else len(names) - 1
     if first > last:
         raise ConfigError(f"--first {args.first} comes after --last {args.last}; swap them")
-    return _run(args, with_required(names[first : last + 1]), None)
+    chosen = with_required(names[first : last + 1])
+    if args.captures and all(stage.prepare is None for stage in chosen):
+        raise ConfigError(
+            f"--first {args.first}: no stage from it on takes in captures, such as"
+            f" {args.captures[0]}; leave --first out, or the captures"
+        )
+    return _run(args, chosen, None)
 
 
 def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None) -> int:
