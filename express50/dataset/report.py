@@ -32,6 +32,7 @@ PICTURES = 12  # per stage
 ROWS = 12
 COLUMNS = 8
 PANELS = 4
+BARS, BINS = 200, 40  # most bars of a panel
 VIDEO_LIMIT = 8_000_000  # bytes
 INK = "#2457a6"
 
@@ -238,7 +239,7 @@ def _svg(figure: Figure) -> Markup:
 
 
 def _metric_bars(figures: dict[str, dict[str, float]], columns: list[str]) -> Markup:
-    """Draw one panel per metric, with a bar per item."""
+    """Draw one panel per metric: a bar per item, or of many items how many have which value."""
     varying = [c for c in columns if len({row.get(c) for row in figures.values()}) > 1][:PANELS]
     if not varying:
         return Markup("")
@@ -246,10 +247,14 @@ def _metric_bars(figures: dict[str, dict[str, float]], columns: list[str]) -> Ma
     figure.subplots(1, len(varying))
     for axes, column in zip(figure.axes, varying, strict=True):
         values = [row[column] for row in figures.values() if column in row]
-        axes.bar(range(len(values)), values, color=INK)
-        axes.set_title(_words(column), fontsize=9)
         axes.tick_params(labelsize=7)
-        axes.set_xticks([])
+        if len(values) <= BARS:
+            axes.bar(range(len(values)), values, color=INK)
+            axes.set_xticks([])
+        else:  # bars narrower than a pixel, and megabytes of them
+            axes.hist(values, bins=BINS, color=INK)
+            axes.set_ylabel("items", fontsize=7)
+        axes.set_title(_words(column), fontsize=9)
         axes.spines[["top", "right"]].set_visible(False)
     figure.tight_layout()
     return _svg(figure)

@@ -108,6 +108,15 @@ def test_the_same_dataset_gives_the_same_page(dataset):
     assert render_page(dataset) == render_page(dataset)
 
 
+def test_plots_do_not_grow_with_the_items(tmp_path):
+    for place in range(300):
+        folder = tmp_path / "matte" / f"S{place:03d}" / "smile"
+        folder.mkdir(parents=True)
+        (folder / "metrics.json").write_text(json.dumps({"coverage": place / 1000}))
+    page = render_page(Dataset(tmp_path))
+    assert page.count("<path") < 150 and "288 more items" in page
+
+
 def test_command_writes_the_page_and_refuses_an_empty_folder(dataset, tmp_path, capsys):
     assert main(["report", str(dataset.root), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["bytes"] > 1000
