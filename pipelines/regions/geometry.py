@@ -179,7 +179,8 @@ class HeadGeometry:
         near: (H, W) uint8 label at the nearest pixel of the mesh; 0 if no pixel shows it.
         rim: (H, W) bool, just beyond the mesh.
         height: (H, W) float32 metres above the neck's end; inf if the model does not mark it.
-        off: (H, W) float32 metres from the mesh to what stands before it; 0 where nothing does.
+        off: (H, W) float32 metres from the mesh to what stands before its face; 0 where nothing
+            stands CLEAR_M before it.
     """
 
     mesh: np.ndarray
@@ -237,7 +238,10 @@ def place(
     if head.end is not None:
         height[y, x] = head.end.height(points)
     if depth is not None:
-        before = (depth[y, x] > 0) & (mesh_depth[y, x] > depth[y, x])
+        # Nothing is further from the mesh than along its own ray; searching takes long.
+        scale = np.linalg.norm(points - camera.center, axis=1) / np.maximum(surface[y, x], 1e-9)
+        before = (depth[y, x] > 0) & ((mesh_depth[y, x] - depth[y, x]) * scale > CLEAR_M)
+        before &= _face(mesh)[y, x]
         places = o3d.core.Tensor((points[before] - head.center).astype(np.float32))
         off[y[before], x[before]] = head.scene.compute_distance(places, nthreads=1).numpy()
     return HeadGeometry(mesh, mesh_depth, mesh[row, column], rim, height, off)
@@ -249,14 +253,17 @@ def before_face(geometry: HeadGeometry, labels: np.ndarray, metre_px: float) -> 
     Only parts that are clear of the mesh count, without what `labels` (H, W) call hair.
     ``metre_px`` is the number of pixels that a metre spans at the head.
     """
-    face = label_mask(geometry.mesh, "skin", "lips", "eyes")
-    clear = face & (geometry.off > CLEAR_M) & (labels != HAIR)
+    clear = _face(geometry.mesh) & (geometry.off > CLEAR_M) & (labels != HAIR)
     size = max(3, int(WIDTH_M * metre_px) // 2 * 2 + 1)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     solid = cv2.morphologyEx(clear.astype(np.uint8), cv2.MORPH_OPEN, kernel)
     count, part = cv2.connectedComponents(solid, connectivity=8)
     far = [k for k in range(1, count) if np.quantile(geometry.off[part == k], 0.9) > HAND_M]
     return np.isin(part, far)
+
+
+def _face(mesh: np.ndarray) -> np.ndarray:
+    return label_mask(mesh, "skin", "lips", "eyes")
 
 
 def _nearest(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

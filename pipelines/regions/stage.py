@@ -17,7 +17,7 @@ from express50.dataset.depth_files import depth_file, read_depth
 from express50.dataset.tracks import existing_track, read_track
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.images import contact_sheet, fit_into, shrink, write_image
-from express50.geometry.cameras import Camera, resized
+from express50.geometry.cameras import Camera, crop_camera, project, resized
 from express50.head.load import load_head
 from pipelines.regions.colour import EARS, SKIN, Scalp, by_colour, decide, face_colours, scalp_votes
 from pipelines.regions.geometry import (
@@ -37,6 +37,7 @@ VOTERS, VOTING_SIDE = 4, 512  # cameras, and their pixels, that show skin colour
 WITNESSES = 10  # cameras, of that size, that show glasses
 AGREEMENT = 0.85  # a camera with less of the tracked mesh inside its matte gets a warning
 SHOWN = 4  # cameras in the contact sheet
+MARGIN = 32  # pixels about the subject: the discs that find hands and glasses are smaller
 TILE = (260, 260)
 UNREADABLE = (CaptureError, FormatError, StageError)
 
@@ -133,7 +134,7 @@ def read_pair(dataset: Dataset, item: str, camera: Camera) -> tuple[np.ndarray, 
     Raises as `read_matted_frame`.
     """
     rgb, alpha = read_matted_frame(dataset, item, camera)
-    return rgb, alpha.astype(np.float32) / 255
+    return rgb, cv2.LUT(alpha, np.arange(256, dtype=np.float32) / 255)
 
 
 def read_depth_of(dataset: Dataset, item: str, camera: Camera) -> np.ndarray | None:
@@ -207,6 +208,13 @@ def label_view(
         glasses: places (n, 3) of ``glasses.find_glasses``.
     """
     camera, rgb, alpha, depth = _shrunk(camera, rgb, alpha, depth, side)
+    whole = ViewLabels(np.zeros(alpha.shape, np.uint8), np.zeros(alpha.shape, bool))
+    rows, columns = window = _window(head, camera, alpha)
+    camera = crop_camera(
+        camera, columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start
+    )
+    rgb, alpha = rgb[window], alpha[window]
+    depth = None if depth is None else depth[window]
     geometry = place(head, camera, alpha, depth)
     labels = by_colour(rgb, alpha, geometry, bare, skin_colours)
     labels = np.where(labels == SCALP, SKIN if bare else HAIR, labels)
@@ -219,7 +227,22 @@ def label_view(
         distance = np.linalg.norm(head.center - camera.center)
         hand = before_face(geometry, labels, camera.K[0, 0] / distance)
         labels = np.where(hand, np.uint8(LABELS.index("hand")), labels)
-    return ViewLabels(np.where(alpha > 0, labels, np.uint8(0)), geometry.mesh > 0)
+    whole.labels[window] = np.where(alpha > 0, labels, np.uint8(0))
+    whole.mesh[window] = geometry.mesh > 0
+    return whole
+
+
+def _window(head: TrackedHead, camera: Camera, alpha: np.ndarray) -> tuple[slice, slice]:
+    """Find the rows and columns that hold the matte (H, W) and the head, with a margin."""
+    size = np.array([camera.width, camera.height])
+    x, y, width, height = cv2.boundingRect((alpha > 0).astype(np.uint8))
+    pixels, ahead = project(camera, head.vertices)
+    if not (ahead > 0).all():
+        return slice(0, camera.height), slice(0, camera.width)
+    ends = np.concatenate([pixels, [[x, y], [x + width, y + height]][: 2 * (width > 0)]])
+    low = np.clip(np.floor(ends.min(0)) - MARGIN, 0, size - 1).astype(int).tolist()
+    high = np.clip(np.ceil(ends.max(0)) + MARGIN, 1, size).astype(int).tolist()
+    return slice(low[1], high[1]), slice(low[0], high[0])
 
 
 def _shrunk(
@@ -265,8 +288,9 @@ def _write_view(
 
 def label_shares(labels: np.ndarray) -> dict[str, float]:
     """Measure the share of the image that each label covers."""
-    counts = np.bincount(labels.ravel(), minlength=len(LABELS)) / labels.size
-    return {name: round(float(share), 6) for name, share in zip(LABELS, counts, strict=True)}
+    count = len(LABELS)
+    shares = cv2.calcHist([labels], [0], None, [count], [0, count]).ravel() / labels.size
+    return {name: round(float(share), 6) for name, share in zip(LABELS, shares, strict=True)}
 
 
 def mesh_fit(mesh: np.ndarray, alpha: np.ndarray, head: np.ndarray) -> dict[str, float]:
