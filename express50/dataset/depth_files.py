@@ -59,7 +59,7 @@ def read_depth(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if path.suffix != ".exr":
         if depth.dtype != np.uint16 or depth.ndim != 2:
             raise FormatError(f"{path}: {depth.dtype} {depth.shape}, expected 16-bit grey depth")
-        return (depth * np.float32(DEPTH_UNIT_M)).astype(np.float32), depth > 0
+        return depth * np.float32(DEPTH_UNIT_M), depth > 0
     if depth.dtype != np.float32 or depth.ndim != 2:
         raise FormatError(f"{path}: {depth.dtype} {depth.shape}, expected one channel of floats")
     if not (np.isfinite(depth).all() and depth.min(initial=0) >= 0):

@@ -123,10 +123,8 @@ def edge_width(image: np.ndarray) -> float | None:
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     grey = cv2.GaussianBlur(grey, (0, 0), SMOOTH)
-    slope = np.hypot(
-        cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=1) / 2,
-        cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=1) / 2,
-    )
+    slopes = [cv2.Sobel(grey, cv2.CV_32F, x, 1 - x, ksize=1, scale=0.5) for x in (1, 0)]
+    slope = cv2.magnitude(*slopes)
     window = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
     height = cv2.dilate(grey, window) - cv2.erode(grey, window)
     steepest = slope == cv2.dilate(slope, np.ones((REACH + 1, REACH + 1), np.uint8))

@@ -6,12 +6,19 @@ rotation part is ``express50.geometry.transforms_torch``; a test holds the two a
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from express50.geometry.shapes import check_shape
 
 LARGEST_ANGLE = 1e15  # radians; beyond this float64 resolves angles to 0.1 or worse
+
+
+def _rotations() -> Any:
+    # SciPy loads it when it is first used, which few stages do: it takes 0.2 core seconds.
+    return scipy.spatial.transform.Rotation
 
 
 def axis_angle_to_matrix(axis_angle: np.ndarray) -> np.ndarray:
@@ -23,7 +30,7 @@ def axis_angle_to_matrix(axis_angle: np.ndarray) -> np.ndarray:
     largest = np.abs(axis_angle).max(initial=0.0)
     if largest > LARGEST_ANGLE:
         raise ValueError(f"axis-angle holds {largest:.3g}, expected at most {LARGEST_ANGLE:g} rad")
-    return Rotation.from_rotvec(axis_angle).as_matrix()
+    return _rotations().from_rotvec(axis_angle).as_matrix()
 
 
 def quat_to_matrix(quats: np.ndarray) -> np.ndarray:
@@ -35,23 +42,23 @@ def quat_to_matrix(quats: np.ndarray) -> np.ndarray:
     quats = np.asarray(quats, dtype=np.float64)
     largest = np.abs(quats).max(-1, keepdims=True)  # squares of tiny or huge ones would be lost
     scaled = quats / np.where(largest > 0, largest, 1.0)
-    return Rotation.from_quat(scaled, scalar_first=True).as_matrix()
+    return _rotations().from_quat(scaled, scalar_first=True).as_matrix()
 
 
 def matrix_to_quat(R: np.ndarray) -> np.ndarray:
     """Return unit quaternions (..., 4), wxyz with w >= 0, of rotation matrices (..., 3, 3)."""
-    return Rotation.from_matrix(R).as_quat(canonical=True, scalar_first=True)
+    return _rotations().from_matrix(R).as_quat(canonical=True, scalar_first=True)
 
 
 def matrix_to_axis_angle(R: np.ndarray) -> np.ndarray:
     """Return axis-angle vectors (..., 3), radians in [0, pi], of rotation matrices (..., 3, 3)."""
-    return Rotation.from_matrix(R).as_rotvec()
+    return _rotations().from_matrix(R).as_rotvec()
 
 
 def slerp(q0: np.ndarray, q1: np.ndarray, t: float | np.ndarray) -> np.ndarray:
     """Interpolate spherically between unit quaternions (..., 4), wxyz, along the shorter arc."""
-    start, end = (Rotation.from_quat(q, scalar_first=True) for q in (q0, q1))
-    way = Rotation.from_rotvec(np.asarray(t)[..., None] * (start.inv() * end).as_rotvec())
+    start, end = (_rotations().from_quat(q, scalar_first=True) for q in (q0, q1))
+    way = _rotations().from_rotvec(np.asarray(t)[..., None] * (start.inv() * end).as_rotvec())
     return (start * way).as_quat(scalar_first=True)
 
 

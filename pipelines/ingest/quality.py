@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 
 import cv2
 import numpy as np
-from scipy.ndimage import median_filter
+import scipy
 
 from express50.files.images import shrink, srgb_to_linear
 
@@ -306,7 +306,7 @@ def measure_drift(cells: np.ndarray) -> Drift | None:
     if usable.sum() < FEWEST_CELLS:
         return None
     stops = np.log2(np.maximum(cells[:, usable], 1e-4) / usual[usable])  # (F, N, 3)
-    curve = median_filter(np.median(stops, axis=1), (DRIFT_SPAN, 1), mode="nearest")
+    curve = scipy.ndimage.median_filter(np.median(stops, axis=1), (DRIFT_SPAN, 1), mode="nearest")
     exposure = curve.mean(axis=1)
     return Drift(
         exposure=float(np.ptp(exposure)),

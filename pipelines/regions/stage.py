@@ -239,7 +239,8 @@ def _window(head: TrackedHead, camera: Camera, alpha: np.ndarray) -> tuple[slice
     pixels, ahead = project(camera, head.vertices)
     if not (ahead > 0).all():
         return slice(0, camera.height), slice(0, camera.width)
-    ends = np.concatenate([pixels, [[x, y], [x + width, y + height]][: 2 * (width > 0)]])
+    matte = np.array([(x, y), (x + width, y + height)])
+    ends = np.concatenate([pixels, matte]) if width else pixels
     low = np.clip(np.floor(ends.min(0)) - MARGIN, 0, size - 1).astype(int).tolist()
     high = np.clip(np.ceil(ends.max(0)) + MARGIN, 1, size).astype(int).tolist()
     return slice(low[1], high[1]), slice(low[0], high[0])
