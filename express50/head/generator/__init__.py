@@ -1,1 +1,1 @@
-"""Make the built-in head; only its stored arrays are read at run time."""
+"""Make the built-in head; at run time only its stored arrays are read."""

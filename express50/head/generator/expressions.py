@@ -1,4 +1,4 @@
-"""Define expression directions by ARKit's names and some more; 1 is full activation."""
+"""Define the expression directions: ARKit's and some more; 1 is full activation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from express50.head.generator.mesh import WholeMesh
 Array = np.ndarray
 Triple = tuple[float, float, float]
 
-# How much of the surrounding skin's motion each lid loop takes, from the margin outwards.
+# Share of the surrounding skin's motion that each lid loop follows, from the margin outwards.
 LID_SHARE = (0.0, 0.08, 0.2, 0.38, 0.58, 0.78, 0.92, 1.0)
 
 
@@ -27,12 +27,12 @@ class Pull:
     radius: Triple
     move: Triple = (0.0, 0.0, 0.0)
     stretch: Triple = (0.0, 0.0, 0.0)
-    sides: str = "both"  # "both" mirrors the pull; "left", "right" or "middle" use it once
-    scope: str = "skin"  # "skin", or the part of it "upper" or "lower" than the mouth's slit
+    sides: str = "both"  # "both" adds the mirrored pull; "left", "right" or "middle" do not
+    scope: str = "skin"  # "skin", or its part that is "upper" or "lower" than the mouth's slit
 
 
 def displacement(mesh: WholeMesh, pulls: tuple[Pull, ...], scopes: dict[str, Array]) -> Array:
-    """Sum (V,3) of pulls in mm; `scopes` maps a scope to its vertex weights (V,)."""
+    """Return the sum (V,3) of pulls in mm; `scopes` has the vertex weights (V,) of each scope."""
     total = np.zeros_like(mesh.vertices)
     for pull in pulls:
         flips = {"both": (1, -1), "left": (1,), "right": (-1,), "middle": (1,)}[pull.sides]
@@ -46,7 +46,7 @@ def displacement(mesh: WholeMesh, pulls: tuple[Pull, ...], scopes: dict[str, Arr
 
 
 def settle_eyes(mesh: WholeMesh, motion: Array) -> Array:
-    """Hold the eyeballs and the lids' margins still; lids give way the more, the further out."""
+    """Return the motion (V,3) with eyeballs and lid margins fixed, growing outwards on the lids."""
     result = motion.copy()
     for tag in ("eyeball", "lid_edge", "lid_hidden"):
         result[mesh.tag(tag)] = 0.0
@@ -55,14 +55,14 @@ def settle_eyes(mesh: WholeMesh, motion: Array) -> Array:
     return result
 
 
-# How much of a motion that would push shut lips through each other is held back, from the slit on.
+# Share, per loop from the slit on, by which a motion of shut lips through each other is reduced.
 SHUT_SHARE = (1.0, 0.7, 0.3)
 
 
 def part_lips(mesh: WholeMesh, motion: Array) -> Array:
-    """Return the motion (V, 3) with shut lips moving up and down as one where they would close.
+    """Return the motion (V, 3) with shut lips moving together where they would overlap.
 
-    No sum of such motions then pushes shut lips through each other.
+    Then no sum of motions pushes shut lips through each other.
     """
     result = motion.copy()
     for k, share in enumerate(SHUT_SHARE):
@@ -78,7 +78,7 @@ def part_lips(mesh: WholeMesh, motion: Array) -> Array:
 _CORNER: Triple = (25.5, -49.5, 87)
 left, middle = partial(Pull, sides="left"), partial(Pull, sides="middle")
 
-# One-sided directions, written for the left; "_L" and "_R" are made of them.
+# One-sided directions, on the left; "_L" and "_R" are made from them.
 PAIRED: dict[str, tuple[Pull, ...]] = {
     "browDown": (
         left((26, 40, 84), (20, 12, 20), (-2.0, -5.0, 1.0)),
@@ -190,9 +190,9 @@ def expression_directions(
 ) -> tuple[tuple[str, ...], Array]:
     """Return names (X) and directions (V,3,X) in mm at full activation, for the mean of people.
 
-    Pulls are placed on the head drawn by rule, `mesh`, and move the same vertices of `mean`; lids
-    and jaw move by the mean's own shape. `jaw` (V,) separates the lips; `hinge` (3,) is the jaw's
-    joint in the mean.
+    Pulls are placed on the head drawn by rule, `mesh`, and move the same vertices of `mean`; the
+    motions of lids and jaw come from the mean's own shape. `jaw` (V,) separates the lips; `hinge`
+    (3,) is the jaw's joint in the mean.
     """
     others = ("teeth", "gums", "tongue", "left_eyeball", "right_eyeball")
     skin = (~np.any([regions[name] for name in others], axis=0)).astype(float)
@@ -218,7 +218,7 @@ def expression_directions(
     return names, np.stack([result[name] for name in names], -1)
 
 
-#  name: share of the opening the upper lid comes down, the lower comes up, slide in x (mm)
+# By name: shares of the opening that the upper lid moves down and the lower up; motion in x, mm.
 _LIDS: dict[str, tuple[float, float, float]] = {
     "eyeBlink": (0.855, 0.14, 0.0),  # lids that touch would pass through each other
     "eyeLookDown": (0.36, -0.1, 0.0),
@@ -235,7 +235,7 @@ def _both_sides(mesh: WholeMesh, name: str, left: Array) -> dict[str, Array]:
 
 
 def _jaw_directions(mesh: WholeMesh, mean: WholeMesh, jaw: Array, hinge: Array) -> dict[str, Array]:
-    """Return slides of the jaw, and how lips stay shut while the jaw opens by 0.3 rad."""
+    """Return the jaw's translations, and the motion that keeps lips shut as it opens by 0.3 rad."""
     share = jaw[:, None]
     sideways = jaw.copy()  # the lips move as one towards their corners
     for tag in ("lip0", "lip1", "lip2", "lip3", "cavity0", "cavity1"):

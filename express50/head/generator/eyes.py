@@ -1,4 +1,4 @@
-"""Build eyelid loops of the skin, the lids' hidden edges and motions, and the eyeballs."""
+"""Build eyelid loops, the lids' hidden edges, the lids' motions, and the eyeballs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ IRIS_RADIUS, PUPIL_RADIUS = 5.9, 1.9
 
 
 def lid_margin() -> Array:
-    """Return the lid margin (40,2) from the front, mm: upper lid outwards, lower lid back."""
+    """Return the lid margin (40,2), front view, mm: upper lid outwards, lower lid back."""
     s = 0.5 - 0.5 * np.cos(np.linspace(0, np.pi, LID_SEGMENTS + 1))
     line = INNER_CANTHUS + s[:, None] * (OUTER_CANTHUS - INNER_CANTHUS)
     upper, lower = line.copy(), line.copy()
@@ -34,13 +34,13 @@ def lid_margin() -> Array:
 
 
 def from_front(xy: Array) -> Array:
-    """Return skin points (N,3) straight behind front-view positions (N,2)."""
+    """Return the skin points (N,3) at front-view positions (N,2)."""
     origins = np.concatenate([xy, np.zeros((len(xy), 1))], 1)
     return cast(origins, np.tile([0.0, 0.0, 1.0], (len(xy), 1)))
 
 
 def add_eye_rings(half: HalfMesh) -> Array:
-    """Add lid loops out to the orbit's rim; return the outer ring's indices."""
+    """Add lid loops out to the orbit's rim; return the indices of the outer one."""
     margin = lid_margin()
     angle = np.pi - np.pi * np.arange(2 * LID_SEGMENTS) / LID_SEGMENTS
     outer = _ORBIT_CENTER + _ORBIT_RADII * np.stack([np.cos(angle), np.sin(angle)], 1)
@@ -73,7 +73,7 @@ def _add_lid_edges(half: HalfMesh, margin: Array, points: Array, label: Array) -
 
 
 def add_eyeball(half: HalfMesh) -> None:
-    """Add a sphere with its pole forward: rings at the pupil's and iris's rims, two UV charts."""
+    """Add a sphere of two charts with rings around its front pole, at the rims of pupil and iris."""
     iris = np.degrees(np.arcsin(IRIS_RADIUS / EYE_RADIUS))
     pupil = np.degrees(np.arcsin(PUPIL_RADIUS / EYE_RADIUS))
     polar = np.radians([pupil, pupil + 2, 0.5 * (pupil + iris), iris, iris + 2,
@@ -102,21 +102,21 @@ def add_eyeball(half: HalfMesh) -> None:
 
 
 def ball_centre(mesh: WholeMesh, side: str) -> Array:
-    """Return the centre (3,) of an eyeball, mm: the middle between its poles."""
+    """Return the centre (3,) of an eyeball, mm: halfway between its poles."""
     ball = mesh.vertices[mesh.tag("eyeball", side)]
     return 0.5 * (ball[0] + ball[-1])
 
 
-_STILL = 5  # lid loop that does not move; loops inside it share the margin's motion
+_STILL = 5  # the lid loop that does not move; loops inside it share the margin's motion
 
 
 def lid_motion(mesh: WholeMesh, side: str, upper: float, lower: float) -> Array:
-    """Return displacement (V,3) mm moving the lids' margins by shares of the opening.
+    """Return the displacement (V,3), mm, that moves lid margins by shares of the opening.
 
-    Loops between the margin and the still loop are spread evenly over the lengthened lid, turning
-    about the eyeball's centre, and the upper lid's fold is pulled smooth onto the lid's sphere.
-    `upper` is the share of the opening by which the upper margin comes down, `lower` that by which
-    the lower one comes up.
+    Loops between the margin and the still loop are spread evenly over the stretched lid, as they
+    turn about the eyeball's centre, and the upper lid's fold is smoothed onto the lid's sphere.
+    `upper` is the share of the opening that the upper margin moves down, `lower` the share that the
+    lower one moves up.
     """
     center = ball_centre(mesh, side)
     loops = np.stack([mesh.vertices[mesh.tag(f"lid{k}", side)] for k in range(_STILL + 1)]) - center
@@ -134,7 +134,7 @@ def lid_motion(mesh: WholeMesh, side: str, upper: float, lower: float) -> Array:
     shell = np.sqrt(np.maximum(LID_RADIUS**2 - loops[..., 0] ** 2, 1.0))
     smooth = np.minimum(drawn, 1.0) * np.array([0.0, 1.0, 1.0, 0.9, 0.5, 0.0])[:, None]
     new_radius = radius + smooth * np.minimum(shell - radius, 4.0).clip(-4.0)
-    shut = np.clip(upper + lower, 0.0, 1.0)  # margins that meet must agree in depth
+    shut = np.clip(upper + lower, 0.0, 1.0)  # margins that meet need the same depth
     new_radius[0] += shut * 0.5 * (radius[0][(-np.arange(count)) % count] - radius[0])
     new_margin = np.arcsin(np.clip(height / new_radius[0], -1, 1))
     new_angle = angle + (angle - angle[_STILL]) / span * (new_margin - angle[0])
@@ -150,7 +150,7 @@ def lid_motion(mesh: WholeMesh, side: str, upper: float, lower: float) -> Array:
 
 
 def turned(offset: Array, angle: Array) -> Array:
-    """Return displacement (N,3) of offsets turned upwards about the x axis by angles (N,)."""
+    """Return the displacement (N,3) of offsets turned upwards about the x axis by angles (N,)."""
     c, s = np.cos(angle), np.sin(angle)
     y = c * offset[:, 1] + s * offset[:, 2]
     z = -s * offset[:, 1] + c * offset[:, 2]

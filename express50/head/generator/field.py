@@ -1,10 +1,10 @@
 """Define the signed field of the head's skin, and cast the rays that sample it.
 
-The field joins anatomical masses by smooth minima. The rays leave a bent central axis; their
-labels are azimuth and latitude.
+The field joins anatomical masses by smooth minima. Rays start on a bent central axis, and are
+labelled by azimuth and latitude.
 
-Everything is in millimetres, on the left half (x is folded to |x|): y up, z forward, origin
-between the ears. Each mass is an ellipsoid or a tapered capsule placed by anthropometry (Farkas,
+Everything is in millimetres, on the left half (x is folded to |x|): y up, z forward, origin between
+the ears. Each mass is an ellipsoid or a tapered capsule placed by anthropometry (Farkas,
 Anthropometry of the Head and Face, 1994: mean adult heights, breadths and depths).
 """
 
@@ -25,7 +25,7 @@ LID_RADIUS = 13.3
 
 @dataclass(frozen=True)
 class Ellipsoid:
-    """A mass by centre and radii, turned by degrees; ``carve`` takes it away."""
+    """A mass by centre and radii, rotated by degrees; ``carve`` removes it."""
 
     centre: tuple[float, float, float]
     radii: tuple[float, float, float]
@@ -37,7 +37,7 @@ class Ellipsoid:
 
 @dataclass(frozen=True)
 class Capsule:
-    """A mass by its ends and the radii there; ``carve`` takes it away."""
+    """A mass by its ends and the radii there; ``carve`` removes it."""
 
     start: tuple[float, float, float]
     end: tuple[float, float, float]
@@ -103,7 +103,7 @@ _LONG = [mass for mass in MASSES if isinstance(mass, Capsule)]
 
 
 def _to_unit_sphere(mass: Ellipsoid) -> Array:
-    """Return the matrix (3,3) that takes directions, as rows, to the ellipsoid's unit sphere."""
+    """Return the matrix (3,3) that maps directions, as rows, to the ellipsoid's unit sphere."""
     a, b = np.radians(mass.tilt), np.radians(mass.yaw)
     rx = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
     ry = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
@@ -119,7 +119,7 @@ _END_RADII = np.array([(mass.start_radius, mass.end_radius) for mass in _LONG], 
 
 
 def _ellipsoid_distances(p: Array) -> Array:
-    """Return distances (N,E), first order near the surfaces."""
+    """Return distances (N,E) to the ellipsoids, first order near their surfaces."""
     q = (p @ _TO_SPHERES - _SHIFT).reshape(len(p), -1, 3)
     k0 = np.sqrt(np.einsum("nec,nec->ne", q, q)) + 1e-12
     q *= _INVERSE_RADII
@@ -128,7 +128,7 @@ def _ellipsoid_distances(p: Array) -> Array:
 
 
 def _capsule_distances(p: Array) -> Array:
-    """Return distances (N,C) to capsules whose radius runs linearly between the ends."""
+    """Return distances (N,C) to the capsules, whose radius is linear between the ends."""
     length2 = np.einsum("cd,cd->c", _AXIS, _AXIS)
     along = p @ _AXIS.T - np.einsum("cd,cd->c", _START, _AXIS)
     offset2 = (p * p).sum(1)[:, None] - 2 * p @ _START.T
@@ -140,7 +140,7 @@ def _capsule_distances(p: Array) -> Array:
 
 
 def skin_field(points: Array) -> Array:
-    """Compute a signed distance-like value, mm, at points (N,3) mm: negative inside the skin."""
+    """Return about the signed distance (N,), mm, of points (N,3) from the skin, negative inside."""
     p = np.array(points, float)
     p[:, 0] = np.sqrt(p[:, 0] ** 2 + 1.0)  # folds without a crease on the mid plane
     ellipsoids = iter(np.ascontiguousarray(_ellipsoid_distances(p).T))
@@ -149,14 +149,14 @@ def skin_field(points: Array) -> Array:
     for mass in MASSES[1:]:
         d = next(ellipsoids if isinstance(mass, Ellipsoid) else capsules)
         sign = -1.0 if mass.carve else 1.0
-        # The polynomial smooth minimum (quadratic), exact where they differ by more than the blend.
+        # A quadratic smooth minimum, exact where the two differ by more than the blend.
         h = np.maximum(mass.blend - np.abs(sign * value - d), 0.0)
         value = sign * (np.minimum(sign * value, d) - (0.25 / mass.blend) * h * h)
     return value
 
 
 def cast(origins: Array, directions: Array) -> Array:
-    """Find the outermost hit (N,3) of the skin on rays, marching inwards from 170 mm."""
+    """Find the outermost hits (N,3) of rays with the skin, marching inwards from 170 mm."""
     d = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     t, active = np.full(len(origins), 170.0), np.arange(len(origins))
     for _ in range(70):
@@ -169,7 +169,7 @@ def cast(origins: Array, directions: Array) -> Array:
 
 
 def cast_out(origins: Array, directions: Array) -> Array:
-    """Find the first exit (N,3) from the skin on rays that start inside it."""
+    """Find where (N,3) rays that start inside the skin first leave it."""
     d = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     t = np.zeros(len(origins))
     for _ in range(30):
@@ -178,7 +178,7 @@ def cast_out(origins: Array, directions: Array) -> Array:
 
 
 def gradient(points: Array) -> Array:
-    """Return unit outward normal (N,3) of the field by tetrahedral differences over 0.25 mm."""
+    """Return unit outward normals (N,3) of the field from tetrahedral differences over 0.25 mm."""
     corners = np.array([[1, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]], float)
     stacked = (points[None] + 0.25 * corners[:, None]).reshape(-1, 3)
     values = skin_field(stacked).reshape(4, -1)
@@ -206,13 +206,13 @@ _CURVES = PchipInterpolator(_TABLE[:, 0], _TABLE[:, 1:])
 
 
 def rays(azimuth: Array, latitude: Array) -> tuple[Array, Array]:
-    """Return origins (N,3) mm and unit directions by azimuth (radians, 0 front), latitude (deg)."""
+    """Return origins (N,3) mm and unit directions of azimuth (radians, 0 front), latitude (deg)."""
     y, z, elevation = _CURVES(np.asarray(latitude, float)).T
     return np.stack([np.zeros_like(y), y, z], -1), sphere(azimuth, elevation)
 
 
 def labels(points: Array) -> tuple[Array, Array]:
-    """Return azimuth (radians) and latitude (deg) of points (N,3) in mm: the inverse of `rays`."""
+    """Return azimuth (radians) and latitude (deg) of points (N,3), mm: the inverse of `rays`."""
     low, high = np.full(len(points), -85.0), np.full(len(points), 89.9)
     for _ in range(40):
         middle = 0.5 * (low + high)
@@ -226,16 +226,16 @@ def labels(points: Array) -> tuple[Array, Array]:
 
 
 def sphere(azimuth: Array, latitude: Array) -> Array:
-    """Return unit vectors (N,3) of the labels, the domain in which the skin is triangulated."""
+    """Return the unit vectors (N,3) of labels, between which the skin is triangulated."""
     b = np.radians(latitude)
     return np.stack([np.cos(b) * np.sin(azimuth), np.sin(b), np.cos(b) * np.cos(azimuth)], -1)
 
 
 def window(points: Array, at: ArrayLike, radius: ArrayLike) -> Array:
-    """Return a Gaussian window (N,), 1 at `at` and exp(-1) at one radius, of points (N,D)."""
+    """Return a Gaussian (N,) of points (N,D): 1 at `at` and exp(-1) at one radius."""
     return np.exp(-(((points - np.array(at)) / np.array(radius)) ** 2).sum(-1))
 
 
 def eye_center(side: str) -> Array:
-    """Return eyeball centre (3,) mm."""
+    """Return the eyeball's centre (3,), mm."""
     return EYE_CENTER * [1.0 if side == "left" else -1.0, 1.0, 1.0]

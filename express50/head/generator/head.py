@@ -1,11 +1,11 @@
 """Make the built-in head: a full head in FLAME's layout with the variety of people.
 
-Run `python -m express50.head.generator.head` after a change here: it rewrites `builtin.npz` with
-the mean and the shape directions that the file has. With `--people ict.npz` these are fitted again
-to the people of ICT-FaceKit (`people`), which takes some minutes.
+Run `python -m express50.head.generator.head` after a change here: it rewrites `builtin.npz`, with
+the mean and the shape directions of the old file. With `--people ict.npz` these are fitted again to
+the people of ICT-FaceKit (`people`), which takes some minutes.
 
-The generator draws a head by rule, features placed by anthropometry (Farkas 1994). The mean of
-people takes over its mesh, UV map, regions, landmarks and motions, vertex by vertex. Measures are
+The generator draws a head by rule, with features placed by anthropometry (Farkas 1994). The mean of
+people has the same vertices, and so its mesh, UV map, regions, landmarks and motions. Units are
 millimetres while building and metres in the result.
 """
 
@@ -33,13 +33,13 @@ from express50.head.load import BUILTIN, load_builtin
 Array = np.ndarray
 
 ROOT, NECK, JAW, LEFT_EYE, RIGHT_EYE = range(5)
-# Rest joints of the head drawn by rule, mm: collar, upper neck, jaw hinge.
+# Joints of the head drawn by rule, mm: collar, upper neck, jaw hinge.
 JOINTS = np.array([(0, -165, -22), (0, -72, -16), (0, -8, 10)], float)
 
 
 @cache
 def procedural_mesh() -> WholeMesh:
-    """Build the head's geometry in millimetres, before directions; deterministic, built once."""
+    """Build the geometry of the head drawn by rule, in millimetres, once per process."""
     half = HalfMesh()
     add_skin(half)
     add_eyeball(half)
@@ -89,7 +89,7 @@ def write_builtin(path: Path, people: People) -> None:
 
 
 def stored_people() -> People:
-    """Return the mean and the directions that the stored head has."""
+    """Return the mean and the directions of the stored head."""
     head = load_builtin()
     template = 1000 * head.template.double().numpy()
     joints = head.joint_regressor.double().numpy()[:LEFT_EYE] @ template
@@ -97,26 +97,26 @@ def stored_people() -> People:
 
 
 def joint_regressor(mesh: WholeMesh, joints: Array) -> Array:
-    """Return weights (5,V), rows sum to 1: least-norm affine ones over vertices near the joints."""
+    """Return weights (5,V) whose rows sum to 1: least-norm ones of the vertices near each joint."""
     regressor, skin = np.zeros((5, len(mesh.vertices))), mesh.tag("grid")
     for j, joint in enumerate(joints):
         if j >= LEFT_EYE:
             near = mesh.tag("eyeball", "left" if j == LEFT_EYE else "right")
         else:
             distance = np.linalg.norm(mesh.vertices[skin] - joint, axis=1)
-            # Mirrored vertices are equally far: rounding must not choose between them.
+            # Mirrored vertices are equally far, so distances are rounded to choose both.
             near = skin[np.argsort(distance.round(3), kind="stable")[:160]]
         system = np.concatenate([mesh.vertices[near].T, np.ones((1, len(near)))])
         regressor[j, near] = np.linalg.lstsq(system, np.append(joint, 1.0), rcond=None)[0]
     return regressor
 
 
-# Along a lip loop from the middle of the upper lip to that of the lower: corners share evenly.
+# The jaw's weight along a lip loop, from the middle of the upper lip to that of the lower.
 _CLOSURE = smoothstep(np.arange(33.0), 7.0, 25.0)
 
 
 def jaw_weight(mesh: WholeMesh) -> Array:
-    """Return share (V,) of the jaw joint: lower lip, chin, jaw line, lower teeth, tongue."""
+    """Return the jaw joint's weight (V,): lower lip, chin, jaw line, lower teeth, tongue."""
     p = mesh.vertices
     angle = np.degrees(np.arctan2(p[:, 1] + 8, np.maximum(p[:, 2] - 10, 1.0)))
     around = smoothstep(angle, -18.5, -31.5)
@@ -146,7 +146,7 @@ def jaw_weight(mesh: WholeMesh) -> Array:
 
 
 def skinning_weights(mesh: WholeMesh, regions: dict[str, Array]) -> Array:
-    """Return weights (V,5), rows sum to 1: collar by the root, head by the neck, jaw and eyes."""
+    """Return weights (V,5) whose rows sum to 1: root for the collar, neck, jaw and eyes above."""
     p = mesh.vertices
     jaw = jaw_weight(mesh)
     height = p[:, 1] - 0.35 * (p[:, 2] + 20)  # the neck's own axis leans forward
@@ -167,12 +167,11 @@ def skinning_weights(mesh: WholeMesh, regions: dict[str, Array]) -> Array:
 def pose_correctives(mesh: WholeMesh, regions: dict[str, Array]) -> Array:
     """Return correctives (36,V*3) in mm per unit of R - I, for the jaw's opening alone.
 
-    Opening by a sets R[2,1] of the jaw to sin a. The lips then close in from the corners and the
-    upper lip gives way a little, which skinning cannot do.
+    Opening by an angle a sets R[2,1] of the jaw to sin a. Then the corners of the mouth move in and
+    the upper lip moves up a little, which skinning cannot express.
     """
     hard = regions["teeth"] | regions["gums"] | regions["tongue"]
     p, sign = mesh.vertices, np.sign(mesh.vertices[:, 0])
-
     folded = np.stack([np.abs(p[:, 0]), p[:, 1], p[:, 2]], 1)
     corner, upper, cheek = (
         np.where(hard, 0.0, window(folded, at, radius))
@@ -192,7 +191,7 @@ def pose_correctives(mesh: WholeMesh, regions: dict[str, Array]) -> Array:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Rewrite the stored head."""
+    """Write the head's file."""
     parser = argparse.ArgumentParser(
         prog="python -m express50.head.generator.head", description=__doc__
     )

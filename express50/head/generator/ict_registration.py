@@ -1,8 +1,8 @@
-"""Register the generator's mesh to ICT-FaceKit's mean face, which gives places to `people`.
+"""Register the generator's mesh to ICT-FaceKit's mean face, for `people`.
 
-Landmarks lie on landmarks, lids, lips and ears along their rims; the rest is laid by non-rigid ICP
-with normals (after Amberg, Romdhani and Vetter 2007). Measures are millimetres in the head space of
-`field`.
+Landmarks are put on landmarks, and lids, lips and ears along their rims. The rest is registered by
+non-rigid ICP with normals (after Amberg, Romdhani and Vetter 2007). Units are millimetres in the
+head space of `field`.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sparse
+import torch
 from scipy.interpolate import PchipInterpolator, RBFInterpolator
 from scipy.sparse.csgraph import dijkstra
 from scipy.sparse.linalg import LinearOperator, cg, splu
@@ -21,15 +22,16 @@ from express50.head.generator.eyes import LID_SEGMENTS
 from express50.head.generator.mesh import WholeMesh
 from express50.head.generator.regions import embed_landmarks
 from express50.head.ict import LANDMARKS, RANGES, IctArrays
+from express50.head.model import vertex_normals
 
 Array = np.ndarray
 
 FLIP, FLAT = np.array([-1.0, 1.0, 1.0]), np.array([0.0, 1.0, 1.0])  # mirrored; on the mid plane
-LIDS, LIPS = range(36, 48), range(60, 68)  # landmarks that rims stand for
-# Rings of edges from the open ends of ICT's skin: the lids' margins, and where closed lips meet.
+LIDS, LIPS = range(36, 48), range(60, 68)  # landmarks that rims replace
+# Edges from the open ends of ICT's skin to the lids' margins, and to where closed lips meet.
 MARGIN_RING, SLIT_RINGS = 2, (7, 8)
-# The left ear's rim from the helix's root over the top to the lobe and up its front edge, (y, z) mm
-# in ICT's own space and in the generator's: read off pictures of both.
+# The left ear's rim from the helix's root over the top to the lobe and up the front edge, (y, z) mm
+# in ICT's own space and in the generator's; read off pictures of both.
 ICT_EAR = np.array([
     (25.4, 12.8), (30.4, 10.6), (33.9, 6.8), (36.1, -1.8), (32.8, -10.3), (25.4, -15.3),
     (18.4, -16.5), (9.3, -15.9), (1.3, -13.3), (-4.7, -9.7), (-11.3, -4.2), (-16.2, 1.8),
@@ -42,15 +44,15 @@ OWN_EAR = np.array([
     (-21.9, -12.6), (-22.3, -8.2), (-18.7, -3.8), (-12.3, -3.1), (-4.2, -3.4), (4.8, -4.6),
     (9.0, -5.5), (11.8, -6.2),
 ])  # fmt: skip
-RIM_POINTS, LOBE = 40, 14  # of a row of the ear; the last place of the table before its front edge
-STIFFNESS = np.geomspace(3000.0, 2.0, 24)  # of the registration, round by round
+RIM_POINTS, LOBE = 40, 14  # points in a row of the ear; the tables' last row before the front edge
+STIFFNESS = np.geomspace(3000.0, 2.0, 24)  # per round
 EAR_FIRMNESS = 20.0
-NORMAL_MM = 6.0  # millimetres that a unit of difference between normals counts as
+NORMAL_MM = 6.0  # distance that is as bad as a unit of difference between normals
 
 
 @dataclass(frozen=True)
 class RimTargets:
-    """Places that vertices must come to: ids (N,), goals (N, 3), weights (N,)."""
+    """Goals of vertices: ids (N,), goals (N, 3), weights (N,)."""
 
     ids: Array
     goals: Array
@@ -59,7 +61,7 @@ class RimTargets:
 
 @dataclass(frozen=True)
 class IctSkin:
-    """ICT's mean skin: all vertices (N, 3) mm, skin's faces, normals, graph, its open ends."""
+    """ICT's mean skin: all vertices (N, 3) mm, its faces, normals, edges, and its open ends."""
 
     points: Array
     faces: Array
@@ -73,14 +75,14 @@ class IctSkin:
         return self.points[list(LANDMARKS)]
 
     def ring(self, marks: Array, steps: tuple[int, ...]) -> Array:
-        """Return the vertices `steps` edges away from the open end that landmarks lie around."""
+        """Return the vertices that are `steps` edges from the open end inside some landmarks."""
         ends = self.ends[np.linalg.norm(self.points[self.ends] - marks.mean(0), axis=1) < 35]
         far = dijkstra(self.edges, indices=ends, unweighted=True, min_only=True)
         return self.points[np.isin(far, steps)]
 
 
 def ict_skin(arrays: IctArrays) -> IctSkin:
-    """Return the skin of ICT's mean face, without mouth, eye sockets and the parts within."""
+    """Return the skin of ICT's mean face, without mouth and eye sockets and what is in them."""
     points = 10.0 * arrays.template
     faces = arrays.faces[(arrays.faces < RANGES["mouth_socket"][0]).all(1)]
     edges, uses = np.unique(
@@ -93,15 +95,11 @@ def ict_skin(arrays: IctArrays) -> IctSkin:
 
 def normals_of(points: Array, faces: Array) -> Array:
     """Return unit vertex normals (N, 3) of a mesh."""
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    normals = np.zeros_like(points)
-    for k in range(3):
-        np.add.at(normals, faces[:, k], np.cross(b - a, c - a))
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return vertex_normals(torch.from_numpy(points)[None], torch.from_numpy(faces))[0].numpy()
 
 
 def rim_targets(mesh: WholeMesh, skin: IctSkin) -> RimTargets:
-    """Return where lids, lips and ears, both sides, belong along ICT's."""
+    """Return the goals of lids, lips and ears of both sides along ICT's."""
     marks = skin.marks
     rows = [
         (
@@ -134,7 +132,7 @@ def _lid_margin(ring: Array, marks: Array) -> Array:
 
 
 def _slit(mesh: WholeMesh, skin: IctSkin) -> Array:
-    """Return where the left half of the lips' loop belongs; upper and lower lip meet in it."""
+    """Return the goals of the left half of the lips' loop, where upper and lower lip meet."""
     around = skin.ring(skin.marks[60:68], SLIT_RINGS)
     corner, out = skin.marks[64], np.abs(around[:, 0])
     bins = np.arange(0.0, 21.2, 1.5)
@@ -145,18 +143,18 @@ def _slit(mesh: WholeMesh, skin: IctSkin) -> Array:
     goal = np.column_stack([x, PchipInterpolator(curve[:, 0], curve[:, 1:])(x)])
     sign = np.r_[np.ones(len(own) // 2), 0.0, -np.ones(len(own) // 2)]
     goal[:, 1] += 0.05 * sign
-    return goal - [0.0, 0.0, 0.6]  # they meet a little within the crease
+    return goal - [0.0, 0.0, 0.6]  # they meet slightly behind the crease
 
 
 def _ear_rim(mesh: WholeMesh, skin: IctSkin) -> tuple[Array, Array]:
-    """Return vertices of the left ear's rim, and where they belong.
+    """Return vertices of the left ear's rim, and their goals.
 
-    In front the ear grows out of the cheek: there the rows from the foot to the rim go with it.
+    Along the front edge, where the ear meets the cheek, the rows from foot to rim have goals too.
     """
     ear = mesh.tag("ear", "left")
     rows = [mesh.tag("ear_foot", "left"), *ear[: 4 * RIM_POINTS].reshape(4, RIM_POINTS)]
     places = cKDTree(mesh.vertices[rows[-1]][:, 1:]).query(OWN_EAR)[1].astype(float)
-    places[0] -= RIM_POINTS  # the row begins after the helix's root
+    places[0] -= RIM_POINTS  # the row starts after the helix's root
     places[1:] = np.maximum.accumulate(places[1:])
     side = skin.points[np.unique(skin.faces)]
     side = side[side[:, 0] > 62]
@@ -193,12 +191,12 @@ def warp_between(mesh: WholeMesh, skin: IctSkin) -> RBFInterpolator:
 
 
 def _free_marks() -> list[int]:
-    """Return the landmarks that no rim stands for."""
+    """Return the landmarks that no rim replaces."""
     return [k for k in range(68) if k not in (*LIDS, *LIPS)]
 
 
 def _outer_points(points: Array, chin: float) -> Array:
-    """Return crown, occiput and places around the neck (N, 3) of a head's skin."""
+    """Return points (N, 3) of a head's skin: crown, occiput and around the neck."""
     x, y, z = points.T
     middle = np.abs(x) < 6
     found = [points[np.argmax(y)], points[np.argmin(np.where(np.abs(y - 30) < 12, z, np.inf))]]
@@ -216,13 +214,13 @@ def is_skin(mesh: WholeMesh) -> Array:
 
 
 def hidden_vertices(mesh: WholeMesh) -> Array:
-    """Return the skin's vertices that no surface of ICT's stands for."""
+    """Return the skin's vertices that have no counterpart on ICT's skin."""
     names = ("nostril3", "nostril4", "nostril5", "nostril_top", "lip0", "lid_edge", "lid_hidden")
     return np.unique(np.concatenate([mesh.tag(name) for name in names]))
 
 
 def register_skin(mesh: WholeMesh, skin: IctSkin, own: Array, warp: RBFInterpolator) -> Array:
-    """Register the generator's skin, vertices `own` (N,), to ICT's; returns places (N, 3)."""
+    """Register the generator's skin, vertices `own` (N,), to ICT's; return its places (N, 3)."""
     index = np.full(len(mesh.vertices), -1)
     index[own] = np.arange(len(own))
     faces = index[mesh.faces[is_skin(mesh)]]
@@ -238,7 +236,7 @@ def register_skin(mesh: WholeMesh, skin: IctSkin, own: Array, warp: RBFInterpola
     held = np.zeros(len(own))
     np.add.at(held, index[targets.ids], 20.0 * targets.weights)
     fixed = at_marks.T @ sparse.diags(mark_trust) @ at_marks + sparse.diags(held + 1e-3)
-    # The folds of the two ears differ: ears keep the generator's.
+    # The folds of the two ears differ, so ears keep the generator's.
     firm = np.where(np.isin(own, mesh.tag("ear")), EAR_FIRMNESS, 1.0)
     start = warp(mesh.vertices[own])
     points = start.copy()
@@ -250,10 +248,10 @@ def register_skin(mesh: WholeMesh, skin: IctSkin, own: Array, warp: RBFInterpola
         towards, normals = sample.places[nearest] - points, sample.normals[nearest]
         alike = (facing * normals).sum(1) > 0.4
         reach = 25 if number < 6 else 12 if number < 11 else 6
-        # At last nothing of the generator's own relief is wanted back.
+        # Later rounds do not pull back to the generator's own relief.
         memory = 0.15 if number < 9 else 0.0
         trust = seen * alike * (np.linalg.norm(towards, axis=1) < reach)
-        # Mostly along the normal: skin may slide to where landmarks and bending want it.
+        # Mostly along the normal, so that skin may slide where landmarks and bending pull it.
         along = trust * (normals * towards).sum(1)
         right = along[:, None] * normals + 0.05 * trust[:, None] * towards
         right -= memory * stiffness * (bending @ (points - start))
@@ -268,7 +266,7 @@ def register_skin(mesh: WholeMesh, skin: IctSkin, own: Array, warp: RBFInterpola
 
 
 def _solve(smooth: sparse.csc_matrix, trust: Array, normals: Array, right: Array) -> Array:
-    """Solve (smooth + trust n n^T) u = right for moves (N, 3) by preconditioned gradients."""
+    """Solve (smooth + trust n n^T) u = right for moves u (N, 3) by conjugate gradients."""
     near = splu((smooth + sparse.diags(trust / 3)).tocsc())
 
     def apply(flat: Array) -> Array:
@@ -284,7 +282,7 @@ def _solve(smooth: sparse.csc_matrix, trust: Array, normals: Array, right: Array
 
 @dataclass(frozen=True)
 class SkinSample:
-    """Places (N, 3) all over ICT's skin, their normals, and the corners and weights they are of."""
+    """Places (N, 3) all over ICT's skin, with normals, and their vertices and weights."""
 
     places: Array
     normals: Array

@@ -1,7 +1,7 @@
-"""Build half a head's mesh, vertices with tags and faces in UV charts, and mirror it.
+"""Build half a head's mesh, with tagged vertices and faces in UV charts, and mirror it.
 
 Parts are built on the subject's left (x >= 0, millimetres). A face's winding follows its chart:
-faces are turned so that their UV area is positive, and charts are laid out as seen from outside.
+faces are flipped so that their UV area is positive, and charts are drawn as seen from outside.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ Array = np.ndarray
 
 @dataclass
 class HalfMesh:
-    """Growing left half. tags name vertex indices, uv holds one (u, v) a vertex and chart."""
+    """The left half while it is built. Tags name vertices; uv has a (u, v) per vertex and chart."""
 
     points: Array = field(default_factory=lambda: np.empty((0, 3)))
     # Azimuth (radians) and latitude (deg) of skin vertices, NaN elsewhere: see `field.rays`.
@@ -25,7 +25,7 @@ class HalfMesh:
     uv: dict[str, dict[int, Array]] = field(default_factory=dict)
 
     def add(self, points: Array, tag: str) -> Array:
-        """Add vertices (N,3), return their indices; `tag` names them (appending to the tag)."""
+        """Add vertices (N,3), append them to a tag, and return their indices."""
         index = len(self.points) + np.arange(len(points))
         self.points = np.concatenate([self.points, points])
         self.labels = np.concatenate([self.labels, np.full((len(points), 2), np.nan)])
@@ -49,7 +49,7 @@ class HalfMesh:
         first = np.linalg.norm(p[a[:-1]] - p[b[1:]], axis=1)
         second = np.linalg.norm(p[a[1:]] - p[b[:-1]], axis=1)
         quads = np.stack([a[:-1], a[1:], b[1:], b[:-1]], 1)
-        split = np.where(  # the margin keeps ties from hanging on rounding
+        split = np.where(  # the margin decides ties, which rounding would decide otherwise
             (first <= second + 1e-6)[:, None, None],
             quads[:, [[0, 1, 2], [0, 2, 3]]],
             quads[:, [[0, 1, 3], [1, 2, 3]]],
@@ -59,14 +59,14 @@ class HalfMesh:
         self.add_faces(chart, faces[~degenerate])
 
     def fan(self, chart: str, center: Array, ring: Array, closed: bool) -> None:
-        """Add triangles from one vertex (1,) to a row."""
+        """Add triangles between one vertex (1,) and a row."""
         a = np.append(ring, ring[0]) if closed else ring
         self.add_faces(chart, np.stack([np.full(len(a) - 1, center), a[:-1], a[1:]], 1))
 
 
 @dataclass(frozen=True)
 class WholeMesh:
-    """Both halves: vertices (V,3) mm, faces (F,3), chart and UV of face corners, mirror map."""
+    """Both halves: vertices (V,3) mm, faces (F,3), charts and UV of face corners, mirror map."""
 
     vertices: Array
     faces: Array
@@ -120,7 +120,7 @@ def mirrored(half: HalfMesh) -> WholeMesh:
     )
 
 
-PAIRED_CHARTS = ("ear", "eye_front", "eye_back")  # they get a second island on the right
+PAIRED_CHARTS = ("ear", "eye_front", "eye_back")  # those with a second island for the right
 # Chart -> left, bottom, right, top in the unit square.
 RECTANGLES = {
     "skin": (0.005, 0.250, 0.995, 0.995),
@@ -138,7 +138,7 @@ RECTANGLES = {
 
 
 def pack_uv(mesh: WholeMesh) -> tuple[Array, Array]:
-    """Fill each chart's rectangle: UV coordinates (T,2) in [0,1] and their faces (F,3)."""
+    """Scale each chart into its rectangle; return UV coordinates (T,2) in [0,1], faces (F,3)."""
     corner_uv = np.empty_like(mesh.corner_uv)
     for chart, (left, bottom, right, top) in RECTANGLES.items():
         of_chart = mesh.face_chart == chart
@@ -146,7 +146,7 @@ def pack_uv(mesh: WholeMesh) -> tuple[Array, Array]:
         low, high = uv.min((0, 1)), uv.max((0, 1))
         size = np.array([right - left, top - bottom])
         corner_uv[of_chart] = [left, bottom] + (uv - low) / (high - low) * size
-    # A vertex has one position per chart, two where the chart is cut on the mid plane.
+    # A vertex has one position per chart, or two if the chart is cut at the mid plane.
     chart_id = np.unique(mesh.face_chart, return_inverse=True)[1]
     side = (mesh.corner_uv[..., 0] > 0).astype(np.int64)
     key = (mesh.faces * len(RECTANGLES) + chart_id[:, None]) * 2 + side
@@ -155,7 +155,7 @@ def pack_uv(mesh: WholeMesh) -> tuple[Array, Array]:
 
 
 def neighbour_mean(values: Array, faces: Array) -> Array:
-    """Return means of the neighbours' values (V,...) over the edges of faces (F,3)."""
+    """Return the means of values (V,...) over neighbours along the edges of faces (F,3)."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges = np.unique(np.sort(edges, 1), axis=0)
     total = np.zeros_like(values)

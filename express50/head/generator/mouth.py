@@ -16,11 +16,11 @@ _OUTER_CENTER_Y, _OUTER_X, _OUTER_UP, _OUTER_DOWN = -49.0, 41.0, 16.0, 20.0
 
 
 def _rows() -> tuple[Array, Array, Array, Array]:
-    """Return front views (33,2) of slit, vermilion and outer loop, and slit x per row point."""
+    """Return slit, vermilion border and outer loop, front views (33,2), and the slit's x (33,)."""
     s = np.linspace(0, 1, LIP_SEGMENTS + 1)
     x = CORNER_X * np.sin(0.5 * np.pi * s)
     t = x / CORNER_X
-    # The closed lips' line is a low bow that dips towards the corners.
+    # The line of closed lips is a shallow bow that falls towards the corners.
     y = -48.8 - 0.7 * np.exp(-((x / 7.0) ** 2)) - 0.5 * t**3 + 0.9 * t * (1 - t)
     slit = np.stack([x, y], 1)
     up = 7.6 * (1 - t**1.7) ** 0.9 + 1.2 * np.exp(-(((x - 5.5) / 3.2) ** 2)) + 0.2
@@ -39,7 +39,7 @@ def _rows() -> tuple[Array, Array, Array, Array]:
 
 
 def add_lip_rings(half: HalfMesh) -> Array:
-    """Add loops from the slit to around the mouth; return the outer row's indices."""
+    """Add loops from the slit outwards around the mouth; return the indices of the outer one."""
     slit, border, outer, x = _rows()
     sign = np.concatenate([np.ones(LIP_SEGMENTS), [0.0], -np.ones(LIP_SEGMENTS)])
     thick = 1 - (x / CORNER_X) ** 4
@@ -66,7 +66,7 @@ def add_lip_rings(half: HalfMesh) -> Array:
 
 
 def _add_cavity(half: HalfMesh, slit: Array, contact: Array, sign: Array, thick: Array) -> None:
-    """Add the pocket behind the lips, wide enough for teeth and tongue, kept inside the skin."""
+    """Add the cavity behind the lips, wide enough for teeth and tongue, inside the skin."""
     n = len(slit)
     angle = 0.5 * np.pi * (1 - np.linspace(0, 2, n))
     up, out = np.sin(angle), np.cos(angle)
@@ -96,7 +96,7 @@ def _add_cavity(half: HalfMesh, slit: Array, contact: Array, sign: Array, thick:
 
 
 def _inside(points: Array, depth: float) -> Array:
-    """Push points in where they are less than `depth` mm under the skin."""
+    """Return points, pushed in where they are less than `depth` mm under the skin."""
     p = points.copy()
     for _ in range(4):
         excess = np.maximum(skin_field(p) + depth, 0.0)
@@ -110,7 +110,7 @@ _LOWER_CROWNS = (5.4, 5.9, 6.8, 6.9, 7.0, 10.4)
 
 
 def _arch(upper: bool) -> tuple[Array, Array, Array]:
-    """Return (x, z) (N,2), outward normals (N,2) and tooth phase of columns along half an arch."""
+    """Return places (x, z) (N,2), outward normals (N,2) and tooth phases along half an arch."""
     widths, shares = np.array(_UPPER_CROWNS if upper else _LOWER_CROWNS), (0.16, 0.5, 0.84, 1.0)
     edges = np.concatenate([[0], np.cumsum(widths)])
     along = np.append(0.0, edges[:-1, None] + shares * widths[:, None])
@@ -130,7 +130,7 @@ def _arch(upper: bool) -> tuple[Array, Array, Array]:
 
 
 def add_teeth(half: HalfMesh, upper: bool) -> None:
-    """Add one dental arch, half: outer gum, crown, biting edge, inner crown, inner gum."""
+    """Add half a dental arch: outer gum, crown, biting edge, inner crown, inner gum."""
     place, normal, phase = _arch(upper)
     groove = np.where(phase == 0.0, 1.0, 0.0)
     bulge = np.where(phase == 0.5, 0.35, 0.0)
@@ -165,7 +165,7 @@ def add_teeth(half: HalfMesh, upper: bool) -> None:
 
 
 def add_tongue(half: HalfMesh) -> None:
-    """Add the tongue, half: cross sections from the root forward to the tip."""
+    """Add half the tongue: cross sections from the root to the tip."""
     sections = 13
     s = np.linspace(0, 1, sections)
     z = 42 + 42 * s

@@ -1,10 +1,10 @@
-"""Give the built-in head the mean and the variety of people.
+"""Fit the built-in head's mean and shape directions to people.
 
-The generator's mesh is registered to ICT-FaceKit's mean face (USC Institute for Creative
-Technologies, MIT licence) by `ict_registration`. The places found there say how every vertex moves
-in each identity of the published model, whose coefficients are independent with unit variance. The
-mean and the principal directions of these people and of their mirror images are kept. Measures are
-millimetres in the head space of `field`.
+`ict_registration` registers the generator's mesh to ICT-FaceKit's mean face (USC Institute for
+Creative Technologies, MIT licence). So every vertex has a place there that moves with each identity
+of the published model, whose coefficients are independent with unit variance. The mean and the
+principal directions of these people and their mirror images are kept. Units are millimetres in the
+head space of `field`.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def fit_people(mesh: WholeMesh, joints: Array, ict: Path) -> People:
 def principal_directions(moves: Array, mirror: Array) -> Array:
     """Return principal directions (V, 3, K) of people (V, 3, N) and of their mirror images."""
     other = moves[mirror] * FLIP[:, None]
-    # Symmetric and lopsided motions do not mix, so each direction is one or the other.
+    # Symmetric and antisymmetric motions are uncorrelated, so each direction is one or the other.
     kinds = [0.5 * (moves + sign * other) for sign in (1.0, -1.0)]
     found, spread = [], []
     for kind in kinds:
@@ -92,7 +92,7 @@ def principal_directions(moves: Array, mirror: Array) -> Array:
     share = np.cumsum(np.concatenate(spread)[order]) / np.sum(spread)
     kept = order[: int(np.searchsorted(share, KEPT_VARIANCE)) + 1]
     directions = np.concatenate(found, axis=1)[:, kept]
-    # The largest entry is positive, so that every machine gives the same sign.
+    # The largest entry is made positive, so that all machines give the same signs.
     largest = directions[np.abs(directions).argmax(0), np.arange(len(kept))]
     return (directions * np.sign(largest)).reshape(*moves.shape[:2], -1)
 
@@ -115,12 +115,12 @@ def _skin_moves(
     moves[own] = found
     moves = _spread(moves, faces, own, known)
     for row in (mesh.tag("lip0", side) for side in ("left", "right")):
-        moves[row] = 0.5 * (moves[row] + moves[row[::-1]])  # lips that meet do so in everyone
+        moves[row] = 0.5 * (moves[row] + moves[row[::-1]])  # the lips meet in all people
     return moves
 
 
 def _spread(moves: Array, faces: Array, own: Array, known: Array) -> Array:
-    """Fill moves of vertices `own` that are not known from those around, as heat spreads."""
+    """Fill in the unknown moves of vertices `own` from those around, as heat spreads."""
     index = np.full(len(moves), -1)
     index[own] = np.arange(len(own))
     pairs = index[faces][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
@@ -138,7 +138,7 @@ def _spread(moves: Array, faces: Array, own: Array, known: Array) -> Array:
 def _fill_inside(
     mesh: WholeMesh, arrays: IctArrays, warp: RBFInterpolator, points: Array, moves: Array
 ) -> tuple[Array, Array]:
-    """Place teeth, gums and tongue as one piece behind the lips, and the mouth's walls around."""
+    """Put teeth, gums and tongue behind the lips as one piece, and the mouth's walls around."""
     names = ("upper_teeth", "lower_teeth", "upper_gums", "lower_gums", "tongue")
     hard = np.unique(np.concatenate([mesh.tag(name) for name in names]))
     own = mesh.vertices[hard]
@@ -151,7 +151,7 @@ def _fill_inside(
     placed[:, 2] += slit[2] - TOOTH_GAP_MM - placed[teeth, 2].max()
     placed[:, 1] += slit[1] - warp(mesh.vertices[mesh.tag("lip0", "left")[:1]])[0, 1]
     points[hard] = placed
-    # Of a person, jaws are wider, longer, further forward: an affine motion, by ICT's teeth.
+    # People's jaws differ by affine motions, which are fitted to ICT's teeth.
     number = slice(RANGES["upper_teeth"][0], RANGES["lower_teeth"][1])
     there = np.pad(10.0 * arrays.template[number], ((0, 0), (0, 1)), constant_values=1.0)
     motion = 10.0 * arrays.shape_dirs[number].reshape(len(there), -1)
@@ -167,7 +167,7 @@ def _fill_inside(
             points[ring] = warp(mesh.vertices[ring]) + share * bent
             moves[ring] += share * (moves[lip] - moves[ring])
     points = _sink(mesh, points)
-    for side in ("left", "right"):  # the lips' own backs lie behind them as drawn, corners too
+    for side in ("left", "right"):  # the backs of the lips are behind them as drawn by rule
         lip, back = mesh.tag("lip0", side), mesh.tag("cavity0", side)
         points[back] = points[lip] + mesh.vertices[back] - mesh.vertices[lip]
     return points, moves
@@ -192,29 +192,27 @@ def _sink(mesh: WholeMesh, points: Array) -> Array:
 def _seat_eyes(
     mesh: WholeMesh, arrays: IctArrays, points: Array, moves: Array
 ) -> tuple[Array, Array, Array]:
-    """Put the eyeballs behind the lids, and the lids around them; also returns the left centre."""
+    """Put the eyeballs behind the lids, and the lids around them; also return the left centre."""
     ball = slice(*RANGES["left_eyeball"])
     centre = 10.0 * arrays.template[ball].mean(0)
     lids = points[np.concatenate([mesh.tag(f"lid{k}", "left") for k in range(3)])] - centre
-    # As far forward as lids of their thickness allow, about the axis that ICT's eyeball has.
+    # On the axis of ICT's eyeball, as far forward as the lids' thickness allows.
     inner = np.sqrt(np.maximum(LID_MM**2 - (lids[:, :2] ** 2).sum(1), 0.0))
     wide = (lids[:, :2] ** 2).sum(1) < 0.8 * LID_MM**2
     centre[2] += np.median((lids[:, 2] - inner)[wide])
     for side, mirror in (("left", 1.0), ("right", -1.0)):
         middle = centre * [mirror, 1, 1]
-        turned = eye_center(side)
-        points[mesh.tag("eyeball", side)] = (
-            mesh.vertices[mesh.tag("eyeball", side)] - turned + middle
-        )
+        eyeball = mesh.tag("eyeball", side)
+        points[eyeball] = mesh.vertices[eyeball] - eye_center(side) + middle
         rigid = 10.0 * arrays.shape_dirs[slice(*RANGES[f"{side}_eyeball"])].mean(0)
-        moves[mesh.tag("eyeball", side)] = rigid
+        moves[eyeball] = rigid
         for k, share in enumerate(LID_SHARE):
             ring = mesh.tag(f"lid{k}", side)
             away = points[ring] - middle
             length = np.linalg.norm(away, axis=1, keepdims=True)
             away /= length
             points[ring] += np.maximum(LID_MM - length, 0.0) * away
-            # Lids keep their distance from the eyeball, and their shape otherwise.
+            # Lids keep their distance from the eyeball.
             radial = np.einsum("nc,ncs->ns", away, moves[ring] - rigid)
             moves[ring] -= (1.0 - share) * away[..., None] * radial[:, None]
         margin = points[mesh.tag("lid0", side)] - middle

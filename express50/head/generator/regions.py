@@ -1,4 +1,4 @@
-"""Choose region masks, the 68 iBUG landmarks, and candidates for the visible jaw line."""
+"""Define region masks, the 68 iBUG landmarks, and candidates for the visible jaw line."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def _mask(mesh: WholeMesh, tags: list[str], side: str = "both") -> Array:
 
 
 def region_masks(mesh: WholeMesh) -> dict[str, Array]:
-    """Return boolean masks (V,) by region name."""
+    """Return masks (V,) bool by region name."""
     x, y, z = np.abs(mesh.vertices[:, 0]), mesh.vertices[:, 1], mesh.vertices[:, 2]
     skin = np.zeros(len(x), bool)  # ears included, without the mouth's cavity
     skin[mesh.faces[np.isin(mesh.face_chart, ("skin", "ear", "ear_right"))]] = True
@@ -58,10 +58,10 @@ def region_masks(mesh: WholeMesh) -> dict[str, Array]:
     return regions
 
 
-# Subject's left side, from the chin (8) to the ear (16), mm; put on the skin before use.
+# On the subject's left, from the chin (8) to the ear (16), mm; projected to the skin before use.
 _JAW = np.array([(0, -95, 86), (16, -94, 79), (31, -87, 62), (44, -77, 44), (53, -64, 28),
                  (61, -46, 16), (67, -26, 10), (70, -6, 9), (71, 14, 8)], float)  # fmt: skip
-# On people, where published marks have it by eyes and nose (docs/LOG.md).
+# Placed, relative to eyes and nose, as in published marks of people (docs/LOG.md).
 _BROW = np.array([(10, 32), (19.5, 36.5), (29.5, 38.5), (41, 37), (52.5, 31.5)], float)
 _BRIDGE = np.array([(0, 24), (0, 13), (0, 1), (0, -13)], float)
 _NOSTRILS = np.array([(0, -28.5), (6.5, -27.5), (13, -25)], float)
@@ -86,7 +86,7 @@ def embed_landmarks(mesh: WholeMesh) -> tuple[Array, Array]:
         (48, "lip3", (-16, -7, -2, 0, 2, 7, 16, 25, 30.5, 32, -30.5, -25)),
         (60, "lip0", (-16, -4, 0, 4, 16, 28, 32, -28)),
     ):
-        # Positions along the loop from the upper to the lower middle; negative on the right.
+        # Positions along the loop from the upper to the lower middle, negative on the right.
         row = mesh.vertices[mesh.tag(tag, "left")]
         for k, place in enumerate(loop, first):
             points[k] = [np.interp(abs(place), np.arange(len(row)), axis) for axis in row.T]
@@ -102,7 +102,7 @@ def embed_landmarks(mesh: WholeMesh) -> tuple[Array, Array]:
 
 
 def _closest(corners: Array, p: Array) -> tuple[Array, Array]:
-    """Return barycentric weights (F,3), clamped and renormalised, and distances (F,) to a point."""
+    """Return a point's barycentric weights (F,3) in triangles, clamped, and its distances (F,)."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     ab, ac, ap = b - a, c - a, p - a
     d00, d01, d11 = (ab * ab).sum(1), (ab * ac).sum(1), (ac * ac).sum(1)
@@ -115,7 +115,7 @@ def _closest(corners: Array, p: Array) -> tuple[Array, Array]:
 
 
 def contour_candidates(mesh: WholeMesh) -> tuple[Array, ...]:
-    """Find the skin vertices that may lie on the visible jaw line, for landmarks 0..16."""
+    """Return the skin vertices that may form the visible jaw line, per landmark 0..16."""
     azimuth, latitude = labels(project(_JAW, 6))
     grid = mesh.tag("grid")
     result = []

@@ -1,7 +1,7 @@
-"""Build the skin: loops of features, nostrils and ears; graded points fill the rest.
+"""Build the skin: loops around features, nostrils and ears, and graded points between them.
 
-The half head is triangulated as a convex hull of its label directions on a sphere (a spherical
-Delaunay triangulation); the closing cap on the mid plane and the holes inside loops are dropped.
+The half head is triangulated as the convex hull of its labels' directions on a sphere (a spherical
+Delaunay triangulation), without the cap on the mid plane and the holes inside loops.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from express50.head.generator.mouth import add_lip_rings
 
 Array = np.ndarray
 
-#          x, y, z, radius of the dense core, spacing there, growth per mm beyond (all mm)
+# x, y, z, radius of a dense core, spacing there, growth of spacing per mm beyond (all mm)
 _DENSITY = np.array([
     (6, -15, 104, 14, 2.6, 0.12), (32, 20, 75, 22, 3.6, 0.10), (10, -48, 98, 30, 3.8, 0.10),
     (15, 40, 88, 22, 4.2, 0.10), (0, -85, 85, 20, 4.6, 0.10), (45, -62, 20, 20, 5.5, 0.10),
@@ -38,14 +38,14 @@ _COARSEST = 11.0
 
 
 def spacing(points: Array) -> Array:
-    """Return wanted edge length (N,) mm at points (N,3)."""
+    """Return the wanted edge length (N,), mm, at points (N,3)."""
     d = np.linalg.norm(points[:, None] - _DENSITY[None, :, :3], axis=-1)
     h = _DENSITY[:, 4] + _DENSITY[:, 5] * np.maximum(d - _DENSITY[:, 3], 0.0)
     return np.minimum(h.min(1), _COARSEST)
 
 
 def add_skin(half: HalfMesh) -> None:
-    """Add the whole skin of the left half, with eye, lip, nostril and ear loops."""
+    """Add all skin of the left half, with loops around eye, lips, nostril and ear."""
     rims = [add_eye_rings(half), add_nostril(half), add_ear(half), add_lip_rings(half)]
     *holes, lips = (half.labels[rim] for rim in rims)
     holes.append(np.concatenate([lips, [[0.0, lips[-1, 1]]]]))
@@ -56,7 +56,7 @@ def add_skin(half: HalfMesh) -> None:
     faces = index[_triangulate(half.labels[index], len(fixed), [len(rim) for rim in rims])]
     half.add_faces("skin", faces)
     half.tags["grid"] = index
-    # The filled vertices are evened out: average of neighbours, put back on the skin; labels too.
+    # Filled vertices and their labels move towards their neighbours' means, on the skin.
     points, direction = half.points, sphere(*np.nan_to_num(half.labels).T)
     for _ in range(6):
         points[filled] += 0.6 * (neighbour_mean(points, faces) - points)[filled]
@@ -69,7 +69,7 @@ def add_skin(half: HalfMesh) -> None:
 
 
 def _add_midline(half: HalfMesh, lip_top: float, lip_bottom: float) -> Array:
-    """Add mid-plane vertices from lip over crown and nape to the collar, and from lip to collar."""
+    """Add vertices on the mid plane, from upper lip to nape and below the lips, and a collar."""
     groups = []
     for azimuth, low, high in (
         (0.0, lip_top, 90.0),
@@ -82,7 +82,7 @@ def _add_midline(half: HalfMesh, lip_top: float, lip_bottom: float) -> Array:
         count = np.concatenate([[0], np.cumsum(step / spacing(points[1:]))])
         n = int(np.ceil(count[-1]))
         pick = np.interp(np.arange(n + 1) * count[-1] / n, count, latitude)
-        # The lips' loop has the ends at the lips, and the crown belongs to the front.
+        # The loop of the lips has the ends there already, and the front line has the crown.
         pick = pick[1:] if low == lip_top else pick[:-1]
         points = cast(*rays(np.full(len(pick), azimuth), pick))
         points[:, 0] = 0.0
@@ -97,7 +97,7 @@ def _add_midline(half: HalfMesh, lip_top: float, lip_bottom: float) -> Array:
 
 
 def _add_fill(half: HalfMesh, fixed: Array, holes: list[Array]) -> Array:
-    """Add graded points (dart throwing, seeded) where no loop is; return their indices."""
+    """Add graded random points (seeded dart throwing) outside all loops; return their indices."""
     azimuth, latitude = np.linspace(0, np.pi, 61), np.linspace(BOTTOM_LATITUDE, 90, 69)
     a, b = np.meshgrid(azimuth, latitude, indexing="ij")
     table = cast(*rays(a.ravel(), b.ravel())).reshape(61, 69, 3)
@@ -127,7 +127,7 @@ def _add_fill(half: HalfMesh, fixed: Array, holes: list[Array]) -> Array:
 
 
 def _triangulate(label: Array, midline: int, rims: list[int]) -> Array:
-    """Return hull triangles without the mid-plane cap, the neck's end and the loops' insides."""
+    """Return the hull's triangles without mid plane, end of the neck and insides of loops."""
     directions = sphere(*label.T)
     flat = np.abs(np.sin(label[:, 0])) < 1e-9
     directions[flat, 0] = 0.0
@@ -143,7 +143,7 @@ def _triangulate(label: Array, midline: int, rims: list[int]) -> Array:
 
 
 def set_skin_uv(half: HalfMesh) -> None:
-    """Skin chart: pseudo-cylindrical, cut along the back, pole at the crown, roomier in front."""
+    """Set the skin's chart: pseudo-cylindrical, cut along the back, with more room in front."""
     index = np.flatnonzero(np.isfinite(half.labels[:, 0]))
     azimuth, latitude = half.labels[index].T
     width = np.interp(
@@ -156,14 +156,14 @@ def set_skin_uv(half: HalfMesh) -> None:
     half.set_uv("skin", index, np.stack([u, v], 1))
 
 
-_INSIDE = np.array([7.0, -16.0, 105.0])  # a point above the nostril from which loops are cast
+_INSIDE = np.array([7.0, -16.0, 105.0])  # the point above the nostril from which loops are cast
 _DOWN = np.array([0.05, -0.97, 0.2])
 _LONG = np.array([-0.24, 0.2, 0.95])  # from the ala's base towards the tip
 _NOSTRIL_POINTS = 14
 
 
 def add_nostril(half: HalfMesh) -> Array:
-    """Add the left nostril; return its outer loop's indices (N,)."""
+    """Add the left nostril; return the indices (N,) of its outer loop."""
     down = _DOWN / np.linalg.norm(_DOWN)
     side = np.cross(_LONG, down)
     side /= np.linalg.norm(side)
@@ -202,7 +202,7 @@ _CONCHA = np.array([-1.5, -4.0])
 
 
 def _place(pq: Array, x: Array) -> Array:
-    """Return ear-plane coordinates (backwards, up) to head space (N,3)."""
+    """Return the points (N,3) in head space of ear-plane coordinates (backwards, up) and x."""
     c, s = np.cos(EAR_TILT), np.sin(EAR_TILT)
     back = c * pq[:, 0] + s * pq[:, 1]
     up = -s * pq[:, 0] + c * pq[:, 1]
@@ -210,13 +210,13 @@ def _place(pq: Array, x: Array) -> Array:
 
 
 def _flare(pq: Array) -> Array:
-    """Return the distance (mm) of the ear's plane from the head's side."""
+    """Return the distance (N,), mm, of the ear's plane from the side of the head."""
     back = np.logaddexp(0.0, 0.35 * (pq[:, 0] + 5.0)) / 0.35  # a smooth max(0, p + 5)
     return 0.5 + 0.5 * back - 0.0016 * pq[:, 1] ** 2
 
 
 def _relief(pq: Array, inset: Array, rim: Array) -> Array:
-    """Return height (mm) of front sheet: helix fold, scapha, antihelix, concha, tragus, lobe."""
+    """Return the front's height (N,), mm: helix, scapha, antihelix, concha, tragus, lobe."""
     back_top = 1 / (1 + np.exp(-(rim[:, 0] * 0.35 + rim[:, 1] * 0.12 - 0.2)))
     inset = inset[:, None]
     helix = back_top * (2.6 * window(inset, 0.06, 0.07) - 2.0 * window(inset, 0.24, 0.09))
@@ -228,7 +228,7 @@ def _relief(pq: Array, inset: Array, rim: Array) -> Array:
 
 
 def add_ear(half: HalfMesh) -> Array:
-    """Add the left ear; return the indices (N,) of the loop by which it is attached."""
+    """Add the left ear; return the indices (N,) of the loop that joins it to the head."""
     closed = np.concatenate([_OUTLINE, _OUTLINE[:1]])
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
     curve = CubicSpline(length, closed, bc_type="periodic")
@@ -256,7 +256,7 @@ def add_ear(half: HalfMesh) -> Array:
         level = np.full(_EAR_POINTS, inset)
         edge = 0.8 if inset == 0.0 else 0.0
         points = _place(pq, side(pq) + _flare(pq) + _relief(pq, level, rim) - edge)
-        if inset < 0.3:  # outside the foot the ear must stay over the skin
+        if inset < 0.3:  # outside its foot the ear must stay above the skin
             under = cast(points * [0, 1, 1], np.tile([1.0, 0.0, 0.0], (_EAR_POINTS, 1)))
             points[:, 0] = np.maximum(points[:, 0], under[:, 0] + 0.5 + 3 * inset)
         steps.append(points)
