@@ -140,9 +140,7 @@ def read_ict_checkout(path: Path) -> IctArrays:
     )
 
 
-def read_obj(
-    path: Path,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Read vertices (V,3), texture coordinates (T,2), faces (F,3), their uv (F,3), material (F,).
 
     Polygons are split into fans. Faces without texture coordinates get coordinate 0.

@@ -95,10 +95,7 @@ class _Place:
 
 
 def detect(
-    net: LandmarkNet,
-    image: np.ndarray,
-    refinements: int = 2,
-    smallest: float = SMALLEST,
+    net: LandmarkNet, image: np.ndarray, refinements: int = 2, smallest: float = SMALLEST
 ) -> Detection:
     """Detect the landmarks of the most face-like place in an image.
 
@@ -118,10 +115,7 @@ def detect(
 
 
 def detect_many(
-    net: LandmarkNet,
-    images: Sequence[np.ndarray],
-    refinements: int = 2,
-    smallest: float = SMALLEST,
+    net: LandmarkNet, images: Sequence[np.ndarray], refinements: int = 2, smallest: float = SMALLEST
 ) -> list[Detection]:
     """Detect as `detect` does in several images, such as a frame set, in less time.
 

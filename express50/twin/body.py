@@ -13,13 +13,7 @@ from express50.head.model import HeadModel, landmarks, pose
 from express50.twin.alive import own_offsets
 from express50.twin.hair import HairMesh, grow_hair, join_hair
 from express50.twin.subjects import TwinPerformance, TwinSubject
-from express50.twin.surface import (
-    Caster,
-    Material,
-    StarMap,
-    smooth_over_mesh,
-    vertex_normals,
-)
+from express50.twin.surface import Caster, Material, StarMap, smooth_over_mesh, vertex_normals
 from express50.twin.worn import WITH_HAND, WornMesh, grow_worn, hold, wear
 
 

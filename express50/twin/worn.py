@@ -21,14 +21,7 @@ from express50.head.model import HeadModel, landmarks
 from express50.landmarks.training.scene import RING, glasses_lines
 from express50.twin.hair import HairMesh, grow_hair
 from express50.twin.subjects import PersonLook
-from express50.twin.surface import (
-    Caster,
-    Material,
-    StarMap,
-    make_lattice,
-    noise,
-    vertex_normals,
-)
+from express50.twin.surface import Caster, Material, StarMap, make_lattice, noise, vertex_normals
 
 HAIRY = ("beard", "moustache", "fringe")
 WITH_SKULL, WITH_HAND = -1, -2

@@ -50,6 +50,4 @@ class MatteConfig:
             raise ConfigError(f"matte.tile is {self.tile}, expected a multiple of 64")
 
 
-PRESETS: dict[str, dict[str, object]] = {
-    "draft": {"side": 128, "cells": 64},
-}
+PRESETS: dict[str, dict[str, object]] = {"draft": {"side": 128, "cells": 64}}

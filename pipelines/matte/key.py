@@ -277,11 +277,7 @@ def _space_around(mask: np.ndarray) -> tuple[int, int, int, int]:
 
 
 def firm_pixels(
-    image: np.ndarray,
-    difference: np.ndarray,
-    core: np.ndarray,
-    model: PlateModel,
-    length: int,
+    image: np.ndarray, difference: np.ndarray, core: np.ndarray, model: PlateModel, length: int
 ) -> np.ndarray:
     """Return the pixels (H, W) bool that look opaque, given the colours of a first core.
 

@@ -199,10 +199,7 @@ def _window_mean(image: np.ndarray, normalize: bool = True) -> np.ndarray:
 
 
 def in_tiles(
-    shape: tuple[int, int],
-    tile: int,
-    overlap: int,
-    compute: Callable[[slice, slice], np.ndarray],
+    shape: tuple[int, int], tile: int, overlap: int, compute: Callable[[slice, slice], np.ndarray]
 ) -> np.ndarray:
     """Call ``compute(rows, columns)`` for tiles of an image, and join the results (H, W) float32.
 

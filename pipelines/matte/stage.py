@@ -24,13 +24,7 @@ from pipelines.matte.consensus import Agreement, agree
 from pipelines.matte.cutout import CutView, cut_out, make_cut_view, soft_alpha
 from pipelines.matte.key import dilated, key_alpha
 from pipelines.matte.plates import LEAST_SHARE, exposed, exposure_gain, match_plate
-from pipelines.matte.visual_hull import (
-    INSIDE,
-    Ball,
-    MatteView,
-    ball_of,
-    projection_of,
-)
+from pipelines.matte.visual_hull import INSIDE, Ball, MatteView, ball_of, projection_of
 
 COLUMNS = 6  # of the picture
 TILE = 240

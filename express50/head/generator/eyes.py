@@ -4,13 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from express50.head.generator.field import (
-    EYE_CENTER,
-    EYE_RADIUS,
-    LID_RADIUS,
-    cast,
-    labels,
-)
+from express50.head.generator.field import EYE_CENTER, EYE_RADIUS, LID_RADIUS, cast, labels
 from express50.head.generator.mesh import HalfMesh, WholeMesh
 
 Array = np.ndarray
@@ -73,7 +67,7 @@ def _add_lid_edges(half: HalfMesh, margin: Array, points: Array, label: Array) -
 
 
 def add_eyeball(half: HalfMesh) -> None:
-    """Add a sphere of two charts with rings around its front pole, at the rims of pupil and iris."""
+    """Add a sphere of two charts, with rings at the rims of pupil and iris."""
     iris = np.degrees(np.arcsin(IRIS_RADIUS / EYE_RADIUS))
     pupil = np.degrees(np.arcsin(PUPIL_RADIUS / EYE_RADIUS))
     polar = np.radians([pupil, pupil + 2, 0.5 * (pupil + iris), iris, iris + 2,

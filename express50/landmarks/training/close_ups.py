@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from express50.head.model import HeadModel
-from express50.landmarks.detector import close_window, cut_crop
+from express50.landmarks.detector import close_window, cut_crop, place_crop, points_in_crop
 from express50.landmarks.network import (
     LEFT_EYE,
     MIRROR,
@@ -108,8 +108,8 @@ def close_crop(
     turn = window[:, :2] @ turn * np.exp(rng.normal() * GROWTH)
     middle = window @ np.array([net.crop / 2, net.crop / 2, 1.0])
     middle = middle + turn @ (rng.normal(size=2) * SHIFT * net.crop)
-    window = np.column_stack([turn, middle - turn @ np.full(2, net.crop / 2)])
-    points = (view.points[ids] - window[:, 2]) @ np.linalg.inv(turn).T
+    window = place_crop(middle, turn, net.crop)
+    points = points_in_crop(window, view.points[ids])
     return degrade(cut_crop(view.image, window, net.crop), rng), points.astype(np.float32)
 
 
