@@ -245,6 +245,7 @@ def _slab(
 
 
 def _guess(view: CutView, place: HeadPlace) -> PersonGuess:
+    """Project a person's parts into a view, to start GrabCut from."""
     labels = np.full(view.valid.shape, cv2.GC_BGD, np.uint8)
     for value, parts in _parts().items():
         for points in parts:

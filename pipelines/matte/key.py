@@ -164,7 +164,7 @@ def dilated(mask: np.ndarray, radius: float) -> np.ndarray:
 
 
 def opened(mask: np.ndarray, radius: int, erode: Erode = eroded) -> np.ndarray:
-    """Return the part of a mask (H, W) that discs cover which lie wholly inside it."""
+    """Return the part of a mask (H, W) that is covered by discs inside it."""
     return (mask > 0) & ~erode(~erode(mask, radius), radius)
 
 

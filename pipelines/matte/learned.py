@@ -154,7 +154,7 @@ class MattingLaplacian:
         """Prepare the windows of an image (H, W, 3), colours in [0, 1], and a band (H, W) bool."""
         self.image = np.ascontiguousarray(image, dtype=np.float64)
         windows = cv2.dilate(band.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        # Windows must lie wholly inside the image.
+        # Windows must lie inside the image.
         windows[[0, -1]] = windows[:, [0, -1]] = False
         self.windows = windows
         mean = _window_mean(self.image)[windows]  # (M, 3)

@@ -36,7 +36,7 @@ RIM = 0.008  # share of the longer side: distance from the outline in which erro
 WINDOW = 5  # pixels, odd: side of the window in which alpha's spread is measured
 NEARBY = 0.04  # share of the longer side: width of the neighbourhood that describes an outline
 
-Matter = Callable[[np.ndarray, Any, np.ndarray], np.ndarray]
+MatteFunction = Callable[[np.ndarray, Any, np.ndarray], np.ndarray]
 """Of a frame (H, W, 3) uint8, its plate or None, and valid pixels: opacity (H, W) float32."""
 
 
@@ -92,8 +92,8 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
         "without_plate": [name for name, matte in mattes.items() if not matte.plated],
         "coverage": {name: round(float(a.mean()) / 255, 6) for name, a in final.items()},
         "border_contact": {name: border_contact(alpha) for name, alpha in final.items()},
-        "removed": {name: _share(alphas[name], final[name]) for name in found.removed},
-        "filled": {name: _share(final[name], alphas[name]) for name in found.filled},
+        "removed": {name: _excess(alphas[name], final[name]) for name in found.removed},
+        "filled": {name: _excess(final[name], alphas[name]) for name in found.filled},
         **({"unchanged": found.unchanged} if found.unchanged else {}),
     }
     named = {note.what for note in found.warnings}
@@ -119,7 +119,7 @@ def camera_mattes(
     """
     subject, expression = item.split("/")
     read = partial(read_peak_frame, dataset, subject, expression)
-    matter = _matter(config)
+    matte_one = _matte_function(config)
     found: dict[str, CameraMatte] = {}
     seen: list[CutView] = []
     dropped: list[Note] = []
@@ -129,7 +129,7 @@ def camera_mattes(
             frame, valid, alpha = read(name), valid_pixels(camera), None
             plate, why = _plate(dataset, subject, name, frame, valid, config)
             if plate is not None or config.method in NETWORKS:
-                alpha = eight_bit(matter(frame, plate, valid), valid)
+                alpha = eight_bit(matte_one(frame, plate, valid), valid)
                 noise = wall_noise(alpha, frame)
                 found[name] = CameraMatte(alpha, shrink(frame, config.side), noise)
         except (CaptureError, StageError) as error:
@@ -187,7 +187,7 @@ def eight_bit(alpha: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.rint(np.where(valid, alpha, np.float32(0)) * 255).astype(np.uint8)
 
 
-def _matter(config: MatteConfig) -> Matter:
+def _matte_function(config: MatteConfig) -> MatteFunction:
     """Return the function that mattes one frame; torch is imported for networks only."""
     if config.method in ("key", "grabcut"):
         return lambda frame, plate, valid: key_alpha(frame, plate, valid, config.shadow)
@@ -237,7 +237,7 @@ def corrected(
     return np.rint(out).astype(np.uint8)
 
 
-def _share(more: np.ndarray, less: np.ndarray) -> float:
+def _excess(more: np.ndarray, less: np.ndarray) -> float:
     """Return the share of the image's opacity by which one alpha (H, W) uint8 exceeds another."""
     excess = np.maximum(more.astype(np.int64) - less, 0).sum()
     return round(float(excess) / 255 / more.size, 6)

@@ -221,7 +221,7 @@ def evidence_of(view: MatteView, space: Space, place: np.ndarray) -> Evidence:
     front = cv2.erode(front[:-1].reshape(shape), disc)
     # By as much as the splats widened it, so that the rim does not count as solid.
     solid = cv2.erode(np.isfinite(front).astype(np.uint8), disc) > 0
-    solid &= _thick(view, np.bincount(pixels[sure], minlength=front.size + 1)[:-1])
+    solid &= _deep_enough(view, np.bincount(pixels[sure], minlength=front.size + 1)[:-1])
     return Evidence(
         known=splat(shape, pixels, spread),
         possible=splat(shape, pixels[possible], spread),
@@ -231,7 +231,7 @@ def evidence_of(view: MatteView, space: Space, place: np.ndarray) -> Evidence:
     )
 
 
-def _thick(view: MatteView, cells: np.ndarray) -> np.ndarray:
+def _deep_enough(view: MatteView, cells: np.ndarray) -> np.ndarray:
     """Return the pixels (h, w) bool whose rays pass enough of the solid `cells` (h * w,).
 
     Between the silhouettes of few cameras the hull has corners that stand out from the subject.
@@ -342,9 +342,9 @@ def missed(
     the hull than its corners stand out.
     """
     lacking = evidence.solid & (view.alpha < INSIDE) & view.valid
-    depth = _depth(evidence.solid)
+    depth = _inner_distance(evidence.solid)
     deep = depth > MARGIN * max(lacking.shape)
-    todo = lacking & (subject[view.name] | (depth > _corner(view, others) * depth.max()))
+    todo = lacking & (subject[view.name] | (depth > _corner_height(view, others) * depth.max()))
     alike = shows_surface(view, evidence, todo, others, subject)
     alike = cv2.morphologyEx(alike.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2))) > 0
     count, spots = cv2.connectedComponents(alike.astype(np.uint8), connectivity=8)
@@ -359,14 +359,14 @@ def missed(
     return grown & (evidence.solid | (view.alpha >= INSIDE)), left
 
 
-def _depth(mask: np.ndarray) -> np.ndarray:
+def _inner_distance(mask: np.ndarray) -> np.ndarray:
     """Return the distance (h, w) of a mask's pixels to its edge; image borders are not edges."""
     if mask.all():
         return np.full(mask.shape, float(max(mask.shape)), np.float32)
     return cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
 
 
-def _corner(view: MatteView, others: Sequence[MatteView]) -> float:
+def _corner_height(view: MatteView, others: Sequence[MatteView]) -> float:
     """Estimate how far the others' hull stands out from a round subject here, in its radii.
 
     The tangents of two cameras, each at an angle to this one, meet at 1 / cos(angle) radii.

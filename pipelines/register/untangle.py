@@ -24,7 +24,7 @@ from pipelines.track.basis import in_regions
 RIMS = ("lips", "left_eye_region", "right_eye_region")
 FIXED = ("left_eyeball", "right_eyeball", "teeth", "gums", "tongue", "boundary")
 GAP_M = 2e-5  # left between surfaces: more than float32 loses, less than anyone sees
-PATCH_M = 0.015  # skin within this distance of a crossing gives way
+PATCH_M = 0.015  # skin within this distance of intersecting faces moves
 WAVE_M = 0.008  # a push spreads over about this wavelength
 PUSH = 30.0  # weight of a push against the springs that hold the skin
 STEPS = 40

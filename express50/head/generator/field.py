@@ -140,7 +140,7 @@ def _capsule_distances(p: Array) -> Array:
 
 
 def skin_field(points: Array) -> Array:
-    """Return about the signed distance (N,), mm, of points (N,3) from the skin, negative inside."""
+    """Return approximate signed distances (N,), mm, of points (N,3) from the skin, < 0 inside."""
     p = np.array(points, float)
     p[:, 0] = np.sqrt(p[:, 0] ** 2 + 1.0)  # folds without a crease on the mid plane
     ellipsoids = iter(np.ascontiguousarray(_ellipsoid_distances(p).T))
