@@ -229,7 +229,7 @@ def fit_plate(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> PlateM
         image[quiet] for image in (error, *(i[window][valid[window]] for i in (plate, *slopes)))
     )
     contrast = np.hypot(x, y, dtype=np.float32) / 8
-    table = _by_level(_noise_table(error, level.astype(np.float32)))
+    table = _noise_table(error, level.astype(np.float32))
     by_level = table[level, np.arange(3)]
     share = _contrast_share(error, by_level, contrast)
     sigma = cv2.LUT(plate, table[None] ** 2)
@@ -246,7 +246,7 @@ def fit_plate(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> PlateM
 
 
 def _noise_table(error: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """Return the robust deviation (8, 3) at each of LEVELS from errors and plate values (N, 3)."""
+    """Return the robust deviation (256, 3) float32 by plate value, from errors at levels (N, 3)."""
     half = (LEVELS[1] - LEVELS[0]) / 2
     table = np.full((len(LEVELS), 3), np.nan)
     for channel in range(3):
@@ -259,7 +259,8 @@ def _noise_table(error: np.ndarray, level: np.ndarray) -> np.ndarray:
         table[:, channel] = (
             np.interp(LEVELS, LEVELS[known], table[known, channel]) if known.any() else overall
         )
-    return np.maximum(table, NOISE_FLOOR)
+    fine = [np.interp(np.arange(256), LEVELS, c) for c in np.maximum(table, NOISE_FLOOR).T]
+    return np.stack(fine, axis=1).astype(np.float32)
 
 
 def _robust_deviation(size: np.ndarray) -> float:
@@ -273,13 +274,6 @@ def _robust_deviation(size: np.ndarray) -> float:
         inside = size[size < 3 * max(deviation, 0.7)]
         deviation = float(np.sqrt(np.mean(inside**2))) / 0.9866
     return deviation
-
-
-def _by_level(table: np.ndarray) -> np.ndarray:
-    """Return the deviation (256, 3) float32 of each channel at every plate value."""
-    steps = np.arange(256)
-    fine = [np.interp(steps, LEVELS, table[:, c]) for c in range(3)]
-    return np.stack(fine, axis=1).astype(np.float32)
 
 
 def _contrast_share(error: np.ndarray, by_level: np.ndarray, contrast: np.ndarray) -> float:

@@ -52,13 +52,6 @@ def place_points(
     return (mesh[model.faces.numpy()[places[0]]] * places[1][..., None]).sum(1)
 
 
-def moved_onto(source: HeadModel, model: HeadModel, points: np.ndarray) -> np.ndarray:
-    """Map points (N, 3) of a source at rest to a model, by a similarity fit of their landmarks."""
-    marks = [landmarks(one, one.template[None])[0].double().numpy() for one in (source, model)]
-    s, R, t = similarity_fit(*marks)
-    return s * points @ R.T + t
-
-
 EYE_BAND_M, CHIN_BAND_M = 0.005, 0.004  # around the height of the eye corners; around the middle
 MASK_SIDE, MASK_SHARE = 512, 0.9  # side of the face's mask, pixels, and the face's share of it
 SMOOTHING = 6  # pixels of the mask, because the face ends along triangles
@@ -74,9 +67,12 @@ class FaceFront:
         region = {name: mask.numpy() for name, mask in builtin.regions.items()}
         front = region["face"] & ~region["nose"] & ~region["lips"]
         rest = model.template.double().numpy()
-        marks = landmarks(model, model.template[None])[0].double().numpy()
+        marks, builtin_marks = (
+            landmarks(one, one.template[None])[0].double().numpy() for one in (model, builtin)
+        )
         if model.name != builtin.name:
-            faces, weights = closest_places(builtin, moved_onto(model, builtin, rest))
+            s, R, t = similarity_fit(marks, builtin_marks)
+            faces, weights = closest_places(builtin, s * rest @ R.T + t)
             inside = (front[builtin.faces.numpy()[faces]] * weights).sum(1) > 0.5
             front = inside & model.regions["face"].numpy()
         all_faces = model.faces.numpy()
