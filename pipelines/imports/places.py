@@ -11,7 +11,7 @@ from express50.contract.layout import Dataset
 from express50.errors import ConfigError
 
 PLACES = ("subject", "expression", "camera", "frame", "clip_frame")
-_PLACE = re.compile(r"\{([^{}:]*)(?::0?(\d)d?)?\}")
+_PLACE = re.compile(r"\{([^{}:]*)(?::0?(\d+)d?)?\}")
 
 
 @dataclass(frozen=True, kw_only=True)

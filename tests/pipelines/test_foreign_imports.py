@@ -32,6 +32,7 @@ from pipelines.imports.footage_check import (
     edge_contrast,
 )
 from pipelines.imports.pictures import ray_lengths
+from pipelines.imports.places import PeakFrame, check_pattern, fill
 from pipelines.matte import STAGE as MATTE
 from pipelines.track import STAGE as TRACK
 from pipelines.track.observe import LandmarkView, Observation
@@ -303,6 +304,13 @@ def test_masks_of_recorded_or_reduced_size_fit_reduced_pictures(dataset, tmp_pat
     for outcome in failed.outcomes:  # no later stage may read a matte of other pictures
         assert "imported for another size of pictures" in outcome.reason
         assert not dataset.item_dir("matte", outcome.item).exists()
+
+
+def test_places_of_a_pattern_are_filled_at_any_width() -> None:
+    peak = PeakFrame(expression="smile", frame=345, clip_frame=5)
+    pattern = "{subject}/{frame:012d}_{clip_frame:03}_{frame}.png"
+    assert check_pattern(pattern, ("frame",)) == {"subject", "frame", "clip_frame"}
+    assert fill(pattern, "S001", peak) == Path("S001/000000000345_005_345.png")
 
 
 def test_a_subject_without_masks_does_not_stop_the_others(tmp_path, capsys) -> None:
