@@ -1,8 +1,9 @@
 """Run the whole chain within a budget: measure, choose, say what to expect, keep to it.
 
 ``dial/run.json`` holds what was chosen and what was spent. A run that was stopped continues with
-the same choices within the same budget. Before each stage the remaining settings are chosen again
-with the speed seen so far; a stage that has begun keeps its setting.
+the same choices within the same budget; one that was finished, with the whole budget again. Before
+each stage the remaining settings are chosen again with the speed seen so far; a stage that has
+begun keeps its setting.
 """
 
 from __future__ import annotations
@@ -206,6 +207,8 @@ def run_within(
         StageError: nothing can be measured.
     """
     state = _resumed(chain, budget, goal)
+    again = state.finished  # for captures that were added since: they get the budget anew
+    state = replace(state, spent=0.0, finished=False) if again else state
     clock = Clock(budget, spent=state.spent)
     run = _Run(chain, clock, state)
     clock.keep = run.keep
@@ -222,6 +225,8 @@ def run_within(
         keep_for_run(chain.dataset, point.settings)
         lines = choice_lines(load, point, budget, clock.now())
     else:
+        if again:
+            run.state = replace(state, seconds=clock.now() + front(load)[0].seconds)
         spent = format_seconds(clock.now())
         lines = iter([f"going on: {spent} of the budget are spent; settings as chosen"])
     for line in lines:

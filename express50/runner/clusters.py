@@ -83,14 +83,20 @@ class RemoteWorkers:
             if parts.scheme in ("tcp", "tls"):
                 socket.create_connection((parts.hostname, parts.port), KNOCK_SECONDS).close()
             client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
-            has_workers = bool(client.nthreads())
+            threads = client.nthreads().values()
         except (OSError, TimeoutError, ValueError, MemoryError) as error:  # of another server, too
             raise StageError(
                 f"scheduler {address}: cannot connect ({error}); expected the address of a running"
                 " dask scheduler, such as tcp://host:8786"
             ) from error
-        if not has_workers:
+        if not threads:
             sys.stderr.write(f"scheduler {address} has no workers yet; waiting\n")
+        elif max(threads) > 1:
+            sys.stderr.write(
+                f"scheduler {address}: a worker has {max(threads)} threads, so that items share a"
+                " process, and receipts count the time and memory of all of them for each; start"
+                " workers with --nthreads 1\n"
+            )
         return cls(client)
 
     def keep(self, tasks: int) -> None:

@@ -166,6 +166,18 @@ def test_a_finished_run_has_nothing_more_to_do(tmp_path, captures):
     assert state.finished and all(s.count("done") == 0 for s in summaries)
 
 
+def test_captures_that_come_after_a_finished_run_get_the_budget_anew(
+    tmp_path, captures, monkeypatch
+):
+    monkeypatch.setattr("express50.dial.run.GRACE", 0.0)
+    _, before = go(tmp_path / "d", captures[:2], "5m")
+    path = dial_dir(Dataset(tmp_path / "d")) / "run.json"
+    write_json(path, json.loads(path.read_text()) | {"spent": 299.99})  # it just fitted
+    summaries, state = go(tmp_path / "d", captures, "5m")
+    assert state.finished and summaries[0].count("done") == 1
+    assert state.settings == before.settings and state.seconds < 100
+
+
 def test_outputs_of_the_pilot_are_not_made_twice(tmp_path, captures):
     summaries, state = go(tmp_path / "d", captures, "5m")
     restored = {s.stage: sum(o.restored for o in s.outcomes) for s in summaries}

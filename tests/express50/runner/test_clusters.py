@@ -145,3 +145,15 @@ def test_jobs_without_a_gpu_are_refused_before_the_first_is_submitted(tmp_path, 
 def test_a_configuration_that_asks_for_cuda_needs_it(stage, without, more):
     assert not stage.needs_gpu(stage.config(**without))
     assert stage.needs_gpu(stage.config(**without | more))
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_workers_of_several_threads_are_warned_about(threads, capsys):
+    from distributed import LocalCluster
+
+    with LocalCluster(
+        n_workers=1, threads_per_worker=threads, processes=False, dashboard_address=None,
+        protocol="tcp://",
+    ) as cluster:  # fmt: skip
+        RemoteWorkers.reach(cluster.scheduler_address).close()
+    assert ("a worker has 2 threads" in capsys.readouterr().err) == (threads == 2)
