@@ -254,7 +254,7 @@ def sampled_views(loaded: Loaded, count: int, generator: torch.Generator) -> lis
         yaw = (2 * a - 1) * max(b, 0.3)
         turn = yaw * yaws[1] if yaw > 0 else -yaw * yaws[0]
         pitch = pitches[0] + c * (pitches[1] - pitches[0])
-        views.append(orbit(front, turn, centre, pitch))
+        views.append(orbit(front, -turn, centre, pitch))  # yaw is towards +x, an orbit towards -x
     return views
 
 

@@ -31,7 +31,10 @@ from grmm.player.distillation import (
     person_of,
     posed,
     sampled_poses,
+    sampled_views,
+    seen_angles,
 )
+from grmm.render import orbit
 from grmm.train import train
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
@@ -94,6 +97,18 @@ def test_unseen_poses_follow_the_decoders(person, whole):
         errors.append(float((posed(whole, pose)[0] - truth).norm(dim=1).mean()))
         changes.append(float((full_means(person, still) - truth).norm(dim=1).mean()))
     assert np.mean(errors) < 0.1 * np.mean(changes)
+
+
+def test_views_are_sampled_on_the_side_that_cameras_saw(loaded):
+    front, centre = front_view(loaded, 32), loaded.model.head_centre
+    cameras = {str(turn): orbit(front, turn, centre) for turn in (0, -40, -70)}  # to the left, +x
+    one_sided = replace(loaded, gallery=replace(loaded.gallery, cameras=cameras))
+    (low, high), _ = seen_angles(one_sided)
+    assert low > -20 and high > 60
+    views = sampled_views(one_sided, 40, torch.Generator().manual_seed(0))
+    x, _, z = torch.stack([view.direction() for view in views]).unbind(1)
+    yaw = torch.rad2deg(torch.atan2(x, z))
+    assert yaw.min() > low - 5 and high - 20 < yaw.max() < high + 5
 
 
 def test_stored_arrays_lose_next_to_nothing(person, avatar):
