@@ -46,14 +46,16 @@ def corner_motion(corners: BoardCorners) -> tuple[np.ndarray, np.ndarray]:
     """
     found = [re.search(r"(\d+)\D*$", name) for name in corners.frames]
     time = np.array([int(m.group(1)) if m else -1 for m in found], float)
-    if len(set(time)) < len(time) or (np.diff(time) < 0).any():
+    if len(set(time)) < len(time):
         time = np.arange(len(found), dtype=float)
+    order = np.argsort(time)  # names without leading zeros are not sorted by number
+    time, place = time[order], np.argsort(order)[corners.frame]
     count = int(corners.corner.max(initial=0)) + 1
     motion = np.zeros((2, *corners.pixels.shape))
     for i in np.unique(corners.camera):
         mine = np.flatnonzero(corners.camera == i)
         seen = np.full((len(time), count, 2), np.nan)
-        seen[corners.frame[mine], corners.corner[mine]] = corners.pixels[mine]
+        seen[place[mine], corners.corner[mine]] = corners.pixels[mine]
         gap = np.diff(time)[:, None, None]
         steps = np.diff(seen, axis=0) / gap
         velocity = (gap[1:] * steps[:-1] + gap[:-1] * steps[1:]) / (gap[1:] + gap[:-1])
@@ -62,7 +64,7 @@ def corner_motion(corners: BoardCorners) -> tuple[np.ndarray, np.ndarray]:
         known = np.full((2, *seen.shape), np.nan)
         known[:, 1:-1] = velocity, 2 * bend / (gap[1:] + gap[:-1])
         known[:, 1:-1][:, ~smooth] = np.nan
-        motion[:, mine] = np.nan_to_num(known[:, corners.frame[mine], corners.corner[mine]])
+        motion[:, mine] = np.nan_to_num(known[:, place[mine], corners.corner[mine]])
     return motion[0], motion[1]
 
 

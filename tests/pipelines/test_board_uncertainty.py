@@ -57,7 +57,9 @@ def test_a_single_camera_has_no_stated_error() -> None:
     assert state_uncertainty(solution, POINTS) == {}
 
 
-def hand_held(rig, late: Mapping[str, float], readout: Mapping[str, float]) -> BoardCorners:
+def hand_held(
+    rig, late: Mapping[str, float], readout: Mapping[str, float], digits: int = 4
+) -> BoardCorners:
     """Corners of a board that is moved about smoothly before cameras that are late by so much."""
     rng = np.random.default_rng(1)
     size, phase = rng.normal(size=(6, 4)), rng.uniform(0, 7, (6, 4))
@@ -76,7 +78,7 @@ def hand_held(rig, late: Mapping[str, float], readout: Mapping[str, float]) -> B
             row = pixels[:, 1:] / camera.height - 0.5
             pixels = pixels + readout.get(name, 0.0) * row * step + rng.normal(size=(70, 2)) * 0.1
             ids = np.flatnonzero(((pixels > 0) & (pixels < (640, 480))).all(axis=1))
-            rows.append((name, f"take2_{frame + 7:04d}", ids, pixels[ids]))
+            rows.append((name, f"take2_{frame + 7:0{digits}d}", ids, pixels[ids]))
     return gather(rows, rig)
 
 
@@ -89,6 +91,13 @@ def test_cameras_that_are_late_by_part_of_a_frame_are_brought_into_step() -> Non
         assert found.late == pytest.approx(late.get(name, 0.0), abs=0.03)
         assert found.readout == pytest.approx(readout.get(name, 0.0), abs=0.05)
     assert not solution.dropped and max(true_errors(solution, rig).values()) < 0.2
+
+
+def test_frames_are_in_the_order_of_their_numbers_with_and_without_zeros() -> None:
+    rig = make_rig(2, span_deg=40)
+    padded, plain = (corner_motion(hand_held(rig, {}, {}, digits)) for digits in (4, 1))
+    assert padded[0].any(axis=1).mean() > 0.5
+    np.testing.assert_array_equal(plain, padded)
 
 
 def test_cameras_in_step_are_left_as_they_are() -> None:
