@@ -135,6 +135,7 @@ def render(args: argparse.Namespace) -> int:
     from grmm import render
 
     _no_file(args.out)
+    _goes_with(args, "drive", "drive_cue")
     loaded = _load(args.checkpoint)
     model, head = loaded.model, _edited_head(loaded, args)
     view = render.camera_of(loaded, args.camera, args.size)
@@ -184,6 +185,9 @@ def export(args: argparse.Namespace) -> int:
     if form not in FORMATS:
         expected = ", ".join(f".{name}" for name in FORMATS if name not in ("splats", "arkit"))
         raise ConfigError(f"{args.out}: unknown kind of file, expected one of {expected}")
+    if form != "html" and (unused := [n for n in ("drive", "shards") if getattr(args, n)]):
+        raise ConfigError(f"--{unused[0]} goes with a .html page, not with {args.out.name}")
+    _goes_with(args, "drive", "drive_cue")
     _no_file(args.out.parent)
     loaded = _load(args.checkpoint)
     head, view = _edited_head(loaded, args), camera_of(loaded, args.camera, args.size)
@@ -219,6 +223,7 @@ def evaluate(args: argparse.Namespace) -> int:
     from grmm.shard_source import ShardSource
 
     _no_file(args.out)
+    _goes_with(args, "fit_cameras", "fit_budget")
     loaded = _load(args.checkpoint, _metric_settings(args), args.fit_budget)
     source = ShardSource(args.shards, "*")
     views = loaded.views(source)
@@ -355,6 +360,14 @@ def study_table(args: argparse.Namespace) -> int:
     write_json(args.out / "table.json", summary)
     write_bytes(args.out / "table.md", markdown(summary).encode())
     return answer(args, summary, markdown(summary))
+
+
+def _goes_with(args: argparse.Namespace, needed: str, *options: str) -> None:
+    """Refuse options that mean nothing without another one."""
+    for option in options:
+        if getattr(args, option) is not None and not getattr(args, needed):
+            first, second = (f"--{name.replace('_', '-')}" for name in (option, needed))
+            raise ConfigError(f"{first} goes with {second}; give {second} too")
 
 
 def _no_file(out: Path) -> None:

@@ -306,3 +306,22 @@ def test_only_the_first_process_reports(shards, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("grmm.train.train", lambda *unused, **also: {})
     assert main(["train", str(shards), str(tmp_path), *TINY, "--json"]) == 0
     assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["export", "{0}", "head.ply", "--drive=clips.npz"],
+        ["export", "{0}", "head.glb", "--shards=somewhere"],
+        ["export", "{0}", "head.html", "--drive-cue=smile"],
+        ["render", "{0}", "pictures", "--drive-cue=smile"],
+        ["evaluate", "{0}", "{1}", "out", "--fit-budget=5s"],
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(
+    arguments, shards, checkpoint, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    assert main([text.format(checkpoint, shards) for text in arguments]) == 2
+    assert "goes with" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
