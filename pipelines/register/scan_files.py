@@ -53,13 +53,13 @@ def run_scans(args: argparse.Namespace) -> int:
             )
     load_head(args.head)  # refuse a wrong name before any work
     out, accounts = args.dataset, []
-    scans, former = scans_of(args.scan), read_index(out / INDEX)
+    scans, former = list_scans(args.scan), read_index(out / INDEX)
     try:
         for name, path in scans.items():
             account: dict = {"name": name, "scan": str(path), "folder": str(out / name)}
             try:
                 account |= register_scan(path, args.head, out / name)
-                words = "current" if account["skipped"] else line_of(account)
+                words = "current" if account["skipped"] else summary_line(account)
             except Express50Error as error:
                 account["error"] = words = str(error)
             accounts.append(account)
@@ -110,7 +110,7 @@ def write_index(path: Path, former: dict[str, dict[str, str]], accounts: list[di
     write_bytes(path, text.getvalue().encode())
 
 
-def scans_of(paths: list[Path]) -> dict[str, Path]:
+def list_scans(paths: list[Path]) -> dict[str, Path]:
     """List scan files, and those in folders, by the names of the folders to write.
 
     Raises:
@@ -215,7 +215,7 @@ def distances(scan: Scan, fitted: FittedScan) -> dict[str, float | None]:
     return found
 
 
-def line_of(account: dict) -> str:
+def summary_line(account: dict) -> str:
     """Describe a registered scan in one line."""
     return (
         f"{account['unit']}, {'coloured' if account['textured'] else 'no colours'},"
