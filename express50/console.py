@@ -53,7 +53,7 @@ class Parser(argparse.ArgumentParser):
         found, left = super().parse_known_args(args, namespace)
         if left:
             near = nearest(left[0].partition("=")[0], self._option_string_actions)
-            self.error(f"unexpected argument {left[0]!r}{near}")
+            self.error(f"unknown argument {left[0]!r}{near}")
         return found, left
 
 

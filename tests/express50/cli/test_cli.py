@@ -141,10 +141,10 @@ def test_bad_item_gives_exit_code_1_and_is_named(run, data, capture, tmp_path):
         (
             ["run", "DATA", "--buget", "1h"],
             2,
-            "unexpected argument '--buget' (did you mean '--budget'",
+            "unknown argument '--buget' (did you mean '--budget'",
         ),
         (["run", "DATA", "--buget=1h"], 2, "(did you mean '--budget'?)"),
-        (["status", "DATA", "more"], 2, "express50 status: error: unexpected argument 'more'"),
+        (["status", "DATA", "more"], 2, "express50 status: error: unknown argument 'more'"),
         (["config", "ingets"], 2, "unknown stage 'ingets' (did you mean 'ingest'?)"),
         (["ingest", "DATA", "--workers=-1"], 2, "--workers -1: expected 0 or more"),
         (["ingest", "DATA", "--threads", "-1"], 2, "--threads -1: expected 1 or more"),
