@@ -87,14 +87,19 @@ def _line_of(error: Exception) -> str:
     if isinstance(error, Express50Error):
         return f"{name}: {words}"
     if isinstance(error, OSError):  # not a bug: permissions, a missing folder, a full disk
-        place = f" {error.filename}:" if error.filename is not None else ""
-        words = error.strerror or words or "no reason given"
-        return f"{name}:{place} {words}; {REMEDIES.get(error.errno or 0, REMEDY)}"
+        return line_of_system(error)
     last = traceback.extract_tb(error.__traceback__)[-1]
     return (
         f"{name}: {Express50Error(words)} (unexpected, in {Path(last.filename).name} line "
         f"{last.lineno}); set {DEBUG}=1, run the same command again and report what it prints"
     )
+
+
+def line_of_system(error: OSError) -> str:
+    """Return one line of what the system refused, where, and what to do."""
+    place = f" {error.filename}:" if error.filename is not None else ""
+    words = error.strerror or " ".join(str(error).split()) or "no reason given"
+    return f"{type(error).__name__}:{place} {words}; {REMEDIES.get(error.errno or 0, REMEDY)}"
 
 
 def add_command(

@@ -18,6 +18,7 @@ from typing import Any
 
 from threadpoolctl import ThreadpoolController
 
+from express50.console import line_of_system
 from express50.contract.config import config_texts
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
@@ -73,6 +74,8 @@ def failure_reason(dataset: Dataset, stage: str, item: str, error: Exception) ->
     reason = f"{type(error).__name__}: {error}"
     if isinstance(error, Express50Error):
         return reason
+    if isinstance(error, PermissionError):  # of the footage, most often: not a defect
+        return line_of_system(error)
     log = dataset.log_file(stage, item)
     try:
         write_bytes(log, "".join(traceback.format_exception(error)).encode())

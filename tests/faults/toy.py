@@ -5,6 +5,7 @@ Run as ``python -m tests.faults.toy ROOT WORKERS``, or ``slurm`` for the workers
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import signal
@@ -64,6 +65,8 @@ def misbehave(dataset: Dataset, item: str, text: str) -> Result:
         raise StageError(f"{item}: text is {text!r}, expected 'repaired'")
     if item.startswith("bug"):
         raise KeyError("absent")
+    if item.startswith("denied"):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), "/raw/cam02")
     if item.startswith("nan"):
         return Result({"value": float("nan")})
     if item.startswith("full") and text != "repaired":

@@ -67,6 +67,13 @@ def test_unexpected_error_leaves_its_traceback_in_a_log_that_success_removes(tmp
     assert "misbehave" in log.read_text()
 
 
+def test_footage_that_may_not_be_read_is_not_a_defect(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["denied1"])
+    (outcome,) = run_toy(dataset).outcomes
+    assert outcome.reason.startswith("PermissionError: /raw/cam02: Permission denied; check its")
+    assert not dataset.log_file("toy", "denied1").exists()
+
+
 def test_second_run_skips_and_a_changed_input_or_config_redoes(tmp_path):
     dataset = make_dataset(tmp_path / "data", ["a", "b"])
     assert set(statuses(run_toy(dataset)).values()) == {"done"}
