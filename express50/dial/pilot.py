@@ -24,7 +24,7 @@ from express50.dial.budget import Clock
 from express50.dial.figures import Cost, PilotFigures, Trial, footage_of, trial_of
 from express50.dial.results import RESULTS, ResultKind, differences, whole_peaks
 from express50.errors import ConfigError, DiskFullError, Express50Error, FormatError
-from express50.files.atomic import write_json
+from express50.files.atomic import link_file, write_json
 from express50.files.digests import files_of, value_digest
 from express50.files.text import read_json_table
 from express50.runner.executor import Pool
@@ -198,7 +198,7 @@ def keep_for_run(dataset: Dataset, settings: Mapping[str, str]) -> None:
 def _link(source: str, target: str) -> None:
     """Link a file that is only ever replaced; copy one that is written to."""
     written = Path(source).name.startswith("ledger.sqlite") or source.endswith(".jsonl")
-    (shutil.copy2 if written else os.link)(source, target)
+    (shutil.copy2 if written else link_file)(source, target)
 
 
 def _rows(path: Path) -> dict[str, Any]:

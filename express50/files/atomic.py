@@ -176,6 +176,14 @@ def _swap(one: Path, other: Path) -> bool:
     )
 
 
+def link_file(source: str | Path, target: str | Path) -> None:
+    """Give a file that is only ever replaced a second name; copy it where that is not possible."""
+    try:
+        os.link(source, target)
+    except OSError:  # another file system, or one without hard links
+        shutil.copy2(source, target)
+
+
 def sync_directory(path: Path) -> None:
     """Flush a folder's entries to the disk."""
     _sync(path, os.O_RDONLY | os.O_DIRECTORY)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 import tarfile
 from collections.abc import Mapping, Sequence
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from express50.errors import FormatError
-from express50.files.atomic import folder_in_one_step, write_json
+from express50.files.atomic import folder_in_one_step, link_file, write_json
 from express50.files.digests import file_sha256
 from express50.files.text import NAME, read_json
 from express50.shards.codecs import AGAIN, crc32
@@ -228,20 +227,13 @@ def gather_shards(sources: Sequence[tuple[Path, str]], out: Path) -> dict[str, s
             name = shard_name(split, sum(row["split"] == split for row in shards))
             shards.append(shard | {"file": name, "split": split})
             digests[name] = known[shard["file"]]
-            _link(root / shard["file"], out / name)
+            link_file(root / shard["file"], out / name)
         for name, digest in known.items():
             if name.endswith(SUBJECT_FILES):
                 digests[name] = digest
-                _link(root / name, out / name)
+                link_file(root / name, out / name)
     _write_index(out, shards)
     return digests
-
-
-def _link(source: Path, target: Path) -> None:
-    try:
-        os.link(source, target)
-    except OSError:  # another file system, or one without hard links
-        shutil.copyfile(source, target)
 
 
 def write_manifest(root: Path, digests: Mapping[str, str] | None = None) -> None:

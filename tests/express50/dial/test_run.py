@@ -243,6 +243,15 @@ def test_a_reference_that_the_trial_lacks_does_not_stop_it(tmp_path, captures):
     assert state.finished and not any("cannot be measured" in line for line in said)
 
 
+def test_a_disk_without_hard_links_will_do(tmp_path, captures, monkeypatch):
+    def refuse(source, target):
+        raise PermissionError(1, "Operation not permitted")  # as exFAT and some network drives
+
+    monkeypatch.setattr("os.link", refuse)
+    _, state = go(tmp_path / "d", captures, "5m")
+    assert state.finished
+
+
 def test_one_item_is_enough(tmp_path):
     captures = captures_of(tmp_path / "captures", subjects=1, expressions=1)
     _, state = go(tmp_path / "d", captures, "5m")
