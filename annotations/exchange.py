@@ -20,6 +20,7 @@ from typing import Any
 
 from annotations.labels import (
     ACTIONS,
+    EXCLUSION_ACTIONS,
     KINDS,
     RULE_PREFIX,
     Label,
@@ -126,7 +127,8 @@ def _label(row: object, where: str) -> Label:
     if not isinstance(row, dict):
         raise AnnotationError(f"{where}: expected an object, got {type(row).__name__}")
     given = {k: v for k, v in row.items() if v not in (None, "")}
-    given.setdefault("expression", "")  # an exclusion names no expression
+    if given.get("action") in EXCLUSION_ACTIONS:
+        given.setdefault("expression", "")
     unknown = sorted(set(map(str, given)) - set(_FIELDS))
     missing = sorted(set(_REQUIRED) - set(given))
     if unknown or missing:

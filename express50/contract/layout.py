@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -202,14 +203,19 @@ def existing_dataset(path: Path) -> Dataset:
 
 
 def exclusion_reason(dataset: Dataset, subject: str) -> str | None:
-    """Return why a subject is excluded (``express50 annotate exclude``), or None if it is not."""
+    """Return why a subject is excluded (``express50 annotate exclude``), or None if it is not.
+
+    The latest event counts: an import may have put an older one below it.
+    """
     path = dataset.labels_file(subject)
-    reason = None
+    reason, latest = None, -math.inf
     data = read_bytes(path, AnnotationError) if path.is_file() else b""
     for line in data.decode("utf-8", errors="replace").split("\n"):
-        with contextlib.suppress(AnnotationError, AttributeError):  # a torn line says nothing
+        with contextlib.suppress(AnnotationError, AttributeError, TypeError):  # a torn line
             row = parse_json(line, str(path), AnnotationError)
-            if row.get("action") in ("exclude", "include"):
+            when = row.get("time", 0)
+            if row.get("action") in ("exclude", "include") and when >= latest:
+                latest = when
                 reason = row.get("reason") if row["action"] == "exclude" else None
     return reason
 

@@ -208,6 +208,7 @@ def test_a_disagreement_is_settled_by_a_reason_in_words(annotate):
         ({"camera": "z"}, "'z'"),
         ({"dhash": "f" * 16}, "f" * 16),
         ({"pts": 3}, "pts 140"),
+        ({"expression": ""}, "missing ['expression']"),
     ],
 )
 def test_import_refuses_invalid_events(annotate, dataset, tmp_path, capsys, change, named):

@@ -61,6 +61,16 @@ def test_later_inclusion_ends_an_exclusion(tmp_path):
     assert included_subjects(dataset) == ["S001", "S002"]
 
 
+def test_the_latest_event_decides_though_an_import_put_an_older_one_below(tmp_path):
+    dataset = make_dataset(tmp_path)
+    for action, when in (("include", 200.0), ("exclude", 100.0)):
+        event = Label(
+            subject="S001", expression="", action=action, annotator="ann", time=when, reason="old"
+        )
+        append_label(dataset, event)
+    assert exclusion_reason(dataset, "S001") is None
+
+
 def test_worklist_orders(tmp_path):
     dataset = make_dataset(tmp_path, ("S001", "S002", "S003"))
     choose_reference(dataset, "S002")
