@@ -96,18 +96,12 @@ def exposed(plate: np.ndarray, gain: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MatchedPlate:
-    """A plate (H, W, 3) uint8 that was matched to a frame.
+    """A plate (H, W, 3) uint8, aligned with a frame and its light evened where that helps.
 
-    Attributes:
-        plate: moved and its light evened, if that helps; else unchanged.
-        moved_px: the largest distance that a corner moved.
-        evened: largest change of light, as a share; 0 if none was needed.
-        share: of the frame's top and sides that the plate explains.
+    `share` is how much of the frame's top and sides it explains.
     """
 
     plate: np.ndarray
-    moved_px: float
-    evened: float
     share: float
 
 
@@ -118,15 +112,12 @@ def match_plate(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> Matc
     usually fills the middle of a frame, so its top and sides are compared.
     """
     rim = valid & _rim(valid.shape, RIM)
-    as_it_is = MatchedPlate(plate, 0.0, 0.0, _explained(plate, frame, rim))
-    if as_it_is.share > GOOD_SHARE:
-        return as_it_is
-    evened, change = _evened(plate, frame, rim)
-    best = as_it_is
-    for light, even in ((plate, 0.0), (evened, change)):
-        moved, corners = _moved(light, frame, valid)
-        for image, far in ((light, 0.0), (moved, corners)):
-            found = MatchedPlate(image, far, even, _explained(image, frame, rim))
+    best = MatchedPlate(plate, _explained(plate, frame, rim))
+    if best.share > GOOD_SHARE:
+        return best
+    for light in (plate, _evened(plate, frame, rim)):
+        for image in (light, _aligned(light, frame, valid)):
+            found = MatchedPlate(image, _explained(image, frame, rim))
             best = found if found.share > best.share + LEAST_GAIN else best
     return best
 
@@ -151,8 +142,8 @@ def _explained(plate: np.ndarray, frame: np.ndarray, rim: np.ndarray) -> float:
     return float((np.abs(cv2.blur(off, (3, 3))).max(2)[rim] < ODD_STEPS).mean())
 
 
-def _moved(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, float]:
-    """Align a plate with a frame by an affine motion; also return how far its corners move."""
+def _aligned(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Return a plate aligned with a frame by an affine motion; unchanged if none fits."""
     scale = min(1.0, ALIGN_SIDE / max(valid.shape))
     grey = [
         cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None, fx=scale, fy=scale,
@@ -170,23 +161,22 @@ def _moved(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> tuple[np.
                 *grey, motion, cv2.MOTION_AFFINE, stop, inputMask=mask, gaussFiltSize=blur
             )
     except cv2.error:  # the rim has no structure, or no motion explains it
-        return plate, 0.0
+        return plate
     motion = affine_from_opencv(motion)
     motion[:, 2] /= scale
     height, width = valid.shape
     corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]])
-    far = float(np.linalg.norm(corners @ motion.T - corners[:, :2], axis=1).max())
-    if far > MOST_MOVED * max(width, height):
-        return plate, 0.0
-    moved = cv2.warpAffine(
+    moved = np.linalg.norm(corners @ motion.T - corners[:, :2], axis=1)
+    if moved.max() > MOST_MOVED * max(width, height):
+        return plate
+    return cv2.warpAffine(
         plate, affine_to_opencv(motion), (width, height),
         flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
     )  # fmt: skip
-    return moved, far
 
 
-def _evened(plate: np.ndarray, frame: np.ndarray, rim: np.ndarray) -> tuple[np.ndarray, float]:
-    """Change a plate's light to a frame's; also return the largest change, as a share.
+def _evened(plate: np.ndarray, frame: np.ndarray, rim: np.ndarray) -> np.ndarray:
+    """Return a plate in a frame's light.
 
     The change is a gain per channel whose logarithm is linear across the image, so that it is also
     known where the person hides the plate.
@@ -207,7 +197,7 @@ def _evened(plate: np.ndarray, frame: np.ndarray, rim: np.ndarray) -> tuple[np.n
     y, x = np.arange(height)[:, None, None] / height, np.arange(width)[:, None] / width
     gain = np.exp(np.clip(slope[0] + slope[1] * y + slope[2] * x, -1.5, 1.5)).astype(np.float32)
     even = linear_to_srgb(np.clip(LIGHT_OF_LEVEL[plate] * gain, 0, 1))
-    return np.rint(255 * even).astype(np.uint8), float(np.abs(gain - 1).max())
+    return np.rint(255 * even).astype(np.uint8)
 
 
 def fit_plate(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> PlateModel:
