@@ -67,7 +67,7 @@ def measure_preset(captures: list[Path], truth: Path, root: Path, preset: str) -
     shutil.rmtree(root, ignore_errors=True)
     dataset = Dataset(root)
     if prepare := stages()["ingest"].prepare:
-        prepare(dataset, captures)
+        prepare(dataset, captures, False)
     costs = {}
     for name in stages():
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:

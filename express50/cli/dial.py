@@ -132,5 +132,5 @@ def _chain(args: argparse.Namespace) -> Iterator[Any]:
             return
         for stage in known:
             if stage.prepare is not None and args.captures:
-                stage.prepare(dataset, args.captures)
+                stage.prepare(dataset, args.captures, args.replace)
         yield Chain(known, dataset, ladders, pool, log if args.json else say)

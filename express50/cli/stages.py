@@ -53,6 +53,8 @@ def add_run_options(parser: argparse.ArgumentParser, captures: bool, preset: boo
     if captures:
         words = "folders of raw captures"
         add("captures", nargs="*", default=[], type=Path, metavar="CAPTURE", help=words)
+        words = "use CAPTURE in place of the captures that its subjects have"
+        add("--replace", action="store_true", help=words)
     add_config_options(parser, preset)
     words = "local worker processes (default 2); 0 works in this process"
     add("--workers", type=int, default=2, metavar="N", help=words)
@@ -217,7 +219,7 @@ def _items(
     from express50.runner.runner import select_items
 
     if stage.prepare is not None and args.captures:
-        prepared = stage.prepare(dataset, args.captures)
+        prepared = stage.prepare(dataset, args.captures, args.replace)
         if args.command != "run" and pattern is None:
             return prepared
     elif not dataset.root.is_dir():

@@ -170,8 +170,9 @@ class Stage:
         help: one line for the command line, in the imperative.
         purpose: one or two sentences for the report.
         runs_first: stages that the command of this one runs before it.
-        prepare: takes captures that the command names into the dataset and returns the ids of
-            their items; only a stage that has it accepts captures.
+        prepare: takes captures that the command names into the dataset, if asked to in place of
+            other captures of their subjects, and returns the ids of their items; only a stage that
+            has it accepts captures.
         account: lines for people about items that were made, printed after the stage's account.
         growth: what its cost is proportional to.
     """
@@ -188,7 +189,7 @@ class Stage:
     help: str = ""
     purpose: str = ""
     runs_first: tuple[str, ...] = ()
-    prepare: Callable[[Dataset, Sequence[Path]], list[str]] | None = None
+    prepare: Callable[[Dataset, Sequence[Path], bool], list[str]] | None = None
     account: Callable[[Dataset, Sequence[str]], Iterable[str]] | None = None
     growth: Growth = Growth()
 

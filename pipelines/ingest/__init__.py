@@ -44,11 +44,11 @@ PRESETS: dict[str, dict[str, object]] = {
 }
 
 
-def register(dataset: Dataset, captures: Sequence[Path]) -> list[str]:
+def register(dataset: Dataset, captures: Sequence[Path], replace: bool = False) -> list[str]:
     """Add captures to the dataset's table, see `pipelines.ingest.stage`."""
     from pipelines.ingest.stage import register as work
 
-    return work(dataset, list(captures))
+    return work(dataset, list(captures), replace)
 
 
 def items(dataset: Dataset) -> list[str]:

@@ -8,9 +8,9 @@ and light: faults are warnings, and the figures go to checks.json.
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -39,8 +39,10 @@ QC_CAMERAS, QC_COLUMNS = 24, 6
 FILE_ENDINGS = ("head", "confidence", "normals")  # later stages write <camera>_<ending>.png
 
 
-def register(dataset: Dataset, captures: list[Path]) -> list[str]:
+def register(dataset: Dataset, captures: list[Path], replace: bool = False) -> list[str]:
     """Add raw captures to the dataset's table; returns their subjects in the given order.
+
+    A subject's other capture that is still there is only given up for them to ``replace`` it.
 
     Raises:
         CaptureError: a folder is not a capture, two captures claim one subject, or the subject
@@ -61,12 +63,11 @@ def register(dataset: Dataset, captures: list[Path]) -> list[str]:
                 "give each capture its own subject id (subject in capture.toml)"
             )
         known = Path(table.get(subject, root))
-        if known.exists() and not known.samefile(root):
+        if known.exists() and not known.samefile(root) and not replace:
             raise CaptureError(
                 f"{root}: subject {subject} of {dataset.root} has the capture {known}; if {root} is"
                 " another person or session, give it another subject id (subject in capture.toml);"
-                f" to use it in place of {known}, delete {subject} from {dataset.captures_file} and"
-                " run the same command again"
+                f" to use it in place of {known}, add --replace"
             )
         if not known.exists():
             log(f"{subject}: {known} is gone, its footage is now read from {root}")
@@ -229,7 +230,7 @@ def _with_cues(
     ends = np.cumsum(usual).tolist()
     rows = zip(raw.clips, ends, usual, strict=True)
     cues = tuple(Cue(clip, end - count, end - 1) for clip, end, count in rows)
-    return replace(raw, cues=cues), outside
+    return dataclasses.replace(raw, cues=cues), outside
 
 
 def usual_count(counts: Sequence[int]) -> int:

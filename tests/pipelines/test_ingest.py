@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
+from express50.__main__ import main
 from express50.capture.frames import decode_proxy, dhash
 from express50.capture.index import Cue, read_index
 from express50.contract.config import resolve_config
@@ -208,7 +209,7 @@ def test_register_checks_before_it_writes(dataset, tmp_path):
         ingest.register(dataset, [tmp_path / "absent"])
 
 
-def test_another_capture_of_a_known_subject_is_refused_until_its_entry_is_deleted(
+def test_another_capture_of_a_known_subject_is_refused_unless_it_replaces_the_first(
     dataset, tmp_path, capsys
 ):
     known, other = tmp_path / "S001", tmp_path / "other"
@@ -216,14 +217,13 @@ def test_another_capture_of_a_known_subject_is_refused_until_its_entry_is_delete
     before = dataset.captures_file.read_bytes()
     with pytest.raises(CaptureError) as error:
         ingest.register(dataset, [other])
-    named = (known, other, dataset.captures_file)
-    assert all(str(path) in str(error.value) for path in named)
+    assert all(str(path) in str(error.value) for path in (known, other, "--replace"))
     assert dataset.captures_file.read_bytes() == before
     (tmp_path / "link").symlink_to(known)
     assert ingest.register(dataset, [tmp_path / "link"]) == ["S001"]  # the same folder
 
-    dataset.captures_file.write_text("{}")  # as the error says
-    assert ingest.register(dataset, [other]) == ["S001"]
+    command = ["ingest", str(dataset.root), str(other), "--workers=0"]
+    assert main(command) == 1 and main([*command, "--replace"]) == 0
     assert dataset.captures()["S001"] == other
     other.rename(known.with_name("moved"))  # no choice is left, so none is asked for
     assert ingest.register(dataset, [known.with_name("moved")]) == ["S001"]
