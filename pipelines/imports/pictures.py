@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import open3d as o3d
 
+from express50.dataset.depth_files import FARTHEST_M as BACKGROUND_M
 from express50.errors import FormatError, StageError
 from express50.files.arrays import read_npy
 from express50.files.images import read_image, resize_area
@@ -71,6 +72,8 @@ def read_foreign_depth(
 ) -> np.ndarray:
     """Read depth (H, W) float32, metres along z of a pinhole camera's picture; 0 is unknown.
 
+    In the file, NaN and 10 km or more, as some tools write a background, are unknown too.
+
     Args:
         path: 16-bit PNG or TIFF, EXR, or .npy, of the size of the footage or of the picture.
         recorded: camera of the footage, with its distortion.
@@ -93,7 +96,8 @@ def read_foreign_depth(
     if values.ndim != 2 or values.dtype.kind not in "fui":
         raise FormatError(f"{path}: {values.dtype} {values.shape}, expected (H, W) depth")
     camera = _camera_of_size(path, values, recorded, seen)
-    known = np.isfinite(values) & (values != 0)
+    away = np.abs(values.astype(np.float64)) * metres
+    known = (away > 0) & (away < BACKGROUND_M)
     depth = np.where(known, values, 0).astype(np.float32)
     if known.any() and (depth[known] < 0).mean() > 0.5:
         raise FormatError(

@@ -420,6 +420,17 @@ def test_depth_of_every_kind_becomes_depth_and_surface(dataset, tmp_path, kind) 
     assert done.count("skipped") == 2
 
 
+def test_a_background_at_infinity_in_numbers_is_unknown(dataset, tmp_path) -> None:
+    def blender(depth, rays):
+        return np.where(depth > 0, depth, 1e10)
+
+    pattern = depths_of(dataset, tmp_path / "depth", as_exr, blender)
+    shutil.rmtree(dataset.stage_dir("matte"))  # nothing else says where the background is
+    assert take("depth", dataset, pattern, "--unit=m") == 0
+    depth, valid = read_depth(dataset.item_dir("depth", "S001/smile") / "cam02.png")
+    assert 0 < valid.mean() < 0.9 and depth.max() < 10
+
+
 def test_depth_with_a_wrong_unit_or_measure_is_named(dataset, tmp_path, capsys) -> None:
     def line(change, *options: str) -> str:
         pattern = depths_of(dataset, tmp_path / "depth", as_exr, change)
