@@ -27,7 +27,8 @@ class ObserveConfig:
     min_score: float = 0.3
     """Leave out cameras whose face score at rest is lower, 0 to 1."""
     search: float = 0.25
-    """Smallest windows searched where no face is found, as a share of the image's longer side."""
+    """Smallest windows searched where no face is found, as a share of the image's longer side; at
+    most 0.08 if no camera then shows one."""
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from express50.errors import FormatError, StageError
 from express50.files.arrays import read_arrays
 from express50.files.images import contact_sheet, write_image
 from express50.geometry.transforms import similarity_fit
-from express50.landmarks.detector import SMALLEST, cut_crop, detect, window_about
+from express50.landmarks.detector import SMALL, SMALLEST, cut_crop, detect, window_about
 from express50.landmarks.network import CROP, MIRROR, LandmarkNet, face_box, load_network
 
 SCHEMA = "express50.observations/1"
@@ -88,11 +89,12 @@ def run(
     seen = list(windows.values())
     frames = np.unique(np.concatenate(seen))
 
-    def score(camera: str, frame: int) -> float:
-        return detect(net, read_proxy(dataset, item, camera, frame), smallest=search).score
+    def score(camera: str, frame: int, smallest: float) -> float:
+        return detect(net, read_proxy(dataset, item, camera, frame), smallest=smallest).score
 
+    searches = (search, SMALL) if search > SMALL else (search,)
     tries = frames_to_try(rest, frames)
-    middle, ranked = choose_cameras(index, score, tries, min_score)
+    search, middle, ranked = choose_cameras(index, score, searches, tries, min_score)
     watching = ranked[:cameras]
     rest = np.union1d(rest, [middle])
     views = [_watch(dataset, item, net, camera, seen, rest, search) for camera in watching]
@@ -126,21 +128,31 @@ def frames_to_try(rest: np.ndarray, frames: np.ndarray) -> list[int]:
 
 
 def choose_cameras(
-    index: Index, score: Callable[[str, int], float], frames: list[int], min_score: float
-) -> tuple[int, list[str]]:
+    index: Index,
+    score: Callable[[str, int, float], float],
+    searches: Sequence[float],
+    frames: list[int],
+    min_score: float,
+) -> tuple[float, int, list[str]]:
     """Find the first of the frames that shows a face, and rank the cameras that see it best.
+
+    `score` rates a camera's frame, searched down to windows of a size. All frames are searched in
+    the first of `searches` before any is in the next, which takes longer.
+
+    Returns:
+        The size of the windows that were enough, the frame and the cameras.
 
     Raises:
         StageError: no camera sees a face in any.
     """
     best = 0.0
-    for frame in frames:
-        scores = {camera: score(camera, frame) for camera in index.cameras}
+    for smallest, frame in product(searches, frames):
+        scores = {camera: score(camera, frame, smallest) for camera in index.cameras}
         ranked = sorted(scores, key=lambda c: (-scores[c], c))
         best = max(best, scores[ranked[0]])
         if scores[ranked[0]] >= min_score:
             enough = max(min_score, RANKED_SHARE * scores[ranked[0]])
-            return frame, [c for c in ranked if scores[c] >= enough]
+            return smallest, frame, [c for c in ranked if scores[c] >= enough]
     raise StageError(
         f"{index.subject}: no camera sees a face in frames {', '.join(map(str, sorted(frames)))}"
         f" (best score {best:.2f}, expected {min_score}); check that the face is in view, label it"

@@ -39,6 +39,7 @@ FOUND_SCORE = 0.5  # the search continues until a face has this score
 # its middle: windows shrink by SHRINK, and are STEP of their side apart.
 SHRINK, STEP = 0.55, 0.5
 SMALLEST = 0.25
+SMALL = 0.08  # where that finds too little: people fill a rig's pictures, but not all others
 BATCH = 32  # windows at a time
 KEEP_SHARE = 0.8  # of a place's score that a nearer look must have to replace it
 # Sizes of the crops of the last look, relative to the trained one, and whether they are mirrored.
@@ -147,6 +148,16 @@ def detect_many(
                 del left[one]
     found = [place for place in best if place is not None]
     return [_detection(place) for place in _with_close_ups(net, pyramids, found)]
+
+
+def detect_at(
+    net: LandmarkNet, image: np.ndarray, window: np.ndarray, refinements: int = 2
+) -> Detection:
+    """Detect as `detect` does, but where a window (2, 3) says that the face is (`window_about`)."""
+    pyramid = make_pyramid(image)
+    coarse = _run(net, [Look(pyramid, window)])
+    found = _refined(net, [pyramid], coarse, refinements)
+    return _detection(_with_close_ups(net, [pyramid], found)[0])
 
 
 def _detection(place: _Place) -> Detection:

@@ -25,6 +25,7 @@ from express50.files.images import shrink, shrunk_size, tile_sheet, write_image
 from express50.geometry.sampling import pictured_share
 
 COLUMNS = 6  # of the contact sheet
+LEAST_BLACK = 0.002  # share of a frame: a smaller corner hides nobody
 TILE = 240  # pixels
 FOLDS = (
     "its lens folds within the image: {:.1%} of the frame stays black;"
@@ -67,8 +68,8 @@ def run(dataset: Dataset, item: str, out: Path, side: int) -> Result:
             dropped.append(Note(name, str(error)))
             continue
         write_frame(out / f"{name}.tif", image)
-        if (share := pictured_share(camera)) < 1:
-            warnings.append(Note(name, FOLDS.format(1 - share)))
+        if (black := 1 - pictured_share(camera)) > LEAST_BLACK:
+            warnings.append(Note(name, FOLDS.format(black)))
         tiles[name] = shrink(image, TILE)
     if not tiles and not plates:
         why = "; ".join(f"{note.what}: {note.why}" for note in dropped[:3])

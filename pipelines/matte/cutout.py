@@ -26,7 +26,6 @@ from express50.errors import NoFaceError
 from express50.files.images import edge_distance, shrink
 from express50.geometry.cameras import Camera, resized
 from express50.geometry.conventions import corner_to_cell
-from express50.geometry.transforms import similarity_fit
 from pipelines.matte.plates import blurred, local_colours, to_light
 from pipelines.matte.visual_hull import (
     Ball,
@@ -39,11 +38,9 @@ from pipelines.matte.visual_hull import (
 )
 
 FACE_SCORE = 0.3  # heads from behind score up to 0.2, profiles from 0.33 on
-SEARCH = 0.08  # smallest windows searched for the face, as a share of the longer side
 SIDE = 512  # pixels of the pictures in which faces are searched
 PIXEL_M = 0.0015  # size on the head of a pixel of the pictures that GrabCut sees
 SURE, LIKELY, HAIR = 0.7, 1.3, 1.6  # skull sizes: no wall inside the first, no hair past the last
-LEAST_POINTS = 12  # fewest landmarks, agreed between cameras, that place a head
 LEAST_DEPTH = 0.05  # metres in front of the camera
 HOLE_M2 = 1.5e-3  # larger gaps show the background
 CUTS = 6  # GrabCut's iterations
@@ -161,27 +158,18 @@ def cut_out(views: Sequence[CutView], ball: Ball | None) -> dict[str, Cut]:
 def _place_head(views: Sequence[CutView]) -> HeadPlace:
     """Place the mean head by all faces that are found, or by the best one."""
     # Imported here, because cameras with plates need no network and torch takes seconds to import.
-    from express50.landmarks.detector import detect_many
+    from express50.landmarks.detector import SMALL, detect_many
     from express50.landmarks.network import load_network
-    from pipelines.calibrate.footage_rig import INNER, mean_landmarks, pose_of_face
-    from pipelines.track.observe import LandmarkView, robust_triangulate
+    from pipelines.track.observe import LandmarkView, place_head
 
-    faces = detect_many(load_network(), [view.rgb for view in views], smallest=SEARCH)
-    head = mean_landmarks()
-    found = [
-        (LandmarkView(view.name, view.camera, face.points, face.sigma, face.score), face)
+    faces = detect_many(load_network(), [view.rgb for view in views], smallest=SMALL)
+    place = place_head([
+        LandmarkView(view.name, view.camera, face.points, face.sigma, face.score)
         for view, face in zip(views, faces, strict=True)
         if face.score >= FACE_SCORE
-    ]
-    points, _ = robust_triangulate([view for view, _ in found])
-    known = np.isfinite(points[INNER]).all(1)
-    if known.sum() >= LEAST_POINTS:
-        return HeadPlace(*similarity_fit(head[INNER][known], points[INNER][known]))
-    for view, face in sorted(found, key=lambda one: -one[1].score):
-        pose, error = pose_of_face(face.points, face.sigma, view.camera, head)
-        if np.isfinite(error):
-            world = np.linalg.inv(view.camera.cam_from_world) @ pose
-            return HeadPlace(1.0, world[:3, :3], world[:3, 3])
+    ])  # fmt: skip
+    if place is not None:
+        return HeadPlace(*place)
     best = max((face.score for face in faces), default=0.0)
     raise NoFaceError(
         f"no face found (score {best:.2f}, expected {FACE_SCORE} or more), and without plates the"

@@ -14,7 +14,7 @@ from express50.errors import ConfigError
 from express50.files.text import ID
 
 STAGES = ("ingest", "calibrate", "observe", "align", "frames", "matte", "track")
-SEARCH = 0.08  # people fill a rig's pictures, but not all photographs
+SEARCH = 0.08  # as `express50.landmarks.detector.SMALL`, which takes seconds to import
 PHOTO_SETTINGS = (
     "observe.min_score=0.2", f"track.search={SEARCH}", f"observe.search={SEARCH}",
     "matte.method=grabcut",

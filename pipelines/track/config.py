@@ -8,7 +8,7 @@ from typing import Literal
 
 from express50.contract.config import check_ranges
 
-VERSION = 22
+VERSION = 23
 UV_WEIGHTS = Path(__file__).with_name("face_uv_weights.npz")
 
 
@@ -31,8 +31,9 @@ class TrackConfig:
     """How many cameras' landmarks are used at the peaks, the best views of the face; 0: all.
     Clips use all."""
     search: float = 0.25
-    """Smallest window searched for a face, as a share of the image's longer side. A face is found
-    in windows of up to three times its width."""
+    """Smallest window searched for a face, as a share of the image's longer side; at most 0.08 if
+    fewer than two cameras then show one. A face is found in windows of up to three times its
+    width."""
     photo_side: int = 512
     """Longer side of the head crops that patches are compared in, pixels."""
     samples: int = 4000

@@ -8,7 +8,9 @@ from itertools import combinations
 import numpy as np
 
 from express50.geometry.cameras import Camera, project_pinhole, project_with_slope, triangulate
+from express50.geometry.transforms import similarity_fit
 from express50.landmarks.irises import Irises
+from pipelines.calibrate.footage_rig import INNER, mean_landmarks, pose_of_face
 
 PAIR_LIMIT = 120
 LANDMARK_FLOOR_PX = 1.0  # least error assumed of a landmark, for a face 128 px tall
@@ -18,6 +20,7 @@ INLIER_SIGMA = 3.5
 MIN_SHARE = 0.4  # of its known landmarks that must agree for a view to stay
 # Largest standard deviation, as a share of the face, so that vague landmarks can disagree too.
 SIGMA_SHARE_LIMIT = 0.04
+LEAST_POINTS = 12  # landmarks on which cameras agree, to place a head by
 # Cameras whose lines of sight to the face differ by less than about this angle see the same.
 SAME_DIRECTION = np.radians(2.0)
 
@@ -133,6 +136,24 @@ def robust_triangulate(views: list[LandmarkView]) -> tuple[np.ndarray, np.ndarra
     weights = np.stack([1.0 / (view.redundancy * view.sigma**2) for view in views])
     points = triangulate([view.camera for view in views], pixels, weights * inliers)
     return points, inliers
+
+
+def place_head(views: list[LandmarkView]) -> tuple[float, np.ndarray, np.ndarray] | None:
+    """Place the mean head by all views of a face, or by the best one; None if that fails.
+
+    Returns:
+        scale, rotation (3, 3) and shift (3,): world = scale * rotation @ head + shift.
+    """
+    points, _ = robust_triangulate(views)
+    head, known = mean_landmarks(), np.isfinite(points[INNER]).all(1)
+    if known.sum() >= LEAST_POINTS:
+        return similarity_fit(head[INNER][known], points[INNER][known])
+    for view in sorted(views, key=lambda view: -view.score):
+        pose, error = pose_of_face(view.points, view.sigma, view.camera, head)
+        if np.isfinite(error):
+            world = np.linalg.inv(view.camera.cam_from_world) @ pose
+            return 1.0, world[:3, :3], world[:3, 3]
+    return None
 
 
 def point_covariance(

@@ -21,12 +21,13 @@ from express50.errors import CaptureError
 from express50.files.images import read_alpha
 from express50.geometry.cameras import Camera, project_pinhole
 from express50.landmarks import EMBEDDED
-from express50.landmarks.detector import follow, window_about
+from express50.landmarks.detector import SMALL, Detection, detect_at, follow, window_about
 from express50.landmarks.irises import find_irises
-from express50.landmarks.network import face_box, load_network
+from express50.landmarks.network import LandmarkNet, face_box, load_network
 from express50.landmarks.sources import Marked, Source, open_source
+from pipelines.calibrate.footage_rig import mean_landmarks
 from pipelines.track.eyes_and_jaw import shut_lids
-from pipelines.track.observe import LandmarkView, Observation, agree
+from pipelines.track.observe import LandmarkView, Observation, agree, place_head
 from pipelines.track.outline import signed_distance
 from pipelines.track.surface import CutCrops, FrameSetCrops, cut_crop, root_light
 
@@ -55,37 +56,45 @@ def open_landmarks(dataset: Dataset, subject: str, landmarks: str, search: float
     return open_source(landmarks, recorded, DETECTOR_PASSES, search, seen)
 
 
-def open_follower(landmarks: str) -> Follow | None:
-    """Return the function that follows a face through a clip; None for sources that have none."""
+def open_follower(
+    landmarks: str, look_at: Callable[[LandmarkNet, np.ndarray, np.ndarray], Detection] = follow
+) -> Follow | None:
+    """Return the function that follows a face through a clip; None for sources that have none.
+
+    `look_at` is `follow`, or `detect_at`, which takes longer and scores as `detect` does.
+    """
     if landmarks != EMBEDDED:
         return None
     net = load_network()
 
     def look(image: np.ndarray, expected: np.ndarray) -> Marked:
         window = window_about(expected)
-        face = follow(net, image, window)
+        face = look_at(net, image, window)
         middle, side = face_box(face.points)
         if np.linalg.norm(middle - face_box(expected)[0]) > MOVED_SHARE * side:
-            face = follow(net, image, window_about(face.points))
+            face = look_at(net, image, window_about(face.points))
         return Marked(face, find_irises(image, face), visible_contour=False)
 
     return look
 
 
 def observe_peaks(
-    dataset: Dataset, subject: str, source: Source, neutral: str, most: int
+    dataset: Dataset, subject: str, landmarks: str, search: float, neutral: str, most: int
 ) -> tuple[list[Observation], list[Note]]:
     """Detect landmarks at every peak, reject outlying views and find shut eyes.
 
     With `most` above 0 only so many cameras are used: those that see the neutral frame best.
     """
+    follow = open_follower(landmarks, detect_at)
+    searches = (search, SMALL) if search > SMALL and follow else (search,)
+    sources = [open_landmarks(dataset, subject, landmarks, smallest) for smallest in searches]
     dropped: list[Note] = []
     peaks, cameras = read_peaks(dataset, subject), read_cameras_of(dataset, subject)
     found = {}
     for expression in sorted(peaks, key=lambda name: name != neutral):
         read = partial(read_peak_frame, dataset, subject, expression)
         try:
-            views = face_views(read, cameras, peaks[expression], source)
+            views = all_face_views(read, cameras, peaks[expression], sources, follow)
         except CaptureError as error:
             dropped.append(Note(expression, str(error)))
             continue
@@ -236,6 +245,42 @@ def face_views(
     if missing and len(missing) == len(cameras):
         raise missing[0]
     return views
+
+
+def all_face_views(
+    read: Read, cameras: dict[str, Camera], frame: int, sources: Sequence[Source],
+    follow: Follow | None,
+) -> list[LandmarkView]:  # fmt: skip
+    """Return `face_views` by the first of `sources`, and of cameras in which it sees no face.
+
+    The next one searches there if fewer than two cameras show a face. At last the rig says where
+    the face must be: so it is found where it is small or lies on its side.
+
+    Raises:
+        CaptureError: no camera's footage has the frame.
+    """
+    views: dict[str, LandmarkView] = {}
+    for source in sources:
+        if len(views) < min(2, len(cameras)):
+            rest = {name: cameras[name] for name in cameras if name not in views}
+            try:
+                seen = face_views(read, rest, frame, source)
+            except CaptureError:
+                if not views:
+                    raise
+                break  # none of the rest has the frame
+            views |= {view.camera_id: view for view in seen}
+    place = place_head(list(views.values()))
+    if follow is not None and place is not None:
+        scale, rotation, shift = place
+        expected = scale * mean_landmarks() @ rotation.T + shift
+        rest = {name: cameras[name] for name in cameras if name not in views}
+        for name in _ahead(rest, expected):
+            with suppress(CaptureError):  # this camera's footage lacks the frame
+                face = follow(read(name), project_pinhole(cameras[name], expected)[0])
+                if face.face.score >= MIN_SCORE:
+                    views[name] = _landmark_view(cameras[name], face)
+    return [views[name] for name in cameras if name in views]
 
 
 def peak_pictures(

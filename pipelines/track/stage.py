@@ -20,6 +20,7 @@ from express50.contract.stage import Note, Result
 from express50.error_model import Bounds, error_bounds, error_models, expect, single_camera_sigma
 from express50.errors import StageError
 from express50.files.digests import path_digest, value_digest
+from express50.geometry.cameras import Camera
 from express50.head.load import load_head
 from express50.head.model import landmarks
 from pipelines.track.appearance import write_texture
@@ -84,7 +85,9 @@ def run(
     along = round(ALONG_SHARE * config.offset_modes) if config.uv_rounds else 0
     basis = _basis(config.head, config.offset_modes, along)
     source = open_landmarks(dataset, item, config.landmarks, config.search)
-    peaks, dropped = observe_peaks(dataset, item, source, config.neutral, config.cameras)
+    peaks, dropped = observe_peaks(
+        dataset, item, config.landmarks, config.search, config.neutral, config.cameras
+    )
     targets, state, lost = fit_landmarks(basis, peaks, config.neutral)
     dropped += lost
     if not targets:
@@ -129,7 +132,20 @@ def run(
     )
     typical = np.concatenate([one.typical for one in bounds])
     expected = expect(error_models()["track"], typical, shared)
-    return Result(metrics, dropped, expected_error=expected)
+    return Result(metrics, dropped, lone_views(peaks, read_cameras_of(dataset, item)), expected)
+
+
+def lone_views(peaks: Sequence[Observation], cameras: Mapping[str, Camera]) -> list[Note]:
+    """Warn of peaks whose face is seen by one of several cameras."""
+    why = (
+        "of {} cameras only {} shows the face: its shape and place along that camera's axis are"
+        " guesses; choose a peak in which more cameras see the face, or check the calibration"
+    )
+    return [
+        Note(peak.expression, why.format(len(cameras), peak.views[0].camera_id))
+        for peak in peaks
+        if len(peak.views) == 1 < len(cameras)
+    ]
 
 
 def clips_identity(

@@ -80,10 +80,17 @@ def test_frames_are_tried_until_one_shows_a_face():
     index = SimpleNamespace(subject="S001", cameras={"a": None, "b": None})
     tries = frames_to_try(np.array([0, 3, 6]), np.arange(0, 71, 10))
     assert tries[:3] == [3, 0, 6] and len(set(tries)) == len(tries)
-    frame, cameras = choose_cameras(index, lambda camera, frame: scores.get(frame, 0), tries, 0.3)
-    assert frame == 40 and cameras == ["a", "b"]
+    asked: list[float] = []
+
+    def score(camera: str, frame: int, smallest: float) -> float:
+        asked.append(smallest)
+        return scores.get(frame, 0.0) if smallest < 0.1 or frame != 40 else 0.2
+
+    assert choose_cameras(index, score, (0.25, 0.08), tries, 0.3) == (0.08, 40, ["a", "b"])
+    # Small windows take long, so they are searched last.
+    assert asked[: 2 * len(tries)] == [0.25] * 2 * len(tries)
     with pytest.raises(StageError, match=r"0, 3, 6 .*0\.10"):
-        choose_cameras(index, lambda camera, frame: scores.get(frame, 0), tries[:3], 0.3)
+        choose_cameras(index, score, (0.25, 0.08), tries[:3], 0.3)
 
 
 def test_windows_of_one_frame_and_windows_that_overlap():

@@ -69,6 +69,12 @@ def test_a_lens_that_folds_leaves_black_and_says_so(dataset):
     assert not written[0, 0].any() and written[written.shape[0] // 2].any()
 
 
+def test_a_corner_beyond_the_lens_that_hides_nobody_is_no_warning(dataset, monkeypatch):
+    monkeypatch.setattr("pipelines.frames.stage.pictured_share", lambda camera: 0.9995)
+    summary = run(dataset, image_side=64)
+    assert summary.ok and metrics_of(dataset, "S001/neutral").get("warnings", []) == []
+
+
 def test_written_frames_are_the_undistorted_footage(dataset):
     peaks = read_peaks(dataset, "S001")
     rig = frames_module.read_cameras_of(dataset, "S001", undistorted=False)
