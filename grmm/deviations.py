@@ -116,7 +116,7 @@ REASONS: dict[str, tuple[str, str]] = {
         "where the footage gives no evidence, the decoded mesh drifts off the tracked surface",
         "displacement 1.36 and 2.02 mm become 0.07 and 0.08; +0.12 and +0.21 dB, at ten times the"
         " weight +0.14 and +0.17 (700 steps, two seeds); on people with motions of their own +0.69"
-        " (200 steps)",
+        " (200 steps); in stage 2 of a fit from one view +1.2, from two +0.1 (two seeds)",
     ),
     "fit.texture_warm_start": (
         "the given pictures show most texels' colours",

@@ -1,8 +1,9 @@
 """Fit an unseen person by inverse rendering, in the paper's two stages.
 
 Stage 1 inverts the codes with all networks fixed, starting from the mean code. Stage 2 fixes the
-codes and fine-tunes the decoders, held near the pretrained model by the locality loss. G22 lists
-what the paper leaves open: iterations, rates, cameras of the locality loss.
+codes and fine-tunes the decoders, held near the pretrained model by the locality loss, and the mesh
+near the tracked one where training held it there. G22 lists what the paper leaves open: iterations,
+rates, cameras of the locality loss.
 """
 
 from __future__ import annotations
@@ -201,7 +202,7 @@ def tune_decoders(state: FitState, until: float = math.inf) -> int:
         rendering = state.model.render(
             state.z_id, z_exp, item.state, item.view, state.views.background, shade
         )
-        loss = _footage_loss(state, rendering, item)
+        loss = _footage_loss(state, rendering, item) + _mesh_loss(state, rendering)
         if settings.locality and number % settings.locality_every == 0:
             weight = settings.locality * settings.locality_every
             loss = loss + weight * locality_loss(state, item, rng)
@@ -279,6 +280,12 @@ def reconstruction(state: FitState, *pairs: tuple[Tensor, Tensor]) -> Tensor:
 def _footage_loss(state: FitState, rendering: Rendering, item: Item) -> Tensor:
     images = (rendering.rgb, rendering.image)
     return reconstruction(state, *((item.comparable(image), item.target) for image in images))
+
+
+def _mesh_loss(state: FitState, rendering: Rendering) -> Tensor:
+    """Weigh how far the mesh lies from the tracked one; few views do not say where it should be."""
+    moved = losses.displacement_mm2(rendering.gaussians.displacement)
+    return state.config.loss.displacement * moved
 
 
 def locality_loss(state: FitState, item: Item, rng: np.random.Generator) -> Tensor:

@@ -67,6 +67,19 @@ def test_stage_two_changes_decoders_only(loaded, views):
     assert all(torch.equal(v, before[k]) for k, v in loaded.model.state_dict().items())
 
 
+@pytest.mark.parametrize(("weight", "moves"), [(0.0, True), (100.0, False)])
+def test_stage_two_keeps_the_mesh_where_training_does(loaded, views, weight, moves):
+    objective = replace(loaded.config.loss, displacement=weight)
+    settings = replace(loaded.config.fit, stage2_iterations=30, stage2_lr=1e-2)
+    loaded = replace(loaded, config=replace(loaded.config, loss=objective, fit=settings))
+    state = start(loaded, views, unseen(views))
+    tune_decoders(state)
+    item = views.item(state.given[0])
+    z_exp = state.z_exp[item.key.expression]
+    moved = state.model.geometry(state.z_id, z_exp, item.state).displacement
+    assert (float(moved.norm(dim=1).max()) > 5e-4) == moves
+
+
 def test_locality_loss_is_zero_until_the_model_is_tuned(loaded, views):
     state = start(loaded, views, unseen(views))
     item = views.item(state.given[0])
