@@ -206,9 +206,7 @@ def _refine(
     loss_scale, timing = limit / 3, dict[str, CameraTiming]()
     for number in range(rounds):
         keep = _held(np.linalg.norm(errors, axis=1) < limit, corners)
-        rig = _drop_cameras(rig, corners, keep, dropped)
-        _require(rig.cameras, dropped)
-        keep &= np.array([name in rig.cameras for name in corners.cameras])[corners.camera]
+        rig, keep = _drop_cameras(rig, corners, keep, dropped)
         if number:
             timing = estimate_timing(rig, seen, keep, points, loss_scale, timing)
             corners = in_step(seen, timing, {n: c.height for n, c in rig.cameras.items()})
@@ -222,6 +220,8 @@ def _refine(
         limit, loss_scale = max(REJECT_SIGMA * sigma, 0.05), 2 * sigma
     # Corners that only the last adjustment shows to be wrong are not reported as accepted.
     keep &= np.linalg.norm(errors, axis=1) < 2 * limit
+    rig, keep = _drop_cameras(rig, corners, keep, dropped)
+    timing = {name: found for name, found in timing.items() if name in rig.cameras}
     return rig, corners.select(keep), errors[keep], timing
 
 
@@ -279,8 +279,8 @@ def _simplest_models(
 
 def _drop_cameras(
     rig: BoardRig, corners: BoardCorners, keep: np.ndarray, dropped: dict[str, str]
-) -> BoardRig:
-    """Drop cameras that the corners left by rejection do not determine."""
+) -> tuple[BoardRig, np.ndarray]:
+    """Drop cameras that the corners left by rejection do not determine, with these corners."""
     cameras = {}
     for index, name in enumerate(corners.cameras):
         if name not in rig.cameras:
@@ -295,7 +295,9 @@ def _drop_cameras(
             )
         else:
             cameras[name] = rig.cameras[name]
-    return BoardRig(cameras, rig.boards)
+    _require(cameras, dropped)
+    held = np.array([name in cameras for name in corners.cameras])
+    return BoardRig(cameras, rig.boards), keep & held[corners.camera]
 
 
 def _weak(rig: BoardRig, found: BoardCorners, kept: BoardCorners) -> dict[str, str]:

@@ -166,6 +166,17 @@ def test_a_camera_out_of_step_is_named() -> None:
     assert rig_errors(solution.cameras, rig)[0] < 0.1
 
 
+def test_a_camera_is_dropped_if_the_last_rejection_leaves_it_too_few_corners() -> None:
+    rig, rng = make_rig(4), np.random.default_rng(4)
+    corners = observe(rig, board_motion(14, 4), 0.1, 4)
+    ways = np.exp(1j * rng.uniform(0, 2 * np.pi, 14)).view(float).reshape(-1, 2)
+    away = 13.0 * ways[np.searchsorted(np.unique(corners.frame), corners.frame)]
+    pixels = corners.pixels + np.where(corners.camera[:, None] == 3, away, 0.0)
+    solution = solve_rig(replace(corners, pixels=pixels), POINTS, sizes_of(rig), rounds=2)
+    assert sorted(solution.dropped) == ["cam03"] and "cam03" not in solution.cameras
+    assert (solution.corners.camera != 3).all()
+
+
 def test_a_camera_that_sees_no_board_is_dropped_and_the_rest_goes_on() -> None:
     rig = make_rig(4)
     observations = observe(rig, board_motion(20, 8), 0.1)
