@@ -51,6 +51,28 @@ def evaluate_unseen(
     Raises:
         ConfigError: the shards hold no such views, or nothing is left to measure.
     """
+    given, own = unseen_views(loaded, views, subject, protocol, among)
+    state = start(loaded, views, given)
+    _, effort = run_stages(state, lambda: {})
+    rows = []
+    for kind, fitted in ((NOVEL_VIEW, True), (NOVEL_EXPRESSION, False)):
+        chosen = [i for i in own if (views.keys[i].expression in state.z_exp) == fitted]
+        chosen = spread(chosen, protocol.images or len(chosen))
+        rows += evaluate(
+            views, chosen, fitted_render(state), judge, lambda key, kind=kind: kind, keep
+        )
+    cameras = sorted({views.keys[i].camera for i in given})
+    return rows, {"subject": subject, "cameras": cameras} | effort
+
+
+def unseen_views(
+    loaded: Loaded,
+    views: HeadViews,
+    subject: str,
+    protocol: FitProtocol,
+    among: Sequence[int] | None = None,
+) -> tuple[list[int], list[int]]:
+    """Choose a person's views to fit from and to measure; see `evaluate_unseen`."""
     given = given_views(views, subject, protocol)
     cameras = {views.keys[i].camera for i in given}
     known = {*(views.keys[i].expression for i in given), *loaded.model.expressions}
@@ -66,16 +88,7 @@ def evaluate_unseen(
             f"{subject}: no view is left to measure: cameras {', '.join(sorted(cameras))} are "
             f"used for the fit, and only expressions {', '.join(sorted(known))} can be drawn"
         )
-    state = start(loaded, views, given)
-    _, effort = run_stages(state, lambda: {})
-    rows = []
-    for kind, fitted in ((NOVEL_VIEW, True), (NOVEL_EXPRESSION, False)):
-        chosen = [i for i in own if (views.keys[i].expression in state.z_exp) == fitted]
-        chosen = spread(chosen, protocol.images or len(chosen))
-        rows += evaluate(
-            views, chosen, fitted_render(state), judge, lambda key, kind=kind: kind, keep
-        )
-    return rows, {"subject": subject, "cameras": sorted(cameras)} | effort
+    return given, own
 
 
 def given_views(views: HeadViews, subject: str, protocol: FitProtocol) -> list[int]:

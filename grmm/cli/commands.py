@@ -218,7 +218,7 @@ def evaluate(args: argparse.Namespace) -> int:
     """Measure a checkpoint on people it has codes for, and on people fitted first."""
     from grmm.data import spread
     from grmm.evaluate import SEEN, evaluate, kind_of, save_pictures, training_render
-    from grmm.identity_evaluation import evaluate_unseen
+    from grmm.identity_evaluation import evaluate_unseen, unseen_views
     from grmm.metrics import PerceptualMetrics
     from grmm.shard_source import ShardSource
 
@@ -239,9 +239,11 @@ def evaluate(args: argparse.Namespace) -> int:
             f"{args.shards}: training saw every chosen sample; drop --heldout, or train with "
             "--holdout-cameras"
         )
+    protocol = _protocol(args)
+    for subject, chosen in unseen.items():  # before anybody is fitted for nothing
+        unseen_views(loaded, views, subject, protocol, chosen)
     render = training_render(loaded.model, views)
     rows = evaluate(views, known, render, judge, kind, keep)
-    protocol = _protocol(args)
     for subject, chosen in unseen.items():
         found, effort = evaluate_unseen(loaded, views, subject, protocol, judge, keep, chosen)
         log(f"{subject}: fitted from {', '.join(effort['cameras'])} in {effort['seconds']} s")

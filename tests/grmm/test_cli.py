@@ -325,3 +325,13 @@ def test_options_that_would_do_nothing_are_refused(
     assert main([text.format(checkpoint, shards) for text in arguments]) == 2
     assert "goes with" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_nobody_is_fitted_if_somebody_lacks_the_views(checkpoint, tmp_path, monkeypatch, capsys):
+    source = EllipsoidSource(subjects=4, size=32)
+    source.keys = [key for key in source.keys if (key.subject, key.expression) != ("S003", "e0")]
+    root = write_shards(tmp_path / "shards", source, ("S002", "S003"))
+    monkeypatch.setattr("grmm.identity_evaluation.run_stages", lambda *unused: pytest.fail("fits"))
+    evaluate = ["evaluate", str(checkpoint), str(root), str(tmp_path / "out")]
+    assert main([*evaluate, "--fit-cameras=cam00", "--fit-expression=e0"]) == 2
+    assert "S003" in capsys.readouterr().err
