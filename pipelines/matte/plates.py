@@ -42,6 +42,7 @@ ALIGN_SIDE = 1024  # pixels of the pictures that are aligned
 ROUNDS = 3  # of solving, since a pixel's covariance depends on its alpha; 0.01 off after two
 OCTAVES = 4  # of distance, in which colours are searched
 TINT = 0.1  # spread in colour, as a share of that in brightness
+SAMPLES = 1e5  # pixels from which exposure and noise are measured
 CHUNK = 1 << 18  # pixels solved at once, to bound memory
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _MATRIX = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
@@ -68,7 +69,7 @@ def exposure_gain(frame: np.ndarray, plate: np.ndarray) -> np.ndarray:
     frame. A large gain is accepted only if there is no peak at small ones.
     """
     gains = np.ones(3)
-    step = max(1, round(np.sqrt(frame.shape[0] * frame.shape[1] / 5e5)))
+    step = max(1, round(np.sqrt(frame.shape[0] * frame.shape[1] / SAMPLES)))
     for channel in range(3):
         a, b = frame[::step, ::step, channel], plate[::step, ::step, channel]
         use = (b > 30) & (b < 240) & (a > 8) & (a < 250)
@@ -139,7 +140,7 @@ def _explained(plate: np.ndarray, frame: np.ndarray, rim: np.ndarray) -> float:
     if not rim.any():  # nothing speaks against the plate
         return 1.0
     off = frame.astype(np.float32) - exposed(plate, exposure_gain(frame, plate))
-    return float((np.abs(cv2.blur(off, (3, 3))).max(2)[rim] < ODD_STEPS).mean())
+    return float((_largest(cv2.blur(off, (3, 3))[rim]) < ODD_STEPS).mean())
 
 
 def _aligned(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> np.ndarray:
@@ -209,10 +210,10 @@ def fit_plate(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> PlateM
     shown = exposed(plate, exposure_gain(frame, plate))
     # The gradient, eighths of an 8-bit step per pixel.
     slopes = [cv2.Sobel(plate, cv2.CV_16S, x, 1 - x) for x in (1, 0)]
-    step = max(1, round(np.sqrt(valid.size / 4e5)))
+    step = max(1, round(np.sqrt(valid.size / SAMPLES)))
     window = np.s_[step // 2 :: step, step // 2 :: step]
     error = (frame[window].astype(np.float32) - shown[window])[valid[window]]
-    quiet = np.abs(error).max(axis=1) < MOST_NOISE
+    quiet = _largest(error) < MOST_NOISE
     if quiet.sum() < max(LEAST_PLATE * len(error), 100):
         return PlateModel(shown, np.full_like(shown, NOISE_FLOOR), np.eye(3, dtype=np.float32))
     error, level, x, y = (
@@ -227,12 +228,17 @@ def fit_plate(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> PlateM
         cv2.accumulateSquare(slope * np.float32(share / 8), sigma)
     sigma = cv2.sqrt(sigma)
     scaled = error / np.sqrt(by_level**2 + (share * contrast) ** 2)
-    inside = scaled[np.abs(scaled).max(axis=1) < 4.0]
+    inside = scaled[_largest(scaled) < 4.0]
     covariance = inside.T @ inside / max(len(inside), 1)
     # A tenth of independent noise, so that no direction that happens to be quiet dominates.
     values, vectors = np.linalg.eigh(covariance + 0.1 * np.eye(3))
     whiten = (vectors / np.sqrt(np.maximum(values, 0.1))) @ vectors.T
     return PlateModel(shown, sigma, whiten.astype(np.float32))
+
+
+def _largest(error: np.ndarray) -> np.ndarray:
+    """Return the largest size (N,) in each row of errors (N, 3), which `max` takes long for."""
+    return np.maximum.reduce([np.abs(channel) for channel in error.T])
 
 
 def _noise_table(error: np.ndarray, level: np.ndarray) -> np.ndarray:

@@ -239,8 +239,7 @@ def corrected(
 
 def _excess(more: np.ndarray, less: np.ndarray) -> float:
     """Return the share of the image's opacity by which one alpha (H, W) uint8 exceeds another."""
-    excess = np.maximum(more.astype(np.int64) - less, 0).sum()
-    return round(float(excess) / 255 / more.size, 6)
+    return round(float(cv2.subtract(more, less).sum()) / 255 / more.size, 6)
 
 
 def border_contact(alpha: np.ndarray) -> dict[str, float]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from express50.errors import StageError
@@ -46,11 +47,11 @@ def head_crop(camera: Camera, vertices: np.ndarray, alpha: np.ndarray) -> Crop:
     if len(pixels) < 0.5 * len(vertices):
         raise StageError("the tracked head lies behind the camera")
     low, high = pixels.min(0), pixels.max(0)
-    y, x = np.nonzero(alpha > 127)
-    if not len(x):
+    x, y, width, height = cv2.boundingRect((alpha > 127).astype(np.uint8))
+    if not width:
         raise StageError("its matte is empty")
     reach = HAIR * (high - low)
-    matte = np.array([[x.min(), y.min()], [x.max() + 1, y.max() + 1]], np.float64)
+    matte = np.array([[x, y], [x + width, y + height]], np.float64)
     low = np.minimum(low, np.maximum(low - reach, matte[0]))
     high = np.maximum(high, np.minimum(high + reach, matte[1]))
     if (high <= 0).any() or (low >= (camera.width, camera.height)).any():
