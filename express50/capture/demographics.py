@@ -32,7 +32,7 @@ def shown_counts(counts: Mapping[str, int]) -> dict[str, int]:
     """Keep counts of at least LEAST_PEOPLE; count smaller groups under OTHERS.
 
     The smallest groups join OTHERS until it is large enough too, since a single small group could
-    be inferred from the total. Empty if there are too few people, or only one group.
+    be inferred from the total. Empty if no group is large enough.
     """
     left = sorted((n, name) for name, n in counts.items() if name != "not given")
     others = counts.get("not given", 0)
