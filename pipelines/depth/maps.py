@@ -22,7 +22,7 @@ from express50.geometry.raycast import barycentrics, camera_rays, join_rays, mes
 from express50.geometry.sampling import bilinear, edge_width
 from pipelines.depth.prior import TrackedSolid
 from pipelines.depth.surface import HeadSurface
-from pipelines.depth.views import INSIDE, project_fast, reduced
+from pipelines.depth.views import INSIDE, in_picture, project_fast, reduced
 
 SURE_MM = 2.0  # bound at which confidence is a half
 COMPARED_SIDE = 512  # longest side, pixels, at which views are compared through the depth
@@ -352,8 +352,7 @@ def photo_errors(views: Sequence[ComparedView]) -> list[PhotoErrors]:
 def _difference(colour: np.ndarray, points: np.ndarray, other: ComparedView) -> np.ndarray:
     """Compare colours (N, 3) with a neighbour's, gains evened: (N,), NaN where hidden."""
     pixels, depth = project_fast(other.camera, points)
-    size = np.array([other.camera.width, other.camera.height])
-    there = (depth > 0) & ((pixels >= 1) & (pixels <= size - 1)).all(1)
+    there = in_picture(other.camera, pixels, depth, inset=1)
     column, row = np.floor(pixels[there]).astype(int).T
     hidden = depth[there] - other.depth[row, column] > HIDDEN_M
     there[there] = other.plain[row, column] & ~hidden

