@@ -11,13 +11,7 @@ from functools import partial
 import jinja2
 import numpy as np
 
-from annotations.labels import (
-    Label,
-    current_labels,
-    origin,
-    read_labels,
-    shows_labelled_frame,
-)
+from annotations.labels import Label, current_labels, origin, read_labels, shows_labelled_frame
 from annotations.suggestions import Suggested, read_suggestions, reference_subject
 from annotations.ui.frames import FaceFinder, crop_to, zoom_box
 from annotations.validate import disagreements

@@ -7,14 +7,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from statistics import median
 
-from annotations.labels import (
-    Label,
-    current_labels,
-    is_person,
-    labels_of,
-    origin,
-    read_labels,
-)
+from annotations.labels import Label, current_labels, is_person, labels_of, origin, read_labels
 from annotations.suggestions import read_suggestions, reference_subject
 from express50.capture.demographics import age_counts, gender_counts, shown_counts
 from express50.capture.index import read_index

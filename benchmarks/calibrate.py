@@ -52,12 +52,7 @@ from express50.twin.config import TwinConfig
 from express50.twin.rig import make_rig, make_sensor
 from express50.twin.truth import Truth, align_worlds
 from pipelines.calibrate import STAGE
-from pipelines.calibrate.board import (
-    BoardCorners,
-    board_from_table,
-    board_points,
-    read_corners,
-)
+from pipelines.calibrate.board import BoardCorners, board_from_table, board_points, read_corners
 from pipelines.calibrate.board_adjust import BoardRig, corner_errors
 from pipelines.calibrate.board_guess import (
     BoardView,
@@ -164,10 +159,7 @@ def gain_figures(palette: WhiteCollector, names: list[str]) -> dict[str, float]:
 
 
 def footage_figures(
-    index: Index,
-    true: Mapping[str, Camera],
-    config: CalibrateConfig,
-    folder: Path,
+    index: Index, true: Mapping[str, Camera], config: CalibrateConfig, folder: Path
 ) -> dict[str, object]:
     """Measure rigs solved from footage alone and perturbed ones refined, the twin's and foreign.
 

@@ -113,9 +113,7 @@ def similar(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> dict
 
 
 def refine_figures(
-    seen: Mapping[int, FrameSetPoints],
-    true: Mapping[str, Camera],
-    judge: RigJudge,
+    seen: Mapping[int, FrameSetPoints], true: Mapping[str, Camera], judge: RigJudge
 ) -> dict[str, object]:
     """Return errors of a perturbed rig before and after, and whether the true one is left as it is.
 
@@ -130,10 +128,7 @@ def refine_figures(
             turn_deg=config.refine_turn_deg, move_mm=config.refine_move_mm, lenses=False,
         )  # fmt: skip
 
-    return {
-        "before": _of(judge(bumped, true)),
-        "footage": _row(by_footage, bumped, true, judge),
-    }
+    return {"before": _of(judge(bumped, true)), "footage": _row(by_footage, bumped, true, judge)}
 
 
 def _row(

@@ -121,14 +121,7 @@ def hurt() -> None:
 hurt()
 
 
-STAGE = Stage(
-    name="faults",
-    version=1,
-    config=FaultConfig,
-    items=items,
-    inputs=inputs,
-    run=run,
-)
+STAGE = Stage(name="faults", version=1, config=FaultConfig, items=items, inputs=inputs, run=run)
 
 
 def main() -> int:

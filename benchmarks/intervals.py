@@ -41,13 +41,7 @@ from benchmarks.intervals_collect import (
     with_tracked,
 )
 from benchmarks.intervals_fit import ause, fit_model
-from benchmarks.intervals_rows import (
-    ALIGN_NOISE,
-    CONDITIONS,
-    make_halves,
-    make_peaks,
-    make_row,
-)
+from benchmarks.intervals_rows import ALIGN_NOISE, CONDITIONS, make_halves, make_peaks, make_row
 from express50.contract.layout import Dataset
 from express50.contract.stage import Unit
 from express50.error_model import FILE, NOMINAL, ErrorModel, error_bounds, error_models, item_error

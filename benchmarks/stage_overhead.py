@@ -44,14 +44,7 @@ def run(dataset: Dataset, item: str, config: EmptyConfig, out: Path) -> Result:
     return Result()
 
 
-STAGE = Stage(
-    name="empty",
-    version=1,
-    config=EmptyConfig,
-    items=items,
-    inputs=inputs,
-    run=run,
-)
+STAGE = Stage(name="empty", version=1, config=EmptyConfig, items=items, inputs=inputs, run=run)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -9,13 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from annotations.align.features import Features, watch
-from annotations.align.suggest import (
-    PLATEAU_SHARE,
-    STILL,
-    Reference,
-    Suggestion,
-    suggest_all,
-)
+from annotations.align.suggest import PLATEAU_SHARE, STILL, Reference, Suggestion, suggest_all
 from annotations.labels import (
     AUTOMATIC,
     Label,

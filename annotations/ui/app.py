@@ -58,11 +58,7 @@ class Desk(Screen[None]):
     ]
 
     def __init__(
-        self,
-        session: Session,
-        cache: FrameCache,
-        faces: FaceFinder | None,
-        sixel_cell: Size | None,
+        self, session: Session, cache: FrameCache, faces: FaceFinder | None, sixel_cell: Size | None
     ) -> None:
         super().__init__()
         self.session = session
@@ -421,11 +417,7 @@ class AnnotateApp(App[None]):
     ENABLE_COMMAND_PALETTE = False
 
     def __init__(
-        self,
-        session: Session,
-        *,
-        faces: FaceFinder | None = None,
-        sixel_cell: Size | None = None,
+        self, session: Session, *, faces: FaceFinder | None = None, sixel_cell: Size | None = None
     ) -> None:
         """Show pictures as sixels where the pixels of a terminal's cell are given."""
         super().__init__()

@@ -174,11 +174,7 @@ def frames_ahead(view: CueView, count: int = AHEAD) -> list[int]:
 
 
 def shots_ahead(
-    scene: TaskScene,
-    view: CueView,
-    aim: Aim,
-    shapes: Sequence[PaneShape],
-    count: int = AHEAD,
+    scene: TaskScene, view: CueView, aim: Aim, shapes: Sequence[PaneShape], count: int = AHEAD
 ) -> list[FrameCrop]:
     """Return pictures to decode for a task, most urgent first; finds the faces on the way.
 

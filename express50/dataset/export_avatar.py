@@ -19,12 +19,7 @@ import cv2
 import numpy as np
 import torch
 
-from express50.capture.frames import (
-    read_cameras_of,
-    read_gains,
-    read_matte,
-    read_peak_frame,
-)
+from express50.capture.frames import read_cameras_of, read_gains, read_matte, read_peak_frame
 from express50.contract.layout import Dataset
 from express50.dataset.export import META, Head, write_head_obj
 from express50.dataset.tracks import Track

@@ -188,10 +188,7 @@ class _Run:
 
 
 def run_within(
-    chain: Chain,
-    budget: Budget | None,
-    goal: Goal | None,
-    ended: Callable[[Stage, Summary], None],
+    chain: Chain, budget: Budget | None, goal: Goal | None, ended: Callable[[Stage, Summary], None]
 ) -> tuple[list[Summary], RunState]:
     """Run the chain within a budget, or to a goal.
 

@@ -44,11 +44,7 @@ DAMAGE = (
 
 
 def read_arrays(
-    path: Path,
-    kind: Kind,
-    what: str,
-    wanted: Collection[str] = (),
-    fix: str = AGAIN,
+    path: Path, kind: Kind, what: str, wanted: Collection[str] = (), fix: str = AGAIN
 ) -> dict[str, np.ndarray]:
     """Read the arrays of an ``.npz`` file by name; refuse arrays of objects.
 

@@ -33,13 +33,7 @@ from express50.runner.publish import (
     stage_lock,
 )
 from express50.runner.replaced import keeping, make_room
-from express50.runner.worker import (
-    Task,
-    failed_receipt,
-    failure_reason,
-    fingerprint,
-    input_digests,
-)
+from express50.runner.worker import Task, failed_receipt, failure_reason, fingerprint, input_digests
 
 WARNINGS = 12  # lines; more of them would hide the account
 ALIKE = 3  # if this many first items fail for the same reason, a setting is wrong

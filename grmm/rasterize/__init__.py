@@ -23,13 +23,7 @@ from grmm.rasterize.projection import (
     rasterize_reference,
 )
 
-__all__ = [
-    "BACKENDS",
-    "NotFiniteTensorError",
-    "RenderOutput",
-    "rasterize",
-    "resolve_backend",
-]
+__all__ = ["BACKENDS", "NotFiniteTensorError", "RenderOutput", "rasterize", "resolve_backend"]
 
 LIMIT = 1e30  # of the size of any value: its square stays finite
 BACKENDS = ("auto", "reference", "cpu", "gsplat")

@@ -53,10 +53,7 @@ class _Camera(ctypes.Structure):
 
 
 def rasterize_cpu(
-    scene: Splats,
-    camera: Pinhole,
-    background: Tensor | None,
-    options: RenderOptions,
+    scene: Splats, camera: Pinhole, background: Tensor | None, options: RenderOptions
 ) -> RenderOutput:
     """Render; see ``grmm.rasterize``."""
     device = scene.means.device

@@ -156,14 +156,10 @@ def _jacobian(points: Tensor, K: Tensor, width: int, height: int) -> Tensor:
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     z = points[:, 2]
     tan_x = _clamp(
-        points[:, 0] / z,
-        -(cx + FOV_MARGIN * width) / fx,
-        (width - cx + FOV_MARGIN * width) / fx,
+        points[:, 0] / z, -(cx + FOV_MARGIN * width) / fx, (width - cx + FOV_MARGIN * width) / fx
     )
     tan_y = _clamp(
-        points[:, 1] / z,
-        -(cy + FOV_MARGIN * height) / fy,
-        (height - cy + FOV_MARGIN * height) / fy,
+        points[:, 1] / z, -(cy + FOV_MARGIN * height) / fy, (height - cy + FOV_MARGIN * height) / fy
     )
     zero = torch.zeros_like(z)
     row_u = torch.stack([fx / z, zero, -fx * tan_x / z], 1)

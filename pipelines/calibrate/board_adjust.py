@@ -45,10 +45,7 @@ def corner_errors(rig: BoardRig, corners: BoardCorners, points: np.ndarray) -> n
 
 
 def adjust_board_rig(
-    rig: BoardRig,
-    corners: BoardCorners,
-    points: np.ndarray,
-    loss_scale_px: float,
+    rig: BoardRig, corners: BoardCorners, points: np.ndarray, loss_scale_px: float
 ) -> BoardRig:
     """Refine the cameras' lenses and poses, and the board's poses, over the corners.
 

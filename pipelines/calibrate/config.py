@@ -62,5 +62,5 @@ class CalibrateConfig:
 
 # More board images and frame sets than standard's take longer and gain nothing (docs/TRADEOFFS.md).
 PRESETS: dict[str, dict[str, object]] = {
-    "draft": {"board_frames": 36, "rounds": 1, "solve_frame_sets": 4, "check_frame_sets": 0},
+    "draft": {"board_frames": 36, "rounds": 1, "solve_frame_sets": 4, "check_frame_sets": 0}
 }

@@ -20,12 +20,7 @@ from express50.geometry.cameras import Camera, pinhole, project, triangulate
 from express50.geometry.transforms import invert_transform, make_transform, rigid_fit
 from express50.rigs.camera_builder import in_metres
 from express50.rigs.world_frame import canonical_from_rig, move_cameras
-from pipelines.calibrate.adjuster import (
-    AdjustedRig,
-    RigPriors,
-    adjust_rig,
-    triangulate_tracks,
-)
+from pipelines.calibrate.adjuster import AdjustedRig, RigPriors, adjust_rig, triangulate_tracks
 from pipelines.calibrate.board_guess import as_model, join_rig, mean_transform
 from pipelines.calibrate.config import AUTO
 from pipelines.calibrate.tracks import (

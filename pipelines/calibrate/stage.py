@@ -37,12 +37,7 @@ from pipelines.calibrate.footage import (
     reduced_camera,
 )
 from pipelines.calibrate.footage_rig import solve_footage, start_camera
-from pipelines.calibrate.given_rig import (
-    FootageCheck,
-    RefinedRig,
-    check_footage,
-    refine_by_footage,
-)
+from pipelines.calibrate.given_rig import FootageCheck, RefinedRig, check_footage, refine_by_footage
 from pipelines.calibrate.timing import CameraTiming
 from pipelines.calibrate.uncertainty import HeadError, state_uncertainty
 

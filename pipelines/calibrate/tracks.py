@@ -241,9 +241,7 @@ def candidate_matches(features: Mapping[int, Mapping[str, Features]]) -> PairMat
 
 
 def mirrored_cameras(
-    seen: Mapping[int, FrameSetPoints],
-    widths: Mapping[str, int],
-    pairs: Iterable[tuple[str, str]],
+    seen: Mapping[int, FrameSetPoints], widths: Mapping[str, int], pairs: Iterable[tuple[str, str]]
 ) -> dict[str, str]:
     """Return which cameras record mirrored pictures, with the reason to believe it.
 

@@ -22,8 +22,7 @@ CLASSES = 28
 _IDS = {"background": (0,), "apparel": (1,), "skin": (2,), "hair": (3,), "lips": (23, 24)}
 _IDS |= {"teeth": (25, 26), "tongue": (27,), "torso": tuple(range(4, 23))}
 LABEL_OF_CLASS = np.array(
-    [LABELS.index(next(name for name in _IDS if k in _IDS[name])) for k in range(CLASSES)],
-    np.uint8,
+    [LABELS.index(next(name for name in _IDS if k in _IDS[name])) for k in range(CLASSES)], np.uint8
 )
 
 

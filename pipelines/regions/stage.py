@@ -350,10 +350,7 @@ def subject_box(labels: np.ndarray) -> tuple[slice, slice]:
         return np.s_[:, :]
     x, y, width, height = cv2.boundingRect(points)
     room = max(width, height) // 20 + 1
-    return (
-        slice(max(0, y - room), y + height + room),
-        slice(max(0, x - room), x + width + room),
-    )
+    return (slice(max(0, y - room), y + height + room), slice(max(0, x - room), x + width + room))
 
 
 def write_picture(out: Path, rows: dict[str, list[np.ndarray]], figures: dict[str, dict]) -> None:

@@ -255,10 +255,7 @@ def split_shape(model: HeadModel, shape: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def offset_modes(
-    model: HeadModel,
-    count: int,
-    sigma: float = OFFSET_SIGMA_M,
-    length: float = OFFSET_LENGTH_M,
+    model: HeadModel, count: int, sigma: float = OFFSET_SIGMA_M, length: float = OFFSET_LENGTH_M
 ) -> np.ndarray:
     """Compute the field's broadest modes (V, count), metres per standard deviation.
 

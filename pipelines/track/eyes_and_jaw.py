@@ -154,11 +154,7 @@ def with_irises_and_jaw(
 
 
 def _iris_term(
-    model: HeadModel,
-    target: Target,
-    mesh: np.ndarray,
-    rotation: np.ndarray,
-    eyes: EyeOffsets,
+    model: HeadModel, target: Target, mesh: np.ndarray, rotation: np.ndarray, eyes: EyeOffsets
 ) -> PixelTerm:
     sightings = []
     for side, vertex in enumerate(eyes.vertices):

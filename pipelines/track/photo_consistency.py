@@ -236,11 +236,7 @@ def _peaks(score: np.ndarray, heights: np.ndarray, pixel: float) -> PatchSearch:
 
 
 def surface_term(
-    found: PatchSearch,
-    samples: MeshPlaces,
-    places: np.ndarray,
-    normals: np.ndarray,
-    weight: float,
+    found: PatchSearch, samples: MeshPlaces, places: np.ndarray, normals: np.ndarray, weight: float
 ) -> NormalTerm | None:
     """Make the term of the samples whose search was conclusive; None if none was."""
     good = np.flatnonzero((found.score > LEAST_SCORE) & (found.sharpness > LEAST_SHARP))

@@ -36,12 +36,7 @@ from pipelines.track.read_inputs import (
     peak_pictures,
     read_clip,
 )
-from pipelines.track.report import (
-    draw_overlays,
-    error_figures,
-    track_metrics,
-    write_sheet,
-)
+from pipelines.track.report import draw_overlays, error_figures, track_metrics, write_sheet
 from pipelines.track.schedule import (
     LANDMARK_STEPS,
     free_modes,

@@ -19,12 +19,7 @@ from express50.capture.raw import (
     read_capture_toml,
     read_meta,
 )
-from express50.capture.readers import (
-    codec_avatars,
-    pictures,
-    renderme,
-    videos,
-)
+from express50.capture.readers import codec_avatars, pictures, renderme, videos
 from express50.capture.readers.selection import Selection, folder_id, parse_selection
 from express50.contract.layout import Dataset, footage_source
 from express50.errors import CalibrationError, CaptureError, Express50Error

@@ -51,11 +51,7 @@ HELD_OUT = 0
 # Steps in which the inverse of a displacement is found.
 TURNS = 6
 # Landmarks that deep creases run along: where lips meet, twice; the upper lids with their lashes.
-CREASES = (
-    ((60, 61, 62, 63, 64), (60, 67, 66, 65, 64)),
-    ((36, 37, 38, 39),),
-    ((42, 43, 44, 45),),
-)
+CREASES = (((60, 61, 62, 63, 64), (60, 67, 66, 65, 64)), ((36, 37, 38, 39),), ((42, 43, 44, 45),))
 # Fractional bits of OpenCV's drawing coordinates.
 FINE = 4
 # Share of the texels about a place whose displacement must be known.
