@@ -22,6 +22,7 @@ import sys
 import time
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -190,7 +191,7 @@ def bump_figures(
 ) -> dict[str, object]:
     """Return whether turned cameras, and no others, are found in the footage."""
     # One expression was recorded; without its cue the instants are spread over all frames.
-    seen = find_points(read_footage(replace(index, cues=()), cameras, frame_sets))
+    seen = find_points(partial(read_footage, replace(index, cues=()), cameras, frame_sets))
     names, rng = sorted(cameras), np.random.default_rng(0)
     quiet = check_footage(cameras, seen)
     accused = {}

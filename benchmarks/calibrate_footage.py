@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,7 @@ RigJudge = Callable[[Mapping[str, Camera], Mapping[str, Camera]], dict[str, floa
 
 def see_capture(root: Path, true: Mapping[str, Camera], count: int) -> dict[int, FrameSetPoints]:
     """Return what the cameras of a raw capture see, in recorded pixels of `reduced_camera`."""
-    return find_points(read_raw_footage(root, true, count))
+    return find_points(partial(read_raw_footage, root, true, count))
 
 
 def small(cameras: Mapping[str, Camera]) -> dict[str, Camera]:

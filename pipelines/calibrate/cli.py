@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -85,7 +86,7 @@ def run_check(args: argparse.Namespace) -> int:
 
         if args.frames < 1:
             raise ConfigError(f"--frames is {args.frames}, expected 1 or more")
-        seen = find_points(read_raw_footage(args.footage, cameras, args.frames))
+        seen = find_points(partial(read_raw_footage, args.footage, cameras, args.frames))
         shown = {name for points in seen.values() for name in points.features}
         footage = check_footage({n: c for n, c in cameras.items() if n in shown}, seen)
     _report(args, cameras, verdict, None, footage)

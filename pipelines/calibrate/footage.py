@@ -8,7 +8,7 @@ read, one at a time, which keeps a rig's full-size images out of memory.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
 import cv2
@@ -24,7 +24,7 @@ from express50.files.images import read_exif
 from express50.files.video import iterate_video
 from express50.geometry.cameras import Camera, resized
 from express50.geometry.conventions import opencv_pixels_to_corner
-from express50.landmarks.detector import detect
+from express50.landmarks.detector import SMALL, Detection, detect
 from express50.landmarks.network import load_network
 from pipelines.calibrate.board import even
 from pipelines.calibrate.config import LONG_SIDE
@@ -114,18 +114,37 @@ def _read_raw(camera: RawCamera, wanted: list[int]) -> Iterator[tuple[int, np.nd
     raise CaptureError(f"{camera.path}: has {length} frames, frame {missing} was expected")
 
 
-def find_points(images: Images) -> dict[int, FrameSetPoints]:
-    """Find landmarks and features, in pixels of the images, by frame number."""
+def find_points(read: Callable[[], Images]) -> dict[int, FrameSetPoints]:
+    """Find landmarks and features, in pixels of the images, by frame number.
+
+    Images are read again, and smaller windows searched, if most frame sets lack a second face.
+    """
     net = load_network()
-    landmarks: dict[int, list[tuple[str, np.ndarray, np.ndarray]]] = {}
+    faces: dict[int, dict[str, Detection]] = {}
     features: dict[int, dict[str, Features]] = {}
-    for frame, name, image in images:
-        face = detect(net, image)
-        sigma = LANDMARK_INFLATION * np.maximum(face.sigma, FEATURE_SIGMA_PX)
-        clear = face.score >= FACE_SCORE
-        landmarks.setdefault(frame, []).extend([(name, face.points, sigma)] if clear else [])
+    for frame, name, image in read():
+        faces.setdefault(frame, {})[name] = detect(net, image)
         features.setdefault(frame, {})[name] = find_features(image)
+    lacking = {frame for frame, seen in faces.items() if len(_clear(seen)) < 2 <= len(seen)}
+    if 2 * len(lacking) > len(faces):
+        for frame, name, image in read():
+            if frame in lacking and faces[frame][name].score < FACE_SCORE:
+                faces[frame][name] = detect(net, image, smallest=SMALL)
+    landmarks = {frame: _landmarks(_clear(seen)) for frame, seen in faces.items()}
     return {f: FrameSetPoints(landmarks[f], without_fixed(features[f])) for f in sorted(features)}
+
+
+def _clear(faces: Mapping[str, Detection]) -> dict[str, Detection]:
+    """Return the cameras that show a face."""
+    return {name: face for name, face in faces.items() if face.score >= FACE_SCORE}
+
+
+def _landmarks(faces: Mapping[str, Detection]) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Return each camera's landmarks and their deviations, which grow as they err together."""
+    sigma = {
+        n: LANDMARK_INFLATION * np.maximum(f.sigma, FEATURE_SIGMA_PX) for n, f in faces.items()
+    }
+    return [(name, face.points, sigma[name]) for name, face in faces.items()]
 
 
 def find_features(image: np.ndarray) -> Features:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -143,7 +144,7 @@ def _given(index: Index, path: Path, has_board: bool, config: CalibrateConfig) -
         # off, and the check cannot find the ones at fault.
         check = _check_footage(index, cameras, max(1, config.check_frame_sets))
         refined = refine_by_footage(
-            cameras, find_points(read_footage(index, cameras, config.solve_frame_sets)),
+            cameras, find_points(partial(read_footage, index, cameras, config.solve_frame_sets)),
             turn_deg=config.refine_turn_deg, move_mm=config.refine_move_mm,
             lenses=config.refine == "all",
             start=check.cameras if check is not None and len(check.moved) == 1 else None,
@@ -266,7 +267,7 @@ def _from_footage(index: Index, config: CalibrateConfig) -> CalibratedRig:
     small = {name: reduced_camera(camera) for name, camera in blank.items()}
     focals = {n: f * small[n].width / blank[n].width for n, f in known_focals(index).items()}
     solved = solve_footage(
-        find_points(read_footage(index, blank, config.solve_frame_sets)),
+        find_points(partial(read_footage, index, blank, config.solve_frame_sets)),
         {name: (camera.width, camera.height) for name, camera in small.items()},
         focals,
         str(index.capture),
@@ -315,7 +316,7 @@ def _check_footage(index: Index, cameras: dict[str, Camera], count: int) -> Foot
     """Search `count` frame sets for moved cameras; None with fewer than three cameras."""
     if count < 1 or len(cameras) < 3:
         return None
-    return check_footage(cameras, find_points(read_footage(index, cameras, count)))
+    return check_footage(cameras, find_points(partial(read_footage, index, cameras, count)))
 
 
 def draw_rig(path: Path, cameras: Mapping[str, Camera], boards: np.ndarray) -> None:

@@ -27,6 +27,7 @@ FEATURE_SIGMA_PX = 0.7
 NEIGHBOURS, WIDEST_DEG = 6, 45.0
 """Features are compared between each camera and this many neighbours, if their axes differ by less
 than the angle: beyond it features no longer look alike."""
+ON_PLANE = 0.005  # of the width: distance from a homography within which a match lies on its plane
 LEAST_MIRRORED = 100  # matches; faces that are their own mirror image give up to 46
 LEAST_POINTS = 20  # that a camera must share with two others to be judged by them
 
@@ -247,22 +248,34 @@ def mirrored_cameras(
 
     In the fullest frame set their features match those of other cameras only if mirrored. `pairs`
     of cameras are compared. Where they stand far apart nothing is found: a face is nearly its own
-    mirror image.
+    mirror image. Matches on one plane prove nothing: the back of a board that is printed on both
+    sides is the front's mirror image.
     """
     frame = max(sorted(seen), key=lambda number: len(seen[number].features))
     features = seen[frame].features
     counts = {name: [0, 0] for name in features}
     for a, b in (pair for pair in pairs if set(pair) <= set(features)):
+        there = features[b]
         for i, mine in enumerate((features[a], mirror_features(features[a], widths[a]))):
-            matches = verified_pairs({frame: (mine, features[b])})
+            found = verified_pairs({frame: (mine, there)}).get(frame, np.zeros((0, 2), int))
+            places = mine[0][found[:, 0]], there[0][found[:, 1]]
+            count = _off_plane(*places, ON_PLANE * widths[b]) if i else len(found)
             for name in (a, b):
-                counts[name][i] += len(matches.get(frame, ()))
+                counts[name][i] += count
     return {
         name: f"{turned} features of its pictures match other cameras if mirrored, {straight} as"
         " recorded: switch mirroring off where they are recorded, or mirror the files"
         for name, (straight, turned) in counts.items()
         if turned > 2 * straight + LEAST_MIRRORED
     }
+
+
+def _off_plane(p: np.ndarray, q: np.ndarray, near: float) -> int:
+    """Count the matches of pixels (M, 2) that are not `near` where one homography has them."""
+    if len(p) < LEAST_INLIERS:
+        return 0
+    H, mask = cv2.findHomography(p, q, cv2.USAC_MAGSAC, near)
+    return len(p) if H is None else int((mask == 0).sum())
 
 
 def mirror_features(features: Features, width: int) -> Features:

@@ -106,7 +106,7 @@ def test_a_board_that_two_cameras_see(boards, tmp_path, capsys) -> None:
     assert "in 0 images, expected at least 4: show it to this camera and a neighbour" in lines[0]
 
 
-def test_onemirror_features_camera_before_a_board(boards, tmp_path, capsys) -> None:
+def test_one_mirrored_camera_before_a_board(boards, tmp_path, capsys) -> None:
     turned = [np.ascontiguousarray(image[:, ::-1]) for image in boards["cam02"]]
     write_boards(tmp_path / "capture", boards | {"cam02": turned})
     lines = [row for row in calibrated(tmp_path, capsys) if "cam02" in row]
@@ -114,7 +114,7 @@ def test_onemirror_features_camera_before_a_board(boards, tmp_path, capsys) -> N
     assert "mirrored; switch that off" in lines[0]
 
 
-def test_onemirror_features_camera_of_a_given_rig(balls, tmp_path, capsys) -> None:
+def test_one_mirrored_camera_of_a_given_rig(balls, tmp_path, capsys) -> None:
     rig, images = balls
     turned = images | {"cam03": np.ascontiguousarray(images["cam03"][:, ::-1])}
     write_capture(tmp_path / "capture", rig, turned)
@@ -123,7 +123,7 @@ def test_onemirror_features_camera_of_a_given_rig(balls, tmp_path, capsys) -> No
     assert line.startswith("  warning S001: cam03: ") and "switch mirroring off" in line
 
 
-def test_onemirror_features_camera_without_any_calibration(monkeypatch) -> None:
+def test_one_mirrored_camera_without_any_calibration(monkeypatch) -> None:
     monkeypatch.setattr("pipelines.calibrate.footage_rig.mean_landmarks", face)
     rig, seen = face_cameras(), {}
     for frame, points in see(rig, features=300).items():

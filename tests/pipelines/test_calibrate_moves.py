@@ -16,6 +16,7 @@ from express50.files.containers import read_picture
 from express50.files.images import write_image
 from express50.geometry.cameras import Camera, project, rays
 from express50.geometry.transforms import look_at
+from express50.landmarks.detector import Detection
 from pipelines.calibrate.adjuster import RigPriors, adjust_rig, move_pose, triangulate_tracks
 from pipelines.calibrate.footage import (
     find_features,
@@ -25,7 +26,13 @@ from pipelines.calibrate.footage import (
     without_fixed,
 )
 from pipelines.calibrate.given_rig import check_footage
-from pipelines.calibrate.tracks import FrameSetPoints, PointTracks, epipolar_distance
+from pipelines.calibrate.tracks import (
+    FrameSetPoints,
+    PointTracks,
+    epipolar_distance,
+    mirror_features,
+    mirrored_cameras,
+)
 
 TURN, SHIFT = np.radians(0.3), 5e-3
 
@@ -200,8 +207,38 @@ def test_freed_poses_return_to_the_truth():
 
 
 def test_blank_images_have_no_landmarks_and_no_features():
-    found = find_points([(3, "cam00", np.zeros((320, 320, 3), np.uint8))])
+    found = find_points(lambda: [(3, "cam00", np.zeros((320, 320, 3), np.uint8))])
     assert found[3].landmarks == [] and found[3].features["cam00"][0].shape == (0, 2)
+
+
+@pytest.mark.parametrize(("scores", "again"), [((0.9, 0.1, 0.1), True), ((0.9, 0.8, 0.1), False)])
+def test_small_faces_are_searched_for_only_if_a_second_one_is_missing(monkeypatch, scores, again):
+    """Scores are of three cameras in windows of the usual size; smaller ones show every face."""
+    tried = []
+
+    def find(net, image, smallest=0.25):
+        camera = int(image[0, 0, 0])
+        tried.append((camera, smallest))
+        score = scores[camera] if smallest == 0.25 else 0.7
+        return Detection(np.ones((68, 2)), np.ones(68), np.ones(68), score)
+
+    monkeypatch.setattr("pipelines.calibrate.footage.detect", find)
+    blank = [(0, f"cam{k}", np.full((32, 32, 3), k, np.uint8)) for k in range(3)]
+    found = find_points(lambda: blank)[0].landmarks
+    assert [name for name, _, _ in found] == [f"cam{k}" for k in range(3)][: 3 if again else 2]
+    assert tried[3:] == ([(1, 0.08), (2, 0.08)] if again else [])
+
+
+@pytest.mark.parametrize("deep", [0.0, 0.2])
+def test_the_back_of_a_board_is_not_a_mirrored_camera(deep):
+    """A board printed on both sides shows its mirror image to the camera behind it."""
+    rng, rig = np.random.default_rng(5), make_rig(2)
+    points = rng.uniform(-0.08, 0.08, (300, 3)) * [1, 1, deep / 0.08]
+    described = np.sqrt(rng.dirichlet(np.ones(128), 300)).astype(np.float32)
+    front, back = ((project(camera, points)[0], described) for camera in rig.values())
+    seen = {0: FrameSetPoints([], {"cam00": front, "cam01": mirror_features(back, 320)})}
+    found = mirrored_cameras(seen, dict.fromkeys(rig, 320), [("cam00", "cam01")])
+    assert set(found) == (set(rig) if deep else set())
 
 
 def write_capture(root, rig, images):

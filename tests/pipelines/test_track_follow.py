@@ -26,6 +26,7 @@ from pipelines.track.read_inputs import (
     open_follower,
 )
 from pipelines.track.sequence import ClipTracker, track_window
+from pipelines.track.stage import lone_views
 from pipelines.track.state import Target, start_state
 from pipelines.track.terms import landmark_anchors
 from tests.express50.landmarks.test_landmarks import on_canvas
@@ -99,6 +100,20 @@ def test_a_face_that_the_search_misses_is_found_where_the_rig_says(
     assert not refused
     searched = all_face_views(str, CAMERAS, 7, [search], None)
     assert {view.camera_id for view in searched} == set(found)
+
+
+def test_a_face_that_one_of_several_cameras_shows_is_warned_of() -> None:
+    stage = Stage(marks())
+
+    def search(image: str, camera_id: str, frame: int) -> Marked:
+        seen = stage.search(image, camera_id, frame)
+        return seen if camera_id == "cam-0.50" else Stage(None).seen(camera_id)
+
+    (view,) = all_face_views(str, CAMERAS, 7, [search], None)
+    alone, _ = agree("smile", 7, [view])
+    (note,) = lone_views([alone], CAMERAS)
+    assert note.what == "smile" and f"of {len(CAMERAS)} cameras only cam-0.50 shows" in note.why
+    assert lone_views([alone], {"cam-0.50": CAMERAS["cam-0.50"]}) == []
 
 
 def test_a_small_face_on_its_side_is_seen_where_it_is_expected() -> None:
