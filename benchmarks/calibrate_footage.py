@@ -36,7 +36,7 @@ RigJudge = Callable[[Mapping[str, Camera], Mapping[str, Camera]], dict[str, floa
 
 def see_capture(root: Path, true: Mapping[str, Camera], count: int) -> dict[int, FrameSetPoints]:
     """Return what the cameras of a raw capture see, in recorded pixels of `reduced_camera`."""
-    return find_points(partial(read_raw_footage, root, true, count))
+    return find_points(partial(read_raw_footage, root, true, count), small=True)
 
 
 def small(cameras: Mapping[str, Camera]) -> dict[str, Camera]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +32,7 @@ from express50.landmarks.network import CROP, MIRROR, LandmarkNet, face_box, loa
 SCHEMA = "express50.observations/1"
 SEEN_SCORE = 0.15  # least score of a frame that shows the face
 TRIES = 8  # number of other frames to search for a face if the frames at rest show none
+FEW = 3  # number of frames to search for a small face, those at rest first
 HELD = 256  # frames of a camera that stay in memory; of longer windows they are decoded twice
 RANKED_SHARE = 0.8  # share of the best camera's score: worse cameras add mostly noise
 
@@ -92,9 +92,11 @@ def run(
     def score(camera: str, frame: int, smallest: float) -> float:
         return detect(net, read_proxy(dataset, item, camera, frame), smallest=smallest).score
 
-    searches = (search, SMALL) if search > SMALL else (search,)
     tries = frames_to_try(rest, frames)
-    search, middle, ranked = choose_cameras(index, score, searches, tries, min_score)
+    looks = [(search, frame) for frame in tries]
+    if search > SMALL:  # which takes four times as long, so in fewer frames
+        looks += [(SMALL, frame) for frame in tries[:FEW]]
+    search, middle, ranked = choose_cameras(index, score, looks, min_score)
     watching = ranked[:cameras]
     rest = np.union1d(rest, [middle])
     views = [_watch(dataset, item, net, camera, seen, rest, search) for camera in watching]
@@ -130,14 +132,13 @@ def frames_to_try(rest: np.ndarray, frames: np.ndarray) -> list[int]:
 def choose_cameras(
     index: Index,
     score: Callable[[str, int, float], float],
-    searches: Sequence[float],
-    frames: list[int],
+    looks: Sequence[tuple[float, int]],
     min_score: float,
 ) -> tuple[float, int, list[str]]:
-    """Find the first of the frames that shows a face, and rank the cameras that see it best.
+    """Find the first look that shows a face, and rank the cameras that see it best.
 
-    `score` rates a camera's frame, searched down to windows of a size. All frames are searched in
-    the first of `searches` before any is in the next, which takes longer.
+    A look is the size of the smallest windows that are searched, and a frame; `score` rates a
+    camera's.
 
     Returns:
         The size of the windows that were enough, the frame and the cameras.
@@ -146,15 +147,16 @@ def choose_cameras(
         StageError: no camera sees a face in any.
     """
     best = 0.0
-    for smallest, frame in product(searches, frames):
+    for smallest, frame in looks:
         scores = {camera: score(camera, frame, smallest) for camera in index.cameras}
         ranked = sorted(scores, key=lambda c: (-scores[c], c))
         best = max(best, scores[ranked[0]])
         if scores[ranked[0]] >= min_score:
             enough = max(min_score, RANKED_SHARE * scores[ranked[0]])
             return smallest, frame, [c for c in ranked if scores[c] >= enough]
+    frames = sorted({frame for _, frame in looks})
     raise StageError(
-        f"{index.subject}: no camera sees a face in frames {', '.join(map(str, sorted(frames)))}"
+        f"{index.subject}: no camera sees a face in frames {', '.join(map(str, frames))}"
         f" (best score {best:.2f}, expected {min_score}); check that the face is in view, label it"
         " with 'express50 annotate mark', or lower observe.min_score"
     )

@@ -114,10 +114,11 @@ def _read_raw(camera: RawCamera, wanted: list[int]) -> Iterator[tuple[int, np.nd
     raise CaptureError(f"{camera.path}: has {length} frames, frame {missing} was expected")
 
 
-def find_points(read: Callable[[], Images]) -> dict[int, FrameSetPoints]:
+def find_points(read: Callable[[], Images], small: bool = False) -> dict[int, FrameSetPoints]:
     """Find landmarks and features, in pixels of the images, by frame number.
 
-    Images are read again, and smaller windows searched, if most frame sets lack a second face.
+    With `small`, images are read again and smaller windows searched if most frame sets lack a
+    second face.
     """
     net = load_network()
     faces: dict[int, dict[str, Detection]] = {}
@@ -126,7 +127,7 @@ def find_points(read: Callable[[], Images]) -> dict[int, FrameSetPoints]:
         faces.setdefault(frame, {})[name] = detect(net, image)
         features.setdefault(frame, {})[name] = find_features(image)
     lacking = {frame for frame, seen in faces.items() if len(_clear(seen)) < 2 <= len(seen)}
-    if 2 * len(lacking) > len(faces):
+    if small and 2 * len(lacking) > len(faces):
         for frame, name, image in read():
             if frame in lacking and faces[frame][name].score < FACE_SCORE:
                 faces[frame][name] = detect(net, image, smallest=SMALL)

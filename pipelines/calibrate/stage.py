@@ -267,7 +267,7 @@ def _from_footage(index: Index, config: CalibrateConfig) -> CalibratedRig:
     small = {name: reduced_camera(camera) for name, camera in blank.items()}
     focals = {n: f * small[n].width / blank[n].width for n, f in known_focals(index).items()}
     solved = solve_footage(
-        find_points(partial(read_footage, index, blank, config.solve_frame_sets)),
+        find_points(partial(read_footage, index, blank, config.solve_frame_sets), small=True),
         {name: (camera.width, camera.height) for name, camera in small.items()},
         focals,
         str(index.capture),

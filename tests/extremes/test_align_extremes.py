@@ -1,5 +1,6 @@
 """Alignment at the edges: faces without size, huge, tiny or still ones, windows of a frame."""
 
+from itertools import product
 from types import SimpleNamespace
 
 import numpy as np
@@ -86,11 +87,12 @@ def test_frames_are_tried_until_one_shows_a_face():
         asked.append(smallest)
         return scores.get(frame, 0.0) if smallest < 0.1 or frame != 40 else 0.2
 
-    assert choose_cameras(index, score, (0.25, 0.08), tries, 0.3) == (0.08, 40, ["a", "b"])
+    looks = list(product((0.25, 0.08), tries))
+    assert choose_cameras(index, score, looks, 0.3) == (0.08, 40, ["a", "b"])
     # Small windows take long, so they are searched last.
     assert asked[: 2 * len(tries)] == [0.25] * 2 * len(tries)
     with pytest.raises(StageError, match=r"0, 3, 6 .*0\.10"):
-        choose_cameras(index, score, (0.25, 0.08), tries[:3], 0.3)
+        choose_cameras(index, score, list(product((0.25, 0.08), tries[:3])), 0.3)
 
 
 def test_windows_of_one_frame_and_windows_that_overlap():

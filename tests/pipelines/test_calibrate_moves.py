@@ -224,7 +224,7 @@ def test_small_faces_are_searched_for_only_if_a_second_one_is_missing(monkeypatc
 
     monkeypatch.setattr("pipelines.calibrate.footage.detect", find)
     blank = [(0, f"cam{k}", np.full((32, 32, 3), k, np.uint8)) for k in range(3)]
-    found = find_points(lambda: blank)[0].landmarks
+    found = find_points(lambda: blank, small=True)[0].landmarks
     assert [name for name, _, _ in found] == [f"cam{k}" for k in range(3)][: 3 if again else 2]
     assert tried[3:] == ([(1, 0.08), (2, 0.08)] if again else [])
 
