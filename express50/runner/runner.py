@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
+from express50.console import count as count_of
 from express50.console import log as write
 from express50.contract.config import config_toml
 from express50.contract.layout import Dataset
@@ -105,7 +106,7 @@ class Summary:
         """Yield the account for people, then what was made again, dropped or failed, and why."""
         said = ("done", "skipped", "failed", *(("left",) if self.count("left") else ()))
         counts = " + ".join(f"{self.count(status)} {status}" for status in said)
-        items = "1 item" if len(self.outcomes) == 1 else f"{len(self.outcomes)} items"
+        items = count_of(len(self.outcomes), "item")
         yield f"{self.stage}: {items} = {counts} in {self.seconds:.1f} s"
         made = [o for o in self.outcomes if o.status == "done"]
         again = Counter((o.restored, o.again) for o in made if o.again or o.restored)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from express50.capture.frames import read_cameras_of, read_peak_frame, read_recorded_cameras
-from express50.console import FAILED, OK, add_command, answer
+from express50.console import FAILED, OK, add_command, answer, count
 from express50.contract.layout import Dataset, existing_dataset, included_subjects
 from express50.contract.stage import Note, Result, stages
 from express50.dataset.depth_files import write_depth
@@ -142,8 +142,7 @@ def run_import(args: argparse.Namespace) -> int:
                     "warnings": found.get("warnings", []), "checks": found.get("imported", {}),
                 })  # fmt: skip
     failed = [row for row in rows if row["reason"]]
-    items = "1 item" if len(rows) == 1 else f"{len(rows)} items"
-    lines = [f"import {stage.name}: {items} = {len(rows) - len(failed)} done"
+    lines = [f"import {stage.name}: {count(len(rows), 'item')} = {len(rows) - len(failed)} done"
              f" + {len(failed)} failed"]  # fmt: skip
     lines += [f"  failed {row['item']}: {row['reason']}" for row in failed]
     lines += [
@@ -289,8 +288,8 @@ def _write_depths(given: PeakPictures, out: Path) -> Result:
         known = depth > 0
         write_depth(out, name, depth, known)
         write_image(out / f"{name}_confidence.png", np.where(known, 255, 0).astype(np.uint8))
-    count = write_fused(out / "surface.ply", cameras, depths, given.footage())
-    return Result({"imported": checks | {"surface_vertices": count}}, (), notes)
+    vertices = write_fused(out / "surface.ply", cameras, depths, given.footage())
+    return Result({"imported": checks | {"surface_vertices": vertices}}, (), notes)
 
 
 @contextmanager
