@@ -146,8 +146,7 @@ def _write_view(
     image, alpha = (seen_by(one, camera, target, options.downscale) for one in (image, alpha))
     level = BACKGROUNDS[options.background]
     if level is None:  # straight alpha: colours are not multiplied by it
-        pixels = np.ascontiguousarray(np.concatenate([image[..., ::-1], alpha[..., None]], -1))
-        data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes()
+        data = encode_png(np.concatenate([image, alpha[..., None]], -1))
     else:
         share = alpha[..., None] / np.float32(255)
         data = encode_png(np.rint(image * share + level * (1 - share)).astype(np.uint8))

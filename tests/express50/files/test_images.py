@@ -1,5 +1,6 @@
 """Image files: types kept, damage named, depth quantised as stated."""
 
+import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
@@ -33,10 +34,12 @@ def test_same_image_gives_same_bytes(tmp_path):
         assert (tmp_path / name).read_bytes() == first
 
 
-def test_jpeg_keeps_colour_order():
-    image = np.zeros((16, 16, 3), np.uint8)
-    image[..., 0] = 200
-    back = images.decode_image(images.encode_jpeg(image))
+def test_jpeg_keeps_colour_order_and_png_alpha():
+    image = np.zeros((16, 16, 4), np.uint8)
+    image[..., 0], image[..., 3] = 200, 7
+    back = cv2.imdecode(np.frombuffer(images.encode_png(image), np.uint8), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(back, image[..., [2, 1, 0, 3]])
+    back = images.decode_image(images.encode_jpeg(image[..., :3]))
     assert abs(int(back[8, 8, 0]) - 200) < 4
     assert back[8, 8, 2] < 6
 
