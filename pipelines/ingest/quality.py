@@ -26,7 +26,7 @@ STEP_COST = 10.0  # cost of a change of lag, in units of log likelihood
 FRAME_COST = 1.0  # cost per frame of a lag: cameras mostly lose few frames
 START_COST = 7.0  # cost of being out of step from the start
 ALIKE = 0.35  # least correlation with the other cameras at which a camera is judged
-EARLY = 8  # a change of lag before this frame looks like one before the start
+EARLY = 8  # a change of lag before this frame of a clip counts as one before its start
 LEAST_SPREAD = 0.15  # of curves of unit variance, between different views
 MOVING = 1.5  # ratio of quick to slow movement; noise alone has less than 1.2
 STILL = 0.05  # share of a camera's usual movement below which a frame repeats the one before
@@ -144,17 +144,22 @@ def find_steps(
     names = sorted(moves)
     if len(names) < FEWEST_CAMERAS:
         return {}, dict.fromkeys(names, f"fewer than {FEWEST_CAMERAS} cameras")
-    steps: dict[str, list[Step]] = {}
+    total, start = len(moves[names[0]]), 0
+    lags = {name: np.zeros(total, np.int64) for name in names}
     judged: set[str] = set()
-    start = 0
     for count in clips:
-        if count >= FEWEST_FRAMES:
-            curves = {n: _curve(moves[n][start : start + count].astype(float)) for n in names}
-            found, alike = _steps_of_clip(curves, reach)
-            judged |= alike
-            for name, path in found.items():
-                steps.setdefault(name, []).extend(Step(start + s.frame, s.lag) for s in path)
+        part = slice(start, min(start + count, total))
+        found, alike = {}, set[str]()
+        if part.stop - part.start >= FEWEST_FRAMES:
+            curves = {n: _curve(moves[n][part].astype(float)) for n in names}
+            found, alike = _lags_of_clip(curves, reach)
+        for name, path in lags.items():
+            # A clip that cannot be judged goes on as the one before it ended.
+            path[part] = found.get(name, 0) if name in alike else path[start - 1]
+        judged |= alike
         start += count
+    edges = {name: np.flatnonzero(np.diff(path, prepend=0)) for name, path in lags.items()}
+    steps = {n: [Step(int(t), int(lags[n][t])) for t in at] for n, at in edges.items() if len(at)}
     why = "too few frames or too little movement that others see too"
     return steps, {name: why for name in names if name not in judged}
 
@@ -170,18 +175,18 @@ def _curve(moves: np.ndarray) -> np.ndarray:
     return values / max(float(values.std()), 1e-6)
 
 
-def _steps_of_clip(
+def _lags_of_clip(
     curves: Mapping[str, np.ndarray], reach: int
-) -> tuple[dict[str, list[Step]], set[str]]:
-    """Return the steps by camera, and the cameras whose movement is like that of the others.
+) -> tuple[dict[str, np.ndarray], set[str]]:
+    """Return the lags (F,) of cameras out of step, and the cameras that move as the others do.
 
     The camera with the strongest evidence is taken out first: left in, it would distort what the
     others are compared with.
     """
-    steps: dict[str, list[Step]] = {}
+    lags: dict[str, np.ndarray] = {}
     alike: set[str] = set()
-    while len(curves) - len(steps) >= FEWEST_CAMERAS:
-        left = {name: curve for name, curve in curves.items() if name not in steps}
+    while len(curves) - len(lags) >= FEWEST_CAMERAS:
+        left = {name: curve for name, curve in curves.items() if name not in lags}
         rest = {n: np.median([c for m, c in left.items() if m != n], axis=0) for n in left}
         # The spread of the median camera: with its own, a camera out of step would look normal.
         misses = [np.mean((left[n] - rest[n])[1:] ** 2) for n in left]
@@ -197,9 +202,10 @@ def _steps_of_clip(
             break
         worst = max(gains, key=lambda name: gains[name][0])
         path = gains[worst][1]
-        edges = np.flatnonzero(np.diff(path, prepend=0))
-        steps[worst] = [Step(int(t), int(path[t])) for t in edges]
-    return steps, alike
+        for t in np.flatnonzero(np.diff(path[:EARLY]))[:1]:
+            path[: t + 1] = path[t + 1]
+        lags[worst] = path
+    return lags, alike
 
 
 def _likeliest_lags(
@@ -250,7 +256,7 @@ def describe_steps(steps: Sequence[Step]) -> str:
     for step in steps:
         change = step.lag - before
         frames = f"{abs(change)} frame{'s' if abs(change) > 1 else ''}"
-        if step.frame < EARLY and before == 0:
+        if step.frame == 0:
             side = "ahead of" if step.lag > 0 else "behind"
             words.append(f"is {frames} {side} the others from its start")
         else:

@@ -70,6 +70,18 @@ def test_a_shifted_camera_is_found_with_its_shift(footage, lag):
     assert steps["cam03"][-1].lag == -lag and steps["cam03"][-1].frame < 16
 
 
+def test_a_lag_lasts_from_clip_to_clip(footage):
+    table = {name: moves(images) for name, images in footage.items()}
+    ahead = moves(footage["cam01"][2:])
+    twice = {name: np.tile(row[: FRAMES - 2], 2) for name, row in table.items()}
+    steps, _ = find_steps(twice | {"cam01": np.tile(ahead, 2)}, (FRAMES - 2,) * 2, 8)
+    assert [step.lag for step in steps["cam01"]] == [2]
+    back = np.concatenate([ahead, table["cam01"][: FRAMES - 2]])
+    steps, _ = find_steps(twice | {"cam01": back}, (FRAMES - 2,) * 2, 8)
+    assert [step.lag for step in steps["cam01"]] == [2, 0]
+    assert steps["cam01"][1].frame == FRAMES - 2
+
+
 @pytest.mark.parametrize(("frame", "lost"), [(20, 1), (45, 1), (60, 3)])
 def test_lost_frames_are_found_where_they_were_lost(footage, frame, lost):
     images = footage["cam02"]
