@@ -7,6 +7,7 @@ of options. `grmm.cli.commands` implements the commands.
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -59,6 +60,13 @@ def at_least(low: int, high: int = 1 << 20) -> Callable[[str], int]:
     return number
 
 
+def finite(text: str) -> float:
+    """Parse a number that is neither NaN nor infinite; a ValueError if it is not one."""
+    if not math.isfinite(value := float(text)):
+        raise ValueError
+    return value
+
+
 FLAG: dict[str, Any] = {"action": "store_true"}
 REPEATED: dict[str, Any] = {"action": "append", "default": []}
 OPTIONS: dict[str, dict[str, Any]] = {
@@ -105,7 +113,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "default": "neutral", "help": "fit from this expression (neutral)",
     },
     "--fit-budget": {"type": parse_seconds, "help": "time per fit: 60s, 5m"},
-    "--background": {"type": float, "default": 0.0, "help": "grey, 0 to 1"},
+    "--background": {"type": finite, "default": 0.0, "help": "grey, 0 to 1"},
     "--partial": FLAG | {"help": "score only the pictures that exist"},
     "--seeds": {"type": at_least(1), "default": 1, "help": "train each row this many times (1)"},
     "--test": REPEATED | {
@@ -134,10 +142,10 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--size": {
         "type": at_least(0, 8192), "default": 0, "help": "longer side in pixels, 0 = as trained",
     },
-    "--yaw": {"type": float, "default": 0.0, "help": "degrees the camera moves around the head"},
-    "--pitch": {"type": float, "default": 0.0, "help": "degrees the camera moves up"},
+    "--yaw": {"type": finite, "default": 0.0, "help": "degrees the camera moves around the head"},
+    "--pitch": {"type": finite, "default": 0.0, "help": "degrees the camera moves up"},
     "--turntable": FLAG | {"help": "write turntable.mp4"},
-    "--degrees": {"type": float, "default": 360.0, "help": "angle that the turntable covers"},
+    "--degrees": {"type": finite, "default": 360.0, "help": "angle that the turntable covers"},
     "--frames": {"type": at_least(1), "default": 72, "help": "number of frames of a video"},
     "--to": {"metavar": "SUBJECT/EXPRESSION", "help": "write interpolation.mp4, ending there"},
     "--drive": {
@@ -150,22 +158,22 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "type": at_least(0), "default": 0, "help": "write samples.jpg with this many new heads",
     },
     "--spread": {
-        "type": float, "default": 1.0, "help": "spread of the samples, 1 = as in training",
+        "type": finite, "default": 1.0, "help": "spread of the samples, 1 = as in training",
     },
-    "--seed": {"type": int, "default": 0, "help": "seed of random choices"},
+    "--seed": {"type": at_least(0), "default": 0, "help": "seed of random choices"},
     "--columns": {"type": at_least(1), "default": 8, "help": "number of expressions in grid.jpg"},
     "--format": {"choices": commands.FORMATS, "help": "format (default: from the file name)"},
     "--shards": {"type": Path, "help": ".html: measure the loss on this footage"},
     "--still": {"type": at_least(16), "default": 512, "help": "height of still pictures, pixels"},
     "--host": {"default": "127.0.0.1", "help": "address to listen on (this machine)"},
-    "--port": {"type": at_least(1, 65535), "default": 8080},
+    "--port": {"type": at_least(1, 65535), "default": 8080, "help": "port to listen on"},
     # Studies
     "--reference": {"type": Path, "required": True, "help": "true pictures"},
     "--ours": {"type": Path, "required": True, "help": "one method's pictures, same names"},
     "--theirs": {"type": Path, "required": True, "help": "the other method's pictures"},
     "--names": {"nargs": 2, "default": ["Ours", "Theirs"], "metavar": "NAME"},
-    "--examples": {"type": int, "default": 15, "help": "examples per participant (15)"},
-    "--participants": {"type": int, "default": 20},
+    "--examples": {"type": at_least(1), "default": 15, "help": "examples per participant (15)"},
+    "--participants": {"type": at_least(1), "default": 20, "help": "number of participants (20)"},
 }  # fmt: skip
 ALIASES = {"--budget": ["--seconds"]}
 

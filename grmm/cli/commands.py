@@ -282,6 +282,7 @@ def score(args: argparse.Namespace) -> int:
     from grmm.metrics import PerceptualMetrics
     from grmm.shard_source import ShardSource, select
 
+    _no_file(args.out)
     # `evaluate` leaves these pixels out too, of all presets but `paper`.
     data = DataConfig(background=args.background, skip_hidden_neck=True)
     source = ShardSource(args.shards, "*")

@@ -65,7 +65,7 @@ class PlayerReport:
         agreement_db: PSNR between its pictures and the full model's, in poses not fitted to.
         full_db: PSNR of the full model's pictures against footage; None without footage.
         loss_db: how much lower the page's PSNR is.
-        footage: which samples: ``held out``, or ``seen`` where training saw all.
+        footage: which samples: ``held out``, or ``seen`` where training saw all; or why none.
         images: how many.
     """
 
@@ -78,7 +78,7 @@ class PlayerReport:
     images: int = 0
 
     def __str__(self) -> str:
-        loss = "loss against footage n/a: give --shards"
+        loss = f"loss against footage n/a: {self.footage or 'give --shards'}"
         if self.loss_db is not None:
             loss = (
                 f"{self.loss_db:.2f} dB lost of the {self.full_db:.2f} dB against {self.images} "
@@ -151,7 +151,7 @@ def _loss(person: Person, avatar: Avatar, subject: str, views: HeadViews) -> dic
         ours.append(psnr_db(picture, item.target))
         full.append(psnr_db(full_picture(person, pose, item.view), item.target))
     if not chosen:
-        return {}
+        return {"footage": f"--shards has no picture of {subject}"}
     before, after = float(np.mean(full)), float(np.mean(ours))
     footage = "held out" if unseen else "seen"
     return {"full_db": before, "loss_db": before - after, "footage": footage, "images": len(chosen)}

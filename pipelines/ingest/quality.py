@@ -149,7 +149,8 @@ def find_steps(
     judged: set[str] = set()
     for count in clips:
         part = slice(start, min(start + count, total))
-        found, alike = {}, set[str]()
+        found: dict[str, np.ndarray] = {}
+        alike: set[str] = set()
         if part.stop - part.start >= FEWEST_FRAMES:
             curves = {n: _curve(moves[n][part].astype(float)) for n in names}
             found, alike = _lags_of_clip(curves, reach)

@@ -70,7 +70,7 @@ def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> Result:
 
 ENCODE = Stage(
     name="encode",
-    version=1,
+    version=2,
     config=EncodeConfig,
     presets=ENCODE_PRESETS,
     items=included,

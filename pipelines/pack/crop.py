@@ -16,7 +16,14 @@ from express50.errors import StageError
 from express50.files.images import linear_to_srgb, resize_area
 from express50.geometry.cameras import Camera, crop_camera, project, resized
 from express50.geometry.conventions import cell_centres, corner_to_cell
-from pipelines.matte.plates import exposed, exposure_gain, local_colours, to_light
+from pipelines.matte.plates import (
+    LEAST_SHARE,
+    exposed,
+    exposure_gain,
+    local_colours,
+    match_plate,
+    to_light,
+)
 
 EDGE = 0.01  # neighbours whose depths differ by more than this share lie on two surfaces
 MARGIN = 0.1  # room on each side, as a share of the head's size
@@ -120,11 +127,15 @@ def cut_own_colours(
     """Cut a frame to (size, size, 3) with the subject's own colour in soft pixels.
 
     Frame and clean plate, or None, are (H, W, 3) uint8 sRGB; the matte (H, W) uint8 is of
-    everything in front of the plate, torso included.
+    everything in front of the plate, torso included. As in `matte`, the plate is matched to the
+    frame first, and not used if it shows another set.
     """
     behind = None
     if plate is not None:
-        behind = exposed(cut_image(plate, crop, size), exposure_gain(frame, plate))
+        found = match_plate(plate, frame, matte == 0)
+        if found.share >= LEAST_SHARE:
+            gain = exposure_gain(frame, found.plate)
+            behind = exposed(cut_image(found.plate, crop, size), gain)
     return own_colours(cut_image(frame, crop, size), cut_image(matte, crop, size), behind)
 
 

@@ -243,6 +243,8 @@ def subject_id(path: Path) -> str:
 
 def _write_footage(picture: PhotoSource, folder: Path) -> None:
     """Copy the file; a turned one, or one of a kind that no stage reads, is stored upright."""
+    if folder.resolve() in picture.path.resolve().parents:
+        return  # made from its own copy, which the next line would delete
     # An earlier picture with another suffix would make the footage ambiguous.
     shutil.rmtree(folder, ignore_errors=True)
     suffix = picture.path.suffix.lower()

@@ -20,7 +20,7 @@ MEAN = np.array([123.5, 116.5, 103.5], np.float32)
 DEVIATION = np.array([58.5, 57.0, 57.5], np.float32)
 CLASSES = 28
 _IDS = {"background": (0,), "apparel": (1,), "skin": (2,), "hair": (3,), "lips": (23, 24)}
-_IDS |= {"teeth": (25, 26), "tongue": (27,), "torso": tuple(range(4, 23))}
+_IDS |= {"teeth": (25, 26), "tongue": (27,), "hand": (5, 14), "torso": tuple(range(4, 23))}
 LABEL_OF_CLASS = np.array(
     [LABELS.index(next(name for name in _IDS if k in _IDS[name])) for k in range(CLASSES)], np.uint8
 )

@@ -176,7 +176,8 @@ def facing(dataset: Dataset, item: str, head: TrackedHead) -> list[Picture]:
     ahead, cameras = head.R[:, 2], read_cameras_of(dataset, item.split("/")[0]).values()
     seeing = [c for c in cameras if (c.center - head.center) @ ahead > 0]
     found = []
-    for k in np.unique(np.linspace(0, len(seeing) - 1, WITNESSES).round().astype(int)):
+    count = min(WITNESSES, len(seeing))  # 0 where all cameras stand behind the head
+    for k in np.linspace(0, len(seeing) - 1, count).round().astype(int):
         with contextlib.suppress(*UNREADABLE):  # the stage names them
             pair = read_pair(dataset, item, seeing[k])
             found.append(_shrunk(seeing[k], *pair, None, VOTING_SIDE)[:3])

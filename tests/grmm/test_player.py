@@ -20,7 +20,7 @@ from grmm.checkpoint import load_checkpoint
 from grmm.edit import trained_head
 from grmm.metrics import psnr_db
 from grmm.model import GRMM
-from grmm.player import export_player, player_page, stored
+from grmm.player import _loss, export_player, player_page, stored
 from grmm.player.distillation import (
     AvatarPose,
     all_gaussians,
@@ -135,7 +135,9 @@ def test_the_report_measures_footage_and_foreign_clips_are_refused(loaded, tmp_p
     report = export_player(tmp_path / "a.html", loaded, head, "S000", views)
     assert report.images == 6 and report.footage == "seen" and report.loss_db < 3
     assert "dB lost" in str(report)
-    assert "n/a" in str(replace(report, loss_db=None))
+    assert "give --shards" in str(replace(report, loss_db=None, footage=None))
+    nothing = _loss(person_of(loaded, head, "S000"), None, "S009", views)
+    assert "n/a: --shards has no picture of S009" in str(replace(report, loss_db=None, **nothing))
     with pytest.raises(ConfigError, match="track them"):
         export_player(tmp_path / "a.html", loaded, head, "S000", None, clip_of("other"))
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from express50.files.images import linear_to_srgb, srgb_to_linear
-from pipelines.pack.crop import own_colours
+from pipelines.pack.crop import Crop, cut_own_colours, own_colours
 
 
 def mixed(subject: np.ndarray, plate: np.ndarray, alpha: np.ndarray) -> np.ndarray:
@@ -50,6 +50,18 @@ def test_without_a_plate_the_rim_is_much_less_the_studios():
         return float((weight * np.abs(image - subject)).mean())
 
     assert rim(own) < 0.35 * rim(frame)
+
+
+def test_a_plate_of_another_set_is_not_used():
+    alpha, rng = ramp(), np.random.default_rng(0)
+    frame = mixed(np.array([60.0, 40, 30]), np.array([200.0, 210, 205]), alpha)
+    other = np.repeat(np.repeat(rng.integers(0, 255, (12, 12, 3)), 8, 0), 8, 1).astype(np.uint8)
+    whole = Crop(0, 0, 96)
+    without = cut_own_colours(frame, alpha, None, whole, 96)
+    assert (cut_own_colours(frame, alpha, other, whole, 96) == without).all()
+    right = np.full_like(frame, (200, 210, 205))
+    expected = own_colours(frame, alpha, right)
+    assert (cut_own_colours(frame, alpha, right, whole, 96) == expected).all()
 
 
 def test_a_lighter_strand_stays_lighter_than_its_neighbours():

@@ -114,11 +114,13 @@ def test_a_second_picture_of_the_same_name_takes_nobodys_place(
         write_image(tmp_path / folder / "eva.png", np.ascontiguousarray(image))
     out = tmp_path / "out"
     make_photo_capture(open_picture(tmp_path / "a/eva.png"), out, "eva", config)
-    before = (out / "cameras/photo/frames/000000.png").read_bytes()
+    stored = out / "cameras/photo/frames/000000.png"
+    before = stored.read_bytes()
     with pytest.raises(CaptureError, match="made from another picture; name this one"):
         make_photo_capture(open_picture(tmp_path / "b/eva.png"), out, "eva", config)
-    assert (out / "cameras/photo/frames/000000.png").read_bytes() == before
-    make_photo_capture(open_picture(tmp_path / "a/eva.png"), out, "eva", config)
+    assert stored.read_bytes() == before
+    make_photo_capture(open_picture(stored), out, "eva", config)
+    assert stored.read_bytes() == before
 
 
 def test_folders_and_focal_lengths_of_no_lens_are_refused(

@@ -26,7 +26,7 @@ from pipelines.regions.geometry import (
     place,
     see,
 )
-from pipelines.regions.stage import label_view
+from pipelines.regions.stage import facing, label_view, read_head
 from tests.pipelines.bump_dataset import make_dataset, published
 from tests.pipelines.region_scenes import COLOURS, RegionScene, camera_at, make_scene, tracked
 from tests.pipelines.stand_ins import Thirds, torchscript
@@ -234,6 +234,12 @@ def test_the_stage_writes_labels_and_heads_of_every_camera(dataset, tmp_path) ->
     assert again.to_json() == metrics["S001/smile"]
     for path in tmp_path.rglob("*.*"):
         assert path.read_bytes() == (folder / path.relative_to(tmp_path)).read_bytes()
+
+
+def test_a_rig_behind_the_head_shows_no_glasses(dataset) -> None:
+    head, _ = read_head(dataset, "S001", "smile")
+    before = replace(head, center=head.center + 10 * head.R[:, 2])
+    assert facing(dataset, "S001/smile", head) and not facing(dataset, "S001/smile", before)
 
 
 def test_smaller_working_sizes_give_labels_of_the_full_size(dataset, tmp_path) -> None:

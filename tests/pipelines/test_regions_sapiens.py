@@ -34,8 +34,17 @@ def test_a_traced_network_gives_parts_at_the_frames_own_size(tmp_path) -> None:
 
 
 def test_the_class_numbers_are_sapiens_own() -> None:
-    known = {0: "background", 1: "apparel", 2: "skin", 3: "hair", 4: "torso", 21: "torso"}
-    known |= {22: "torso", 23: "lips", 24: "lips", 25: "teeth", 26: "teeth", 27: "tongue"}
+    known = {0: "background", 1: "apparel", 2: "skin", 3: "hair", 4: "torso", 5: "hand"}
+    known |= {
+        14: "hand",
+        21: "torso",
+        22: "torso",
+        23: "lips",
+        24: "lips",
+        25: "teeth",
+        26: "teeth",
+        27: "tongue",
+    }
     assert {k: LABELS[LABEL_OF_CLASS[k]] for k in known} == known
 
 
