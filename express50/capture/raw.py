@@ -234,7 +234,7 @@ def _read_camera(folder: Path) -> RawCamera:
 
 def _frame_names(folder: Path) -> tuple[str, ...]:
     """List image names in order; they must count up from zero, or frames would be mixed up."""
-    names = image_names(folder)
+    names = sorted(image_names(folder), key=lambda name: len(Path(name).stem))  # 9 before 10
     if not names:
         raise CaptureError(f"{folder}: holds no image, expected 000000.png and so on")
     for number, name in enumerate(names):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -148,9 +149,11 @@ def run_preview(args: argparse.Namespace) -> int:
     try:
         yaws = tuple(float(part) for part in args.yaws.split(","))
     except ValueError:
-        raise ConfigError(
-            f"--yaws {args.yaws!r}: expected numbers with commas, such as 0,40,90"
-        ) from None
+        yaws = (math.nan,)
+    if not all(map(math.isfinite, yaws)):
+        raise ConfigError(f"--yaws {args.yaws!r}: expected numbers with commas, such as 0,40,90")
+    if args.size < 1:
+        raise ConfigError(f"--size {args.size}: expected at least 1")
     model = load_head(args.model)
     args.out.parent.mkdir(parents=True, exist_ok=True)
     write_image(args.out, contact_sheet(model, yaws, args.size))

@@ -30,7 +30,7 @@ from typing import IO, Any
 from express50.contract.layout import Dataset
 from express50.errors import FormatError, check_known
 from express50.files.atomic import write_json
-from express50.files.digests import text_digest
+from express50.files.digests import files_of, text_digest
 from express50.files.text import NAME, read_json, read_json_table
 from express50.runner.ledger import Ledger
 from express50.runner.publish import hold_stages
@@ -249,7 +249,7 @@ def names_any_of(digests: Collection[str], others: Collection[str] = ()) -> Test
 
 def files_that(test: Test, root: Path) -> Iterator[Path]:
     """Yield files below a folder whose path or content passes a test."""
-    for path in sorted(p for p in root.rglob("*") if p.is_file()):
+    for path in files_of(root, hidden=True):
         if test(str(path.relative_to(root)).encode()) or says(path, test):
             yield path
 

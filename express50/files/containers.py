@@ -9,6 +9,7 @@ before anything is read.
 from __future__ import annotations
 
 import io
+import warnings
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -113,7 +114,10 @@ def decode_picture(data: bytes, where: str) -> np.ndarray:
         CaptureError: the bytes are not such an image, or the image has too many pixels.
     """
     try:
-        with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "AVIF")) as header:
+        with (
+            warnings.catch_warnings(action="ignore"),  # Pillow's limit is lower than ours
+            Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "AVIF")) as header,
+        ):
             width, height = header.size
     except (*ARRAY_DAMAGE, Image.DecompressionBombError) as error:
         raise CaptureError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable
 from functools import lru_cache, wraps
 from pathlib import Path
@@ -53,14 +54,16 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def files_of(folder: Path) -> list[Path]:
-    """List every file below a folder, sorted by relative path, without hidden names."""
-    found = (path for path in folder.rglob("*") if path.is_file())
-    return sorted(
-        path
-        for path in found
-        if not any(part.startswith(".") for part in path.relative_to(folder).parts)
-    )
+def files_of(folder: Path, hidden: bool = False) -> list[Path]:
+    """List every file below a folder, also in linked folders, sorted; hidden names if asked to."""
+    found = []
+    for place, folders, names in os.walk(folder, followlinks=True):
+        here = Path(place).resolve()
+        parts = [[n for n in part if hidden or n[0] != "."] for part in (folders, names)]
+        # A link to a folder that it lies in would never end.
+        folders[:] = [n for n in parts[0] if not here.is_relative_to((here / n).resolve())]
+        found += [Path(place, name) for name in parts[1]]
+    return sorted(path for path in found if path.is_file())
 
 
 def path_digest(path: Path, sha256: Callable[[Path], str] = file_sha256) -> str:

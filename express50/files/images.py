@@ -75,7 +75,9 @@ def open_image(path: Path) -> oiio.ImageInput:
     Raises:
         FormatError: it is missing or not an image.
     """
-    source = oiio.ImageInput.open(str(path)) if Path(path).is_file() else None
+    straight = oiio.ImageSpec()
+    straight.attribute("oiio:UnassociatedAlpha", 1)  # otherwise colours are multiplied by alpha
+    source = oiio.ImageInput.open(str(path), straight) if Path(path).is_file() else None
     if source is None:
         why = _error_text(oiio.geterror) or "it cannot be opened"
         raise FormatError(f"{path}: cannot be read as an image ({why}); copy it again")
@@ -158,11 +160,13 @@ def write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:
     spec.attribute("Compression", f"jpeg:{quality}" if ending in (".jpg", ".jpeg") else "zip")
     if quality >= 95:
         spec.attribute("jpeg:subsampling", "4:4:4")
+    spec.attribute("oiio:UnassociatedAlpha", 1)
     if ending == ".exr":  # otherwise its header would hold the time of writing
         spec.attribute("DateTime", "1970:01:01 00:00:00")
     target = oiio.ImageOutput.create(str(path))
     if target is None or not target.open(str(path), spec):
-        raise FormatError(f"{path}: cannot be written ({oiio.geterror().strip()})")
+        why = target.geterror() if target else oiio.geterror()
+        raise FormatError(f"{path}: cannot be written ({why.strip()}); give another path")
     written = target.write_image(image.reshape(image.shape[0], image.shape[1], channels))
     if not target.close() or not written:
         raise FormatError(f"{path}: writing failed ({target.geterror().strip()})")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -101,7 +102,6 @@ def load_stored(path: Path, name: str) -> HeadModel:
 
 def is_stored(path: Path) -> bool:
     """Return whether a file holds a head model's arrays by the names of `FIELDS`."""
-    if not zipfile.is_zipfile(path):
-        return False
-    with zipfile.ZipFile(path) as archive:
+    with suppress(zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
         return "skinning.npy" in archive.namelist()
+    return False

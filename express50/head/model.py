@@ -124,6 +124,10 @@ def check_head(model: HeadModel) -> HeadModel:
         "uv_faces": (model.uv_faces, model.uv.shape[0]),
         "landmark_faces": (model.landmark_faces, model.faces.shape[0]),
     }
+    if model.contour is not None:
+        ranges["contour"] = (torch.cat(model.contour), vertices)
+        if len(model.contour) != 17:
+            raise HeadModelError(f"{where}: contour has {len(model.contour)} lists, expected 17")
     for key, (index, count) in ranges.items():
         if index.numel() and (int(index.min()) < 0 or int(index.max()) >= count):
             raise HeadModelError(

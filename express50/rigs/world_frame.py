@@ -110,7 +110,8 @@ def judge(cameras: Mapping[str, Camera]) -> RigVerdict:
     problem = _describe_behind(depths_behind(cameras))
     point = meeting_point(cameras)
     if point is None:
-        return RigVerdict(len(cameras), None, None, None, problem, "", ("the axes are parallel",))
+        words = ("the axes are parallel",) if len(cameras) > 1 else ()
+        return RigVerdict(len(cameras), None, None, None, problem, "", words)
     gaps = {name: point - camera.center for name, camera in cameras.items()}
     distance = float(np.median([np.linalg.norm(gap) for gap in gaps.values()]))
     axes = {name: camera.cam_from_world[2, :3] for name, camera in cameras.items()}

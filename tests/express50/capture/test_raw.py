@@ -1,6 +1,7 @@
 """Raw captures: what is read, and what each kind of damage is answered with."""
 
 import json
+import shutil
 
 import pytest
 
@@ -69,6 +70,15 @@ def test_gap_in_frames_drops_the_camera_and_names_the_frame(raw):
     capture = read_capture(raw)
     assert list(capture.cameras) == ["cam00", "cam02"]
     assert "frame 3 is missing: found 000004.png" in capture.dropped["cam01"]
+
+
+def test_frame_numbers_need_no_leading_zeros(raw):
+    frames = raw / "cameras/cam01/frames"
+    for path in frames.iterdir():
+        path.rename(frames / f"{int(path.stem)}.png")
+    for number in range(6, 12):
+        shutil.copy(frames / "0.png", frames / f"{number}.png")
+    assert read_capture(raw).cameras["cam01"].names == tuple(f"{n}.png" for n in range(12))
 
 
 def test_camera_without_or_with_two_kinds_of_footage_is_dropped(raw):

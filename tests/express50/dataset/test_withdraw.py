@@ -147,9 +147,14 @@ def test_points_and_pixels_that_spell_an_id_by_chance_name_nobody(dataset):
     assert len(list(dataset.item_dir("depth", "S002/smile").iterdir())) == 5
 
 
-def test_what_is_left_is_found_and_makes_exit_code_1(dataset, capsys):
+@pytest.mark.parametrize("linked", [False, True])
+def test_what_is_left_is_found_and_makes_exit_code_1(dataset, tmp_path, capsys, linked):
     model = dataset.root / "grmm" / "model.pt"
-    model.parent.mkdir()
+    if linked:  # to another disk
+        (tmp_path / "disk").mkdir()
+        model.parent.symlink_to(tmp_path / "disk")
+    else:
+        model.parent.mkdir()
     model.write_bytes(b"\x00codes of S001\x00")
     command = ["subject", "withdraw", str(dataset.root), "S001", "--yes", "--json"]
     assert main(command) == 1

@@ -1,12 +1,16 @@
 """Image files: types kept, damage named, depth quantised as stated."""
 
+import struct
+import zlib
+
 import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from express50.errors import FormatError
+from express50.errors import CaptureError, FormatError
 from express50.files import images
+from express50.files.containers import decode_picture
 
 RNG = np.random.default_rng(0)
 
@@ -15,7 +19,7 @@ RNG = np.random.default_rng(0)
     ("name", "dtype"),
     [("a.png", np.uint8), ("a.png", np.uint16), ("a.tif", np.uint16), ("a.exr", np.float32)],
 )
-@pytest.mark.parametrize("shape", [(7, 9), (7, 9, 3), (1, 1, 3)])
+@pytest.mark.parametrize("shape", [(7, 9), (7, 9, 3), (7, 9, 4), (1, 1, 3)])
 def test_lossless_round_trip_keeps_type_and_values(tmp_path, name, dtype, shape):
     top = 1.0 if dtype == np.float32 else np.iinfo(dtype).max
     image = (RNG.random(shape) * top).astype(dtype)
@@ -32,6 +36,19 @@ def test_same_image_gives_same_bytes(tmp_path):
         first = (tmp_path / name).read_bytes()
         images.write_image(tmp_path / name, image)
         assert (tmp_path / name).read_bytes() == first
+
+
+def test_an_unwritable_path_says_why(tmp_path):
+    with pytest.raises(FormatError, match="Could not open"):
+        images.write_image(tmp_path / "absent" / "a.jpg", np.zeros((2, 2, 3), np.uint8))
+
+
+def test_a_picture_below_our_limit_is_read_without_a_warning():
+    small = images.encode_png(np.zeros((1, 1), np.uint8))
+    head = b"IHDR" + struct.pack(">II", 9600, 9600) + small[24:29]
+    png = small[:12] + head + struct.pack(">I", zlib.crc32(head)) + small[33:]
+    with pytest.raises(CaptureError, match="damaged image"):
+        decode_picture(png, "big")
 
 
 def test_jpeg_keeps_colour_order_and_png_alpha():

@@ -36,7 +36,7 @@ def test_a_head_model_of_ones_own_is_read_from_its_arrays(tmp_path: Path) -> Non
     assert all(head.regions[name].equal(mask) for name, mask in builtin.regions.items())
 
 
-@pytest.mark.parametrize("change", ["missing", "shape", "contour"])
+@pytest.mark.parametrize("change", ["missing", "shape", "regions", "contour", "index"])
 def test_a_stored_head_model_that_does_not_fit_is_refused(tmp_path: Path, change: str) -> None:
     with np.load(BUILTIN) as stored:
         arrays = dict(stored)
@@ -44,8 +44,14 @@ def test_a_stored_head_model_that_does_not_fit_is_refused(tmp_path: Path, change
         del arrays["faces"]
     elif change == "shape":
         arrays["template"] = arrays["template"][:-1]
-    else:
+    elif change == "regions":
         arrays["region_names"] = arrays["region_names"][:-1]
+    elif change == "contour":
+        arrays["contour"] = arrays["contour"] + len(arrays["template"])
     np.savez(tmp_path / "mine.npz", **arrays)
+    if change == "index":
+        data = bytearray((tmp_path / "mine.npz").read_bytes())
+        data[data.rfind(b"PK\x01\x02")] = 0
+        (tmp_path / "mine.npz").write_bytes(data)
     with pytest.raises(HeadModelError, match="mine"):
         load_head(tmp_path / "mine.npz")

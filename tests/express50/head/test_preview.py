@@ -41,4 +41,5 @@ def test_the_command_writes_the_sheet(tmp_path, capsys):
     assert main(["head", "preview", str(out), "--yaws", "0,40", "--size", "16"]) == 0
     assert read_image(out).shape == (16 * len(POSES), 32, 3)
     assert "procedural" in capsys.readouterr().out
-    assert main(["head", "preview", str(out), "--yaws", "left"]) == 2
+    for wrong in (["--yaws", "left"], ["--yaws", "nan"], ["--size", "0"]):
+        assert main(["head", "preview", str(out), *wrong]) == 2

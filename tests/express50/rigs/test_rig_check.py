@@ -54,7 +54,8 @@ def test_millimetres_and_a_stray_camera_are_warned_of():
 
 
 def test_one_camera_has_no_meeting_point():
-    assert judge(make_rig(count=1)).meeting is None
+    verdict = judge(make_rig(count=1))
+    assert verdict.meeting is None and verdict.warnings == ()
 
 
 def test_import_writes_a_calibration_that_is_read_again(tmp_path, capsys):

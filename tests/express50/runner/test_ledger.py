@@ -92,13 +92,21 @@ def test_folder_digest_sees_names_and_contents_but_not_hidden_files(tmp_path):
     assert len({first, renamed, path_digest(tmp_path)}) == 3
 
 
-def test_stat_digest_follows_size_and_time(tmp_path):
-    (tmp_path / "x").write_text("1")
-    os.utime(tmp_path / "x", ns=(5, 5))
-    first = stat_digest(tmp_path)
-    assert stat_digest(tmp_path) == first
-    os.utime(tmp_path / "x", ns=(5, 6))
-    assert stat_digest(tmp_path) != first
+@pytest.mark.parametrize("linked", [False, True])
+def test_stat_digest_follows_size_and_time(tmp_path, linked):
+    """A camera's folder may be a link to another disk, and links may form a circle."""
+    capture, folder = tmp_path / "capture", tmp_path / "disk" if linked else tmp_path / "capture"
+    capture.mkdir()
+    folder.mkdir(exist_ok=True)
+    (folder / "x").write_text("1")
+    os.utime(folder / "x", ns=(5, 5))
+    if linked:
+        (capture / "cam00").symlink_to(folder)
+        (folder / "again").symlink_to(folder)
+    first = stat_digest(capture)
+    assert stat_digest(capture) == first
+    os.utime(folder / "x", ns=(5, 6))
+    assert stat_digest(capture) != first
 
 
 def test_missing_input_names_the_remedy(tmp_path):
