@@ -40,7 +40,7 @@ check: $(READY) ## lint and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: $(READY) ## every benchmark, each ends in one JSON object
+bench: $(READY) ## the benchmarks that need no arguments, each ends in one JSON object
 	$(BIN)/python -m benchmarks.all
 
 tradeoff: $(READY) ## sweep the speed-accuracy knobs into docs/TRADEOFFS.md

@@ -1,4 +1,4 @@
-"""Run every benchmark that needs no arguments, one after the other; their last lines are kept."""
+"""Run the benchmarks that need no arguments and share a night; their last lines are kept."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import subprocess
 import sys
 
 # Hours on two cores, most of them in `ablate`, `align`, `track`, `depth` and `grmm`. `regions`
-# wants the dataset of the demo; `demo` and the sweeps are jobs of their own.
+# needs the demo's dataset; `budget`, `demo`, `intervals`, `scale` and the sweeps take a night each.
 NAMES = (
-    "ablate", "align", "calibrate", "depth", "faults", "fps", "grmm", "head", "matte",
+    "ablate", "align", "calibrate", "depth", "faults", "fps", "grmm", "head", "landmarks", "matte",
     "matte_views", "occluders --quick", "raster", "register", "shards", "stage_overhead", "track",
 )  # fmt: skip
 

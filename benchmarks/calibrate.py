@@ -266,7 +266,7 @@ def stated_figures(
     The smaller rigs are parts of the recorded one: neighbours, and cameras evenly apart.
     """
     found, names = {}, sorted(sizes)
-    for count in (4, 8, len(names)):
+    for count in sorted({min(n, len(names)) for n in (4, 8, len(names))}):
         stated, off = list[float](), list[float]()
         apart = len(names) // count
         parts = [names[first::apart] for first in range(apart)]

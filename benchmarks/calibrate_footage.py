@@ -1,13 +1,11 @@
 """Measure rigs solved from footage alone, and given rigs refined, against true cameras.
 
-Parts of ``python -m benchmarks.calibrate``. COLMAP's incremental mapping on the same features and
-landmarks (all frame sets of a camera as one picture, since cameras do not move) stands beside the
-solution.
+Parts of ``python -m benchmarks.calibrate``. What COLMAP's mapping makes of the same features is in
+docs/LOG.md.
 """
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -15,7 +13,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera, project, triangulate
@@ -27,7 +24,7 @@ from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.footage import find_points, read_raw_footage, reduced_camera
 from pipelines.calibrate.footage_rig import FootageSolution, solve_footage
 from pipelines.calibrate.given_rig import RefinedRig, refine_by_footage
-from pipelines.calibrate.tracks import FrameSetPoints, match_descriptors
+from pipelines.calibrate.tracks import FrameSetPoints
 from pipelines.calibrate.uncertainty import camera_errors, head_points
 
 BUMP_DEG, BUMP_MM = 0.3, 5.0
@@ -47,7 +44,7 @@ def small(cameras: Mapping[str, Camera]) -> dict[str, Camera]:
 def sfm_figures(
     seen: Mapping[int, FrameSetPoints], true: Mapping[str, Camera], config: CalibrateConfig
 ) -> dict[str, object]:
-    """Return errors of rigs with unknown and with known focal lengths, and of COLMAP's mapping."""
+    """Return errors of rigs with unknown and with known focal lengths."""
     rig = small(true)
     sizes = {name: (camera.width, camera.height) for name, camera in rig.items()}
     known = {name: float(camera.K[0, 0]) for name, camera in rig.items()}
@@ -65,7 +62,6 @@ def sfm_figures(
         except CalibrationError as error:
             row = {"cameras_registered": 0, "cameras": len(rig), "refused": str(error)}
         rows[key] = row | {"seconds": round(time.process_time() - started, 2)}
-    rows["baseline"] = {"colmap_mapping": similar(colmap_mapping(seen, rig), rig)}
     return rows
 
 
@@ -170,94 +166,6 @@ def perturbed(rig: Mapping[str, Camera]) -> dict[str, Camera]:
         pose = move_pose(camera.cam_from_world, np.concatenate([turn, shift]))
         found[name] = replace(camera, cam_from_world=pose)
     return found
-
-
-def colmap_mapping(
-    seen: Mapping[int, FrameSetPoints], rig: Mapping[str, Camera]
-) -> dict[str, Camera]:
-    """Return the largest model of COLMAP's mapping, which is given sizes, not focal lengths."""
-    with tempfile.TemporaryDirectory() as folder:
-        root = Path(folder)
-        _write_database(root / "database.db", seen, rig)
-        options = pycolmap.IncrementalPipelineOptions()
-        options.random_seed, options.num_threads = 0, 1
-        options.extract_colors = False
-        options.min_model_size = 3
-        options.mapper.abs_pose_min_num_inliers = 15
-        options.mapper.init_min_num_inliers = 30
-        options.mapper.init_min_tri_angle = 8.0
-        (root / "models").mkdir()
-        models = pycolmap.incremental_mapping(root / "database.db", root, root / "models", options)
-    best = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
-    found: dict[str, Camera] = {}
-    if best is None:
-        return found
-    for number in best.reg_image_ids():
-        image = best.image(number)
-        camera = best.camera(image.camera_id)
-        pose = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
-        params = tuple(float(p) for p in camera.params)
-        found[image.name] = Camera(
-            image.name, camera.width, camera.height, "SIMPLE_RADIAL", params, pose
-        )
-    return found
-
-
-def _write_database(
-    path: Path, seen: Mapping[int, FrameSetPoints], rig: Mapping[str, Camera]
-) -> None:
-    database = pycolmap.Database.open(path)
-    ids, cameras, points = {}, {}, {}
-    for name, camera in sorted(rig.items()):
-        params = [1.2 * max(camera.width, camera.height), camera.width / 2, camera.height / 2, 0.0]
-        made = pycolmap.Camera(
-            model="SIMPLE_RADIAL", width=camera.width, height=camera.height, params=params
-        )
-        made.camera_id = database.write_camera(made)
-        single = pycolmap.Rig()
-        single.add_ref_sensor(made.sensor_id)
-        number = database.write_rig(single)
-        image = pycolmap.Image(name=name, camera_id=made.camera_id)
-        image.image_id = ids[name] = database.write_image(image)
-        frame = pycolmap.Frame()
-        frame.rig_id = number
-        frame.add_data_id(image.data_id)
-        database.write_frame(frame)
-        cameras[name] = made
-        points[name] = np.concatenate([_pixels(frame_set, name) for frame_set in seen.values()])
-        database.write_keypoints(ids[name], points[name].astype(np.float32))
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = 0
-    names = sorted(rig)
-    for i, a in enumerate(names):
-        for b in names[i + 1 :]:
-            pairs = _pairs(seen, a, b)
-            if len(pairs) < 15:
-                continue
-            geometry = pycolmap.estimate_two_view_geometry(
-                cameras[a], points[a], cameras[b], points[b], pairs, options
-            )
-            database.write_matches(ids[a], ids[b], pairs)
-            if len(geometry.inlier_matches) >= 15:
-                database.write_two_view_geometry(ids[a], ids[b], geometry)
-    database.close()
-
-
-def _pixels(points: FrameSetPoints, name: str) -> np.ndarray:
-    """Return a camera's pixels in a frame set: 68 landmarks (zeros without a face), features."""
-    faces = {camera: pixels for camera, pixels, _ in points.landmarks}
-    return np.concatenate([faces.get(name, np.zeros((68, 2))), points.features[name][0]])
-
-
-def _pairs(seen: Mapping[int, FrameSetPoints], a: str, b: str) -> np.ndarray:
-    """Match (M, 2) of two cameras, keypoints numbered over all frame sets."""
-    found, at = [np.zeros((0, 2), int)], np.zeros(2, int)
-    for points in seen.values():
-        if {a, b} <= {name for name, _, _ in points.landmarks}:
-            found.append(np.arange(68)[:, None] + at)
-        found.append(match_descriptors(points.features[a][1], points.features[b][1]) + 68 + at)
-        at += [68 + len(points.features[name][0]) for name in (a, b)]
-    return np.concatenate(found).astype(np.uint32)
 
 
 def _five(value: float) -> float:

@@ -9,9 +9,7 @@ within its bound, items weighted alike; 90 is meant. Errors of one person or rig
 differ in all rows of the stage; ``rows_off`` lie outside of 88 to 92 with it. ``items_inside``
 counts the items whose error lies in the interval of their ``expected_error``. ``depth.ause`` is the
 sparsification error of depth (0 is ideal, Ilg et al. 2018) over all pixels, ``_skin`` over those of
-bare skin, ``_before`` with the confidence that former versions had. ``halves`` has no truth:
-captures of ``--foreign`` are run on either half of their cameras, and results must differ by no
-more than both bounds together.
+bare skin.
 What is made is kept in DIR and taken up again; ``--made`` takes only that. ``--fit`` makes the same
 of other subjects, and writes ``express50/error_models.json`` from it; raise the versions of the
 stages then. The last line is one JSON object.
@@ -34,14 +32,13 @@ from benchmarks.common import make_parser
 from benchmarks.intervals_collect import (
     Figures,
     Sample,
-    half_shares,
     peak_samples,
     row_samples,
     sampled,
     with_tracked,
 )
 from benchmarks.intervals_fit import ause, fit_model
-from benchmarks.intervals_rows import ALIGN_NOISE, CONDITIONS, make_halves, make_peaks, make_row
+from benchmarks.intervals_rows import ALIGN_NOISE, CONDITIONS, make_peaks, make_row
 from express50.contract.layout import Dataset
 from express50.contract.stage import Unit
 from express50.error_model import FILE, NOMINAL, ErrorModel, error_bounds, error_models, item_error
@@ -65,7 +62,6 @@ FIT, TEST = tuple(range(61, 69)), (71, 72, 73, 74)  # subjects
 FIT_RIGS, TEST_RIGS = range(10), range(100, 110)  # seeds of simulated rigs
 FIT_PEAKS, TEST_PEAKS = ((81, 82), (83,)), ((91, 92), (93,))  # subjects per noise of ALIGN_NOISE
 BAR = 88.0, 92.0  # percent
-HALVES_PEAKS = {"neutral": 2, "smile": 9}  # frames of the foreign captures
 # Cameras, focal length in pixels, distance in metres, noise of corners in pixels.
 RIGS: dict[str, tuple[int, float, float, float]] = {
     "2 views": (2, 900.0, 1.1, 0.1),
@@ -89,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         write_models(rows)
         return 0
     figures = measure(rows)
-    figures |= {"halves": halves(options), "cpu_seconds": round(time.process_time() - began)}
+    figures["cpu_seconds"] = round(time.process_time() - began)
     print(json.dumps({"benchmark": "intervals"} | figures))
     return 0
 
@@ -106,7 +102,6 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--made", action="store_true", help="only rows that are made already")
     parser.add_argument("--fit", action="store_true", help="fit the constants, on other subjects")
-    parser.add_argument("--foreign", nargs="*", type=Path, default=[], help="captures, no truth")
     options = parser.parse_args(arguments)
     mine, others = (FIT, TEST) if options.fit else (TEST, FIT)
     options.subjects = options.subjects or list(mine)
@@ -237,34 +232,15 @@ def spread(shares: Mapping[str, Sequence[float]]) -> Iterator[tuple[str, list[fl
 
 def sparsification(depth: Sequence[Sample]) -> dict:
     """Return the mean sparsification errors of depth's items."""
-    keys = ("depth.ause", "depth.ause_before", "depth.ause_skin", "depth.ause_skin_before")
+    keys = ("depth.ause", "depth.ause_skin")
     rows = []
     for sample in depth:
-        doubt = error_bounds("depth", sample.figures, sample.shared).bound
-        sides = [(sample.errors, doubt), (sample.errors, -sample.baseline)]
-        bare = sample.skin
-        rows.append([ause(*pair) for pair in sides])
-        rows[-1] += [
-            ause(errors[bare], key[bare]) if bare.any() else np.nan for errors, key in sides
-        ]
+        doubt, bare = error_bounds("depth", sample.figures, sample.shared).bound, sample.skin
+        skin = ause(sample.errors[bare], doubt[bare]) if bare.any() else np.nan
+        rows.append([ause(sample.errors, doubt), skin])
     if not rows:
         return dict.fromkeys(keys)
     return {k: round(float(v), 3) for k, v in zip(keys, np.nanmean(rows, axis=0), strict=True)}
-
-
-def halves(options: argparse.Namespace) -> dict:
-    """Return how often results of two halves of the cameras agree within both bounds."""
-    found: dict[str, list[float]] = {}
-    for capture in options.foreign:
-        one, other = made = [
-            Dataset(options.work / "halves" / f"{capture.name}-{half}") for half in (0, 1)
-        ]
-        if not options.made:
-            one, other = make_halves(capture, HALVES_PEAKS, options.work)
-        if all(dataset.stage_dir("register").is_dir() for dataset in made):
-            for stage, share in half_shares(one, other):
-                found.setdefault(stage, []).append(share)
-    return {stage: round(100 * float(np.mean(rows)), 1) for stage, rows in found.items()}
 
 
 def write_models(rows: Sequence[Row]) -> None:

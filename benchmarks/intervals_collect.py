@@ -27,7 +27,6 @@ from express50.error_model import (
     PEOPLE_DIFFER,
     ErrorModel,
     error_bounds,
-    error_models,
     single_camera_sigma,
 )
 from express50.files.images import read_alpha, shrink
@@ -60,7 +59,6 @@ class Sample:
         figures: by name (N,).
         errors: (N,) true ones.
         shared: (N,) deviations that all have in common, as `error_bounds` takes them.
-        baseline: (N,) confidence of former versions, of depth alone.
         skin: (N,) where the truth shows the head's own surface, of depth alone.
     """
 
@@ -69,7 +67,6 @@ class Sample:
     figures: dict[str, np.ndarray]
     errors: np.ndarray
     shared: np.ndarray
-    baseline: np.ndarray = field(default_factory=lambda: np.zeros(0))
     skin: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
 
 
@@ -79,14 +76,11 @@ def sampled(
     parts: Sequence[Figures],
     errors: Sequence[np.ndarray],
     shared: Sequence[np.ndarray] | None = None,
-    whole: bool = False,
     **further: Sequence[np.ndarray],
 ) -> Sample:
-    """Join the elements of an item's parts, and draw at most SAMPLES of them unless `whole`."""
+    """Join the elements of an item's parts, and draw at most SAMPLES of them."""
     every = np.concatenate(errors)
-    kept = np.arange(len(every))
-    if not whole:
-        kept = np.random.default_rng(0).permutation(len(every))[:SAMPLES]
+    kept = np.random.default_rng(0).permutation(len(every))[:SAMPLES]
     figures = {
         name: np.concatenate(
             [np.broadcast_to(p[name], e.shape) for p, e in zip(parts, errors, strict=True)]
@@ -179,7 +173,7 @@ def _depth(peak: _Peak) -> Iterator[Sample]:
         for n in surface.figures["cameras"]
     }
     pictures = [picture_of(peak.cameras[n], *read(), read) for n, read in reads.items()]
-    parts, errors, shared, old, skin = [], [], [], [], []
+    parts, errors, shared, skin = [], [], [], []
     lone = PEOPLE_DIFFER if len(pictures) == 1 else 0.0
     for name, view, _ in surface_maps(surface, pictures, solid):
         place = peak.subject, peak.frame, peak.true_camera(name)
@@ -188,9 +182,8 @@ def _depth(peak: _Peak) -> Iterator[Sample]:
         parts.append({k: np.broadcast_to(v, both.shape)[both] for k, v in view.figures.items()})
         errors.append(1e3 * np.abs(view.depth - true)[view.valid & there])
         shared.append(1e3 * lone * view.depth[view.valid & there])
-        old.append(old_confidence(parts[-1]))
         skin.append(peak.truth.skin(*place)[view.valid & there])
-    yield sampled("depth", peak.name, parts, errors, shared, baseline=old, skin=skin)
+    yield sampled("depth", peak.name, parts, errors, shared, skin=skin)
 
 
 def _surface(folder: Path) -> HeadSurface:
@@ -202,14 +195,6 @@ def _surface(folder: Path) -> HeadSurface:
     sure = found.confidence.astype(np.float32)
     parts = found.vertices, normals, found.faces, sure, found.colors
     return HeadSurface(*parts, None, figures)  # type: ignore[arg-type]
-
-
-def old_confidence(figures: Figures) -> np.ndarray:
-    """Return the confidence (N,) that former versions of depth stated, from the same figures."""
-    slant = np.clip(4 / figures["slant"], 0, 1) / (1 + figures["jump"] / 4)
-    photo = np.exp(-(figures["photo"] - 0.5) / 5)
-    believed = np.where(np.isfinite(photo), photo, 0.2)
-    return np.sqrt((1.05 - figures["disagreement"]) * slant * believed)
 
 
 @dataclass(frozen=True)
@@ -276,29 +261,3 @@ def peak_samples(dataset: Dataset, truth: Truth) -> Iterator[Sample]:
         rows = [(peak_figures(s), abs(s.frame - true[e])) for e, s in found.items() if e != NEUTRAL]
         parts: list[Figures] = [dict(figures) for figures, _ in rows]
         yield sampled("align", subject, parts, [np.array([off]) for _, off in rows])
-
-
-def half_shares(one: Dataset, other: Dataset) -> Iterator[tuple[str, float]]:
-    """Yield stage and share of the vertices that two results place within both bounds together.
-
-    The two are of the same moments, from cameras that they do not share: bounds of independent
-    errors add in squares.
-    """
-    models = error_models()
-    for subject in one.subjects():
-        sides = [(d, read_cameras_of(d, subject)) for d in (one, other)]
-        for expression in read_peaks(one, subject):
-            pair = [_meshes_of(d, subject, expression, cameras) for d, cameras in sides]
-            for stage in pair[0].keys() & pair[1].keys():
-                meshes = [found[stage] for found in pair]
-                off = 1e3 * (meshes[0].vertices - meshes[1].vertices)
-                apart = np.linalg.norm(off, axis=1)
-                if stage == "register":
-                    faces = load_head(read_track(one.track_file(subject)).head).faces
-                    apart = np.abs((off * mesh_normals(meshes[0].vertices, faces)).sum(1))
-                bounds = []
-                for mesh in meshes:
-                    sample = sampled(stage, subject, [mesh.figures], [apart], [mesh.shared], True)
-                    sample = with_tracked(sample, models["track"])
-                    bounds.append(error_bounds(stage, sample.figures, sample.shared).bound)
-                yield stage, float(np.mean(apart <= np.hypot(*bounds)))

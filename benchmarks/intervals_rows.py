@@ -1,8 +1,7 @@
 """Record a digital twin under a condition and run the chain up to registration on it.
 
 A condition is a row of ``CONDITIONS``: how many cameras, how many pixels, how far away, and what is
-wrong with the footage. Peaks are the truth's, as alignment has rows of its own. Captures without
-truth are run twice, on either half of their cameras.
+wrong with the footage. Peaks are the truth's, as alignment has rows of its own.
 """
 
 from __future__ import annotations
@@ -157,22 +156,6 @@ def keep_cameras(capture: Path, kept: Sequence[str]) -> None:
         (capture / "plates" / f"{name}.png").unlink(missing_ok=True)
     (capture / "calibration.json").unlink()
     write_cameras(capture / "calibration.json", {name: cameras[name] for name in kept})
-
-
-def make_halves(source: Path, peaks: dict[str, int], root: Path) -> list[Dataset]:
-    """Run the chain on every other camera of a capture, and on the rest."""
-    made = []
-    for half in (0, 1):
-        dataset = Dataset(root / "halves" / f"{source.name}-{half}")
-        capture = dataset.root / "capture" / source.name
-        if not capture.is_dir():
-            shutil.copytree(source, capture)
-            for folder in (capture, *capture.rglob("*")):
-                folder.chmod(0o755 if folder.is_dir() else 0o644)
-            keep_cameras(capture, sorted(p.name for p in (capture / "cameras").iterdir())[half::2])
-        run_chain(dataset, capture, peaks)
-        made.append(dataset)
-    return made
 
 
 SCRIPT = (

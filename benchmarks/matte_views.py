@@ -67,7 +67,7 @@ from pipelines.matte.plates import LEAST_SHARE, match_plate
 from pipelines.matte.stage import corrected, make_view
 from pipelines.matte.visual_hull import ball_of
 
-PRESETS = ("draft", "standard", "reference")
+PRESETS = ("draft", "standard")
 RIG = TwinConfig(
     subjects=1,
     first_subject=61,
@@ -122,15 +122,8 @@ def main() -> int:
                 for preset, config in configs.items():
                     row = measure(keyed[::step], config, sheet_of(args, preset, scene, step, frame))
                     rows.setdefault((len(keyed[::step]), preset, scene), []).append(row)
-                    print(
-                        subject,
-                        frame,
-                        scene,
-                        preset,
-                        len(keyed[::step]),
-                        rounded(row),
-                        file=sys.stderr,
-                    )
+                    words = subject, frame, scene, preset, len(keyed[::step]), rounded(row)
+                    print(*words, file=sys.stderr)
         if not args.plates_only:
             for scene, shots in {"recorded": clean, **walls(clean)}.items():
                 for step in (1, 3):

@@ -1,9 +1,9 @@
 """Measure labels and head mattes against the twin's truth: ``python -m benchmarks.regions``.
 
-Every preset labels the same items from the same mattes, tracks and depth maps. Beside it stand
+The stage (``standard``) labels items from their mattes, tracks and depth maps. Beside it stand
 simpler ways to lose the torso: keep it (``no_cut``), cut along the image row of the tracked chin
-(``chin_line``) or of the neck's tracked end (``neck_line``); and two limits: the standard preset on
-the true mesh instead of the tracked one (``true_mesh``), and the same matte without the pixels that
+(``chin_line``) or of the neck's tracked end (``neck_line``); and two limits: the stage on the true
+mesh instead of the tracked one (``true_mesh``), and the same matte without the pixels that
 truly show torso (``true_cut``), whose error is the matte's own. IoU of a part is over the pixels
 of all views in which the truth or the labels have it. Seconds are processor seconds per view,
 reading included. The last line is one JSON object.
@@ -25,7 +25,7 @@ from benchmarks.common import evenly, make_parser
 from benchmarks.regions_truth import iou_figures, true_head_alpha, true_labels, view_row
 from express50.capture.frames import read_cameras_of
 from express50.capture.index import read_peaks
-from express50.contract.config import PRESETS, resolve_config
+from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.segmentation_labels import TORSO
 from express50.dataset.tracks import read_track
@@ -34,7 +34,7 @@ from express50.geometry.cameras import Camera, project
 from express50.head.load import load_head
 from express50.head.model import landmarks
 from express50.twin.truth import Truth
-from pipelines.regions import STAGE
+from pipelines.regions import STAGE, RegionsConfig
 from pipelines.regions.geometry import head_alpha, head_labels, make_head
 from pipelines.regions.stage import label_view, read_depth_of, read_head, read_pair
 
@@ -49,7 +49,6 @@ def main() -> int:
     parser = make_parser("regions", __doc__)
     parser.add_argument("--dataset", type=Path, default=Path("build/demo/data/demo"))
     parser.add_argument("--truth", type=Path, default=Path("build/demo/twin/truth"))
-    parser.add_argument("--presets", nargs="+", default=list(PRESETS), choices=PRESETS)
     parser.add_argument("--set", dest="assignments", action="append", default=[])
     parser.add_argument("--items", type=int, default=4, help="this many, evenly chosen; 0: all")
     args = parser.parse_args()
@@ -59,10 +58,10 @@ def main() -> int:
         sys.exit(f"{args.dataset}: no depth maps; run 'make demo' or name --dataset and --truth")
     if args.items:
         items = evenly(items, args.items)
-    configs = {p: resolve_config(STAGE, p, None, args.assignments) for p in args.presets}
+    config = resolve_config(STAGE, "standard", None, args.assignments)
     rows: dict[str, list[dict]] = {}
     for item in items:
-        for name, row in measure_item(dataset, truth, item, configs).items():
+        for name, row in measure_item(dataset, truth, item, config).items():
             rows.setdefault(name, []).append(row)
     result = {name: summary(found) for name, found in rows.items()}
     for name, figures in result.items():
@@ -71,8 +70,10 @@ def main() -> int:
     return 0
 
 
-def measure_item(dataset: Dataset, truth: Truth, item: str, configs: dict) -> dict[str, dict]:
-    """Measure every preset and baseline on one item."""
+def measure_item(
+    dataset: Dataset, truth: Truth, item: str, config: RegionsConfig
+) -> dict[str, dict]:
+    """Measure the stage and every baseline on one item."""
     subject, expression = item.split("/")
     frame = read_peaks(dataset, subject)[expression]
     cameras = true_world_cameras(dataset, truth, subject)
@@ -83,19 +84,17 @@ def measure_item(dataset: Dataset, truth: Truth, item: str, configs: dict) -> di
         )
         for name, camera in cameras.items()
     }
-    found = {}
-    for preset, config in configs.items():
-        with tempfile.TemporaryDirectory() as folder:
-            out = Path(folder)
-            start = time.process_time()
-            STAGE.run(dataset, item, config, out)
-            seconds = time.process_time() - start
-            rows = [
-                view_row(*true[name], read_image(out / f"{name}_head.png") / 255.0,
-                         read_image(out / f"{name}.png"))
-                for name in true
-            ]  # fmt: skip
-        found[preset] = {"rows": rows, "seconds": seconds / len(true)}
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder)
+        start = time.process_time()
+        STAGE.run(dataset, item, config, out)
+        seconds = time.process_time() - start
+        rows = [
+            view_row(*true[name], read_image(out / f"{name}_head.png") / 255.0,
+                     read_image(out / f"{name}.png"))
+            for name in true
+        ]  # fmt: skip
+    found: dict[str, dict] = {"standard": {"rows": rows, "seconds": seconds / len(true)}}
     found["true_mesh"] = {"rows": true_mesh_rows(dataset, truth, item, true), "seconds": None}
     matte = baselines(dataset, item)["no_cut"]
     shown = {name: matte(name) * (labels != TORSO) for name, (labels, _) in true.items()}
@@ -110,7 +109,7 @@ def measure_item(dataset: Dataset, truth: Truth, item: str, configs: dict) -> di
 def true_mesh_rows(
     dataset: Dataset, truth: Truth, item: str, true: Mapping[str, Pair]
 ) -> list[dict]:
-    """Measure the standard preset with perfect tracking."""
+    """Measure the stage with perfect tracking."""
     subject, expression = item.split("/")
     frame = read_peaks(dataset, subject)[expression]
     labels = head_labels(truth.head_model(subject))
