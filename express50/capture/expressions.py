@@ -41,7 +41,12 @@ def load_script() -> tuple[Expression, ...]:
     script = []
     for row in tomllib.loads(file.read_text(encoding="utf-8"))["expression"]:
         numbers = {key: tuple(row[key]) for key in ("jaw", "neck", "gaze") if key in row}
-        script.append(Expression(**row | numbers))
+        controls = {
+            name.replace("_LR", side): value
+            for name, value in row.get("controls", {}).items()
+            for side in (("_L", "_R") if name.endswith("_LR") else ("",))
+        }
+        script.append(Expression(**row | numbers | {"controls": controls}))
     return tuple(script)
 
 
