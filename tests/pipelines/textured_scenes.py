@@ -12,11 +12,32 @@ from express50.geometry.transforms import look_at
 from express50.head.model import HeadModel
 from pipelines.track.surface import Visibility, sample_normals
 from pipelines.track.terms import MeshPlaces
-from tests.express50.geometry.mesh_scenes import sphere
 from tests.express50.head.tiny_head import tiny_head
 
 RADIUS = 0.1
 ORIGIN = np.zeros(3)
+
+
+def sphere(rings: int = 12, radius: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """A closed sphere of 2 * rings segments, faces counter-clockwise from outside."""
+    segments = 2 * rings
+    polar = np.pi * np.arange(1, rings) / rings
+    around = 2 * np.pi * np.arange(segments) / segments
+    y, ring = np.cos(polar)[:, None] + 0 * around, np.sin(polar)[:, None]
+    middle = np.stack([ring * np.sin(around), y, ring * np.cos(around)], -1).reshape(-1, 3)
+    vertices = np.concatenate([middle, [[0, 1, 0], [0, -1, 0]]]) * radius
+    at = np.arange((rings - 1) * segments).reshape(rings - 1, segments)
+    a, b = at[:-1], np.roll(at, -1, 1)[:-1]
+    c, d = at[1:], np.roll(at, -1, 1)[1:]
+    top, bottom = len(vertices) - 2, len(vertices) - 1
+    first, last = at[0], at[-1]
+    faces = [
+        np.stack([a, c, d], -1).reshape(-1, 3),
+        np.stack([a, d, b], -1).reshape(-1, 3),
+        np.stack([np.full(segments, top), first, np.roll(first, -1)], -1),
+        np.stack([np.full(segments, bottom), np.roll(last, -1), last], -1),
+    ]
+    return vertices, np.concatenate(faces)
 
 
 def rig(
