@@ -195,7 +195,7 @@ def _at_scale(view: CutView, factor: float) -> CutView:
 
 
 @cache
-def _parts() -> dict[int, tuple[np.ndarray, ...]]:
+def parts_of_a_person() -> dict[int, tuple[np.ndarray, ...]]:
     """Return convex parts (N, 3) of a person, head space, metres, by GrabCut label."""
     from express50.head.load import load_head
     from pipelines.calibrate.footage_rig import mean_landmarks
@@ -205,11 +205,11 @@ def _parts() -> dict[int, tuple[np.ndarray, ...]]:
     chin, bottom = float(face[8, 1]), float(vertices[:, 1].min())
     skull = vertices[vertices[:, 1] > chin]
     middle = (skull.min(0) + skull.max(0)) / 2
-    back = float(np.median(vertices[vertices[:, 1] < bottom + 0.02, 2]))  # the neck's axis
-    neck = _slab((0.03, 0.04), (chin, bottom - 0.05), back, 0.03)
-    torso = _slab((0.07, 0.2, 0.24), (bottom, bottom - 0.08, bottom - 0.7), back, 0.1)
-    hair = _slab((0.16, 0.18), (middle[1], bottom - 0.1), back, 0.12)
-    wide = _slab((0.18, 0.3, 0.34), (chin, bottom - 0.05, bottom - 0.9), back, 0.25)
+    throat, back = (_middle_depth(vertices, y) for y in (chin - 0.02, bottom + 0.01))
+    neck = _slab((0.03, 0.04), (chin, bottom - 0.05), (throat, back), 0.03)
+    torso = _slab((0.07, 0.2, 0.24), (bottom, bottom - 0.08, bottom - 0.7), (back,) * 3, 0.1)
+    hair = _slab((0.16, 0.18), (middle[1], bottom - 0.1), (back,) * 2, 0.12)
+    wide = _slab((0.18, 0.3, 0.34), (chin, bottom - 0.05, bottom - 0.9), (back,) * 3, 0.25)
     sure, likely, reach = (middle + k * (skull - middle) for k in (SURE, LIKELY, HAIR))
     for part in (likely, reach):  # no hair grows in front of a face
         part[:, 2] = np.minimum(part[:, 2], skull[:, 2].max())
@@ -220,13 +220,20 @@ def _parts() -> dict[int, tuple[np.ndarray, ...]]:
     }
 
 
+def _middle_depth(vertices: np.ndarray, height: float) -> float:
+    """Return the middle of the depths that a head has at a height."""
+    near = vertices[np.abs(vertices[:, 1] - height) < 0.01, 2]
+    return float(near.min() + near.max()) / 2
+
+
 def _slab(
-    half_widths: tuple[float, ...], heights: tuple[float, ...], back: float, thick: float
-) -> np.ndarray:
-    """Return the corners (N, 3) of a slab around depth `back`, with half widths at heights."""
+    half_widths: tuple[float, ...], heights: tuple[float, ...], depths: tuple[float, ...],
+    thick: float,
+) -> np.ndarray:  # fmt: skip
+    """Return the corners (N, 3) of a slab, with half widths around depths at heights."""
     return np.array([
-        (side * width, height, back + face * thick)
-        for width, height in zip(half_widths, heights, strict=True)
+        (side * width, height, depth + face * thick)
+        for width, height, depth in zip(half_widths, heights, depths, strict=True)
         for side in (-1, 1)
         for face in (-1, 1)
     ])  # fmt: skip
@@ -235,7 +242,7 @@ def _slab(
 def _guess(view: CutView, place: HeadPlace) -> PersonGuess:
     """Project a person's parts into a view, to start GrabCut from."""
     labels = np.full(view.valid.shape, cv2.GC_BGD, np.uint8)
-    for value, parts in _parts().items():
+    for value, parts in parts_of_a_person().items():
         for points in parts:
             pixels = place.pixels(points, view.camera)
             if len(pixels) > 2:

@@ -17,6 +17,7 @@ from express50.contract.layout import Dataset
 from express50.errors import ConfigError, StageError
 from express50.files.images import read_alpha, write_image
 from express50.geometry.cameras import pinhole
+from express50.head.load import load_head
 from express50.runner.runner import run_stage
 from express50.shards.reader import ShardReader
 from express50.twin.config import TwinConfig
@@ -25,7 +26,7 @@ from pipelines import calibrate, frames, ingest
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.matte import STAGE as MATTE
 from pipelines.matte.config import MatteConfig
-from pipelines.matte.cutout import cut_out, make_cut_view, soft_alpha
+from pipelines.matte.cutout import cut_out, make_cut_view, parts_of_a_person, soft_alpha
 from pipelines.matte.stage import valid_pixels
 from pipelines.photo.capture import make_photo_capture, open_picture, single_camera
 from pipelines.track.config import TrackConfig
@@ -93,6 +94,15 @@ def test_small_and_large_pictures_are_cut_alike(alpha: np.ndarray, scale: float)
     )
     found = cv2.resize(alpha_of(image), (512, 256), interpolation=cv2.INTER_AREA)
     assert np.abs(found - alpha[:256])[ABOVE_THE_SUIT].mean() < 0.02
+
+
+def test_what_counts_as_certain_lies_inside_the_head_model() -> None:
+    vertices = load_head("procedural").template.double().numpy()
+    for part in parts_of_a_person()[cv2.GC_FGD]:
+        for point in part[part[:, 1] > vertices[:, 1].min()]:
+            near = vertices[np.abs(vertices[:, 1] - point[1]) < 0.01]
+            inside = (near.min(0) <= point) & (point <= near.max(0))
+            assert inside[0] and inside[2], point
 
 
 def test_what_shows_no_face_is_refused() -> None:
