@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import numpy as np
@@ -55,13 +54,6 @@ def test_a_kilometre_away_keeps_a_tenth_of_a_millimetre_in_double() -> None:
     )
 
 
-def test_huge_coefficients_stay_finite() -> None:
-    model = tiny_head().to(dtype=torch.float32)
-    shape, expression = zeros(dtype=torch.float32)
-    posed = pose(model, shape + 1e6, expression - 1e6)
-    assert torch.isfinite(posed).all()
-
-
 def test_an_empty_batch_and_no_coefficients() -> None:
     model = tiny_head()
     none = torch.zeros(0, 5, dtype=torch.float64), torch.zeros(0, 4, dtype=torch.float64)
@@ -88,14 +80,3 @@ def test_degenerate_faces_give_zero_normals_and_finite_gradients(dtype: torch.dt
     assert (normals == 0).all()
     normals.sum().backward()
     assert torch.isfinite(line.grad).all()
-
-
-def test_a_vertex_bound_to_no_joint_collapses_without_nan() -> None:
-    """Rows of zero weights are refused by check_head; posing itself must still not give NaN."""
-    model = tiny_head()
-    weights = model.skinning.clone()
-    weights[3] = 0.0
-    posed = pose(
-        dataclasses.replace(model, skinning=weights), *zeros(), root=torch.ones(1, 3).double()
-    )
-    assert torch.isfinite(posed).all()

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pycolmap
 import torch
@@ -50,6 +49,7 @@ from tests.express50.capture.layouts import (
 )
 from tests.express50.head.flame_files import write_flame
 from tests.express50.rigs.test_other_tools import SIZE, WRITERS
+from tests.express50.rigs.test_read import make_rig, write_yaml
 from tests.grmm.packed import write_shards
 from tests.grmm.synthetic import EllipsoidSource
 from tests.synth import make_capture, noise_video_images, write_video
@@ -71,7 +71,7 @@ def write_seeds(root: Path) -> None:
     write_renderme(root, cameras=3, expressions=1, frames=2)
     (root / "binary").mkdir()
     pycolmap.Reconstruction(str(root / "scan/sparse/0")).write_binary(str(root / "binary"))
-    _write_opencv(root / "yaml")
+    write_yaml(root / "yaml", make_rig(2))
     for tool, (_, write) in WRITERS.items():
         (root / tool).mkdir()
         write(root / tool)
@@ -123,19 +123,6 @@ def _write_scans(root: Path) -> None:
     (root / "marks.pp").write_text(f"<PickedPoints>{marks}</PickedPoints>")
     (root / "marks.json").write_text(json.dumps({str(k): row for k, row in enumerate(rows)}))
     np.savetxt(root / "marks.txt", rows)
-
-
-def _write_opencv(folder: Path) -> None:
-    folder.mkdir()
-    for name in ("a", "b"):
-        storage = cv2.FileStorage(str(folder / f"{name}.yml"), cv2.FILE_STORAGE_WRITE)
-        for key, value in (
-            ("image_width", 64), ("image_height", 48), ("R", np.eye(3)), ("T", np.ones((3, 1))),
-            ("camera_matrix", np.array([[90.0, 0, 32], [0, 90, 24], [0, 0, 1]])),
-            ("distortion_coefficients", np.full((5, 1), 0.01)),
-        ):  # fmt: skip
-            storage.write(key, value)
-        storage.release()
 
 
 def _write_pictures(root: Path) -> None:
@@ -252,7 +239,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "scan/sparse/0/images.txt": _capture_of("scan"),
     "binary/cameras.bin": _rig_of("binary"),
     "binary/images.bin": _rig_of("binary"),
-    "yaml/a.yml": _rig_of("yaml"),
+    "yaml/cam00.yml": _rig_of("yaml"),
     "caliscope/camera_array.toml": _tool("caliscope"),
     "aniposelib/calibration.toml": _tool("aniposelib"),
     "kalibr/camchain.yaml": _tool("kalibr"),

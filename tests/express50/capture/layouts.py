@@ -17,6 +17,7 @@ from express50.files.images import encode_jpeg, encode_png
 from express50.geometry.cameras import Camera, resized
 from express50.geometry.conventions import K_to_opencv, opengl_from_cam_from_world
 from express50.geometry.transforms import look_at
+from tests.express50.rigs import test_read
 
 WIDTH, HEIGHT = 64, 96
 SHAPE = (HEIGHT, WIDTH, 3)
@@ -190,21 +191,9 @@ def write_transforms(root: Path, steps=2) -> Path:
 
 def write_colmap(root: Path) -> Path:
     """Four photographs with a COLMAP model in sparse/0, as text."""
-    import pycolmap
-
-    path = root / "scan"
+    path, cameras = root / "scan", rig([f"p{n}" for n in range(4)])
     (path / "images").mkdir(parents=True)
-    model = pycolmap.Reconstruction()
-    for number, (name, camera) in enumerate(rig([f"p{n}" for n in range(4)]).items(), 1):
-        model.add_camera_with_trivial_rig(
-            pycolmap.Camera(
-                model=camera.model, width=camera.width, height=camera.height,
-                params=list(camera.params), camera_id=number,
-            )
-        )  # fmt: skip
-        image = pycolmap.Image(name=f"{name}.png", camera_id=number, image_id=number)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.cam_from_world[:3]))
-        (path / "images" / f"{name}.png").write_bytes(encode_png(picture(number - 1, 0)))
-    (path / "sparse/0").mkdir(parents=True)
-    model.write_text(str(path / "sparse/0"))
+    for number, name in enumerate(cameras):
+        (path / "images" / f"{name}.png").write_bytes(encode_png(picture(number, 0)))
+    test_read.write_colmap(path / "sparse/0", cameras)
     return path

@@ -35,7 +35,7 @@ def test_ages_are_summed_up():
         ({"not given": 80}, {}),
     ],
 )
-def test_nobody_of_a_group_under_five_is_counted_or_can_be_told_by_subtraction(counts, shown):
+def test_groups_under_five_are_not_counted_and_cannot_be_inferred_by_subtraction(counts, shown):
     assert shown_counts(counts) == shown
 
 
@@ -52,6 +52,6 @@ def test_only_known_keys_of_a_capture_go_on():
 
 
 @pytest.mark.parametrize("age", [None, "31", True, -1, 201, math.nan, math.inf, -math.inf])
-def test_what_is_no_age_is_not_given(age):
+def test_what_is_not_an_age_counts_as_not_given(age):
     assert mean_age([{"age": age}], 1) is None
     assert age_counts([{"age": age}]) == {"not given": 1}

@@ -106,7 +106,7 @@ def test_a_forged_orientation_in_the_index_is_refused(dataset: Dataset, orientat
         index_from_json(content, Path())
 
 
-def test_what_is_no_image_is_one_error(tmp_path: Path) -> None:
+def test_what_is_not_an_image_is_one_error(tmp_path: Path) -> None:
     (tmp_path / "a.jpg").write_text("no image")
     with pytest.raises(FormatError, match=r"a\.jpg: cannot be read as an image"):
         read_exif(tmp_path / "a.jpg")

@@ -99,7 +99,7 @@ def test_names_from_outside_send_no_control_sequences(capsys):
     assert both.err == "cleared \\x1b[2J\\r\\x9b\n"
 
 
-def test_json_is_alone_on_standard_output(data, capture):
+def test_standard_output_holds_only_the_json(data, capture):
     command = [sys.executable, "-m", "express50", "ingest", str(data), str(capture), "--json"]
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
     account = json.loads(done.stdout)
@@ -179,14 +179,14 @@ def test_a_dataset_in_the_place_of_a_capture_is_refused(run, data, capture):
     assert not (data.parent / "new").exists()
 
 
-def test_what_to_ingest_must_be_said_once(run, data):
+def test_the_first_ingest_needs_a_capture(run, data):
     data.mkdir()
     for command in ("ingest", "run"):
         code, _, err = run(command, data)
         assert code == 2 and "has no captures yet; name a CAPTURE" in err
 
 
-def test_one_of_a_thing_is_not_many(run, tmp_path):
+def test_one_of_a_thing_is_singular(run, tmp_path):
     make_capture(tmp_path / "one", subject="S001", cameras=1, frames=1, expressions=("smile",))
     code, out, _ = run("ingest", tmp_path / "data", tmp_path / "one")
     assert code == 0 and "1 camera, 1 frame each, 1 expression\n" in out

@@ -43,7 +43,7 @@ def of(tmp_path, run, receipts, now):
     return row
 
 
-def test_a_run_tells_what_is_done_running_and_missing_and_when_it_ends(tmp_path):
+def test_a_run_states_what_is_done_running_and_missing_and_when_it_ends(tmp_path):
     run = Run(
         stage="toy",
         items=14,
@@ -85,7 +85,7 @@ def test_an_output_that_stood_when_its_item_failed_is_counted_once(tmp_path):
     assert row.counts() == {"done": 0, "failed": 1, "running": 0, "missing": 1}
 
 
-def test_the_rate_is_that_of_late_and_sinks_while_nothing_ends(tmp_path):
+def test_the_rate_is_recent_and_falls_while_no_item_ends(tmp_path):
     slow = [receipt(f"slow{n}", 100.0 + 10 * n) for n in range(60)]
     quick = [receipt(f"quick{n}", 700.0 + n) for n in range(60)]
     run = Run(stage="toy", items=200, begun=90.0, seen=759.0)
@@ -206,7 +206,7 @@ def test_page_follows_a_run_of_another_process_to_its_end(tmp_path, monkeypatch,
     assert "script" not in parsed(text).seen
 
 
-def test_a_killed_run_is_told_from_one_that_works(tmp_path):
+def test_a_killed_run_counts_as_stopped(tmp_path):
     dataset = toy.make_dataset(tmp_path / "data", [f"item{n}" for n in range(40)])
     process = start(dataset, 0)
     first_with(dataset, lambda row: row.running)
@@ -217,7 +217,7 @@ def test_a_killed_run_is_told_from_one_that_works(tmp_path):
     assert row.missing + row.done == 40 and row.missing > 0
 
 
-def test_serve_answers_on_this_machine_alone(tmp_path):
+def test_serve_answers_only_on_this_machine(tmp_path):
     of(tmp_path, None, [receipt("a", 1.0, stage="ingest")], 2.0)
     command = [sys.executable, "-u", "-m", "express50", "status", str(tmp_path), "--serve", "0"]
     with subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.PIPE, text=True) as process:
@@ -231,7 +231,7 @@ def test_serve_answers_on_this_machine_alone(tmp_path):
     assert process.returncode == 130
 
 
-def test_what_is_no_ledger_is_one_error_that_tells_nobody_to_delete(tmp_path, capsys):
+def test_a_file_that_is_not_a_ledger_is_one_error_without_advice_to_delete_it(tmp_path, capsys):
     (tmp_path / "ledger.sqlite").write_bytes(b"no database" * 100)
     assert main(["status", str(tmp_path)]) == 1
     error = capsys.readouterr().err
@@ -258,7 +258,7 @@ def test_status_reads_ledgers_of_before_runs_were_kept_and_writes_nothing(tmp_pa
     assert (tmp_path / "ledger.sqlite").read_bytes() == before
 
 
-def test_outdated_outputs_are_said_with_what_they_were_made_with(tmp_path, capsys):
+def test_outdated_outputs_are_listed_with_what_changed(tmp_path, capsys):
     make_capture(tmp_path / "S001", subject="S001", cameras=2, frames=4)
     root = tmp_path / "data"
     ingest = ["ingest", str(root), str(tmp_path / "S001"), "--workers", "0"]

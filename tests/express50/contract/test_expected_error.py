@@ -12,7 +12,7 @@ from express50.errors import StageError
     "figures",
     [(math.nan, 0, 1), (1, 0, math.inf), (1, -math.inf, 2), (2, 0, 1), (0, 1, 2)],
 )
-def test_figures_that_are_no_interval_are_refused(figures):
+def test_figures_that_are_not_an_interval_are_refused(figures):
     with pytest.raises(StageError):
         ExpectedError(*figures, "mm")
 

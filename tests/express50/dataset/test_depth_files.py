@@ -83,7 +83,7 @@ def test_normals_come_back_within_the_error_stated(tmp_path):
     assert 0.16 < worst < 0.4 and (back * normals).sum(-1)[valid].min() > 0.99
 
 
-def test_normals_of_no_length_and_foreign_pictures_are_refused(tmp_path):
+def test_normals_without_length_and_foreign_pictures_are_refused(tmp_path):
     valid = np.ones((2, 2), bool)
     for bad in (np.zeros((2, 2, 3)), np.full((2, 2, 3), np.nan), np.full((2, 2, 3), 2.0)):
         with pytest.raises(ValueError, match="unit length"):

@@ -211,7 +211,7 @@ def test_an_interrupted_export_leaves_the_former_one(dataset, tmp_path, monkeypa
     assert files_of(tmp_path) == before
 
 
-def test_a_folder_that_is_no_export_is_left_alone(dataset, tmp_path, capsys) -> None:
+def test_a_folder_that_is_not_an_export_is_kept(dataset, tmp_path, capsys) -> None:
     (tmp_path / "S001").mkdir()
     (tmp_path / "S001" / "thesis.tex").write_text("years of work")
     assert export(dataset, tmp_path, "obj", "--subject=S001") == 1

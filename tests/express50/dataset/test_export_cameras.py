@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from express50.dataset.export_avatar import centred, seen_by
 from express50.geometry.cameras import Camera, pinhole_camera, project
-from express50.geometry.conventions import cam_from_world_from_opengl, opengl_from_cam_from_world
 from express50.geometry.transforms import look_at
 
 shift = st.floats(-15.0, 15.0)
@@ -56,10 +55,3 @@ def test_a_dot_moves_to_where_the_centred_camera_sees_it() -> None:
     right = pinhole_camera("c", np.diag([300.0, 300, 1]) + [[0, 0, 45], [0, 0, 35], [0, 0, 0]],
                            90, 70, np.eye(4))  # fmt: skip
     assert centred(right) is right and seen_by(image, right, right) is image
-
-
-def test_opengl_matrices_are_inverted_by_their_reader() -> None:
-    pose = look_at(np.array([0.3, 0.1, 1.0]), np.zeros(3), np.array([0, 1.0, 0]))
-    np.testing.assert_allclose(
-        cam_from_world_from_opengl(opengl_from_cam_from_world(pose)), pose, atol=1e-12
-    )

@@ -66,7 +66,7 @@ def test_a_stage_whose_every_item_failed_is_shown(dataset):
     assert "no face" in page and 'href="#track"' in page and 'href="#depth"' not in page
 
 
-def test_damaged_pictures_and_logs_cost_themselves_alone(dataset):
+def test_damaged_pictures_and_logs_do_not_stop_the_page(dataset):
     picture = dataset.root / "align/S1/qc/view.jpg"
     picture.write_bytes(picture.read_bytes()[:-200])
     log = dataset.root / "grmm/train/log.jsonl"

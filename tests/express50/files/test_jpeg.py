@@ -30,7 +30,7 @@ def test_whole_pictures_are_whole(data):
 
 
 @given(st.floats(0.0, 0.999))
-def test_what_is_cut_anywhere_is_told(share):
+def test_a_jpeg_cut_anywhere_is_found(share):
     for data in (PLAIN, PROGRESSIVE, RESTARTS, with_thumbnail(PLAIN)):
         # the very last scan of a progressive file may be cut from its marker on
         cut = data[: max(2, min(int(share * len(data)), len(data) - 2))]

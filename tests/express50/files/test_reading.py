@@ -63,7 +63,7 @@ def test_size_and_kind_of_a_file_are_looked_at(tmp_path: Path) -> None:
         read_text(tmp_path / "b", FormatError)
 
 
-def test_an_error_is_one_line_that_steers_no_terminal_and_keeps_its_ends() -> None:
+def test_an_error_is_one_line_without_control_characters_and_keeps_its_ends() -> None:
     assert str(FormatError("a\nb\r\n\x1b[2Jc\x07")) == "a b  [2Jc"
     long = str(FormatError("where " + "x" * 100_000 + " fix it"))
     assert len(long) < 1300 and long.startswith("where x") and long.endswith("x fix it")

@@ -50,7 +50,7 @@ def test_a_point_behind_the_camera_has_no_pixel():
     assert depth[0] == pytest.approx(-1.0)
 
 
-def test_infinite_points_have_no_pixel_and_warn_nobody():
+def test_infinite_points_have_no_pixel_and_give_no_warning():
     camera = Camera("a", 320, 240, "PINHOLE", (300.0, 300.0, 160.0, 120.0), np.eye(4))
     points = [[np.inf, 0, 1], [0, 0, np.inf], [np.nan, 0, 1], [0, 0, 1]]
     pixels, depth = cameras.project(camera, points)

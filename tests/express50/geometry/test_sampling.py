@@ -19,7 +19,7 @@ def test_a_plane_is_reproduced_with_its_slope() -> None:
 
 
 @pytest.mark.parametrize("shape", [(), (3,)])
-def test_quick_sampling_differs_by_the_rounding_of_places_alone(shape: tuple[int, ...]) -> None:
+def test_quick_sampling_differs_only_by_the_rounding_of_places(shape: tuple[int, ...]) -> None:
     image = np.broadcast_to(PLANE.reshape(20, 30, *([1] * len(shape))), (20, 30, *shape))
     image = np.ascontiguousarray(image, np.float32)
     exact = (POINTS @ [3, -2] + 7).reshape(-1, *([1] * len(shape)))

@@ -22,7 +22,7 @@ def test_unknown_endings_are_refused(tmp_path: Path) -> None:
         load_head(tmp_path / "head.glb")
 
 
-def test_an_empty_folder_is_no_checkout(tmp_path: Path) -> None:
+def test_an_empty_folder_is_not_a_checkout(tmp_path: Path) -> None:
     with pytest.raises(HeadModelError, match="give a checkout"):
         load_head(tmp_path)
 

@@ -31,7 +31,7 @@ def test_a_name_without_a_side_sets_both():
         expression_vector(head, {"eyeBlonk": 1.0})
 
 
-def test_contact_sheet_has_a_row_a_pose():
+def test_contact_sheet_has_a_row_per_pose():
     sheet = contact_sheet(load_builtin(), yaws=(0.0,), size=24)
     assert sheet.shape == (24 * len(POSES), 24, 3)
 

@@ -154,7 +154,7 @@ def test_points_of_a_file_are_undistorted(tmp_path: Path) -> None:
         assert np.linalg.norm(ideal - rows[0, :2]) > 0.5
 
 
-def test_unknown_points_and_frames_are_no_evidence(tmp_path: Path) -> None:
+def test_unknown_points_and_frames_are_not_evidence(tmp_path: Path) -> None:
     rows = given_rows(70)
     rows[5] = np.nan
     source = open_source(str(write_json(tmp_path / "p.json", rows)), {"a": LENS})

@@ -160,14 +160,14 @@ def test_crops_move_points_with_the_picture() -> None:
     assert np.median(errors) < 1.5
 
 
-def test_detector_refuses_what_is_no_picture(network: LandmarkNet) -> None:
+def test_detector_refuses_what_is_not_a_picture(network: LandmarkNet) -> None:
     for image in (np.zeros((8, 8), np.uint8), np.zeros((8, 8, 3)), np.zeros((0, 8, 3), np.uint8)):
         with pytest.raises(ValueError, match="expected uint8"):
             detect(network, image)
 
 
 @pytest.mark.parametrize("name", ["brick", "moon", "coins", "text", "chelsea"])
-def test_walls_coins_and_cats_are_no_faces(network: LandmarkNet, name: str) -> None:
+def test_walls_coins_and_cats_are_not_faces(network: LandmarkNet, name: str) -> None:
     """The network alone is fooled by some of them (0.86 on bricks); its crops do not agree."""
     data = pytest.importorskip("skimage.data")
     picture = np.atleast_3d(getattr(data, name)())
@@ -343,7 +343,7 @@ OPENINGS = {
 
 
 @pytest.mark.parametrize("opening", OPENINGS)
-def test_shut_eyes_and_lips_are_told_from_open_ones(network: LandmarkNet, opening: str) -> None:
+def test_shut_eyes_and_lips_differ_from_open_ones(network: LandmarkNet, opening: str) -> None:
     model = load_head("procedural")
     *moves, gap, width = OPENINGS[opening]
     (opened, true), (shut, _) = (gaps_seen(network, model, move, gap, width) for move in moves)

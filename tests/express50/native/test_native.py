@@ -41,7 +41,7 @@ def test_a_stale_library_is_not_used(fresh_loader, monkeypatch):
         native.load()
 
 
-def test_a_file_that_is_no_library_is_reported(fresh_loader, tmp_path, monkeypatch):
+def test_a_file_that_is_not_a_library_is_reported(fresh_loader, tmp_path, monkeypatch):
     (tmp_path / "baseline.so").write_bytes(b"not a library")
     monkeypatch.setattr(build, "library_file", lambda variant: tmp_path / f"{variant}.so")
     assert "does not load" in native.why_missing()

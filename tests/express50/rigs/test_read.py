@@ -53,7 +53,7 @@ def write_colmap(folder, rig):
         image = pycolmap.Image(name=f"{name}.png", camera_id=number, image_id=number)
         pose = pycolmap.Rigid3d(camera.cam_from_world[:3])
         model.add_image_with_trivial_frame(image, pose)
-    folder.mkdir()
+    folder.mkdir(parents=True)
     model.write_text(str(folder))
 
 
@@ -264,21 +264,6 @@ def test_rubbish_is_one_clear_error(tmp_path, content):
     for kind in ("transforms", "nersemble", "express50", "renderme360"):
         with pytest.raises(CalibrationError, match="rubbish.json"):
             read_rig(path, kind)
-
-
-@pytest.mark.parametrize(
-    ("content", "reason"),
-    [
-        ("[" * 10**6, "nested too deeply"),
-        ('{"cameras": {"a": 1e400}}', "line 1 holds 1e400"),
-        ('{"cameras": {"a": ', "not JSON"),
-    ],
-)
-def test_json_that_cannot_be_read_is_said(tmp_path, content, reason):
-    path = tmp_path / "rig.json"
-    path.write_text(content)
-    with pytest.raises(CalibrationError, match=reason):
-        read_rig(path)
 
 
 def test_thin_prism_distortion_is_refused(tmp_path):
