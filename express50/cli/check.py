@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import shutil
 import time
 from pathlib import Path
 from typing import Any
@@ -97,12 +96,11 @@ def run_check(args: argparse.Namespace) -> int:
 
 def run_prune(args: argparse.Namespace) -> int:
     """Delete replaced and stale outputs, and say what that freed."""
-    from express50.runner.replaced import empty, size_of
+    from express50.runner.replaced import empty
 
     dataset = existing_dataset(args.dataset)
-    stale = size_of(dataset.stale_dir)
-    shutil.rmtree(dataset.stale_dir, ignore_errors=True)
-    files, size = map(sum, zip(empty(dataset), stale, strict=True))
+    freed = (empty(folder) for folder in (dataset.replaced_dir, dataset.stale_dir))
+    files, size = map(sum, zip(*freed, strict=True))
     line = f"{args.dataset}: freed {decimal(size)} in {count(files, 'file')}"
     return answer(args, {"files": files, "bytes": size}, line)
 

@@ -15,8 +15,9 @@ from markupsafe import Markup
 from express50.console import format_seconds
 from express50.contract.layout import Dataset
 from express50.contract.stage import stages, typical_error
-from express50.errors import FormatError
-from express50.files.images import encode_jpeg, read_image, resize_area
+from express50.errors import CaptureError, FormatError
+from express50.files.containers import read_srgb
+from express50.files.images import encode_jpeg, resize_area
 from express50.files.text import parse_json, read_json_table, read_text
 from express50.runner.ledger import Ledger, Receipt
 
@@ -193,14 +194,14 @@ def _embed(picture: Picture) -> dict[str, object]:
     """Encode a picture as a JPEG data URI, at most PICTURE_WIDTH wide; caption only if damaged."""
     path, caption = picture
     try:
-        image = read_image(path)
-    except FormatError as error:
+        image = read_srgb(path)
+    except CaptureError as error:
         return {"uri": "", "caption": f"{caption}: cannot be shown, {error}", "wide": False}
     height, width = image.shape[:2]
     if width > PICTURE_WIDTH:
         image = resize_area(image, PICTURE_WIDTH, max(1, round(height * PICTURE_WIDTH / width)))
-    data = encode_jpeg(image[..., :3] if image.ndim == 3 else image, 85)
-    return {"uri": _address("image/jpeg", data), "caption": caption, "wide": width > 1.8 * height}
+    uri = _address("image/jpeg", encode_jpeg(image, 85))
+    return {"uri": uri, "caption": caption, "wide": width > 1.8 * height}
 
 
 def _address(kind: str, data: bytes) -> str:

@@ -17,6 +17,7 @@ import io
 import re
 import shutil
 import sqlite3
+import string
 import tarfile
 import zipfile
 import zlib
@@ -45,7 +46,8 @@ DAMAGED = (
 )  # fmt: skip
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".exr", ".tif", ".ply", ".glb", ".mp4"}
 CHUNK = 1 << 24
-OVERLAP = 256
+OVERLAP = 256  # bytes; longer than any id
+WORD = (string.ascii_letters + string.digits + "_-").encode()
 TEXT_LIMIT = 1 << 24
 RUN = re.compile(rb"[A-Za-z0-9][A-Za-z0-9_-]*")
 PART = re.compile(rb"[A-Za-z0-9]+")
@@ -290,10 +292,12 @@ def _blocks(path: Path) -> Iterator[bytes]:
 
 
 def _pieces(file: IO[bytes]) -> Iterator[bytes]:
-    tail = b""
+    tail = b""  # the last word, which may go on in the next block
     while block := file.read(CHUNK):
-        yield tail + block
-        tail = block[-OVERLAP:]
+        text = tail + block
+        tail = text[len(text.rstrip(WORD)) :][-OVERLAP:]
+        yield text[: len(text) - len(tail)]
+    yield tail
 
 
 def _tar_texts(path: Path) -> Iterator[bytes]:

@@ -101,15 +101,16 @@ def make_room(dataset: Dataset) -> bool:
     usage = shutil.disk_usage(dataset.root)
     short = bool(usage.total) and usage.free < LEAST_ROOM
     if short:
-        empty(dataset)
+        empty(dataset.replaced_dir)
     return short
 
 
-def empty(dataset: Dataset) -> tuple[int, int]:
-    """Delete all replaced outputs; returns how many files and bytes that freed."""
-    freed = size_of(dataset.replaced_dir)
-    shutil.rmtree(dataset.replaced_dir, ignore_errors=True)
-    return freed
+def empty(folder: Path) -> tuple[int, int]:
+    """Delete a folder of outputs as far as possible; return how many files and bytes that freed."""
+    before = size_of(folder)
+    shutil.rmtree(folder, ignore_errors=True)
+    left = size_of(folder)
+    return before[0] - left[0], before[1] - left[1]
 
 
 def size_of(folder: Path) -> tuple[int, int]:

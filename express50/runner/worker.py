@@ -130,7 +130,7 @@ def run_task(task: Task) -> Receipt:
             metrics, files = _run_and_publish(task)
         made = Made(task.inputs, files, config_texts(task.config), task.stage.version)
     except DiskFullError:
-        if not empty(task.dataset)[0]:
+        if not empty(task.dataset.replaced_dir)[0]:
             raise
         return run_task(task)  # with the space of what was replaced earlier
     except Exception as error:  # noqa: BLE001 (a defect that one item shows must not stop others)

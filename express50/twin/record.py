@@ -22,7 +22,7 @@ from express50.capture.expressions import select
 from express50.console import count
 from express50.contract.config import field_documents
 from express50.errors import CaptureError
-from express50.files.atomic import dump_json, write_json
+from express50.files.atomic import dump_json, link_file, write_json
 from express50.runner.worker import cap_threads
 from express50.twin.config import TwinConfig
 
@@ -218,8 +218,8 @@ def _publish(config: TwinConfig, subject: str, staging: Path, out: Path) -> None
     rows = [f"{name},{first},{last}\n" for name, first, last in about["cues"]]
     (capture / "cues.csv").write_text("expression_id,start_frame,end_frame\n" + "".join(rows))
     if config.board_frames:
-        # All subjects have the same board pictures, so hard links save space.
-        shutil.copytree(staging / "board", capture / "board", copy_function=os.link)
+        # All subjects have the same board pictures, so links save space.
+        shutil.copytree(staging / "board", capture / "board", copy_function=link_file)
         (capture / "board" / "board.toml").write_text(BOARD_TOML)
     if config.give_calibration:
         shutil.copyfile(truth / "cameras.json", capture / "calibration.json")

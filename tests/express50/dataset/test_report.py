@@ -1,5 +1,6 @@
 """The report page: everything inside one file, failures and drops named, nothing invented."""
 
+import base64
 import json
 import re
 
@@ -9,7 +10,7 @@ import pytest
 from express50.__main__ import main
 from express50.contract.layout import Dataset
 from express50.dataset.report import number, render_page, spread
-from express50.files.images import write_image
+from express50.files.images import decode_image, write_image
 from express50.runner.ledger import Ledger, Receipt
 
 
@@ -64,6 +65,14 @@ def test_a_stage_whose_every_item_failed_is_shown(dataset):
         )
     page = render_page(dataset)
     assert "no face" in page and 'href="#track"' in page and 'href="#depth"' not in page
+
+
+def test_pictures_of_16_bits_keep_their_brightness(dataset):
+    path = dataset.root / "ingest/S1/qc/deep.png"
+    write_image(path, np.full((20, 60), 90 * 257, np.uint16))
+    data = re.findall(r'base64,([^"]*)"', render_page(dataset))
+    levels = [decode_image(base64.b64decode(one)).mean() for one in data]
+    assert np.allclose(levels, 90, atol=2) and len(levels) == 5
 
 
 def test_damaged_pictures_and_logs_do_not_stop_the_page(dataset):

@@ -14,6 +14,7 @@ from express50.capture.index import read_index
 from express50.capture.readers.read import read_people
 from express50.cli.status import read_status
 from express50.contract.layout import Dataset
+from express50.dataset import withdraw as withdraw_module
 from express50.dataset.withdraw import (
     files_that,
     names,
@@ -222,6 +223,13 @@ def test_no_subject_is_withdrawn_while_a_stage_runs(dataset):
         for files in (tree(dataset.root), before)
     )
     assert after == before
+
+
+def test_ids_at_the_joint_of_two_blocks_are_whole_words(tmp_path, monkeypatch):
+    monkeypatch.setattr(withdraw_module, "CHUNK", 8)
+    for text, found in (("abc S0012 x", []), ("abc S001 x", [True]), ("xyz1 S001", [True])):
+        (tmp_path / "a.txt").write_text(text)
+        assert [True for _ in files_that(names("S001"), tmp_path)] == found
 
 
 def test_texts_in_arrays_and_archives_are_read_and_numbers_are_not(tmp_path):

@@ -1,7 +1,9 @@
 import csv
 import dataclasses
+import errno
 import hashlib
 import json
+import os
 import tomllib
 
 import numpy as np
@@ -124,9 +126,13 @@ def test_the_same_pictures_make_the_same_video(tmp_path):
     assert len(videos) == 1
 
 
-def test_command_line_records(tmp_path, capsys):
+def test_command_line_records_also_where_files_have_one_name(tmp_path, capsys, monkeypatch):
+    def link(*paths):
+        raise OSError(errno.EPERM, "Operation not permitted")  # as on exFAT
+
+    monkeypatch.setattr(os, "link", link)
     flags = "--subjects 1 --cameras 1 --width 40 --height 40 --expressions neutral"
-    flags += " --frames-per-expression 4 --board-frames 0 --frames jpg --give-calibration --json"
+    flags += " --frames-per-expression 4 --board-frames 1 --frames jpg --give-calibration --json"
     assert main(["twin", "record", str(tmp_path / "t"), *flags.split(), "--workers", "1"]) == 0
     assert json.loads(capsys.readouterr().out)["recorded"] == ["S001"]
     root = tmp_path / "t" / "captures" / "S001"
