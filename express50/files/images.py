@@ -325,8 +325,9 @@ def depth_to_uint16(depth: np.ndarray, valid: np.ndarray) -> np.ndarray:
         raise ValueError(
             f"valid depth must lie in (0, {DEPTH_LIMIT_M:.3f}) m; is the rig in metres?"
         )
-    steps = np.where(valid, np.maximum(np.rint(depth / DEPTH_UNIT_M), 1), 0)
-    return np.nan_to_num(steps).astype(np.uint16)
+    steps = np.zeros(depth.shape, np.uint16)
+    steps[valid] = np.maximum(np.rint(inside / DEPTH_UNIT_M), 1)
+    return steps
 
 
 def srgb_to_linear(image_srgb: np.ndarray) -> np.ndarray:

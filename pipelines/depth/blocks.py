@@ -13,11 +13,9 @@ from functools import cached_property
 from itertools import product
 
 import numpy as np
-import scipy.sparse as sparse
 from scipy.ndimage import (
     binary_dilation,
     generate_binary_structure,
-    label,
     maximum_filter,
     minimum_filter,
 )
@@ -247,52 +245,6 @@ def dilated(grid: LevelSet) -> LevelSet:
     table = grid.table.copy()
     table[wanted] = HELD + np.arange(len(blocks) - HELD)
     return replace(grid, table=table, blocks=blocks)
-
-
-def largest_body(grid: LevelSet) -> LevelSet:
-    """Keep the largest connected part of the inside; other parts become outside."""
-    parts, size = _inside_parts(grid)
-    if np.count_nonzero(size) < 2:
-        return grid
-    largest = int(size.argmax())
-    floats = (parts.blocks > 0) & (parts.blocks != largest)
-    table = np.where(floats[:, 0, 0, 0][parts.table] & (grid.table == INSIDE), OUTSIDE, grid.table)
-    blocks = grid.blocks.copy()
-    blocks[HELD:][floats[HELD : len(blocks)]] = grid.voxel
-    return LevelSet(grid.origin, grid.voxel, grid.shape, table.astype(np.int32), blocks)
-
-
-def _inside_parts(grid: LevelSet) -> tuple[LevelSet, np.ndarray]:
-    """Number the connected inside parts, from 1 (0 is outside), and count their voxels (P,).
-
-    Parts are found within each block, then joined across the blocks' borders (26 neighbours).
-    Blocks wholly inside that touch share a row, after the rows of the grid.
-    """
-    touching = np.ones((3, 3, 3))
-    inside = np.pad(grid.blocks[HELD:] < 0, ((0, 0), (0, 1), (0, 1), (0, 1)))  # a wall after each
-    own, count = label(inside.reshape(-1, BLOCK + 1, BLOCK + 1), touching)
-    own = own.reshape(inside.shape)[:, :BLOCK, :BLOCK, :BLOCK]
-    deep, deeps = label(grid.table == INSIDE, touching)
-    full = np.broadcast_to(np.arange(1 + count, 1 + count + deeps)[:, None, None, None],
-                           (deeps, BLOCK, BLOCK, BLOCK))  # fmt: skip
-    blocks = np.concatenate([np.zeros((HELD, BLOCK, BLOCK, BLOCK), np.int32), own, full])
-    table = np.where(deep > 0, len(grid.blocks) - 1 + deep, grid.table)
-    parts = LevelSet(grid.origin, grid.voxel, grid.shape, table, blocks.astype(np.int32))
-    total = 1 + count + deeps
-    around = windows(parts, held(grid)[own.any((1, 2, 3))], 1, 1).astype(np.int64)
-    middle, pairs = around[:, 1:-1, 1:-1, 1:-1], []
-    for x, y, z in product((0, 1, 2), repeat=3):
-        other = around[:, x : x + BLOCK, y : y + BLOCK, z : z + BLOCK]
-        key = (middle * total + other)[(middle != other) & (middle > 0) & (other > 0)]
-        # Runs of one pair are shortened first: sorting all of them would take most of the time.
-        pairs.append(np.unique(key[np.diff(key, prepend=-1) != 0]))
-    first, second = np.divmod(np.concatenate(pairs), total)
-    graph = sparse.coo_matrix((np.ones(len(first)), (first, second)), (total, total))
-    joined = sparse.csgraph.connected_components(graph, directed=False)[1]
-    size = np.bincount(joined[own.ravel()], minlength=joined.max() + 1)  # outside is part 0
-    size[0] = 0
-    np.add.at(size, joined[1 + count :], BLOCK**3 * np.bincount(deep.ravel())[1:])
-    return replace(parts, blocks=joined[blocks]), size
 
 
 def smoothed(grid: LevelSet, sigma: float, truncate: float = 4.0) -> LevelSet:

@@ -74,10 +74,10 @@ class TrackedSolid:
             for view, alpha in zip(views, alphas, strict=True)
         ]
 
-    def without_glasses(self, views: Sequence[DepthView]) -> list[DepthView]:
+    def without_glasses(self, views: Sequence[DepthView]) -> Sequence[DepthView]:
         """Clear the mattes where views show glasses; the silhouettes stay."""
         if not len(self.glasses):
-            return list(views)
+            return views
         found = []
         for view in views:
             way = (view.camera.center - self.glasses).astype(np.float32)

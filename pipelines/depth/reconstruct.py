@@ -29,7 +29,6 @@ from pipelines.depth.blocks import (
     build,
     combined,
     held,
-    largest_body,
     refined,
     voxel_index,
 )
@@ -166,7 +165,8 @@ def _moved(
     mesh = extract_mesh(grid)
     if not len(mesh.faces):
         return grid
-    scores = patch_scores(views, grid, mesh, offsets, noise)
+    weights = view_weights(views, mesh, grid.voxel)
+    scores = patch_scores(views, weights, grid, mesh, offsets, noise)
     points = rim_targets(views, grid, extent)
     pinned, count = np.zeros(len(mesh.vertices)), np.zeros(len(mesh.vertices))
     if len(points):
@@ -185,7 +185,6 @@ def _finished(
     views: Sequence[DepthView], clear: Sequence[DepthView], grid: LevelSet, noise: float
 ) -> HeadSurface:
     """Take mesh, confidence and colours from the final grid; `clear` views are compared."""
-    grid = largest_body(grid)
     mesh = extract_mesh(grid)
     if not len(mesh.faces):
         raise StageError(
@@ -194,7 +193,8 @@ def _finished(
         )
     mesh = mesh._replace(faces=largest_part(mesh.vertices, mesh.faces))
     offsets = np.array([-1.0, 0.0, 1.0]) * grid.voxel
-    agreement = patch_scores(clear, grid, mesh, offsets, noise)[:, 1]
+    weights = view_weights(clear, mesh, grid.voxel)
+    agreement = patch_scores(clear, weights, grid, mesh, offsets, noise)[:, 1]
     confidence = averaged(np.clip(agreement, 0, 1), mesh.faces, rounds=6)
     used, faces = np.unique(mesh.faces, return_inverse=True)
     vertices, agreement, confidence = mesh.vertices[used], agreement[used], confidence[used]
@@ -209,38 +209,41 @@ def _finished(
     }
     floor = np.where(on_hull, HULL_CONFIDENCE, LEAST_CONFIDENCE)
     confidence = np.maximum(confidence, floor).astype(np.float32)
-    colors, normals = vertex_colors(views, mesh, grid.voxel)[used], mesh.normals[used]
+    if clear is not views:
+        weights = view_weights(views, mesh, grid.voxel)
+    colors, normals = vertex_colors(views, weights, mesh)[used], mesh.normals[used]
     return HeadSurface(vertices, normals, faces.reshape(-1, 3), confidence, colors, grid, figures)
 
 
-def vertex_colors(views: Sequence[DepthView], mesh: HeadMesh, lift: float) -> np.ndarray:
-    """Average the views' colours per vertex (V, 3) uint8, weighted by the cosine squared.
-
-    A view counts where it sees the point ``lift`` metres above the vertex.
-    """
-    weights = view_weights(views, mesh, lift) ** 2
-    total = np.zeros((len(mesh.vertices), 3))
+def vertex_colors(views: Sequence[DepthView], weights: np.ndarray, mesh: HeadMesh) -> np.ndarray:
+    """Average the views' colours per vertex (V, 3) uint8, by the squares of weights (C, V)."""
+    total, seen = np.zeros((len(mesh.vertices), 3)), (weights**2).sum(0)
     for view, weight in zip(views, weights, strict=True):
-        pixels, _ = project_fast(view.camera, mesh.vertices)
-        total += weight[:, None] * bilinear(view.rgb.astype(np.float32), pixels)
-    seen = weights.sum(0)
+        shown = weight > 0
+        pixels, _ = project_fast(view.camera, mesh.vertices[shown])
+        colours = bilinear(view.rgb.astype(np.float32), pixels)
+        total[shown] += weight[shown, None] ** 2 * colours
     mean = np.where(seen[:, None] > 0, total / np.maximum(seen, 1e-9)[:, None], 128.0)
     return np.rint(mean).clip(0, 255).astype(np.uint8)
 
 
 def patch_scores(
-    views: Sequence[DepthView], grid: LevelSet, mesh: HeadMesh, offsets: np.ndarray, noise: float
+    views: Sequence[DepthView],
+    weights: np.ndarray,
+    grid: LevelSet,
+    mesh: HeadMesh,
+    offsets: np.ndarray,
+    noise: float,
 ) -> np.ndarray:
     """Score how well the views agree (V, D) on patches moved along normals by offsets (D,) metres.
 
-    Scores are correlations in [-1, 1], averaged over neighbours; 0 where under two views see the
-    vertex.
+    Views count by their `view_weights` (C, V). Scores are correlations in [-1, 1], averaged over
+    neighbours; 0 where under two views see the vertex.
     """
     vertices, normals, faces = mesh
     spacing = SPACING_VOXELS * grid.voxel
     pixel = np.median([pixel_size(view, vertices.mean(0)) for view in views])
     greys = grey_images(views, 0.4 * spacing / pixel)
-    weights = view_weights(views, mesh, grid.voxel)
     # Samples of a patch lie no closer than the pixels: finer ones would repeat them.
     ticks = (np.arange(SAMPLES) - (SAMPLES - 1) / 2) * max(spacing, float(pixel))
     flat = np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2)

@@ -20,7 +20,14 @@ from express50.errors import CaptureError, FormatError, StageError
 from express50.files.images import contact_sheet, shrink, srgb_to_linear, write_image
 from express50.geometry import meshes
 from express50.head.load import load_head
-from pipelines.depth.maps import DepthMaps, PhotoErrors, Picture, picture_of, surface_maps
+from pipelines.depth.maps import (
+    DepthMaps,
+    PhotoErrors,
+    Picture,
+    has_normal,
+    picture_of,
+    surface_maps,
+)
 from pipelines.depth.prior import TrackedSolid, close_mesh, matte_agreement
 from pipelines.depth.reconstruct import reconstruct, tracked_surface
 from pipelines.depth.surface import HeadSurface
@@ -153,7 +160,7 @@ def write_maps(out: Path, camera_id: str, maps: DepthMaps) -> None:
         raise StageError(f"{camera_id}: {error}") from None
     confidence = np.rint(maps.confidence * 255).astype(np.uint8)
     write_image(out / f"{camera_id}_confidence.png", confidence)
-    known = np.any(maps.normals, axis=-1)  # the surface has no normal where its triangles fold back
+    known = has_normal(maps.normals)  # the surface has none where its triangles fold back
     write_normals(out / f"{camera_id}_normals.png", maps.normals, known)
 
 

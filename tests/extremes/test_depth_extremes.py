@@ -13,7 +13,7 @@ from express50.files.images import depth_to_uint16
 from express50.geometry.cameras import transform_camera
 from express50.geometry.transforms import make_transform
 from express50.shards.reader import sample_picture
-from pipelines.depth.reconstruct import patch_scores, reconstruct
+from pipelines.depth.reconstruct import patch_scores, reconstruct, view_weights
 from pipelines.depth.surface import (
     HeadMesh,
     extract_mesh,
@@ -155,14 +155,15 @@ def test_a_vertex_that_no_view_sees_scores_zero(views):
     vertices = np.array([[0, 0, 50.0], [0, 0, -50.0], [0.01, 0, 50.0]])
     normals = np.array([[0, 0, 1.0], [0, 0, 0.0], [0, 0, 1.0]])
     mesh = HeadMesh(vertices, normals, np.array([[0, 1, 2]]))
-    offsets = np.array([-0.01, 0, 0.01])
-    assert (patch_scores(views, FLAT, mesh, offsets, 1.0) == 0).all()
+    weights, offsets = view_weights(views, mesh, FLAT.voxel), np.array([-0.01, 0, 0.01])
+    assert (patch_scores(views, weights, FLAT, mesh, offsets, 1.0) == 0).all()
 
 
 def test_scores_are_correlations_wherever_a_vertex_lies(views):
     vertices = np.array([[0, 0, 0.09], [0.01, 0, 0.09], [0, 0, 50.0]])
     mesh = HeadMesh(vertices, np.array([[0, 0, 1.0]] * 3), np.array([[0, 1, 2]]))
-    scores = patch_scores(views, FLAT, mesh, np.array([-0.01, 0, 0.01]), 1.0)
+    weights, offsets = view_weights(views, mesh, FLAT.voxel), np.array([-0.01, 0, 0.01])
+    scores = patch_scores(views, weights, FLAT, mesh, offsets, 1.0)
     assert np.isfinite(scores).all() and np.abs(scores).max() <= 1 + 1e-5
 
 

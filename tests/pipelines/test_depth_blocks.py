@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.ndimage import gaussian_filter, label, map_coordinates
+from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
@@ -18,7 +18,6 @@ from pipelines.depth.blocks import (
     LevelSet,
     build,
     combined,
-    largest_body,
     refined,
     smoothed,
 )
@@ -196,20 +195,6 @@ def test_a_head_cut_by_the_box_is_closed_there():
         mesh = trimesh.Trimesh(*extract_mesh(cut)[::2], process=False)
         assert mesh.is_watertight
         np.testing.assert_allclose(mesh.volume, np.pi * 0.08**2 * 0.3, rtol=0.05)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_the_largest_body_is_the_dense_one(seed):
-    """Bodies that lie across blocks, and some that touch at a corner of voxels only."""
-    rng = np.random.default_rng(seed)
-    values = gaussian_filter(rng.normal(size=(60, 50, 70)), 2.2) + 0.03
-    values[2:40, 2:40, 2:40] = np.minimum(values[2:40, 2:40, 2:40], -1.0)
-    grid = from_dense(np.zeros(3), VOXEL, values.astype(np.float32))
-    dense = to_dense(grid)
-    parts, count = label(dense < 0, np.ones((3, 3, 3)))
-    assert count > 5 and (grid.table == 1).any()
-    largest = parts == 1 + np.bincount(parts.ravel())[1:].argmax()
-    assert np.array_equal(to_dense(largest_body(grid)) < 0, largest)
 
 
 def test_grids_are_combined_where_either_is_held():

@@ -10,11 +10,10 @@ import pytest
 from benchmarks.depth import trace
 from express50.geometry.cameras import Camera, rays
 from express50.geometry.raycast import mesh_scene
-from pipelines.depth.blocks import LevelSet, build, combined, largest_body
+from pipelines.depth.blocks import LevelSet, build
 from pipelines.depth.maps import cast_maps
 from pipelines.depth.surface import HeadSurface, extract_mesh, grid_normals
 from tests.pipelines.bump_head import ring
-from tests.pipelines.dense_grid import to_dense
 
 RADIUS, VOXEL = 0.09, 0.003
 
@@ -70,11 +69,3 @@ def test_rays_miss_an_empty_box_and_a_ball_behind_the_camera():
     assert not np.isfinite(trace(empty, camera)).any()
     away = replace(camera, cam_from_world=np.diag([1.0, -1.0, -1.0, 1.0]) @ camera.cam_from_world)
     assert not np.isfinite(trace(ball(), away)).any()
-
-
-def test_only_the_largest_body_stays():
-    grid, speck = ball(), ball(0.12, 0.012)
-    left = largest_body(combined(np.minimum, grid, speck))
-    assert (to_dense(left)[to_dense(speck) < 0] > 0).all()
-    assert np.array_equal(to_dense(left) < 0, to_dense(grid) < 0)
-    assert largest_body(grid) is grid
