@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from express50.contract.layout import Dataset, footage_root
 from express50.errors import CaptureError, FormatError, StageError
-from express50.files.digests import cached_by_file
+from express50.files.digests import cached_by_file, file_version
 from express50.files.text import NAME, read_json_table
 
 SCHEMA = "express50.index/1"
@@ -82,15 +82,16 @@ def calibration_file(dataset: Dataset, index: Index) -> Path | None:
 
 
 def read_index(dataset: Dataset, subject: str) -> Index:
-    """Read a subject's index (cached until the file changes).
+    """Read a subject's index (cached until it or the table of captures changes).
 
     Raises:
         StageError: the subject is not ingested, or its capture is no longer registered.
         FormatError: the file does not follow its schema.
     """
     path = dataset.index_file(subject)
+    table = dataset.captures_file  # says where the footage lies
     try:
-        return _read_cached(path, dataset, subject)
+        return _read_cached(path, dataset, subject, table.is_file() and file_version(table))
     except FileNotFoundError as error:
         known = ", ".join(dataset.subjects()) or "none"
         raise StageError(
@@ -100,7 +101,7 @@ def read_index(dataset: Dataset, subject: str) -> Index:
 
 
 @cached_by_file(64)
-def _read_cached(path: Path, dataset: Dataset, subject: str) -> Index:
+def _read_cached(path: Path, dataset: Dataset, subject: str, captures_version: Hashable) -> Index:
     captures = dataset.captures()
     if subject not in captures:
         raise StageError(

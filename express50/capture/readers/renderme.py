@@ -118,6 +118,7 @@ def read(path: Path, selection: Selection) -> RawCapture:
     root = path if path.is_dir() else path.parent
     skipped, taken, lengths = {}, {}, {}
     pictures: dict[str, dict[Moment, str]] = {}
+    seen: set[str] = set()
     for part, performance in known.items():
         if not selection.has_sequence(part, "*" if path.is_file() else USUAL):
             skipped[f"sequence {part}"] = (
@@ -125,16 +126,21 @@ def read(path: Path, selection: Selection) -> RawCapture:
             )
             continue
         try:
-            frames, lengths[part] = _frames(performance, selection)
+            frames, lengths[part] = _frames(performance)
         except CaptureError as error:
             skipped[f"sequence {part}"] = str(error)
+            continue
+        seen |= frames.keys()
+        frames = {name: keys for name, keys in frames.items() if selection.has_camera(name)}
+        if not frames:
+            skipped[f"sequence {part}"] = "has no picture of the cameras that were asked for"
             continue
         taken[part] = performance
         for camera, keys in frames.items():
             prefix = f"{performance.raw.name}{WITHIN}Camera/{camera.removeprefix('cam')}/color"
             table = pictures.setdefault(camera, {})
             table |= {(part, key): f"{prefix}/{key}" for key in keys}
-    check_selection(selection, list(known), sorted(pictures) or list(selection.cameras))
+    check_selection(selection, list(known), sorted(seen) or list(selection.cameras))
     if not taken:
         reasons = "; ".join(f"{what}: {why}" for what, why in sorted(skipped.items()))
         raise CaptureError(f"{path}: no performance can be used: {reasons}")
@@ -169,7 +175,7 @@ def read(path: Path, selection: Selection) -> RawCapture:
     )
 
 
-def _frames(performance: Performance, selection: Selection) -> tuple[dict[str, list[int]], int]:
+def _frames(performance: Performance) -> tuple[dict[str, list[int]], int]:
     """Read the frame numbers by camera, and the clip's number of frames as the file states it.
 
     Raises:
@@ -181,7 +187,7 @@ def _frames(performance: Performance, selection: Selection) -> tuple[dict[str, l
         raise CaptureError(f"{performance.raw}: has no Camera group; copy the file again")
     found: dict[str, list[int]] = {}
     for name in members(group):
-        if not name.isdecimal() or not selection.has_camera(f"cam{name}"):
+        if not name.isdecimal():
             continue
         colour = child(file, f"Camera/{name}/color")
         keys = members(colour) if isinstance(colour, h5py.Group) else []

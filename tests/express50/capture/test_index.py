@@ -1,6 +1,8 @@
 """The frame index: round trip, checks, and errors that say which command to run."""
 
 import json
+import shutil
+from pathlib import Path
 
 import pytest
 
@@ -36,6 +38,13 @@ def test_index_is_read_again_when_the_file_changes(ingested):
     assert read_index(ingested, "S001") is read_index(ingested, "S001")
     path.write_text(path.read_text().replace('"fps": 24.0', '"fps": 25.0'))
     assert read_index(ingested, "S001").fps == 25.0
+
+
+def test_footage_that_was_moved_is_found_in_the_same_process(ingested, capture, tmp_path):
+    assert read_index(ingested, "S001").capture == capture
+    moved = Path(shutil.copytree(capture, tmp_path / "moved"))
+    ingested.captures_file.write_text(json.dumps({"S001": str(moved)}))
+    assert read_index(ingested, "S001").capture == moved
 
 
 @pytest.mark.parametrize(

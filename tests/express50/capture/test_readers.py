@@ -98,10 +98,15 @@ def test_renderme_key_frames_and_what_is_left_out(tmp_path):
     assert_rig(dataset, subject, {k: c for k, c in rig(names).items() if k != "cam03"})
 
 
-def test_renderme_of_two_actors_or_annotations_alone_is_refused(tmp_path):
+def test_renderme_of_two_actors_annotations_alone_or_an_unknown_camera_is_refused(tmp_path):
     layouts.write_renderme(tmp_path, expressions=1)
     with pytest.raises(CaptureError, match="anno/0026"):
         read_any(tmp_path / "anno" / "0026")
+    (tmp_path / "wishes").mkdir()
+    wish = 'source = "../raw/0026"\ncameras = ["cam99"]\n'
+    (tmp_path / "wishes/capture.toml").write_text(wish)
+    with pytest.raises(CaptureError, match="'cam99', which is not there; the layout has cam00"):
+        read_any(tmp_path / "wishes")
     (tmp_path / "raw/0026/0027_e0_raw.smc").write_bytes(b"")
     with pytest.raises(CaptureError, match="0026, 0027"):
         subject_of(tmp_path / "raw" / "0026")
