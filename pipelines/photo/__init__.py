@@ -94,7 +94,8 @@ def run_photo(args: argparse.Namespace) -> int:
                 summaries.append(run_stage(stage, dataset, config, chosen, pool=pool))
                 if not summaries[-1].ok:
                     break
-        panel = folder / "panel.jpg"
+        # Not in the capture: ingest would be outdated.
+        panel = dataset.root / "panels" / subject / "panel.jpg"
         if summaries[-1].ok:
             write_panel(dataset, subject, configs[-1], panel)
     done = summaries[-1].ok

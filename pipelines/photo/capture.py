@@ -333,6 +333,6 @@ def write_panel(dataset: Dataset, subject: str, config: TrackConfig, path: Path)
     column = draw_column(image, camera, model.to(dtype=torch.float64), mesh, dots, PANEL_TILE)
     head = (mesh - track.t[0]) @ track.R[0]
     turned = render_preview(model, head, yaw=PANEL_YAW, size=PANEL_TILE)
-    write_image(
-        path, np.concatenate([column[:PANEL_TILE], column[PANEL_TILE:], turned], axis=1), quality=90
-    )
+    tiles = [column[:PANEL_TILE], column[PANEL_TILE:], turned]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_image(path, np.concatenate(tiles, axis=1), quality=90)

@@ -48,9 +48,11 @@ def tracked(tmp_path_factory: pytest.TempPathFactory, astronaut: np.ndarray) -> 
     return folder / "out", metrics
 
 
-def test_a_bare_photograph_is_tracked(tracked: tuple[Path, dict]) -> None:
+def test_a_bare_photograph_is_tracked(tracked: tuple[Path, dict], capsys) -> None:
     out, metrics = tracked
-    assert (out / "photos/eva_1/panel.jpg").stat().st_size > 30_000
+    assert (out / "panels/eva_1/panel.jpg").stat().st_size > 30_000
+    assert main(["ingest", str(out), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["skipped"] == 1, "nothing that ingest read changed"
     # A face 120 px tall: 2 px are 8 mm of a face's 24 cm at the very most.
     assert metrics["landmark_rms_px_mean"] < 2.0
     assert metrics["marked_views"] == 1
