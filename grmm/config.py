@@ -142,6 +142,9 @@ class DataConfig:
     skip_hidden_neck: bool = False
     """Ignore pixels where the torso is in front of the neck: each camera sees a different side
     of the collar. The paper treats them as background, which contradicts other views."""
+    hide_behind_torso: bool = False
+    """Draw nothing where the footage's depth has the torso in front of it, if the shards know that
+    depth. Otherwise all cameras must agree on where the neck ends."""
 
     def __post_init__(self) -> None:
         check_ranges("data", self, background=(0, 1))
@@ -243,7 +246,7 @@ class Config:
 Preset = dict[str, dict[str, Any]]
 # Our additions to the paper, at any size; docs/PAPER.md lists the measured effect of each.
 PLUS: Preset = {
-    "data": {"skip_hidden_neck": True},
+    "data": {"skip_hidden_neck": True, "hide_behind_torso": True},
     "model": {"refine_alpha": True},
     "loss": {"laplacian": 0.0, "displacement": 0.01},
     "train": {"warm_start": True},

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -22,7 +22,7 @@ from express50.geometry.transforms import make_transform
 from express50.head.model import HeadModel, pose
 from grmm.config import DataConfig
 from grmm.head_crop import behind_torso, crop_view, head_window
-from grmm.model import HeadState, PinholeView
+from grmm.model import HeadState, PinholeView, Rendering
 
 NO_OFFSETS = np.zeros((0, 3), np.float32)
 CACHE_BYTES = 512 << 20  # of decoded samples: a few hundred of 512 px
@@ -99,7 +99,7 @@ class Sample:
         depth: (H, W) float32 camera z, metres; 0 where unknown. None: no depth.
         place: camera and head.
         parts: (H, W) uint8 of segmentation_labels.LABELS. None: the shards have none.
-        bare: True where alpha and depth leave the torso out already.
+        bare: True if alpha leaves the torso out already.
     """
 
     image: np.ndarray
@@ -147,6 +147,9 @@ class Item:
         depth_valid: (H, W) bool.
         parts: (H, W) uint8 of segmentation_labels.LABELS. None: the shards have none.
         hidden: (H, W) bool, where the torso hides the neck (DataConfig.skip_hidden_neck).
+        torso: (H, W) metres, depth of the torso; 0 where unknown or DataConfig.hide_behind_torso is
+            off.
+        background: grey behind footage and renderings.
     """
 
     key: SampleKey
@@ -158,6 +161,16 @@ class Item:
     depth_valid: Tensor
     parts: np.ndarray | None
     hidden: Tensor
+    torso: Tensor
+    background: float
+
+    def before_torso(self, rendering: Rendering) -> Rendering:
+        """Return a rendering that is background where the torso is in front of what was drawn."""
+        behind = (self.torso > 0) & (rendering.depth > self.torso)
+        rgb, image = (
+            torch.where(behind, self.background, each) for each in (rendering.rgb, rendering.image)
+        )
+        return replace(rendering, rgb=rgb, image=image)
 
     def comparable(self, image: Tensor) -> Tensor:
         """Return ``image`` (3, H, W) with the footage where the neck is hidden."""
@@ -190,7 +203,7 @@ class HeadViews:
     def __init__(self, source: Source, head: HeadModel, data: DataConfig = DEFAULTS) -> None:
         """Wrap a source tracked with ``head``; items are put on the head's device."""
         self.source, self.head = source, head
-        self.background, self.skip_hidden = data.background, data.skip_hidden_neck
+        self.background, self.data = data.background, data
         self._hidden: Cache[int, np.ndarray] = Cache(CACHE_BYTES // 8, lambda bits: bits.nbytes)
         self._samples: Cache[int, Sample] = Cache(CACHE_BYTES, lambda sample: sample.nbytes)
         self._coming: dict[int, Future[Sample]] = {}
@@ -216,9 +229,13 @@ class HeadViews:
         view = self.view_of(sample.place)
         matte = sample.alpha
         depth = np.zeros_like(matte) if sample.depth is None else sample.depth
-        if sample.parts is not None and not sample.bare:
-            torso = sample.parts == TORSO
-            matte, depth = np.where(torso, 0, matte), np.where(torso, 0, depth)
+        torso = np.zeros_like(depth)
+        if sample.parts is not None:
+            labelled = sample.parts == TORSO
+            if self.data.hide_behind_torso:
+                torso = np.where(labelled, depth, 0)
+            depth = np.where(labelled, 0, depth)
+            matte = matte if sample.bare else np.where(labelled, 0, matte)
         hidden = self._hidden_neck(index, sample, state, view)
         rows, columns = slice(0, height), slice(0, width)
         if crop:
@@ -238,6 +255,8 @@ class HeadViews:
             depth_valid=known > 0,
             parts=None if sample.parts is None else sample.parts[rows, columns],
             hidden=torch.from_numpy(hidden[rows, columns]).to(self.head.device),
+            torso=self._tensor(torso[rows, columns]),
+            background=self.background,
         )
 
     def _hidden_neck(
@@ -245,7 +264,7 @@ class HeadViews:
     ) -> np.ndarray:
         """Find the pixels (H, W) where the torso hides the neck; the masks are kept as bits."""
         height, width = sample.alpha.shape
-        if sample.parts is None or not self.skip_hidden:
+        if sample.parts is None or not self.data.skip_hidden_neck:
             return np.zeros((height, width), bool)
         torso = sample.parts == TORSO
 

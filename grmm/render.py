@@ -60,7 +60,7 @@ def comparison_sheet(path: Path, views: HeadViews, indices: Many[int], render: R
     rows, labels = [], []
     for index in indices:
         item = views.item(index)
-        out = render(item)
+        out = item.before_torso(render(item))
         pictures = [to_uint8(image) for image in (item.target, out.image, out.rgb)]
         pictures.append(depth_picture(out.depth, out.alpha))
         pictures.append(to_uint8(4 * (out.image - item.target).abs()))

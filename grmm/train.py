@@ -193,6 +193,7 @@ def objective(
 ) -> dict[str, Tensor]:
     """Compute the weighted terms of the objective by name (paper: Training and Losses)."""
     weights, model = config.loss, state.model
+    rendering = item.before_torso(rendering)
     images = {"rgb": item.comparable(rendering.rgb)}
     if model.refinement is not None:
         images["image"] = item.comparable(rendering.image)

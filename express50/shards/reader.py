@@ -11,7 +11,7 @@ as they are. The writer is in :mod:`express50.shards.writer`.
 parameters, with world = R @ head + t in the cameras' world (``offsets``: whether
 ``<subject>.offsets.npy`` beside the shards is to be added to the rest shape; ``registered``:
 whether ``<subject>.registered.npz`` has the expression's mesh); ``label`` (who chose the
-frame), ``torso`` (removed or kept in alpha and depth), ``parts`` (whether there are labels),
+frame), ``torso`` (removed or kept in alpha), ``parts`` (whether there are labels),
 ``occluded`` (share of the face that each of hand and apparel hides), ``crop``, ``source_size``
 (of the peak frame that was cropped) and, if that was reduced, ``recorded_size``; ``consent``,
 ``licence``, ``session``.

@@ -152,7 +152,7 @@ class LoadedSample:
         depth: metres.
         valid: bool, the depth is known.
         parts: uint8 labels, or None.
-        torso: `removed` from alpha and valid, or `kept`.
+        torso: `removed` from alpha, or `kept`.
     """
 
     rgb: np.ndarray
@@ -190,9 +190,10 @@ def load_sample(
             f"frame, matte, depth and regions differ in size: {', '.join(map(str, sizes))}"
         )
     torso = "kept"
-    if head is not None and config.torso == "remove":
-        # Depth without colour is also dropped: the rest of the torso would bend the head.
-        alpha, valid, torso = head, valid & (head > 127), "removed"
+    if head is not None and parts is not None and config.torso == "remove":
+        # Depth stays where labels tell whose it is: elsewhere a torso's would bend the head.
+        alpha, torso = head, "removed"
+        valid = valid & ((head > 127) | label_mask(parts, "torso"))
     if config.min_confidence > 0:
         sure = read_image(folder / f"{camera.id}_confidence.png")
         valid = valid & (sure >= round(255 * config.min_confidence))

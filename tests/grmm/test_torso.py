@@ -12,7 +12,7 @@ from grmm.cli import main
 from grmm.config import DataConfig
 from grmm.data import HeadViews
 from grmm.head_crop import behind_torso
-from grmm.model import PinholeView
+from grmm.model import PinholeView, Rendering
 from grmm.render import to_uint8
 from grmm.shard_source import ShardSource
 from tests.grmm import packed
@@ -40,6 +40,15 @@ class Labelled(Dressed):
         return replace(sample, parts=parts)
 
 
+class Behind(Labelled):
+    """Labelled, with the left half of the shirt far behind the head."""
+
+    def read(self, index):
+        sample = super().read(index)
+        sample.depth[int(0.8 * self.size) :, : self.size // 2] = 2.0
+        return sample
+
+
 class Bare(Labelled):
     """Labelled, with a matte that is said to leave the torso out."""
 
@@ -59,6 +68,20 @@ def test_a_matte_without_torso_or_labels_is_taken_as_it_is():
     for source in (Bare, Dressed):
         item = HeadViews(source(size=64), ellipsoid_head()).item(0)
         assert float(item.target[:, 58:, 20:44].min()) == 1 and item.mask[58:].all()
+
+
+def test_nothing_is_drawn_behind_the_torso_and_all_before_it():
+    hiding = DataConfig(hide_behind_torso=True, background=0.25)
+    item = HeadViews(Behind(size=64), ellipsoid_head(), hiding).item(0)
+    picture, depth = torch.full((3, 64, 64), 0.5), torch.full((64, 64), 0.6)
+    drawn = Rendering(image=picture, rgb=picture, depth=depth, alpha=depth, gaussians=None)
+    shown = item.before_torso(drawn)
+    assert not item.depth_valid[52:].any()
+    for image in (shown.image, shown.rgb):
+        assert (image[:, 52:, 32:] == 0.25).all()
+        assert (image[:, 52:, :32] == 0.5).all() and (image[:, :50] == 0.5).all()
+    plain = HeadViews(Behind(size=64), ellipsoid_head()).item(0)
+    assert torch.equal(plain.before_torso(drawn).image, picture)
 
 
 def necked_head():

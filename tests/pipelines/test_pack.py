@@ -382,7 +382,7 @@ def test_a_torso_that_was_not_separated_is_not_called_removed(dataset, tmp_path)
     assert metrics["with_parts"] == 1 and metrics["torso_removed"] == 0
 
 
-def test_the_torso_leaves_alpha_and_depth_and_its_labels_are_packed(dataset, packed, tmp_path):
+def test_the_torso_leaves_alpha_but_its_labels_and_depth_are_packed(dataset, packed, tmp_path):
     assert packed[1]["with_parts"] == packed[1]["torso_removed"] == 0
     assert packed[1]["encoded"]["S001"]["warnings"][0]["what"] == "regions"
     before = ShardReader(packed[0]).select(subjects=["S001"], cameras=["cam02"])
@@ -409,7 +409,9 @@ def test_the_torso_leaves_alpha_and_depth_and_its_labels_are_packed(dataset, pac
     assert kept["alpha"][torso].mean() > 0.9 and kept["valid"][torso].any()
     # The crop follows what is left, so that the pixels of the two need not be the same.
     gone = removed["parts"] == LABELS.index("torso")
-    assert removed["alpha"][gone].mean() < 0.05 and not removed["valid"][gone].any()
+    assert removed["alpha"][gone].mean() < 0.05 and removed["valid"][gone].mean() > 0.9
+    beside = (removed["alpha"] < 0.4) & ~gone
+    assert beside.any() and not removed["valid"][beside].any()
 
 
 def test_labels_are_cut_by_the_nearest_pixel():
