@@ -226,7 +226,7 @@ def sample_expression(
 def _sample_weights(rows: int, rng: np.random.Generator, spread: float, what: str) -> np.ndarray:
     """Return weights (rows,) that sum to 1; a weighted sum has the rows' mean and covariance."""
     if rows < 2:
-        raise ConfigError(f"the checkpoint has {rows} of {what}, expected two or more to draw from")
+        raise ConfigError(f"the checkpoint has {rows} {what}, too few to draw new ones from")
     noise = spread * rng.standard_normal(rows) / np.sqrt(rows - 1)
     return 1 / rows + noise - noise.mean()
 

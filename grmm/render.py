@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 from collections.abc import Sequence as Many
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -13,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from express50.dataset.tracks import OF_FRAMES, Sequence, read_sequence
+from express50.dataset.tracks import OF_FRAMES, RIG_RATE, Sequence, read_sequence
 from express50.errors import ConfigError
 from express50.files.images import contact_sheet, write_image
 from grmm.checkpoint import Loaded
@@ -33,7 +34,6 @@ from grmm.head_crop import draw_window
 from grmm.model import PinholeView
 from grmm.networks import normalise_depth
 
-VIDEO_RATE = 24  # frames per second, as the rig's
 YAWS, PITCHES = (-60, -30, 0, 30, 60), (20, 0, -20)  # degrees of the sheet of novel views
 Sheet = tuple[list[list[np.ndarray]], list[str]]
 COLUMNS = "footage, refined, drawn, depth, error times four"  # of comparison sheets
@@ -295,12 +295,15 @@ def write_sheet(path: Path, rows: Many[Many[np.ndarray]], labels: Many[str] | No
     write_image(path, contact_sheet(rows, labels, rows[0][0].shape[:2]))
 
 
-def write_video(path: Path, frames: Iterable[np.ndarray]) -> None:
-    """Write (H, W, 3) uint8 frames as H.264; an odd last row or column is cut."""
+def write_video(path: Path, frames: Iterable[np.ndarray], rate: float = RIG_RATE) -> None:
+    """Write (H, W, 3) uint8 frames as H.264; an odd last row or column is cut.
+
+    ``rate`` is in frames per second.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(f".{path.name}.part.mp4")
     with av.open(str(aside), "w") as container:
-        stream = container.add_stream("libx264", rate=VIDEO_RATE)
+        stream = container.add_stream("libx264", rate=Fraction(rate).limit_denominator(1001))
         stream.pix_fmt = "yuv420p"
         stream.options = {"crf": "16", "preset": "veryfast"}
         for number, frame in enumerate(frames):

@@ -22,6 +22,7 @@ from express50.geometry.shapes import check_finite, check_shape
 
 SCHEMA = "express50.track/2"
 SEQUENCE_SCHEMA = "express50.sequence/1"
+RIG_RATE = 24.0  # frames per second of the project's rig
 REGISTRATION_SCHEMA = "express50.registration/1"
 _WIDTHS = {"neck": (3,), "jaw": (3,), "eyes": (6,), "R": (3, 3), "t": (3,)}
 
@@ -80,6 +81,7 @@ class Sequence(HeadPoses):
     """Holds a subject's head in every frame of its tracked clips."""
 
     cues: tuple[str, ...]  # clip ids, one per frame
+    rate: float  # frames per second; 24 if the file does not say
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -230,8 +232,11 @@ def read_sequence(path: Path) -> Sequence:
     make = "'express50 track --set track.frames=clips', or 'express50 photo' on a video"
     with _arrays_of(path, "sequence", SEQUENCE_SCHEMA, make=make) as arrays:
         cues = arrays["cues"]
-        numbers = _checked(arrays, cues, {})
-        return Sequence(head=str(arrays["head"]), cues=tuple(cues.tolist()), **numbers)
+        numbers, rate = _checked(arrays, cues, {}), float(arrays.get("rate", RIG_RATE))
+        if not 0 < rate < np.inf:
+            raise ValueError(f"rate is {rate:g}, expected frames per second")
+        names = tuple(cues.tolist())
+        return Sequence(head=str(arrays["head"]), cues=names, rate=rate, **numbers)
 
 
 def _checked(

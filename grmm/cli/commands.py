@@ -131,6 +131,7 @@ def fit(args: argparse.Namespace) -> int:
 
 def render(args: argparse.Namespace) -> int:
     """Write pictures, sheets and videos of one head."""
+    from express50.dataset.tracks import RIG_RATE
     from express50.files.images import write_image
     from grmm import render
 
@@ -144,6 +145,7 @@ def render(args: argparse.Namespace) -> int:
     write_image(args.out / "picture.png", render.picture(loaded, head, view))
     say(f"wrote {args.out / 'picture.png'}")
     videos: dict[str, Any] = {}
+    rates: dict[str, float] = {}
     if args.turntable:
         videos["turntable"] = render.turntable(loaded, head, view, args.frames, args.degrees)
     if args.to:
@@ -151,9 +153,9 @@ def render(args: argparse.Namespace) -> int:
         videos["interpolation"] = render.interpolation(loaded, head, end, view, args.frames)
     if args.drive:
         clips = render.read_clips(args.drive, args.drive_cue)
-        videos["driven"] = render.driven(loaded, head, clips, view)
+        videos["driven"], rates["driven"] = render.driven(loaded, head, clips, view), clips.rate
     for name, frames in videos.items():
-        render.write_video(args.out / f"{name}.mp4", frames)
+        render.write_video(args.out / f"{name}.mp4", frames, rates.get(name, RIG_RATE))
         say(f"wrote {args.out / name}.mp4")
     sheets: dict[str, Any] = {}
     if args.views:

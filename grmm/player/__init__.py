@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from express50.dataset.tracks import Sequence
+from express50.dataset.tracks import RIG_RATE, Sequence
 from express50.files.atomic import write_bytes
 from grmm.checkpoint import Loaded
 from grmm.data import HeadViews, spread
@@ -39,7 +39,7 @@ from grmm.player.distillation import (
     seen_angles,
     turning_point,
 )
-from grmm.render import VIDEO_RATE, check_clips
+from grmm.render import check_clips
 
 HERE = Path(__file__).parent
 # How the arrays of an `Avatar` are stored. Whole numbers are multiples of the largest value of
@@ -109,7 +109,8 @@ def export_player(
         gap = len(person.own) - 12 - clips.expression.shape[1]
         coefficients = np.pad(clips.expression, ((0, 0), (0, gap)))
         frames = np.concatenate([coefficients, clips.neck, clips.jaw, clips.eyes], 1)
-    content, shown = player_page(person, distil(person), subject, frames, VIDEO_RATE)
+    rate = RIG_RATE if clips is None else clips.rate
+    content, shown = player_page(person, distil(person), subject, frames, rate)
     write_bytes(path, content)
     report = PlayerReport(
         gaussians=len(shown.opacities),

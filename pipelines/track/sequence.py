@@ -260,6 +260,7 @@ def write_clips(
     head: str,
     shape: np.ndarray,
     cues: tuple[Cue, ...],
+    fps: float,
     read: ReadClip,
     keep: Path,
     identity: str,
@@ -269,8 +270,8 @@ def write_clips(
     Finished windows lie in `keep` under a digest of everything they depend on, so a run after a
     crash continues where the last one stopped; they go once the sequence is written.
 
-    `head` names the head model, `shape` (S,) are its own coefficients; `identity` says which
-    inputs, settings and fit of the peaks the windows are of.
+    `head` names the head model, `shape` (S,) are its own coefficients; `fps` is the footage's
+    rate; `identity` says which inputs, settings and fit of the peaks the windows are of.
 
     Returns:
         Metrics (`frames`, `jitter_mm` per cue), and dropped frames.
@@ -304,6 +305,7 @@ def write_clips(
     arrays = {"frames": np.array(numbers, dtype=np.int64), "cues": np.array(names)}
     arrays |= pose_arrays(poses, tracker.person.expression_size)
     arrays |= {"schema": np.array(SEQUENCE_SCHEMA), "head": np.array(head), "shape": shape}
+    arrays["rate"] = np.array(fps / tracker.stride)
     write_npz(out / "sequence.npz", arrays)
     # Only publishing is left; a run that ends before that tracks the clips again.
     shutil.rmtree(keep, ignore_errors=True)

@@ -117,8 +117,9 @@ def run(
         follow = open_follower(config.landmarks)
         read = partial(read_clip, dataset, item, source, follow, peaks, config.photo_side)
         shape = split_shape(basis.model, state.shape)[0]
+        index = read_index(dataset, item)
         metrics["clips"], lost = write_clips(
-            out, tracker, config.head, shape, read_index(dataset, item).cues, read,
+            out, tracker, config.head, shape, index.cues, index.fps, read,
             dataset.windows_dir(item), clips_identity(inputs, config, shape, state, eyes),
         )  # fmt: skip
         dropped += lost

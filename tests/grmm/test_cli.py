@@ -271,11 +271,13 @@ def test_a_head_is_driven_by_tracked_clips(checkpoint, tmp_path, capsys):
         for name in ("expression", "neck", "jaw", "eyes", "R", "t")
     }
     arrays |= {"shape": frames[0].shape, "frames": np.array([3, 4]), "cues": np.array(["a", "b"])}
+    arrays["rate"] = np.array(29.97)
     path = tmp_path / "sequence.npz"
     np.savez(path, schema="express50.sequence/1", head=loaded.head_spec, **arrays)
     render = ["render", str(checkpoint), str(tmp_path / "out"), f"--drive={path}"]
     assert main([*render, "--size=32"]) == 0
-    assert (tmp_path / "out" / "driven.mp4").stat().st_size > 0
+    with av.open(str(tmp_path / "out" / "driven.mp4")) as video:
+        assert float(video.streams.video[0].average_rate) == pytest.approx(29.97, abs=0.01)
 
     from express50.dataset.tracks import read_sequence
 

@@ -145,7 +145,7 @@ def test_the_report_measures_footage_and_foreign_clips_are_refused(loaded, tmp_p
 def clip_of(head, frames=3):
     zeros = np.zeros((frames, 3))
     return Sequence(
-        head=head, cues=("a",) * frames, frames=np.arange(frames), shape=np.zeros(3),
+        head=head, cues=("a",) * frames, frames=np.arange(frames), rate=24.0, shape=np.zeros(3),
         expression=np.zeros((frames, 4)), neck=zeros, jaw=zeros + 0.2, eyes=np.zeros((frames, 6)),
         R=np.tile(np.eye(3), (frames, 1, 1)), t=zeros,
     )  # fmt: skip

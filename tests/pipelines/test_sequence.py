@@ -161,7 +161,7 @@ def run(scene, keep: Path, watched: list[int], fail_at: int | None = None, hide:
     out = keep.with_name(keep.name + "-out")
     out.mkdir(exist_ok=True)
     metrics, dropped = write_clips(
-        out, quick(scene), "tiny", scene.shape, CUES, read, keep, "inputs"
+        out, quick(scene), "tiny", scene.shape, CUES, 60.0, read, keep, "inputs"
     )
     with np.load(out / "sequence.npz", allow_pickle=False) as data:
         return dict(data), metrics, dropped
@@ -196,7 +196,7 @@ def test_frames_without_a_face_are_left_out_and_said(tmp_path: Path) -> None:
     assert "1 of 5 frames" in dropped[0].why
     with pytest.raises(StageError, match="no frame of any clip"):
         write_clips(
-            tmp_path, quick(make_scene()), "tiny", np.zeros(5), CUES, lambda c, f: [],
+            tmp_path, quick(make_scene()), "tiny", np.zeros(5), CUES, 60.0, lambda c, f: [],
             tmp_path / "n", "",
         )  # fmt: skip
 
@@ -249,9 +249,10 @@ def test_kept_windows_go_when_the_sequence_is_written(
         sequence.np, "savez", lambda *a, **k: (kept.append(keep.is_dir()), savez(*a, **k))
     )
     write_clips(
-        tmp_path, quick(scene), "tiny", scene.shape, CUES,
+        tmp_path, quick(scene), "tiny", scene.shape, CUES, 60.0,
         lambda c, f: [(found(seen[k]), unseen) for k in f], keep, "inputs",
     )  # fmt: skip
     assert kept[-1] and not keep.exists()
     with np.load(tmp_path / "sequence.npz", allow_pickle=False) as data:
         assert data["R"].shape == (FRAMES, 3, 3) and data["shape"].shape == (5,)
+        assert data["rate"] == 60
