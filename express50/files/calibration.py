@@ -56,8 +56,8 @@ def _parse_camera(path: str, camera_id: str, row: object) -> Camera:
     model = row["model"]
     if not isinstance(model, str) or model not in MODELS:
         raise CalibrationError(f"{where}: model {model!r} is unknown; expected {', '.join(MODELS)}")
-    params = _numbers(where, "params", row["params"], (len(MODELS[model]),))
-    pose = _numbers(where, "world_to_camera", row["world_to_camera"], (4, 4))
+    params = finite_array(row["params"], (len(MODELS[model]),), f"{where} has params")
+    pose = finite_array(row["world_to_camera"], (4, 4), f"{where} has world_to_camera")
     R = pose[:3, :3]
     if not is_rigid(pose):
         raise CalibrationError(
@@ -79,19 +79,22 @@ def _parse_camera(path: str, camera_id: str, row: object) -> Camera:
     return Camera(camera_id, size[0], size[1], model, tuple(map(float, params)), pose)
 
 
-def _numbers(where: str, name: str, value: object, shape: tuple[int, ...]) -> np.ndarray:
-    """Convert to a finite float array of the given shape, or raise CalibrationError."""
+def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray:
+    """Convert a value to a float array of the given shape, with numbers of less than LARGEST.
+
+    Raises:
+        CalibrationError: it is not such an array; the message begins with ``what``.
+    """
     try:
-        array = np.array(value, dtype=np.float64)
+        array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise CalibrationError(f"{where}: {name} is not an array of numbers") from None
-    if array.shape != shape:
-        raise CalibrationError(f"{where}: {name} has shape {array.shape}, expected {shape}")
-    if not np.isfinite(array).all():
-        raise CalibrationError(f"{where}: {name} holds NaN or Inf, expected finite numbers")
-    if np.abs(array).max(initial=0.0) > LARGEST:  # its square would not be finite
+        array = np.zeros(0)
+    largest = np.abs(array).max(initial=0.0)  # NaN if one is
+    if array.shape != shape or not largest < LARGEST:
+        got = "nothing" if value is None else f"shape {array.shape}"
+        got = f"{largest:.3g}" if array.shape == shape else got
         raise CalibrationError(
-            f"{where}: {name} holds {np.abs(array).max():.3g}, expected at most {LARGEST:g}"
+            f"{what}: got {got}, expected {shape}, finite and below {LARGEST:g}; export it again"
         )
     return array
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from express50.errors import CalibrationError
-from express50.files.calibration import LARGEST, camera_rows, parse_cameras
+from express50.files.calibration import camera_rows, parse_cameras
 from express50.files.text import read_bytes
 from express50.geometry.cameras import Camera, resized
 
@@ -103,22 +103,6 @@ def in_metres(cameras: dict[str, Camera], metres_per_unit: float) -> dict[str, C
         pose[:3, 3] *= metres_per_unit
         found[name] = replace(camera, cam_from_world=pose)
     return found
-
-
-def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Convert a value to a finite float array of the given shape.
-
-    Raises:
-        CalibrationError: it is not such an array; the message begins with ``what``.
-    """
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        array = np.zeros(0)
-    if array.shape != shape or not (np.abs(array) < LARGEST).all():
-        got = "nothing" if value is None else f"shape {array.shape}"
-        raise CalibrationError(f"{what}: got {got}, expected {shape}, finite; export it again")
-    return array
 
 
 def as_rig(cameras: Iterable[Camera], path: Path) -> dict[str, Camera]:

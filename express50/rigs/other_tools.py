@@ -30,6 +30,7 @@ import numpy as np
 
 from express50.errors import CalibrationError, CaptureError
 from express50.files.arrays import read_arrays
+from express50.files.calibration import finite_array
 from express50.files.containers import attribute, child, members, open_hdf5, read_array
 from express50.files.text import read_json_table, read_toml, read_xml, read_yaml
 from express50.geometry.cameras import Camera, resized
@@ -39,7 +40,6 @@ from express50.rigs.camera_builder import (
     as_rig,
     camera_from_K,
     checked,
-    finite_array,
     names_from_files,
 )
 

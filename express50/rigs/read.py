@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from express50.errors import CalibrationError
-from express50.files.calibration import read_cameras
+from express50.files.calibration import finite_array, read_cameras
 from express50.files.text import read_json, read_yaml, reason
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_from_opencv
@@ -22,7 +22,6 @@ from express50.rigs.camera_builder import (
     at_size,
     camera_from_K,
     checked,
-    finite_array,
     holds,
     in_metres,
 )

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from express50.errors import CaptureError
+from express50.files.arrays import read_arrays
 from express50.files.calibration import read_cameras, write_cameras
 from express50.geometry.cameras import Camera, rays
 from express50.geometry.transforms import make_transform, rigid_fit
@@ -177,17 +178,13 @@ class Truth:
             )
         about = json.loads((folder / "subject.json").read_text())
         peaks = json.loads((folder / "peaks.json").read_text())
-        with np.load(folder / "frames.npz", allow_pickle=False) as data:
-            arrays = {name: data[name] for name in _PLAY}
+        stored = {path.stem: read_arrays(path, CaptureError, "truth")
+                  for path in folder.glob("*.npz")}  # fmt: skip
         play = TwinPerformance(
-            cues=tuple((str(e), int(a), int(b)) for e, a, b in about["cues"]), peaks=peaks, **arrays
-        )
-        with np.load(folder / "body.npz", allow_pickle=False) as stored:
-            data = dict(stored)
-        own = None
-        if (folder / "own.npz").is_file():
-            with np.load(folder / "own.npz", allow_pickle=False) as stored:
-                own = stored["own"]
+            cues=tuple((str(e), int(a), int(b)) for e, a, b in about["cues"]), peaks=peaks,
+            **{name: stored["frames"][name] for name in _PLAY},
+        )  # fmt: skip
+        data, own = stored["body"], stored.get("own", {}).get("own")
         look: dict[str, Any] = about["look"]
         look |= {name: np.array(value) for name, value in look.items() if isinstance(value, list)}
         person = TwinSubject(
@@ -200,15 +197,11 @@ class Truth:
             vertices=data["hair_vertices"], faces=data["hair_faces"], tangents=blank, normals=blank,
             colours=blank, moves=data.get("hair_moves", np.full(len(blank), -1)),
         )  # fmt: skip
-        worn, hand = bare(), np.zeros((0, 4, 4))
-        if (folder / "worn.npz").is_file():
-            with np.load(folder / "worn.npz", allow_pickle=False) as stored:
-                parts = dict(stored)
-            hand = parts.pop("hand")
-            worn = WornMesh(**parts)
+        parts = stored.get("worn", {"hand": np.zeros((0, 4, 4)), **vars(bare())})
+        hand = parts.pop("hand")
         extras = Extras(
             hair=hair, cloth_vertices=data["cloth_vertices"], cloth_faces=data["cloth_faces"],
-            skull=data["skull"], skull_rest=data["skull_rest"], worn=worn, hand=hand,
+            skull=data["skull"], skull_rest=data["skull_rest"], worn=WornMesh(**parts), hand=hand,
         )  # fmt: skip
         body = assemble(load_head(about["head"]), person, extras, data["scalp"], data["centre"])
         return body, play

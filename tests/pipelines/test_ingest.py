@@ -138,7 +138,7 @@ def test_wrong_calibration_fails_its_item_only(dataset, tmp_path):
     summary = run(dataset)
     assert {o.item: o.status for o in summary.outcomes} == {"S001": "failed", "S002": "done"}
     assert "CalibrationError" in summary.outcomes[0].reason
-    assert "cam00: params has shape (5,), expected (8,)" in summary.outcomes[0].reason
+    assert "cam00 has params: got shape (5,), expected (8,)" in summary.outcomes[0].reason
 
 
 def test_calibration_for_another_size_fails_the_item(dataset):

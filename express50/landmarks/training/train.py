@@ -7,7 +7,7 @@ No photograph of a person is used. The shipped file comes from both heads and se
 with the weights of the one before as `--start`; docs/LOG.md has the commands. `--parts` trains only
 these parts of given weights; all others, including batch normalisations, do not change. The result
 depends on the arguments alone, up to rounding. An interrupted run continues from its last state in
-DIR to the same result.
+DIR to the same result. `benchmarks.landmarks` measures the weights.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ from express50.landmarks.network import (
     LandmarkNet,
     Output,
     heat_loss,
-    load_network,
     save_network,
     trainable_network,
 )
@@ -53,7 +52,6 @@ BATCH = 32
 RATE, RATE_ON = 2e-3, 1e-3  # from random weights, from given ones
 FIRST_FILES = 6
 STEPS_PER_FILE = 300
-HELD_OUT = 0
 # The trunk, what finds points and faces with it, and the close-ups, which do not use it.
 PARTS = ("trunk", "heat", "shape", "face", "outline", *CLOSE_UPS)
 SMALL_EVERY = 4  # after the small steps, one in this many stays small, for blurred faces
@@ -74,7 +72,7 @@ class TrainingPlan:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Render missing views, train, save, and print the errors on held-out heads."""
+    """Render missing views, train, and save."""
     parser = argparse.ArgumentParser(
         prog="python -m express50.landmarks.training.train", description=__doc__
     )
@@ -100,10 +98,6 @@ def main(arguments: list[str] | None = None) -> int:
     for name in set(options.parts) & set(CLOSE_UPS):
         setattr(net, name, train_part(CLOSE_UPS[name], models, options.views, plan.seed))
     save_network(net, options.out)
-    net = load_network(options.out)
-    for model in models:
-        views = open_views(options.views, model, HELD_OUT, plan.seed)
-        print(f"{model.name}: held-out heads {validate(net, views, plan.seed)}")
     return 0
 
 
@@ -139,7 +133,7 @@ def train(
         # Few files at first, so that training starts early.
         files = min(plan.files, FIRST_FILES + step // STEPS_PER_FILE)
         while len(sets) < len(models) * files:
-            number = HELD_OUT + 1 + len(sets) // len(models)
+            number = 1 + len(sets) // len(models)
             sets.append(open_views(folder, models[len(sets) % len(models)], number, plan.seed))
         # Seeded by the step, so that a continued run draws the same crops.
         rng = np.random.default_rng([plan.seed, 2, step])
@@ -212,33 +206,6 @@ def crop_loss(net: LandmarkNet, crops: list[TrainingCrop]) -> torch.Tensor:
     edge = output.outline, output.outline_log_scale, output.outline_heat
     points = points + 0.5 * place_loss(*edge, outline)[0].mean(1) * share
     return points.sum() + functional.binary_cross_entropy_with_logits(output.logit, batch.score)
-
-
-@torch.inference_mode()
-def validate(net: LandmarkNet, views: list[TrainingView], seed: int) -> str:
-    """Describe the errors by the head's yaw, and how often visibility and score are right."""
-    rng = np.random.default_rng([seed, 3])
-    backgrounds = make_backgrounds(50, rng)
-    errors, seen, right = [], [], []
-    for start in range(0, len(views), BATCH):
-        some = views[start : start + BATCH]
-        batch = crop_batch([random_crop(view, backgrounds, rng) for view in some])
-        output = net(batch.images)
-        error = (output.points - batch.points[:, :POINTS]).norm(dim=-1).mean(1)
-        errors.append(torch.where(batch.weight > 0, error, torch.nan))
-        full = batch.weight >= 1.0
-        seen.append(((output.seen > 0) == (batch.visible > 0.5))[full].float().mean(1))
-        clear = (batch.score <= 0) | (batch.score >= 1)
-        right.append(((output.logit > 0) == (batch.score > 0.5))[clear].float())
-    error, facing = torch.cat(errors), torch.from_numpy(np.stack([view.facing for view in views]))
-    parts = [
-        f"{name} {float(error[(facing > low) & (facing <= high)].nanmedian()):.2f}"
-        for name, low, high in (("front", 0.7, 1.0), ("turned", 0.3, 0.7), ("profile", -0.1, 0.3))
-    ]
-    return (
-        f"error median {', '.join(parts)} crop px; visibility right "
-        f"{100 * torch.cat(seen).mean():.1f} %, score {100 * torch.cat(right).mean():.1f} %"
-    )
 
 
 if __name__ == "__main__":

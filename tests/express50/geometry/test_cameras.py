@@ -145,10 +145,10 @@ def test_calibration_file_round_trip(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"params": [1, 2, 3]}, "params has shape"),
+        ({"params": [1, 2, 3]}, "has params: got shape"),
         ({"world_to_camera": [[1, 0], [0, 1]]}, r"shape \(2, 2\), expected \(4, 4\)"),
         ({"world_to_camera": (2 * np.eye(4)).tolist()}, "is not a rotation"),
-        ({"world_to_camera": np.full((4, 4), 1e300).tolist()}, "holds 1e.300, expected at most"),
+        ({"world_to_camera": np.full((4, 4), 1e300).tolist()}, "got 1e.300, expected"),
         ({"model": "FISHY"}, "is unknown"),
         ({"params": [-1, 82, 31, 25, 0, 0, 0, 0]}, "focal length -1"),
         ({"width": 0}, "positive integer"),

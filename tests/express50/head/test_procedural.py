@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from express50.head.generator.head import procedural_mesh, stored_people, write_builtin
 from express50.head.load import BUILTIN, load_builtin
 from express50.head.model import REGIONS, landmarks
+from tests.express50.head.test_mouth import covered
 
 
 @pytest.fixture(scope="module")
@@ -94,17 +95,7 @@ def test_the_stored_arrays_are_those_that_the_generator_makes(head, tmp_path):
 
 
 def test_uv_charts_do_not_overlap(head):
-    side = 2048
-    counts = np.zeros((side, side), np.int32)
-    for corners in head.uv.double().numpy()[head.uv_faces.numpy()] * side:
-        low, high = np.floor(corners.min(0)).astype(int), np.ceil(corners.max(0)).astype(int)
-        x = np.arange(low[0], high[0])[None] + 0.5
-        y = np.arange(low[1], high[1])[:, None] + 0.5
-        inside = np.ones((high[1] - low[1], high[0] - low[0]), bool)
-        for a, b in ((0, 1), (1, 2), (2, 0)):
-            p, q = corners[a], corners[b]
-            inside &= (q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0]) > 1e-4
-        counts[low[1] : high[1], low[0] : high[0]] += inside
+    counts = covered(head.uv.double().numpy(), head.uv_faces.numpy(), 2048)
     assert counts.max() == 1
     assert (counts == 1).mean() > 0.6
 
