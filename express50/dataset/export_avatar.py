@@ -11,6 +11,7 @@ and static offset.
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -258,7 +259,7 @@ def seen_by(image: np.ndarray, camera: Camera, target: Camera, factor: int = 1) 
 
 def _is_flame(model: HeadModel) -> bool:
     """Return True if FLAME's coefficients give this model's vertices."""
-    return model.name.startswith("flame-")
+    return re.fullmatch(r"flame-[0-9a-f]{12}(\+mouth)?", model.name) is not None
 
 
 def write_parameters(head: Head, steps: list[str], shift: np.ndarray, out: Path) -> None:

@@ -10,16 +10,14 @@ from express50.errors import StageError
 
 @pytest.mark.parametrize(
     "figures",
-    [(math.nan, 0, 1), (1, 0, math.inf), (1, -math.inf, 2), (2, 0, 1), (0, 1, 2)],
-)
-def test_figures_that_are_not_an_interval_are_refused(figures):
+    [
+        (math.nan, 0, 1, "mm"), (1, 0, math.inf, "mm"), (1, -math.inf, 2, "mm"),
+        (2, 0, 1, "mm"), (0, 1, 2, "mm"), (1, 0, 2, "inch"),
+    ],
+)  # fmt: skip
+def test_figures_that_are_not_an_interval_and_unknown_units_are_refused(figures):
     with pytest.raises(StageError):
-        ExpectedError(*figures, "mm")
-
-
-def test_an_unknown_unit_is_refused():
-    with pytest.raises(StageError):
-        ExpectedError(1, 0, 2, "inch")
+        ExpectedError(*figures)
 
 
 def test_what_is_not_known_is_not_written():

@@ -6,23 +6,6 @@ from express50.contract.layout import Dataset
 from express50.errors import FormatError
 
 
-def test_places_follow_the_documented_layout(tmp_path):
-    dataset = Dataset(tmp_path)
-    relative = {
-        dataset.item_dir("track", "S001"): "track/S001",
-        dataset.frame_file("S001", "smile", "cam03"): "frames/S001/smile/cam03.tif",
-        dataset.matte_file("S001", "smile", "cam03"): "matte/S001/smile/cam03.png",
-        dataset.captures_file: "captures.json",
-        dataset.labels_file("S001"): "labels/S001.jsonl",
-        dataset.ledger: "ledger.sqlite",
-        dataset.config_file("track"): "config/track.toml",
-        dataset.report_dir: "report",
-    }
-    assert {p.relative_to(tmp_path).as_posix(): v for p, v in relative.items()} == {
-        v: v for v in relative.values()
-    }
-
-
 def test_subjects_are_those_with_an_index_sorted(tmp_path):
     dataset = Dataset(str(tmp_path))
     for name in ("S002", "S001", "empty"):

@@ -18,6 +18,7 @@ from express50.errors import HeadModelError
 from express50.geometry.raycast import mesh_scene
 from express50.geometry.transforms import rigid_fit
 from express50.head.flame import load_flame, read_flame
+from express50.head.load import BUILTIN, load_head
 from express50.head.model import HeadModel, landmarks, pose
 from express50.head.mouth import (
     CORNERS,
@@ -279,6 +280,15 @@ def test_room_is_found_where_there_is_any() -> None:
 def test_the_lips_of_the_stand_in_are_those_of_a_face(bare) -> None:
     ring = bare.template[list(UPPER_RING + LOWER_RING)].numpy()
     assert np.abs(ring - MOUTH).max(0)[0] < 0.03 and np.ptp(ring[:, 1]) < 0.02
+
+
+def test_a_head_of_ones_own_is_not_flame_whatever_its_name(tmp_path) -> None:
+    path = tmp_path / "flame-mine.npz"
+    path.write_bytes(BUILTIN.read_bytes())
+    track = read_track(write_track(tmp_path / "track.npz", track_arrays(path)))
+    head = Head(subject="S001", track=track, model=load_head(path), albedo=None)
+    write_parameters(head, ["neutral"], np.zeros(3), tmp_path)
+    assert (tmp_path / "meshes/00000.obj").is_file()
 
 
 def test_readers_of_the_layout_get_5143_vertices(path, model, tmp_path) -> None:
