@@ -85,7 +85,8 @@ def clean_leftovers(dataset: Dataset, stage: str) -> None:
     It is renamed first, so that no worker publishes what is being deleted. Published folders that a
     kill between two renames left beside their place are put back.
     """
-    left = list(dataset.staging_dir.glob(f"{stage}-*"))
+    own = re.compile(rf"{re.escape(stage)}-(leftovers-)?[0-9a-f]{{32}}")  # of no stage `x-...`
+    left = [path for path in dataset.staging_dir.glob(f"{stage}-*") if own.fullmatch(path.name)]
     if not left:
         return
     taken = dataset.staging_dir / f"{stage}-leftovers-{uuid.uuid4().hex}"
