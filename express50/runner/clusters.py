@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+from multiprocessing import resource_tracker
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -148,6 +149,7 @@ def start_cluster(workers: dict[int, dict], threads: int, **scheduler: object) -
         "distributed.nanny.pre-spawn-environ": thread_environment(threads),
     }
     options = {"dashboard": False, "dashboard_address": ":0", "port": 0, "protocol": "tcp://"}
+    _start_tracker()
     with dask.config.set(settings):
         cluster = SpecCluster(
             workers=workers,
@@ -155,6 +157,20 @@ def start_cluster(workers: dict[int, dict], threads: int, **scheduler: object) -
             silence_logs=logging.CRITICAL,
         )
         return Client(cluster, set_as_default=False), cluster
+
+
+def _start_tracker() -> None:
+    """Start the process that frees semaphores; after a kill it must not warn that it frees them."""
+    name, quiet = "PYTHONWARNINGS", "ignore:resource_tracker:UserWarning"
+    former = os.environ.get(name)
+    os.environ[name] = f"{former},{quiet}" if former else quiet
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        if former is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = former
 
 
 def cuda_devices() -> list[str]:

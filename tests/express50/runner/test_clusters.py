@@ -2,6 +2,8 @@
 
 import dataclasses
 import os
+import subprocess
+import sys
 import time
 
 import pytest
@@ -157,3 +159,15 @@ def test_workers_of_several_threads_are_warned_about(threads, capsys):
     ) as cluster:  # fmt: skip
         RemoteWorkers.reach(cluster.scheduler_address).close()
     assert ("a worker has 2 threads" in capsys.readouterr().err) == (threads == 2)
+
+
+def test_a_killed_run_leaves_no_warning_of_semaphores():
+    code = (
+        "import multiprocessing, os\n"
+        "from express50.runner.clusters import _start_tracker\n"
+        "_start_tracker()\n"
+        "held = multiprocessing.get_context('spawn').Semaphore()\n"
+        "os.kill(os.getpid(), 9)\n"
+    )
+    killed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (killed.returncode, killed.stderr) == (-9, "")
