@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
@@ -22,9 +22,11 @@ from express50.files.atomic import write_bytes
 from express50.local_server import NOT_FOUND, PageServer, Reply
 from express50.runner.ledger import COLUMNS, Ledger, Receipt, Run
 from express50.runner.outdated import few, outdated
+from express50.runner.publish import is_running
 
 PAGE_SECONDS = 3.0  # between two writes of the page during a run
 SILENT_SECONDS = 15.0  # a run that has not updated the ledger for this long was killed
+UNLOCKED_SECONDS = 5.0  # the same where nobody holds the stage's lock, as far as this machine sees
 RECENT = 50  # the time left is estimated from the rate of this many last items
 FAILED_SHOWN = 200
 SLOWEST_SHOWN = 10
@@ -102,7 +104,7 @@ def show_status(args: argparse.Namespace) -> int:
 
 def _read(dataset: Dataset) -> list[StageStatus]:
     with Ledger(dataset.ledger, read_only=True) as ledger:
-        return read_status(ledger, list(stages()))
+        return read_status(ledger, list(stages()), locked=lambda name: is_running(dataset, name))
 
 
 def _keep_page(dataset: Dataset, path: Path) -> list[StageStatus]:
@@ -164,21 +166,33 @@ def _outdated_lines(why: Mapping[tuple[str, str], str]) -> Iterator[str]:
 
 
 def read_status(
-    ledger: Ledger, names: Sequence[str], now: float | None = None
+    ledger: Ledger,
+    names: Sequence[str],
+    now: float | None = None,
+    locked: Callable[[str], bool] = lambda stage: True,
 ) -> list[StageStatus]:
-    """Read the status of every stage, in order; ``now`` is in seconds since 1970."""
+    """Read the status of every stage, in order.
+
+    ``now`` is in seconds since 1970; ``locked`` says whether some process holds a stage's lock.
+    """
     moment = time.time() if now is None else now
     runs = ledger.runs()
-    return [_stage(name, ledger.read(name), runs.get(name), moment) for name in names]
+    rows = []
+    for name in names:
+        silence = SILENT_SECONDS if locked(name) else UNLOCKED_SECONDS
+        rows.append(_stage(name, ledger.read(name), runs.get(name), moment, silence))
+    return rows
 
 
-def _stage(name: str, table: dict[str, Receipt], run: Run | None, now: float) -> StageStatus:
+def _stage(
+    name: str, table: dict[str, Receipt], run: Run | None, now: float, silence: float
+) -> StageStatus:
     receipts = tuple(table.values())
     failed = {r.item: r for r in receipts if r.reason}
     alive, open_items, former, missing, rate = False, 0, 0, 0, 0.0
     running: dict[str, float] = {}
     if run is not None:
-        alive = not run.ended and now - run.seen < SILENT_SECONDS
+        alive = not run.ended and now - run.seen < silence
         settled = [r.time for r in receipts if r.time >= run.begun]
         # An item's receipt may be written before the run's next update says that it has ended.
         began = run.running if alive else {}

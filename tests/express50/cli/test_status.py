@@ -11,15 +11,17 @@ import time
 import urllib.error
 import urllib.request
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from express50.__main__ import main
 from express50.cli import status as status_cli
-from express50.cli.status import SILENT_SECONDS, read_status, status_page
+from express50.cli.status import SILENT_SECONDS, UNLOCKED_SECONDS, read_status, status_page
 from express50.console import format_seconds
 from express50.runner.ledger import Ledger, Receipt, Run
+from express50.runner.publish import is_running
 from tests.faults import toy
 from tests.synth import make_capture
 
@@ -212,7 +214,10 @@ def test_a_killed_run_counts_as_stopped(tmp_path):
     first_with(dataset, lambda row: row.running)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    row = status_of_toy(dataset, time.time() + SILENT_SECONDS)
+    assert status_of_toy(dataset, time.time() + SILENT_SECONDS).state == "stopped"
+    with Ledger(dataset.ledger, read_only=True) as ledger:  # its lock is free, so it is sooner sure
+        soon, locked = time.time() + UNLOCKED_SECONDS, partial(is_running, dataset)
+        (row,) = read_status(ledger, ["toy"], soon, locked)
     assert row.state == "stopped"
     assert row.missing + row.done == 40 and row.missing > 0
 
