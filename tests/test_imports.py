@@ -147,7 +147,15 @@ def test_class_names_are_unique():
 
 @pytest.mark.parametrize("module", LIGHT)
 def test_light_modules_import_nothing_heavy(module):
-    code = f"import sys, {module}; print(sorted({HEAVY!r} & set(sys.modules)))"
+    assert_loads_none(HEAVY, module)
+
+
+def test_align_and_the_annotator_start_without_torch():
+    assert_loads_none({"torch"}, "annotations.align.stage, annotations.ui.session")
+
+
+def assert_loads_none(heavy, modules):
+    code = f"import sys, {modules}; print(sorted({heavy!r} & set(sys.modules)))"
     environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)

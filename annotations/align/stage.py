@@ -37,7 +37,10 @@ def run(dataset: Dataset, item: str, out: Path, *, accept: float, match: bool) -
     """Suggest, accept and write ``suggestions.json``, ``peaks.json`` and a contact sheet."""
     index = read_index(dataset, item)
     if not index.cues:
-        raise StageError(f"{item}: cues.csv names no expression; add the script's timing")
+        raise StageError(
+            f"{item}: cues.csv names no expression; add rows expression_id,start_frame,end_frame,"
+            " then run 'express50 ingest' again"
+        )
     found, dropped = suggest_for(dataset, index, match)
     labels = accept_sure(dataset, index, found, accept)
     dropped += _not_taken(index, found, labels, accept)

@@ -10,11 +10,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-import torch
 from scipy.ndimage import gaussian_filter1d
 
 from express50.capture.expressions import NEUTRAL
@@ -26,8 +25,9 @@ from express50.errors import FormatError, StageError
 from express50.files.arrays import read_arrays
 from express50.files.images import contact_sheet, write_image
 from express50.geometry.transforms import similarity_fit
-from express50.landmarks.detector import SMALL, SMALLEST, cut_crop, detect, window_about
-from express50.landmarks.network import CROP, MIRROR, LandmarkNet, face_box, load_network
+
+if TYPE_CHECKING:
+    from express50.landmarks.network import LandmarkNet
 
 SCHEMA = "express50.observations/1"
 SEEN_SCORE = 0.15  # least score of a frame that shows the face
@@ -79,11 +79,17 @@ def run(
     search: float,
 ) -> Result:
     """Write ``observations.npz`` and a picture of the watching cameras at rest."""
+    from express50.landmarks.detector import SMALL, detect
+    from express50.landmarks.network import load_network
+
     index = read_index(dataset, item)
     cues = {c.expression_id: cue_frames(index, c, stride) for c in index.cues}
     windows = {expression: frames for expression, frames in cues.items() if len(frames)}
     if not windows:
-        raise StageError(f"{item}: cues.csv names no expression in the footage; add its timing")
+        raise StageError(
+            f"{item}: cues.csv names no expression in the footage; add rows"
+            " expression_id,start_frame,end_frame, then run 'express50 ingest' again"
+        )
     net = load_network()
     rest = windows.get(NEUTRAL, np.array([frames[0] for frames in windows.values()]))
     seen = list(windows.values())
@@ -223,7 +229,7 @@ STEADY_FRAMES = 1.0  # heads turn slowly: their motion is averaged over this man
 
 
 def find_points(
-    net: LandmarkNet, images: Sequence[np.ndarray], smallest: float = SMALLEST
+    net: LandmarkNet, images: Sequence[np.ndarray], smallest: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find landmarks (T, 68, 2), corner-origin pixels, and scores (T,) in T frames (H, W, 3) uint8.
 
@@ -231,6 +237,11 @@ def find_points(
     all frames and their mirror images are then looked at through the same window, except those
     where the face has left it.
     """
+    import torch
+
+    from express50.landmarks.detector import detect, window_about
+    from express50.landmarks.network import CROP, MIRROR, face_box
+
     middle = detect(net, images[len(images) // 2], smallest=smallest)
     centre, side = face_box(middle.points)
     window = window_about(middle.points)
@@ -295,6 +306,8 @@ def steady(values: np.ndarray) -> np.ndarray:
 
 def _cut(image: np.ndarray, window: np.ndarray, size: int) -> np.ndarray:
     """Cut a square through an affine (2, 3) from its pixels to the image's, corner origin."""
+    from express50.landmarks.detector import cut_crop
+
     step = float(np.sqrt(abs(np.linalg.det(window[:, :2]))))
     height, width = image.shape[:2]
     if step > 1.5:  # blurred first, because fine detail would alias
