@@ -37,12 +37,7 @@ def split_subjects(
         )
     test = set(test_subjects)
     if not test and fraction > 0 and len(subjects) > 1:
-        draw = {}
-        for name in subjects:  # uniform in [0, 1)
-            digest = hashlib.sha256(f"0:{name}".encode()).digest()
-            draw[name] = int.from_bytes(digest[:8]) / 2**64
-        test = {name for name in subjects if draw[name] < fraction}
-        test = test or {min(subjects, key=lambda name: draw[name])}
+        test = {name for name in subjects if draw(name) < fraction} or {min(subjects, key=draw)}
     train = sorted(set(subjects) - test)
     if not train:
         raise StageError(
@@ -50,6 +45,11 @@ def split_subjects(
             " fewer pack.test_subjects"
         )
     return {"train": train, "test": sorted(test)}
+
+
+def draw(subject: str) -> float:
+    """Return a subject's place in [0, 1), uniform over ids: a hash of its id."""
+    return int.from_bytes(hashlib.sha256(f"0:{subject}".encode()).digest()[:8]) / 2**64
 
 
 def write_card(

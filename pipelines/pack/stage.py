@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from express50.files.images import contact_sheet, write_image
 from express50.files.text import read_json_table
 from express50.shards.reader import ShardReader, sample_panels, write_offsets, write_registered
 from express50.shards.writer import ShardWriter, gather_shards, write_manifest
-from pipelines.pack.card import split_subjects, write_card
+from pipelines.pack.card import draw, split_subjects, write_card
 from pipelines.pack.config import EncodeConfig, PackConfig
 from pipelines.pack.sample import encode_sample, load_sample, read_subject
 
@@ -78,7 +78,6 @@ def encode(dataset: Dataset, name: str, config: EncodeConfig, out: Path) -> Resu
 def warn_of_gaps(metas: list[dict]) -> list[Note]:
     """Warn of a subject's samples without labels of parts, and without consent or licence."""
     warnings = []
-    name = metas[0]["subject"]
     if bare := sum(not meta["parts"] for meta in metas):
         why = (
             f"{bare} of {len(metas)} samples have no labels of parts, and their alpha holds the"
@@ -87,8 +86,8 @@ def warn_of_gaps(metas: list[dict]) -> list[Note]:
         warnings.append(Note("regions", why))
     keys = {"consent": "consent_id", "licence": "licence"}
     if lacking := [keys[key] for key in keys if metas[0][key] is None]:
-        why = f"capture.toml gives no {' and no '.join(lacking)}; its samples will not state it"
-        warnings.append(Note(name, why))
+        why = f"gives no {' and no '.join(lacking)}; the samples will not state it"
+        warnings.append(Note("capture.toml", why))
     return warnings
 
 
@@ -126,7 +125,18 @@ def pack(dataset: Dataset, config: PackConfig, out: Path) -> Result:
     again = "run 'express50 pack' without a subset"
     mixed = [key for key in ("size", "profile") if "," in totals[key]]
     warnings = [Note(key, f"subjects were encoded with {totals[key]}; {again}") for key in mixed]
-    return Result(metrics, dropped, warnings)
+    return Result(metrics, dropped, warnings + warn_of_lent(splits["test"], config))
+
+
+def warn_of_lent(test: Sequence[str], config: PackConfig) -> list[Note]:
+    """Warn of a test subject that is drawn only for want of an id below the fraction."""
+    if config.test_subjects:
+        return []
+    why = (
+        "is tested on only until somebody with a lower hash of the id joins, and trained on from"
+        " then; name it in pack.test_subjects to keep it"
+    )
+    return [Note(name, why) for name in test if draw(name) >= config.test_fraction]
 
 
 def _read_accounts(dataset: Dataset) -> tuple[dict[str, dict], list[Note]]:

@@ -30,7 +30,7 @@ from pipelines.pack.card import people_lines, split_subjects
 from pipelines.pack.config import EncodeConfig, PackConfig
 from pipelines.pack.crop import Crop, crop_pinhole, cut_depth, cut_image, cut_labels, head_crop
 from pipelines.pack.sample import nameless, occluded, read_subject
-from pipelines.pack.stage import warn_of_gaps
+from pipelines.pack.stage import warn_of_gaps, warn_of_lent
 from tests.pipelines.bump_dataset import make_dataset, published
 
 SMALL = EncodeConfig(size=64)
@@ -153,7 +153,10 @@ def test_split_is_disjoint_and_stable():
     assert 2 <= len(split["test"]) <= 16
     grown = split_subjects([*names, "S999"], (), 0.2)
     assert set(split["test"]) <= set(grown["test"])
-    assert split_subjects(["A", "B"], (), 0.01)["test"] != []
+    lent = split_subjects(["A", "B"], (), 0.01)["test"]
+    assert [note.what for note in warn_of_lent(lent, PackConfig(test_fraction=0.01))] == lent != []
+    assert warn_of_lent(split["test"], PackConfig(test_fraction=0.2)) == []
+    assert warn_of_lent(lent, PackConfig(test_subjects=tuple(lent))) == []
     assert split_subjects(["A"], (), 0.5) == {"train": ["A"], "test": []}
     assert split_subjects(["A", "B"], ("B",), 0.5) == {"train": ["A"], "test": ["B"]}
     with pytest.raises(StageError, match="A, B"):
@@ -192,7 +195,7 @@ def test_samples_carry_consent_and_licence_and_lack_of_them_is_a_warning(packed)
     assert not [row for row in warnings if "consent" in row["why"]]
     whole = [meta | {"parts": True} for meta in metas]
     (note,) = warn_of_gaps([whole[0] | {"consent": None, "licence": None}])
-    assert note.what == "S001" and "consent_id" in note.why and "licence" in note.why
+    assert note.what == "capture.toml" and "consent_id" in note.why and "licence" in note.why
     assert warn_of_gaps(whole) == []
 
 
