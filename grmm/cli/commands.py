@@ -309,7 +309,9 @@ def _report(args: argparse.Namespace, rows: list, judge: PerceptualMetrics) -> i
 def ablate(args: argparse.Namespace) -> int:
     """Train and measure every row of the ablation that is not measured yet."""
     from grmm.ablate import Ablation, ablate
+    from grmm.shard_source import open_shards
 
+    open_shards([args.shards, *args.also], "train")  # first, as in `train`
     config = train_config(args)
     if args.fit_budget is not None:
         config = replace(config, fit=replace(config.fit, seconds=args.fit_budget))
