@@ -104,14 +104,7 @@ def read_capture(root: Path) -> RawCapture:
     """
     meta = read_meta(root)
     cameras, dropped = _read_cameras(root)
-    given = root / "calibration.json"
-    calibration = read_cameras(given) if given.is_file() else None
-    if calibration is not None:
-        for name in sorted(set(calibration) - set(cameras) - set(dropped)):
-            dropped[name] = f"calibrated, but {root / 'cameras' / name} is not there"
-        for name in sorted(set(cameras) - set(calibration)):
-            dropped[name] = "not in calibration.json; add it, or delete that file to calibrate all"
-            del cameras[name]
+    calibration = read_calibration(root, cameras, dropped)
     return RawCapture(
         root=root,
         subject=meta["subject"],
@@ -128,6 +121,26 @@ def read_capture(root: Path) -> RawCapture:
         board=_read_board(root, cameras),
         cues=read_cues(root / "cues.csv"),
     )
+
+
+def read_calibration(
+    root: Path, cameras: dict[str, RawCamera], dropped: dict[str, str]
+) -> dict[str, Camera] | None:
+    """Read calibration.json, if it is there, and drop cameras that only one side knows.
+
+    Raises:
+        CalibrationError: it is malformed.
+    """
+    given = root / "calibration.json"
+    if not given.is_file():
+        return None
+    calibration = read_cameras(given)
+    for name in sorted(set(calibration) - set(cameras) - set(dropped)):
+        dropped[name] = "calibrated, but its footage is not there"
+    for name in sorted(set(cameras) - set(calibration)):
+        dropped[name] = "not in calibration.json; add it, or delete that file to calibrate all"
+        del cameras[name]
+    return calibration
 
 
 def read_meta(root: Path) -> dict:

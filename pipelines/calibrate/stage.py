@@ -263,6 +263,12 @@ def _read_board(index: Index, limit: int) -> tuple[BoardCorners, np.ndarray, Whi
 
 
 def _from_footage(index: Index, config: CalibrateConfig) -> CalibratedRig:
+    if len(index.cameras) == 1:
+        raise CalibrationError(
+            f"{index.capture}: has one camera, and solving from footage needs two; track one camera"
+            " with 'express50 photo FILE OUT', or add calibration.json and run 'express50 ingest'"
+            " again"
+        )
     blank = {name: start_camera(name, size, 1.0) for name, size in sizes_of(index).items()}
     small = {name: reduced_camera(camera) for name, camera in blank.items()}
     focals = {n: f * small[n].width / blank[n].width for n, f in known_focals(index).items()}

@@ -253,7 +253,10 @@ def split_cues(cues: tuple[Cue, ...], frames: int) -> tuple[tuple[Cue, ...], dic
 def odd_cues(cues: tuple[Cue, ...]) -> dict[str, str]:
     """Return which expressions share frames with one before them; say so if there are none."""
     if not cues:
-        return {"expressions": "cues.csv names none; later stages have nothing to do without them"}
+        return {
+            "expressions": "cues.csv names none, and later stages need one; add rows expression_id,"
+            "start_frame,end_frame, then run 'express50 ingest' again"
+        }
     found = {}
     for a, b in combinations(cues, 2):
         first, last = max(a.start_frame, b.start_frame), min(a.end_frame, b.end_frame)

@@ -6,7 +6,7 @@ its unit; ``metres_per_unit`` in capture.toml does.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from express50.capture.readers.selection import (
     check_selection,
     common_timeline,
     folder_id,
-    identifier,
+    unique_ids,
 )
 from express50.errors import CalibrationError, CaptureError, FormatError
 from express50.files.containers import inside
@@ -46,7 +46,7 @@ def read_photos(path: Path, selection: Selection) -> RawCapture:
     Raises:
         CaptureError: two names become one camera id, or no photograph can be used.
     """
-    ids = _camera_ids(path, image_names(path), lambda name: Path(name).stem)
+    ids = unique_ids(path, image_names(path), lambda name: Path(name).stem)
     check_selection(selection, [MOMENT], sorted(ids.values()))
     dropped: dict[str, str] = {}
     cameras: dict[str, RawCamera] = {}
@@ -128,7 +128,7 @@ def _read_posed(
     selection: Selection,
 ) -> RawCapture:
     """Read the existing pictures, by moment, by camera."""
-    ids = _camera_ids(root, calibration, str)
+    ids = unique_ids(root, calibration, str)
     check_selection(selection, [MOMENT], sorted(calibration))
     there = {
         ids[name]: {moment: file for moment, file in table.items() if _is_picture(root, file)}
@@ -161,16 +161,3 @@ def _read_posed(
 
 def _is_picture(root: Path, name: str) -> bool:
     return bool(name) and inside(root, name).is_file()
-
-
-def _camera_ids(root: Path, names: Iterable[str], stem: Callable[[str], str]) -> dict[str, str]:
-    """Return each name's camera id; two names that become one id are an error."""
-    owners: dict[str, str] = {}
-    for name in names:
-        camera = identifier(stem(name))
-        if camera in owners:
-            raise CaptureError(
-                f"{root}: {owners[camera]} and {name} both become camera {camera}; rename one"
-            )
-        owners[camera] = name
-    return {name: camera for camera, name in owners.items()}

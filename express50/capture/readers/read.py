@@ -74,6 +74,10 @@ LAYOUTS = (
     Layout(
         "photos", "a folder of images", pictures.fits_photos, folder_id, pictures.read_photos
     ),
+    Layout(
+        "videos", "a folder of videos, one per camera",
+        videos.fits_videos, folder_id, videos.read_videos,
+    ),
     Layout("video", "a video file", videos.fits_video, videos.video_id, videos.read_video),
 )  # fmt: skip
 

@@ -12,7 +12,7 @@ import fnmatch
 import math
 import re
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -66,6 +66,23 @@ def identifier(text: str, other: str = "_-") -> str:
     """Make an id of any text: ``_`` replaces all but letters, digits and ``other``."""
     clean = re.sub(rf"[^A-Za-z0-9{re.escape(other)}]+", "_", text).strip("_-")
     return clean or "unnamed"
+
+
+def unique_ids(root: Path, names: Iterable[str], stem: Callable[[str], str]) -> dict[str, str]:
+    """Return the camera id of each name's stem.
+
+    Raises:
+        CaptureError: two names become one id.
+    """
+    owners: dict[str, str] = {}
+    for name in names:
+        camera = identifier(stem(name))
+        if camera in owners:
+            raise CaptureError(
+                f"{root}: {owners[camera]} and {name} both become camera {camera}; rename one"
+            )
+        owners[camera] = name
+    return {name: camera for camera, name in owners.items()}
 
 
 def folder_id(path: Path) -> str:

@@ -1,4 +1,4 @@
-"""Read footage stored as videos: NeRSemble v2, RAVDESS, and a single video without cameras.
+"""Read footage stored as videos: NeRSemble v2, RAVDESS, a video, or one per camera in a folder.
 
 NeRSemble v2: a participant's folder, ``018/``, one video per sequence and camera. Footage is
 colour-corrected when it is read (``color_calibration.json``: a polynomial per camera, in linear
@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from express50.capture.colour_correction import check_matrix
-from express50.capture.raw import VIDEO_SUFFIXES, RawCamera, RawCapture
+from express50.capture.raw import VIDEO_SUFFIXES, RawCamera, RawCapture, read_calibration, read_cues
 from express50.capture.readers.selection import (
     Moment,
     Selection,
@@ -25,6 +25,7 @@ from express50.capture.readers.selection import (
     common_timeline,
     folder_id,
     identifier,
+    unique_ids,
 )
 from express50.errors import CalibrationError, CaptureError
 from express50.files.images import ORIENTATION
@@ -35,6 +36,7 @@ from express50.rigs.other_tools import read_nersemble
 CAMERAS = Path("calibration/camera_params.json")
 COLOURS = Path("calibration/color_calibration.json")
 BACKGROUND = "BACKGROUND"
+CLIP = "clip"
 
 NAME = re.compile(r"0[123]-(0[12])-(0[1-8])-(0[12])-(0[12])-(\d\d)-(\d\d)")
 CHANNELS = {"01": "speech", "02": "song"}
@@ -200,7 +202,8 @@ def read_actor(path: Path, selection: Selection) -> RawCapture:
 
 def fits_video(path: Path) -> bool:
     """Return whether a path is a video file."""
-    return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
+    usual = path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".")
+    return usual and path.is_file()
 
 
 def video_id(path: Path) -> str:
@@ -216,12 +219,45 @@ def read_video(path: Path, selection: Selection) -> RawCapture:
     Raises:
         CaptureError: it is not a video.
     """
-    check_selection(selection, ["clip"], ["video"])
-    orientation = ORIENTATION[video_turn(path)]
-    camera = RawCamera(
-        id="video", kind="videos", path=path.parent, names=(path.name,), orientation=orientation
-    )
+    check_selection(selection, [CLIP], ["video"])
     return RawCapture(
         root=path.parent, subject=video_id(path), fps=video_fps(path), meta={},
-        cameras={"video": camera}, clips=(selection.expression("clip"),),
+        cameras={"video": _one_video("video", path)}, clips=(selection.expression(CLIP),),
+    )  # fmt: skip
+
+
+def _one_video(camera: str, path: Path) -> RawCamera:
+    turn = ORIENTATION[video_turn(path)]
+    return RawCamera(
+        id=camera, kind="videos", path=path.parent, names=(path.name,), orientation=turn
+    )
+
+
+def fits_videos(path: Path) -> bool:
+    """Return whether a folder holds videos."""
+    return path.is_dir() and any(map(fits_video, path.iterdir()))
+
+
+def read_videos(path: Path, selection: Selection) -> RawCapture:
+    """Read each video of a folder as a camera; frame 17 of all shows the same moment.
+
+    ``cues.csv`` and ``calibration.json`` beside them are those of our own layout (docs/FORMAT.md);
+    without cues, the whole footage is one clip.
+
+    Raises:
+        CaptureError: one of them is not a video, two names become one camera id, or the cues are
+            malformed.
+        CalibrationError: calibration.json is malformed.
+    """
+    files = sorted(filter(fits_video, path.iterdir()))
+    ids = unique_ids(path, (file.name for file in files), lambda name: Path(name).stem)
+    check_selection(selection, [CLIP], sorted(ids.values()))
+    wanted = {ids[f.name]: f for f in files if selection.has_camera(ids[f.name])}
+    cameras = {camera: _one_video(camera, file) for camera, file in wanted.items()}
+    dropped: dict[str, str] = {}
+    calibration, cues = read_calibration(path, cameras, dropped), read_cues(path / "cues.csv")
+    return RawCapture(
+        root=path, subject=folder_id(path), fps=video_fps(files[0]), meta={}, cues=cues,
+        cameras=cameras, dropped=dropped, calibration=calibration,
+        clips=() if cues else (selection.expression(CLIP),),
     )  # fmt: skip

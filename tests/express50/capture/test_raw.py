@@ -97,7 +97,7 @@ def test_cameras_on_one_side_of_the_calibration_only_are_dropped(raw):
     capture = read_capture(raw)
     assert list(capture.cameras) == ["cam01", "cam02"]
     assert "not in calibration.json" in capture.dropped["cam00"]
-    assert "cam77 is not there" in capture.dropped["cam77"]
+    assert "footage is not there" in capture.dropped["cam77"]
 
 
 def test_malformed_calibration_is_an_error(raw):

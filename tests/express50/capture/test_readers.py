@@ -13,7 +13,7 @@ from express50.capture.readers.selection import common_timeline
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.errors import CalibrationError, CaptureError
-from express50.files.calibration import read_cameras
+from express50.files.calibration import read_cameras, write_cameras
 from express50.files.images import encode_png
 from express50.geometry.cameras import project
 from express50.runner.runner import run_stage
@@ -235,6 +235,24 @@ def test_a_telephones_video_is_read_upright(tmp_path):
     camera = read_index(dataset, "talk").cameras["video"]
     assert (camera.width, camera.height, camera.orientation) == (64, 48, 6)
     assert near(read_frame(dataset, "talk", "video", 2, False), images[2], 20)
+
+
+def test_a_folder_of_videos_is_a_rig_with_cues_and_cameras_beside_them(tmp_path):
+    folder, images = tmp_path / "rig", noise_video_images(4)
+    folder.mkdir()
+    for name in ("GoPro 1.MP4", "left.mov"):
+        write_video(folder / name, images)
+    assert (detect(folder).name, subject_of(folder)) == ("videos", "rig")
+    index = read_index(*ingested(tmp_path, folder))
+    assert list(index.cameras) == ["GoPro_1", "left"] and index.cues == (Cue("clip", 0, 3),)
+    (folder / "cues.csv").write_text("expression_id,start_frame,end_frame\nsmile,1,2\n")
+    write_cameras(folder / "calibration.json", rig(["left"]))
+    found = read_any(folder)
+    assert found.cues == (Cue("smile", 1, 2),) and list(found.calibration) == ["left"]
+    assert list(found.cameras) == ["left"] and "GoPro_1" in found.dropped
+    write_video(folder / "left.mp4", images)
+    with pytest.raises(CaptureError, match="left.mov and left.mp4 both become camera left"):
+        read_any(folder)
 
 
 def test_a_video_that_one_camera_lacks_costs_the_camera_or_the_video_whichever_is_less(tmp_path):
