@@ -25,6 +25,7 @@ from pipelines.register.lay import (
     GivenSurface,
     Plate,
     SurfaceSearch,
+    around_nostrils,
     lay,
     mesh_normals,
     skin_trust,
@@ -144,6 +145,17 @@ def test_hair_and_doubtful_places_get_no_trust(model):
     assert np.median(skin_trust(model, mesh, mesh, colors, confidence)[lips]) > 0.5
     nowhere = skin_trust(model, mesh, mesh + 1.0, colors, confidence)
     assert nowhere == pytest.approx(confidence)
+
+
+def test_the_underside_of_the_nose_is_around_nostrils_and_its_bridge_is_not(model):
+    mesh = posed(model, 5)
+    nose = model.regions["nose"].numpy()
+    around = around_nostrils(model, mesh, mesh)
+    low, high = np.percentile(mesh[nose, 1], (20, 90))
+    assert around[nose & (mesh[:, 1] < low)].mean() > 0.7
+    assert not around[nose & (mesh[:, 1] > high)].any()
+    assert around[model.regions["face"].numpy() & ~nose].mean() < 0.05
+    assert not around_nostrils(replace(model, regions={}), mesh, mesh).any()
 
 
 @pytest.mark.parametrize(
