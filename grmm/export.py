@@ -327,11 +327,12 @@ def spz_bytes(gaussians: GaussianCloud) -> bytes:
     """Encode Gaussians as SPZ, about twenty bytes each before compression.
 
     Raises:
-        ValueError: a position is 128 m or more from the origin.
+        ConfigError: a position is 128 m or more from the origin.
     """
     fixed = np.rint(gaussians.means.astype(np.float64) * (1 << FRACTION_BITS)).astype(np.int64)
     if np.abs(fixed).max(initial=0) >= 1 << 23:
-        raise ValueError(f"means reach {np.abs(gaussians.means).max()} m, expected under 128 m")
+        far = np.abs(gaussians.means).max()
+        raise ConfigError(f"the head reaches {far:.4g} m, SPZ holds under 128 m; check --control")
     logs = np.log(gaussians.scales.astype(np.float64).clip(min=1e-30))
     harmonics = (gaussians.colors.astype(np.float64) - 0.5) / SH_DC
     parts = [

@@ -171,13 +171,14 @@ def make_photo_capture(
     images = [image for n, image in enumerate(upright_frames(picture)) if n in probes]
     height, width = images[0].shape[:2]
     low, high = (max(width, height) * limit for limit in FOCAL_LIMITS)
-    if focal_px is not None and not low <= focal_px <= high:
+    start = (focal_px, "given") if focal_px else guess_focal(picture, width, height, film_mm)
+    if not low <= start[0] <= high:
         raise CaptureError(
-            f"--focal-px {focal_px:g}: expected {low:g} to {high:g} for a picture"
-            f" {max(width, height)} px long; millimetres on 35 mm film go to --film-mm"
+            f"{picture.path}: its focal length is {start[0]:.4g} px ({start[1]}), expected {low:g}"
+            f" to {high:g} for a picture {max(width, height)} px long; give it with --focal-px, or"
+            " in millimetres on 35 mm film with --film-mm"
         )
     faces = find_faces(picture.path, images, config)
-    start = (focal_px, "given") if focal_px else guess_focal(picture, width, height, film_mm)
     basis = make_basis(load_head(config.head))
     surest = sorted(faces, key=lambda face: -face.score)[:FOCAL_FACES]
     focal = weigh_focal(basis, surest, (width, height), start)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from express50.errors import ConfigError
 from grmm.export import GaussianCloud, ply_bytes, splats_glb, spz_bytes
 
 SH_DC = 0.28209479177387814
@@ -153,7 +154,7 @@ def test_values_that_are_not_finite_are_refused(one, name):
 
 
 def test_spz_refuses_far_positions(cloud):
-    with pytest.raises(ValueError, match="128 m"):
+    with pytest.raises(ConfigError, match="128 m"):
         spz_bytes(replace(cloud, means=cloud.means + 130))
 
 

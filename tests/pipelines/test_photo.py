@@ -131,11 +131,11 @@ def test_folders_and_focal_lengths_of_no_lens_are_refused(
     with pytest.raises(CaptureError, match="is a folder.*express50 ingest"):
         open_picture(tmp_path)
     write_image(tmp_path / "eva.png", astronaut)
-    for focal in (50.0, 1e6):
+    for lens in ({"focal_px": 50.0}, {"focal_px": 1e6}, {"film_mm": 0.001}):
         with pytest.raises(CaptureError, match="expected 51.2 to 51200 for a picture 512 px long"):
             make_photo_capture(
                 open_picture(tmp_path / "eva.png"), tmp_path / "out", "eva", TrackConfig(),
-                focal_px=focal,
+                **lens,
             )  # fmt: skip
     assert not (tmp_path / "out").exists()
 
