@@ -37,7 +37,7 @@ ERROR_RANGE_DEG = 45.0  # white in those of normals
 
 
 def measure_dataset(dataset: Dataset, truth_root: Path, out: Path | None = None) -> dict:
-    """Return every figure that the published stages allow, and error pictures below ``out``."""
+    """Return all figures that the published stages allow; write error pictures below ``out``."""
     truth = Truth(truth_root)
     measures = {
         "calibrate": measure_calibrate,
@@ -123,12 +123,12 @@ def enlarged(image: np.ndarray, camera: Camera, how: int = cv2.INTER_LINEAR) -> 
 def enlarged_depth(
     depth: np.ndarray, valid: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return depth and validity (H, W) at a camera's size, valid where every neighbour is."""
+    """Return the depth and validity (H, W) at a camera's size, valid where every neighbour is."""
     return enlarged(depth, camera), enlarged(valid.astype(np.float32), camera) == 1
 
 
 def measure_matte(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
-    """Return mean absolute alpha errors over whole images, and over the truth's soft rim."""
+    """Return the mean absolute alpha errors over whole images, and over the truth's soft rim."""
     whole, rim, rows, names = [], [], [], []
     for subject, expression, frame, camera in sampled_views(dataset, truth):
         path = dataset.matte_file(subject, expression, camera.id)
@@ -152,7 +152,7 @@ def measure_matte(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
 
 
 def measure_track(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
-    """Return root mean square distance between tracked and true vertices of the same topology."""
+    """Return the rms distance between tracked and true vertices of the same topology."""
     squares, medians = [], []
     for subject in dataset.subjects():
         path = dataset.track_file(subject)
@@ -236,7 +236,7 @@ def _normal_error(path: Path, truth: Truth, subject: str, frame: int, camera: Ca
 
 
 def measure_regions(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
-    """Return mean absolute error of head's alpha and the parts' mean intersection over union."""
+    """Return the mean absolute error of the head's alpha, and the parts' mean IoU."""
     found, rows, names = [], [], []
     for subject, expression, frame, camera in sampled_views(dataset, truth):
         folder = dataset.item_dir("regions", f"{subject}/{expression}")

@@ -184,10 +184,7 @@ def shares_of(truth: Truth, subject: str, cue: Cue) -> np.ndarray:
 
 
 def farthest_frames(dataset: Dataset, subject: str) -> Iterator[tuple[str, int]]:
-    """Find the baseline.
-
-    The frame whose landmarks are furthest from neutral, head motion removed.
-    """
+    """Find the baseline's frames: landmarks furthest from neutral, head motion removed."""
     seen, index = read_observations(dataset, subject), read_index(dataset, subject)
     points = seen.points[0].astype(np.float64)
     windows = {

@@ -147,7 +147,7 @@ def main() -> int:
 
 
 def gain_figures(palette: WhiteCollector, names: list[str]) -> dict[str, float]:
-    """Return root mean square error of the colour gains, percent, and one of leaving colours be."""
+    """Return the rms error of the colour gains and of leaving colours as they are, percent."""
     found = palette.gains(names)
     measured = np.array([found.gain.get(name, np.ones(3)) for name in names])
     every = sorted(make_rig(RIG.cameras, RIG.width, RIG.height, RIG.seed))
@@ -212,7 +212,7 @@ def bump_figures(
 
 
 def board_files(index: Index) -> dict[str, list[Path]]:
-    """Return board images of every camera."""
+    """Return the board images of every camera."""
     table = index.board or {"cameras": {}}
     return {
         name: [index.capture / file for file in table["cameras"].get(name, [])]

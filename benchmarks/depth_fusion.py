@@ -89,7 +89,7 @@ def _warped(
     corner: tuple[int, int],
     shape: tuple[int, ...],
 ) -> np.ndarray:
-    """Return other view's picture as seen through a plane at a depth, of a window of this view."""
+    """Return a window of this view as another view's picture shows it, on a plane at a depth."""
     matrix = plane * moved[0]
     matrix[:, 2] += moved[1]
     window = np.array([[1, 0, corner[0]], [0, 1, corner[1]], [0, 0, 1.0]])

@@ -48,7 +48,7 @@ class Case:
 
 
 def make_dataset(case: Case, name: str = "data") -> Dataset:
-    """Return a dataset of a few small inputs."""
+    """Make a dataset of a few small inputs."""
     root = case.scratch / name
     (root / "in").mkdir(parents=True)
     case.notes.mkdir()
@@ -78,7 +78,7 @@ def environment(**variables: str) -> dict[str, str]:
 
 
 def start(case: Case, dataset: Dataset, *options: str, **variables: str) -> subprocess.Popen:
-    """Return a driver, in a group of its own."""
+    """Start a driver, in a group of its own."""
     command = [sys.executable, "-m", "benchmarks.fault_stage", str(dataset.root), str(case.notes)]
     return launch([*command, *options], **variables)
 
@@ -119,7 +119,7 @@ def strike(case: Case, victims: list[psutil.Process] | list[subprocess.Popen], k
 
 
 def workers_of(driver: subprocess.Popen) -> list[psutil.Process]:
-    """Return processes that do a driver's work: the children of its nannies."""
+    """Return the processes that do a driver's work: the children of its nannies."""
     found = []
     with contextlib.suppress(psutil.NoSuchProcess):
         for one in psutil.Process(driver.pid).children(recursive=True):

@@ -50,7 +50,7 @@ class FaultConfig:
 
 
 def items(dataset: Dataset) -> list[str]:
-    """Name of the input files."""
+    """List the names of the input files."""
     return sorted(path.stem for path in (dataset.root / "in").glob("*.txt"))
 
 

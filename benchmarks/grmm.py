@@ -153,10 +153,7 @@ def frames_per_second(draw: Callable[[], object], seconds: float = 4.0) -> float
 
 
 def speeds(loaded: Loaded) -> dict[str, float]:
-    """Measure frame rates: everything from scratch at 256 px.
-
-    At 512 px a head at rest before a moving camera.
-    """
+    """Measure frame rates: all from scratch at 256 px; a resting head, moving camera at 512."""
     model = loaded.model
     view, centre = frontal(loaded), model.head_centre
     heads = [

@@ -121,7 +121,7 @@ def size_of(frame: Frame) -> float:
 
 
 def on_real(net: LandmarkNet, frames: list[Frame]) -> dict:
-    """Return errors on photographs, of all points and by group."""
+    """Return the errors on photographs: of all points, and by group."""
     errors, scores = [], []
     for frame in frames:
         face = detect(net, frame.image)
@@ -163,7 +163,7 @@ def _framed(
 
 
 def on_rendered(net: LandmarkNet, frames: list[Frame]) -> dict:
-    """Return errors by turn of all kinds of points, and how well scales are stated."""
+    """Return the errors of every kind of point by the head's turn, and how true its scales are."""
     result: dict = {}
     for name, (low, high) in TURNS.items():
         marks, edges, said = [], [], []

@@ -36,7 +36,7 @@ class Shot:
 
 
 def undisturbed(shots: list[Shot]) -> list[Shot]:
-    """Leave the shot as it is."""
+    """Leave the shots as they are."""
     return shots
 
 
@@ -50,7 +50,7 @@ def shadow(shots: list[Shot]) -> list[Shot]:
 
 
 def stand(shots: list[Shot]) -> list[Shot]:
-    """Return a stand and a cable behind the subject, in every fourth camera."""
+    """Put a stand and a cable behind the subject in every fourth camera."""
     rng = np.random.default_rng(2)
     return [
         _behind(shot, np.array(STAND), _stand(shot, rng)) if k % 4 == 0 else shot
@@ -59,7 +59,7 @@ def stand(shots: list[Shot]) -> list[Shot]:
 
 
 def patch(shots: list[Shot]) -> list[Shot]:
-    """Return a patch of one colour on the skin; two cameras have the same colour behind it."""
+    """Paint a patch of one colour on the skin; two cameras see the same colour behind it."""
     front = shots[len(shots) // 2]
     rows, columns = np.nonzero((front.depth > 0) & (front.true > 0.99))
     height, width = front.true.shape
@@ -72,7 +72,7 @@ def patch(shots: list[Shot]) -> list[Shot]:
 
 
 def bumped(shots: list[Shot]) -> list[Shot]:
-    """Return one camera turned and rolled: frame, plate and truth move together."""
+    """Turn and roll one camera: frame, plate and truth move together."""
     k = len(shots) // 2 - 3
     return [*shots[:k], _moved(shots[k]), *shots[k + 1 :]]
 
@@ -165,7 +165,7 @@ def _noisy(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _behind(shot: Shot, light: np.ndarray, cover: np.ndarray) -> Shot:
-    """Return frame with `light` (3,) over the backdrop by `cover` (H, W), behind the subject."""
+    """Return the shot with `light` (3,) over its backdrop by `cover` (H, W), behind the subject."""
     plate = srgb_to_linear(shot.plate / 255)
     change = ((1 - shot.true) * cover * shot.valid)[..., None] * (light - plate)
     return replace(shot, frame=_srgb8(srgb_to_linear(shot.frame / 255) + change))
@@ -176,7 +176,7 @@ def _srgb8(linear: np.ndarray) -> np.ndarray:
 
 
 def _blob(shot: Shot, rng: np.random.Generator) -> np.ndarray:
-    """Return a round soft shape (H, W) in [0, 1] in the upper half, at the left or right."""
+    """Draw a round soft shape (H, W) in [0, 1] in the upper half, at the left or right."""
     height, width = shot.true.shape
     y, x = np.mgrid[0:height, 0:width] / max(height, width)
     middle = rng.choice([0.15, 0.85]) + rng.uniform(-0.05, 0.05), rng.uniform(0.2, 0.6)
@@ -186,7 +186,7 @@ def _blob(shot: Shot, rng: np.random.Generator) -> np.ndarray:
 
 
 def _stand(shot: Shot, rng: np.random.Generator) -> np.ndarray:
-    """Return an upright pole with a box on it and a cable across (H, W) in [0, 1]."""
+    """Draw an upright pole with a box on it and a cable across, (H, W) in [0, 1]."""
     height, width = shot.true.shape
     image = np.zeros((height, width), np.uint8)
     x = int(width * (rng.choice([0.1, 0.9]) + rng.uniform(-0.03, 0.03)))
@@ -205,7 +205,7 @@ def _points(shot: Shot) -> np.ndarray:
 
 
 def _painted(shot: Shot, at: np.ndarray, colour: np.ndarray, behind: bool) -> Shot:
-    """Return surface around a point (3,) in a colour (3,), 8-bit steps and the plate behind too."""
+    """Paint the surface about a point (3,) in a colour (3,), 8-bit steps, perhaps the plate."""
     near = (np.linalg.norm(_points(shot) - at, axis=-1) < PATCH_M) & (shot.depth > 0)
     if not near.any():
         return shot

@@ -88,7 +88,7 @@ def plain(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def cluttered(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Return blotches, boxes, cables and fine texture (size, size, 3), linear light."""
+    """Draw blotches, boxes, cables and fine texture (size, size, 3), linear light."""
     coarse = rng.uniform(0.08, 0.7, (9, 9, 3)).astype(np.float32)
     image = cv2.resize(coarse, (size, size), interpolation=cv2.INTER_CUBIC)
     for _ in range(14):

@@ -179,7 +179,7 @@ def key(shot: Shot) -> Keyed:
 
 
 def measure(keyed: list[Keyed], config: MatteConfig, sheet: Path | None) -> Figures:
-    """Return errors before and after of one moment, and the seconds between."""
+    """Return errors of one moment before and after the cameras agree, and the seconds it takes."""
     started = time.process_time()
     ball = ball_of({k.shot.camera.id: k.shot.camera for k in keyed})
     if ball is None:
@@ -203,7 +203,7 @@ def measure(keyed: list[Keyed], config: MatteConfig, sheet: Path | None) -> Figu
 
 
 def without_plates(shots: list[Shot], sheet: Path | None) -> Figures:
-    """Return errors of a moment whose plates are withheld, beside those with plates."""
+    """Return the errors of a moment whose plates are withheld, beside those with plates."""
     started = time.process_time()
     ball = ball_of({shot.camera.id: shot.camera for shot in shots})
     views = [make_cut_view(pinhole(shot.camera), shot.frame, shot.valid) for shot in shots]

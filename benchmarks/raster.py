@@ -250,7 +250,7 @@ def pair_alphas(splats: Projection, gaussians: Tensor, pixels: Tensor, size: int
 
 
 def before(alphas: Tensor, pixels: Tensor) -> Tensor:
-    """Return transmittance (M,) in front of each pair, its pixel's earlier pairs multiplied up."""
+    """Return the transmittance (M,) in front of each pair, from its pixel's earlier pairs."""
     # One running sum of logarithms over all pixels; float64 keeps its end as exact as its start.
     logs = torch.log1p(-alphas.double())
     running = torch.cumsum(logs, 0) - logs

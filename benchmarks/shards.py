@@ -199,12 +199,12 @@ def exhaust(samples: Iterator[Members]) -> None:
 
 
 def order(count: int) -> list[int]:
-    """Return random sample numbers."""
+    """Draw random sample numbers."""
     return random.Random(0).choices(range(count), k=count)
 
 
 def ours(given: list[Members], folder: Path) -> Callable[[], Passes]:
-    """Measure our tar with its index."""
+    """Write our tar with its index; return its passes."""
     writer = ShardWriter(folder, SHARD)
     for first in range(0, len(given), CAMERAS):
         group = given[first : first + CAMERAS]
@@ -229,7 +229,7 @@ def ours(given: list[Members], folder: Path) -> Callable[[], Passes]:
 
 
 def webdataset(given: list[Members], folder: Path) -> Callable[[], Passes]:
-    """Measure WebDataset: a tar read in a stream, shuffled in a buffer, as its users do."""
+    """Write WebDataset: a tar read in a stream, shuffled in a buffer, as its users do."""
     wds = importlib.import_module("webdataset")
     folder.mkdir()
     pattern = str(folder / "train-%06d.tar")
@@ -247,7 +247,7 @@ def webdataset(given: list[Members], folder: Path) -> Callable[[], Passes]:
 
 
 def litdata(given: list[Members], folder: Path) -> Callable[[], Passes]:
-    """Measure litdata's chunks."""
+    """Write litdata's chunks."""
     lit = importlib.import_module("litdata")
     inputs = list(range(len(given)))
     _Given.samples = given
@@ -277,7 +277,7 @@ def _given(number: int) -> Members:
 
 
 def mosaic(given: list[Members], folder: Path) -> Callable[[], Passes]:
-    """Measure MosaicML's MDS."""
+    """Write MosaicML's MDS."""
     streaming = importlib.import_module("streaming")
     columns = dict.fromkeys(given[0], "bytes")
     with streaming.MDSWriter(out=str(folder), columns=columns) as writer:

@@ -30,7 +30,7 @@ class EmptyConfig:
 
 
 def items(dataset: Dataset) -> list[str]:
-    """Name of the input files."""
+    """List the names of the input files."""
     return sorted(path.stem for path in (dataset.root / "in").glob("*.txt"))
 
 
@@ -68,7 +68,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def make_dataset(root: Path, count: int) -> Dataset:
-    """Return a dataset of `count` small inputs."""
+    """Make a dataset of `count` small inputs."""
     (root / "in").mkdir(parents=True)
     for number in range(count):
         (root / "in" / f"item{number:05d}.txt").write_text(f"{number}")

@@ -100,7 +100,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 
 
 def preset_names(text: str) -> tuple[str, ...]:
-    """Name of presets, from one with commas; empty for landmark_only alone."""
+    """Split names of presets at commas; none are left for landmark_only alone."""
     names = tuple(name for name in text.split(",") if name and name != "landmark_only")
     if not set(names) <= set(PRESETS):
         raise argparse.ArgumentTypeError(f"{text!r}, expected some of {','.join(PRESETS)}")

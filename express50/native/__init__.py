@@ -34,7 +34,7 @@ def why_missing() -> str:
 
 @cache
 def load(variant: str | None = None) -> ctypes.CDLL:
-    """Return shared library of ``variant``, or the best that was built and this processor can run.
+    """Return the library of ``variant``, or the best that was built and this processor can run.
 
     Raises:
         NativeLibraryError: it was not built, is older than its source or does not load.

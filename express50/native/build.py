@@ -40,7 +40,7 @@ class BuildError(Exception):
 
 
 def variants() -> tuple[str, ...]:
-    """Name of the variants that can run on this kind of processor."""
+    """List the variants that can run on this kind of processor."""
     x86 = platform.machine().lower() in ("x86_64", "amd64")
     return tuple(VARIANTS) if x86 else ("baseline",)
 
@@ -51,7 +51,7 @@ def library_file(variant: str) -> Path:
 
 
 def source_digest() -> str:
-    """Digest of all sources; it is compiled into the library to notice a stale one."""
+    """Return the digest of all sources; it is compiled into the library to notice a stale one."""
     digest = hashlib.sha256()
     for name in SOURCES:
         digest.update((HERE / name).read_bytes())
