@@ -8,13 +8,14 @@ opaque as a dark one. benchmarks/matte.py compares it with plain keys and textbo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from express50.files.images import LIGHT_OF_LEVEL, edge_distance
+from express50.files.images import LIGHT_OF_LEVEL, edge_distance, shrink
 from pipelines.matte.plates import (
     PlateModel,
     blurred,
@@ -40,8 +41,7 @@ OPEN = 1.5  # deviations: an area that differs by less shows the plate
 BLACK, WHITE = 24, 250  # grey levels beyond which two surfaces may look the same
 FILL = 0.012  # distance from the solid's edge from which its spots and gaps are filled
 WIDE = 0.01  # radius of a disc that is wider than strands and soft edges
-_LUMA = np.array([[0.299, 0.587, 0.114]], dtype=np.float32)
-
+WINDOW_SIDE = 960  # longer side, pixels, of the picture in which the subject is looked for first
 
 Erode = Callable[[np.ndarray, int], np.ndarray]
 """`eroded` or `eroded_about`."""
@@ -62,18 +62,16 @@ def key_alpha(frame: np.ndarray, plate: np.ndarray, valid: np.ndarray, shadow: f
     """
     alpha = np.zeros(valid.shape, np.float32)
     length = max(valid.shape)
-    model, image = fit_plate(plate, frame, valid), frame.astype(np.float32)
+    whole = subject_window(frame, plate, valid, shadow)
+    model = fit_plate(plate, frame, valid, whole)
+    frame, image = frame[whole], frame[whole].astype(np.float32)
     dark, difference, unshaded = plate_difference(image, model, shadow, length)
-    difference = np.where(valid, difference, 0.0)
-    region = subject_region(difference)
+    difference = np.where(valid[whole], difference, 0.0)
+    region = subject_region(difference, valid.size)
     if not region.any():
         return alpha
     # The remaining steps work around the subject only.
-    x, y, width, height = cv2.boundingRect(region.astype(np.uint8))
-    margin = 2 * _pixels(CORE, length) + 2  # beyond every disc, and three deviations of the blurs
-    window = np.s_[
-        max(0, y - margin) : y + height + margin, max(0, x - margin) : x + width + margin
-    ]
+    window = _box_around(region, _margin(length))
     part = PlateModel(model.plate[window], model.sigma[window], model.whiten)
     frame, image, dark = frame[window], image[window], dark[window]
     difference, region = difference[window], region[window]
@@ -83,9 +81,42 @@ def key_alpha(frame: np.ndarray, plate: np.ndarray, valid: np.ndarray, shadow: f
     if support.core.any():
         firm = firm_pixels(image, difference, support.core, part, length)
         support = find_support(firm, region, clear, length)
-    alpha[window] = _opacity(frame, difference, dark, support, part, length)
+    alpha[whole][window] = _opacity(frame, difference, dark, support, part, length)
     alpha[~valid] = 0.0
     return alpha
+
+
+def subject_window(
+    frame: np.ndarray, plate: np.ndarray, valid: np.ndarray, shadow: float
+) -> tuple[slice, slice]:
+    """Return rows and columns around the subject of a frame, looked for in a smaller picture.
+
+    What is too thin to show there does not count further than `_margin` from all that does.
+    """
+    small = [shrink(image, WINDOW_SIDE) for image in (frame, plate, 255 * valid.astype(np.uint8))]
+    region, factor = np.ones((1, 1), bool), max(valid.shape)  # the whole frame
+    if small[0] is not frame:
+        known, side = small[2] == 255, max(small[2].shape)
+        model, image = fit_plate(small[1], small[0], known), small[0].astype(np.float32)
+        difference = plate_difference(image, model, shadow, side)[1]
+        found = subject_region(np.where(known, difference, 0.0), known.size)
+        if found.any():
+            region, factor = found, factor / side
+    return _box_around(region, _margin(max(valid.shape)) + math.ceil(2 * factor), factor)
+
+
+def _margin(length: int) -> int:
+    return 2 * _pixels(CORE, length) + 2  # beyond every disc, and three deviations of the blurs
+
+
+def _box_around(mask: np.ndarray, margin: int, factor: float = 1.0) -> tuple[slice, slice]:
+    """Return rows and columns about a mask (h, w) of a picture that is `factor` times as large."""
+    x, y, width, height = (factor * side for side in cv2.boundingRect(mask.astype(np.uint8)))
+    ends = ((y, y + height), (x, x + width))
+    rows, columns = (
+        slice(max(0, math.floor(low) - margin), math.ceil(high) + margin) for low, high in ends
+    )
+    return rows, columns
 
 
 def _opacity(
@@ -168,9 +199,13 @@ def opened(mask: np.ndarray, radius: int, erode: Erode = eroded) -> np.ndarray:
     return (mask > 0) & ~erode(~erode(mask, radius), radius)
 
 
-def _length(error: np.ndarray, model: PlateModel) -> np.ndarray:
-    """Return the root mean square (H, W) of errors (H, W, 3), whitened: 1 on average for noise."""
-    white = cv2.transform(error / model.sigma, model.whiten)
+def whitened(error: np.ndarray, model: PlateModel) -> np.ndarray:
+    """Return errors (H, W, 3) from a plate as independent ones of deviation 1 for noise."""
+    return cv2.transform(error / model.sigma, model.whiten)
+
+
+def _length(white: np.ndarray) -> np.ndarray:
+    """Return the root mean square (H, W) of whitened errors (H, W, 3): 1 on average for noise."""
     return cv2.sqrt(cv2.transform(cv2.multiply(white, white), np.full((1, 3), 1 / 3)))
 
 
@@ -187,14 +222,14 @@ def plate_difference(
         difference from the plate without shadow.
     """
     off = image - model.plate
-    difference = _length(off, model)
+    difference = _length(whitened(off, model))
     if shadow <= 0:
         return np.zeros_like(difference), difference, difference
     # Darkening linear light by s darkens sRGB values by about s^(1/2.2).
-    lumas = [cv2.transform(values, _LUMA) for values in (image, model.plate)]
+    lumas = [cv2.cvtColor(values, cv2.COLOR_RGB2GRAY) for values in (image, model.plate)]
     dark = np.clip(lumas[0] / np.maximum(lumas[1], 1.0), (1 - shadow) ** (1 / 2.2), 1.0)
     off += model.plate * (1 - dark)[..., None]
-    shaded = _length(off, model)
+    shaded = _length(whitened(off, model))
     # Opening drops narrow areas.
     broad = opened(shaded < 3.0, _pixels(WIDE, length), eroded_about)
     return dark * broad, np.where(broad, np.minimum(difference, shaded), difference), difference
@@ -208,8 +243,11 @@ def shade_of_plate(dark: np.ndarray, clear: np.ndarray, length: int) -> np.ndarr
     return (blurred(dark * weight, reach) + 1e-3) / (blurred(weight, reach) + 1e-3)
 
 
-def subject_region(difference: np.ndarray) -> np.ndarray:
-    """Return the pixels (H, W) of large connected parts that differ, each with a certain pixel."""
+def subject_region(difference: np.ndarray, size: int) -> np.ndarray:
+    """Return the pixels (H, W) of large connected parts that differ, each with a certain pixel.
+
+    `size` is that of the whole frame, pixels.
+    """
     smooth = np.sqrt(cv2.blur(difference**2, (3, 3)))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(
         (smooth > 2.2).astype(np.uint8), connectivity=8
@@ -221,7 +259,7 @@ def subject_region(difference: np.ndarray) -> np.ndarray:
         return np.zeros(difference.shape, bool)
     area = stats[:, cv2.CC_STAT_AREA]
     # A few isolated pixels are not a subject, however much they differ.
-    least = max(LEAST_PART * area[sure].max(), 2e-4 * difference.size)
+    least = max(LEAST_PART * area[sure].max(), 2e-4 * size)
     return (sure & (area >= least))[labels]
 
 
@@ -284,14 +322,13 @@ def firm_pixels(
     Thin hair differs less from the plate than dense hair. Skin under dark hair may differ little
     too, but is not a mixture of hair and plate: colours off the line between these are subject.
     """
-    off = image - model.plate
-    own = subject_colour(image, core, length) - model.plate
-    reach = _length(own, model)
+    colours = image, subject_colour(image, core, length)
+    off, own = (whitened(colour - model.plate, model) for colour in colours)
+    reach = _length(own)
     firm = difference > np.maximum(FIRM * reach, 2 * LOW)
-    white = cv2.transform(own / model.sigma, model.whiten)
-    along = np.einsum("...i,...i->...", cv2.transform(off / model.sigma, model.whiten), white)
+    along = np.einsum("...i,...i->...", off, own)
     share = np.clip(along / (3 * np.maximum(reach, 1e-3) ** 2), 0, 1)
-    misfit = _length(off - share[..., None] * own, model)
+    misfit = _length(off - share[..., None] * own)
     # At least half of the difference, because in 8-bit steps mixtures lie on a curve.
     return firm | (core & (misfit > np.maximum(2 * LOW, 0.5 * difference)))
 

@@ -61,6 +61,9 @@ class PlateModel:
     whiten: np.ndarray
 
 
+WHOLE = np.s_[:, :]
+
+
 def exposure_gain(frame: np.ndarray, plate: np.ndarray) -> np.ndarray:
     """Estimate the gain (3,) of linear light from plate to frame, (H, W, 3) uint8 sRGB each.
 
@@ -201,31 +204,34 @@ def _evened(plate: np.ndarray, frame: np.ndarray, rim: np.ndarray) -> np.ndarray
     return np.rint(255 * even).astype(np.uint8)
 
 
-def fit_plate(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> PlateModel:
-    """Model a plate (H, W, 3) uint8 in a frame's exposure, and the frame's noise around it.
+def fit_plate(
+    plate: np.ndarray, frame: np.ndarray, valid: np.ndarray, window: tuple[slice, slice] = WHOLE
+) -> PlateModel:
+    """Model a window of a plate (H, W, 3) uint8 in a frame's exposure, and the frame's noise.
 
     The noise is measured on the frame (H, W, 3) uint8 where `valid` (H, W); with too little plate
     in view it is NOISE_FLOOR everywhere.
     """
-    shown = exposed(plate, exposure_gain(frame, plate))
+    gain = exposure_gain(frame, plate)
+    shown = exposed(plate[window], gain)
     # The gradient, eighths of an 8-bit step per pixel.
     slopes = [cv2.Sobel(plate, cv2.CV_16S, x, 1 - x) for x in (1, 0)]
     step = max(1, round(np.sqrt(valid.size / SAMPLES)))
-    window = np.s_[step // 2 :: step, step // 2 :: step]
-    error = (frame[window].astype(np.float32) - shown[window])[valid[window]]
+    some = np.s_[step // 2 :: step, step // 2 :: step]
+    error = (frame[some].astype(np.float32) - exposed(plate[some], gain))[valid[some]]
     quiet = _largest(error) < MOST_NOISE
     if quiet.sum() < max(LEAST_PLATE * len(error), 100):
         return PlateModel(shown, np.full_like(shown, NOISE_FLOOR), np.eye(3, dtype=np.float32))
     error, level, x, y = (
-        image[quiet] for image in (error, *(i[window][valid[window]] for i in (plate, *slopes)))
+        image[quiet] for image in (error, *(i[some][valid[some]] for i in (plate, *slopes)))
     )
     contrast = np.hypot(x, y, dtype=np.float32) / 8
     table = _noise_table(error, level.astype(np.float32))
     by_level = table[level, np.arange(3)]
     share = _contrast_share(error, by_level, contrast)
-    sigma = cv2.LUT(plate, table[None] ** 2)
+    sigma = cv2.LUT(np.ascontiguousarray(plate[window]), table[None] ** 2)
     for slope in slopes if share > 0 else ():
-        cv2.accumulateSquare(slope * np.float32(share / 8), sigma)
+        cv2.accumulateSquare(slope[window] * np.float32(share / 8), sigma)
     sigma = cv2.sqrt(sigma)
     scaled = error / np.sqrt(by_level**2 + (share * contrast) ** 2)
     inside = scaled[_largest(scaled) < 4.0]

@@ -18,6 +18,7 @@ from pipelines.matte.key import (
     eroded_about,
     key_alpha,
     plate_difference,
+    subject_window,
 )
 from pipelines.matte.learned import MattingLaplacian
 from pipelines.matte.plates import (
@@ -215,6 +216,21 @@ def test_pixels_without_footage_are_transparent() -> None:
     plate = np.where(valid[..., None], scene.plate, 0).astype(np.uint8)
     alpha = key_alpha(frame, plate, valid, MatteConfig().shadow)
     assert (alpha[~valid] == 0).all() and alpha[120, 128] == 1
+
+
+def test_a_window_around_the_subject_harms_nothing(monkeypatch) -> None:
+    scene, side = make_scene(3, "fair"), (0, 0, 200, 200)
+    plate = cv2.copyMakeBorder(scene.plate, *side, cv2.BORDER_REFLECT_101)
+    frame = np.clip(plate + np.random.default_rng(0).normal(0, 1.5, plate.shape), 0, 255)
+    frame[:, 200:-200] = scene.frame
+    alpha = cv2.copyMakeBorder(scene.alpha, *side, cv2.BORDER_CONSTANT)
+    wide = Scene(frame=frame.astype(np.uint8), plate=plate, alpha=alpha)
+    whole = mae(key(wide), wide)
+    monkeypatch.setattr("pipelines.matte.key.WINDOW_SIDE", 160)
+    valid = np.ones(wide.alpha.shape, bool)
+    columns = subject_window(wide.frame, plate, valid, MatteConfig().shadow)[1]
+    assert columns.stop - columns.start < 0.5 * frame.shape[1]
+    assert mae(key(wide), wide) < 1.02 * whole
 
 
 @pytest.mark.parametrize(
