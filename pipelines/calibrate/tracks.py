@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -202,13 +203,13 @@ def match_descriptors(
         return np.zeros((0, 2), int)
     likeness = a @ b.T
     if allowed is not None:
-        likeness[~allowed] = -1.0
-    distance = np.sqrt(np.maximum(2 - 2 * likeness, 0))
-    best = distance.argmin(1)
-    rows = np.arange(len(best))
-    nearest = np.partition(distance, 1, axis=1)
-    good = nearest[:, 0] < RATIO * np.minimum(nearest[:, 1], 1.0)
-    good &= distance.argmin(0)[best] == rows
+        np.copyto(likeness, -1.0, where=~allowed)
+    rows, best = np.arange(len(a)), likeness.argmax(1)
+    good = likeness.argmax(0)[best] == rows
+    first = likeness[rows, best]
+    likeness[rows, best] = -1.0  # leaves the second best as the largest
+    nearest, second = (np.sqrt(np.maximum(2 - 2 * v, 0)) for v in (first, likeness.max(1)))
+    good &= nearest < RATIO * np.minimum(second, 1.0)
     return np.stack([rows[good], best[good]], axis=1)
 
 
@@ -253,20 +254,23 @@ def mirrored_cameras(
     """
     frame = max(sorted(seen), key=lambda number: len(seen[number].features))
     features = seen[frame].features
-    counts = {name: [0, 0] for name in features}
-    for a, b in (pair for pair in pairs if set(pair) <= set(features)):
-        there = features[b]
-        for i, mine in enumerate((features[a], mirror_features(features[a], widths[a]))):
-            found = verified_pairs({frame: (mine, there)}).get(frame, np.zeros((0, 2), int))
-            places = mine[0][found[:, 0]], there[0][found[:, 1]]
-            count = _off_plane(*places, ON_PLANE * widths[b]) if i else len(found)
-            for name in (a, b):
-                counts[name][i] += count
+    pairs = [pair for pair in pairs if set(pair) <= set(features)]
+    turned, straight = Counter[str](), Counter[str]()
+    for a, b in pairs:
+        mine, there = mirror_features(features[a], widths[a]), features[b]
+        found = verified_pairs({frame: (mine, there)}).get(frame, np.zeros((0, 2), int))
+        places = mine[0][found[:, 0]], there[0][found[:, 1]]
+        turned.update(dict.fromkeys((a, b), _off_plane(*places, ON_PLANE * widths[b])))
+    suspects = {name for name in features if turned[name] > LEAST_MIRRORED}
+    for a, b in (pair for pair in pairs if suspects & set(pair)):
+        agreed = verified_pairs({frame: (features[a], features[b])}).values()
+        straight.update(dict.fromkeys((a, b), sum(map(len, agreed))))
     return {
-        name: f"{turned} features of its pictures match other cameras if mirrored, {straight} as"
-        " recorded: switch mirroring off where they are recorded, or mirror the files"
-        for name, (straight, turned) in counts.items()
-        if turned > 2 * straight + LEAST_MIRRORED
+        name: f"{turned[name]} features of its pictures match other cameras if mirrored,"
+        f" {straight[name]} as recorded: switch mirroring off where they are recorded, or mirror"
+        " the files"
+        for name in sorted(suspects)
+        if turned[name] > 2 * straight[name] + LEAST_MIRRORED
     }
 
 
