@@ -54,7 +54,7 @@ ALWAYS = (
     ),
     Deviation(
         paper="tracking by VHAP, 68 FAN landmarks",
-        ours="our own tracker; users may bring the points of any detector",
+        ours="our own tracker; users may bring FAN's weights",
         reason="VHAP's licence (CONTRIBUTING.md)",
         effect="face 1.39 mm from the truth on the twin (docs/LOG.md); VHAP was not run",
     ),

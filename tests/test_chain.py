@@ -148,7 +148,7 @@ def wrong_commands(root: Path, twin: Path, junk: Path) -> list[list[str]]:
     for stage, setting in [
         ("matte", 'method="bgmv2"'), ("matte", f'weights="{lost}"'),
         ("matte", f'weights="{junk / "junk.npz"}"'), ("matte", 'method="gren"'),
-        ("track", f'landmarks="{junk / "junk.npz"}"'), ("track", 'landmarks="lost.npz"'),
+        ("track", f'landmarks="{junk / "junk.npz"}"'), ("track", 'landmarks="fan:lost.pt"'),
         ("track", f'head="{lost}"'), ("track", "clip_rounds=maybe"),
         ("depth", "voxel_mm=-1"), ("depth", "voxel_mm=nan"), ("register", "weight=few"),
         ("regions", f'segmentation="{lost}"'), ("encode", "size=-4"), ("encode", 'profile="gif"'),

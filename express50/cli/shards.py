@@ -1,4 +1,4 @@
-"""``express50 shards`` verifies packed shards, lists and shows samples."""
+"""``express50 shards`` verifies packed shards, lists and shows samples, splits and merges."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from express50.console import FAILED, OK, add_command, answer, count, say_json
+from express50.console import FAILED, OK, add_command, answer, count, say, say_json
 from express50.errors import FormatError
 
 
 def add_commands(subparsers: Any) -> None:
     """Add the ``shards`` command."""
-    parser = subparsers.add_parser("shards", help="verify, list or show packed shards")
+    parser = subparsers.add_parser(
+        "shards", help="verify, list, show, split or merge packed shards"
+    )
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     words = "check every file and member against checksums"
     verify = add_command(actions, "verify", run_verify, words, dataset=False)
@@ -21,12 +23,47 @@ def add_commands(subparsers: Any) -> None:
         actions, "show", run_show, "print a sample's meta and write it as a picture", dataset=False,
         example="express50 shards show data/pack/shards S001_smile_cam03 --out a.png",
     )  # fmt: skip
-    for action in (verify, listing, show):
+    split = add_command(
+        actions, "split", run_split, "write part of the samples as shards of their own",
+        dataset=False, json=False,
+        example="express50 shards split data/pack/shards test_only --split test",
+    )  # fmt: skip
+    words = "write the samples of several folders as one"
+    merge = add_command(actions, "merge", run_merge, words, dataset=False, json=False)
+    for action in (verify, listing, show, split):
         action.add_argument("directory", type=Path, metavar="DIR", help="folder of shards")
     show.add_argument("key", nargs="?", metavar="KEY", help="sample; the first by default")
     show.add_argument("--out", type=Path, help="picture of rgb, alpha and depth to write")
+    merge.add_argument("directories", type=Path, nargs="+", metavar="DIR", help="shards")
     listing.add_argument("--subject", action="append", help="only this subject; may be repeated")
-    listing.add_argument("--split", help="only samples of this split")
+    for name in ("subject", "expression", "camera"):
+        split.add_argument(f"--{name}", action="append", help="only this; may be repeated")
+    for action in (listing, split):
+        action.add_argument("--split", help="only samples of this split")
+    for action in (split, merge):
+        action.add_argument("out", type=Path, metavar="OUT", help="empty or absent folder")
+        action.add_argument("--shard-mb", type=int, default=256, help="size of a shard, MB [256]")
+
+
+def run_split(args: argparse.Namespace) -> int:
+    """Copy the samples that match."""
+    from express50.shards.reader import ShardReader
+    from express50.shards.writer import copy_samples
+
+    wanted = (args.subject, args.expression, args.camera, args.split)
+    reader = ShardReader(args.directory).select(*wanted)
+    say(f"{args.out}: {count(copy_samples([reader], args.out, args.shard_mb), 'sample')}")
+    return OK
+
+
+def run_merge(args: argparse.Namespace) -> int:
+    """Copy the samples of all folders."""
+    from express50.shards.reader import ShardReader
+    from express50.shards.writer import copy_samples
+
+    readers = [ShardReader(directory) for directory in args.directories]
+    say(f"{args.out}: {count(copy_samples(readers, args.out, args.shard_mb), 'sample')}")
+    return OK
 
 
 def run_verify(args: argparse.Namespace) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-EMBEDDED = "embedded"  # any other source is the path of a file of points
+EMBEDDED, FAN = "embedded", "fan:"  # sources; anything else is the path of a file of points
 WEIGHTS = Path(__file__).with_name(
     "weights.npz"
 )  # here, because the network's module imports torch
@@ -14,4 +14,6 @@ def source_files(landmarks: str) -> dict[str, Path]:
     """Return the files that a source reads, by name; a stage's output depends on them."""
     if landmarks == EMBEDDED:
         return {"weights": WEIGHTS}
+    if landmarks.startswith(FAN):
+        return {"weights": WEIGHTS, "fan": Path(landmarks.removeprefix(FAN)).expanduser()}
     return {"landmarks": Path(landmarks).expanduser()}

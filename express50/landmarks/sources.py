@@ -1,4 +1,8 @@
-"""Open a source of landmarks: the embedded network, or a file of another detector's points.
+"""Open a source of landmarks: the embedded network, the user's FAN weights, or a file.
+
+FAN is the face alignment network (Bulat and Tzimiropoulos 2017). Its published weights are
+TorchScript files (2DFAN4, 3DFAN4) that map crops (B, 3, 256, 256) in [0, 1] to heat maps (B, 68,
+64, 64). The embedded network finds the face, FAN its points; nothing is downloaded.
 
 A source is called with an image, its camera's id and its frame. It returns a `Marked` face: its
 `Detection`, its irises, and which convention its jaw line follows.
@@ -7,17 +11,19 @@ A source is called with an image, its camera's id and its frame. It returns a `M
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
-from express50.errors import FormatError
-from express50.files.arrays import read_arrays
+from express50.errors import ConfigError, FormatError
+from express50.files.arrays import DAMAGE, read_arrays
 from express50.files.text import read_json
 from express50.geometry.cameras import Camera, normalised
-from express50.landmarks import EMBEDDED, source_files
-from express50.landmarks.detector import SMALLEST, Detection, detect
+from express50.geometry.conventions import cell_to_corner
+from express50.landmarks import source_files
+from express50.landmarks.detector import SMALLEST, Detection, cut_crop, detect, place_crop
 from express50.landmarks.irises import Irises, find_irises
 from express50.landmarks.network import load_network
 
@@ -40,10 +46,24 @@ class Marked:
 Source = Callable[[np.ndarray, str, int], Marked]
 
 
+def _existing_files(landmarks: str) -> dict[str, Path]:
+    files = source_files(landmarks)
+    for path in files.values():
+        if not path.is_file():
+            raise ConfigError(
+                f"landmarks {landmarks!r}: no file {path}; expected 'embedded', 'fan:' and the "
+                "path of FAN's TorchScript weights, or the path of a file of points"
+            )
+    return files
+
+
 def try_source(landmarks: str) -> None:
-    """Read a source's file as far as possible without cameras; raise as `read_points` does."""
-    if landmarks != EMBEDDED:
-        _read_raw(source_files(landmarks)["landmarks"])
+    """Read a source's files as far as possible without cameras; raise as `open_source` does."""
+    files = _existing_files(landmarks)
+    if "landmarks" in files:
+        _read_raw(files["landmarks"])
+    elif "fan" in files:
+        load_fan(files["fan"])
 
 
 def open_source(
@@ -56,17 +76,20 @@ def open_source(
     """Return a source that is ready to be called.
 
     Args:
-        landmarks: `embedded`, or the path of a file of points (.npz or .json, docs/FORMAT.md).
+        landmarks: `embedded`, `fan:PATH` (TorchScript weights) or the path of a file of points
+            (.npz or .json, see docs/FORMAT.md).
         cameras: as recorded, by id; points of a file are undistorted with them.
         refinements: looks of the embedded network.
         smallest: smallest windows that it searches, see `detect`.
         pictures: pinhole cameras of the images, by id; by default of the recorded size.
 
     Raises:
-        FormatError: the file of points is missing or malformed.
+        ConfigError: the file is missing, or is not of the expected kind.
+        FormatError: the file of points is malformed.
     """
-    if landmarks != EMBEDDED:
-        table = read_points(source_files(landmarks)["landmarks"], cameras, pictures)
+    files = _existing_files(landmarks)
+    if "landmarks" in files:
+        table = read_points(files["landmarks"], cameras, pictures)
 
         def look_up(image: np.ndarray, camera_id: str, frame: int) -> Marked:
             rows = table.get((camera_id, frame))
@@ -82,10 +105,12 @@ def open_source(
 
         return look_up
     net = load_network()
+    fan = load_fan(files["fan"]) if "fan" in files else None
 
     def find(image: np.ndarray, camera_id: str, frame: int) -> Marked:
         face = detect(net, image, refinements, smallest)
-        return Marked(face, find_irises(image, face), visible_contour=False)
+        face = face if fan is None else find_with_fan(fan, image, face)
+        return Marked(face, find_irises(image, face), visible_contour=fan is not None)
 
     return find
 
@@ -223,3 +248,80 @@ def _checked(rows: np.ndarray, camera: Camera, path: Path, key: tuple[str, int])
             f"{camera.height} image; expected pixels of the footage as recorded"
         )
     return rows
+
+
+FAN_CROP, HEAT = 256, 64
+# FAN's crop spans 200 / 195 times the sum of the sides of a box that reaches from above the brows
+# (by BROW of the points' height) to the chin, about a centre RAISE of the box's height higher.
+SPAN, RAISE, BROW = 200.0 / 195.0, 0.12, 0.12
+REACH = 3  # cells around a heat map's peak that give its place
+
+
+def load_fan(path: Path) -> torch.jit.ScriptModule:
+    """Read TorchScript weights.
+
+    Raises:
+        ConfigError: the file is not TorchScript, or does not map crops to heat maps.
+    """
+    wanted = f"expected FAN's TorchScript weights, (1, 3, {FAN_CROP}, {FAN_CROP}) to 68 heat maps"
+    try:
+        fan = torch.jit.load(str(path), map_location="cpu").eval()
+        with torch.inference_mode():
+            output = _heat(fan, torch.zeros(1, 3, FAN_CROP, FAN_CROP))
+    except (*DAMAGE, torch.jit.Error) as error:
+        # PyTorch's message is a page long and guesses what happened to the file.
+        raise ConfigError(f"landmarks: {path} cannot be loaded or called; {wanted}") from error
+    if tuple(output.shape) != (1, POINTS, HEAT, HEAT):
+        raise ConfigError(f"landmarks: {path} gives {tuple(output.shape)}; {wanted}")
+    return fan
+
+
+def find_with_fan(fan: torch.jit.ScriptModule, image: np.ndarray, face: Detection) -> Detection:
+    """Find the points of a detected face with FAN; the face keeps its score.
+
+    A point's confidence is its heat map's peak times the score; sigma comes from the peak's spread.
+    The image is (H, W, 3) uint8 RGB.
+    """
+    window = fan_window(face.points)
+    crop = cut_crop(image, window, FAN_CROP)
+    with torch.inference_mode():
+        batch = torch.from_numpy(crop).permute(2, 0, 1)[None].float() / 255.0
+        heat = _heat(fan, batch)[0].double().numpy()
+    if not np.isfinite(heat).all():
+        raise ConfigError("landmarks: FAN's weights give NaN or infinite heat maps; use others")
+    found = [_peak(one) for one in heat]
+    cells, spread, height = (np.array(part) for part in zip(*found, strict=True))
+    step = FAN_CROP / HEAT
+    points = (cells * step) @ window[:, :2].T + window[:, 2]
+    scale = float(np.sqrt(abs(np.linalg.det(window[:, :2]))))
+    confidence = np.clip(height, 0.0, 1.0)
+    sigma = np.maximum(spread, 0.5) * step * scale / np.maximum(confidence, 0.05)
+    return replace(face, points=points, sigma=sigma, confidence=face.score * confidence)
+
+
+def fan_window(points: np.ndarray) -> np.ndarray:
+    """Place an upright crop around landmarks (68, 2): affine (2, 3) from crop to image pixels."""
+    low, high = points.min(0), points.max(0)
+    low = low - [0.0, BROW * (high[1] - low[1])]
+    centre = 0.5 * (low + high) - [0.0, RAISE * (high[1] - low[1])]
+    scale = SPAN * max(float((high - low).sum()), 8.0) / FAN_CROP
+    return place_crop(centre, scale * np.eye(2), FAN_CROP)
+
+
+def _heat(fan: torch.jit.ScriptModule, batch: torch.Tensor) -> torch.Tensor:
+    """Run FAN; a stack of hourglasses returns a list, whose last heat maps count."""
+    output = fan(batch)
+    return output[-1] if isinstance(output, list | tuple) else output
+
+
+def _peak(heat: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """Find a heat map's peak: place (2,) in cells, corner origin, spread in cells, and height."""
+    row, column = np.unravel_index(int(np.argmax(heat)), heat.shape)
+    rows = slice(max(row - REACH, 0), row + REACH + 1)
+    columns = slice(max(column - REACH, 0), column + REACH + 1)
+    share = np.clip(heat[rows, columns], 0.0, None)
+    total = max(float(share.sum()), 1e-12)
+    y, x = cell_to_corner(np.mgrid[rows, columns][:, : share.shape[0], : share.shape[1]])
+    place = np.array([(share * x).sum(), (share * y).sum()]) / total
+    variance = float((share * ((x - place[0]) ** 2 + (y - place[1]) ** 2)).sum()) / total
+    return place, (0.5 * variance) ** 0.5, float(heat[row, column])

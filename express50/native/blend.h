@@ -67,6 +67,11 @@ template <class Real> struct Hit {
     VecOf<Real> length(const Splat<Real>& s) const {
         return s.slope_u * dx + (s.slope_v * dy + s.length);
     }
+    // Lanes whose transmittance falls through one half here: the Gaussian of the median depth.
+    MaskOf<Real> crosses() const {
+        const VecOf<Real> half = broadcast(Real(0.5));
+        return below(VecOf<Real>{}, alpha) & below(half, before) & at_most(after, half);
+    }
 };
 
 // Walks one Gaussian over a tile. Updates the transmittance (negative: the pixel is finished),
@@ -158,9 +163,10 @@ template <class Real> class Lines {
 // Scratch of one thread.
 template <class Real> struct Workspace {
     int channels, stride;  // stride: channels padded to whole vectors
+    bool wants_median;
     Lines<Real> pixels;  // forward: colours; backward: their gradients
     std::vector<Real> color, color_gradient;
-    alignas(64) Real transmittance[kPixels], alpha[kPixels], weighted[kPixels];
+    alignas(64) Real transmittance[kPixels], alpha[kPixels], weighted[kPixels], median[kPixels];
     alignas(64) Real before[kPixels], suffix[kPixels];
     PixelList<Real> list;
 
@@ -175,8 +181,9 @@ template <class Real> struct Workspace {
     std::vector<Where> where;  // of each hit
     std::vector<size_t> hit_start;
 
-    explicit Workspace(int c)
-        : channels(c), stride(channel_vectors<Real>(c) * Lanes<Real>::N), pixels(kPixels * stride), color(stride), color_gradient(stride) {}
+    Workspace(int c, bool median_too)
+        : channels(c), stride(channel_vectors<Real>(c) * Lanes<Real>::N), wants_median(median_too),
+          pixels(kPixels * stride), color(stride), color_gradient(stride) {}
     bool planar() const { return channels <= kPlanarMax; }
 };
 
@@ -240,7 +247,7 @@ int blend_tile(Workspace<Real>& w, const TileFrame& tile, const Splat<Real>* spl
     const Centers<Real> centers(tile);
     int open = start_tile(tile, w.transmittance), used = 0;
     w.pixels.clear();
-    for (Real* sums : {w.alpha, w.weighted}) std::fill(sums, sums + kPixels, Real(0));
+    for (Real* sums : {w.alpha, w.weighted, w.median}) std::fill(sums, sums + kPixels, Real(0));
     for (int64_t i = 0; i < count && open > 0; ++i) {
         const int32_t id = ids[i];
         prefetch(splats, boxes, colors, w.channels, ids[std::min(i + kAhead, count - 1)]);
@@ -250,11 +257,15 @@ int blend_tile(Workspace<Real>& w, const TileFrame& tile, const Splat<Real>* spl
         w.list.count = 0;
         open -= walk(s, boxes[id], tile, centers, w.transmittance, [&](const Hit<Real>& hit) {
             contributed = true;
-            const V weight = hit.alpha * hit.before;
+            const V weight = hit.alpha * hit.before, length = hit.length(s);
             const int at = hit.position();
             Real *alpha = w.alpha + at, *weighted = w.weighted + at;
             store(alpha, load(alpha) + weight);
-            store(weighted, load(weighted) + weight * hit.length(s));
+            store(weighted, load(weighted) + weight * length);
+            if (w.wants_median) {
+                Real* median = w.median + at;
+                store(median, choose(hit.crosses(), length, load(median)));
+            }
             if (CV >= 0) {
                 w.list.add(at, hit.lanes, weight);
             } else {

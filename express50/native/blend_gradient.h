@@ -76,7 +76,8 @@ inline size_t replay(Workspace<Real>& w, const TileFrame& tile, const Centers<Re
         const int at = hit.position();
         const V weight = hit.alpha * hit.before, by_depth = load(w.weighted + at);
         V value = load(w.alpha + at) + by_depth * hit.length(s);
-        const V by_length = weight * by_depth;
+        V by_length = weight * by_depth;
+        if (w.wants_median) by_length += choose(hit.crosses(), load(w.median + at), V{});
         depth += by_length, depth_x += by_length * hit.dx, depth_y += by_length * hit.dy;
         if (CV >= 0) {
             store(w.before + at, hit.before);
@@ -135,7 +136,8 @@ inline void retreat(Workspace<Real>& w, const Centers<Real>& centers, const Spla
     m.sxx = sum<Real>(sxx), m.sxy = sum<Real>(sxy), m.syy = sum<Real>(syy);
 }
 
-// Derivative of blend_tile. w.pixels, w.weighted and w.alpha hold the gradients of the pixels. Writes one record for each Gaussian: its colour gradient and its moments.
+// Derivative of blend_tile. w.pixels, w.weighted, w.alpha and w.median hold the gradients of the
+// pixels. Writes one record for each Gaussian: its colour gradient and its moments.
 template <class Real, int CV>
 void blend_tile_gradient(Workspace<Real>& w, const TileFrame& tile, const Splat<Real>* splats,
                          const Box* boxes, const Real* colors, const int32_t* ids, int used,

@@ -18,10 +18,11 @@
 
 #define EXPRESS50_GAUSSIANS(Real, suffix)                                                         \
     EXPRESS50_EXPORT int64_t gaussians_project_##suffix(                                          \
-        const Camera* cam, int64_t n, const Real* means, const Real* quats, const Real* scales,   \
-        const Real* opacities, Splat<Real>* splats, Real* depths, Box* boxes) {                   \
-        return project_scene<Real>(*cam, {n, means, quats, scales, opacities},                    \
-                                   {splats, depths, boxes});                                      \
+        const Camera* cam, int64_t n, int64_t channels, const Real* means, const Real* quats,     \
+        const Real* scales, const Real* opacities, Splat<Real>* splats, Real* depths, Box* boxes, \
+        Real* colors) {                                                                           \
+        return project_scene<Real>(*cam, {n, int(channels), means, quats, scales, opacities},     \
+                                   {splats, depths, boxes, colors});                              \
     }                                                                                             \
     EXPRESS50_EXPORT void gaussians_bin_##suffix(const Camera* cam, int64_t n,                    \
                                                  const Real* depths, const Box* boxes,            \
@@ -31,20 +32,21 @@
     EXPRESS50_EXPORT void gaussians_forward_##suffix(                                             \
         const Camera* cam, int64_t channels, const Splat<Real>* splats, const Box* boxes,         \
         const Real* colors, const Real* background, const int64_t* starts, int32_t* ids,          \
-        int32_t* used, Real* image, Real* weighted, Real* alpha) {                                \
+        int32_t* used, Real* image, Real* weighted, Real* alpha, Real* median) {                  \
         forward<Real>(*cam, int(channels), splats, boxes, colors, background, starts, ids, used,  \
-                      image, weighted, alpha);                                                    \
+                      image, weighted, alpha, median);                                            \
     }                                                                                             \
     EXPRESS50_EXPORT void gaussians_backward_##suffix(                                            \
         const Camera* cam, int64_t n, int64_t channels, const Real* means, const Real* quats,     \
         const Real* scales, const Real* opacities, const Splat<Real>* splats, const Box* boxes,   \
         const Real* colors, const Real* background, const int64_t* starts, const int32_t* ids,    \
         const int32_t* used, const Real* d_image, const Real* d_weighted, const Real* d_alpha,    \
-        double* moments, Real* d_means, Real* d_quats, Real* d_scales, Real* d_opacities,         \
-        Real* d_colors, CameraGradient<double>* d_cam) {                                          \
-        backward<Real>(*cam, {n, means, quats, scales, opacities}, int(channels), splats, boxes,  \
+        const Real* d_median, double* moments, Real* d_means, Real* d_quats, Real* d_scales,      \
+        Real* d_opacities, Real* d_colors, CameraGradient<double>* d_cam) {                               \
+        backward<Real>(*cam, {n, int(channels), means, quats, scales, opacities}, splats, boxes,  \
                        colors, background, starts, ids, used, d_image, d_weighted, d_alpha,       \
-                       moments, {d_means, d_quats, d_scales, d_opacities, d_colors}, d_cam);      \
+                       d_median, moments,                                                         \
+                       {d_means, d_quats, d_scales, d_opacities, d_colors}, d_cam);               \
     }
 
 EXPRESS50_GAUSSIANS(float, f32)

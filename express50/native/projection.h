@@ -12,14 +12,14 @@ using Wide = VecOf<double>;  // one number of each Gaussian
 constexpr int kWide = Lanes<double>::N;
 
 constexpr double kAlphaMin = 1.0 / 255.0, kAlphaMax = 0.99, kTransmittanceMin = 1e-4;
-constexpr double kFovMargin = 0.15;
+constexpr double kCompensationMin = 0.005, kFovMargin = 0.15;
 
 // Mirrored by grmm/rasterize/cpu.py.
 struct Camera {
     double fx, fy, cx, cy;
     double R[9], t[3];
     double near, eps2d;
-    int32_t width, height, threads;
+    int32_t width, height, antialiased, normals, threads;
 };
 
 // A camera and what is the same for all Gaussians in it: divisions are most of a projection's time.
@@ -53,9 +53,10 @@ struct Projected {
     Wide J[9];                // d(u, v, ray length) / d(camera coordinates)
     Wide rows[9];             // J M: square root of the covariance over (u, v, ray length)
     Wide xx, xy, yy, tu, tv;  // that covariance, before dilation
-    Wide cross[3], det;
+    Wide cross[3], det_sharp, det, ratio;
     Wide A, B, C;  // conic
     Wide mean2d[2], slope[2], opacity;
+    Wide normal[3], inverse_steepness;  // see project_normal
 };
 
 template <class T> inline T dot3(const T* a, const T* b) {
@@ -79,6 +80,23 @@ inline void quaternion_to_matrix(const Wide* q, Wide* m) {
     m[0] = 1.0 - 2.0 * (y * y + z * z), m[1] = 2.0 * (x * y - w * z), m[2] = 2.0 * (x * z + w * y);
     m[3] = 2.0 * (x * y + w * z), m[4] = 1.0 - 2.0 * (x * x + z * z), m[5] = 2.0 * (y * z - w * x);
     m[6] = 2.0 * (x * z - w * y), m[7] = 2.0 * (y * z + w * x), m[8] = 1.0 - 2.0 * (x * x + y * y);
+}
+
+// Unit normal, towards the camera, of the plane ray length = l + slope . (pixel - mean2d): minus the
+// derivative of (ray length - slope . pixel) by camera coordinates.
+inline void project_normal(Projected& g) {
+    const Wide zero = Wide{};
+    for (int k = 0; k < 3; ++k)
+        g.normal[k] = g.slope[0] * g.J[k] + g.slope[1] * g.J[3 + k] - g.J[6 + k];
+    const Wide steepness = square_root(dot3(g.normal, g.normal));
+    g.inverse_steepness = choose(below(zero, steepness), 1.0 / steepness, zero);
+    for (int k = 0; k < 3; ++k) g.normal[k] *= g.inverse_steepness;
+}
+
+// The part of the antialiased opacity that dilation leaves: the root of a ratio that is kept from 0.
+inline Wide compensation(Wide ratio) {
+    const Wide least = broadcast(kCompensationMin * kCompensationMin);
+    return square_root(choose(below(ratio, least), least, ratio));
 }
 
 inline void project(const View& view, const Gaussians& in, Projected& g) {
@@ -118,7 +136,8 @@ inline void project(const View& view, const Gaussians& in, Projected& g) {
     g.xx = dot3(u, u), g.xy = dot3(u, v), g.yy = dot3(v, v);
     g.tu = dot3(t, u), g.tv = dot3(t, v);
     cross3(u, v, g.cross);
-    g.det = dot3(g.cross, g.cross) + e * (g.xx + g.yy) + e * e;
+    g.det_sharp = dot3(g.cross, g.cross);
+    g.det = g.det_sharp + e * (g.xx + g.yy) + e * e;
     const Wide inverse_det = 1.0 / g.det;
     g.A = (g.yy + e) * inverse_det, g.B = -g.xy * inverse_det, g.C = (g.xx + e) * inverse_det;
     Wide t_v[3], u_t[3];
@@ -126,11 +145,14 @@ inline void project(const View& view, const Gaussians& in, Projected& g) {
     g.slope[0] = (e * g.tu + dot3(g.cross, t_v)) * inverse_det;
     g.slope[1] = (e * g.tv + dot3(g.cross, u_t)) * inverse_det;
     g.opacity = in.opacity;
+    g.ratio = g.det_sharp * inverse_det;
+    if (cam.antialiased) g.opacity *= compensation(g.ratio);
+    if (cam.normals) project_normal(g);
 }
 
 // Gradient of a loss by what the blending reads of the Gaussians.
 struct SplatGradient {
-    Wide mean2d[2], conic[3], opacity, length, slope[2];
+    Wide mean2d[2], conic[3], opacity, length, slope[2], normal[3];
 };
 
 // Derivative by the quaternion (before normalisation) of sum(G * Rq).
@@ -150,23 +172,40 @@ inline void quaternion_gradient(const Projected& g, const Wide* G, Wide* out) {
 
 // Writes gradients by the Gaussians; adds those by the camera. All are exactly 0 where `d` is.
 inline void project_gradient(const View& view, const Gaussians& in, const Projected& g,
-                             const SplatGradient& d, Gaussians& out, CameraGradient<Wide>& d_cam) {
+                             SplatGradient d, Gaussians& out, CameraGradient<Wide>& d_cam) {
     const Camera& cam = view.cam;
     const Wide zero = Wide{};
     const Wide *u = g.rows, *v = g.rows + 3, *t = g.rows + 6;
     const double e = cam.eps2d;
+    Wide d_steep[3] = {zero, zero, zero};  // by the normal before it gets length 1
+    if (cam.normals) {
+        const Wide along = dot3(g.normal, d.normal);
+        for (int k = 0; k < 3; ++k)
+            d_steep[k] = (d.normal[k] - g.normal[k] * along) * g.inverse_steepness;
+        d.slope[0] += dot3(d_steep, g.J), d.slope[1] += dot3(d_steep, g.J + 3);
+    }
     const Wide inverse_det = 1.0 / g.det;
     const Wide n_u = d.slope[0] * inverse_det, n_v = d.slope[1] * inverse_det;  // by numerators
-    const Wide d_det = -(d.conic[0] * g.A + d.conic[1] * g.B + d.conic[2] * g.C) * inverse_det -
-                       n_u * g.slope[0] - n_v * g.slope[1];
+    Wide d_det = -(d.conic[0] * g.A + d.conic[1] * g.B + d.conic[2] * g.C) * inverse_det -
+                 n_u * g.slope[0] - n_v * g.slope[1];
+    Wide d_sharp = zero;
     out.opacity = d.opacity;
+    if (cam.antialiased) {
+        const Wide root = compensation(g.ratio);
+        out.opacity = d.opacity * root;
+        const MaskOf<double> sharp = below(broadcast(kCompensationMin * kCompensationMin), g.ratio);
+        const Wide d_ratio = choose(sharp, d.opacity * in.opacity * 0.5 / root, zero);
+        d_sharp = d_ratio * inverse_det;
+        d_det -= d_ratio * g.ratio * inverse_det;
+    }
+    d_sharp += d_det;
     const Wide d_xx = d.conic[2] * inverse_det + e * d_det;
     const Wide d_yy = d.conic[0] * inverse_det + e * d_det;
     const Wide d_xy = -d.conic[1] * inverse_det, d_tu = e * n_u, d_tv = e * n_v;
     Wide t_v[3], u_t[3], v_c[3], c_t[3], t_c[3], c_u[3], d_c[3], v_dc[3], dc_u[3];
     cross3(t, v, t_v), cross3(u, t, u_t), cross3(v, g.cross, v_c), cross3(g.cross, t, c_t);
     cross3(t, g.cross, t_c), cross3(g.cross, u, c_u);
-    for (int k = 0; k < 3; ++k) d_c[k] = 2.0 * d_det * g.cross[k] + n_u * t_v[k] + n_v * u_t[k];
+    for (int k = 0; k < 3; ++k) d_c[k] = 2.0 * d_sharp * g.cross[k] + n_u * t_v[k] + n_v * u_t[k];
     cross3(v, d_c, v_dc), cross3(d_c, u, dc_u);
     Wide d_rows[9];
     for (int k = 0; k < 3; ++k) {
@@ -178,6 +217,10 @@ inline void project_gradient(const View& view, const Gaussians& in, const Projec
     for (int k = 0; k < 3; ++k) out.scale[k] = zero;
     for (int i = 0; i < 3; ++i)
         for (int m = 0; m < 3; ++m) d_J[3 * i + m] = dot3(d_rows + 3 * i, g.M + 3 * m);
+    for (int m = 0; m < 3; ++m) {
+        d_J[m] += g.slope[0] * d_steep[m], d_J[3 + m] += g.slope[1] * d_steep[m];
+        d_J[6 + m] -= d_steep[m];
+    }
     for (int m = 0; m < 3; ++m)
         for (int k = 0; k < 3; ++k) {
             const Wide d_M =

@@ -31,8 +31,10 @@ void pixel_range(double mean, double extent, int size, int32_t& first, int32_t& 
     last = int32_t(std::clamp(std::floor(mean + reach - 0.5) + 1, 0.0, double(size)));
 }
 
+// The last three channels are written by `project_scene` if the camera asks for normals.
 template <class Real> struct Scene {
     int64_t n;
+    int channels;
     const Real *means, *quats, *scales, *opacities;
 
     // The Gaussians of `count` indices, the last again and again to fill the lanes.
@@ -54,8 +56,10 @@ template <class Real> struct ProjectedScene {
     Splat<Real>* splats;
     Real* depths;
     Box* boxes;
+    Real* colors;
 
-    int64_t write(const View& view, const Projected& g, const int64_t* at, int count) const {
+    int64_t write(const View& view, const Projected& g, const int64_t* at, int count,
+                  int channels) const {
         const double half = 0.5 * kLog2E, e = view.cam.eps2d;
         Wide level;
         for (int lane = 0; lane < kWide; ++lane) level[lane] = std::log(g.opacity[lane] / kAlphaMin);
@@ -67,6 +71,8 @@ template <class Real> struct ProjectedScene {
         int64_t entries = 0;
         for (int lane = 0; lane < count; ++lane) {
             const int64_t i = at[lane];
+            Real* const normal = view.cam.normals ? colors + (i + 1) * channels - 3 : nullptr;
+            if (normal) std::fill(normal, normal + 3, Real(0));
             boxes[i] = Box{0, 0, 0, 0}, depths[i] = 0;
             if (!(bits(g.front) >> lane & 1) || g.opacity[lane] < kAlphaMin) continue;
             Box reach;
@@ -78,6 +84,8 @@ template <class Real> struct ProjectedScene {
                 Real(g.mean2d[0][lane]), Real(g.mean2d[1][lane]), Real(l11[lane]), Real(l21[lane]),
                 Real(l22[lane]), Real(g.opacity[lane]), Real(cutoff[lane]), Real(g.length[lane]),
                 Real(g.slope[0][lane]), Real(g.slope[1][lane])};
+            if (normal)
+                for (int k = 0; k < 3; ++k) normal[k] = Real(g.normal[k][lane]);
             entries += reach.tiles();
         }
         return entries;
@@ -97,7 +105,7 @@ int64_t project_scene(const Camera& cam, const Scene<Real>& scene,
         for (int lane = 0; lane < count; ++lane) at[lane] = first + lane;
         Projected g;
         project(view, scene.gather(at, count), g);
-        entries += out.write(view, g, at, count);
+        entries += out.write(view, g, at, count, scene.channels);
     }
     return entries;
 }
@@ -147,11 +155,11 @@ void store_colors(const Workspace<Real>& w, const Camera& cam, const TileFrame& 
 template <class Real>
 void forward(const Camera& cam, int channels, const Splat<Real>* splats, const Box* boxes,
                 const Real* colors, const Real* background, const int64_t* starts, int32_t* ids,
-                int32_t* used, Real* image, Real* weighted, Real* alpha) {
+                int32_t* used, Real* image, Real* weighted, Real* alpha, Real* median) {
     const int64_t tiles = int64_t(tile_columns(cam)) * tile_rows(cam);
 #pragma omp parallel num_threads(cam.threads)
     {
-        Workspace<Real> w(channels);
+        Workspace<Real> w(channels, median != nullptr);
 #pragma omp for schedule(dynamic)
         for (int64_t i = 0; i < tiles; ++i) {
             const TileFrame tile = tile_frame(cam, i);
@@ -166,6 +174,7 @@ void forward(const Camera& cam, int channels, const Splat<Real>* splats, const B
                     const int at = Block<Real>::place(x, y);
                     const int64_t to = tile.pixel(cam, x, y);
                     alpha[to] = w.alpha[at], weighted[to] = w.weighted[at];
+                    if (median) median[to] = w.median[at];
                 }
         }
     }

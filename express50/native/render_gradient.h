@@ -40,16 +40,18 @@ void load_color_gradients(Workspace<Real>& w, const Camera& cam, const TileFrame
 template <class Real, int CV>
 void load_gradients(Workspace<Real>& w, const Camera& cam, const TileFrame& tile,
                     const Real* background, const Real* d_image, const Real* d_weighted,
-                    const Real* d_alpha) {
+                    const Real* d_alpha, const Real* d_median) {
     if (!d_image) w.pixels.clear();
     std::fill(w.alpha, w.alpha + kPixels, Real(0));
     std::fill(w.weighted, w.weighted + kPixels, Real(0));
+    std::fill(w.median, w.median + kPixels, Real(0));
     for (int y = 0; y < tile.height; ++y)
         for (int x = 0; x < tile.width; ++x) {
             const int64_t from = tile.pixel(cam, x, y);
             const int at = Block<Real>::place(x, y);
             if (d_alpha) w.alpha[at] = d_alpha[from];
             if (d_weighted) w.weighted[at] = d_weighted[from];
+            if (d_median) w.median[at] = d_median[from];
         }
     if (d_image) load_color_gradients<Real, CV>(w, cam, tile, background, d_image);
 }
@@ -62,6 +64,7 @@ inline SplatGradient splat_gradient(const Projected& g, const Wide* m) {
     d.conic[0] = 0.5 * m[3], d.conic[1] = m[4], d.conic[2] = 0.5 * m[5];
     d.opacity = -m[0] / g.opacity;
     d.length = m[6], d.slope[0] = m[7], d.slope[1] = m[8];
+    for (Wide& by_normal : d.normal) by_normal = Wide{};
     return d;
 }
 
@@ -122,8 +125,13 @@ void finish_gaussians(const View& view, const Scene<Real>& scene, const int64_t*
     for (int lane = 0; lane < count; ++lane)
         for (int k = 0; k < kMoments; ++k)
             moments[k][lane] = totals.moments[at[lane] * kMoments + k];
+    SplatGradient d = splat_gradient(g, moments);
+    if (view.cam.normals)
+        for (int lane = 0; lane < count; ++lane)
+            for (int k = 0; k < 3; ++k)
+                d.normal[k][lane] = out.colors[(at[lane] + 1) * scene.channels - 3 + k];
     Gaussians d_in;
-    project_gradient(view, in, g, splat_gradient(g, moments), d_in, d_cam);
+    project_gradient(view, in, g, d, d_in, d_cam);
     for (int lane = 0; lane < count; ++lane) out.write(at[lane], d_in, lane);
 }
 
@@ -131,7 +139,7 @@ void finish_gaussians(const View& view, const Scene<Real>& scene, const int64_t*
 // the camera.
 template <class Real>
 CameraGradient<double> finish_chunk(const View& view, const Scene<Real>& scene, int64_t begin,
-                                    int64_t end, int channels, const Totals<Real>& totals,
+                                    int64_t end, const Totals<Real>& totals,
                                     const SceneGradient<Real>& out) {
     CameraGradient<Wide> d_cam = {};
     int64_t at[kWide];
@@ -140,7 +148,7 @@ CameraGradient<double> finish_chunk(const View& view, const Scene<Real>& scene, 
         if (totals.reached[i])
             at[count++] = i;
         else
-            out.clear(i, channels);
+            out.clear(i, scene.channels);
         if (count == kWide || (count && i + 1 == end)) {
             finish_gaussians(view, scene, at, count, totals, out, d_cam);
             count = 0;
@@ -172,11 +180,13 @@ struct Bands {
 };
 
 template <class Real>
-void backward(const Camera& cam, const Scene<Real>& scene, int channels,
-              const Splat<Real>* splats, const Box* boxes, const Real* colors, const Real* background, const int64_t* starts,
+void backward(const Camera& cam, const Scene<Real>& scene, const Splat<Real>* splats,
+              const Box* boxes, const Real* colors, const Real* background, const int64_t* starts,
               const int32_t* ids, const int32_t* used, const Real* d_image,
-              const Real* d_weighted, const Real* d_alpha, double* moments, const SceneGradient<Real>& out, CameraGradient<double>* d_cam) {
+              const Real* d_weighted, const Real* d_alpha, const Real* d_median,
+              double* moments, const SceneGradient<Real>& out, CameraGradient<double>* d_cam) {
     const int64_t n = scene.n;
+    const int channels = scene.channels;
     const uint32_t threads = cam.threads;
     const Bands bands(cam, used);
     Lines<Real> color_records(bands.most_records() * channels);
@@ -184,7 +194,7 @@ void backward(const Camera& cam, const Scene<Real>& scene, int channels,
     Totals<Real> totals{out.colors, moments, std::vector<uint8_t>(n, 0)};
 #pragma omp parallel num_threads(threads)
     {
-        Workspace<Real> w(channels);
+        Workspace<Real> w(channels, d_median != nullptr);
         for (int64_t begin = 0; begin < bands.tiles; begin += bands.step) {
             const int64_t end = bands.end(begin), *first = bands.first.data();
 #pragma omp for schedule(dynamic)
@@ -194,8 +204,8 @@ void backward(const Camera& cam, const Scene<Real>& scene, int channels,
                 const int64_t at = first[i] - first[begin];
                 with_layout<Real>(channels, [&](auto layout) {
                     constexpr int CV = decltype(layout)::value;
-                    load_gradients<Real, CV>(w, cam, tile, background, d_image, d_weighted,
-                                             d_alpha);
+                    load_gradients<Real, CV>(w, cam, tile, background, d_image, d_weighted, d_alpha,
+                                             d_median);
                     blend_tile_gradient<Real, CV>(
                         w, tile, splats, boxes, colors, ids + starts[i], used[i],
                         color_records.data() + at * channels, records.data() + at);
@@ -222,7 +232,7 @@ void backward(const Camera& cam, const Scene<Real>& scene, int channels,
 #pragma omp parallel for num_threads(threads) schedule(dynamic)
     for (int64_t chunk = 0; chunk < chunks; ++chunk)
         partial[chunk] = finish_chunk(view, scene, chunk * kChunk,
-                                      std::min(n, (chunk + 1) * kChunk), channels, totals, out);
+                                      std::min(n, (chunk + 1) * kChunk), totals, out);
     double* total = &d_cam->fx;
     for (const CameraGradient<double>& part : partial)
         for (int k = 0; k < kCameraNumbers; ++k) total[k] += (&part.fx)[k];

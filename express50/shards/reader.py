@@ -101,6 +101,7 @@ class ShardReader:
         self,
         subjects: Collection[str] | None = None,
         expressions: Collection[str] | None = None,
+        cameras: Collection[str] | None = None,
         split: str | None = None,
     ) -> ShardReader:
         """Return a reader of the samples that match all the given ids; None matches any.
@@ -108,7 +109,7 @@ class ShardReader:
         Raises:
             UnknownNameError: an id or a split is unknown; the error lists the known ones.
         """
-        wanted = {"subject": subjects, "expression": expressions}
+        wanted = {"subject": subjects, "expression": expressions, "camera": cameras}
         wanted["split"] = None if split is None else [split]
         chosen = self.entries
         for name, values in wanted.items():

@@ -1,4 +1,4 @@
-"""Write, check and gather shards.
+"""Write, check, split and merge shards.
 
 The same samples give the same bytes, and a group never spans two shards.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import tarfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from express50.errors import FormatError
-from express50.files.atomic import link_file
+from express50.files.atomic import folder_in_one_step, link_file, write_json
 from express50.files.digests import file_sha256
 from express50.files.text import NAME, read_json
 from express50.shards.codecs import AGAIN, crc32
@@ -25,6 +26,7 @@ from express50.shards.reader import (
     SUBJECT_FILES,
     ShardReader,
     read_entries,
+    subject_file,
 )
 
 BLOCK = tarfile.BLOCKSIZE
@@ -312,3 +314,104 @@ def _manifest_faults(root: Path) -> list[str]:
         elif file_sha256(root / name) != digest:
             faults.append(f"{root / name}: SHA-256 differs from the manifest's {digest[:12]}...")
     return faults
+
+
+def copy_samples(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> int:
+    """Write all samples of several readers into the folder `out`; return how many.
+
+    Raises:
+        FormatError: there is no sample, a member is damaged, `out` is not empty, two readers hold
+            the same (subject, expression), or they hold a subject in different splits or with
+            different files.
+    """
+    out = out.resolve()
+    if out.exists() and not out.is_dir():
+        raise FormatError(f"{out}: is a file; expected an empty or absent folder")
+    if out.exists() and any(out.iterdir()):
+        raise FormatError(f"{out}: is not empty; expected an empty or absent folder")
+    if shard_mb < 1:
+        raise FormatError(f"--shard-mb is {shard_mb}, expected at least 1")
+    if not any(len(reader) for reader in readers):
+        raise FormatError(f"{readers[0].root}: no sample matches; 'express50 shards ls' lists them")
+    splits = _checked_splits(readers)
+    groups = [(reader, *row) for reader in readers for row in reader.groups().items()]
+    groups.sort(key=lambda group: splits[group[1][0]])
+    names = {s: sorted(k for k, v in splits.items() if v == s) for s in set(splits.values())}
+    aside = out.with_name(f".{out.name}.unfinished")
+    with folder_in_one_step(aside, out):
+        writer = ShardWriter(aside, shard_mb * 10**6)
+        for reader, (subject, expression), numbers in groups:
+            samples = [
+                PackedSample(subject, expression, reader.entries[n].camera, reader.members(n))
+                for n in numbers
+            ]
+            writer.add_group(splits[subject], samples)
+        writer.close()
+        for reader in readers:
+            for subject in sorted({entry.subject for entry in reader.entries}):
+                _copy_subject_files(reader, subject, aside)
+        write_json(aside / "splits.json", names | {"chosen_by": "the shards these are made of"})
+        _write_card(readers, aside)
+        write_manifest(aside, writer.digests)
+        if out.exists():
+            out.rmdir()  # fails if somebody has filled the folder meanwhile
+    return sum(len(reader) for reader in readers)
+
+
+def _checked_splits(readers: Sequence[ShardReader]) -> dict[str, str]:
+    """Return the split of every subject.
+
+    Raises:
+        FormatError: two folders hold the same group, or a subject is in two splits.
+    """
+    owners: dict[tuple[str, str], ShardReader] = {}
+    for reader in readers:
+        for group in reader.groups():
+            if owners.setdefault(group, reader) is not reader:
+                raise FormatError(
+                    f"{reader.root}: {'/'.join(group)} is in {owners[group].root} too, expected in"
+                    " one folder; leave it out of one of them with 'express50 shards split'"
+                )
+    splits: dict[str, str] = {}
+    for reader in readers:
+        for entry in reader.entries:
+            if splits.setdefault(entry.subject, entry.split) != entry.split:
+                raise FormatError(
+                    f"{reader.root}: {entry.subject} is in split {entry.split!r} here and in"
+                    f" {splits[entry.subject]!r} elsewhere; pack again with pack.test_subjects set"
+                )
+    return splits
+
+
+def _copy_subject_files(reader: ShardReader, subject: str, out: Path) -> None:
+    """Copy a subject's files beside the shards.
+
+    Raises:
+        FormatError: a file that its samples need is missing, or `out` has a different one.
+    """
+    for name in SUBJECT_FILES:
+        source, target = subject_file(reader.root, subject, name), subject_file(out, subject, name)
+        if not source.is_file():
+            own = (n for n, entry in enumerate(reader.entries) if entry.subject == subject)
+            tracks = (reader.meta(number).get("track") for number in own)
+            if any(isinstance(track, dict) and track.get(Path(name).stem) for track in tracks):
+                raise FormatError(f"{source}: is missing; copy it again or {AGAIN}")
+            continue
+        if target.exists() and target.read_bytes() != source.read_bytes():
+            raise FormatError(
+                f"{source}: differs from the other folder's {target.name}; pack this subject in"
+                " one run"
+            )
+        shutil.copyfile(source, target)
+
+
+def _write_card(readers: Sequence[ShardReader], out: Path) -> None:
+    """Write the sources' cards one after the other, so that consent and licence are kept."""
+    parts = []
+    for reader in readers:
+        card = reader.root / "card.md"
+        parts.append(card.read_text(encoding="utf-8") if card.is_file() else "(no card)\n")
+    count = len({entry.key for reader in readers for entry in reader.entries})
+    folders = f"{len(readers)} folder{'s' if len(readers) > 1 else ''}"
+    text = f"# {count} samples of {folders} of shards\n\nTheir cards, as they were:\n\n"
+    (out / "card.md").write_text(text + "\n".join(parts), encoding="utf-8")

@@ -17,6 +17,7 @@ from express50.geometry.shapes import PIXEL_LIMIT
 from grmm.rasterize.projection import (
     NotFiniteTensorError,
     Pinhole,
+    RenderOptions,
     RenderOutput,
     Splats,
     rasterize_reference,
@@ -40,6 +41,9 @@ def rasterize(
     height: int,
     *,
     background: Tensor | None = None,
+    antialiased: bool = False,
+    median_depth: bool = False,
+    normals: bool = False,
     backend: str = "auto",
 ) -> RenderOutput:
     """Render Gaussians into one pinhole image; differentiable in every tensor argument.
@@ -56,6 +60,9 @@ def rasterize(
         width: pixels.
         height: pixels.
         background: (C,) colour behind the Gaussians, black if None. Depth has no background.
+        antialiased: scale opacity by sqrt(det before / det after dilation) (Mip-Splatting, 2024).
+        median_depth: also give the median depth.
+        normals: also give blended normals.
         backend: ``auto`` takes gsplat for CUDA tensors, else the native kernel if it was built,
             else the reference.
 
@@ -66,17 +73,18 @@ def rasterize(
     """
     splats = Splats(means=means, quats=quats, scales=scales, opacities=opacities, colors=colors)
     camera = Pinhole(K=K, cam_from_world=cam_from_world, width=width, height=height)
+    options = RenderOptions(antialiased=antialiased, median_depth=median_depth, normals=normals)
     _check(splats, camera, background)
     name = resolve_backend(backend, means.device)
     if name == "cpu":  # a backend is imported when it is used: gsplat may start a long build
         from grmm.rasterize.cpu import rasterize_cpu
 
-        return rasterize_cpu(splats, camera, background)
+        return rasterize_cpu(splats, camera, background, options)
     if name == "gsplat":
         from grmm.rasterize.gsplat_backend import rasterize_gsplat
 
-        return rasterize_gsplat(splats, camera, background)
-    return rasterize_reference(splats, camera, background)
+        return rasterize_gsplat(splats, camera, background, options)
+    return rasterize_reference(splats, camera, background, options)
 
 
 def resolve_backend(backend: str = "auto", device: torch.device | str = "cpu") -> str:

@@ -20,8 +20,10 @@ from grmm.rasterize.projection import (
     DILATION_PX2,
     NEAR_M,
     Pinhole,
+    RenderOptions,
     RenderOutput,
     Splats,
+    depth_of_rays,
     expected_depth,
 )
 
@@ -44,27 +46,39 @@ class _Camera(ctypes.Structure):
         ("eps2d", ctypes.c_double),
         ("width", ctypes.c_int32),
         ("height", ctypes.c_int32),
+        ("antialiased", ctypes.c_int32),
+        ("normals", ctypes.c_int32),
         ("threads", ctypes.c_int32),
     ]
 
 
-def rasterize_cpu(scene: Splats, camera: Pinhole, background: Tensor | None) -> RenderOutput:
+def rasterize_cpu(
+    scene: Splats, camera: Pinhole, background: Tensor | None, options: RenderOptions
+) -> RenderOutput:
     """Render; see ``grmm.rasterize``."""
     device = scene.means.device
     if device.type != "cpu":
         raise ValueError(f"backend 'cpu' got tensors on {device}; use 'auto' or 'gsplat'")
-    image, weighted, alpha = _Rasterize.apply(
+    image, weighted, alpha, median = _Rasterize.apply(
         *vars(scene).values(),
         camera.K,
         camera.cam_from_world,
         background,
         (camera.width, camera.height),
+        options,
     )
-    return RenderOutput(colors=image, depth=expected_depth(weighted, alpha, camera.K), alpha=alpha)
+    channels = scene.colors.shape[1]
+    return RenderOutput(
+        colors=image[..., :channels] if options.normals else image,
+        depth=expected_depth(weighted, alpha, camera.K),
+        alpha=alpha,
+        median_depth=None if median is None else depth_of_rays(median, camera.K),
+        normals=image[..., channels:] if options.normals else None,
+    )
 
 
 class _Rasterize(torch.autograd.Function):
-    """Colours, sum of weight * ray length, and alpha."""
+    """Colours and normals, sum of weight * ray length, alpha and median ray length."""
 
     @staticmethod
     def forward(
@@ -78,22 +92,27 @@ class _Rasterize(torch.autograd.Function):
         cam_from_world: Tensor,
         background: Tensor | None,
         size: tuple[int, int],
-    ) -> tuple[Tensor, Tensor, Tensor]:
+        options: RenderOptions,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         ctx.set_materialize_grads(False)
         # The kernel reads raw memory, so tensors must be contiguous.
         geometry = [x.contiguous() for x in (means, quats, scales, opacities)]
-        camera = _camera(K, cam_from_world, size)
+        camera = _camera(K, cam_from_world, size, options)
+        if options.normals:  # three more channels, which the projection fills
+            colors = torch.nn.functional.pad(colors, (0, 3))
+            background = None if background is None else torch.nn.functional.pad(background, (0, 3))
         colors, background = colors.contiguous(), _contiguous(background)
-        splats, boxes, starts, ids = _bin(camera, geometry)
+        splats, boxes, starts, ids = _bin(camera, geometry, colors)
         used = torch.empty(starts.numel() - 1, dtype=torch.int32)
         blended = (splats, boxes, colors, background, starts, ids, used)
         shape, dtype = (camera.height, camera.width), means.dtype
         image = _empty((*shape, colors.shape[1]), dtype)
         weighted, alpha = _empty(shape, dtype), _empty(shape, dtype)
-        _call("forward", dtype, camera, colors.shape[1], *blended, image, weighted, alpha)
+        median = _empty(shape, dtype) if options.median_depth else None
+        _call("forward", dtype, camera, colors.shape[1], *blended, image, weighted, alpha, median)
         ctx.camera = camera
         ctx.save_for_backward(*geometry, *blended, alpha, K, cam_from_world)
-        return image, weighted, alpha
+        return image, weighted, alpha, median
 
     @staticmethod
     @once_differentiable
@@ -115,19 +134,28 @@ class _Rasterize(torch.autograd.Function):
         d_pose = torch.zeros(4, 4, dtype=torch.float64)
         d_pose[:3, :3] = d_camera[4:13].reshape(3, 3)
         d_pose[:3, 3] = d_camera[13:]
-        d_background = None
+        d_background, asked = None, channels - 3 * ctx.camera.normals
         if background is not None and d_images[0] is not None:
-            d_background = torch.einsum("hwc,hw->c", d_images[0], 1.0 - alpha)
-        return *grads, d_K.to(K.dtype), d_pose.to(cam_from_world.dtype), d_background, None
+            d_background = torch.einsum("hwc,hw->c", d_images[0][..., :asked], 1.0 - alpha)
+        grads[4] = grads[4][:, :asked]
+        d_camera_inputs = d_K.to(K.dtype), d_pose.to(cam_from_world.dtype)
+        return *grads, *d_camera_inputs, d_background, None, None
 
 
-def _bin(camera: _Camera, geometry: list[Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Project, then sort into tiles: splats (N, 10), boxes (N, 4), tile starts and Gaussian ids."""
+def _bin(
+    camera: _Camera, geometry: list[Tensor], colors: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Project, then sort into tiles: splats (N, 10), boxes (N, 4), tile starts and Gaussian ids.
+
+    Writes the normals into the last channels of ``colors`` where the camera asks for them.
+    """
     n, dtype = geometry[0].shape[0], geometry[0].dtype
     splats = torch.empty(n, _SPLAT, dtype=dtype)
     depths = torch.empty(n, dtype=dtype)
     boxes = torch.empty(n, 4, dtype=torch.int32)
-    entries = _call("project", dtype, camera, n, *geometry, splats, depths, boxes)
+    entries = _call(
+        "project", dtype, camera, n, colors.shape[1], *geometry, splats, depths, boxes, colors
+    )
     if entries >= 2**31:
         raise ValueError(
             f"the Gaussians cover {entries} tiles in all, expected under 2^31; scales is too large"
@@ -140,7 +168,9 @@ def _bin(camera: _Camera, geometry: list[Tensor]) -> tuple[Tensor, Tensor, Tenso
     return splats, boxes, starts, ids
 
 
-def _camera(K: Tensor, cam_from_world: Tensor, size: tuple[int, int]) -> _Camera:
+def _camera(
+    K: Tensor, cam_from_world: Tensor, size: tuple[int, int], options: RenderOptions
+) -> _Camera:
     """Return the camera as the kernel reads it, in float64."""
     (fx, _, cx), (_, fy, cy), _ = K.tolist()
     pose = cam_from_world.tolist()
@@ -152,6 +182,8 @@ def _camera(K: Tensor, cam_from_world: Tensor, size: tuple[int, int]) -> _Camera
         eps2d=DILATION_PX2,
         width=size[0],
         height=size[1],
+        antialiased=options.antialiased,
+        normals=options.normals,
         threads=torch.get_num_threads(),
     )
 

@@ -14,10 +14,13 @@ from torch import Tensor
 
 from express50.geometry.conventions import cell_to_corner
 from grmm.rasterize.projection import (
+    ALPHA_MAX,
     Pinhole,
     Projection,
+    RenderOptions,
     RenderOutput,
     Splats,
+    depth_of_rays,
     expected_depth,
     project,
 )
@@ -27,13 +30,15 @@ CHUNK = 32  # channels of one pass; more would not fit the shared memory of the 
 WIDTHS = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32)  # channel counts that every gsplat release compiles
 
 
-def rasterize_gsplat(scene: Splats, camera: Pinhole, background: Tensor | None) -> RenderOutput:
+def rasterize_gsplat(
+    scene: Splats, camera: Pinhole, background: Tensor | None, options: RenderOptions
+) -> RenderOutput:
     """Render; see ``grmm.rasterize``. The tensors must be float32 on a CUDA device."""
     gsplat = _require_gsplat(scene.means)
     width, height, K = camera.width, camera.height, camera.K
-    splats = project(scene, camera)
+    splats = project(scene, camera, options.antialiased)
     tiles = _tiles(gsplat, splats, width, height)
-    channels = [plane_channels(splats, K), scene.colors]
+    channels = [plane_channels(splats, K), splats.normals[:, : 3 * options.normals], scene.colors]
     passes = []
     for values in _padded_chunks(torch.cat(channels, 1)):
         image, alpha = gsplat.rasterize_to_pixels(
@@ -43,11 +48,19 @@ def rasterize_gsplat(scene: Splats, camera: Pinhole, background: Tensor | None) 
         passes.append(image[0])
     values, alpha = torch.cat(passes, -1), alpha[0, ..., 0]
     widths = [part.shape[1] for part in channels]
-    planes, image = values[..., : sum(widths)].split(widths, -1)
+    planes, normals, image = values[..., : sum(widths)].split(widths, -1)
     if background is not None:
         image = image + (1.0 - alpha)[..., None] * background
-    depth = expected_depth(combine_planes(planes, K), alpha, K)
-    return RenderOutput(colors=image, depth=depth, alpha=alpha)
+    median = None
+    if options.median_depth:
+        median = depth_of_rays(_median_ray_length(gsplat, splats, tiles, width, height), K)
+    return RenderOutput(
+        colors=image,
+        depth=expected_depth(combine_planes(planes, K), alpha, K),
+        alpha=alpha,
+        median_depth=median,
+        normals=normals if options.normals else None,
+    )
 
 
 def plane_channels(splats: Projection, K: Tensor) -> Tensor:
@@ -97,6 +110,55 @@ def _tiles(gsplat: Any, splats: Projection, width: int, height: int) -> tuple[Te
         splats.means2d[None], radii[None].contiguous(), splats.depths[None], TILE, columns, rows
     )
     return gsplat.isect_offset_encode(keys, 1, columns, rows), ids
+
+
+def _median_ray_length(
+    gsplat: Any, splats: Projection, tiles: tuple[Tensor, Tensor], width: int, height: int
+) -> Tensor:
+    """Return each pixel's ray length (H, W) where the transmittance passes one half.
+
+    gsplat's kernels do not report it, but list all pairs of Gaussian and pixel in order.
+    """
+    gaussians, pixels = _crossings(gsplat, splats, tiles, width, height)
+    center = cell_to_corner(
+        torch.stack([pixels % width, pixels // width], 1).to(splats.means2d.dtype)
+    )
+    length, slopes = splats.planes[gaussians, 0], splats.planes[gaussians, 1:]
+    length = length + (slopes * (center - splats.means2d[gaussians])).sum(1)
+    empty = length.new_zeros(height * width)
+    return empty.index_put((pixels,), length).reshape(height, width)
+
+
+@torch.no_grad()
+def _crossings(
+    gsplat: Any, splats: Projection, tiles: tuple[Tensor, Tensor], width: int, height: int
+) -> tuple[Tensor, Tensor]:
+    """Find Gaussian and pixel numbers (P,) where the transmittance falls through one half."""
+    offsets, ids = tiles
+    ends = torch.cat([offsets.flatten()[1:], offsets.new_tensor([len(ids)])])
+    batches = -(-int((ends - offsets.flatten()).max()) // TILE**2)
+    through = splats.means2d.new_ones(1, height, width)
+    gaussians, pixels, _ = gsplat.rasterize_to_indices_in_range(
+        0, batches, through, splats.means2d[None], splats.conics[None].contiguous(),
+        splats.opacities[None], width, height, TILE, offsets, ids,
+    )  # fmt: skip
+    center = cell_to_corner(
+        torch.stack([pixels % width, pixels // width], 1).to(splats.means2d.dtype)
+    )
+    dx, dy = (center - splats.means2d[gaussians]).unbind(1)
+    xx, xy, yy = splats.conics[gaussians].unbind(1)
+    sigma = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
+    alphas = (splats.opacities[gaussians] * torch.exp(-sigma)).clamp(max=ALPHA_MAX)
+    # One running sum of logarithms over all pixels; float64 keeps its end as exact as its start.
+    logs = torch.log1p(-alphas.double())
+    after = torch.cumsum(logs, 0)
+    first = torch.searchsorted(pixels, pixels)
+    after = torch.exp(after - (after - logs)[first])
+    before = after / (1.0 - alphas.double())
+    # Rounding may show two Gaussians at the half; the first of them is the one.
+    crosses = ((before > 0.5) & (after <= 0.5)).nonzero()[:, 0]
+    crosses = crosses[torch.cat([crosses.new_ones(1), pixels[crosses].diff()])[: len(crosses)] > 0]
+    return gaussians[crosses], pixels[crosses]
 
 
 def _padded_chunks(values: Tensor) -> list[Tensor]:

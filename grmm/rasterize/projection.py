@@ -26,6 +26,7 @@ NEAR_M = 0.01  # Gaussians whose mean is not beyond it are dropped
 DILATION_PX2 = 0.3  # added to the diagonal of every 2D covariance
 ALPHA_MAX = 0.99  # keeps 1 - alpha away from zero
 TRANSMITTANCE_MIN = 1e-4  # a pixel stops before it gets darker than this
+COMPENSATION_MIN = 0.005  # floor of the antialiasing factor: its square root has no slope at 0
 FOV_MARGIN = 0.15  # the Jacobian is clamped this part of the image size beyond the border
 TILE = 32  # pixels of the reference; only speed and memory depend on it
 
@@ -55,6 +56,15 @@ class Pinhole:
     height: int
 
 
+@dataclass(frozen=True, kw_only=True)
+class RenderOptions:
+    """The settings of ``rasterize``; see there."""
+
+    antialiased: bool
+    median_depth: bool
+    normals: bool
+
+
 @dataclass(frozen=True)
 class RenderOutput:
     """The images that ``rasterize`` returns.
@@ -63,11 +73,17 @@ class RenderOutput:
         colors: (H, W, C) blended colours (any channels), background included.
         depth: (H, W) RaDe expected depth, camera z in metres; 0 where alpha is 0.
         alpha: (H, W) in [0, 1).
+        median_depth: (H, W) camera z in metres of the plane of the Gaussian at which the
+            transmittance falls to one half or less; 0 where it never does. None unless asked for.
+        normals: (H, W, 3) blended unit normals of those planes, camera axes, towards the camera,
+            without background; divide by their length for a direction. None unless asked for.
     """
 
     colors: Tensor
     depth: Tensor
     alpha: Tensor
+    median_depth: Tensor | None = None
+    normals: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -80,7 +96,8 @@ class Projection:
         depths: (N,) camera z of the means, metres.
         planes: (N, 3) ray length l at the mean (m) and its slope (s_u, s_v) in m/px, so that the
             Gaussian lies at ray length ``l + s . (pixel - mean2d)``.
-        opacities: (N,).
+        normals: (N, 3) unit normals of those planes, camera axes, towards the camera.
+        opacities: (N,) after the antialiasing compensation, if any.
         extents: (N, 2) half width and height of the box in which alpha reaches 1/255, pixels.
         visible: (N,) bool, in front of the near plane and touching the image.
     """
@@ -89,12 +106,13 @@ class Projection:
     conics: Tensor
     depths: Tensor
     planes: Tensor
+    normals: Tensor
     opacities: Tensor
     extents: Tensor
     visible: Tensor
 
 
-def project(scene: Splats, camera: Pinhole) -> Projection:
+def project(scene: Splats, camera: Pinhole, antialiased: bool = False) -> Projection:
     """Project Gaussians into a camera; differentiable in their geometry and in the camera."""
     dtype, width, height = scene.means.dtype, camera.width, camera.height
     means, quats, scales, opacities, _ = (tensor.double() for tensor in vars(scene).values())
@@ -107,16 +125,22 @@ def project(scene: Splats, camera: Pinhole) -> Projection:
     jacobian = _jacobian(points, K, width, height)
     rows = _product(jacobian, _product(R, quat_to_matrix(quats)) * scales[:, None, :])
     variances = rows.square().sum(2)  # of u, v and the ray length
-    conics, slopes = _regression(rows, variances)
+    conics, slopes, compensation = _regression(rows, variances)
     planes = torch.cat([points.norm(dim=1, keepdim=True), slopes], 1)
     focal = torch.stack([K[0, 0], K[1, 1]])
     means2d = focal * points[:, :2] / points[:, 2:] + K[:2, 2]
+    if antialiased:
+        opacities = opacities * compensation
+    # On the plane (ray length - slope . pixel) is constant, so minus its derivative by camera
+    # coordinates points at the camera (RaDe-GS, section 3).
+    steep = (slopes[:, :, None] * jacobian[:, :2]).sum(1) - jacobian[:, 2]
     extents, visible = _extents(means2d, variances[:, :2] + DILATION_PX2, opacities, width, height)
     return Projection(
         means2d=means2d.to(dtype),
         conics=conics.to(dtype),
         depths=points[:, 2].to(dtype),
         planes=planes.to(dtype),
+        normals=torch.nn.functional.normalize(steep, dim=1).to(dtype),
         opacities=opacities.to(dtype),
         extents=extents,
         visible=visible & front,
@@ -154,8 +178,8 @@ def _clamp(value: Tensor, low: Tensor, high: Tensor) -> Tensor:
     return torch.where(value < low, low, torch.where(value > high, high, value))
 
 
-def _regression(rows: Tensor, variances: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the conics (N, 3) and slopes (N, 2) of the ray length.
+def _regression(rows: Tensor, variances: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the conics (N, 3), slopes (N, 2) of the ray length and antialiasing factors (N,).
 
     ``rows`` (N, 3, 3), a square root of the covariance over (u, v, ray length), and its diagonal
     ``variances`` (N, 3). The slope is that of the regression of the ray length t on the pixel,
@@ -169,11 +193,13 @@ def _regression(rows: Tensor, variances: Tensor) -> tuple[Tensor, Tensor]:
     xx, yy = variances[:, 0], variances[:, 1]
     xy, tu, tv = (u * v).sum(1), (t * u).sum(1), (t * v).sum(1)
     normal, eps2d = torch.linalg.cross(u, v), DILATION_PX2
-    det = normal.square().sum(1) + eps2d * (xx + yy) + eps2d * eps2d
+    det_sharp = normal.square().sum(1)
+    det = det_sharp + eps2d * (xx + yy) + eps2d * eps2d
     conics = torch.stack([(yy + eps2d) / det, -xy / det, (xx + eps2d) / det], 1)
     slope_u = (eps2d * tu + (normal * torch.linalg.cross(t, v)).sum(1)) / det
     slope_v = (eps2d * tv + (normal * torch.linalg.cross(u, t)).sum(1)) / det
-    return conics, torch.stack([slope_u, slope_v], 1)
+    compensation = (det_sharp / det).clamp(min=COMPENSATION_MIN**2).sqrt()
+    return conics, torch.stack([slope_u, slope_v], 1), compensation
 
 
 @torch.no_grad()
@@ -198,6 +224,12 @@ def ray_lengths(K: Tensor, width: int, height: int) -> Tensor:
     return (1.0 + x[None, :].square() + y[:, None].square()).sqrt()
 
 
+def depth_of_rays(ray_length: Tensor, K: Tensor) -> Tensor:
+    """Convert ``ray_length`` (H, W) along the rays of pixel centres to camera z (H, W)."""
+    height, width = ray_length.shape
+    return ray_length / ray_lengths(K, width, height).to(ray_length.dtype)
+
+
 def expected_depth(weighted_ray_length: Tensor, alpha: Tensor, K: Tensor) -> Tensor:
     """Compute the expected camera z (H, W), m, from sum of weight * ray length and alpha.
 
@@ -210,32 +242,42 @@ def expected_depth(weighted_ray_length: Tensor, alpha: Tensor, K: Tensor) -> Ten
     return torch.where(hit, weighted_ray_length / (safe * lengths), torch.zeros_like(alpha))
 
 
-def rasterize_reference(scene: Splats, camera: Pinhole, background: Tensor | None) -> RenderOutput:
+def rasterize_reference(
+    scene: Splats, camera: Pinhole, background: Tensor | None, options: RenderOptions
+) -> RenderOutput:
     """Render; see ``grmm.rasterize``."""
     width, height, K, colors = camera.width, camera.height, camera.K, scene.colors
-    splats = project(scene, camera)
+    splats = project(scene, camera, options.antialiased)
     visible = splats.visible.nonzero()[:, 0]
     order = visible[torch.sort(splats.depths[visible].detach(), stable=True).indices]
+    channels = torch.cat([colors, splats.normals], 1) if options.normals else colors
     rows = []
     for top in range(0, height, TILE):
         h = min(TILE, height - top)
         tiles = [
-            _blend(splats, colors, order, left, top, min(TILE, width - left), h)
+            _blend(splats, channels, order, left, top, min(TILE, width - left), h)
             for left in range(0, width, TILE)
         ]
         rows.append([torch.cat(parts, 1) for parts in zip(*tiles, strict=True)])
-    image, weighted, alpha = (torch.cat(parts, 0) for parts in zip(*rows, strict=True))
+    image, weighted, alpha, median = (torch.cat(parts, 0) for parts in zip(*rows, strict=True))
+    image, normals = image.split([colors.shape[1], image.shape[2] - colors.shape[1]], 2)
     if background is not None:
         image = image + (1.0 - alpha)[..., None] * background
-    return RenderOutput(colors=image, depth=expected_depth(weighted, alpha, K), alpha=alpha)
+    return RenderOutput(
+        colors=image,
+        depth=expected_depth(weighted, alpha, K),
+        alpha=alpha,
+        median_depth=depth_of_rays(median, K) if options.median_depth else None,
+        normals=normals if options.normals else None,
+    )
 
 
 def _blend(
     splats: Projection, colors: Tensor, order: Tensor, left: int, top: int, width: int, height: int
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Blend one tile front to back.
 
-    Returns colours (h, w, C), and (h, w) each: ray length * weight, alpha.
+    Returns colours (h, w, C), and (h, w) each: ray length * weight, alpha, median ray length.
 
     Guards as gsplat: alpha capped at 0.99, contributions under 1/255 skipped, and a pixel stops
     before the Gaussian that would bring its transmittance to 1e-4 or less.
@@ -261,10 +303,15 @@ def _blend(
     kept = after > TRANSMITTANCE_MIN
     weights = alpha * before * kept
     length, slope_u, slope_v = splats.planes[ids][:, :, None].unbind(1)
-    weighted = (weights * (length + slope_u * dx + slope_v * dy)).sum(0)
+    lengths = length + slope_u * dx + slope_v * dy
+    weighted = (weights * lengths).sum(0)
+    # At most one Gaussian per pixel takes the transmittance through one half.
+    crosses = kept & (before > 0.5) & (after <= 0.5)
+    median = torch.where(crosses, lengths, torch.zeros_like(lengths)).sum(0)
     image = weights.T @ colors[ids]
     return (
         image.reshape(height, width, -1),
         weighted.reshape(height, width),
         weights.sum(0).reshape(height, width),
+        median.reshape(height, width),
     )

@@ -39,10 +39,10 @@ def _setting_files(config: TrackConfig) -> dict[str, Path]:
     found = source_files(config.landmarks)
     if config.head != "procedural":
         found["head"] = Path(config.head).expanduser()
-    for name in ("head", "landmarks"):
+    for name, setting in (("head", "head"), ("landmarks", "landmarks"), ("fan", "landmarks")):
         if name in found and not found[name].exists():
             raise ConfigError(
-                f"track.{name} is {getattr(config, name)}: no such file; give its path, or"
+                f"track.{setting} is {getattr(config, setting)}: no such file; give its path, or"
                 " leave the setting out"
             )
     return found

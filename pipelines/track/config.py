@@ -19,7 +19,8 @@ class TrackConfig:
     head: str = "procedural"
     """Head model: procedural, the path of a FLAME pickle, or of ICT-FaceKit."""
     landmarks: str = "embedded"
-    """Source of landmarks: embedded, or the path of a file of points (docs/FORMAT.md)."""
+    """Source of landmarks: embedded, fan:PATH of FAN's TorchScript weights, or the path of a file
+    of points (docs/FORMAT.md)."""
     frames: Literal["peaks", "clips"] = "peaks"
     """Track the peak frames alone, or every frame of the cue windows as well."""
     stride: int = 1

@@ -19,9 +19,12 @@ class Scene:
     tensors: dict[str, Tensor]  # arguments of rasterize that are tensors, float64
     width: int
     height: int
+    antialiased: bool = False
 
 
-def random_scene(n: int, channels: int, width: int = 61, height: int = 47, seed: int = 0) -> Scene:
+def random_scene(
+    n: int, channels: int, width: int = 61, height: int = 47, seed: int = 0, antialiased=False
+) -> Scene:
     """A cloud that partly leaves the image, seen by a turned camera with an odd principal point."""
     generator = torch.Generator().manual_seed(seed)
 
@@ -48,6 +51,7 @@ def random_scene(n: int, channels: int, width: int = 61, height: int = 47, seed:
         },
         width,
         height,
+        antialiased,
     )
 
 
@@ -65,13 +69,19 @@ def render(scene: Scene, backend: str, dtype: torch.dtype = torch.float64) -> di
         **leaves,
         width=scene.width,
         height=scene.height,
+        antialiased=scene.antialiased,
+        median_depth=True,
+        normals=True,
         backend=backend,
     )
+    assert out.median_depth is not None and out.normals is not None
     generator = torch.Generator().manual_seed(7)
     images = {
         "image": out.colors,
         "depth": out.depth,
         "alpha": out.alpha,
+        "median_depth": out.median_depth,
+        "normals": out.normals,
     }
     loss = torch.zeros((), dtype=dtype)
     for image in images.values():

@@ -43,3 +43,13 @@ def rasterize_to_pixels(means2d, conics, colors, opacities, width, height, tile,
     weights = dense(means2d, conics, opacities, width, height, ids)
     image = (weights.T @ colors[0, ids]).reshape(1, height, width, -1)
     return image, weights.sum(0).reshape(1, height, width, 1)
+
+
+def rasterize_to_indices_in_range(
+    first, last, through, means2d, conics, opacities, width, height, tile, offsets, ids
+):
+    """Stand-in: all pairs that were blended, by pixel and nearest first."""
+    assert first == 0 and last * tile**2 >= len(ids) and through.shape == (1, height, width)
+    weights = dense(means2d, conics, opacities, width, height, ids.long())
+    pixels, places = (weights > 0).T.nonzero().unbind(1)
+    return ids.long()[places], pixels, torch.zeros_like(pixels)

@@ -12,9 +12,10 @@ from tests.grmm.gaussian_scenes import random_scene, relative_error, render
 
 
 @pytest.mark.parametrize("channels", [0, 3, 35, 70])
-def test_plane_channels_chunks_and_camera_gradients(channels, monkeypatch):
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_plane_channels_chunks_and_camera_gradients(channels, antialiased, monkeypatch):
     monkeypatch.setattr(gsplat_backend, "_require_gsplat", lambda means: gsplat_kernels)
-    scene = random_scene(60, channels, width=40, height=33, seed=2)
+    scene = random_scene(60, channels, width=40, height=33, seed=2, antialiased=antialiased)
     expected, got = render(scene, "reference"), render(scene, "gsplat")
     errors = {name: relative_error(expected[name], got[name]) for name in expected}
     assert max(errors.values()) < 1e-10, errors
@@ -52,10 +53,10 @@ def test_gsplat_matches_the_reference(channels):
     """Boundary-band metric: a few pixels may flip at alpha = 1/255, the others agree closely."""
     scene = random_scene(400, channels, width=128, height=96, seed=6)
     leaves = {k: v.float().cuda().requires_grad_() for k, v in scene.tensors.items()}
-    extra = {"width": 128, "height": 96}
+    extra = {"width": 128, "height": 96, "median_depth": True, "normals": True}
     got = rasterize(**leaves, **extra, backend="gsplat")
     expected = rasterize(**scene.tensors, **extra, backend="reference")
-    for name in ("colors", "depth", "alpha"):
+    for name in ("colors", "depth", "alpha", "median_depth", "normals"):
         difference = (getattr(got, name).cpu() - getattr(expected, name)).abs()
         assert (difference < 1e-4).double().mean() > 0.999, name
     got.colors.square().mean().backward()

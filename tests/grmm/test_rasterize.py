@@ -86,9 +86,10 @@ def test_contributions_under_one_level_are_skipped(backend):
     assert out.alpha[8, 12].item() == 0.0 and out.depth[8, 12].item() == 0.0
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize(("n", "channels"), [(50, 3), (300, 38), (200, 60), (150, 8), (100, 0)])
-def test_native_equals_reference_in_float64(n, channels):
-    scene = random_scene(n, channels, seed=n)
+def test_native_equals_reference_in_float64(n, channels, antialiased):
+    scene = random_scene(n, channels, seed=n, antialiased=antialiased)
     expected, got = render(scene, "reference"), render(scene, "cpu")
     errors = {name: relative_error(expected[name], got[name]) for name in expected}
     assert max(errors.values()) < 1e-12, errors
@@ -124,16 +125,18 @@ def test_every_variant_gives_the_same_float64_scene(variant, monkeypatch):
     width=st.integers(1, 40),
     height=st.integers(1, 40),
     seed=st.integers(0, 10_000),
+    antialiased=st.booleans(),
 )
-def test_native_equals_reference_on_random_scenes(n, channels, width, height, seed):
-    scene = random_scene(n, channels, width, height, seed)
+def test_native_equals_reference_on_random_scenes(n, channels, width, height, seed, antialiased):
+    scene = random_scene(n, channels, width, height, seed, antialiased)
     expected, got = render(scene, "reference"), render(scene, "cpu")
     for name in expected:
         assert torch.allclose(expected[name], got[name], rtol=1e-9, atol=1e-10), name
 
 
 @pytest.mark.parametrize("backend", CPU_BACKENDS)
-def test_gradients_match_finite_differences(backend):
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_gradients_match_finite_differences(backend, antialiased):
     scene = random_scene(7, 2, width=8, height=6, seed=3)
     scene.tensors["scales"] *= 10.0
     scene.tensors["opacities"] = 0.5 + 0.4 * scene.tensors["opacities"]
@@ -152,11 +155,15 @@ def test_gradients_match_finite_differences(backend):
             K=K,
             width=8,
             height=6,
+            antialiased=antialiased,
+            median_depth=True,
+            normals=True,
             backend=backend,
         )
-        return out.colors, out.depth, out.alpha
+        return out.colors, out.depth, out.alpha, out.median_depth, out.normals
 
     assert images(intrinsics, *tensors.values())[2].max() > 0.3
+    assert (images(intrinsics, *tensors.values())[3] > 0).any()
     assert torch.autograd.gradcheck(
         images, (intrinsics, *tensors.values()), eps=1e-6, atol=1e-6, rtol=1e-4
     )
@@ -245,6 +252,37 @@ def test_depth_of_a_plane(backend, angle):
         # Nearer neighbours win; blending the z of the means is biased by slope times splat size.
         assert error.mean() < 0.15 * (out.colors[..., 0] / out.alpha - truth).abs().mean()
         assert error.max() < 2e-3
+
+
+@pytest.mark.parametrize("backend", CPU_BACKENDS)
+@pytest.mark.parametrize("angle", [0.0, 0.6, -1.0])
+def test_normals_of_a_plane_face_the_camera(backend, angle):
+    normal = torch.tensor([math.sin(angle), 0.0, math.cos(angle)], dtype=F64)
+    out = rasterize(**plane(normal), width=64, height=48, normals=True, backend=backend)
+    got = torch.nn.functional.normalize(out.normals, dim=-1)
+    # The dilated covariance bends them a little towards the ray.
+    assert (got @ -normal).min() > math.cos(math.radians(5))
+    assert torch.allclose(out.normals.norm(dim=-1), out.alpha, rtol=1e-3)
+
+
+@pytest.mark.parametrize("backend", CPU_BACKENDS)
+def test_median_depth_is_that_of_the_gaussian_at_one_half(backend):
+    def median(*opacities):
+        scene = on_axis(*range(1, len(opacities) + 1), opacities=list(opacities))
+        out = rasterize(**scene, width=17, height=17, median_depth=True, backend=backend)
+        return out.median_depth[8, 8].item()
+
+    assert median(0.4, 0.4, 0.4) == pytest.approx(2.0, abs=1e-13)  # T = 0.6, then 0.36
+    assert median(0.5, 0.9) == pytest.approx(1.0, abs=1e-13)  # exactly one half counts
+    assert median(0.2, 0.3) == 0.0  # T = 0.56
+
+
+def test_median_depth_and_normals_come_only_when_asked():
+    scene = random_scene(20, 4).tensors
+    plain = rasterize(**scene, width=61, height=47)
+    assert plain.median_depth is None and plain.normals is None
+    both = rasterize(**scene, width=61, height=47, median_depth=True, normals=True)
+    assert torch.equal(plain.colors, both.colors) and torch.equal(plain.depth, both.depth)
 
 
 @pytest.mark.parametrize("backend", CPU_BACKENDS)

@@ -254,7 +254,9 @@ def test_a_video_is_tracked_in_every_frame(tmp_path: Path, astronaut: np.ndarray
     assert moved[-1] - moved[0] == pytest.approx(4.0, abs=0.5)
 
 
-@pytest.mark.parametrize("setting", ["head=flame.pkl", "landmarks=points.npz"])
+@pytest.mark.parametrize(
+    "setting", ["head=flame.pkl", "landmarks=points.npz", "landmarks=fan:x.pt"]
+)
 def test_a_missing_file_is_reported_with_the_setting_that_names_it(
     tracked: tuple[Path, dict], tmp_path: Path, setting: str, capsys: pytest.CaptureFixture
 ) -> None:

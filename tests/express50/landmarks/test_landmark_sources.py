@@ -1,4 +1,4 @@
-"""Irises, teeth and files of points."""
+"""Irises, teeth, FAN and files of points: what stands beside the embedded network."""
 
 from __future__ import annotations
 
@@ -6,17 +6,23 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+import torch
 
-from express50.errors import FormatError
+from express50.errors import ConfigError, FormatError
 from express50.geometry.cameras import Camera, project
-from express50.landmarks.detector import Detection, detect
+from express50.landmarks.detector import Detection, detect, points_in_crop
 from express50.landmarks.irises import EYES, find_irises
 from express50.landmarks.network import load_network
 from express50.landmarks.sources import (
+    FAN_CROP,
     SCHEMA,
+    fan_window,
+    find_with_fan,
     given_detection,
+    load_fan,
     open_source,
     read_points,
     source_files,
@@ -80,6 +86,48 @@ def test_lips_are_seen_apart_over_teeth() -> None:
     assert 3.5 < gap < 7.5  # her teeth show over five pixels
 
 
+class StandIn(torch.nn.Module):
+    """FAN's signature: heat peaks where the crop is brightest, the same for all points."""
+
+    def forward(self, crops: torch.Tensor) -> list[torch.Tensor]:
+        heat = torch.nn.functional.avg_pool2d(crops.mean(1, keepdim=True), 4)
+        return [heat.expand(-1, 68, -1, -1), heat.expand(-1, 68, -1, -1)]
+
+
+def fan_file(folder: Path, module: torch.nn.Module) -> Path:
+    path = folder / "fan.pt"
+    torch.jit.script(module).save(str(path))
+    return path
+
+
+def test_fan_gives_points_in_image_pixels(tmp_path: Path) -> None:
+    image = np.zeros((SIZE, SIZE, 3), np.uint8)
+    cv2.circle(image, (120, 90), 3, (255, 255, 255), -1)
+    points = np.random.default_rng(0).uniform(60, 150, (68, 2))
+    face = Detection(points, np.ones(68), np.full(68, 0.9), 0.8)
+    found = find_with_fan(load_fan(fan_file(tmp_path, StandIn())), image, face)
+    np.testing.assert_allclose(found.points, np.tile([120.5, 90.5], (68, 1)), atol=0.7)
+    assert found.score == face.score
+    assert (found.sigma > 0).all() and (found.confidence <= 0.8).all()
+
+
+def test_fan_sees_the_whole_face() -> None:
+    points = np.random.default_rng(1).uniform(400, 500, (68, 2))
+    inside = points_in_crop(fan_window(points), points)
+    assert inside.min() > 0.1 * FAN_CROP and inside.max() < 0.9 * FAN_CROP
+
+
+def test_wrong_or_absent_weights_are_one_clear_error(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no file"):
+        open_source(f"fan:{tmp_path / 'absent.pt'}", {})
+    (tmp_path / "text.pt").write_text("no weights")
+    with pytest.raises(ConfigError, match="cannot be loaded") as caught:
+        open_source(f"fan:{tmp_path / 'text.pt'}", {})
+    assert "miniz" not in str(caught.value)  # PyTorch guesses that the file is corrupted
+    with pytest.raises(ConfigError, match=r"gives \(1, 3, 256, 256\)"):
+        load_fan(fan_file(tmp_path, torch.nn.Identity()))
+
+
 def given_rows(count: int = 68) -> np.ndarray:
     rng = np.random.default_rng(3)
     return np.concatenate([rng.uniform(60, 140, (count, 2)), np.ones((count, 1))], axis=1)
@@ -134,9 +182,7 @@ def test_bad_points_are_refused(tmp_path: Path, change, message: str) -> None:
         read_points(path, {"a": LENS})
 
 
-def test_other_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match="No such file"):
-        open_source(str(tmp_path / "absent.npz"), {})
+def test_files_that_are_none_are_refused(tmp_path: Path) -> None:
     path = write_json(tmp_path / "p.json", given_rows(), camera="z")
     with pytest.raises(FormatError, match="cameras z"):
         read_points(path, {"a": LENS})
