@@ -11,6 +11,7 @@ import re
 import signal
 import sys
 import traceback
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -65,7 +66,7 @@ def run_handler(
     Any error becomes one line on standard error; with EXPRESS50_DEBUG=1 the traceback follows.
     """
     try:
-        with _stop_on_sigterm():
+        with _stop_on_sigterm(), _warnings_on_one_line(program):
             code = handler(args)
         with readers_may_leave(sys.stdout):
             sys.stdout.flush()
@@ -80,6 +81,17 @@ def run_handler(
             f"{program}: interrupted; finished work is kept, run the same command to continue\n"
         )
         return INTERRUPTED
+
+
+@contextlib.contextmanager
+def _warnings_on_one_line(program: str) -> Iterator[None]:
+    """Print warnings as lines of the program: a place in a library's code helps no user."""
+    former = warnings.formatwarning
+    warnings.formatwarning = lambda message, *_args, **_kw: f"{program}: warning: {message}\n"
+    try:
+        yield
+    finally:
+        warnings.formatwarning = former
 
 
 def _line_of(error: Exception) -> str:

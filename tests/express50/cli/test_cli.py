@@ -268,3 +268,13 @@ def test_interrupt_keeps_what_is_finished_and_says_so(run, data, capture, monkey
     code, out, err = run("ingest", data, capture)
     assert (code, out) == (130, "")
     assert "interrupted" in err
+
+
+def test_a_librarys_warning_is_one_line_without_its_place():
+    code = (
+        "import argparse, warnings\n"
+        "from express50.console import run_handler\n"
+        "run_handler('grmm', lambda args: warnings.warn('slow') or 0, argparse.Namespace())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stderr == "grmm: warning: slow\n"
