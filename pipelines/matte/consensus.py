@@ -75,6 +75,8 @@ class Agreement:
 def agree(views: Sequence[MatteView], cells: int) -> Agreement:
     """Compare the views of one frame set, on `cells` cells along each side of space."""
     doubted = {view.name: why for view in views if (why := _why_useless(view))}
+    # Most of the others must be right; otherwise the wrong ones cannot be identified.
+    most = len(doubted) + (len(views) - len(doubted)) // 3
     while True:
         used = [view for view in views if view.name not in doubted]
         if len(used) < FEWEST:
@@ -82,8 +84,7 @@ def agree(views: Sequence[MatteView], cells: int) -> Agreement:
             return Agreement(warnings=_named(doubted), unchanged=few)
         removed, filled, misfits = _compare(used, cells)
         worst = max(misfits, key=lambda name: misfits[name].size)
-        # Most cameras must be right; otherwise the wrong ones cannot be identified.
-        if misfits[worst].size <= 1 or len(doubted) >= len(views) // 3:
+        if misfits[worst].size <= 1 or len(doubted) >= most:
             return Agreement(removed, filled, _named(doubted))
         doubted[worst] = misfits[worst].words
 

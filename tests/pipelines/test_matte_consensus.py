@@ -103,6 +103,15 @@ def test_one_wrong_camera_is_named_and_other_mattes_stay(wrong):
     assert changed(found) == set()
 
 
+def test_empty_mattes_do_not_keep_a_wrong_one_from_being_named():
+    views = make_views()
+    nothing = {k: np.zeros((SIZE, SIZE)) for k in (0, 3, 6, 9)}
+    wrong = np.roll(views[5].alpha, SIZE // 3, axis=1)
+    found = agree(with_alpha(views, nothing | {5: wrong}), **OPTIONS)
+    assert {note.what for note in found.warnings} == {views[k].name for k in (*nothing, 5)}
+    assert views[5].name not in changed(found)
+
+
 def test_a_wrong_camera_does_not_hide_what_another_must_remove():
     views = make_views()
     shade = disc(0.12, 0.3, 0.09)
