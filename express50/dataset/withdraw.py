@@ -6,9 +6,9 @@ A checkpoint loses the person's codes and frames; only retraining removes what i
 learned. The raw capture lies outside the dataset: deleting it is up to its owner.
 
 Ids match as whole words: with letters or digits next to it, it is a different id, and so is a part
-of another subject's id (S001 of S001_2). Archives, arrays
-of text and the ledger are searched; pixels and points are not, as they may contain any four bytes
-by chance.
+of another subject's id (S001 of S001_2). A number in JSON or TOML is not an id. Archives, arrays of
+text and the ledger are searched; pixels and points are not, as they may contain any four bytes by
+chance.
 """
 
 from __future__ import annotations
@@ -51,6 +51,11 @@ WORD = (string.ascii_letters + string.digits + "_-").encode()
 TEXT_LIMIT = 1 << 24
 RUN = re.compile(rb"[A-Za-z0-9][A-Za-z0-9_-]*")
 PART = re.compile(rb"[A-Za-z0-9]+")
+# Numbers in JSON and TOML, also several in one text, and decimals: an id of digits is none of them.
+_RUN = rb"(?:\s*+,?\s*+-?\d[\d.eE+-]*+(?![\w/]))++"
+NUMBERS = re.compile(
+    rb"[:=\[]" + _RUN + rb"|,(?P<row>" + _RUN + rb')(?P<end>\s*\])?|"\d+(?: \d+)++"|\d{1,20}\.\d+'
+)
 LONGEST_ID = 6  # in parts joined by '_' or '-'
 
 
@@ -211,8 +216,17 @@ def names_in(dataset: Dataset, subject: str) -> Test:
 def names(subject: str, others: Collection[str] = ()) -> Test:
     """Make a test of whether a text names a subject, and not just ``others`` with longer ids."""
     longer = sorted((other for other in others if subject in other), key=len, reverse=True)
-    word = _words([*longer, subject])
-    return lambda text: any(m[0] == subject.encode() for m in word.finditer(text))
+    word, number = _words([*longer, subject]), subject.isdigit()
+
+    def says_it(text: bytes) -> bool:
+        text = _without_numbers(text) if number else text
+        return any(m[0] == subject.encode() for m in word.finditer(text))
+
+    return says_it
+
+
+def _without_numbers(text: bytes) -> bytes:
+    return NUMBERS.sub(lambda m: m[0] if m["row"] and not m["end"] else b" ", text)
 
 
 def _words(ids: Sequence[str]) -> re.Pattern[bytes]:
@@ -246,7 +260,7 @@ def names_any_of(digests: Collection[str], others: Collection[str] = ()) -> Test
             seen[run] = any(map(says_one, longer.sub(b" ", run).split()))
         return seen[run]
 
-    return lambda text: any(hit(run) for run in set(RUN.findall(text)))
+    return lambda text: any(hit(run) for run in set(RUN.findall(_without_numbers(text))))
 
 
 def files_that(test: Test, root: Path) -> Iterator[Path]:

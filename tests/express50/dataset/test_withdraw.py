@@ -225,6 +225,18 @@ def test_no_subject_is_withdrawn_while_a_stage_runs(dataset):
     assert after == before
 
 
+@pytest.mark.parametrize("test", [names("104"), names_any_of({text_digest("104")})])
+def test_a_number_is_not_an_id_of_digits(test):
+    for text in (
+        '{"frame": 104, "x": 0.104}', '[103,104]', '[["smile", 104, 111]]', "x = 104\n",
+        '{"pts": "103 104 105"}', "error 0.104 px", '{"n":104}', "[\n 104\n]",
+    ):  # fmt: skip
+        assert not test(text.encode()), text
+    for text in ('{"subject": "104"}', "track/104/track.npz", "\n104\n", "104_smile_cam00.json",
+                 "104,smile,3\n", '["104"]', '{"104": "/a"}', "104: no face"):  # fmt: skip
+        assert test(text.encode()), text
+
+
 def test_ids_at_the_joint_of_two_blocks_are_whole_words(tmp_path, monkeypatch):
     monkeypatch.setattr(withdraw_module, "CHUNK", 8)
     for text, found in (("abc S0012 x", []), ("abc S001 x", [True]), ("xyz1 S001", [True])):
