@@ -57,10 +57,8 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument("--head", default=default.head, help=words["head"] + f" [{default.head}]")
     parser.add_argument("--expressions", metavar="ID,ID...", help=words["expressions"])
     parser.add_argument("--wear", metavar="KIND,KIND...", default="", help=words["wear"])
-    kind = parser.add_mutually_exclusive_group()
-    kind.add_argument("--video", action="store_true", help="write H.264 videos [default]")
-    kind.add_argument("--frames", choices=("png", "jpg"), nargs="?", const="png",
-                      help="write single images instead of videos")  # fmt: skip
+    parser.add_argument("--frames", choices=("png", "jpg"), nargs="?", const="png",
+                        help="write single images instead of H.264 videos")  # fmt: skip
     parser.add_argument("--give-calibration", action="store_true", help=words["give_calibration"])
     parser.add_argument("--no-plates", action="store_true", help="leave clean plates out")
     parser.add_argument("--no-hair", action="store_true", help="bald subjects")

@@ -41,7 +41,7 @@ def fits_photos(path: Path) -> bool:
 def read_photos(path: Path, selection: Selection) -> RawCapture:
     """Read each photograph as a camera of one moment; calibrate solves the cameras.
 
-    A photograph that lies on its side by its EXIF is read upright.
+    A photograph whose EXIF says that it lies on its side is read upright.
 
     Raises:
         CaptureError: two names become one camera id, or no photograph can be used.
@@ -140,7 +140,7 @@ def _read_posed(
     scale, warnings = selection.metres_per_unit, {}
     if scale is None:
         warnings["scale"] = (
-            f"{layout} does not say what its unit is, metres are assumed; say metres_per_unit in "
+            f"{layout} does not state its unit, metres are assumed; set metres_per_unit in "
             "capture.toml"
         )
     return RawCapture(

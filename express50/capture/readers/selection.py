@@ -63,7 +63,7 @@ class Selection:
 
 
 def identifier(text: str, other: str = "_-") -> str:
-    """Make an id of any text: ``_`` replaces all but letters, digits and ``other``."""
+    """Make an id of any text: ``_`` replaces everything but letters, digits and ``other``."""
     clean = re.sub(rf"[^A-Za-z0-9{re.escape(other)}]+", "_", text).strip("_-")
     return clean or "unnamed"
 

@@ -118,7 +118,7 @@ class Clip:
 
     @property
     def sequence(self) -> str:
-        """Return clip's name as an expression: ``happy_strong_kids_1``, of songs ``song_...``."""
+        """Return the clip's name as an expression: ``happy_strong_kids_1``, ``song_sad_...``."""
         words = [self.emotion, self.intensity, self.statement, str(self.repetition)]
         return "_".join(["song", *words] if self.channel == "song" else words)
 
@@ -214,7 +214,7 @@ def video_id(path: Path) -> str:
 def read_video(path: Path, selection: Selection) -> RawCapture:
     """Read a video as one camera and one clip, named ``clip`` unless the selection names it.
 
-    A video that lies on its side, as telephones store what they film upright, is read upright.
+    A video that a phone stored on its side is read upright.
 
     Raises:
         CaptureError: it is not a video.
