@@ -16,6 +16,7 @@ perceptron that sees it and the landmarks.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -289,8 +290,9 @@ def save_network(net: LandmarkNet, path: Path) -> None:
         np.savez_compressed(file, **state)
 
 
+@lru_cache(maxsize=2)  # landmarks in pictures, and on the face UV map
 def load_network(path: Path = WEIGHTS) -> LandmarkNet:
-    """Read weights written by `save_network`, for evaluation only.
+    """Read weights written by `save_network`, for evaluation only. Callers share the network.
 
     Batch normalisations are folded into the convolutions before them.
     """

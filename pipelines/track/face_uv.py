@@ -11,7 +11,6 @@ the jaw line, which is not an edge on the map.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -102,7 +101,7 @@ def slide_term(
     colors, mass = unwrap(model, uv_map, pictures, mesh)
     if not (mass > LEAST_SEEN).any():
         return None
-    at, error = read_marks(uv_network(), colors)
+    at, error = read_marks(load_network(UV_WEIGHTS), colors)
     rims = LIPS_APART[FIRST:]
     # Single precision is for places about the head, not for those of the world.
     places = uv_map.image((uv_map.samples.at(mesh) - mesh.mean(0)).astype(np.float32))
@@ -152,12 +151,6 @@ def between(places: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     c, d = places[row + 1, column], places[row + 1, column + 1]
     steps = [np.linalg.norm(x - y, axis=1) for x, y in ((a, b), (c, d), (a, c), (b, d))]
     return bilinear(places, at).astype(np.float64), np.max(steps, axis=0)
-
-
-@lru_cache(maxsize=1)
-def uv_network() -> LandmarkNet:
-    """Read the shipped network once."""
-    return load_network(UV_WEIGHTS)
 
 
 @dataclass(frozen=True)

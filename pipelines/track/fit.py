@@ -97,11 +97,13 @@ def vertex_sigma(
     root = axes / np.sqrt(np.maximum(values, 1e-9 * values[-1]))  # of the shared covariance
     every, found = Points(basis, np.arange(len(basis.model.template))), []
     for pose, (inverse, follow) in zip(state.poses, own, strict=True):
+        spread = np.concatenate([root[:-BIAS], follow @ root])
+        covariance = spread @ spread.T
+        covariance[basis.shape_size :, basis.shape_size :] += inverse
         jacobian = every.linearise(np.r_[state.shape, pose.own], pose.rotation)[1]
-        slope = jacobian[..., basis.shape_size :]
-        along = slope @ (follow @ root) + jacobian[..., : basis.shape_size] @ root[:-BIAS]
-        alone = np.einsum("vij,jk,vik->v", slope, inverse, slope, optimize=True)
-        found.append(np.sqrt(np.maximum((along**2).sum((1, 2)) + alone, 0)))
+        slope = jacobian.reshape(-1, len(covariance))
+        variance = np.einsum("vi,vi->v", slope @ covariance, slope).reshape(-1, 3).sum(1)
+        found.append(np.sqrt(np.maximum(variance, 0)))
     return np.stack(found)
 
 

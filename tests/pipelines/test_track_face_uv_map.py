@@ -11,7 +11,8 @@ import torch
 from express50.errors import HeadModelError
 from express50.geometry.raycast import mesh_scene
 from express50.head.load import load_head
-from express50.landmarks.network import MIRROR, trainable_network
+from express50.landmarks.network import MIRROR, load_network, trainable_network
+from pipelines.track.config import UV_WEIGHTS
 from pipelines.track.face_uv import (
     FIRST,
     HEIGHT,
@@ -27,7 +28,6 @@ from pipelines.track.face_uv import (
     reading_map,
     to_texels,
     to_window,
-    uv_network,
     window,
 )
 from pipelines.track.face_uv_training.cases import Case, Lamps, draw_case, draw_meshes, draw_person
@@ -175,7 +175,7 @@ def test_the_shipped_network_finds_landmarks_of_heads_it_has_not_seen(cases) -> 
         for seed in range(4):
             drawn = warped(case, np.random.default_rng(seed))
             true, known = where_seen(drawn, to_texels(MARKS))
-            at, error = read_marks(uv_network(), np.float32(drawn.colors) / 255.0)
+            at, error = read_marks(load_network(UV_WEIGHTS), np.float32(drawn.colors) / 255.0)
             assert at.shape == (68 - FIRST, 2) and (error > 0).all()
             shown = known[FIRST:]
             before.append(np.linalg.norm(true[FIRST:] - mark_places(), axis=1)[shown].mean())
@@ -188,8 +188,8 @@ def test_what_is_seen_far_from_home_is_not_read_nearer_to_it(cases, shift) -> No
     moved = []
     for case in cases:
         colors = np.float32(case.colors) / 255.0
-        at, _ = read_marks(uv_network(), colors)
-        there, _ = read_marks(uv_network(), np.roll(colors, shift, axis=(1, 0)))
+        at, _ = read_marks(load_network(UV_WEIGHTS), colors)
+        there, _ = read_marks(load_network(UV_WEIGHTS), np.roll(colors, shift, axis=(1, 0)))
         moved.append((there - at).mean(0))
     assert np.abs(np.mean(moved, axis=0) - shift).max() < SHORT, moved
 
@@ -212,8 +212,8 @@ def test_creases_darken_lips_and_lids_that_are_seen_and_nothing_else() -> None:
 
 def test_a_mirror_image_is_read_as_one(cases) -> None:
     colors = np.float32(cases[0].colors) / 255.0
-    at, error = read_marks(uv_network(), colors)
-    flipped, same = read_marks(uv_network(), colors[:, ::-1].copy())
+    at, error = read_marks(load_network(UV_WEIGHTS), colors)
+    flipped, same = read_marks(load_network(UV_WEIGHTS), colors[:, ::-1].copy())
     back = np.stack([WIDTH - flipped[:, 0], flipped[:, 1]], axis=1)
     order = MIRROR[FIRST:] - FIRST
     np.testing.assert_allclose(back[order], at, atol=0.02)
@@ -222,7 +222,7 @@ def test_a_mirror_image_is_read_as_one(cases) -> None:
 
 @pytest.mark.parametrize("level", [0.0, 1.0, 1e6])
 def test_a_chart_of_one_colour_gives_finite_landmarks(level: float) -> None:
-    at, error = read_marks(uv_network(), np.full((HEIGHT, WIDTH, 3), level, np.float32))
+    at, error = read_marks(load_network(UV_WEIGHTS), np.full((HEIGHT, WIDTH, 3), level, np.float32))
     assert np.isfinite(at).all() and np.isfinite(error).all()
 
 
