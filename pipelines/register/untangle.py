@@ -2,7 +2,8 @@
 
 Intersecting faces are pushed apart until a plane separates them; a thin plate spreads the push over
 the skin around. Each step starts from the one before, so separated faces do not spring back, and
-closed lips still touch. Eyeballs and teeth do not move.
+closed lips still touch. Where skin is crumpled, neighbouring faces intersect: their corners move
+as the vertices around them do on average. Eyeballs and teeth do not move.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ SHARE, GROWTH = 0.4, 0.05
 # at rest if the cosine is over the second.
 OPPOSED, AGREE = -0.3, 0.3
 BACK_STEPS = 8  # in these first steps, opposed faces move back against their normals
+FLAT = 16  # from this step on, crumpled skin is flattened
+PUSHED_ONLY, EVERY = 3, 4  # crumpled faces are pushed in these first steps, then in every fourth
 
 
 def crossing_pairs(model: HeadModel, mesh: np.ndarray) -> np.ndarray:
@@ -68,7 +71,11 @@ def untangled(model: HeadModel, mesh: np.ndarray) -> np.ndarray:
         return mesh
     skin, best, fewest = Skin(model, mesh), mesh, len(pairs)
     for step in range(STEPS):
-        mesh = mesh + skin.parting(mesh, pairs, step)
+        crumpled = skin.joined(pairs) & (step >= PUSHED_ONLY) & (step % EVERY != EVERY - 1)
+        if crumpled.any():
+            mesh = skin.evened(mesh, pairs[crumpled], step)
+        if not crumpled.all():
+            mesh = mesh + skin.parting(mesh, pairs[~crumpled], step)
         pairs = crossing_pairs(model, mesh)
         if len(pairs) < fewest:
             best, fewest = mesh, len(pairs)
@@ -97,6 +104,31 @@ class Skin:
         stiffness, mass = cotangent_laplacian(mesh, self.faces)
         scale = (WAVE_M / (2 * np.pi)) ** 2 * (np.median(mass) * mass) ** -0.5
         self.bend = sparse.diags(scale) @ stiffness
+        edges = np.concatenate([self.faces[:, [k, (k + 1) % 3]] for k in range(3)])
+        half = sparse.coo_matrix((np.ones(len(edges)), edges.T), (len(mesh),) * 2).tocsr()
+        self.edges = half + half.T
+
+    def joined(self, pairs: np.ndarray) -> np.ndarray:
+        """Mark the pairs (P,) of faces that an edge joins."""
+        first, second = (self.faces[pairs[:, k]] for k in range(2))
+        found = [
+            np.asarray(self.edges[first[:, i], second[:, j]]).ravel() > 0
+            for i in range(3)
+            for j in range(3)
+        ]
+        return np.any(found, axis=0)
+
+    def evened(self, mesh: np.ndarray, pairs: np.ndarray, step: int) -> np.ndarray:
+        """Return the mesh with the pairs' corners moved half way to their neighbours' mean."""
+        some = np.unique(self.faces[pairs])
+        some = some[self.free[some]]
+        # The model itself may be crumpled there: later steps leave its shape out.
+        rest = self.rest * (step < FLAT)
+        moved, around = mesh - rest, self.edges[some]
+        mean = (around @ moved) / np.asarray(around.sum(1)).reshape(-1, 1)
+        result = mesh.copy()
+        result[some] = rest[some] + (moved[some] + mean) / 2
+        return result
 
     def parting(self, mesh: np.ndarray, pairs: np.ndarray, step: int) -> np.ndarray:
         """Return moves (V, 3) that separate the pairs further; steps count from 0."""
