@@ -344,7 +344,8 @@ def run_agree(args: argparse.Namespace) -> int:
         return answer(args, data, "no expression was marked by two people yet")
     groups = {"all": overall} | pairs | expressions
     lines = table(("of", *_FIGURES), [{"of": name} | row for name, row in groups.items()])
-    return answer(args, data, *lines, f"alpha of all, 95 %: {overall['alpha_interval']}")
+    interval = overall["alpha_interval"]
+    return answer(args, data, *lines, f"alpha of all, 95 %: {interval or 'n/a (too few clips)'}")
 
 
 def run_review(args: argparse.Namespace) -> int:

@@ -184,6 +184,7 @@ class FrameDialog(ModalScreen[int | None]):
             self.dismiss(number)
         else:
             event.input.clear()
+            event.input.placeholder = f"{number} is outside {self._first} to {self._last}"
 
 
 class HelpDialog(ModalScreen[None]):

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 from rich.text import Text
+from textual.widgets import Input
 
 from annotations import cli
 from annotations.labels import append_label, current_labels, make_mark, read_labels
@@ -79,7 +80,10 @@ def test_every_movement_key_moves_the_cursor(suggested, make_app):
                 assert app.desk.query_one("#frame", PicturePane).look.frame == frame
             await pilot.press("g", "2", "9", "enter")
             assert app.desk.view.cursor == 29
-            await pilot.press("g", "7", "escape")
+            await pilot.press("g", "7", "enter")
+            await pilot.pause()
+            assert "7 is outside" in app.screen.query_one(Input).placeholder
+            await pilot.press("escape")
             assert app.desk.view.cursor == 29
 
     asyncio.run(run())
