@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -14,7 +15,14 @@ from express50.geometry.cameras import inside_frame, rays
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.raycast import camera_rays, join_rays, mesh_scene
 from express50.geometry.sampling import bilinear
-from pipelines.depth.views import DepthView, hull_distance, silhouette_distance
+from pipelines.depth.views import (
+    DepthView,
+    hull_distance,
+    in_picture,
+    project_fast,
+    silhouette_distance,
+)
+from pipelines.regions.things import NEAR_M, FaceView
 
 REACH = 0.015  # metres that the hull may lie above a mesh that is trusted; beyond is hair or cloth
 BORDER = 0.03  # metres from the mesh's open border, where collars are, over which trust grows
@@ -34,7 +42,7 @@ class TrackedSolid:
     """A tracked mesh with caps over its holes, and those over large ones (the neck) as `border`.
 
     `body` goes on below large holes: silhouettes of a torso are not those of a head. `glasses` are
-    places (n, 3) all over frames and lenses.
+    places (n, 3) all over frames and lenses. `shown` are views of the face with things before it.
     """
 
     scene: o3d.t.geometry.RaycastingScene
@@ -43,6 +51,22 @@ class TrackedSolid:
     low: np.ndarray
     high: np.ndarray
     glasses: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    shown: tuple[FaceView, ...] = ()
+
+    @cached_property
+    def bare_px(self) -> list[np.ndarray]:
+        """Return the signed distances (H, W), pixels, to the edge of what shows the face."""
+        return [silhouette_distance(view.bare.astype(np.float32)) for view in self.shown]
+
+    def carved(self, points: np.ndarray, hull: np.ndarray) -> np.ndarray:
+        """Take the room before the face that views see away from the hull's distances (N,)."""
+        for view, bare in zip(self.shown, self.bare_px, strict=True):
+            pixels, depth = project_fast(view.camera, points)
+            inside = in_picture(view.camera, pixels, depth)
+            before = bilinear(view.depth, pixels[inside]) - NEAR_M - depth[inside]
+            beside = bilinear(bare, pixels[inside]) * depth[inside] / view.camera.K[0, 0]
+            hull[inside] = np.maximum(hull[inside], np.minimum(before, beside))
+        return hull
 
     def merge(
         self, points: np.ndarray, hull: np.ndarray, outlines: Sequence[DepthView], reach: float

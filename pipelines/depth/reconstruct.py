@@ -10,7 +10,7 @@ its own with other supports and scores (docs/LOG.md, Depth).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -91,15 +91,19 @@ def reconstruct(
     outlines = [] if solid is None else solid.outlines(views)
     clear = views if solid is None else solid.without_glasses(views)
 
-    def start(points: np.ndarray) -> np.ndarray:
+    def room(points: np.ndarray) -> np.ndarray:
         hull = hull_distance(views, points)
+        return hull if solid is None else solid.carved(points, hull)
+
+    def start(points: np.ndarray) -> np.ndarray:
+        hull = room(points)
         return hull if solid is None else solid.merge(points, hull, outlines, 2 * voxels[0])
 
     grid = build(low, high, voxels[0], start)
     for level, voxel in enumerate(voxels):
         if grid.voxel != voxel:
             grid = refined(grid, voxel)
-        hull = _hull_near(views, grid)
+        hull = _hull_near(room, grid)
         grid = combined(np.maximum, grid, hull)
         if solid is None or level:
             grid = fair(grid, FAIR_VOXELS * voxel)
@@ -142,13 +146,13 @@ def _check_size(low: np.ndarray, high: np.ndarray, voxel: float) -> None:
         )
 
 
-def _hull_near(views: Sequence[DepthView], grid: LevelSet) -> LevelSet:
-    """Measure distances to the visual hull near the grid's surface; elsewhere they are inside."""
+def _hull_near(hull_of: Callable[[np.ndarray], np.ndarray], grid: LevelSet) -> LevelSet:
+    """Take distances to the hull near the grid's surface; elsewhere they are inside."""
 
     def values(places: np.ndarray) -> np.ndarray:
         near = np.abs(at(grid, places)) < 4 * grid.voxel
         hull = np.full(near.shape, -UNSEEN, np.float32)
-        hull[near] = hull_distance(views, grid.points(voxel_index(places)[near]))
+        hull[near] = hull_of(grid.points(voxel_index(places)[near]))
         return hull
 
     inside = np.ones(grid.table.shape, bool)

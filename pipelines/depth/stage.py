@@ -32,6 +32,8 @@ from pipelines.depth.prior import TrackedSolid, close_mesh, matte_agreement
 from pipelines.depth.reconstruct import reconstruct, tracked_surface
 from pipelines.depth.surface import HeadSurface
 from pipelines.depth.views import DepthView, make_view, without_contradiction
+from pipelines.regions.geometry import head_labels, make_head
+from pipelines.regions.things import face_views
 
 ERROR_STEPS = 30.0  # 8-bit steps at the bright end of the error maps
 BLANK = 24  # grey of unknown pixels
@@ -132,7 +134,8 @@ def read_tracked(
     if expression not in track.expressions:
         return None, {"used": False, "why": f"{expression} is not tracked"}
     vertices = track.vertices[track.row(expression)].astype(np.float64)
-    faces = load_head(track.head).faces.numpy()
+    model = load_head(track.head)
+    faces = model.faces.numpy()
     if faces.max() >= len(vertices):
         raise FormatError(
             f"{path}: {len(vertices)} vertices do not fit the head's {faces.max() + 1};"
@@ -142,10 +145,18 @@ def read_tracked(
     if agreement < AGREEMENT:
         why = f"only {agreement:.0%} of it lies in the mattes, under {AGREEMENT:.0%}"
         return None, {"used": False, "why": why, "agreement": agreement}
+    head = make_head(vertices, track.R[track.row(expression)], head_labels(model))
+    shown = face_views(head, [(view.camera, view.rgb, view.alpha) for view in views])
     solid, glasses = close_mesh(vertices, faces), track.glasses_in(expression)
+    solid = replace(solid, shown=tuple(shown))
     if glasses is not None:
         solid = replace(solid, glasses=glasses)
-    return solid, {"used": True, "agreement": agreement, "glasses": len(solid.glasses) > 0}
+    return solid, {
+        "used": True,
+        "agreement": agreement,
+        "glasses": len(solid.glasses) > 0,
+        "things": len(shown) > 0,
+    }
 
 
 def write_maps(out: Path, camera_id: str, maps: DepthMaps) -> None:

@@ -224,12 +224,12 @@ def place(
     if not hit.any():
         height = np.full(mesh.shape, np.inf if head.end is None else -np.inf, np.float32)
         return HeadGeometry(mesh, mesh_depth, mesh, hit, height, np.zeros_like(height))
-    row, column, pixels = _nearest(hit)
+    row, column, pixels = nearest(hit)
     surface = mesh_depth[row, column]
     rim = ~hit & (pixels * surface / camera.K[0, 0] <= rim_m)
     known = hit if depth is None else (alpha > 0) & (depth > 0)
     if depth is not None and known.any():
-        there = _nearest(known)[:2]
+        there = nearest(known)[:2]
         surface = depth[there]
     height = np.full(mesh.shape, np.inf, np.float32)
     off = np.zeros(mesh.shape, np.float32)
@@ -266,7 +266,7 @@ def _face(mesh: np.ndarray) -> np.ndarray:
     return label_mask(mesh, "skin", "lips", "eyes")
 
 
-def _nearest(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def nearest(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find row, column and distance in pixels (H, W) of the nearest pixel of a mask (H, W)."""
     distance, cell = cv2.distanceTransformWithLabels(
         (~mask).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL

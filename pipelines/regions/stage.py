@@ -31,7 +31,7 @@ from pipelines.regions.geometry import (
     place,
     see,
 )
-from pipelines.regions.glasses import Picture, find_glasses, shown_before
+from pipelines.regions.things import Picture, find_glasses, shown_before
 
 VOTERS, VOTING_SIDE = 4, 512  # cameras, and their pixels, that show skin colours and bare scalps
 WITNESSES = 10  # cameras, of that size, that show glasses

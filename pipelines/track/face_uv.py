@@ -95,9 +95,16 @@ def with_slide(target: Target, slide: SlideTerm | None) -> Target:
 
 
 def slide_term(
-    model: HeadModel, uv_map: FaceUvMap, pictures: FrameSetCrops, mesh: np.ndarray
+    model: HeadModel,
+    uv_map: FaceUvMap,
+    pictures: FrameSetCrops,
+    mesh: np.ndarray,
+    covered: np.ndarray | None = None,
 ) -> SlideTerm | None:
-    """Find where a frame set's skin belongs, about its mesh (V, 3); None if too little is seen."""
+    """Find where a frame set's skin belongs, about its mesh (V, 3); None if too little is seen.
+
+    Landmarks on vertices that hair has `covered` (V,) are left out: the network guesses there.
+    """
     colors, mass = unwrap(model, uv_map, pictures, mesh)
     if not (mass > LEAST_SEEN).any():
         return None
@@ -108,10 +115,14 @@ def slide_term(
     found, step = between(places, at + rims)
     home, home_step = between(places, mark_places() + rims)
     seen = bilinear((mass > LEAST_SEEN).astype(np.float32), at + rims)
-    good = np.flatnonzero((seen > 0.99) & (np.maximum(step, home_step) < TORN_M))
+    anchors = landmark_anchors(model).some(slice(FIRST, None))
+    usable = (seen > 0.99) & (np.maximum(step, home_step) < TORN_M)
+    if covered is not None:
+        usable &= ~covered[anchors.vertices].any(1)
+    good = np.flatnonzero(usable)
     if not len(good):
         return None
-    anchors = landmark_anchors(model).some(good + FIRST)
+    anchors = anchors.some(good)
     # The map rounds off where landmarks lie, but shows well how far they have moved.
     goals = anchors.at(mesh) + found[good] - home[good]
     normals = anchors.at(vertex_normals(torch.from_numpy(mesh)[None], model.faces)[0].numpy())

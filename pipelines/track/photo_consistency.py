@@ -53,11 +53,6 @@ COVERED_SHARE, COVERED_TRUST = 0.25, 0.3
 # A beard or a fringe covers a place if more than a share of the neighbouring samples, BESIDE of
 # them, is unlike skin; brows and nostrils are narrower.
 BESIDE, COVERING = 40, 0.65
-# A thing hides the face where views agree CLEAR_M to BEFORE_M before the mesh, better by a MARGIN
-# than at it, and a share of the ASKED neighbours finds it at the same height. Fewer places than
-# LEAST_PLACES are mismatches: a bare face has up to 15.
-CLEAR_M, BEFORE_M, MARGIN = 0.008, 0.045, 0.1
-EVERY, ASKED, AGREEING, SAME_M, LEAST_PLACES = 2, 16, 0.4, 0.004, 24
 
 SkinSamples = list[tuple[MeshPlaces, float]]
 """Where the surface is searched for, and the trust in what is found there."""
@@ -312,26 +307,3 @@ def under_hair(
     near = cKDTree(places[seen]).query(mesh[face], BESIDE)[1]
     hidden[face] = odd[near].mean(1) > COVERING
     return hidden
-
-
-def things_before(
-    model: HeadModel, skin: SkinSamples, pictures: FrameSetCrops, mesh: np.ndarray
-) -> np.ndarray:
-    """Find places (n, 3) on the surface of what stands clear of the face of the mesh (V, 3).
-
-    There the views agree better than on the mesh behind. Things thinner than a patch are missed.
-    """
-    samples = skin[0][0].some(slice(None, None, EVERY))
-    (views,) = patch_views(model, pictures, mesh, [samples])
-    places, pixel = views.places, views.pixel
-    heights = np.arange(-CLEAR_M, BEFORE_M, min(STEP_PX * pixel, SAME_M))
-    score = agreement(views, heights)
-    before = heights > CLEAR_M
-    found = _peaks(score[:, before], heights[before], pixel)
-    at_mesh = score[:, ~before].max(1)
-    sure = found.score > np.maximum(LEAST_SCORE, at_mesh + MARGIN)
-    tops = places + found.height[:, None] * views.normals
-    near = cKDTree(places).query(places, ASKED)[1]
-    same = sure[near] & (np.abs(found.height[near] - found.height[:, None]) < SAME_M)
-    agreed = tops[sure & (same.mean(1) > AGREEING)]
-    return agreed if len(agreed) >= LEAST_PLACES else agreed[:0]

@@ -14,7 +14,7 @@ from express50.files.images import shrink
 from express50.geometry.cameras import resized
 from express50.head.model import HeadModel
 from pipelines.regions.geometry import head_labels, make_head
-from pipelines.regions.glasses import find_glasses
+from pipelines.regions.things import Picture, face_views, find_glasses
 from pipelines.track.basis import ALONG, OFF, Basis, freeze_shape
 from pipelines.track.eyes_and_jaw import EyeOffsets, with_irises_and_jaw
 from pipelines.track.face_uv import FaceUvMap, make_uv_map, reading_map, slide_term, with_slide
@@ -24,7 +24,6 @@ from pipelines.track.photo_consistency import (
     SkinSamples,
     patch_terms,
     skin_samples,
-    things_before,
     under_hair,
 )
 from pipelines.track.skin_flow import FINE, flow_term, skin_map
@@ -39,8 +38,9 @@ PATCH_REACH_M = 0.008  # of the first search, to either side of the mesh
 NARROWING, NARROWINGS = 0.6, 3  # factor of the reach from round to round, and how often
 IN_HAIR = 30.0  # factor on a landmark's standard deviation where hair surrounds it
 BESIDE_M, BESIDE_THING = 0.02, 6.0  # metres from a thing, and the factor within them
-GLASSES_SIDE = 320  # pixels, about a millimetre each, of the crops in which glasses are looked for
-SEARCHES = 3  # rounds in which things are looked for; later ones look only where some were found
+SEARCHED_SIDE = 320  # pixels, about a millimetre each, of crops in which things are looked for
+APART_M = 0.003  # between the places on a thing that are kept
+SEARCHES = (0, 2)  # rounds in which things are looked for; more find the same
 FOLLOWING = 3  # rounds in which the skin is followed
 # Trust in patches grows by this factor per round: far from the surface whole groups of them may
 # match wrongly.
@@ -161,8 +161,8 @@ def refine(
         for index, (target, pictures) in enumerate(zip(targets, evidence.pictures, strict=True)):
             mesh, terms = meshes[index], [*target.terms]
             hidden = under_hair(model, evidence.skin, pictures, mesh)
-            if current.patch_reach_m and (number < SEARCHES or len(things[index])):
-                things[index] = things_before(model, evidence.skin, pictures, mesh)
+            if current.patch_reach_m and number in SEARCHES:
+                things[index] = things_before(model, pictures, mesh, turns[index])
                 if index not in glasses:
                     glasses[index] = glasses_on(model, pictures, mesh, turns[index])
                 hiding[index] = np.concatenate([things[index], glasses[index]])
@@ -175,7 +175,7 @@ def refine(
                 reach, weight = current.patch_reach_m, current.patch_weight
                 terms += patch_terms(model, evidence.skin, pictures, mesh, reach, weight, hidden)
             if current.read_uv and evidence.uv_map is not None:
-                slides[index] = slide_term(model, evidence.uv_map, pictures, mesh)
+                slides[index] = slide_term(model, evidence.uv_map, pictures, mesh, hidden)
             terms += flows.get(index, [])
             sigma = doubted(model, target, hidden, things[index])
             target = replace(target, terms=tuple(terms), sigma=sigma)
@@ -202,13 +202,31 @@ def glasses_on(
 
     Landmarks on them keep their weight: detectors know glasses.
     """
-    head, seen = make_head(mesh, rotation, head_labels(model)), []
+    head, seen = make_head(mesh, rotation, head_labels(model)), matted(pictures)
+    return find_glasses(head, [s for s in seen if (s[0].center - head.center) @ head.R[:, 2] > 0])
+
+
+def things_before(
+    model: HeadModel, pictures: FrameSetCrops, mesh: np.ndarray, rotation: np.ndarray
+) -> np.ndarray:
+    """Find places (n, 3) on what else stands before a mesh (V, 3): hands, mostly."""
+    head = make_head(mesh, rotation, head_labels(model))
+    views = face_views(head, matted(pictures))
+    places = np.concatenate([np.zeros((0, 3)), *(view.things for view in views)])
+    cells = np.floor((places - head.center) / APART_M)
+    return places[np.unique(cells, axis=0, return_index=True)[1]]
+
+
+def matted(pictures: FrameSetCrops) -> list[Picture]:
+    """Reduce the crops that have mattes."""
+    found = []
     for crop in pictures.crops:
-        if crop.alpha is not None and (crop.camera.center - head.center) @ rotation[:, 2] > 0:
-            rgb = shrink(crop.image, GLASSES_SIDE)
+        if crop.alpha is not None:
+            rgb = shrink(crop.image, SEARCHED_SIDE)
             camera = resized(crop.camera, rgb.shape[1], rgb.shape[0])
-            seen.append((camera, rgb, shrink(crop.alpha, GLASSES_SIDE) / 255))
-    return find_glasses(head, seen)
+            alpha = shrink(crop.alpha, SEARCHED_SIDE)
+            found.append((camera, rgb, alpha.astype(np.float32) / 255))
+    return found
 
 
 def free_modes(targets: list[Target]) -> tuple[str, ...]:

@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 
 from express50.files.images import LIGHT_OF_LEVEL, resize_area
 from express50.geometry.cameras import Camera, crop_camera, inside_frame, project_pinhole, resized
-from express50.geometry.conventions import corner_to_cell
 from express50.geometry.raycast import join_rays, mesh_scene
 from express50.geometry.sampling import bilinear_slope
 from express50.geometry.transforms import unit
@@ -141,14 +140,15 @@ def without(pictures: FrameSetCrops, things: np.ndarray) -> FrameSetCrops:
         return pictures
     crops = []
     for crop in pictures.crops:
-        height, width = crop.image.shape[:2]
-        seen = np.zeros((height, width), np.uint8)
-        pixels, ahead = project_pinhole(crop.camera, things)
-        size = THING_M * crop.camera.K[0, 0] / np.maximum(ahead, 1e-3)
-        for (x, y), radius in zip(corner_to_cell(pixels), size, strict=True):
-            cv2.circle(seen, (round(x), round(y)), max(1, round(radius)), 1, -1)
-        whole = np.full((height, width), 255, np.uint8) if crop.alpha is None else crop.alpha
-        crops.append(replace(crop, alpha=np.where(seen > 0, np.uint8(0), whole)))
+        seen = np.zeros(crop.image.shape[:2], np.uint8)
+        pixels, inside = inside_frame(crop.camera, things)
+        column, row = pixels[inside].astype(np.int64).T
+        seen[row, column] = 1
+        far = float(np.linalg.norm(things - crop.camera.center, axis=1).mean())
+        size = 2 * max(1, round(THING_M * crop.camera.K[0, 0] / far)) + 1
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+        whole = np.full(seen.shape, 255, np.uint8) if crop.alpha is None else crop.alpha
+        crops.append(replace(crop, alpha=np.where(cv2.dilate(seen, disc) > 0, np.uint8(0), whole)))
     return replace(pictures, crops=tuple(crops))
 
 

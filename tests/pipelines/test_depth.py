@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from express50.errors import StageError
-from express50.geometry.cameras import rays
+from express50.geometry.cameras import rays, unproject
 from express50.geometry.raycast import mesh_scene
 from pipelines.depth.blocks import build
 from pipelines.depth.maps import cast_maps, picture_of, surface_maps
@@ -24,6 +24,7 @@ from pipelines.depth.views import (
     silhouette_distance,
     without_contradiction,
 )
+from pipelines.regions.things import FaceView
 from tests.pipelines.bump_head import mesh, render, ring
 
 QUICK = 4.0  # millimetres per voxel
@@ -156,6 +157,21 @@ def test_what_glasses_hide_is_not_compared_and_the_head_is_believed_behind_them(
     points, height = np.array([[0, 0, 0.12], [0, 0.12, 0]]), np.full(2, 0.05)
     assert bare.belief(points, height).tolist() == [0, 0]
     assert worn.belief(points, height).tolist() == [1, 0]
+
+
+def test_room_before_the_face_is_carved_where_a_view_shows_it_bare(shots):
+    """A hand leaves the hull full of air between it and the face."""
+    camera, _, _, true = next(shot for shot in shots if shot[0].center[2] > 0.8)
+    bare = (true > 0) & (np.arange(camera.width) < camera.width / 2)
+    view = FaceView(camera, true.astype(np.float32), bare, (true > 0) & ~bare, np.zeros((0, 3)))
+    solid = close_mesh(*mesh())
+    middle = camera.width // 2
+    pixels = np.array([[middle + x + 0.5, middle + 0.5] for x in (-12, -12, 12)])
+    depth = true[middle, pixels[:, 0].astype(int)] - [0.03, 0.004, 0.03]
+    points, hull = unproject(camera, pixels, depth), np.full(3, -0.05, np.float32)
+    air, skin, thing = replace(solid, shown=(view,)).carved(points, hull.copy())
+    assert air > 0.01 and skin < 0 and thing < 0
+    np.testing.assert_array_equal(solid.carved(points, hull.copy()), hull)
 
 
 def test_fewer_cameras_still_give_a_head(shots):

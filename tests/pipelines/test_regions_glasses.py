@@ -13,8 +13,8 @@ from express50.contract.segmentation_labels import LABELS, label_mask
 from express50.geometry.cameras import project
 from express50.geometry.conventions import corner_to_cell
 from pipelines.regions.geometry import see
-from pipelines.regions.glasses import CELL_M, Picture, find_glasses, shown_before
 from pipelines.regions.stage import label_view
+from pipelines.regions.things import CELL_M, Picture, find_glasses, shown_before
 from tests.pipelines.region_scenes import RegionScene, make_scene
 
 RADIUS, TUBE_M, LIFT_M, DARK = 0.022, 0.0018, 0.014, (25, 25, 30)

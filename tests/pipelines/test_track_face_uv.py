@@ -138,9 +138,15 @@ def test_landmarks_seen_aside_pull_the_mesh_there(head, chart, monkeypatch) -> N
     np.testing.assert_allclose(far.sigma, slide.sigma, rtol=1e-4)
 
 
-def test_a_map_that_is_hardly_seen_gives_no_term(head, chart, monkeypatch) -> None:
+def test_what_is_hardly_seen_or_in_hair_gives_no_term(head, chart, monkeypatch) -> None:
+    read_as(monkeypatch)
+    mesh, covered = posed(head), np.zeros(len(head.template), bool)
+    covered[landmark_anchors(head).vertices[48:]] = True  # the mouth
+    assert slide_term(head, chart, None, mesh, covered).marks.max() < 48
+    covered[:] = True
+    assert slide_term(head, chart, None, mesh, covered) is None
     read_as(monkeypatch, mass=0.05)
-    assert slide_term(head, chart, None, posed(head)) is None
+    assert slide_term(head, chart, None, mesh) is None
 
 
 def test_a_place_needs_two_views(head, chart) -> None:

@@ -1,0 +1,417 @@
+"""Find what stands before the tracked face: glasses by colour, hands by how well views agree.
+
+**Glasses.** Frames are too thin for depth maps. But every view sees a place on a frame in a colour
+unlike skin, whereas a place before a bare face has skin behind it in some view. So colours carve
+the space before the eyes as silhouettes carve a hull. What is left is glasses if it runs around an
+eye; lenses, which show the colours behind them, fill the ring.
+
+**Hands** have the colour of skin, and their outlines lie within the head's. But views that see the
+face agree on it, and views that see a hand agree before it. So along every ray to the face a view
+is compared with its neighbours, on the tracked mesh and wherever the mattes leave room before it.
+A ray that ends on the face leaves no room for things before it: agreement carves too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import open3d as o3d
+from scipy import ndimage
+
+from express50.contract.segmentation_labels import LABELS, label_mask
+from express50.files.images import LIGHT_OF_LEVEL, shrink
+from express50.geometry.cameras import (
+    Camera,
+    crop_camera,
+    inside_frame,
+    project_pinhole,
+    resized,
+    unproject,
+)
+from express50.geometry.conventions import cell_to_corner
+from express50.geometry.raycast import join_rays
+from pipelines.regions.colour import colour_logs, like_skin
+from pipelines.regions.geometry import WIDTH_M, TrackedHead, nearest, see
+
+EYES, SKIN = LABELS.index("eyes"), LABELS.index("skin")
+CELL_M = 0.002
+# Of the searched box: half its size beside the eyes and above them, and its ends along the gaze.
+BOX_M = ((-0.08, 0.08), (-0.045, 0.04), (-0.03, 0.045))
+CLEAR_M, FAR_M = 0.003, 0.03  # from the mesh, between which glasses are looked for
+LEAST_VIEWS, ERRING = 4, 16  # views that see an odd colour; one view in so many may see skin
+LEAST_SKIN = 200  # pixels of skin in a view that is asked
+LEAST_CELLS = 20  # of a connected part
+FRONT_M, BRIDGE_M, REACH_M = 0.015, 0.005, 0.045  # depth of a rim, half a bridge, rim from its eye
+BEARINGS, AROUND = 24, 0.6  # about an eye, and the share of them that shows a rim
+EYE_M = 0.015  # radius of an eye with its lashes and shadow, which are not glasses
+WIDER_M = 0.0012  # by which cells are wider than glasses: odd pixels are dilated by one
+
+FACE = ("skin", "lips", "eyes")  # what opens behind lips is not within NEAR_M of the mesh
+SIDE, AROUND_M = 384, 0.1  # most pixels of the crops that are compared, and their margin
+NEAR_M = 0.008  # the face is within so much of the tracked mesh
+HEIGHTS_M = np.arange(0.012, 0.1, 0.006)  # before it, about which things are looked for
+STEPS_M = (-0.0022, -0.0007, 0.0008, 0.0023)  # compared about each of them
+APART = (0.5, 0.97)  # cosines between views that are compared: others look alike, or unlike
+NEIGHBOURS = 4  # views that a view is compared with, and the cosine that they are nearest to
+BEST_APART = 0.8
+PATCH_PX, NOISE = 9, 0.006  # side of what is compared and averaged; noise of root light
+# Agreement by which a thing must be better than the face to be one, and to leave the face unsure.
+THING_MARGIN, BARE_MARGIN = 0.1, -0.05
+EDGE_M = 0.005  # from the border between face and thing, within which the nearest edge is taken
+LEAST_THING, WITNESSES = 0.005, 2  # share of the face in so many views; less is chance
+
+Picture = tuple[Camera, np.ndarray, np.ndarray]
+"""A pinhole camera, its frame (H, W, 3) uint8 and its matte (H, W) in [0, 1]."""
+_Line = tuple[np.ndarray, np.ndarray]
+"""Homogeneous pixels (3, h, w) of places, and what a metre along their rays adds to them."""
+
+
+def find_glasses(head: TrackedHead, pictures: Sequence[Picture]) -> np.ndarray:
+    """Find places (n, 3), world, CELL_M apart, all over frames and lenses; none without glasses."""
+    nothing = np.zeros((0, 3))
+    eyes = (head.vertices[head.labels.vertices == EYES] - head.center) @ head.R
+    if not len(eyes) or len(pictures) < LEAST_VIEWS:
+        return nothing
+    sides = [eyes[eyes[:, 0] * side > np.median(eyes[:, 0]) * side] for side in (-1, 1)]
+    eyes = np.array([np.r_[eye.mean(0)[:2], eye[:, 2].max()] for eye in sides])
+    axes = [np.arange(low, high, CELL_M) for low, high in BOX_M]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) + eyes.mean(0)
+    odd = _odd(head, pictures, grid.reshape(-1, 3)).reshape(grid.shape[:3])
+    parts, _ = ndimage.label(odd, np.ones((3, 3, 3)))
+    odd &= (np.bincount(parts.ravel()) >= LEAST_CELLS)[parts]
+    frame = grid[odd]
+    beside = np.abs(frame[:, 0] - eyes[:, 0].mean()) > BRIDGE_M
+    near = [np.linalg.norm(frame[:, :2] - eye[:2], axis=1) for eye in eyes]
+    lenses = []
+    for k, eye in enumerate(eyes):
+        rim = frame[beside & (near[k] < np.minimum(near[1 - k], REACH_M))]
+        if _is_around(rim, eye):
+            lenses.append(_lens(rim, grid[:, :, 0, :2]))
+    return np.concatenate([frame, *lenses]) @ head.R.T + head.center if lenses else nothing
+
+
+def _odd(head: TrackedHead, pictures: Sequence[Picture], grid: np.ndarray) -> np.ndarray:
+    """Mark the places (N,) of a grid (N, 3), about the head's centre, that no view sees as skin."""
+    local = (grid @ head.R.T).astype(np.float32)
+    apart = head.scene.compute_distance(o3d.core.Tensor(local), nthreads=1).numpy()
+    ids = np.flatnonzero((apart > CLEAR_M) & (apart < FAR_M))
+    odd, seen = np.zeros(len(ids), int), np.zeros(len(ids), int)
+    for camera, rgb, alpha in pictures:
+        open_still = seen - odd <= len(pictures) // ERRING  # the others are skin, or beside it
+        ids, odd, seen = ids[open_still], odd[open_still], seen[open_still]
+        places = local[ids]
+        mesh, _ = see(head, camera)
+        skin = (mesh == SKIN) & (alpha > 0.99)
+        if skin.sum() < LEAST_SKIN:
+            continue
+        logs = colour_logs(rgb)
+        unlike = ~like_skin(logs.reshape(-1, 3), logs[skin]).reshape(skin.shape)
+        shown = cv2.dilate((unlike & (alpha > 0.5)).astype(np.uint8), np.ones((3, 3), np.uint8))
+        pixels, inside = inside_frame(camera, places + head.center)
+        column, row = np.clip(pixels.astype(np.int64), 0, np.array(skin.shape[::-1]) - 1).T
+        rays = join_rays(places, camera.center - head.center - places)
+        inside &= ~head.scene.test_occlusions(rays, nthreads=1).numpy()
+        seen += inside
+        odd += inside & (shown[row, column] > 0)
+    found = np.zeros(len(grid), bool)
+    found[ids[(odd >= LEAST_VIEWS) & (seen - odd <= seen // ERRING)]] = True
+    return found
+
+
+def _is_around(rim: np.ndarray, eye: np.ndarray) -> bool:
+    """Check that a rim (N, 3) runs around an eye (3,), in axes of the head; brows do not."""
+    off = rim[:, :2] - eye[:2]
+    x, y = off[np.linalg.norm(off, axis=1) > EYE_M].T
+    bearing = ((np.arctan2(y, x) / (2 * np.pi) % 1) * BEARINGS).astype(int)
+    return len(np.unique(bearing)) >= AROUND * BEARINGS
+
+
+def _lens(rim: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Fill a rim (N, 3) with places (n, 3); `grid` (nx, ny, 2) has the columns along the gaze."""
+    rim = rim[rim[:, 2] > np.quantile(rim[:, 2], 0.9) - FRONT_M]  # without the bar to the ear
+    outline = cv2.convexHull(((rim[:, :2] - grid[0, 0]) / CELL_M).round().astype(np.int32))
+    filled = cv2.fillConvexPoly(np.zeros(grid.shape[1::-1], np.uint8), outline, 1).T > 0
+    plane = np.linalg.lstsq(np.c_[rim[:, :2], np.ones(len(rim))], rim[:, 2], rcond=None)[0]
+    places = grid[filled]
+    return np.c_[places, np.c_[places, np.ones(len(places))] @ plane]
+
+
+def shown_before(places: np.ndarray, camera: Camera, depth: np.ndarray) -> np.ndarray:
+    """Return pixels (H, W) bool that show places (n, 3) of glasses before a head.
+
+    The depth (H, W) is the head's, camera z in metres, 0 beside it.
+    """
+    found = np.zeros(depth.shape, np.uint8)
+    pixels, inside = inside_frame(camera, places)
+    ahead = places[inside] @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
+    column, row = pixels[inside].astype(np.int64).T
+    clear = (depth[row, column] == 0) | (ahead < depth[row, column])
+    found[row[clear], column[clear]] = 1
+    if not clear.any():
+        return found > 0
+    metre_px = camera.K[0, 0] / np.median(ahead)
+    size = (int(np.ceil(CELL_M * metre_px)) | 1) + 2
+    whole = cv2.morphologyEx(found, cv2.MORPH_CLOSE, np.ones((size, size), np.uint8))
+    size = 2 * round(WIDER_M * metre_px) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    return cv2.erode(whole, kernel) > 0
+
+
+@dataclass(frozen=True)
+class FaceView:
+    """What one view shows where it would see the tracked face, were there nothing before it.
+
+    Attributes:
+        camera: pinhole.
+        depth: (H, W) of the head, camera z in metres, 0 beside it.
+        bare: (H, W) bool, surely the face.
+        covered: (H, W) bool, surely something before it.
+        things: (n, 3) places, world, on what covers it.
+    """
+
+    camera: Camera
+    depth: np.ndarray
+    bare: np.ndarray
+    covered: np.ndarray
+    things: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """A crop about the head: picture (H, W, 3), matte (H, W), grey root of light (H, W).
+
+    `mesh` and `depth` (H, W) are what `see` says of the head.
+    """
+
+    camera: Camera
+    rgb: np.ndarray
+    alpha: np.ndarray
+    grey: np.ndarray
+    mesh: np.ndarray
+    depth: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Sweep:
+    """How well a view agrees with others on the face and before it, in a window (h, w).
+
+    Attributes:
+        face: (h, w) bool.
+        places: (h, w, 3) on the head, about its centre, and unit `ways` (h, w, 3) towards them.
+        on_face: (h, w) best agreement within NEAR_M of the head.
+        before: (HEIGHTS_M, h, w) that before it.
+        free: (HEIGHTS_M, h, w) bool, where there may be a thing.
+    """
+
+    camera: Camera
+    depth: np.ndarray
+    window: tuple[slice, slice]
+    face: np.ndarray
+    places: np.ndarray
+    ways: np.ndarray
+    on_face: np.ndarray
+    before: np.ndarray
+    free: np.ndarray
+
+    def decide(self, center: np.ndarray) -> FaceView:
+        """Tell the face from things; the head's `center` (3,) is in the world."""
+        asked = self.face & self.free.any(0)
+        score = np.where(self.free, self.before, np.float32(-2))
+        better = np.where(asked, score.max(0) - self.on_face, 0)
+        size = (PATCH_PX, PATCH_PX)
+        better = cv2.blur(better, size) / np.maximum(cv2.blur(asked.astype(np.float32), size), 1e-3)
+        bare = self.face & ~(asked & (better > BARE_MARGIN))
+        thing = (asked & (better > THING_MARGIN)).astype(np.uint8)
+        thing = cv2.morphologyEx(thing, cv2.MORPH_OPEN, _disc(self, WIDTH_M / 2)) > 0
+        height = HEIGHTS_M[score.argmax(0)][thing][:, None]
+        shown, hidden = np.zeros((2, *self.depth.shape), bool)
+        shown[self.window] = cv2.erode(bare.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        hidden[self.window] = thing
+        things = center + self.places[thing] - height * self.ways[thing]
+        return FaceView(self.camera, self.depth, shown, hidden, things)
+
+
+def face_views(head: TrackedHead, pictures: Sequence[Picture]) -> list[FaceView]:
+    """Tell the face from what stands before it in every view of it; empty if nothing does.
+
+    The views' cameras are those of crops of the pictures.
+    """
+    shots = [shot for picture in pictures if (shot := _shot(head, picture))]
+    sweeps = []
+    for own, shot in enumerate(shots):
+        face = label_mask(shot.mesh, *FACE) & (shot.alpha > 0.5)
+        if (shot.camera.center - head.center) @ head.R[:, 2] > 0 and face.sum() >= LEAST_SKIN:
+            sweeps.append(_sweep(head, shots, own, face))
+    if len(sweeps) < LEAST_VIEWS:
+        return []
+    views = [sweep.decide(head.center) for sweep in sweeps]
+    for sweep in sweeps:
+        _carve(head, sweep, [view for view in views if view.camera is not sweep.camera])
+    views = [sweep.decide(head.center) for sweep in sweeps]
+    pictured = {shot.camera.id: shot for shot in shots}
+    views = [_up_to_edges(view, pictured[view.camera.id]) for view in views]
+    hidden = [
+        v.covered.sum() > LEAST_THING * s.face.sum() for v, s in zip(views, sweeps, strict=True)
+    ]
+    if sum(hidden) < WITNESSES:
+        return []
+    return [replace(view, things=_agreed(view.things, views)) for view in views]
+
+
+def _agreed(things: np.ndarray, views: Sequence[FaceView]) -> np.ndarray:
+    """Keep the places (n, 3) before the face that no view sees the face through."""
+    for view in views:
+        pixels, inside = inside_frame(view.camera, things)
+        column, row = pixels[inside].astype(np.int64).T
+        ahead = (
+            things[inside] @ view.camera.cam_from_world[2, :3] + view.camera.cam_from_world[2, 3]
+        )
+        kept = np.ones(len(things), bool)
+        kept[inside] = ~(view.bare[row, column] & (ahead < view.depth[row, column] - NEAR_M))
+        things = things[kept]
+    return things
+
+
+def _up_to_edges(view: FaceView, shot: _Shot) -> FaceView:
+    """Move the border between face and thing onto an edge of the picture.
+
+    Patches straddle the border, so that it is sure only within EDGE_M.
+    """
+    disc = _disc(view, EDGE_M)
+    markers = np.zeros(view.depth.shape, np.int32)
+    for number, mask in enumerate((view.bare, view.covered), 1):
+        markers[cv2.erode(mask.astype(np.uint8), disc) > 0] = number
+    beside = (view.depth == 0) | (shot.alpha <= 0.5)
+    markers[cv2.erode(beside.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0] = 3
+    split = cv2.watershed(np.ascontiguousarray(shot.rgb), markers)
+    return replace(view, bare=(split == 1) & ~beside, covered=(split == 2) & ~beside)
+
+
+def _disc(view: FaceView | _Sweep, radius_m: float) -> np.ndarray:
+    """Make a disc of a radius at the head, for morphology."""
+    metre_px = view.camera.K[0, 0] / float(np.median(view.depth[view.depth > 0]))
+    side = 2 * max(1, round(radius_m * metre_px)) + 1
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+
+
+def _shot(head: TrackedHead, picture: Picture) -> _Shot | None:
+    """Crop a picture to the head and what is near it, at most SIDE pixels; None if not in it."""
+    camera, rgb, alpha = picture
+    pixels, ahead = project_pinhole(camera, head.vertices)
+    if (ahead <= 1e-3).any():
+        return None
+    margin = AROUND_M * camera.K[0, 0] / float(np.median(ahead))
+    x0, y0 = np.maximum(np.floor(pixels.min(0) - margin), 0).astype(int).tolist()
+    ends = np.minimum(np.ceil(pixels.max(0) + margin), (camera.width, camera.height))
+    width, height = (ends.astype(int) - (x0, y0)).tolist()
+    if min(width, height) < PATCH_PX:
+        return None
+    window = np.s_[y0 : y0 + height, x0 : x0 + width]
+    rgb, alpha = (shrink(np.ascontiguousarray(image[window]), SIDE) for image in (rgb, alpha))
+    camera = resized(crop_camera(camera, x0, y0, width, height), rgb.shape[1], rgb.shape[0])
+    grey = np.sqrt(cv2.GaussianBlur(LIGHT_OF_LEVEL[rgb], (0, 0), 0.7)).mean(2)
+    return _Shot(camera, rgb, alpha, grey, *see(head, camera))
+
+
+def _sweep(head: TrackedHead, shots: Sequence[_Shot], own: int, face: np.ndarray) -> _Sweep:
+    """Compare a view, number `own`, with its neighbours where it sees the `face` (H, W)."""
+    camera, depth = shots[own].camera, shots[own].depth
+    x, y, width, height = cv2.boundingRect(face.astype(np.uint8))
+    window = np.s_[max(0, y - PATCH_PX) : y + height + PATCH_PX,
+                   max(0, x - PATCH_PX) : x + width + PATCH_PX]  # fmt: skip
+    row, column, _ = nearest(depth[window] > 0)
+    shape = row.shape
+    cells = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), -1).reshape(-1, 2)
+    part = crop_camera(camera, window[1].start, window[0].start, shape[1], shape[0])
+    places = unproject(part, cell_to_corner(cells), depth[window][row, column].ravel())
+    ways = (places - camera.center) / np.linalg.norm(places - camera.center, axis=1)[:, None]
+    places, ways = (values.reshape(*shape, 3) for values in (places - head.center, ways))
+    lines = [_line(shot.camera, head.center, places, ways) for shot in shots]
+    free = np.ones((len(HEIGHTS_M), *shape), bool)
+    for line, shot in zip(lines, shots, strict=True):
+        for room, offset in zip(free, HEIGHTS_M, strict=True):
+            room &= _looked_up(shot.alpha, _at(line, offset), 1.0) > 0.5
+    mine = _patches(shots[own].grey[window])
+    near = [(shots[k], lines[k]) for k in _neighbours(head, shots, own)]
+    step = STEPS_M[1] - STEPS_M[0]
+    about = np.arange(-NEAR_M, NEAR_M + step / 2, step)
+    on_face = np.max([_agreement(mine, near, offset) for offset in about], axis=0)
+    before = np.full(free.shape, np.float32(-1))
+    for k, offset in enumerate(HEIGHTS_M):
+        if (free[k] & face[window]).any():
+            before[k] = np.max([_agreement(mine, near, offset + more) for more in STEPS_M], axis=0)
+    return _Sweep(camera, depth, window, face[window], places, ways, on_face, before, free)
+
+
+def _neighbours(head: TrackedHead, shots: Sequence[_Shot], own: int) -> list[int]:
+    """Choose the views that a view is compared with."""
+    ways = np.array([shot.camera.center - head.center for shot in shots])
+    ways /= np.linalg.norm(ways, axis=1)[:, None]
+    cosine = ways @ ways[own]
+    ranked = np.argsort(np.abs(cosine - BEST_APART), kind="stable").tolist()
+    return [k for k in ranked if APART[0] < cosine[k] < APART[1]][:NEIGHBOURS]
+
+
+def _agreement(
+    mine: tuple[np.ndarray, ...], near: Sequence[tuple[_Shot, _Line]], offset: float
+) -> np.ndarray:
+    """Correlate `_patches` of a view with those of its neighbours `offset` metres before the head.
+
+    Returns:
+        The best correlation (h, w), averaged over a patch; -1 where no neighbour sees the place.
+    """
+    best, size = np.full(mine[0].shape, np.float32(-1)), (PATCH_PX, PATCH_PX)
+    for shot, line in near:
+        point = _at(line, offset)
+        theirs = _patches(_looked_up(shot.grey, point, 0.0, cv2.INTER_LINEAR))
+        hidden = _looked_up(shot.depth, point, 0.0)
+        seen = (hidden == 0) | (point[2] < hidden + HEIGHTS_M[0])
+        seen &= _looked_up(shot.alpha, point, 0.0) > 0.5
+        product = cv2.blur(mine[0] * theirs[0], size) - mine[1] * theirs[1]
+        best = np.maximum(best, np.where(seen, product / (mine[2] * theirs[2]), -1))
+    return cv2.blur(best, size)
+
+
+def _patches(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a picture (H, W), and mean and deviation, with noise, about each pixel."""
+    mean, square = (cv2.blur(values, (PATCH_PX, PATCH_PX)) for values in (grey, grey * grey))
+    return grey, mean, np.sqrt(np.maximum(square - mean * mean, 0) + np.float32(NOISE**2))
+
+
+def _line(camera: Camera, center: np.ndarray, places: np.ndarray, ways: np.ndarray) -> _Line:
+    """Project places and ways (h, w, 3), about `center` (3,): homogeneous pixels (3, h, w)."""
+    matrix = camera.K @ camera.cam_from_world[:3, :3]
+    start = places @ matrix.T + matrix @ (center - camera.center)
+    first, second = (np.moveaxis(values, -1, 0) for values in (start, ways @ matrix.T))
+    return np.ascontiguousarray(first, np.float32), np.ascontiguousarray(second, np.float32)
+
+
+def _at(line: _Line, offset: float) -> np.ndarray:
+    """Return x, y and depth (3, h, w) `offset` before; the first pixel's middle is the origin."""
+    point = line[0] - np.float32(offset) * line[1]
+    point[:2] /= np.maximum(point[2], np.float32(1e-6))
+    point[:2] -= np.float32(0.5)
+    return point
+
+
+def _looked_up(
+    image: np.ndarray, point: np.ndarray, beyond: float, interpolation: int = cv2.INTER_NEAREST
+) -> np.ndarray:
+    """Look points (3, h, w) of `_at` up in an image (H, W), which is `beyond` outside."""
+    return cv2.remap(
+        image, point[0], point[1], interpolation,
+        borderMode=cv2.BORDER_CONSTANT, borderValue=beyond,
+    )  # fmt: skip
+
+
+def _carve(head: TrackedHead, sweep: _Sweep, views: Sequence[FaceView]) -> None:
+    """Take the room before the face that others see away from a sweep."""
+    for view in views:
+        line = _line(view.camera, head.center, sweep.places, sweep.ways)
+        ends = np.where(view.bare, view.depth - np.float32(NEAR_M), 0)
+        for room, offset in zip(sweep.free, HEIGHTS_M, strict=True):
+            point = _at(line, offset)
+            room &= point[2] >= _looked_up(ends, point, 0.0)
