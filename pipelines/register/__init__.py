@@ -30,13 +30,14 @@ def run(dataset: Dataset, item: str, config: NoSettings, out: Path) -> Result:
 
 STAGE = Stage(
     name="register",
-    version=6,
+    version=7,
     config=NoSettings,
     items=peak_items,
     inputs=inputs,
     run=run,
     help="lay the tracked mesh onto the reconstructed surface",
-    purpose="Each vertex moves along its normal to the surface, except under hair and where no view"
-    " shows skin. Every vertex gets a residual, a standard deviation and an error bound.",
+    purpose="Each vertex moves along its normal to the surface, except under hair, at lips, eyes"
+    " and nostrils, and where no view shows skin. Every vertex gets a residual, a standard"
+    " deviation and an error bound.",
     growth=Growth(items=("subjects", "expressions")),
 )

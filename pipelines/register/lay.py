@@ -37,7 +37,8 @@ NOISE_M = 0.0003  # standard deviation of a height that is fully trusted
 SURFACE_M = 0.0004
 STAY_M = 0.003  # standard deviation of the tracked mesh where no surface is found
 FOLD_M = 0.03  # a vertex that faces the mesh itself nearer than this lies in a fold
-NOSTRILS_M = 0.010  # around nostrils, depth's surface lies up to 2.5 mm outside the skin
+NOSTRILS_M = 0.010  # so near to nostrils, depth's surface lies up to 2.5 mm outside the skin
+FINE = ("lips", "left_eye_region", "right_eye_region")  # with few views depth errs by 1 mm here
 SAMPLES = 64  # of the posterior; their standard deviation is known to 9 %
 # Trust in regions where the surface is not skin or is coarser than tracking; ears consist of folds.
 TRUST = {
@@ -191,11 +192,12 @@ def folded(mesh: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarr
     return hit["t_hit"].numpy() < FOLD_M
 
 
-def around_nostrils(model: HeadModel, mesh: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Mark places (N, 3) that lie within NOSTRILS_M of the folds of a mesh's (V, 3) nose."""
-    inside = folded(mesh, mesh_normals(mesh, model.faces), model.faces.numpy())
-    distance, _ = cKDTree(mesh[inside & in_regions(model, ("nose",))]).query(places)
-    return distance < NOSTRILS_M
+def too_fine(model: HeadModel, mesh: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Mark places (N, 3) at lips, eyes and nostrils of a mesh (V, 3), which depth rounds off."""
+    folds = folded(mesh, mesh_normals(mesh, model.faces), model.faces.numpy())
+    distance, _ = cKDTree(mesh[folds & in_regions(model, ("nose",))]).query(places)
+    _, owner = cKDTree(mesh).query(places)
+    return (distance < NOSTRILS_M) | in_regions(model, FINE)[owner]
 
 
 def mesh_normals(vertices: np.ndarray, faces: torch.Tensor) -> np.ndarray:

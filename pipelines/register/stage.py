@@ -25,10 +25,10 @@ from express50.head.preview import render_preview
 from pipelines.register.lay import (
     GivenSurface,
     LaidMesh,
-    around_nostrils,
     lay,
     mesh_normals,
     skin_trust,
+    too_fine,
 )
 from pipelines.register.untangle import crossings
 from pipelines.track.sequence import write_npz
@@ -61,7 +61,7 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
             " run 'express50 track' again"
         )
     trust = skin_trust(model, start, surface.vertices, surface.colors, surface.confidence)
-    trust[around_nostrils(model, start, surface.vertices)] = 0.0
+    trust[too_fine(model, start, surface.vertices)] = 0.0
     laid = lay(model, start, GivenSurface(surface.vertices, surface.faces, trust), DETAIL_M)
     cameras = list(read_cameras_of(dataset, subject).values())
     shared = lone_sigma(laid, cameras, model)

@@ -25,10 +25,10 @@ from pipelines.register.lay import (
     GivenSurface,
     Plate,
     SurfaceSearch,
-    around_nostrils,
     lay,
     mesh_normals,
     skin_trust,
+    too_fine,
 )
 from pipelines.register.stage import rest_offsets
 from pipelines.register.untangle import crossing_pairs, untangled
@@ -147,15 +147,18 @@ def test_hair_and_doubtful_places_get_no_trust(model):
     assert nowhere == pytest.approx(confidence)
 
 
-def test_the_underside_of_the_nose_is_around_nostrils_and_its_bridge_is_not(model):
+def test_lips_eyes_and_the_underside_of_the_nose_are_too_fine_for_depth(model):
     mesh = posed(model, 5)
-    nose = model.regions["nose"].numpy()
-    around = around_nostrils(model, mesh, mesh)
+    face, nose, lips, eye = (
+        model.regions[k].numpy() for k in ("face", "nose", "lips", "left_eye_region")
+    )
+    fine = too_fine(model, mesh, mesh + 0.0005 * mesh_normals(mesh, model.faces))
     low, high = np.percentile(mesh[nose, 1], (20, 90))
-    assert around[nose & (mesh[:, 1] < low)].mean() > 0.7
-    assert not around[nose & (mesh[:, 1] > high)].any()
-    assert around[model.regions["face"].numpy() & ~nose].mean() < 0.05
-    assert not around_nostrils(replace(model, regions={}), mesh, mesh).any()
+    assert fine[nose & (mesh[:, 1] < low)].mean() > 0.7 and fine[lips | eye].mean() > 0.9
+    assert not fine[nose & (mesh[:, 1] > high)].any()
+    other = face & ~nose & ~lips & ~eye & ~model.regions["right_eye_region"].numpy()
+    assert fine[other].mean() < 0.1
+    assert not too_fine(replace(model, regions={}), mesh, mesh).any()
 
 
 @pytest.mark.parametrize(
@@ -250,7 +253,7 @@ def test_the_stage_writes_a_mesh_that_later_stages_take(dataset, tmp_path):
     track = read_track(dataset.track_file("S001"))
     assert np.array_equal(best_vertices(dataset, "S001", track), track.vertices)
     result = STAGE.run(dataset, "S001/smile", NoSettings(), out)
-    assert result.metrics["seen_share"] > 0.5 and not result.warnings
+    assert result.metrics["seen_share"] > 0.4 and not result.warnings
     assert result.metrics["residual_mm_median"] < 0.05
     assert result.metrics["moved_mm_p95"] > 0.1
     assert (out / "qc" / "registration.jpg").is_file()
