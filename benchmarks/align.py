@@ -222,7 +222,7 @@ def as_markdown(figures: dict) -> list[str]:
     lines = [
         f"Made by `python -m benchmarks.align --doc docs/TRADEOFFS.md` on {figures['subjects']}"
         f" synthetic subjects, {figures['labels']} clips; the reference's clips are not counted."
-        " Suggestions whose confidence reaches `align.accept` are accepted without a person.",
+        " Suggestions whose confidence reaches `align.accept` are accepted automatically.",
         "",
     ]
     head = ["accept", "labels by hand", "mean error of the others, frames", "within one frame"]

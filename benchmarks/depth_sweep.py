@@ -85,7 +85,7 @@ def as_markdown(rows: list[dict], item: str) -> list[str]:
         " setting at a time differs from `standard`. The columns views, pixels (of the longest"
         " side) and voxel show what was used: the footage may have fewer views, or be too coarse"
         " for smaller voxels. Seconds are of one core; errors are over all cameras of the rig,"
-        " including those left out.",
+        " including those that the setting leaves out.",
         "",
     ]
     head = ("setting", "value", "views", "pixels", "voxel mm", "seconds", "median mm", "95 % mm",

@@ -143,7 +143,7 @@ def as_markdown(rows: list[dict], people: int, cameras: int, size: int) -> list[
         "px, two more held out. One setting at a time differs from `--preset demo`. A budget is "
         "processor seconds of one core, counted from the first image read. PSNR is over all pixels "
         "but the torso, and over the head alone. Seconds per picture cover decoding, drawing, "
-        "refining and comparing it. Each row is one run, so a tenth of a dB means nothing."
+        "refining and comparing it. Each row is one run; a tenth of a dB is noise."
     )
     head = ["setting", "budget s", "steps", "PSNR dB", "head dB", "SSIM", "seconds per picture"]
     lines = [

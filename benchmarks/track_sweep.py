@@ -110,7 +110,7 @@ def as_markdown(rows: list[dict], cameras: int) -> list[str]:
         f"Made by `python -m benchmarks.track_sweep`: one twin subject, {len(EXPRESSIONS)}"
         f" expressions, {cameras} cameras. One setting at a time differs from `standard`. Errors"
         " are root mean squares against ground truth, seconds are processor seconds per frame. All"
-        " rows are of one head, so differences under 0.1 mm mean nothing."
+        " rows are of one head; differences under 0.1 mm are noise."
     )
     head = ["setting", "face mm", "head mm", "jaw degrees", "outline IoU", "seconds"]
     lines = [
