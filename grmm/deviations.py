@@ -101,8 +101,8 @@ REASONS: dict[str, tuple[str, str]] = {
     ),
     "data.hide_behind_torso": (
         "each camera looks behind the collar from another side, so no end of the neck suits all",
-        "the trained model of six people drawn with it: 28.38 to 29.35 dB, with every pixel counted"
-        " 22.2 to 29.3 (20 held-out views)",
+        "28.25 to 28.75 dB, with every pixel counted 22.1 to 28.5 (held-out views of six people,"
+        " two and three seeds)",
     ),
     "model.refine_alpha": (
         "normalised depth is 0 at the nearest pixel and in the background; alpha separates them",
