@@ -3,8 +3,8 @@
 The faces that the cameras see place a head in the world, and so show roughly where skull, hair and
 shoulders are in every picture, even from behind. GrabCut (Rother, Kolmogorov and Blake 2004) finds
 their outlines by colours. Then the cameras correct each other: the person is nowhere that others
-see past them, and everywhere that all others see them; GrabCut runs again within these limits. A
-single camera has its colours only.
+see past them, and, if they are many, everywhere that all others see them; GrabCut runs again
+within these limits. A single camera has its colours only.
 
 Around an outline, alpha is the posterior mean of a mixture (Bayesian matting, Chuang et al. 2001)
 of two colours, the person's nearby and the wall's. The wall behind the person is interpolated from
@@ -45,6 +45,7 @@ LEAST_DEPTH = 0.05  # metres in front of the camera
 HOLE_M2 = 1.5e-3  # larger gaps show the background
 CUTS = 6  # GrabCut's iterations
 FEWEST = 4  # cameras that can correct each other
+MANY = 7  # of fewer cameras, the hull is so much larger than the person that it holds much wall
 SLACK_PX = (3.0, 1.5)  # distance from an outline within which it proves nothing, per round
 COLOURS, RARE = 32, 1e-5  # colour cells along each axis of Lab; share of a cell that is never seen
 UNSEEN = 2 / COLOURS**3  # the person does not have colours of a smaller share
@@ -303,7 +304,7 @@ def _corrected(
         ],
     )
     return [
-        _cut(view, _labels(matte, evidence, guess.labels, odd), guess)
+        _cut(view, _labels(matte, evidence, guess.labels, odd, len(views) >= MANY), guess)
         if view.known is None
         else view.known
         for view, matte, evidence, guess, odd in zip(
@@ -313,20 +314,26 @@ def _corrected(
 
 
 def _labels(
-    view: MatteView, evidence: Evidence, guess: np.ndarray, foreign: np.ndarray
+    view: MatteView, evidence: Evidence, guess: np.ndarray, foreign: np.ndarray, many: bool
 ) -> np.ndarray:
     """Return GrabCut labels (h, w) from a view's mask, the other views' evidence, and the guess.
 
     GrabCut learns the person's colours where no other view sees the wall and no pixel is `foreign`
-    (h, w). Large foreign patches are labelled wall.
+    (h, w). Large foreign patches are labelled wall. What all others see as the person is certain
+    only if they are `many`; else it is likely where the guess has a person as well.
     """
-    inside = ((view.alpha > 0) & evidence.likely & ~foreign) | evidence.solid
+    sure = cv2.erode(evidence.solid.astype(np.uint8), np.ones((5, 5))) > 0
+    solid = evidence.solid
+    if not many:
+        sure = (guess == cv2.GC_FGD) & view.valid
+        solid = solid & ~foreign & ((guess == cv2.GC_FGD) | (guess == cv2.GC_PR_FGD))
+    inside = ((view.alpha > 0) & evidence.likely & ~foreign) | solid
     labels = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     beyond = (evidence.known & ~evidence.possible) | (guess == cv2.GC_BGD)
     patches = cv2.morphologyEx(foreign.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3))) > 0
     beyond |= patches & (guess != cv2.GC_FGD)
     labels[beyond | ~view.valid] = cv2.GC_BGD
-    labels[cv2.erode(evidence.solid.astype(np.uint8), np.ones((5, 5))) > 0] = cv2.GC_FGD
+    labels[sure] = cv2.GC_FGD
     return labels
 
 
