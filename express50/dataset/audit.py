@@ -26,7 +26,7 @@ from express50.files.digests import file_sha256, files_of
 from express50.runner.imported import AGAIN, import_trouble
 from express50.runner.ledger import FileMark, Ledger, Receipt
 from express50.runner.outdated import BAD_INPUT, differing, few, published_digest, why_outdated
-from express50.runner.publish import clean_leftovers, hold_stages, is_running, set_aside
+from express50.runner.publish import clean_leftovers, hold_stages, is_running, leftovers, set_aside
 from express50.runner.replaced import size_of
 from express50.runner.worker import fingerprint, input_digests
 from express50.shards.reader import read_entries
@@ -228,7 +228,7 @@ class _StageAudit:
                 self._note(stage, "is running; its items were not checked")
                 self.broken.add("")
                 continue
-            if found := list(self.dataset.staging_dir.glob(f"{stage.name}-*")):
+            if found := leftovers(self.dataset, stage.name):
                 if self.fix:
                     clean_leftovers(self.dataset, stage.name)
                 what = f"unfinished outputs of {count(len(found), 'interrupted run')}"

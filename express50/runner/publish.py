@@ -79,14 +79,19 @@ def discard_stale(dataset: Dataset, stage: str, item: str) -> None:
     shutil.rmtree(dataset.stale_dir / stage / item, ignore_errors=True)
 
 
+def leftovers(dataset: Dataset, stage: str) -> list[Path]:
+    """Return the folders that interrupted runs of a stage left in staging."""
+    own = re.compile(rf"{re.escape(stage)}-(leftovers-)?[0-9a-f]{{32}}")  # of no stage `x-...`
+    return [path for path in dataset.staging_dir.glob(f"{stage}-*") if own.fullmatch(path.name)]
+
+
 def clean_leftovers(dataset: Dataset, stage: str) -> None:
     """Delete what killed runs of one stage left unfinished; the caller holds the stage's lock.
 
     It is renamed first, so that no worker publishes what is being deleted. Published folders that a
     kill between two renames left beside their place are put back.
     """
-    own = re.compile(rf"{re.escape(stage)}-(leftovers-)?[0-9a-f]{{32}}")  # of no stage `x-...`
-    left = [path for path in dataset.staging_dir.glob(f"{stage}-*") if own.fullmatch(path.name)]
+    left = leftovers(dataset, stage)
     if not left:
         return
     taken = dataset.staging_dir / f"{stage}-leftovers-{uuid.uuid4().hex}"

@@ -166,7 +166,7 @@ def test_other_settings_are_a_note_and_nothing_is_set_aside(dataset):
 
 
 def test_leftovers_are_swept_and_a_running_stage_is_left_alone(dataset):
-    leftover = dataset.staging_dir / "toy-S001-0123"
+    leftover = dataset.staging_dir / f"toy-{0:032x}"
     leftover.mkdir()
     output(dataset).unlink()
     with stage_lock(dataset, "toy"):
