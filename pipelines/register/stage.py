@@ -11,7 +11,14 @@ import torch
 from express50.capture.frames import read_cameras_of
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
-from express50.dataset.tracks import REGISTRATION_SCHEMA, Track, existing_track, read_track
+from express50.dataset.tracks import (
+    REGISTRATION_SCHEMA,
+    STRANGE,
+    Track,
+    existing_track,
+    read_track,
+    shape_spread,
+)
 from express50.error_model import error_bounds, single_camera_sigma
 from express50.errors import FormatError, StageError
 from express50.files.digests import file_sha256
@@ -71,7 +78,12 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
     if metrics["seen_share"] < LEAST_SEEN:
         why = f"the surface was found at only {metrics['seen_share']:.0%} of the face's vertices"
         warnings.append(Note(expression, why))
-    return Result(metrics, (), warnings, doubt.expected)
+    expected = doubt.expected
+    if shape_spread(track.shape) > STRANGE:  # the error model knows people only
+        expected = None
+        why = "the tracked head has a shape that nobody has, so no error is stated; see 'track'"
+        warnings.append(Note(expression, why))
+    return Result(metrics, (), warnings, expected)
 
 
 def lone_sigma(laid: LaidMesh, cameras: Sequence[Camera], model: HeadModel) -> np.ndarray:

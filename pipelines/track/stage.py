@@ -17,6 +17,7 @@ from express50.capture.frames import read_cameras_of
 from express50.capture.index import read_index
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
+from express50.dataset.tracks import STRANGE, shape_spread
 from express50.error_model import Bounds, error_bounds, error_models, expect, single_camera_sigma
 from express50.errors import StageError
 from express50.files.digests import path_digest, value_digest
@@ -61,9 +62,6 @@ from pipelines.track.terms import Term
 
 SCHEMA = "express50.track/2"
 DECIMALS = 7
-# Of 327 tracks of people, photographs and mistaken cameras, none exceeded 1.07; two rigs whose
-# mattes and synchronisation were wrong had 1.9 and 2.4.
-STRANGE = 1.2  # root mean square of shape coefficients, standard deviations
 # Number of modes along the skin (for each of three axes) per mode along the normals: texture
 # locates the skin less finely than patches do.
 ALONG_SHARE = 4 / 15
@@ -139,7 +137,7 @@ def run(
 
 def strange_shape(shape: np.ndarray) -> list[Note]:
     """Warn of a shape that no person has; its coefficients (K,) are in standard deviations."""
-    spread = float(np.sqrt(np.mean(np.square(shape)))) if len(shape) else 0.0
+    spread = shape_spread(shape)
     if spread <= STRANGE:
         return []
     why = (
