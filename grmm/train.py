@@ -20,8 +20,9 @@ import torch.distributed as distributed
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
+from express50 import native
 from express50.console import count, log
-from express50.errors import TrainError
+from express50.errors import NotReadyError, TrainError
 from express50.files.atomic import check_space, write_json
 from express50.head.model import HeadModel
 from grmm import losses
@@ -76,10 +77,13 @@ def train(
 
     Raises:
         TrainError: nothing to train on, or the objective is not finite.
-        ConfigError: the configuration differs from the one resumed.
+        ConfigError: the configuration differs from the one resumed, or there is neither a GPU nor
+            the native library.
     """
     # --- Processes, samples, model -------------------------------------------------------------
     rank, world, device = join_processes()
+    if device.type == "cpu" and (why := native.why_missing()):  # a step would take minutes
+        raise NotReadyError(f"training without a GPU needs the native library: {why}")
     torch.manual_seed(config.train.seed)
     perceptual = PerceptualMetrics(config.metrics)  # first, because it may reject its files
     views = HeadViews(source, head.to(device), config.data)

@@ -111,6 +111,14 @@ def test_a_disk_that_fills_up_takes_the_weights_still(tmp_path, source, monkeypa
     assert [path.name for path in tmp_path.glob("*checkpoint*")] == ["checkpoint.pt"]
 
 
+def test_training_on_a_cpu_without_the_native_library_is_refused(tmp_path, source, monkeypatch):
+    monkeypatch.setattr("express50.native.why_missing", lambda: "it was not built; build it")
+    if best_device().type == "cpu":
+        with pytest.raises(ConfigError, match="needs the native library: it was not built"):
+            train(source, ellipsoid_head(), tmp_path / "out", tiny_config())
+        assert not (tmp_path / "out").exists()
+
+
 def test_saving_takes_a_bounded_share_of_the_time(tmp_path, source, monkeypatch):
     saves, galleries = [], []
     real_save, real_gallery = train_module.save, train_module.collect_gallery
