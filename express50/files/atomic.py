@@ -91,8 +91,8 @@ def naming_full_disk(path: Path) -> Iterator[None]:
 
 def _full(path: Path, why: str) -> DiskFullError:
     return DiskFullError(
-        f"{path}: the disk is full ({why}); free some space and run the same command again: "
-        "it continues where it stopped"
+        f"{path}: the disk is full ({why}); free some space and run the same command again; "
+        "finished work is kept"
     )
 
 
