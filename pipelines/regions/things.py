@@ -31,7 +31,7 @@ from express50.geometry.cameras import (
     resized,
     unproject,
 )
-from express50.geometry.conventions import cell_to_corner
+from express50.geometry.conventions import cell_to_corner, corner_to_cell
 from express50.geometry.raycast import join_rays
 from pipelines.regions.colour import colour_logs, like_skin
 from pipelines.regions.geometry import WIDTH_M, TrackedHead, nearest, see
@@ -393,7 +393,7 @@ def _at(line: _Line, offset: float) -> np.ndarray:
     """Return x, y and depth (3, h, w) `offset` before; the first pixel's middle is the origin."""
     point = line[0] - np.float32(offset) * line[1]
     point[:2] /= np.maximum(point[2], np.float32(1e-6))
-    point[:2] -= np.float32(0.5)
+    point[:2] = corner_to_cell(point[:2])
     return point
 
 
