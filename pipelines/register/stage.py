@@ -82,7 +82,7 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
     if shape_spread(track.shape) > STRANGE:  # the error model knows people only
         expected = None
         why = "the tracked head has a shape that nobody has, so no error is stated; see 'track'"
-        warnings.append(Note(expression, why))
+        warnings.append(Note("head shape", why))
     return Result(metrics, (), warnings, expected)
 
 
