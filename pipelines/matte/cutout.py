@@ -322,16 +322,17 @@ def _labels(
     (h, w). Large foreign patches are labelled wall. What all others see as the person is certain
     only if they are `many`; else it is likely where the guess has a person as well.
     """
-    sure = cv2.erode(evidence.solid.astype(np.uint8), np.ones((5, 5))) > 0
-    solid = evidence.solid
-    if not many:
-        sure = (guess == cv2.GC_FGD) & view.valid
-        solid = solid & ~foreign & ((guess == cv2.GC_FGD) | (guess == cv2.GC_PR_FGD))
+    solid, certain = evidence.solid, guess == cv2.GC_FGD
+    if many:
+        sure = cv2.erode(solid.astype(np.uint8), np.ones((5, 5))) > 0
+    else:
+        sure = certain & view.valid
+        solid = solid & ~foreign & (certain | (guess == cv2.GC_PR_FGD))
     inside = ((view.alpha > 0) & evidence.likely & ~foreign) | solid
     labels = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     beyond = (evidence.known & ~evidence.possible) | (guess == cv2.GC_BGD)
     patches = cv2.morphologyEx(foreign.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3))) > 0
-    beyond |= patches & (guess != cv2.GC_FGD)
+    beyond |= patches & ~certain
     labels[beyond | ~view.valid] = cv2.GC_BGD
     labels[sure] = cv2.GC_FGD
     return labels
