@@ -30,6 +30,7 @@ from benchmarks.common import (
     add_twin_options,
     check_twin_options,
     make_parser,
+    recorded,
     replace_section,
     run_or_stop,
 )
@@ -42,7 +43,6 @@ from express50.contract.layout import Dataset
 from express50.files.images import write_image
 from express50.files.text import markdown_table
 from express50.twin.config import TwinConfig
-from express50.twin.record import record
 from express50.twin.truth import Truth
 from pipelines import ingest
 from pipelines.ingest import register
@@ -64,10 +64,11 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     check_twin_options(parser, options)
     with tempfile.TemporaryDirectory() as scratch:
-        dataset = Dataset(Path(scratch) / "dataset")
         if options.dataset is None:
-            truth = record_subjects(Path(scratch), dataset, options.subjects, options.frames)
+            config = twin_config(options.subjects, options.frames)
+            dataset, truth = recorded(config, Path(scratch) / "twin", "standard")
         else:  # labels are written: not into somebody's dataset
+            dataset = Dataset(Path(scratch) / "dataset")
             shutil.copytree(options.dataset / "ingest", dataset.root / "ingest")
             shutil.copy(options.dataset / "captures.json", dataset.captures_file)
             truth = Truth(options.truth)
@@ -234,17 +235,13 @@ def as_markdown(figures: dict) -> list[str]:
     return lines + markdown_table(head, rows)
 
 
-def record_subjects(scratch: Path, dataset: Dataset, subjects: int, frames: int) -> Truth:
-    """Record and ingest subjects that nothing was developed on."""
-    config = TwinConfig(
+def twin_config(subjects: int, frames: int) -> TwinConfig:
+    """Return subjects that nothing was developed on."""
+    return TwinConfig(
         subjects=subjects, first_subject=61, cameras=1, width=256, height=256,
         frames_per_expression=frames, board_frames=0, give_calibration=True, footage="jpg",
         plates=False, seed=17,
     )  # fmt: skip
-    record(config, scratch / "twin")
-    register(dataset, sorted((scratch / "twin" / "captures").iterdir()))
-    run_or_stop(ingest.STAGE, dataset, "standard")
-    return Truth(scratch / "twin" / "truth")
 
 
 def record_4k(scratch: Path, dataset: Dataset, cameras: int = 24, frames: int = 12) -> Dataset:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.common import rounded
 from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera, project, triangulate
 from express50.geometry.transforms import matrix_to_axis_angle, similarity_fit
@@ -58,7 +59,7 @@ def sfm_figures(
                 eye_distance_mm=config.eye_distance_mm,
             )  # fmt: skip
             row = similar(solved.cameras, rig) | {"weak": len(solved.weak)}
-            row["stated_to_true_error"] = stated_to_true(solved, rig)
+            row |= rounded({"stated_to_true_error": stated_to_true(solved, rig)})
         except CalibrationError as error:
             row = {"cameras_registered": 0, "cameras": len(rig), "refused": str(error)}
         rows[key] = row | {"seconds": round(time.process_time() - started, 2)}
@@ -82,7 +83,7 @@ def stated_to_true(solved: FootageSolution, true: Mapping[str, Camera]) -> float
         np.mean([solved.uncertainty[n].px ** 2 for n in names]),
         np.mean(np.square(list(off.values()))),
     ]
-    return _five(float(np.sqrt(squares[0] / squares[1])))
+    return float(np.sqrt(squares[0] / squares[1]))
 
 
 def similar(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> dict[str, object]:
@@ -99,14 +100,15 @@ def similar(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> dict
     degrees = np.degrees(np.linalg.norm(matrix_to_axis_angle(np.stack(turns)), axis=1))
     shifts = 1e3 * np.linalg.norm(scale * centers[0] @ R.T + t - centers[1], axis=1)
     focals = [100 * abs(estimated[n].K[0, 0] / true[n].K[0, 0] - 1) for n in names]
-    return count | {
-        "rotation_error_deg": _five(degrees.mean()),
-        "rotation_error_deg_max": _five(degrees.max()),
-        "translation_error_mm": _five(shifts.mean()),
-        "translation_error_mm_max": _five(shifts.max()),
-        "scale_error_percent": _five(100 * abs(1 / scale - 1)),
-        "focal_error_percent": _five(np.mean(focals)),
+    errors = {
+        "rotation_error_deg": float(degrees.mean()),
+        "rotation_error_deg_max": float(degrees.max()),
+        "translation_error_mm": float(shifts.mean()),
+        "translation_error_mm_max": float(shifts.max()),
+        "scale_error_percent": float(100 * abs(1 / scale - 1)),
+        "focal_error_percent": float(np.mean(focals)),
     }
+    return count | rounded(errors)
 
 
 def refine_figures(
@@ -138,21 +140,20 @@ def _row(
     found = refine(bumped)
     seconds = time.process_time() - started
     quiet = refine(true)
-    return {
-        **_of(judge(found.cameras, true)),
+    row = {
         "kept_given": bool(found.kept),
-        "held_out_before_px": _five(found.before_px),
-        "held_out_after_px": _five(found.after_px),
+        "held_out_before_px": float(found.before_px),
+        "held_out_after_px": float(found.after_px),
         "true_rig_left": bool(quiet.kept),
-        "true_rig_head_px": _five(judge(quiet.cameras, true)["head_px"]),
-        "seconds": round(seconds, 2),
+        "true_rig_head_px": judge(quiet.cameras, true)["head_px"],
     }
+    return _of(judge(found.cameras, true)) | rounded(row) | {"seconds": round(seconds, 2)}
 
 
 def _of(row: Mapping[str, float]) -> dict[str, object]:
     keys = ("rotation_error_deg", "rotation_error_deg_max", "translation_error_mm",
             "translation_error_mm_max", "head_px")  # fmt: skip
-    return {key: _five(row[key]) for key in keys}
+    return rounded({key: row[key] for key in keys})
 
 
 def perturbed(rig: Mapping[str, Camera]) -> dict[str, Camera]:
@@ -166,7 +167,3 @@ def perturbed(rig: Mapping[str, Camera]) -> dict[str, Camera]:
         pose = move_pose(camera.cam_from_world, np.concatenate([turn, shift]))
         found[name] = replace(camera, cam_from_world=pose)
     return found
-
-
-def _five(value: float) -> float:
-    return float(f"{value:.5g}")

@@ -51,12 +51,12 @@ def check_twin_options(parser: argparse.ArgumentParser, options: argparse.Namesp
         parser.error("give both --dataset and --truth, or neither")
 
 
-def recorded(config: TwinConfig, folder: Path) -> tuple[Dataset, Truth]:
-    """Return a twin recording, made where it is not there, and ingested."""
+def recorded(config: TwinConfig, folder: Path, preset: str = "draft") -> tuple[Dataset, Truth]:
+    """Return a twin recording, made where it is not there, and ingested with a preset."""
     record(config, folder, report=print_progress())
     dataset = Dataset(folder / "data")
     ingest.register(dataset, sorted((folder / "captures").iterdir()))
-    run_or_stop(ingest.STAGE, dataset, "draft")
+    run_or_stop(ingest.STAGE, dataset, preset)
     return dataset, Truth(folder / "truth")
 
 
@@ -103,6 +103,12 @@ def true_pictures(
 def rms(values: Iterable[Any]) -> float:
     """Return the root mean square."""
     return float(np.sqrt(np.mean(np.square(np.asarray([*values])))))
+
+
+def means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Return the mean of each figure over the rows that have it."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    return {n: float(np.mean([row[n] for row in rows if n in row])) for n in names}
 
 
 def rounded(row: Mapping[str, object]) -> dict[str, object]:

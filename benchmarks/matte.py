@@ -25,14 +25,13 @@ import json
 import sys
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from benchmarks.common import evenly, make_parser, recorded, rounded, true_pictures
-from benchmarks.matte_scenes import make_scenes
+from benchmarks.common import evenly, make_parser, means, recorded, rounded, true_pictures
+from benchmarks.matte_scenes import Scene, make_scenes
 from express50.contract.layout import Dataset
 from express50.files.images import srgb_to_linear
 from express50.twin.config import TwinConfig
@@ -52,21 +51,6 @@ SMALL = TwinConfig(
 Rows = dict[str, list[dict[str, float]]]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Picture:
-    """Frame and plate (H, W, 3) uint8, pixels with footage (H, W) and true alpha (H, W).
-
-    `front` (H, W, 3) is the subject's part of the frame's light, where that is known.
-    """
-
-    name: str
-    frame: np.ndarray
-    plate: np.ndarray
-    valid: np.ndarray
-    true: np.ndarray
-    front: np.ndarray | None = None
-
-
 def main() -> int:
     """Run and print."""
     parser = make_parser("matte", __doc__)
@@ -79,7 +63,7 @@ def main() -> int:
     args = parser.parse_args()
     cv2.setNumThreads(1)
     result: dict[str, object] = {"benchmark": "matte", "size": args.size}
-    result |= measured(scenes(args.size))
+    result |= measured(make_scenes(args.size))
     if args.twin:
         twin = pictures(*dataset_and_truth(args), args.pictures)
         result["twin"] = measured(twin, textbook=False)
@@ -87,7 +71,7 @@ def main() -> int:
     return 0
 
 
-def measured(found: Iterable[Picture], textbook: bool = True) -> dict[str, object]:
+def measured(found: Iterable[Scene], textbook: bool = True) -> dict[str, object]:
     """Return means over pictures of our key and every baseline, and ratios to the soft key."""
     rows: Rows = {}
     shadow = MatteConfig().shadow
@@ -98,19 +82,16 @@ def measured(found: Iterable[Picture], textbook: bool = True) -> dict[str, objec
         for name, alpha, seconds in baselines(picture, textbook):
             _add(rows, name, alpha, picture, seconds)
         print(picture.name, rounded({n: r[-1]["sad"] for n, r in rows.items()}), file=sys.stderr)
-    means = {
-        name: {key: float(np.mean([row[key] for row in mine])) for key in mine[0]}
-        for name, mine in rows.items()
-    }
-    soft, ours = means["soft_key"], means["standard"]
+    table = {name: means(mine) for name, mine in rows.items()}
+    soft, ours = table["soft_key"], table["standard"]
     for key in ("sad", "gradient_error", "sad_rim", "gradient_error_rim"):
         short = key.replace("_error", "").replace("_rim", "")
         end = "_rim" if key.endswith("_rim") else ""
         ours[f"{short}_ratio_to_soft_key{end}"] = ours[key] / soft[key]
-    return {"pictures": len(rows["soft_key"])} | {n: rounded(m) for n, m in means.items()}
+    return {"pictures": len(rows["soft_key"])} | {n: rounded(m) for n, m in table.items()}
 
 
-def _add(rows: Rows, name: str, alpha: np.ndarray, picture: Picture, seconds: float) -> None:
+def _add(rows: Rows, name: str, alpha: np.ndarray, picture: Scene, seconds: float) -> None:
     row = errors(alpha, picture.true)
     row["seconds_per_megapixel"] = 1e6 * seconds / alpha.size
     if picture.front is not None:
@@ -118,7 +99,7 @@ def _add(rows: Rows, name: str, alpha: np.ndarray, picture: Picture, seconds: fl
     rows.setdefault(name, []).append(row)
 
 
-def composite_errors(alpha: np.ndarray, picture: Picture) -> dict[str, float]:
+def composite_errors(alpha: np.ndarray, picture: Scene) -> dict[str, float]:
     """Return the error of the subject before black, mean absolute light in soft pixels, times 1000.
 
     `composite_error` with the subject's own colours as estimated, `composite_error_footage` with
@@ -135,21 +116,7 @@ def composite_errors(alpha: np.ndarray, picture: Picture) -> dict[str, float]:
     return found
 
 
-def scenes(size: int) -> Iterator[Picture]:
-    """Yield the drawn scenes."""
-    for scene in make_scenes(size):
-        whole = np.ones(scene.alpha.shape, bool)
-        yield Picture(
-            name=scene.name,
-            frame=scene.frame,
-            plate=scene.plate,
-            valid=whole,
-            true=scene.alpha,
-            front=scene.front,
-        )
-
-
-def pictures(dataset: Dataset, truth: Truth, limit: int) -> Iterator[Picture]:
+def pictures(dataset: Dataset, truth: Truth, limit: int) -> Iterator[Scene]:
     """Yield peaks of the twin, an even choice of at most `limit`."""
     every = [
         (subject, camera, frame)
@@ -159,7 +126,7 @@ def pictures(dataset: Dataset, truth: Truth, limit: int) -> Iterator[Picture]:
     ]
     for subject, camera, frame in evenly(every, limit):
         name = f"{subject} {camera.id} {frame}"
-        yield Picture(name=name, **true_pictures(dataset, truth, subject, camera, frame))
+        yield Scene(name=name, **true_pictures(dataset, truth, subject, camera, frame))
 
 
 def dataset_and_truth(args: argparse.Namespace) -> tuple[Dataset, Truth]:
@@ -171,7 +138,7 @@ def dataset_and_truth(args: argparse.Namespace) -> tuple[Dataset, Truth]:
     return recorded(SMALL, args.small)
 
 
-def baselines(picture: Picture, textbook: bool) -> Iterator[tuple[str, np.ndarray, float]]:
+def baselines(picture: Scene, textbook: bool) -> Iterator[tuple[str, np.ndarray, float]]:
     """Name, alpha (H, W) and seconds of every plain key and, if asked for, textbook method."""
     start = time.process_time()
     frame, valid = picture.frame, picture.valid
@@ -199,7 +166,7 @@ def baselines(picture: Picture, textbook: bool) -> Iterator[tuple[str, np.ndarra
         yield "closed_form", alpha, seconds + spent
 
 
-def _best(alphas: list[np.ndarray], picture: Picture) -> np.ndarray:
+def _best(alphas: list[np.ndarray], picture: Scene) -> np.ndarray:
     return min(alphas, key=lambda alpha: float(np.abs(alpha - picture.true).mean()))
 
 

@@ -33,16 +33,17 @@ PLATES = ("plain", "cluttered")
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """A frame and its clean plate (H, W, 3) uint8, and the truth.
+    """Frame and clean plate (H, W, 3) uint8, pixels with footage (H, W), true alpha (H, W).
 
-    True are `alpha` (H, W) float32 and `front` (H, W, 3), the subject's part of the frame's light.
+    `front` (H, W, 3) is the subject's part of the frame's light, where that is known.
     """
 
     name: str
     frame: np.ndarray
     plate: np.ndarray
-    alpha: np.ndarray
-    front: np.ndarray
+    valid: np.ndarray
+    true: np.ndarray
+    front: np.ndarray | None = None
 
 
 def make_scenes(size: int) -> Iterator[Scene]:
@@ -75,7 +76,8 @@ def make_scene(hair: str, backdrop: str, size: int, rng: np.random.Generator) ->
         name=f"{hair} {backdrop}",
         frame=exposed(frame * np.array(GAIN), rng),
         plate=exposed(plate, rng),
-        alpha=alpha.astype(np.float32),
+        valid=np.ones((size, size), bool),
+        true=alpha.astype(np.float32),
         front=seen * np.array(GAIN),
     )
 

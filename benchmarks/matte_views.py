@@ -45,6 +45,7 @@ from benchmarks.common import (
     check_twin_options,
     evenly,
     make_parser,
+    means,
     recorded,
     rounded,
     true_pictures,
@@ -140,15 +141,7 @@ def main() -> int:
         "benchmark": "matte_views",
         **summary(rows),
         "no_plate": bare_summary(bare),
-        "plates": {
-            name: rounded(
-                {
-                    key: float(np.mean([row[key] for row in mine if key in row]))
-                    for key in {key: None for row in mine for key in row}
-                }
-            )
-            for name, mine in plates.items()
-        },
+        "plates": {name: rounded(means(mine)) for name, mine in plates.items()},
     }
     print(json.dumps(result))
     return 0
@@ -192,14 +185,19 @@ def measure(keyed: list[Keyed], config: MatteConfig, sheet: Path | None) -> Figu
     ]
     seconds = time.process_time() - started
     if sheet is not None:
-        rows = [[k.shot.frame, k.alpha, a] for k, a in zip(keyed, after, strict=True)]
-        sheet.parent.mkdir(parents=True, exist_ok=True)
-        write_image(sheet, contact_sheet(rows[:8], [k.shot.camera.id for k in keyed[:8]]))
-    before = [errors(k.alpha / 255, k.shot.true) for k in keyed]
-    later = [errors(a / 255, k.shot.true) for k, a in zip(keyed, after, strict=True)]
-    row = {name: float(np.mean([e[name] for e in later])) for name in ("sad", "mae")}
-    row |= {f"{name}_key": float(np.mean([e[name] for e in before])) for name in ("sad", "mae")}
+        pictures = [[k.shot.frame, k.alpha, a] for k, a in zip(keyed, after, strict=True)]
+        write_sheet(sheet, pictures, [k.shot for k in keyed])
+    before = means([errors(k.alpha / 255, k.shot.true) for k in keyed])
+    later = means([errors(a / 255, k.shot.true) for k, a in zip(keyed, after, strict=True)])
+    row = {name: later[name] for name in ("sad", "mae")}
+    row |= {f"{name}_key": before[name] for name in ("sad", "mae")}
     return row | {"named": float(len(found.warnings)), "seconds_per_moment": seconds}
+
+
+def write_sheet(path: Path, pictures: list[list[np.ndarray]], shots: list[Shot]) -> None:
+    """Write a row of pictures for each of the first eight cameras."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_image(path, contact_sheet(pictures[:8], [shot.camera.id for shot in shots[:8]]))
 
 
 def without_plates(shots: list[Shot], sheet: Path | None) -> Figures:
@@ -213,9 +211,8 @@ def without_plates(shots: list[Shot], sheet: Path | None) -> Figures:
     alone = [_alone(shot, view) for shot, view in zip(shots, views, strict=True)]
     keyed = [key(shot).alpha / 255 for shot in shots]
     if sheet is not None:
-        rows = [[s.frame, (255 * a).astype(np.uint8)] for s, a in zip(shots, alphas, strict=True)]
-        sheet.parent.mkdir(parents=True, exist_ok=True)
-        write_image(sheet, contact_sheet(rows[:8], [shot.camera.id for shot in shots[:8]]))
+        steps = [(255 * alpha).astype(np.uint8) for alpha in alphas]
+        write_sheet(sheet, [[s.frame, a] for s, a in zip(shots, steps, strict=True)], shots)
     sad, sad_plate, sad_alone = (
         np.array([errors(a, shot.true)["sad"] for a, shot in zip(found, shots, strict=True)])
         for found in (alphas, keyed, alone)
@@ -238,45 +235,34 @@ def _alone(shot: Shot, view: CutView) -> np.ndarray:
 
 def with_plates(wrong: list[Shot], right: list[Shot]) -> Figures:
     """Return errors of shots with wrong plates; those that are refused count for nothing else."""
-    kept: dict[str, list[float]] = {name: [] for name in ("sad", "sad_untouched", "sad_right")}
-    refused = 0
+    kept: list[Figures] = []
     for shot, good in zip(wrong, right, strict=True):
         matched = match_plate(shot.plate, shot.frame, shot.valid)
-        if matched.share < LEAST_SHARE:
-            refused += 1
-            continue
-        for name, plate in (
-            ("sad", matched.plate),
-            ("sad_untouched", shot.plate),
-            ("sad_right", good.plate),
-        ):
-            kept[name].append(errors(key(replace(shot, plate=plate)).alpha / 255, shot.true)["sad"])
-    means = {name: float(np.mean(values)) for name, values in kept.items() if values}
-    return means | {"refused": refused / len(wrong)}
+        if matched.share >= LEAST_SHARE:
+            plates = {"sad": matched.plate, "sad_untouched": shot.plate, "sad_right": good.plate}
+            kept.append(
+                {
+                    name: errors(key(replace(shot, plate=plate)).alpha / 255, shot.true)["sad"]
+                    for name, plate in plates.items()
+                }
+            )
+    return means(kept) | {"refused": 1 - len(kept) / len(wrong)}
 
 
 def bare_summary(rows: dict[tuple[int, str], list[Figures]]) -> dict[str, Any]:
     """Return means over the peaks by number of cameras and scene, and of all scenes together."""
     table: dict[str, Any] = {}
+    every = []
     for (count, scene), mine in rows.items():
-        means = {name: float(np.mean([row[name] for row in mine])) for name in mine[0]}
-        table.setdefault(f"cameras_{count}", {})[scene] = means
-    every = [means for scenes in table.values() for means in scenes.values()]
-    for means in every:
-        means["sad_ratio_to_plate"] = means["sad"] / means["sad_plate"]
-    result: dict[str, Any] = {
-        cameras: {scene: rounded(means) for scene, means in scenes.items()}
-        for cameras, scenes in table.items()
-    }
+        row = means(mine)
+        row["sad_ratio_to_plate"] = row["sad"] / row["sad_plate"]
+        table.setdefault(f"cameras_{count}", {})[scene] = rounded(row)
+        every.append(row)
     if every:
-        total, plates = (sum(means[name] for means in every) for name in ("sad", "sad_plate"))
-        result |= rounded(
-            {
-                "sad_ratio_to_plate": total / plates,
-                "worst_ratio": max(means["worst_ratio"] for means in every),
-            }
-        )
-    return result
+        total, plates = (sum(row[name] for row in every) for name in ("sad", "sad_plate"))
+        worst = max(row["worst_ratio"] for row in every)
+        table |= rounded({"sad_ratio_to_plate": total / plates, "worst_ratio": worst})
+    return table
 
 
 def sheet_of(
@@ -292,10 +278,10 @@ def summary(rows: dict[tuple[int, str, str], list[Figures]]) -> dict[str, object
     """Return means over the peaks by number of cameras, preset and scene, with their ratios."""
     table: dict[str, Any] = {}
     for (count, preset, scene), mine in rows.items():
-        means = {name: float(np.mean([row[name] for row in mine])) for name in mine[0]}
-        means["sad_ratio_to_key"] = means["sad"] / means["sad_key"]
+        row = means(mine)
+        row["sad_ratio_to_key"] = row["sad"] / row["sad_key"]
         scenes = table.setdefault(f"cameras_{count}", {}).setdefault(preset, {})
-        scenes[scene] = rounded(means)
+        scenes[scene] = rounded(row)
     return table
 
 

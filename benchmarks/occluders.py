@@ -30,7 +30,7 @@ import numpy as np
 from benchmarks.accuracy import true_world_cameras
 from benchmarks.common import make_parser, rms, run_or_stop
 from benchmarks.regions_truth import true_labels
-from benchmarks.track import prepare
+from benchmarks.track import prepare, twin_config
 from benchmarks.track_views import face_of
 from express50.capture.frames import read_cameras_of
 from express50.capture.index import read_peaks
@@ -74,11 +74,10 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.quick:
         options.cameras, options.side, options.ways = 12, 320, ["on"]
-    twin = TwinConfig(
-        subjects=1, first_subject=options.subject, cameras=options.cameras, width=options.side,
-        height=options.side, expressions=("neutral", "smile", "jaw_open"),
-        frames_per_expression=4, board_frames=0, give_calibration=True, footage="jpg", seed=5,
-    )  # fmt: skip
+    twin = twin_config(1, options.cameras, options.side)
+    twin = replace(
+        twin, first_subject=options.subject, expressions=("neutral", "smile", "jaw_open")
+    )
     result: dict = {"benchmark": "occluders"}
     kinds = {"none": ()} | {name: (KINDS | FURTHER)[name] for name in options.kinds}
     for way in options.ways:

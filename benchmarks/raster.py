@@ -19,8 +19,8 @@ import platform
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
+import psutil
 import torch
 from torch import Tensor
 
@@ -69,7 +69,7 @@ def rival(
     """Return autograd's seconds over explicit pairs and how often ours fit in, or why not."""
     channels = scene["colors"].shape[1]
     # Gathered colours, their products and both gradients; then some 40 numbers for each pair.
-    needed, free = len(pairs[0]) * (4 * 4 * channels + 300), free_bytes()
+    needed, free = len(pairs[0]) * (4 * 4 * channels + 300), psutil.virtual_memory().available
     if needed > free / 2:
         reason = f"needs about {needed / 2**30:.0f} GiB, half the free memory is {free / 2**31:.0f}"
         return {"torch_pairs": "n/a", "torch_pairs_reason": reason}
@@ -79,15 +79,6 @@ def rival(
         "torch_pairs_forward_backward_s": round(both, 4),
         "speedup_forward_backward": round(both / ours, 1),
     }
-
-
-def free_bytes() -> float:
-    """Return the free memory of this machine; without /proc, 8 GiB."""
-    table = Path("/proc/meminfo")
-    if not table.exists():
-        return 8.0 * 2**30
-    fields = dict(line.split(":") for line in table.read_text().splitlines())
-    return 1024.0 * int(fields["MemAvailable"].split()[0])
 
 
 def case(

@@ -183,18 +183,14 @@ def measured(
         got = [sample["rgb.jpg"] for sample in one_pass()]
         if len(got) != len(given) or not set(got) <= expected:
             return {"why": f"n/a: {name} gave {len(got)} samples, expected {len(given)}"}
-        seconds = least(partial(_exhaust_pass, one_pass))
+        seconds = least(partial(exhaust, one_pass))
         row[f"{name}_per_s"] = round(len(given) / seconds)
     return row
 
 
-def _exhaust_pass(one_pass: Callable[[], Iterator[Members]]) -> None:
-    exhaust(one_pass())
-
-
-def exhaust(samples: Iterator[Members]) -> None:
-    """Take every sample."""
-    for _ in samples:
+def exhaust(one_pass: Callable[[], Iterator[Members]]) -> None:
+    """Take every sample of a pass."""
+    for _ in one_pass():
         pass
 
 

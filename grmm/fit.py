@@ -202,7 +202,9 @@ def tune_decoders(state: FitState, until: float = math.inf) -> int:
         rendering = state.model.render(
             state.z_id, z_exp, item.state, item.view, state.views.background, shade
         )
-        loss = _footage_loss(state, rendering, item) + _mesh_loss(state, rendering)
+        # Few views do not say where the mesh should be: it stays near the tracked one.
+        moved = losses.displacement_mm2(rendering.gaussians.displacement)
+        loss = _footage_loss(state, rendering, item) + state.config.loss.displacement * moved
         if settings.locality and number % settings.locality_every == 0:
             weight = settings.locality * settings.locality_every
             loss = loss + weight * locality_loss(state, item, rng)
@@ -281,12 +283,6 @@ def _footage_loss(state: FitState, rendering: Rendering, item: Item) -> Tensor:
     rendering = item.before_torso(rendering)
     images = (rendering.rgb, rendering.image)
     return reconstruction(state, *((item.comparable(image), item.target) for image in images))
-
-
-def _mesh_loss(state: FitState, rendering: Rendering) -> Tensor:
-    """Weigh how far the mesh lies from the tracked one; few views do not say where it should be."""
-    moved = losses.displacement_mm2(rendering.gaussians.displacement)
-    return state.config.loss.displacement * moved
 
 
 def locality_loss(state: FitState, item: Item, rng: np.random.Generator) -> Tensor:

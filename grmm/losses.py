@@ -51,21 +51,17 @@ def ssim_map(a: Tensor, b: Tensor) -> Tensor:
     dtype = a.dtype if a.dtype in (torch.float32, torch.float64) else torch.float32
     a, b = a.to(dtype), b.to(dtype)
     stack = torch.cat([a, b, a * a, b * b, a * b])[None]  # (1, 5 C, H, W)
-    mean_a, mean_b, aa, bb, ab = _blur(stack)[0].chunk(5)
-    covariance = ab - mean_a * mean_b
-    variances = (aa - mean_a * mean_a) + (bb - mean_b * mean_b)
-    luminance = (2 * mean_a * mean_b + SSIM_C1) / (mean_a * mean_a + mean_b * mean_b + SSIM_C1)
-    return luminance * (2 * covariance + SSIM_C2) / (variances + SSIM_C2)
-
-
-def _blur(stack: Tensor) -> Tensor:
-    """Slide the window over (1, C, H, W), one axis after the other, one channel at a time."""
+    # The window slides over one axis after the other, in one channel at a time.
     channels, height, width = stack.shape[1:]
     rows, columns = (_window(n, stack.dtype, stack.device) for n in (height, width))
     across = columns.view(1, 1, 1, -1).expand(channels, -1, -1, -1)
     down = rows.view(1, 1, -1, 1).expand(channels, -1, -1, -1)
     blurred = nn.functional.conv2d(stack, across, groups=channels)
-    return nn.functional.conv2d(blurred, down, groups=channels)
+    mean_a, mean_b, aa, bb, ab = nn.functional.conv2d(blurred, down, groups=channels)[0].chunk(5)
+    covariance = ab - mean_a * mean_b
+    variances = (aa - mean_a * mean_a) + (bb - mean_b * mean_b)
+    luminance = (2 * mean_a * mean_b + SSIM_C1) / (mean_a * mean_a + mean_b * mean_b + SSIM_C1)
+    return luminance * (2 * covariance + SSIM_C2) / (variances + SSIM_C2)
 
 
 @lru_cache(maxsize=32)

@@ -103,7 +103,17 @@ def read_capture(root: Path) -> RawCapture:
         CalibrationError: calibration.json exists but is malformed.
     """
     meta = read_meta(root)
-    cameras, dropped = _read_cameras(root)
+    folder = root / "cameras"
+    if not folder.is_dir():
+        raise CaptureError(f"{folder}: no such folder; expected cameras/<id>/video.mp4 or frames/")
+    cameras, dropped = {}, {}
+    for path in sorted(p for p in folder.iterdir() if not p.name.startswith(".")):
+        if not path.is_dir():
+            continue
+        try:
+            cameras[path.name] = _read_camera(path)
+        except CaptureError as error:
+            dropped[path.name] = str(error)
     calibration = read_calibration(root, cameras, dropped)
     return RawCapture(
         root=root,
@@ -210,21 +220,6 @@ def plain(value: object) -> object:
     if isinstance(value, list):
         return [plain(one) for one in value]
     return value if isinstance(value, str | int | float) else str(value)
-
-
-def _read_cameras(root: Path) -> tuple[dict[str, RawCamera], dict[str, str]]:
-    folder = root / "cameras"
-    if not folder.is_dir():
-        raise CaptureError(f"{folder}: no such folder; expected cameras/<id>/video.mp4 or frames/")
-    cameras, dropped = {}, {}
-    for path in sorted(p for p in folder.iterdir() if not p.name.startswith(".")):
-        if not path.is_dir():
-            continue
-        try:
-            cameras[path.name] = _read_camera(path)
-        except CaptureError as error:
-            dropped[path.name] = str(error)
-    return cameras, dropped
 
 
 def _read_camera(folder: Path) -> RawCamera:

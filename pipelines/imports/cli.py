@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -184,28 +184,22 @@ def _plan_tracks(
 
     def write(out: Path) -> Result:
         arrays, notes = read_foreign_track(dataset, subject, peaks, source)
-        checks = _check_track(dataset, subject, peaks, arrays, args.trust, notes)
+        cameras, vertices = read_cameras_of(dataset, subject), arrays["vertices"]
+        for mesh in vertices:
+            check_in_view(cameras, mesh, subject)
+        model = load_head(str(arrays["head"]))
+        marks = landmarks(model, torch.from_numpy(vertices)).double().numpy()
+        errors: dict[str, float | None] = {}
+        for peak, points in zip(peaks, marks, strict=True):
+            found = observe_peak(dataset, subject, peak, notes)
+            with trusting(args.trust, notes):
+                where = f"{subject}/{peak.expression}"
+                errors[peak.expression] = check_landmarks(found, points, where)
+        checks = {"landmarks_off_of_face": errors, "expressions": len(peaks)}
         write_npz(out / "track.npz", arrays)
         return Result({"imported": checks}, (), notes)
 
     return {subject: write}
-
-
-def _check_track(
-    dataset: Dataset, subject: str, peaks: list[PeakFrame], arrays: Mapping[str, np.ndarray],
-    trust: bool, notes: list[Note],
-) -> dict[str, object]:  # fmt: skip
-    cameras, vertices = read_cameras_of(dataset, subject), arrays["vertices"]
-    marks = landmarks(load_head(str(arrays["head"])), torch.from_numpy(vertices)).double().numpy()
-    for mesh in vertices:
-        check_in_view(cameras, mesh, subject)
-    errors: dict[str, float | None] = {}
-    for peak, points in zip(peaks, marks, strict=True):
-        found = observe_peak(dataset, subject, peak, notes)
-        with trusting(trust, notes):
-            where = f"{subject}/{peak.expression}"
-            errors[peak.expression] = check_landmarks(found, points, where)
-    return {"landmarks_off_of_face": errors, "expressions": len(peaks)}
 
 
 @dataclass(frozen=True)

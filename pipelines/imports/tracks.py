@@ -120,7 +120,20 @@ def _read_steps(
         path = files[-1]
     if path.suffix != ".npz":
         raise ConfigError(f"{path}: no such file; expected a folder or {WHAT} (.npz)")
-    return _steps_of_npz(path, peaks, ours, source)
+    arrays = read_arrays(path, FormatError, WHAT, ROWS)
+    if "focal_length" in arrays and source.cameras is None:
+        raise CalibrationError(
+            f"{path}: was tracked without calibrated cameras (it has a focal_length); track it with"
+            " those of the dataset, or import the folder that its export wrote"
+        )
+    motion = np.eye(4)
+    if source.cameras is not None:
+        rig = read_rig(source.cameras, None, None, 1.0)
+        motion = aligning_transform(rig, ours, str(path))
+    count = len(arrays["translation"])
+    names = [str(n) for n in np.ravel(arrays.get("timestep_id", np.arange(count)))]
+    chosen = _choose(names[:count], peaks, source.in_clip, str(path))
+    return {e: _step(path, arrays, names.index(key), motion) for e, key in chosen.items()}
 
 
 def _steps_of_transforms(
@@ -170,25 +183,6 @@ def _camera_of(where: str, name: str, row: dict, axes: str) -> Camera:
         return frame_camera(where, name, row, None)
     except (KeyError, TypeError, ValueError, OverflowError, np.linalg.LinAlgError) as error:
         raise CalibrationError(f"{where}: its camera cannot be read ({error})") from None
-
-
-def _steps_of_npz(
-    path: Path, peaks: list[PeakFrame], ours: Mapping[str, Camera], source: TrackSource
-) -> dict[str, FlameStep]:
-    arrays = read_arrays(path, FormatError, WHAT, ROWS)
-    if "focal_length" in arrays and source.cameras is None:
-        raise CalibrationError(
-            f"{path}: was tracked without calibrated cameras (it has a focal_length); track it with"
-            " those of the dataset, or import the folder that its export wrote"
-        )
-    motion = np.eye(4)
-    if source.cameras is not None:
-        rig = read_rig(source.cameras, None, None, 1.0)
-        motion = aligning_transform(rig, ours, str(path))
-    count = len(arrays["translation"])
-    names = [str(n) for n in np.ravel(arrays.get("timestep_id", np.arange(count)))]
-    chosen = _choose(names[:count], peaks, source.in_clip, str(path))
-    return {e: _step(path, arrays, names.index(key), motion) for e, key in chosen.items()}
 
 
 def _choose(keys: list[str], peaks: list[PeakFrame], in_clip: bool, where: str) -> dict[str, str]:
@@ -255,7 +249,13 @@ def _make_track(
                     " track its sequences together"
                 )
     shape = _fitted(first.shared["shape"], model.shape_dirs.shape[2], "shape", first.where)
-    offsets = _offsets(first, model)
+    given, count = first.shared["static_offset"], len(model.template)
+    if len(given) > count:
+        raise FormatError(
+            f"{first.where}: static_offset of {len(given)} vertices, the head model has {count};"
+            " name the model that it was tracked with (--head)"
+        )
+    offsets = np.vstack([given, np.zeros((count - len(given), 3))])
     rows = [_posed(steps[peak.expression], model, shape, offsets) for peak in peaks]
     track = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
     track |= {
@@ -277,16 +277,6 @@ def _fitted(values: np.ndarray, count: int, name: str, where: str) -> np.ndarray
             " name the model that it was tracked with (--head)"
         )
     return values[:count]
-
-
-def _offsets(step: FlameStep, model: HeadModel) -> np.ndarray:
-    given, count = step.shared["static_offset"], len(model.template)
-    if len(given) > count:
-        raise FormatError(
-            f"{step.where}: static_offset of {len(given)} vertices, the head model has {count};"
-            " name the model that it was tracked with (--head)"
-        )
-    return np.vstack([given, np.zeros((count - len(given), 3))])
 
 
 def _posed(

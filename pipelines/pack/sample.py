@@ -94,7 +94,16 @@ def read_subject(dataset: Dataset, name: str) -> PackedSubject:
     peaks = read_peaks(dataset, name)
     peak_rows = read_json_table(dataset.peaks_file(name), FormatError)
     track = read_track(existing_track(dataset, name))
-    registered, notes = _read_registered(dataset, name, track)
+    registered, notes, digest = {}, [], file_sha256(dataset.track_file(name))
+    for expression in track.expressions:
+        path = dataset.registration_file(name, expression)
+        try:
+            registration = registration_of(path, track, digest)
+        except FormatError as error:
+            notes.append(Note(f"{name}/{expression}", f"packed without its registration: {error}"))
+            continue
+        if registration is not None:
+            registered[expression] = registration
     return PackedSubject(
         name=name,
         cameras=read_cameras_of(dataset, name),
@@ -114,23 +123,6 @@ def read_subject(dataset: Dataset, name: str) -> PackedSubject:
             "session": index.meta.get("session"),
         },
     )
-
-
-def _read_registered(
-    dataset: Dataset, name: str, track: Track
-) -> tuple[dict[str, Registration], list[Note]]:
-    """Read a subject's registrations by expression, and why one cannot be packed."""
-    found, notes, digest = {}, [], file_sha256(dataset.track_file(name))
-    for expression in track.expressions:
-        path = dataset.registration_file(name, expression)
-        try:
-            registration = registration_of(path, track, digest)
-        except FormatError as error:
-            notes.append(Note(f"{name}/{expression}", f"packed without its registration: {error}"))
-            continue
-        if registration is not None:
-            found[expression] = registration
-    return found, notes
 
 
 def nameless(label: dict) -> dict:

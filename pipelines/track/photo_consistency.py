@@ -120,7 +120,25 @@ def search(views: PatchViews, reach: float) -> PatchSearch:
     pixel = views.pixel
     steps = max(3, int(np.ceil(reach / (STEP_PX * pixel))))
     heights = np.arange(-steps, steps + 1) * (reach / steps)
-    return _peaks(agreement(views, heights), heights, pixel)
+    # The highest score of each patch is placed between the steps by a parabola.
+    score = agreement(views, heights)
+    best = score.argmax(1)
+    inner = (best > 0) & (best < len(heights) - 1)
+    at = np.clip(best, 1, len(heights) - 2)
+    row = np.arange(len(score))
+    left, top, right = score[row, at - 1], score[row, at], score[row, at + 1]
+    bend = np.maximum(2 * top - left - right, 1e-6)
+    shift = np.clip(0.5 * (right - left) / bend, -0.5, 0.5)
+    step = heights[1] - heights[0]
+    far = np.abs(np.arange(len(heights))[None] - at[:, None]) > 2
+    # A patch that is much the same everywhere, as on a flat cheek, has no clear height.
+    rival = np.where(far, score, -1.0).max(1)
+    return PatchSearch(
+        heights[at] + shift * step,
+        np.where(inner, top, 0.0),
+        np.where(inner, np.clip(top - rival, 0.0, 1.0), 0.0),
+        pixel,
+    )
 
 
 def agreement(views: PatchViews, heights: np.ndarray) -> np.ndarray:
@@ -207,27 +225,6 @@ def _shapes(
     # Another part of the face under the patch does not continue it.
     rise = np.where(np.abs(rise) < spacing * PATCH, rise, 0.0)
     return np.swapaxes(flat + rise[..., None] * normals[:, None], 1, 2)
-
-
-def _peaks(score: np.ndarray, heights: np.ndarray, pixel: float) -> PatchSearch:
-    """Find the highest score of every row (S, D), placed between the steps by a parabola."""
-    best = score.argmax(1)
-    inner = (best > 0) & (best < len(heights) - 1)
-    at = np.clip(best, 1, len(heights) - 2)
-    row = np.arange(len(score))
-    left, top, right = score[row, at - 1], score[row, at], score[row, at + 1]
-    bend = np.maximum(2 * top - left - right, 1e-6)
-    shift = np.clip(0.5 * (right - left) / bend, -0.5, 0.5)
-    step = heights[1] - heights[0]
-    far = np.abs(np.arange(len(heights))[None] - at[:, None]) > 2
-    # A patch that is much the same everywhere, as on a flat cheek, has no clear height.
-    rival = np.where(far, score, -1.0).max(1)
-    return PatchSearch(
-        heights[at] + shift * step,
-        np.where(inner, top, 0.0),
-        np.where(inner, np.clip(top - rival, 0.0, 1.0), 0.0),
-        pixel,
-    )
 
 
 def surface_term(

@@ -20,7 +20,7 @@ def keyed(frame: np.ndarray, plate: np.ndarray) -> np.ndarray:
 def test_skin_under_dark_hair_is_solid_before_grey(blur: float) -> None:
     """It differs from grey by less than half of what dark hair does."""
     scene = make_scene("dark", "plain", 320, np.random.default_rng(0))
-    frame, plate, true = scene.frame, scene.plate, scene.alpha
+    frame, plate, true = scene.frame, scene.plate, scene.true
     if blur:
         frame, plate, true = (cv2.GaussianBlur(x, (0, 0), blur) for x in (frame, plate, true))
     alpha = keyed(frame, plate)
@@ -38,7 +38,7 @@ def test_coarse_noise_opens_no_holes_in_the_face() -> None:
     )
     alpha = keyed(frame, plate)
     assert alpha[110:205, 130:190].mean() > 0.98
-    assert np.abs(alpha - scene.alpha).mean() < 0.03
+    assert np.abs(alpha - scene.true).mean() < 0.03
 
 
 def test_only_strands_and_no_solid() -> None:

@@ -266,7 +266,7 @@ def test_a_shifted_plate_and_one_in_other_light_are_brought_to_the_frame(
     valid = np.ones((256, 256), bool)
     matched = match_plate(wrong, scene.frame, valid)
     before, after, right = (
-        np.abs(key_alpha(scene.frame, plate, valid, MatteConfig().shadow) - scene.alpha).mean()
+        np.abs(key_alpha(scene.frame, plate, valid, MatteConfig().shadow) - scene.true).mean()
         for plate in (wrong, matched.plate, scene.plate)
     )
     assert matched.share > LEAST_SHARE

@@ -60,17 +60,13 @@ class HeadScene:
         self.head = head
         self.canvas = head.canvas
         self.scene = mesh_scene(head.vertices, self.faces)
-        self.openness = self._measure_openness(np.random.default_rng(head.look))
-
-    def _measure_openness(self, rng: Rng) -> np.ndarray:
-        """Return the share (V,) of the ambient light that reaches each vertex."""
-        starts = self.head.vertices + 6e-4 * self.head.normals
+        # Share (V,) of the ambient light that reaches each vertex.
+        rng, starts = np.random.default_rng(head.look), head.vertices + 6e-4 * head.normals
         free = np.zeros(len(starts), np.float32)
         for _ in range(OPEN_RAYS):
-            way = unit(self.head.normals + unit(rng.normal(size=starts.shape).astype(np.float32)))
-            rays = join_rays(starts, way)
-            free += ~self.scene.test_occlusions(rays, 0.0, OPEN_M).numpy()
-        return free / OPEN_RAYS
+            way = unit(head.normals + unit(rng.normal(size=starts.shape).astype(np.float32)))
+            free += ~self.scene.test_occlusions(join_rays(starts, way), 0.0, OPEN_M).numpy()
+        self.openness = free / OPEN_RAYS
 
     def render(
         self, rng: Rng, side: int, yaw: float, close: tuple[np.ndarray, float] | None = None
@@ -193,26 +189,14 @@ class HeadScene:
         width = float(np.ptp(np.concatenate(rings_2d), axis=0).max())
         thick = max(1, int(round(width * rng.uniform(0.0, 0.045))))
         for line, closed in [(rings[0], 1), (rings[1], 1), (bridge, 0), *((t, 0) for t in temples)]:
-            self._draw_line(rgba, eye, projection, line, closed, color, thick)
+            # Only the parts that the head does not hide.
+            seen, flat = self._seen(eye, line), project(projection, line)
+            for k in range(len(line) - 1 + closed):
+                j = (k + 1) % len(line)
+                if seen[k] and seen[j]:
+                    ends = [tuple(int(v) for v in np.round(flat[i] * 8)) for i in (k, j)]
+                    cv2.line(rgba, *ends, color, thick, cv2.LINE_AA, 3)
         return opaque
-
-    def _draw_line(
-        self,
-        rgba: np.ndarray,
-        eye: np.ndarray,
-        projection: np.ndarray,
-        line: np.ndarray,
-        closed: int,
-        color: tuple[float, ...],
-        thick: int,
-    ) -> None:
-        """Draw the parts of a line (N, 3) that the head does not hide, in place."""
-        seen, flat = self._seen(eye, line), project(projection, line)
-        for k in range(len(line) - 1 + closed):
-            j = (k + 1) % len(line)
-            if seen[k] and seen[j]:
-                ends = [tuple(int(v) for v in np.round(flat[i] * 8)) for i in (k, j)]
-                cv2.line(rgba, *ends, color, thick, cv2.LINE_AA, 3)
 
 
 def glasses_lines(
