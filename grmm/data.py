@@ -166,11 +166,14 @@ class Item:
 
     def before_torso(self, rendering: Rendering) -> Rendering:
         """Return a rendering that is background where the torso is in front of what was drawn."""
-        behind = (self.torso > 0) & (rendering.depth > self.torso)
-        rgb, image = (
-            torch.where(behind, self.background, each) for each in (rendering.rgb, rendering.image)
-        )
+        images = (rendering.rgb, rendering.image)
+        rgb, image = (self.without_hidden(each, rendering.depth) for each in images)
         return replace(rendering, rgb=rgb, image=image)
+
+    def without_hidden(self, image: Tensor, depth: Tensor) -> Tensor:
+        """Return ``image`` (3, H, W) with the background where the torso is before its depth."""
+        behind = (self.torso > 0) & (depth > self.torso)
+        return torch.where(behind, self.background, image)
 
     def comparable(self, image: Tensor) -> Tensor:
         """Return ``image`` (3, H, W) with the footage where the neck is hidden."""

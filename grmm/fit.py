@@ -26,7 +26,7 @@ from grmm import losses
 from grmm.checkpoint import Gallery, Loaded, collect_gallery, save_checkpoint
 from grmm.config import Config
 from grmm.data import NO_OFFSETS, HeadViews, Item, Shuffle, spread
-from grmm.edit import HeadCodes, between, trained_head
+from grmm.edit import HeadCodes, between, trained_head, transfer
 from grmm.evaluate import Render, evaluate, mean
 from grmm.metrics import PerceptualMetrics
 from grmm.model import GRMM, PinholeView, Rendering
@@ -355,7 +355,13 @@ def save_fit(state: FitState, out: Path) -> None:
     for frame in trained.frames:
         if frame[1] in known:
             donors.setdefault(frame[1], frame)
-    frames = {f: replace(trained.frames[f], offsets=NO_OFFSETS) for f in donors.values()}
+    mine = next(iter(own.frames.values()))
+    frames = {
+        f: transfer(mine, trained.frames[f])
+        if f[0] == subject  # a person of the training keeps the head that was fitted now
+        else replace(trained.frames[f], offsets=NO_OFFSETS)
+        for f in donors.values()
+    }
     # Training cameras stay for rendering; the subject's own come first.
     cameras: dict[str, PinholeView] = own.cameras | {
         f"training_{name}": view for name, view in trained.cameras.items()

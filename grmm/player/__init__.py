@@ -32,7 +32,7 @@ from grmm.player.distillation import (
     distil,
     drawn,
     front_view,
-    full_picture,
+    full_rendering,
     person_of,
     sampled_poses,
     sampled_views,
@@ -130,13 +130,17 @@ def _agreement(person: Person, avatar: Avatar) -> float:
     rows = []
     for pose, view in zip(poses, sampled_views(person.loaded, PICTURES, generator), strict=True):
         ours = drawn(avatar, pose, view, person.loaded.config.data.background)
-        rows.append(psnr_db(ours.colors.permute(2, 0, 1), full_picture(person, pose, view)))
+        full = full_rendering(person, pose, view).image
+        rows.append(psnr_db(ours.colors.permute(2, 0, 1), full))
     return float(np.mean(rows))
 
 
 @torch.no_grad()
 def _loss(person: Person, avatar: Avatar, subject: str, views: HeadViews) -> dict[str, object]:
-    """Compare both with footage that training did not see, or with all if it saw all."""
+    """Compare both with footage that training did not see, or with all if it saw all.
+
+    The torso hides what it hides in `evaluate`.
+    """
     loaded, keys = person.loaded, views.keys
     own = [
         i for i, key in enumerate(keys)
@@ -148,9 +152,11 @@ def _loss(person: Person, avatar: Avatar, subject: str, views: HeadViews) -> dic
     for index in chosen:
         item = views.item(index)
         pose = person.pose(views.place(index).tracked, keys[index].expression)
-        picture = drawn(avatar, pose, item.view, views.background).colors.permute(2, 0, 1)
-        ours.append(psnr_db(picture, item.target))
-        full.append(psnr_db(full_picture(person, pose, item.view), item.target))
+        page = drawn(avatar, pose, item.view, views.background)
+        picture = item.without_hidden(page.colors.permute(2, 0, 1), page.depth)
+        ours.append(psnr_db(picture, item.target, ~item.hidden))
+        picture = item.before_torso(full_rendering(person, pose, item.view)).image
+        full.append(psnr_db(picture, item.target, ~item.hidden))
     if not chosen:
         return {"footage": f"--shards has no picture of {subject}"}
     before, after = float(np.mean(full)), float(np.mean(ours))

@@ -23,7 +23,7 @@ from grmm.config import SCALE_RANGE_MM
 from grmm.data import Tracked, padded
 from grmm.edit import HeadCodes, trained_head
 from grmm.head_crop import draw_window
-from grmm.model import PinholeView, quat_multiply
+from grmm.model import PinholeView, Rendering, quat_multiply
 from grmm.networks import DISPLACEMENT_M
 from grmm.rasterize import RenderOutput, rasterize
 from grmm.render import frontal, orbit
@@ -412,11 +412,11 @@ def drawn(avatar: Avatar, pose: AvatarPose, view: PinholeView, grey: float = 0.0
     )  # fmt: skip
 
 
-def full_picture(person: Person, pose: AvatarPose, view: PinholeView) -> Tensor:
-    """Draw the full model, refined, (3, H, W)."""
+def full_rendering(person: Person, pose: AvatarPose, view: PinholeView) -> Rendering:
+    """Draw the full model."""
     loaded, head = person.loaded, person.at(pose)
     state = head.state(loaded)
     gaussians = loaded.model.geometry(head.z_id, head.z_exp, state)
     colours = loaded.model.appearance(head.z_id, state, view)
     behind = loaded.config.data.background
-    return draw_window(loaded.model, gaussians, colours, view, behind).image
+    return draw_window(loaded.model, gaussians, colours, view, behind)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from express50.contract.stage import Command
+from express50.errors import ConfigError
 
 
 def add_options(parser: Any) -> None:
@@ -24,6 +25,11 @@ def run(args: Any) -> int:
         from pipelines.register.scan_files import run_scans
 
         return run_scans(args)
+    if args.head != "procedural":
+        raise ConfigError(
+            f"--head {args.head} is for scans; a dataset's head model is track.head, so run"
+            f" 'express50 track' with --set track.head={args.head}"
+        )
     from express50.cli.stages import run_one
 
     return run_one(args)

@@ -41,13 +41,17 @@ COLUMNS = (
     "warnings", "error",
 )  # fmt: skip
 PICTURES, FAR_MM = len(YAWS) * len(PITCHES), 10.0
-DATASET_OPTIONS = ("set", "config", "items", "scheduler", "slurm", "print_job")
+# Options that only runs on datasets use, with their defaults.
+DATASET_OPTIONS: dict[str, object] = {
+    "set": [], "config": None, "preset": None, "items": None, "workers": 2, "scheduler": None,
+    "slurm": None, "print_job": False, "threads": 1, "strict": False,
+}  # fmt: skip
 
 
 def run_scans(args: argparse.Namespace) -> int:
     """Register the scans of a command line; one that fails does not stop the others."""
-    for name in DATASET_OPTIONS:
-        if getattr(args, name):
+    for name, default in DATASET_OPTIONS.items():
+        if getattr(args, name) != default:
             raise ConfigError(
                 f"--{name.replace('_', '-')} is for datasets and has no effect with --scan; omit it"
             )

@@ -13,7 +13,15 @@ from grmm.checkpoint import load_checkpoint
 from grmm.config import MetricsConfig
 from grmm.data import HeadViews
 from grmm.edit import trained_head
-from grmm.fit import fit, invert_codes, locality_loss, reconstruction, start, tune_decoders
+from grmm.fit import (
+    fit,
+    invert_codes,
+    locality_loss,
+    reconstruction,
+    save_fit,
+    start,
+    tune_decoders,
+)
 from grmm.identity_evaluation import NOVEL_VIEW, FitProtocol, evaluate_unseen
 from grmm.metrics import PerceptualMetrics
 from grmm.render import expression_grid, frontal, interpolation, turntable
@@ -130,6 +138,24 @@ def test_a_fitted_person_takes_on_expressions_of_training(loaded, views, tmp_pat
     torch.testing.assert_close(moved.z_id, again.model.z_id[0].detach())
     tuned = fit(again, views, unseen(views)[:1], [], tmp_path / "again")  # and can be fitted again
     assert tuned["subject"] == "S002"
+
+
+def test_a_person_of_the_training_keeps_the_fitted_head(loaded, tmp_path):
+    """Other expressions of the training came without offsets, and took them from all frames."""
+
+    class WithOffsets(EllipsoidSource):
+        def place(self, index):
+            place = super().place(index)
+            return replace(place, tracked=replace(place.tracked, offsets=offsets))
+
+    offsets = np.full((len(ellipsoid_head().template), 3), 1e-3, np.float32)
+    views = HeadViews(WithOffsets(size=32), ellipsoid_head())
+    save_fit(start(loaded, views, [0]), tmp_path)
+    again = load_checkpoint(tmp_path / "checkpoint.pt")
+    assert views.keys[0].frame == ("S000", "e0") and set(again.model.expressions) == {"e0", "e1"}
+    for expression in again.model.expressions:
+        shown = trained_head(again, "S000", expression).tracked.offsets
+        np.testing.assert_array_equal(shown, offsets)
 
 
 def test_fit_stops_at_its_time_budget(loaded, views, tmp_path):

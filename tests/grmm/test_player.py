@@ -14,10 +14,12 @@ import torch
 from PIL import Image
 
 from benchmarks.player import CHROMIUM, chromium
+from express50.contract.segmentation_labels import TORSO
 from express50.dataset.tracks import Sequence
 from express50.errors import ConfigError
 from grmm.checkpoint import load_checkpoint
 from grmm.edit import trained_head
+from grmm.evaluate import evaluate, mean, training_render
 from grmm.metrics import psnr_db
 from grmm.model import GRMM
 from grmm.player import _loss, export_player, player_page, stored
@@ -27,7 +29,7 @@ from grmm.player.distillation import (
     distil,
     drawn,
     front_view,
-    full_picture,
+    full_rendering,
     person_of,
     posed,
     sampled_poses,
@@ -117,7 +119,7 @@ def test_stored_arrays_lose_next_to_nothing(person, avatar):
     for pose in sampled_poses(person, 2, torch.Generator().manual_seed(3)):
         ours, exact = (drawn(one, pose, view).colors.permute(2, 0, 1) for one in (back, avatar))
         assert psnr_db(ours.detach(), exact.detach()) > 45
-        assert psnr_db(ours.detach(), full_picture(person, pose, view).detach()) > 25
+        assert psnr_db(ours.detach(), full_rendering(person, pose, view).image.detach()) > 25
 
 
 def test_the_page_is_closed_and_names_are_escaped(person, avatar):
@@ -129,11 +131,25 @@ def test_the_page_is_closed_and_names_are_escaped(person, avatar):
     assert not re.search(r'https?://|src="(?!data:)|href=', page)
 
 
+class BehindShirts(EllipsoidSource):
+    """Samples in which a shirt close to the camera hides the lower half."""
+
+    def read(self, index):
+        sample = super().read(index)
+        shirt = np.arange(self.size)[:, None] >= self.size // 2
+        shirt = np.broadcast_to(shirt, sample.alpha.shape)
+        depth = np.where(shirt, 0.1, sample.depth).astype(np.float32)
+        return replace(sample, parts=np.where(shirt, TORSO, 0).astype(np.uint8), depth=depth)
+
+
 def test_the_report_measures_footage_and_foreign_clips_are_refused(loaded, tmp_path):
     head = trained_head(loaded, "S000", "e0")
-    views = loaded.views(EllipsoidSource(size=32))
+    views = loaded.views(BehindShirts(size=32))
     report = export_player(tmp_path / "a.html", loaded, head, "S000", views)
     assert report.images == 6 and report.footage == "seen" and report.loss_db < 3
+    own = [index for index, key in enumerate(views.keys) if key.subject == "S000"]
+    rows = evaluate(views, own, training_render(loaded.model, views))
+    assert report.full_db == pytest.approx(mean(rows, "psnr_db"), abs=0.01)
     assert "dB lost" in str(report)
     assert "give --shards" in str(replace(report, loss_db=None, footage=None))
     nothing = _loss(person_of(loaded, head, "S000"), None, "S009", views)

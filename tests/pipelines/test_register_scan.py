@@ -206,7 +206,9 @@ def test_wrong_options_are_refused_before_the_work(person, tmp_path):
     (tmp_path / "empty").mkdir()
     assert run(tmp_path / "out", "--scan", tmp_path / "empty") == 2
     assert run(tmp_path / "out", "--scan", tmp_path / "none.obj") == 2
-    assert run(tmp_path / "out", "--scan", scan, "--items", "S*") == 2
+    for words in ("--items S*", "--workers 8", "--threads 4", "--preset draft", "--strict"):
+        assert run(tmp_path / "out", "--scan", scan, *words.split()) == 2
+    assert run(tmp_path / "out", "--head", "ict.npz") == 2  # without a scan
     (tmp_path / "out" / "a").mkdir(parents=True)
     (tmp_path / "out" / "a" / "letter.txt").write_text("mine")
     assert run(tmp_path / "out", "--scan", scan) == 1
