@@ -73,7 +73,9 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
             argument("expression", metavar="EXPRESSION")
         if "annotator" in shared:
             words = "annotator's name (default: your login)"
-            login = _login()
+            login = None
+            with suppress(KeyError, OSError):  # some containers have no login names
+                login = getpass.getuser()
             argument(
                 "--annotator", type=person, default=login, required=login is None, metavar="NAME",
                 help=words,
@@ -96,13 +98,6 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
     argument("file", type=Path, metavar="FILE")
     words = "add events from a .csv or .json; known ones are skipped"
     add("import", run_import, words)("file", type=Path, metavar="FILE")
-
-
-def _login() -> str | None:
-    """Return the user's login name; None where the system has none, as in some containers."""
-    with suppress(KeyError, OSError):
-        return getpass.getuser()
-    return None
 
 
 def _add_labelling_verbs(add: Callable[..., Callable]) -> None:

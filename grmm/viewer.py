@@ -193,22 +193,20 @@ class Viewer:
             newest = max(watcher.changed, head_changed)
             resting = time.perf_counter() - newest > REST_SECONDS
             if watcher.drawn < newest or (resting and not watcher.still):
-                self._show(watcher, moving=not resting)
+                moving = not resting
+                began = time.perf_counter()
+                device = self.loaded.model.z_id.device
+                view = view_of_camera(watcher.client.camera, self.heights[moving], device)
+                picture = self.preview.draw(self.head, view, moving)
+                watcher.client.scene.set_background_image(
+                    picture, format="jpeg", jpeg_quality=QUALITY[moving]
+                )
+                watcher.drawn, watcher.still = began, not moving
+                if moving:
+                    rate = 1 / (time.perf_counter() - began)
+                    self._status.content = f"{rate:.0f} frames per second"
                 busy = True
         return busy
-
-    def _show(self, watcher: Watcher, moving: bool) -> None:
-        began = time.perf_counter()
-        device = self.loaded.model.z_id.device
-        view = view_of_camera(watcher.client.camera, self.heights[moving], device)
-        picture = self.preview.draw(self.head, view, moving)
-        watcher.client.scene.set_background_image(
-            picture, format="jpeg", jpeg_quality=QUALITY[moving]
-        )
-        watcher.drawn, watcher.still = began, not moving
-        if moving:
-            rate = 1 / (time.perf_counter() - began)
-            self._status.content = f"{rate:.0f} frames per second"
 
     def _join(self, client: viser.ClientHandle) -> None:
         watcher = Watcher(client=client, changed=time.perf_counter())

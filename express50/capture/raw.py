@@ -237,22 +237,17 @@ def _read_camera(folder: Path) -> RawCamera:
         return RawCamera(id=folder.name, kind="video", path=found[0])
     if not frames.is_dir():
         raise CaptureError(f"{folder}: holds no footage, expected video.mp4 or frames/000000.png")
-    return RawCamera(id=folder.name, kind="frames", path=frames, names=_frame_names(frames))
-
-
-def _frame_names(folder: Path) -> tuple[str, ...]:
-    """List image names in order; they must count up from zero, or frames would be mixed up."""
-    names = sorted(image_names(folder), key=lambda name: len(Path(name).stem))  # 9 before 10
-    if not names:
-        raise CaptureError(f"{folder}: holds no image, expected 000000.png and so on")
-    for number, name in enumerate(names):
+    files = sorted(image_names(frames), key=lambda name: len(Path(name).stem))  # 9 before 10
+    if not files:
+        raise CaptureError(f"{frames}: holds no image, expected 000000.png and so on")
+    for number, name in enumerate(files):
         stem = Path(name).stem
         if not stem.isdecimal() or len(stem) > 18 or int(stem) != number:
             raise CaptureError(
-                f"{folder}: frame {number} is missing: found {name}, expected {number:06d} with "
+                f"{frames}: frame {number} is missing: found {name}, expected {number:06d} with "
                 f"one of {' '.join(IMAGE_SUFFIXES)}; restore it, or renumber from 000000"
             )
-    return tuple(names)
+    return RawCamera(id=folder.name, kind="frames", path=frames, names=tuple(files))
 
 
 def image_names(folder: Path) -> list[str]:

@@ -110,7 +110,15 @@ class ShardWriter:
         size = sum(
             BLOCK + _padded(len(data)) for sample in samples for data in sample.members.values()
         )
-        file = self._open_for(split, size)
+        file = self._file
+        full = file is not None and file.tell() + size > self.shard_bytes
+        if file is None or full or self._shards[-1]["split"] != split:
+            self._finish_shard()
+            number = self._counts.get(split, 0)
+            name = shard_name(split, number)
+            self._counts[split] = number + 1
+            self._shards.append({"file": name, "split": split, "samples": []})
+            file = self._file = (self.root / name).open("xb")  # never over an old shard
         for sample in sorted(samples, key=lambda one: one.camera):
             if sample.key in self._keys:
                 raise FormatError(f"key {sample.key} appears twice; rename a subject or expression")
@@ -125,18 +133,6 @@ class ShardWriter:
         """Finish the last shard and write ``index.json``."""
         self._finish_shard()
         _write_index(self.root, self._shards)
-
-    def _open_for(self, split: str, size: int) -> BinaryIO:
-        file = self._file
-        full = file is not None and file.tell() + size > self.shard_bytes
-        if file is None or full or self._shards[-1]["split"] != split:
-            self._finish_shard()
-            number = self._counts.get(split, 0)
-            name = shard_name(split, number)
-            self._counts[split] = number + 1
-            self._shards.append({"file": name, "split": split, "samples": []})
-            file = self._file = (self.root / name).open("xb")  # never over an old shard
-        return file
 
     def _write(self, file: BinaryIO, data: bytes) -> None:
         """Append to the open shard, and hash the bytes while the processor's cache has them."""

@@ -48,7 +48,16 @@ class LivingSkin:
             if depth > 0.01:
                 kind, side = name.split("_")
                 light *= 1 - DEPTH * depth * self._fold(kind, SIDES[side], places)
-        red = self.flush * self._flushed(places)
+        # Cheeks, nose, forehead and chin redden.
+        marks = self.marks
+        spots = [(0.5 * (marks[46] + marks[54]), 0.03, 1.0), (marks[30], 0.02, 0.7),
+                 (0.5 * (marks[41] + marks[48]), 0.03, 1.0), (marks[8], 0.025, 0.4),
+                 (marks[27] + [0, 0.04, 0], 0.04, 0.5)]  # fmt: skip
+        total = np.zeros(len(places), np.float32)
+        for centre, radius, weight in spots:
+            away = ((places - centre) ** 2).sum(1)
+            total += weight * np.exp(-away / (2 * radius**2)).astype(np.float32)
+        red = self.flush * np.minimum(total, 1.0)
         tint = np.stack([0.15 * red, -red, -0.85 * red], 1)
         return (light[:, None] * (1 + FLUSH * tint)).astype(np.float32)
 
@@ -82,18 +91,6 @@ class LivingSkin:
         across = off @ np.array([along[1], -along[0]]) / np.linalg.norm(along)
         faded = _round(off, 0.006) * smoothstep(share, -0.15, 0.1) * smoothstep(share, 1.3, 0.9)
         return 1.3 * front * faded * np.cos(np.clip(across / 0.004, -np.pi, np.pi))
-
-    def _flushed(self, places: np.ndarray) -> np.ndarray:
-        """Return how much (N,) places redden: cheeks, nose, forehead and chin do."""
-        marks = self.marks
-        spots = [(0.5 * (marks[46] + marks[54]), 0.03, 1.0), (marks[30], 0.02, 0.7),
-                 (0.5 * (marks[41] + marks[48]), 0.03, 1.0), (marks[8], 0.025, 0.4),
-                 (marks[27] + [0, 0.04, 0], 0.04, 0.5)]  # fmt: skip
-        total = np.zeros(len(places), np.float32)
-        for centre, radius, weight in spots:
-            away = ((places - centre) ** 2).sum(1)
-            total += weight * np.exp(-away / (2 * radius**2)).astype(np.float32)
-        return np.minimum(total, 1.0)
 
 
 def _ripple(phase: np.ndarray) -> np.ndarray:

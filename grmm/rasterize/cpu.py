@@ -123,7 +123,9 @@ class _Rasterize(torch.autograd.Function):
         n, channels = colors.shape
         grads = [_empty(tuple(x.shape), x.dtype) for x in (*geometry, colors)]
         d_camera = torch.zeros(16, dtype=torch.float64)
-        moments = _workspace(n * _MOMENTS, torch.float64)
+        moments = getattr(_scratch, "moments", None)  # this thread's, kept for the next call
+        if moments is None or moments.numel() < n * _MOMENTS:
+            moments = _scratch.moments = _empty((n * _MOMENTS,), torch.float64)
         _call(
             "backward", colors.dtype, ctx.camera, n, channels, *geometry, *blended,
             *map(_contiguous, d_images),
@@ -199,14 +201,6 @@ def _empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
 
 def _contiguous(tensor: Tensor | None) -> Tensor | None:
     return None if tensor is None else tensor.contiguous()
-
-
-def _workspace(size: int, dtype: torch.dtype) -> Tensor:
-    """Return an uninitialised scratch of this thread, valid until the next call."""
-    buffers = _scratch.__dict__
-    if dtype not in buffers or buffers[dtype].numel() < size:
-        buffers[dtype] = _empty((size,), dtype)
-    return buffers[dtype]
 
 
 def _call(name: str, dtype: torch.dtype, camera: _Camera, *arguments: int | Tensor | None) -> int:

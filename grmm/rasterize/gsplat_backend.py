@@ -40,7 +40,11 @@ def rasterize_gsplat(
     tiles = _tiles(gsplat, splats, width, height)
     channels = [plane_channels(splats, K), splats.normals[:, : 3 * options.normals], scene.colors]
     passes = []
-    for values in _padded_chunks(torch.cat(channels, 1)):
+    # Zeros pad the last chunk of channels to a width that gsplat has.
+    chunks = list(torch.cat(channels, 1).split(CHUNK, dim=1))
+    missing = min(w for w in WIDTHS if w >= chunks[-1].shape[1]) - chunks[-1].shape[1]
+    chunks[-1] = torch.nn.functional.pad(chunks[-1], (0, missing))
+    for values in chunks:
         image, alpha = gsplat.rasterize_to_pixels(
             splats.means2d[None], splats.conics[None].contiguous(), values[None].contiguous(),
             splats.opacities[None], width, height, TILE, *tiles,
@@ -159,11 +163,3 @@ def _crossings(
     crosses = ((before > 0.5) & (after <= 0.5)).nonzero()[:, 0]
     crosses = crosses[torch.cat([crosses.new_ones(1), pixels[crosses].diff()])[: len(crosses)] > 0]
     return gaussians[crosses], pixels[crosses]
-
-
-def _padded_chunks(values: Tensor) -> list[Tensor]:
-    """Return channels (N, C) in parts of at most ``CHUNK``; zeros pad the last to a legal width."""
-    chunks = list(values.split(CHUNK, dim=1))
-    missing = min(w for w in WIDTHS if w >= chunks[-1].shape[1]) - chunks[-1].shape[1]
-    chunks[-1] = torch.nn.functional.pad(chunks[-1], (0, missing))
-    return chunks

@@ -234,7 +234,12 @@ def skin_trust(
     reference = np.unique(nearest[distance < NEAR_M])
     if len(reference) < LEAST:
         return confidence.astype(np.float64)
-    odd = _oddness(colors, reference)
+    # Standard deviations that colours are off those of bare skin.
+    log = np.log(srgb_to_linear(colors / 255.0) + 0.01)
+    axes = np.stack([log[:, 0] - log[:, 1], log[:, 2] - log[:, 1], log.mean(1)], axis=1)
+    middle = np.median(axes[reference], axis=0)
+    spread = 1.4826 * np.median(np.abs(axes[reference] - middle), axis=0)
+    odd = np.linalg.norm((axes - middle) / np.maximum(spread, SPREADS), axis=1)
     _, owner = cKDTree(mesh).query(vertices, distance_upper_bound=LIPS_M)
     odd[np.r_[in_regions(model, ("lips",)), False][owner]] = 0.0
     sure = confidence / max(float(np.median(confidence[reference])), 1e-6)
@@ -245,12 +250,3 @@ def skin_trust(
     near = distance < AROUND_M
     around = (trust[some][nearest] * near).sum(1) / np.maximum(near.sum(1), 1)
     return trust * around**2
-
-
-def _oddness(colors: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Return how many standard deviations (N,) colours (N, 3) are off those of a reference."""
-    log = np.log(srgb_to_linear(colors / 255.0) + 0.01)
-    axes = np.stack([log[:, 0] - log[:, 1], log[:, 2] - log[:, 1], log.mean(1)], axis=1)
-    middle = np.median(axes[reference], axis=0)
-    spread = 1.4826 * np.median(np.abs(axes[reference] - middle), axis=0)
-    return np.linalg.norm((axes - middle) / np.maximum(spread, SPREADS), axis=1)

@@ -118,7 +118,15 @@ def _track_frame(
 ) -> tuple[Target, Pose]:
     """Fit one frame, from the pose of the one before where there is one."""
     person, model = tracker.person, tracker.person.model
-    pose = _start(person, observation, before)
+    # The face of the frame before, or a face at rest, is moved to where the landmarks are.
+    anchors = landmark_anchors(model)
+    if before is None:
+        template = anchors.at(model.template.numpy())
+        pose = start_state(person, [initial_pose(observation, template)]).poses[0]
+    else:
+        own, marks = before.own.copy(), anchors.at(_mesh(person, before))
+        rotation, own[-3:] = initial_pose(observation, (marks - own[-3:]) @ before.rotation)
+        pose = Pose(own, rotation)
     # Views from behind are left out as at the peaks.
     sigma = posed_sigma(observation, pose.rotation, pose.own[-3:])
     target = Target(observation, sigma, False, shut_terms(model, observation))
@@ -128,18 +136,6 @@ def _track_frame(
     target = with_irises_and_jaw(model, target, mesh, pose.rotation, tracker.eyes)
     pose = _fitted(person, target, pose, ROUND_STEPS)
     return fit_to_pictures(tracker, target, pose, cut_crops)
-
-
-def _start(person: Basis, observation: Observation, before: Pose | None) -> Pose:
-    """Move the face of the frame before, or a face at rest, to where the landmarks are."""
-    anchors = landmark_anchors(person.model)
-    if before is None:
-        template = anchors.at(person.model.template.numpy())
-        return start_state(person, [initial_pose(observation, template)]).poses[0]
-    own = before.own.copy()
-    marks = anchors.at(_mesh(person, before))
-    rotation, own[-3:] = initial_pose(observation, (marks - own[-3:]) @ before.rotation)
-    return Pose(own, rotation)
 
 
 def _mesh(person: Basis, pose: Pose) -> np.ndarray:

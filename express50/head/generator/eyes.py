@@ -46,24 +46,21 @@ def add_eye_rings(half: HalfMesh) -> Array:
         half.labels[index] = margin_label + f * (outer_label - margin_label)
     for inner, out in zip(indices[:-1], indices[1:], strict=True):
         half.strip("skin", inner, out, closed=True)
-    _add_lid_edges(half, indices[0], rings[0], margin_label)
-    return indices[-1]
-
-
-def _add_lid_edges(half: HalfMesh, margin: Array, points: Array, label: Array) -> None:
-    """Add the lid's thickness: an edge down to the eyeball, then a strip hidden under the lid."""
+    # The lid's thickness: an edge down to the eyeball, then a strip hidden under the lid.
+    points = rings[0]
     away = points - EYE_CENTER
     edge = EYE_CENTER + away * (EYE_RADIUS + 0.15) / np.linalg.norm(away, axis=1, keepdims=True)
     xy = points[:, :2] - points[:, :2].mean(0)
     xy = xy / np.linalg.norm(xy, axis=1, keepdims=True)
     hidden = edge + np.pad(xy * 4.0, ((0, 0), (0, 1))) - EYE_CENTER
     hidden = EYE_CENTER + hidden * (EYE_RADIUS + 0.2) / np.linalg.norm(hidden, axis=1)[:, None]
-    middle = label.mean(0)
-    rows = [margin]
-    for tag, ring, f in (("lid_edge", edge, 0.86), ("lid_hidden", hidden, 0.6)):
+    middle = margin_label.mean(0)
+    rows = [indices[0]]
+    for tag, ring, share in (("lid_edge", edge, 0.86), ("lid_hidden", hidden, 0.6)):
         rows.append(half.add(ring, tag))
-        half.labels[rows[-1]] = middle + f * (label - middle)
+        half.labels[rows[-1]] = middle + share * (margin_label - middle)
         half.strip("skin", rows[-2], rows[-1], closed=True)
+    return indices[-1]
 
 
 def add_eyeball(half: HalfMesh) -> None:

@@ -118,17 +118,17 @@ _AXIS = np.array([np.subtract(mass.end, mass.start) for mass in _LONG], float)
 _END_RADII = np.array([(mass.start_radius, mass.end_radius) for mass in _LONG], float)
 
 
-def _ellipsoid_distances(p: Array) -> Array:
-    """Return distances (N,E) to the ellipsoids, first order near their surfaces."""
+def skin_field(points: Array) -> Array:
+    """Return approximate signed distances (N,), mm, of points (N,3) from the skin, < 0 inside."""
+    p = np.array(points, float)
+    p[:, 0] = np.sqrt(p[:, 0] ** 2 + 1.0)  # folds without a crease on the mid plane
+    # Distances to ellipsoids, first order near their surfaces.
     q = (p @ _TO_SPHERES - _SHIFT).reshape(len(p), -1, 3)
     k0 = np.sqrt(np.einsum("nec,nec->ne", q, q)) + 1e-12
     q *= _INVERSE_RADII
     k1 = np.sqrt(np.einsum("nec,nec->ne", q, q)) + 1e-12
-    return k0 * (k0 - 1.0) / k1
-
-
-def _capsule_distances(p: Array) -> Array:
-    """Return distances (N,C) to the capsules, whose radius is linear between the ends."""
+    ellipsoids = iter(np.ascontiguousarray((k0 * (k0 - 1.0) / k1).T))
+    # Distances to capsules, whose radius is linear between the ends.
     length2 = np.einsum("cd,cd->c", _AXIS, _AXIS)
     along = p @ _AXIS.T - np.einsum("cd,cd->c", _START, _AXIS)
     offset2 = (p * p).sum(1)[:, None] - 2 * p @ _START.T
@@ -136,15 +136,7 @@ def _capsule_distances(p: Array) -> Array:
     t = np.clip(along / length2, 0.0, 1.0)
     distance2 = offset2 - 2 * t * along + t * t * length2
     radius = _END_RADII[:, 0] + (_END_RADII[:, 1] - _END_RADII[:, 0]) * t
-    return np.sqrt(np.maximum(distance2, 0.0)) - radius
-
-
-def skin_field(points: Array) -> Array:
-    """Return approximate signed distances (N,), mm, of points (N,3) from the skin, < 0 inside."""
-    p = np.array(points, float)
-    p[:, 0] = np.sqrt(p[:, 0] ** 2 + 1.0)  # folds without a crease on the mid plane
-    ellipsoids = iter(np.ascontiguousarray(_ellipsoid_distances(p).T))
-    capsules = iter(np.ascontiguousarray(_capsule_distances(p).T))
+    capsules = iter(np.ascontiguousarray((np.sqrt(np.maximum(distance2, 0.0)) - radius).T))
     value = next(ellipsoids)
     for mass in MASSES[1:]:
         d = next(ellipsoids if isinstance(mass, Ellipsoid) else capsules)

@@ -88,7 +88,12 @@ def random_head(
     canvas, brows = _move_brows(model, Canvas.of(model), rng)
     points = landmarks(model, vertices)[0].numpy()
     points[BROWS] = place_points(model, brows, vertices[0].numpy())
-    _meet_lips(points)
+    # Inner lips that passed through each other are put where they meet.
+    upper, lower = (list(ids) for ids in INNER_LIPS)
+    through = (points[upper] - points[lower]) @ (points[27] - points[8]) < 0
+    middle = 0.5 * (points[upper] + points[lower])
+    for ids in (upper, lower):
+        points[ids] = np.where(through[:, None], middle, points[ids])
     look = int(rng.integers(2**31))
     hair = paint(canvas, np.random.default_rng(look))[1]
     skin = vertices[0].numpy()
@@ -115,15 +120,6 @@ def _move_brows(model: HeadModel, canvas: Canvas, rng: Rng) -> tuple[Canvas, Pla
     marks = canvas.marks.copy()
     marks[BROWS] = place_points(model, places)
     return replace(canvas, marks=marks), places
-
-
-def _meet_lips(points: np.ndarray) -> None:
-    """Put inner lips of points (68, 3) that passed through each other where they meet, in place."""
-    upper, lower = (list(ids) for ids in INNER_LIPS)
-    through = (points[upper] - points[lower]) @ (points[27] - points[8]) < 0
-    middle = 0.5 * (points[upper] + points[lower])
-    for ids in (upper, lower):
-        points[ids] = np.where(through[:, None], middle, points[ids])
 
 
 def waves(points: np.ndarray, rng: Rng, count: int, low: float, high: float) -> np.ndarray:
