@@ -87,7 +87,8 @@ def error_bounds(
         np.exp(np.interp(score, model.scores, table) + beyond)
         for table in (model.typical, model.bound)
     )
-    typical, bound = np.hypot(typical, HALF * shared), np.hypot(bound, NINE_IN_TEN * shared)
+    if np.any(shared):
+        typical, bound = np.hypot(typical, HALF * shared), np.hypot(bound, NINE_IN_TEN * shared)
     return Bounds(typical, bound, expect(model, typical, shared))
 
 
@@ -103,13 +104,12 @@ def single_camera_sigma(cameras: Sequence[Camera], places: np.ndarray) -> np.nda
 
 def scores_of(model: ErrorModel, figures: Mapping[str, np.ndarray | float]) -> np.ndarray:
     """Return the scores (N,) of N elements."""
-    rows = np.broadcast_arrays(*(np.atleast_1d(figures[name]) for name in model.features))
-    total = np.zeros(rows[0].shape)
-    for values, weight, (low, high) in zip(rows, model.weights, model.limits, strict=True):
-        worst = high if weight > 0 else low
+    total = np.zeros(1)
+    for name, weight, (low, high) in zip(model.features, model.weights, model.limits, strict=True):
+        values, worst = np.atleast_1d(figures[name]), high if weight > 0 else low
         known = np.isfinite(values)
-        logs = np.log(np.maximum(np.where(known, values, 1.0), TINY))
-        total += weight * np.where(known, np.clip(logs, low, high), worst)
+        logs = np.clip(np.log(np.maximum(np.where(known, values, 1.0), TINY)), low, high)
+        total = total + weight * np.where(known, logs, worst)
     return total
 
 

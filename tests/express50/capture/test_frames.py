@@ -3,6 +3,7 @@
 import json
 import tarfile
 
+import cv2
 import numpy as np
 import pytest
 
@@ -145,6 +146,16 @@ def test_peaks_are_checked_against_the_footage(ingested):
     path.write_text('{"smile": 3}')
     with pytest.raises(FormatError, match="not a table of peaks"):
         read_peaks(ingested, "S001")
+
+
+@pytest.mark.parametrize("size", [(360, 640), (320, 320), (97, 131), (8, 9), (8, 5)])
+def test_dhash_has_the_bits_of_opencv(size):
+    rng = np.random.default_rng(0)
+    for level in (0, 20, 200):
+        image = rng.integers(level, level + 30, (*size, 3)).astype(np.uint8)
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        cells = cv2.resize(grey, (9, 8), interpolation=cv2.INTER_AREA)
+        assert dhash(image) == np.packbits(cells[:, :-1] < cells[:, 1:]).tobytes().hex()
 
 
 def test_dhash_bits_follow_their_definition():
