@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -15,7 +16,10 @@ from express50.files.images import edge_distance
 from express50.geometry.cameras import Camera, crop_camera, project, rays, unproject
 from express50.geometry.conventions import opencv_pixels_to_corner
 from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
-from express50.head.model import HeadModel
+from express50.head.load import HeadTopology
+
+if TYPE_CHECKING:
+    from express50.head.model import HeadModel
 
 SCALP = len(LABELS)
 """Skin that may bear hair: a label of the mesh alone, never written."""
@@ -56,16 +60,16 @@ class HeadLabels:
     missing: tuple[str, ...]
 
 
-def head_labels(model: HeadModel) -> HeadLabels:
+def head_labels(model: HeadModel | HeadTopology) -> HeadLabels:
     """Label a model's vertices by its regions; a vertex without one is skin."""
-    masks = {name: mask.cpu().numpy() for name, mask in model.regions.items()}
+    masks = {name: np.asarray(mask) for name, mask in model.regions.items()}
     none = np.zeros(len(model.template), bool)
     scalp = masks.get("scalp", none)
     labels = np.where(scalp, SCALP, LABELS.index("skin")).astype(np.uint8)
     for label, names in _REGIONS:
         for name in names:
             labels[masks.get(name, none)] = LABELS.index(label)
-    faces = model.faces.cpu().numpy()
+    faces = np.asarray(model.faces)
     present = set(np.unique(labels[faces]).tolist()) | {LABELS.index("background")}
     by_mesh = [label for label, _ in _REGIONS if LABELS.index(label) not in present]
     end = np.flatnonzero(masks.get("boundary", none))

@@ -18,7 +18,7 @@ from express50.dataset.tracks import existing_track, read_track
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.images import contact_sheet, fit_into, shrink, write_image
 from express50.geometry.cameras import Camera, crop_camera, project, resized
-from express50.head.load import load_head
+from express50.head.load import load_topology
 from pipelines.regions.colour import EARS, SKIN, Scalp, by_colour, decide, face_colours, scalp_votes
 from pipelines.regions.geometry import (
     HAIR,
@@ -118,7 +118,7 @@ def read_head(
     """
     path = existing_track(dataset, subject)
     track = read_track(path)
-    row, labels = track.row(expression), head_labels(load_head(track.head))
+    row, labels = track.row(expression), head_labels(load_topology(track.head))
     vertices = track.vertices[row].astype(np.float64)
     if vertices.shape != (len(labels.vertices), 3):
         raise FormatError(
