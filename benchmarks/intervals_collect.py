@@ -177,12 +177,12 @@ def _depth(peak: _Peak) -> Iterator[Sample]:
     lone = PEOPLE_DIFFER if len(pictures) == 1 else 0.0
     for name, view, _ in surface_maps(surface, pictures, solid):
         place = peak.subject, peak.frame, peak.true_camera(name)
-        true, there = peak.truth.render_depth(*place)
+        true, there = (values[view.window] for values in peak.truth.render_depth(*place))
         both = there[view.valid]
         parts.append({k: np.broadcast_to(v, both.shape)[both] for k, v in view.figures.items()})
         errors.append(1e3 * np.abs(view.depth - true)[view.valid & there])
         shared.append(1e3 * lone * view.depth[view.valid & there])
-        skin.append(peak.truth.skin(*place)[view.valid & there])
+        skin.append(peak.truth.skin(*place)[view.window][view.valid & there])
     yield sampled("depth", peak.name, parts, errors, shared, skin=skin)
 
 

@@ -8,6 +8,7 @@ camera axes (x right, y down, z forward): component c is stored as round(127 c) 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,8 @@ from express50.files.images import (
 )
 
 NORMAL_STEPS = 127  # from 0 to 1 in one component
+Whole = Callable[[np.ndarray], np.ndarray]
+"""Makes the map of a picture (H, W[, C]) from that of a window in it (h, w[, C])."""
 FARTHEST_M = 1e4  # no rig is this large: beyond this its unit must be wrong
 
 
@@ -31,8 +34,10 @@ def depth_file(folder: Path, camera_id: str) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
-def write_depth(folder: Path, camera_id: str, depth: np.ndarray, valid: np.ndarray) -> Path:
-    """Write a depth map (H, W), metres; returns the file.
+def write_depth(
+    folder: Path, camera_id: str, depth: np.ndarray, valid: np.ndarray, whole: Whole = np.asarray
+) -> Path:
+    """Write a depth map (h, w), metres, of a window or the whole picture; returns the file.
 
     Raises:
         ValueError: a valid depth is not finite, not positive or over 10 km.
@@ -42,10 +47,10 @@ def write_depth(folder: Path, camera_id: str, depth: np.ndarray, valid: np.ndarr
         raise ValueError(f"valid depth must lie in (0, {FARTHEST_M:g}) m; is the rig in metres?")
     if inside.max(initial=0) < DEPTH_LIMIT_M:
         path = folder / f"{camera_id}.png"
-        write_image(path, depth_to_uint16(depth, valid))
+        write_image(path, whole(depth_to_uint16(depth, valid)))
     else:
         path = folder / f"{camera_id}.exr"
-        write_image(path, np.where(valid, depth, 0).astype(np.float32))
+        write_image(path, whole(np.where(valid, depth, 0).astype(np.float32)))
     return path
 
 
@@ -70,8 +75,10 @@ def read_depth(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return depth, depth > 0
 
 
-def write_normals(path: Path, normals: np.ndarray, valid: np.ndarray) -> None:
-    """Write unit normals (H, W, 3), camera axes, as an 8-bit PNG.
+def write_normals(
+    path: Path, normals: np.ndarray, valid: np.ndarray, whole: Whole = np.asarray
+) -> None:
+    """Write unit normals (h, w, 3) of a window or the whole picture, camera axes, as 8-bit PNG.
 
     Raises:
         ValueError: a valid normal is not finite or not of unit length.
@@ -82,7 +89,7 @@ def write_normals(path: Path, normals: np.ndarray, valid: np.ndarray) -> None:
         raise ValueError(f"{path.name}: valid normals must be finite and of unit length")
     code = np.zeros(normals.shape, np.uint8)
     code[valid] = np.clip(np.rint(known * NORMAL_STEPS) + NORMAL_STEPS + 1, 1, 255)
-    write_image(path, code)
+    write_image(path, whole(code))
 
 
 def read_normals(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -72,11 +72,12 @@ def picture_of(
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """The maps (H, W) of the surface in one camera, `valid` where it lies inside the matte.
+    """The maps (h, w) of the surface in a window of one camera, `valid` where inside the matte.
 
-    Depth is in metres, normals (H, W, 3) in camera axes, both 0 where not valid. `covered` is the
+    Depth is in metres, normals (h, w, 3) in camera axes, both 0 where not valid. `covered` is the
     share of the matte with depth, `spill` that of the surface outside. `figures` describe how well
-    each of the N valid pixels is known; `bounds` follow from them.
+    each of the N valid pixels is known; `bounds` follow from them. `window` are the rows and
+    columns of a picture of `size` (H, W), None if the maps cover it.
     """
 
     depth: np.ndarray
@@ -86,10 +87,20 @@ class DepthMaps:
     spill: float
     figures: Mapping[str, np.ndarray | float]
     bounds: Bounds | None = None
+    window: tuple[slice, slice] | None = None
+    size: tuple[int, int] = (0, 0)
+
+    def whole(self, values: np.ndarray) -> np.ndarray:
+        """Return values (h, w[, C]) of the window as those of the picture (H, W[, C]), else 0."""
+        if self.window is None:
+            return values
+        found = np.zeros((*self.size, *values.shape[2:]), values.dtype)
+        found[self.window] = values
+        return found
 
     @property
     def confidence(self) -> np.ndarray:
-        """Return SURE_MM / (SURE_MM + bound), (H, W) float32 in [0, 1]; 0 where not valid."""
+        """Return SURE_MM / (SURE_MM + bound), (h, w) float32 in [0, 1]; 0 where not valid."""
         found = np.zeros(self.depth.shape, np.float32)
         if self.bounds is not None:
             found[self.valid] = SURE_MM / (SURE_MM + self.bounds.bound)
@@ -156,12 +167,13 @@ def surface_maps(
     for picture, errors in zip(pictures, photo, strict=True):
         camera, (rgb, alpha) = picture.camera, picture.read()
         seen = cast_window(surface, scene, camera, alpha, apart)
+        valid = seen.whole(seen.valid)
         figures = {
             **seen.figures,
             **common,
-            "photo": smoothed_errors(errors, seen.valid, WINDOW),
-            "photo_wide": smoothed_errors(errors, seen.valid, 3 * WINDOW),
-            "grain": grain(rgb, seen.valid),
+            "photo": smoothed_errors(errors, valid, WINDOW),
+            "photo_wide": smoothed_errors(errors, valid, 3 * WINDOW),
+            "grain": grain(rgb, valid),
         }
         shared = 1e3 * PEOPLE_DIFFER * seen.depth[seen.valid] if len(pictures) == 1 else 0.0
         bounds = error_bounds("depth", figures, shared)
@@ -195,9 +207,9 @@ def cast_window(
     alpha: np.ndarray,
     apart_mm: np.ndarray | None,
 ) -> DepthMaps:
-    """Cast rays only where the surface projects to; the maps are of the whole frame (H, W) uint8.
+    """Cast rays only where the surface projects to; `alpha` (H, W) uint8 is of the whole picture.
 
-    A head fills a third of a frame.
+    A head fills a third of a picture.
     """
     pixels, depth = project_fast(camera, surface.vertices)
     low, high = np.zeros(2, int), np.array([camera.width, camera.height])
@@ -208,14 +220,8 @@ def cast_window(
     part = crop_camera(camera, *low.tolist(), *(high - low).tolist())
     seen = cast_maps(surface, scene, part, alpha[window].astype(np.float32) / 255, apart_mm)
 
-    def whole(values: np.ndarray) -> np.ndarray:
-        found = np.zeros((*alpha.shape, *values.shape[2:]), values.dtype)
-        found[window] = values
-        return found
-
     covered = float(seen.valid.sum() / max(int((alpha > 255 * INSIDE).sum()), 1))
-    maps = (whole(seen.depth), whole(seen.valid), whole(seen.normals))
-    return DepthMaps(*maps, covered, seen.spill, seen.figures)
+    return replace(seen, covered=covered, window=window, size=alpha.shape)
 
 
 def cast_maps(
@@ -431,6 +437,11 @@ def smoothed_errors(photo: PhotoErrors, valid: np.ndarray, window: int) -> np.nd
         for values in (np.where(known, photo.errors, 0.0), known)
     )
     mean = np.where(count > 0.5 / window**2, total / np.maximum(count, 1e-6), np.nan)
-    rows, columns = np.nonzero(valid)
-    height, width = mean.shape
-    return 0.5 + mean[rows * height // valid.shape[0], columns * width // valid.shape[1]]
+    x, y, width, height = cv2.boundingRect(valid.astype(np.uint8))
+    rows, columns = (
+        np.arange(first, first + length) * small // large
+        for first, length, small, large in zip(
+            (y, x), (height, width), mean.shape, valid.shape, strict=True
+        )
+    )
+    return 0.5 + mean[np.ix_(rows, columns)][valid[y : y + height, x : x + width]]

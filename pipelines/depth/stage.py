@@ -19,7 +19,7 @@ from express50.error_model import error_models, expect, single_camera_sigma
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.images import contact_sheet, shrink, srgb_to_linear, write_image
 from express50.geometry import meshes
-from express50.head.load import load_head
+from express50.head.load import load_topology
 from pipelines.depth.maps import (
     DepthMaps,
     PhotoErrors,
@@ -134,8 +134,8 @@ def read_tracked(
     if expression not in track.expressions:
         return None, {"used": False, "why": f"{expression} is not tracked"}
     vertices = track.vertices[track.row(expression)].astype(np.float64)
-    model = load_head(track.head)
-    faces = model.faces.numpy()
+    model = load_topology(track.head)
+    faces = model.faces
     if faces.max() >= len(vertices):
         raise FormatError(
             f"{path}: {len(vertices)} vertices do not fit the head's {faces.max() + 1};"
@@ -166,13 +166,13 @@ def write_maps(out: Path, camera_id: str, maps: DepthMaps) -> None:
         StageError: the depth is more than any file holds.
     """
     try:
-        write_depth(out, camera_id, maps.depth, maps.valid)
+        write_depth(out, camera_id, maps.depth, maps.valid, maps.whole)
     except ValueError as error:
         raise StageError(f"{camera_id}: {error}") from None
     confidence = np.rint(maps.confidence * 255).astype(np.uint8)
-    write_image(out / f"{camera_id}_confidence.png", confidence)
+    write_image(out / f"{camera_id}_confidence.png", maps.whole(confidence))
     known = has_normal(maps.normals)  # the surface has none where its triangles fold back
-    write_normals(out / f"{camera_id}_normals.png", maps.normals, known)
+    write_normals(out / f"{camera_id}_normals.png", maps.normals, known, maps.whole)
 
 
 def write_ply(path: Path, surface: HeadSurface) -> None:
@@ -222,9 +222,10 @@ def view_figures(view: DepthMaps, photo: PhotoErrors) -> dict[str, float]:
 
 def view_panels(rgb: np.ndarray, view: DepthMaps, errors: np.ndarray) -> list[np.ndarray]:
     """Draw frame, depth, normals, confidence and photometric errors (h, w) of a camera."""
-    step = max(1, max(view.depth.shape) // (2 * TILE))  # of pixels: the sheet shows no more
+    step = max(1, max(view.size) // (2 * TILE))  # of pixels: the sheet shows no more
     depth, valid, normals, sure = (
-        values[::step, ::step] for values in (view.depth, view.valid, view.normals, view.confidence)
+        view.whole(values)[::step, ::step]
+        for values in (view.depth, view.valid, view.normals, view.confidence)
     )
     near = np.zeros_like(depth)
     if valid.any():

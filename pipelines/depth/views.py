@@ -107,12 +107,16 @@ def silhouette_distance(alpha: np.ndarray) -> np.ndarray:
     size = (width * UPSAMPLE, height * UPSAMPLE)
     large = cv2.resize(alpha.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
     mask = (large > INSIDE).astype(np.uint8)
-    inside = cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_5)
-    outside = cv2.distanceTransform(1 - mask, cv2.DIST_L2, cv2.DIST_MASK_5)
     # Distances are to pixel centres across the contour: half a pixel too long on either side.
-    signed = np.where(mask > 0, inside - 0.5, 0.5 - outside) / UPSAMPLE
+    signed = cv2.distanceTransform(1 - mask, cv2.DIST_L2, cv2.DIST_MASK_5)
+    cv2.subtract(0.5, signed, dst=signed)
+    x, y, w, h = cv2.boundingRect(mask)
+    box = np.s_[max(0, y - 1) : y + h + 1, max(0, x - 1) : x + w + 1]
+    part = np.ascontiguousarray(mask[box])
+    signed[box] += cv2.distanceTransform(part, cv2.DIST_L2, cv2.DIST_MASK_5) - part
+    signed /= UPSAMPLE
     limit = float(width + height)  # a matte without a contour is infinitely far from one
-    signed = np.clip(signed, -limit, limit).astype(np.float32)
+    np.clip(signed, -limit, limit, out=signed)
     return cv2.resize(signed, (width, height), interpolation=cv2.INTER_AREA)
 
 

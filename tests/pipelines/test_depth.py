@@ -243,6 +243,7 @@ def test_confidence_separates_good_depth_from_bad(surface, shots):
     views = surface_maps(surface, pictures)
     sure, unsure = [], []
     for (_, view, _), (*_, true) in zip(views, shots, strict=True):
+        true = true[view.window]
         error = np.abs(view.depth - true)
         both = view.valid & (true > 0)
         cut = np.median(view.confidence[both])
