@@ -270,20 +270,27 @@ def rim_figures(
     The frame (h, w, 3) uint8 may be reduced; `noise` is that of the full one. If a subject differs
     from the wall by little more than noise, keying may miss parts and leave a ragged outline.
     """
-    rim, share = rim_of(alpha), alpha.astype(np.float32) / 255
+    contrast, side = cv2.resize(outline_contrast(alpha, rgb), alpha.shape[::-1]), max(alpha.shape)
+    x, y, width, height = cv2.boundingRect(alpha)
+    margin = max(1, round(RIM * side)) + _nearby_side(alpha) + WINDOW  # beyond it all is 0
+    window = np.s_[
+        max(0, y - margin) : y + height + margin, max(0, x - margin) : x + width + margin
+    ]
+    rim, share = rim_of(alpha)[window], alpha[window].astype(np.float32) / 255
     open_part = share * (1 - share)
     inside = (share > 0.5).astype(np.uint8)
     edge = inside - cv2.erode(inside, np.ones((3, 3)))
-    contrast = cv2.resize(outline_contrast(alpha, rgb), alpha.shape[::-1])[rim]
+    ragged = cv2.blur(edge.astype(np.float32), (_nearby_side(alpha),) * 2)[rim]
+    contrast = contrast[window][rim]
     return {
         "soft": 0.05 + 4 * open_part[rim],
         "spread": 0.01 + deviation(share)[rim],
         # Length of the outline nearby, as a multiple of a straight one's.
-        "ragged": 0.1 + _nearby(edge.astype(np.float32))[rim] * _nearby_side(alpha),
+        "ragged": 0.1 + ragged * _nearby_side(alpha),
         "faint": (0.5 + noise) / (2 + contrast),
         "noise": 0.5 + noise,
         "width": 0.1 + float(open_part.sum()) / max(int(edge.sum()), 1),
-        "side": float(max(alpha.shape)),
+        "side": float(side),
         "plated": 1.0 if plated else 2.0,
         "views": float(views),
     }
