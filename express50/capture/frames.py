@@ -107,6 +107,13 @@ class FrameReader:
             )
         return corrected(image, self.source)
 
+    def key_frame(self, frame: int) -> int:
+        """Return the last frame up to this one that is read without decoding others."""
+        if self.source.kind == "frames":
+            return frame
+        video, number = self._video_of(frame)
+        return frame - number + video.key_frame(number)
+
     def _video_of(self, frame: int) -> tuple[VideoReader, int]:
         """Find the video that holds a frame, and the frame's number in it; one stays open."""
         starts = np.concatenate([[0], np.cumsum(self.source.clips or (self.source.frames,))])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -64,15 +65,21 @@ def _reduced(camera: Camera, image: np.ndarray, frame: int) -> np.ndarray:
 def read_footage(index: Index, cameras: Mapping[str, Camera], count: int) -> Images:
     """Yield reduced images of ingested footage at up to `count` instants.
 
-    The instants are the middles of cues, or spread over all frames where there are no cues.
+    The instants are the middles of cues, or spread over all frames where there are no cues. A key
+    frame of the first camera earlier in the cue is taken instead: of 4K footage with one key frame
+    per second, reading it takes a tenth of the time.
     """
     cues = [cue for cue in index.cues if cue.end_frame < index.frames]
-    wanted = sorted(set(_middles(cues, count))) or even(index.frames, count)
+    spread = even(index.frames, count)
+    starts = _middles(cues, count) or dict(zip(spread, [0, *(f + 1 for f in spread)], strict=False))
+    wanted: list[int] = []
     for name in sorted(cameras):
-        reader = FrameReader(index, name)
-        for frame in wanted:
-            yield frame, name, _reduced(cameras[name], reader.read(frame), frame)
-        reader.close()
+        with closing(FrameReader(index, name)) as reader:
+            if not wanted:
+                keys = {frame: reader.key_frame(frame) for frame in starts}
+                wanted = sorted({key if key >= starts[f] else f for f, key in keys.items()})
+            for frame in wanted:
+                yield frame, name, _reduced(cameras[name], reader.read(frame), frame)
 
 
 def read_raw_footage(root: Path, cameras: Mapping[str, Camera], count: int) -> Images:
@@ -85,16 +92,16 @@ def read_raw_footage(root: Path, cameras: Mapping[str, Camera], count: int) -> I
     """
     capture = read_capture(root)
     lengths = [len(camera.names) for camera in capture.cameras.values() if camera.names]
-    wanted = _middles(capture.cues, count) or even(min(lengths, default=1), count)
+    wanted = sorted(_middles(capture.cues, count)) or even(min(lengths, default=1), count)
     for name in sorted(set(capture.cameras) & set(cameras)):
         for frame, image in _read_raw(capture.cameras[name], wanted):
             yield frame, name, _reduced(cameras[name], image, frame)
 
 
-def _middles(cues: Iterable[Cue], count: int) -> list[int]:
-    """Return the middle frames of up to `count` cues, evenly chosen."""
-    middles = sorted((cue.start_frame + cue.end_frame) // 2 for cue in cues)
-    return [middles[i] for i in even(len(middles), count)]
+def _middles(cues: Iterable[Cue], count: int) -> dict[int, int]:
+    """Return the middle frames of up to `count` cues, evenly chosen, each with its cue's start."""
+    middles = sorted(((cue.start_frame + cue.end_frame) // 2, cue.start_frame) for cue in cues)
+    return dict(middles[i] for i in even(len(middles), count))
 
 
 def _read_raw(camera: RawCamera, wanted: list[int]) -> Iterator[tuple[int, np.ndarray]]:

@@ -61,6 +61,17 @@ def test_a_read_decodes_from_the_nearest_key_frame(tmp_path, monkeypatch):
     assert decoded == [stamp for stamp in pts if nearest <= stamp <= pts[50]]
 
 
+def test_a_key_frame_before_a_frame_is_found_and_reads_go_on(video):
+    with av.open(str(video)) as container:
+        frames = list(container.decode(video=0))
+    reader = VideoReader(video, tuple(frame.pts for frame in frames))
+    for wanted in (0, 5, 30, FRAMES - 1):
+        found = reader.key_frame(wanted)
+        earlier = [k for k in range(wanted + 1) if frames[k].key_frame]
+        assert found == earlier[-1]
+        assert np.array_equal(reader.read(found), frames[found].to_ndarray(format="rgb24"))
+
+
 def test_forward_reads_do_not_seek(video, monkeypatch):
     pts = tuple(stamp for stamp, _ in iterate_video(video))
     reader = VideoReader(video, pts)
