@@ -143,8 +143,8 @@ def measure(dataset_root: Path, truth_root: Path, item: str, name: str) -> dict 
     sure = None
     if name in PRESETS:
         found["raycast"] = both_ways(surface, [picture.camera for picture in pictures[::8]])
-        views = surface_maps(surface, pictures)
-        sure = {name: view.whole(view.confidence) for name, view, _ in views}
+        maps = surface_maps(surface, pictures)
+        sure = {name: view.whole(view.confidence) for name, view, _ in maps}
     return found | score(mesh, truth, subject, frame, pictures, sure)
 
 

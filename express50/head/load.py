@@ -54,13 +54,14 @@ def load_topology(spec: str | Path) -> HeadTopology:
     path = BUILTIN if str(spec) == "procedural" else Path(spec).expanduser()
     if path.suffix == ".npz" and path.is_file() and is_stored(path):
         arrays = read_arrays(path, HeadModelError, "a stored head model", FIELDS)
-        names, masks = arrays.get("region_names"), arrays.get("regions")
-        known = names is not None and masks is not None
-        regions = dict(zip(names.tolist(), masks.astype(bool), strict=True)) if known else {}
+        regions: dict[str, np.ndarray] = {}
+        if "regions" in arrays and "region_names" in arrays:
+            names, masks = arrays["region_names"].tolist(), arrays["regions"].astype(bool)
+            regions = dict(zip(names, masks, strict=True))
         return HeadTopology(arrays["template"], arrays["faces"].astype(np.int64), regions)
     model = load_head(spec)
-    masks = {name: mask.numpy() for name, mask in model.regions.items()}
-    return HeadTopology(model.template.numpy(), model.faces.numpy(), masks)
+    regions = {name: mask.numpy() for name, mask in model.regions.items()}
+    return HeadTopology(model.template.numpy(), model.faces.numpy(), regions)
 
 
 def load_head(spec: str | Path) -> HeadModel:
