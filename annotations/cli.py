@@ -41,7 +41,7 @@ from annotations.validate import (
 )
 from annotations.worklist import ORDERS, coverage, effort, progress, worklist
 from express50.capture.index import Index, read_index
-from express50.console import FAILED, OK, answer, count, format_table
+from express50.console import FAILED, OK, add_command, answer, count, format_table
 from express50.contract.layout import Dataset, exclusion_reason, included_subjects
 from express50.errors import AnnotationError, UnknownNameError, check_known
 
@@ -50,27 +50,24 @@ AROUND = 4  # frames on either side when one subject or expression is shown
 
 
 def add_commands(subparsers: argparse._SubParsersAction) -> None:
-    """Add ``annotate`` with its verbs."""
-    words = "label peak frames, compare annotators, review and export"
-    annotate = subparsers.add_parser("annotate", help=words, description=words)
-    verbs = annotate.add_subparsers(dest="verb", metavar="VERB", required=True)
+    """Add ``annotate`` with its actions."""
+    words = "label peak frames, review and export labels"
+    annotate = subparsers.add_parser("annotate", help=words)
+    actions = annotate.add_subparsers(dest="action", metavar="ACTION", required=True)
 
     def add(name: str, handler: Callable, words: str, *shared: str) -> Callable:
-        """Add a verb with some shared arguments; return the function that adds its own."""
-        parser = verbs.add_parser(name, help=words, description=words)
-        parser.set_defaults(handler=handler)
+        """Add an action with some shared arguments; return the function that adds its own."""
+        parser = add_command(actions, name, handler, words, dataset=False)
         argument = parser.add_argument
-        argument("dataset", type=dataset_folder, metavar="DATASET")
-        argument("--json", action="store_true", help="print JSON")
-        only = "only this one; may be repeated"
-        if "subjects" in shared:
-            argument("--subject", action="append", metavar="ID", help=only)
-        if "expressions" in shared:
-            argument("--expression", action="append", metavar="ID", help=only)
+        argument("dataset", type=dataset_folder, metavar="DATASET", help="folder of the dataset")
+        for kind in ("subject", "expression"):
+            if f"{kind}s" in shared:
+                words = f"only this {kind}; may be repeated"
+                argument(f"--{kind}", action="append", metavar="ID", help=words)
         if "subject" in shared or "clip" in shared:
-            argument("subject", metavar="SUBJECT")
+            argument("subject", metavar="SUBJECT", help="subject's id")
         if "clip" in shared:
-            argument("expression", metavar="EXPRESSION")
+            argument("expression", metavar="EXPRESSION", help="expression's id")
         if "annotator" in shared:
             words = "annotator's name (default: your login)"
             login = None
@@ -82,73 +79,80 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
             )  # fmt: skip
         return argument
 
-    _add_labelling_verbs(add)
-    _add_reviewing_verbs(add)
+    _add_labelling_actions(add)
+    _add_reviewing_actions(add)
     words = "print or choose the reference person, to whose frames all others are matched"
     argument = add("reference", run_reference, words)
-    argument("subject", nargs="?", metavar="SUBJECT", help="new reference")
-    words = "label by RenderMe-360's rule: a clip's last frame is its peak (default: e0 to e11)"
+    argument("subject", nargs="?", metavar="SUBJECT", help="new reference (default: print it)")
+    words = "label clips by RenderMe-360's rule: the last frame is the peak (default: e0 to e11)"
     add("rule", run_rule, words, "subjects", "expressions")
-    words = "leave a subject out, and record the reason"
+    words = "exclude a subject from all stages, and record the reason"
     argument = add("exclude", run_exclusion, words, "subject", "annotator")
-    argument("reason", metavar="REASON", help="heavy makeup, large glasses, ...")
+    argument("reason", metavar="REASON", help="such as 'heavy makeup' or 'large glasses'")
     words = "include an excluded subject again"
     add("include", run_exclusion, words, "subject", "annotator")
-    argument = add("export", run_export, "write every event as .csv or .json", "subjects")
-    argument("file", type=Path, metavar="FILE")
-    words = "add events from a .csv or .json; known ones are skipped"
-    add("import", run_import, words)("file", type=Path, metavar="FILE")
+    words = "write every label event to a file"
+    argument = add("export", run_export, words, "subjects")
+    argument("file", type=Path, metavar="FILE", help=".csv or .json")
+    words = "add label events from a file, and skip those that the dataset has"
+    argument = add("import", run_import, words)
+    argument("file", type=Path, metavar="FILE", help=".csv or .json")
 
 
-def _add_labelling_verbs(add: Callable[..., Callable]) -> None:
+def _add_labelling_actions(add: Callable[..., Callable]) -> None:
     argument = add("ui", run_ui, "label peak frames in the terminal", "annotator")
-    argument("--subjects", metavar="GLOB", help="only these subjects")
-    argument("--expressions", metavar="GLOB", help="only these expressions")
-    argument("--order", choices=ORDERS, default="doubt", help="task order [%(default)s]")
+    argument("--subjects", metavar="GLOB", help="only subjects that match, such as 'S00*'")
+    argument("--expressions", metavar="GLOB", help="only expressions that match")
+    order = "order of the tasks (default: %(default)s)"
+    argument("--order", choices=ORDERS, default="doubt", help=order)
     words = "hide suggestions and others' marks until you decide"
     argument("--blind", action="store_true", help=words)
     words = "block characters, or sixels for terminals that draw them (xterm -ti vt340, foot,"
-    words += " WezTerm, iTerm2) [%(default)s]"
+    words += " WezTerm, iTerm2) (default: %(default)s)"
     argument("--pictures", choices=("blocks", "sixel"), default="blocks", help=words)
-    add("suggest", run_suggest, "list the frames that align suggests, doubtful first", "subjects")
+    words = "list the frames that align suggests, the most doubtful first"
+    add("suggest", run_suggest, words, "subjects")
     words = "list what you still have to label, in the best order"
     argument = add("next", run_next, words, "subjects", "annotator")
-    argument("--order", choices=ORDERS, default=ORDERS[0], help="default: %(default)s")
-    argument("--count", type=int, default=10, metavar="N", help="at most this many [10]")
+    argument("--order", choices=ORDERS, default=ORDERS[0], help=order)
+    words = "list at most this many (default: %(default)s)"
+    argument("--count", type=int, default=10, metavar="N", help=words)
     argument = add("mark", run_mark, "mark the peak frame of an expression", "clip", "annotator")
     argument("frame", type=int, metavar="FRAME", help="0-based decode index")
-    argument("--camera", help="camera it was judged in (default: the suggestion's)")
-    argument("--first", type=int, metavar="FRAME", help="first frame of its plateau")
-    argument("--last", type=int, metavar="FRAME", help="last frame of its plateau")
+    words = "camera in which you judged it (default: the suggestion's)"
+    argument("--camera", metavar="ID", help=words)
+    argument("--first", type=int, metavar="FRAME", help="first frame of the plateau")
+    argument("--last", type=int, metavar="FRAME", help="last frame of the plateau")
     argument = add("flag", run_flag, "record that an expression has no peak", "clip", "annotator")
     argument("reason", metavar="REASON", help=", ".join(FLAG_REASONS) + ", ...")
     add("undo", run_undo, "undo your last event on an expression", "clip", "annotator")
     add("labels", run_labels, "list every label in force", "subjects")
 
 
-def _add_reviewing_verbs(add: Callable[..., Callable]) -> None:
+def _add_reviewing_actions(add: Callable[..., Callable]) -> None:
     words = "check labels against the footage and each other; exit code 1 if one is wrong"
     add("validate", run_validate, words, "subjects")
     words = "show how well annotators agree: overall, by expression and by pair"
     add("agree", run_agree, words, "subjects")
     words = "list disagreements, or settle one"
     argument = add("review", run_review, words, "subjects", "annotator")
-    words = "marks at most this many frames apart agree [2]"
+    words = "marks at most this many frames apart agree (default: %(default)s)"
     argument("--beyond", type=int, default=2, metavar="FRAMES", help=words)
     argument("--all", action="store_true", help="also list settled disagreements")
     words = "VERDICT is a frame, the annotator who is right, or the reason for a flag: "
     words += f"{', '.join(FLAG_REASONS)}, or flag:REASON"
     argument("--settle", nargs=3, metavar=("SUBJECT", "EXPRESSION", "VERDICT"), help=words)
-    words = "print a table of subjects and expressions that shows the missing labels"
+    words = "print a table of subjects and expressions that shows which labels are missing"
     add("coverage", run_coverage, words)
     add("status", run_status, "show how many labels each subject has, and the time they took")
     words = "write a contact sheet of all labels, or of a subject or expression, as one HTML file"
     argument = add("sheet", run_sheet, words, "subjects", "expressions")
-    argument("file", type=Path, metavar="OUT.html")
+    argument("file", type=Path, metavar="OUT.html", help="page to write")
     argument("--camera", metavar="ID", help="show this camera (default: the label's)")
-    words = "frames before and after each label [4 for chosen subjects or expressions, else 0]"
+    words = "frames to show before and after each label (default: 4 with --subject or --expression,"
+    words += " else 0)"
     argument("--around", type=int, metavar="N", help=words)
-    words = "outline suggestions less sure than this [%(default)s]"
+    words = "outline suggestions with less confidence than this (default: %(default)s)"
     argument("--sure", type=float, default=0.5, metavar="P", help=words)
 
 
@@ -434,18 +438,18 @@ def run_rule(args: argparse.Namespace) -> int:
 def run_exclusion(args: argparse.Namespace) -> int:
     """Append an exclusion, or include the subject again."""
     chosen_subjects(args.dataset, [args.subject])
-    reason = args.reason.strip() if args.verb == "exclude" else None
-    if args.verb == "include" and exclusion_reason(args.dataset, args.subject) is None:
+    reason = args.reason.strip() if args.action == "exclude" else None
+    if args.action == "include" and exclusion_reason(args.dataset, args.subject) is None:
         raise AnnotationError(f"{args.subject} is not excluded")
     if reason == "":
         raise AnnotationError(f"{args.subject}: give a reason for it, such as 'heavy makeup'")
     event = Label(
-        subject=args.subject, expression="", action=args.verb, annotator=args.annotator,
+        subject=args.subject, expression="", action=args.action, annotator=args.annotator,
         time=time.time(), reason=reason,
     )  # fmt: skip
     append_label(args.dataset, event)
     because = f": {event.reason}" if event.reason else ""
-    return answer(args, asdict(event), f"{args.subject}: {args.verb}d{because}")
+    return answer(args, asdict(event), f"{args.subject}: {args.action}d{because}")
 
 
 def run_export(args: argparse.Namespace) -> int:

@@ -125,7 +125,11 @@ def add_command(
     example: str | None = None,
     **options: Any,
 ) -> argparse.ArgumentParser:
-    """Add a command's parser, for most commands with the arguments DATASET and --json."""
+    """Add a command's parser, for most commands with the arguments DATASET and --json.
+
+    Its description, unless given, is its ``help`` as a sentence.
+    """
+    options.setdefault("description", f"{help[0].upper()}{help[1:]}.")
     if example is not None:
         options |= {"epilog": f"example:\n  {example}"}
         options |= {"formatter_class": argparse.RawDescriptionHelpFormatter}

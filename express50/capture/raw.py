@@ -146,7 +146,7 @@ def read_calibration(
         return None
     calibration = read_cameras(given)
     for name in sorted(set(calibration) - set(cameras) - set(dropped)):
-        dropped[name] = "calibrated, but its footage is not there"
+        dropped[name] = "calibrated, but the capture has no footage of it"
     for name in sorted(set(cameras) - set(calibration)):
         dropped[name] = "not in calibration.json; add it, or delete that file to calibrate all"
         del cameras[name]
@@ -232,7 +232,7 @@ def _read_camera(folder: Path) -> RawCamera:
     frames = folder / "frames"
     if len(found) + frames.is_dir() > 1:
         names = ", ".join([video.name for video in found] + ["frames/"] * frames.is_dir())
-        raise CaptureError(f"{folder}: holds {names}; expected only one, move the others away")
+        raise CaptureError(f"{folder}: holds {names}, expected only one; move the others away")
     if found:
         return RawCamera(id=folder.name, kind="video", path=found[0])
     if not frames.is_dir():

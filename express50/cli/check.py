@@ -19,38 +19,38 @@ def add_commands(subparsers: Any) -> None:
     words = "compare a dataset with its ledger, and repair it"
     check = add_command(
         subparsers, "check", run_check, words,
-        description="Compares every output with what was published (presence and size; SHA-256 if\n"
+        description="Compare every output with what was published (presence and size; SHA-256 if\n"
         "the modification time differs; --deep reads every byte) and with the present\n"
-        "inputs and settings. Looks for unfinished and unknown outputs, labels of frames\n"
+        "inputs and settings. Look for unfinished and unknown outputs, labels of frames\n"
         "that do not exist, missing captures, and traces of withdrawn people.\n"
         "Exit code 0 if no problem is left, 1 otherwise.",
         example="express50 check DATASET --fix && express50 run DATASET",
     )  # fmt: skip
     check.add_argument("--deep", action="store_true", help="read every byte of every output")
-    words = "set wrong outputs aside, so that their stage makes them again; delete leftovers"
+    words = "set wrong outputs aside, so that the next run makes them again; delete leftovers"
     check.add_argument("--fix", action="store_true", help=words)
     words = "delete outputs that were replaced or set aside"
     add_command(
         subparsers, "prune", run_prune, words,
-        description="Stages keep the last two replaced outputs of each item while the disk has 2 "
-        "GB left, so that going back to old settings or inputs takes no work. This command deletes "
-        "them, and outputs that were set aside because they were wrong. The present outputs "
-        "stay.",
+        description="Delete outputs that were replaced, or set aside because they were wrong. The "
+        "present outputs stay. As long as the disk has 2 GB left, stages keep the last two "
+        "replaced outputs of each item, so that going back to old settings or inputs takes no "
+        "work.",
     )  # fmt: skip
     subject = subparsers.add_parser("subject", help="withdraw a person from a dataset")
     actions = subject.add_subparsers(dest="action", metavar="ACTION", required=True)
     words = "remove everything that the dataset holds about a subject"
     withdraw = add_command(
         actions, "withdraw", run_withdraw, words,
-        description="Removes a subject's index, derived files, labels and receipts, the packed\n"
-        "shards, and everything else that names the person. Takes codes and frames out\n"
-        "of checkpoints, notes the time in withdrawn.json, then searches the rest for\n"
-        "the subject's id. Without --yes it only lists what it would remove.\n"
+        description="Remove a subject's index, derived files, labels and receipts, the packed\n"
+        "shards, and everything else that names the person. Take codes and frames out\n"
+        "of checkpoints, note the time in withdrawn.json, then search the rest for the\n"
+        "subject's id. Without --yes, only list what would be removed.\n"
         "'express50 check' proves the removal at any later time.",
         example="express50 subject withdraw DATASET S001 --yes",
     )  # fmt: skip
-    withdraw.add_argument("subject", metavar="SUBJECT")
-    withdraw.add_argument("--yes", action="store_true", help="remove")
+    withdraw.add_argument("subject", metavar="SUBJECT", help="id of the subject to remove")
+    withdraw.add_argument("--yes", action="store_true", help="remove; without it, only list")
     words = "a model outside the dataset that may name withdrawn people; may be repeated"
     for add in (check.add_argument, withdraw.add_argument):
         add("--checkpoint", type=Path, action="append", default=[], metavar="FILE", help=words)

@@ -35,19 +35,19 @@ from express50.errors import ConfigError
 def add_commands(subparsers: Any) -> None:
     """Add ``tune``, and ``--budget`` and ``--error`` to ``run``."""
     run = subparsers.choices["run"]
-    words = "choose the settings that fit in this time: 45m, 2h, 1h30m; 40ch means core hours; "
+    words = "choose the settings that fit this time: 45m, 2h, 1h30m, or 40ch (core hours); "
     words += "not with --preset or --print-job"
     run.add_argument("--budget", metavar="TIME", help=words)
-    words = "choose the quickest settings with this expected error, such as 0.5mm; "
+    words = "choose the quickest settings that reach this expected error, such as 0.5mm; "
     words += "not with --preset or --print-job"
     run.add_argument("--error", metavar="ERROR", help=words)
     run.set_defaults(handler=run_chain)
     words = "measure the error of the whole chain against its time on this dataset"
     parser = add_command(
         subparsers, "tune", run_tune, words,
-        description="Tries every setting of every stage on a few expressions of one subject,\n"
-        "prints the choices that no other beats in both time and error, and writes\n"
-        "DATASET/dial/front.csv. Later 'run --budget' and 'plan' use the measurements.",
+        description="Try every setting of every stage on a few expressions of one subject, print\n"
+        "the choices that no other choice beats in both time and error, and write them to\n"
+        "DATASET/dial/front.csv. Later, 'run --budget' and 'plan' use the measurements.",
         example="express50 tune DATASET && express50 report DATASET",
     )  # fmt: skip
     add_run_options(parser, captures=True, preset=False)
@@ -61,7 +61,7 @@ def run_chain(args: argparse.Namespace) -> int:
     from express50.dial.run import closing_lines, run_within
 
     if args.first or args.last:
-        raise ConfigError("--budget and --error run the whole chain; leave --first and --last out")
+        raise ConfigError("--budget and --error run all stages; omit --first and --last")
     budget = None if args.budget is None else parse_budget(args.budget)
     goal = None if args.error is None else parse_goal(args.error)
 

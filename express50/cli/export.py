@@ -19,7 +19,7 @@ def add_commands(subparsers: Any) -> None:
     """Add ``export``, ``report`` and ``head preview``."""
     parser = add_command(
         subparsers, "export", run_export, "write tracked heads for other tools",
-        description="Writes tracked heads as a GaussianAvatars data set or as meshes.",
+        description="Write tracked heads as a GaussianAvatars dataset or as meshes.",
         example="express50 export data/mine out --format gaussian-avatars --subject S001\n"
         "writes OUT/<subject>/; an earlier export of the subject is replaced",
     )  # fmt: skip
@@ -29,26 +29,30 @@ def add_commands(subparsers: Any) -> None:
     for name in ("subject", "expression"):
         words = f"only this {name}; may be repeated"
         add(f"--{name}", action="append", default=[], metavar="ID", help=words)
-    words = "clips: a mesh per tracked frame (needs track.frames=clips, or a video) [peaks]"
+    words = "a mesh per peak, or per tracked frame (which needs track.frames=clips, or a video)"
+    words += " (default: peaks)"
     add("--frames", choices=("peaks", "clips"), default="peaks", help=words)
     add = parser.add_argument_group("with --format gaussian-avatars").add_argument
-    words = "background of the pictures [alpha: pictures with opacity]"
+    words = "background of the pictures (default: alpha, which stores the opacity)"
     add("--background", choices=("alpha", "white", "black"), default="alpha", help=words)
     words = "masks without the torso, from the regions stage"
     add("--head-only", action="store_true", help=words)
-    add("--downscale", type=int, default=1, metavar="N", help="make pictures N times smaller [1]")
+    words = "make pictures N times smaller (default: 1)"
+    add("--downscale", type=int, default=1, metavar="N", help=words)
     words = "divide out the cameras' colour gains that calibrate measured on a board"
     add("--even-colour", action="store_true", help=words)
-    words = "expression to hold back for testing; may be repeated [the last three tenths]"
+    words = "expression to hold out for testing; may be repeated (default: the last three tenths)"
     add("--test-expression", action="append", metavar="ID", help=words)
-    add("--validation-camera", metavar="ID", help="camera to hold back in training [the last]")
+    words = "camera to hold out in training (default: the last)"
+    add("--validation-camera", metavar="ID", help=words)
 
     words = "write one self-contained HTML page of results and pictures"
-    parser = add_command(subparsers, "report", run_report, words, description=run_report.__doc__)
-    parser.add_argument("--out", type=Path, help="folder of the page (default: DATASET/report)")
-    parser.add_argument("--title", help="heading of the page")
+    parser = add_command(subparsers, "report", run_report, words)
+    words = "folder of the page (default: DATASET/report)"
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help=words)
+    parser.add_argument("--title", metavar="TEXT", help="heading of the page")
 
-    area = subparsers.add_parser("head", help="look at a head model")
+    area = subparsers.add_parser("head", help="draw a head model")
     actions = area.add_subparsers(dest="action", metavar="ACTION", required=True)
     words = "draw a head model in typical poses"
     parser = add_command(
@@ -58,11 +62,12 @@ def add_commands(subparsers: Any) -> None:
     )  # fmt: skip
     add = parser.add_argument
     add("out", type=Path, metavar="OUT", help="picture to write (.png or .jpg)")
-    words = "head model: procedural, or the path of a FLAME, ICT-FaceKit or .npz file [procedural]"
+    words = "procedural, or the path of a FLAME, ICT-FaceKit or .npz model (default: procedural)"
     add("--model", default="procedural", help=words)
-    words = "directions to look from, degrees to the subject's left [0,40,90]"
+    words = "directions to look from, degrees to the subject's left (default: 0,40,90)"
     add("--yaws", default="0,40,90", metavar="DEG,...", help=words)
-    add("--size", type=int, default=256, help="side of a picture, pixels [256]")
+    words = "side of a picture, pixels (default: 256)"
+    add("--size", type=int, default=256, metavar="N", help=words)
 
 
 def run_export(args: argparse.Namespace) -> int:

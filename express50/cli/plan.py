@@ -77,21 +77,22 @@ def add_commands(subparsers: Any) -> None:
     words = "estimate what a campaign costs, from measured datasets"
     parser = add_command(
         subparsers, "plan", run_plan, words,
-        description="Scales the time and disk space that every stage took on a dataset to the\n"
-        "size of a campaign. Every figure comes from receipts or from 'express50 tune' on this\n"
+        description="Scale the time and disk space that every stage took on a dataset to the size\n"
+        "of a campaign. Every figure comes from receipts or from 'express50 tune' on this\n"
         "machine; stages that were not run are n/a. A second dataset of another size\n"
-        "(--also) separates the costs that grow with the footage from the others.",
+        "(--also) separates costs that grow with the footage from constant ones.",
         example="express50 plan DATASET --also OTHER --target express-50 --workers 32",
     )  # fmt: skip
     add = parser.add_argument
     words = "another measured dataset, of another size; may be repeated"
     add("--also", type=Path, action="append", default=[], metavar="DATASET", help=words)
-    add("--target", choices=list(TARGETS), help="a named campaign")
+    add("--target", choices=list(TARGETS), help="plan a campaign of this dataset's size")
     for name in SIZES:
-        words = f"{name.replace('_', ' ')} of the campaign (default: as in --target, else measured)"
+        words = f"{name.replace('_', ' ')} of the campaign (default: --target's, else DATASET's)"
         add(f"--{name.replace('_', '-')}", type=int, metavar="N", help=words)
-    add("--size", metavar="WxH", help="picture size of the campaign's cameras, pixels")
-    add("--workers", type=int, default=1, metavar="N", help="cores to use (default 1)")
+    words = "picture size of the campaign's cameras, pixels"
+    add("--size", metavar="WIDTHxHEIGHT", help=words)
+    add("--workers", type=int, default=1, metavar="N", help="cores to use (default: 1)")
 
 
 def run_plan(args: argparse.Namespace) -> int:

@@ -28,21 +28,24 @@ def add_commands(subparsers: Any) -> None:
         dataset=False, json=False,
         example="express50 shards split data/pack/shards test_only --split test",
     )  # fmt: skip
-    words = "write the samples of several folders as one"
+    words = "write the samples of several folders into one"
     merge = add_command(actions, "merge", run_merge, words, dataset=False, json=False)
     for action in (verify, listing, show, split):
         action.add_argument("directory", type=Path, metavar="DIR", help="folder of shards")
-    show.add_argument("key", nargs="?", metavar="KEY", help="sample; the first by default")
-    show.add_argument("--out", type=Path, help="picture of rgb, alpha and depth to write")
-    merge.add_argument("directories", type=Path, nargs="+", metavar="DIR", help="shards")
-    listing.add_argument("--subject", action="append", help="only this subject; may be repeated")
-    for name in ("subject", "expression", "camera"):
-        split.add_argument(f"--{name}", action="append", help="only this; may be repeated")
+    show.add_argument("key", nargs="?", metavar="KEY", help="sample to show (default: the first)")
+    words = "write colours, matte and depth to this picture"
+    show.add_argument("--out", type=Path, metavar="FILE", help=words)
+    merge.add_argument("directories", type=Path, nargs="+", metavar="DIR", help="folders of shards")
+    for action, names in ((listing, ("subject",)), (split, ("subject", "expression", "camera"))):
+        for name in names:
+            words = f"only this {name}; may be repeated"
+            action.add_argument(f"--{name}", action="append", metavar="ID", help=words)
     for action in (listing, split):
-        action.add_argument("--split", help="only samples of this split")
+        action.add_argument("--split", metavar="NAME", help="only samples of this split")
     for action in (split, merge):
-        action.add_argument("out", type=Path, metavar="OUT", help="empty or absent folder")
-        action.add_argument("--shard-mb", type=int, default=256, help="size of a shard, MB [256]")
+        action.add_argument("out", type=Path, metavar="OUT", help="folder to make, or an empty one")
+        words = "size of a shard, MB (default: 256)"
+        action.add_argument("--shard-mb", type=int, default=256, metavar="MB", help=words)
 
 
 def run_split(args: argparse.Namespace) -> int:

@@ -19,7 +19,7 @@ def add_commands(subparsers: Any) -> None:
     """Add one command per stage, ``run`` and ``config``."""
     for stage in stages().values():
         parser = add_command(
-            subparsers, stage.name, run_one, stage.help, description=stage.help,
+            subparsers, stage.name, run_one, stage.help,
             epilog=f"settings of the stage: express50 config {stage.name}",
         )  # fmt: skip
         add_run_options(parser, captures=stage.prepare is not None)
@@ -28,9 +28,8 @@ def add_commands(subparsers: Any) -> None:
     words, names = "run all stages in order", list(stages())
     parser = add_command(
         subparsers, "run", run_all, words,
-        description="Runs all stages in order and skips items that are up to date. With --budget\n"
-        "or --error it first measures a few expressions, then chooses the settings of\n"
-        "every stage.",
+        description="Run all stages in order, and skip items that are up to date. With --budget\n"
+        "or --error, first measure a few expressions, then choose the settings of every stage.",
         example="express50 run DATASET CAPTURE... --budget 2h\n"
         "settings of a stage: express50 config STAGE",
     )  # fmt: skip
@@ -39,7 +38,7 @@ def add_commands(subparsers: Any) -> None:
     parser.add_argument("--last", metavar="STAGE", choices=names, help="last stage to run")
     words = "print the settings of stages as TOML"
     parser = add_command(subparsers, "config", show_config, words, dataset=False, json=False)
-    parser.add_argument("stage", nargs="*", metavar="STAGE", help="stages to print; all by default")
+    parser.add_argument("stage", nargs="*", metavar="STAGE", help="stages to print (default: all)")
     add_config_options(parser)
 
 
@@ -51,23 +50,23 @@ def add_run_options(parser: argparse.ArgumentParser, captures: bool, preset: boo
     """
     add = parser.add_argument
     if captures:
-        words = "folders of raw captures"
+        words = "captures to add to the dataset: folders or videos"
         add("captures", nargs="*", default=[], type=Path, metavar="CAPTURE", help=words)
-        words = "use CAPTURE in place of the captures that its subjects have"
+        words = "let CAPTURE replace the capture that its subject already has"
         add("--replace", action="store_true", help=words)
     add_config_options(parser, preset)
-    words = "local worker processes (default 2); 0 works in this process"
+    words = "local worker processes (default: 2); 0: work in this process"
     add("--workers", type=int, default=2, metavar="N", help=words)
-    add("--scheduler", metavar="ADDRESS", help="dask scheduler, tcp://host:port")
-    words = "run in SLURM jobs: partition=P,time=4:00:00,memory=16G,cores=4,jobs=8 or jobs.toml"
+    add("--scheduler", metavar="ADDRESS", help="run on a dask scheduler, tcp://host:port")
+    words = "run in SLURM jobs: partition=P,time=4:00:00,memory=16G,cores=4,jobs=8, or a TOML file"
     add("--slurm", metavar="JOBS", help=words)
     parser.set_defaults(print_job=False)
     if preset:
-        words = "print the script of a SLURM job, and run nothing"
+        words = "with --slurm: print the script of a job, and run nothing"
         add("--print-job", action="store_true", help=words)
-    words = "threads an item may use (default 1)"
+    words = "threads that an item may use (default: 1)"
     add("--threads", type=int, default=1, metavar="N", help=words)
-    words = "exit with 1 also if part of an item was dropped, such as a camera"
+    words = "exit code 1 also if part of an item, such as a camera, was dropped"
     add("--strict", action="store_true", help=words)
 
 
@@ -76,7 +75,7 @@ def add_config_options(parser: argparse.ArgumentParser, preset: bool = True) -> 
     add = parser.add_argument
     parser.set_defaults(preset=None)
     if preset:
-        add("--preset", metavar="P", help=f"{', '.join(PRESETS)} (default standard)")
+        add("--preset", metavar="PRESET", help=f"{', '.join(PRESETS)} (default: standard)")
     add("--config", type=Path, metavar="FILE", help="TOML file of settings, one table per stage")
     words = "change one setting; may be repeated"
     add("--set", action="append", default=[], metavar="STAGE.KEY=VALUE", help=words)
@@ -93,7 +92,7 @@ def run_one(args: argparse.Namespace) -> int:
     for text in args.set:
         if not text.startswith(tuple(f"{stage.name}." for stage in chosen)):
             raise ConfigError(
-                f"--set {text!r}: this command runs {' and '.join(s.name for s in chosen)} only; "
+                f"--set {text!r}: this command only runs {' and '.join(s.name for s in chosen)}; "
                 f"expected {args.stage}.key=value"
             )
     return _run(args, chosen, args.items)
@@ -109,8 +108,8 @@ def run_all(args: argparse.Namespace) -> int:
     chosen = with_required(names[first : last + 1])
     if args.captures and all(stage.prepare is None for stage in chosen):
         raise ConfigError(
-            f"--first {args.first}: no stage from it on takes in captures, such as"
-            f" {args.captures[0]}; leave --first out, or the captures"
+            f"--first {args.first}: the stages from there on read no captures, but"
+            f" {args.captures[0]} was given; omit --first, or the captures"
         )
     return _run(args, chosen, None)
 
@@ -150,7 +149,7 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
             items = _items(stage, dataset, args, pattern)
             failed = [summary.stage for summary in summaries if not summary.ok]
             if failed and not (stage.items(dataset) if items is None else items):
-                why = f"because {failed[-1]} failed; see above"
+                why = f"because {failed[-1]} failed (see above)"
                 log(f"express50: {stage.name} has nothing to do, {why}")
                 break
             summaries.append(run_stage(stage, dataset, config, items, pool=pool))
@@ -227,7 +226,8 @@ def _items(
             f"{dataset.root}: no such dataset; run 'express50 ingest {dataset.root} CAPTURE'"
         )
     elif stage.prepare is not None and not stage.items(dataset):
-        raise ConfigError(f"{dataset.root}: it has no captures yet; name a CAPTURE after it")
+        call = f"express50 {args.command} {dataset.root} CAPTURE"
+        raise ConfigError(f"{dataset.root}: has no captures yet; run '{call}'")
     if pattern is None:
         return None
     # A stage that runs first in another's command may have other items; take the same subjects'.

@@ -65,18 +65,18 @@ class StageStatus:
 
 def add_commands(subparsers: Any) -> None:
     """Add ``status``."""
-    words = "show what is done, failed or outdated, expected errors, time and memory"
+    words = "show what is done, failed or outdated, with expected errors, time and memory"
     parser = add_command(
         subparsers, "status", show_status, words, json=False,
-        description="Shows per stage the items that are done, failed, running or missing, time,"
-        " memory and the expected error; then what is outdated, and why. Exit code 1 if an item"
+        description="Show for each stage how many items are done, failed, running or missing, its"
+        " time, memory and expected error; then what is outdated, and why. Exit code 1 if an item"
         " failed.",
     )  # fmt: skip
     page = "write an HTML page, and update it while a stage runs"
     how = parser.add_mutually_exclusive_group()
-    how.add_argument("--json", action="store_true", help="print receipts as JSON")
+    how.add_argument("--json", action="store_true", help="print the receipts as JSON")
     how.add_argument("--page", type=Path, metavar="FILE", help=page)
-    how.add_argument("--serve", type=int, metavar="PORT", help="serve the page on this machine")
+    how.add_argument("--serve", type=int, metavar="PORT", help="serve this page to this machine")
 
 
 def show_status(args: argparse.Namespace) -> int:
@@ -162,7 +162,7 @@ def _outdated_lines(why: Mapping[tuple[str, str], str]) -> Iterator[str]:
     for (stage, words), items in groups.items():
         yield f"outdated {stage} {few(items, 2)}: {words}"
     if groups:
-        yield "the next run makes these again, unless only settings changed and it has the old ones"
+        yield "the next run makes these again, or takes back kept outputs of the same settings"
 
 
 def read_status(

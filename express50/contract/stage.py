@@ -237,7 +237,7 @@ def stages() -> dict[str, Stage]:
                 )
             found[stage.name] = stage
     if not found:
-        raise StageError(f"express50 is not installed, so that no stage is known; {INSTALL}")
+        raise StageError(f"no stage is known, because express50 is not installed; {INSTALL}")
     return found
 
 

@@ -110,8 +110,8 @@ def audit(
             with Ledger(dataset.ledger, read_only) as ledger:
                 _StageAudit(dataset, stages, ledger, result, deep, fix).run()
         result.findings += _person_findings(dataset, checkpoints)
-    what = {dataset.stale_dir: "set aside earlier, which nothing reads"}
-    what[dataset.replaced_dir] = "since replaced, kept in case you go back to their settings"
+    what = {dataset.stale_dir: "that were set aside and are no longer used"}
+    what[dataset.replaced_dir] = "that were replaced, kept in case you go back to their settings"
     for folder, words in what.items():
         files, size = size_of(folder)
         if files:
@@ -138,7 +138,7 @@ def _capture_findings(dataset: Dataset) -> Iterator[Finding]:
         if what:
             yield Finding(kind="capture", where=f"captures.json {subject}", what=what, fix=fix)
     for subject in sorted(set(dataset.subjects()) - set(captures)):
-        what = "captures.json does not name its capture"
+        what = "captures.json has no entry for it"
         yield Finding(kind="capture", where=f"ingest {subject}", what=what, fix=fix)
 
 
@@ -169,7 +169,7 @@ def _label_findings(dataset: Dataset, problems: LabelProblems) -> Iterator[Findi
 def _ledger_finding(dataset: Dataset, fix: bool, read_only: bool) -> Finding | None:
     """Find a ledger that is missing or damaged; rename it, so that stages start a new one."""
     again = f"express50 run {dataset.root}: every item is made again, to the same bytes"
-    what = "is missing; without it no output counts as made by a run"
+    what = "is missing; without it, no output is known to come from a run"
     if dataset.ledger.is_file():
         try:
             with Ledger(dataset.ledger, read_only) as ledger:
@@ -278,7 +278,7 @@ class _StageAudit:
             elif item in made and (fault := self._changed(stage, item, made[item].files)):
                 yield fault
         for item in sorted(there - (done & made.keys())):
-            what = "an output without a receipt: its run did not finish, or no run made it"
+            what = "has no receipt: its run did not finish, or no run made it"
             yield Fault(item, "unknown", what)
 
     def _changed(self, stage: str, item: str, marks: Mapping[str, FileMark]) -> Fault | None:
@@ -288,7 +288,7 @@ class _StageAudit:
         shared = sorted(marks.keys() & there.keys())
         other = [name for name in shared if self._differs(there[name], marks[name])]
         foreign = sorted(there.keys() - marks.keys())
-        states = {"gone": gone, "not as published": other, "written by no run": foreign}
+        states = {"missing": gone, "not as published": other, "not written by a run": foreign}
         words = [f"{few(names)} {state}" for state, names in states.items() if names]
         if words:
             kind = "missing" if gone else "changed" if other else "foreign"
@@ -333,15 +333,15 @@ class _StageAudit:
         if receipt is not None and receipt.imported:  # no run can make it again
             how = AGAIN
         elif fault.foreign:
-            how = "move the files that no run wrote out of the folder, then check again"
+            how = "move files that no run wrote out of the folder, then check again"
         elif not known and fault.kind == "unknown":
-            how = f"{stage} no longer has such an item; move it away if you do not need it"
+            how = f"{stage} no longer has such an item; delete it if you do not need it"
         elif self.fix:
             fixed, how = True, f"set aside; make it again: {again}"
             set_aside(self.dataset, stage, fault.item)
             self.ledger.forget(stage, [fault.item])
         else:
-            how = f"--fix, then {again}" if known else "--fix; the stage no longer has such an item"
+            how = f"--fix, then {again}" if known else "--fix (the stage no longer has this item)"
         self._find(fault.kind, f"{stage} {fault.item}", fault.what, how, fixed)
 
     def _judge(self, stage: Stage, receipts: dict[str, Receipt]) -> None:
@@ -376,7 +376,7 @@ class _StageAudit:
             elif self._waits(item):
                 self._note(stage, f"{item} cannot be checked until its inputs are made again")
             else:
-                what = f"made from a different {few(changed)} than the current one"
+                what = f"these inputs changed since it was made: {few(changed)}"
                 self._settle(name, Fault(item, "outdated", what), True)
         for reason, items in unreadable.items():
             if not all(self._waits(item) for item in items):

@@ -68,7 +68,7 @@ def tracked_subjects(dataset: Dataset, wanted: Sequence[str]) -> list[str]:
     check_known(str(dataset.root), "subject", wanted, dataset.subjects())
     for name in wanted:
         if (reason := exclusion_reason(dataset, name)) is not None:
-            raise StageError(f"{name}: is excluded ({reason}) and cannot be exported")
+            raise StageError(f"{name}: excluded ({reason}), so it cannot be exported")
         existing_track(dataset, name)
     if wanted:
         return list(dict.fromkeys(wanted))

@@ -113,19 +113,20 @@ def export_avatar(dataset: Dataset, head: Head, options: AvatarOptions, out: Pat
 def _check_options(track: Track, cameras: dict[str, Camera], options: AvatarOptions) -> None:
     if not 1 <= options.downscale <= min(min(c.width, c.height) for c in cameras.values()):
         raise ConfigError(
-            f"downscale {options.downscale}: expected 1 (full size) up to the images' shorter side"
+            f"--downscale {options.downscale}: expected 1 (full size) to the images' shorter side"
         )
     unknown = sorted(set(options.test_expressions or ()) - set(track.expressions))
     if unknown:
         raise ConfigError(
-            f"test expressions: unknown {', '.join(unknown)}; expected some of"
+            f"--test-expression: unknown {', '.join(unknown)}; expected some of"
             f" {', '.join(track.expressions)}"
         )
     if set(options.test_expressions or ()) >= set(track.expressions):
-        raise ConfigError("test expressions: all are held out, which leaves none to train on")
+        raise ConfigError("--test-expression: all expressions are held out; leave some to train on")
     if options.validation_camera not in (None, *cameras):
         raise ConfigError(
-            f"validation camera {options.validation_camera!r}: expected one of {', '.join(cameras)}"
+            f"--validation-camera {options.validation_camera!r}: expected one of"
+            f" {', '.join(cameras)}"
         )
 
 

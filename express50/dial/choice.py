@@ -336,7 +336,7 @@ def expected_lines(point: Point) -> Iterator[str]:
     if stated:
         yield f"expected error: {', '.join(stated)}"
     if others:
-        words = "no stage states these errors; difference from the most expensive settings"
+        words = "difference from the most expensive settings (no stage states these errors)"
         yield f"{words}: {', '.join(others)}"
 
 
@@ -363,9 +363,9 @@ def _why(load: Workload, stage: Stage, point: Point) -> str:
     name, label = stage.name, point.settings[stage.name]
     ladder = list(load.ladders[name])
     if len(ladder) == 1:
-        return "has one setting"
+        return "only one setting"
     if name not in load.measured.losses:
-        return "no measured error depends on it: standard"
+        return "standard, as no measured error depends on it"
     if cost_at(load, name, label) is None:
         why = next((t.failed[name] for t in load.measured.trials if name in t.failed), "no time")
         return f"not measured: {why}"

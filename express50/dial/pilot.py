@@ -254,7 +254,9 @@ def _base(pilot: Pilot, settings: dict[str, str], choices: Sequence[str]) -> Tri
         if broken not in choices or settings[broken] == ladder[-1] or pilot.clock.closed():
             return base
         settings |= {broken: ladder[ladder.index(settings[broken]) + 1]}
-        pilot.chain.tell(f"{broken} made nothing at its cheapest; trying {settings[broken]}")
+        pilot.chain.tell(
+            f"{broken} made nothing at its cheapest setting; trying {settings[broken]}"
+        )
 
 
 def measure(pilot: Pilot, allowance: float) -> PilotFigures:

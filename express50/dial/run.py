@@ -103,7 +103,7 @@ def _measure_one(chain: Chain, clock: Clock, allowance: float) -> PilotFigures:
     root = chain.dataset.root
     subjects = [s for s in chain.dataset.captures() if not exclusion_reason(chain.dataset, s)]
     if not subjects:
-        raise StageError(f"{root}: no capture is registered; name a CAPTURE")
+        raise StageError(f"{root}: has no captures yet; run 'express50 run {root} CAPTURE'")
     for subject in subjects[:PILOTS]:
         try:
             found = measure(Pilot(chain, subject, clock), allowance)
@@ -112,7 +112,7 @@ def _measure_one(chain: Chain, clock: Clock, allowance: float) -> PilotFigures:
                 raise
             raise ConfigError(
                 f"--budget {clock.budget.text}: the time ended before the footage of {subject} was"
-                " ingested; give more"
+                " ingested; give more time"
             ) from error
         broken = broken_stage(chain, found.trials[0])
         if not broken or clock.closed():  # a stage without time has no output
@@ -225,7 +225,7 @@ def run_within(
         if again:
             run.state = replace(state, seconds=clock.now() + front(load)[0].seconds)
         spent = format_seconds(clock.now())
-        lines = iter([f"going on: {spent} of the budget are spent; settings as chosen"])
+        lines = iter([f"continuing with the chosen settings; {spent} of the budget are spent"])
     for line in lines:
         chain.tell(line)
     run.keep()
@@ -272,12 +272,13 @@ def _first_choice(run: _Run, load: Workload, goal: Goal | None) -> Point:
         asked = f"--budget {clock.budget.text if clock.budget else ''}"
         if clock.closed():
             raise ConfigError(
-                f"{asked}: the time ended while settings were measured, which is kept; the cheapest"
-                f" need more than {format_seconds(least)} {words}; give several times as much"
+                f"{asked}: the time ended while settings were measured (the measurements are kept);"
+                f" the cheapest need more than {format_seconds(least)} {words}; give several times"
+                " as much"
             )
         raise ConfigError(
             f"{asked}: the cheapest settings need about {format_seconds(least)} {words},"
-            f" {format_seconds(clock.now())} of them for measuring, which is kept; give --budget"
+            f" {format_seconds(clock.now())} of it already spent on measuring; give --budget"
             f" {budget_text(1.1 * least, load.cores)} or more"
         )
     point = choose(points, left * SAFETY, wanted)

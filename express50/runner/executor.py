@@ -113,7 +113,7 @@ class Pool:
             fix += f" than {job.memory}, or more time"
         words = (
             f"its worker process died {last} times ({why}); run "
-            f"this item with --workers 0 to see, or {fix}"
+            f"this item with --workers 0 to see why, or {fix}"
         )
         for killer in left:
             settle(failed_receipt(killer, words, last))
@@ -225,7 +225,7 @@ def _loss_is_one_error() -> Iterator[None]:
     except (CancelledError, OSError) as error:  # dask's CommClosedError is an OSError
         reason = f"{type(error).__name__}: {error}".split("\n")[0]
         raise StageError(
-            f"lost the dask scheduler ({reason}); start it, run the same again"
+            f"lost the dask scheduler ({reason}); start it and run the same command again"
         ) from error
 
 

@@ -22,7 +22,7 @@ from express50.runner.publish import discard_stale, run_folder, set_aside
 from express50.runner.worker import Task, run_task
 
 Digest = Callable[[Path], str]
-AGAIN = "import it again, or give it up with 'express50 import remove'"
+AGAIN = "import it again, or remove it with 'express50 import remove'"
 
 
 def import_inputs(dataset: Dataset, item: str, digest: Digest = path_digest) -> dict[str, str]:
@@ -89,11 +89,13 @@ def import_trouble(
 ) -> str | None:
     """Say why an imported item no longer holds; None if it does."""
     if receipt.status != "done" or made is None:
-        return receipt.reason or f"it was imported, and has no receipt; {AGAIN}"
+        return receipt.reason or f"it was imported, but its receipt is incomplete; {AGAIN}"
     try:
         now: Mapping[str, str] = import_inputs(dataset, receipt.item, digest)
     except Express50Error as error:
-        return f"what it was imported for cannot be read ({error})"
+        return f"cannot compare it with the cameras and peaks it was imported for ({error})"
     # Peaks that were labelled later were not imported; they do not concern it.
     changed = [name for name, value in made.inputs.items() if now.get(name) != value]
-    return f"it was imported for another {', '.join(changed[:3])}; {AGAIN}" if changed else None
+    if changed:
+        return f"imported, but since then these changed: {', '.join(changed[:3])}; {AGAIN}"
+    return None

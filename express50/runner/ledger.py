@@ -128,7 +128,7 @@ CREATE TABLE IF NOT EXISTS runs (
 """
 OF_ITEMS = ("receipts", "made", "settings")
 TABLES = {*OF_ITEMS, "digests", "runs"}
-DELETE = "delete it and run the stages again, the same outputs will be made"
+DELETE = "delete it and run the stages again; they make the same outputs"
 COLUMNS = tuple(one.name for one in fields(Receipt) if one.name != "made")
 KINDS = {"item": str, "fingerprint": str, "status": str, "reason": str, "metrics": dict}
 
@@ -187,7 +187,9 @@ class Ledger:
             if self._read_only:  # a reader must not be advised to delete
                 words = f"cannot be read as a ledger ({error})"
             elif isinstance(error, sqlite3.OperationalError) and "no such" not in str(error):
-                words = f"the ledger cannot be used ({error}); fix that and run the same again"
+                words = (
+                    f"the ledger cannot be used ({error}); fix that and run the same command again"
+                )
             else:
                 words = f"not a ledger ({error}); {DELETE}"
             raise FormatError(f"{self._path}: {words}") from error

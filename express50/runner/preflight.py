@@ -93,8 +93,8 @@ def _memory_problems(ledger: Ledger, stages: Iterable[Stage], pool: Pool) -> Ite
         fit = max(math.floor(total * WORKER_SHARE / max(peak, 1)), 1)
         if pool.workers > fit:
             yield (
-                f"{stage.name}: {pool.workers} workers need {decimal(peak)} each, as the largest "
-                f"item did, and this machine has {decimal(total)}; use --workers {fit}"
+                f"{stage.name}: {pool.workers} workers need {decimal(peak)} each (as the largest "
+                f"item did), and this machine has {decimal(total)}; use --workers {fit}"
             )
 
 
@@ -134,9 +134,9 @@ def _space_problems(dataset: Dataset, needs: Sequence[tuple[str, int, float]]) -
     elif need > room:
         largest = max(needs, key=lambda one: one[1] * one[2])
         yield (
-            f"{dataset.root}: about {decimal(int(need))} are needed, most of it by {largest[0]} "
+            f"{dataset.root}: about {decimal(int(need))} of disk are needed, most by {largest[0]} "
             f"({count(largest[1], 'item')} of {decimal(int(largest[2]))}), and "
-            f"{decimal(int(room))} can be used; free some space, or make fewer items with --items"
+            f"{decimal(int(room))} are free; free some space, or make fewer items with --items"
         )
 
 

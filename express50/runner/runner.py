@@ -113,7 +113,7 @@ class Summary:
         for (restored, why), count in again.most_common():
             yield f"  {'restored' if restored else 'made again'} {count}: {why or 'same as before'}"
         if imported := sum(o.reason == KEPT for o in self.outcomes):
-            yield f"  kept {imported} imported: 'express50 import remove' gives them up"
+            yield f"  kept {imported} imported (to drop them: 'express50 import remove')"
         for outcome in self.outcomes:
             if outcome.status == "failed":
                 yield f"  failed {outcome.item}: {outcome.reason}"
@@ -184,7 +184,7 @@ def run_stage(
     dataset = Dataset(dataset.root.resolve())
     chosen = list(stage.items(dataset) if items is None else items)
     if not chosen:
-        status = f"'express50 status {dataset.root}' shows which stage before it must run first"
+        status = f"'express50 status {dataset.root}' shows which earlier stage must run first"
         before = "name a CAPTURE" if stage.prepare else status
         raise StageError(f"{dataset.root}: {stage.name} has nothing to do; {before}")
     shared = nullcontext(pool) if pool else Pool(workers, scheduler)
@@ -210,7 +210,8 @@ def run_stage(
     if monitor is not None and monitor.closed():
         outcomes |= {item: Outcome(item, "left") for item in missing}
     elif missing:  # items = done + skipped + failed + left
-        raise StageError(f"{stage.name}: no account of {', '.join(sorted(missing))}; run it again")
+        names = ", ".join(sorted(missing))
+        raise StageError(f"{stage.name}: the outcome of {names} is unknown; run it again")
     seconds = time.perf_counter() - started
     return Summary(stage.name, tuple(outcomes[item] for item in chosen), seconds)
 

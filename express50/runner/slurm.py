@@ -222,7 +222,7 @@ class SlurmWorkers(RemoteWorkers):
             except StageError as error:
                 if not self._names:
                     raise
-                sys.stderr.write(f"{error}; going on with {len(self._names)} jobs\n")
+                sys.stderr.write(f"{error}; continuing with {len(self._names)} jobs\n")
                 return
             if self._count == 1:
                 sys.stderr.write(f"SLURM jobs are submitted; their output is in {self.logs}\n")

@@ -16,43 +16,43 @@ class TwinConfig:
     """Settings of ``express50 twin record``; the same settings give the same bytes."""
 
     head: str = "procedural"
-    "Head model spec of ``load_head``; it must name its expression directions."
+    "head model: procedural, or the path of a file; its expressions must have names"
     subjects: int = 4
-    "Number of subjects."
+    "number of subjects"
     first_subject: int = 1
-    "Number of the first subject's id; S001 for 1. Subjects do not depend on how many there are."
+    "number of the first subject, 1 for S001; a subject does not depend on how many there are"
     cameras: int = 24
-    "Number of cameras on the rig, over about 300 degrees."
+    "number of cameras, spread over about 300 degrees"
     width: int = 960
-    "Image width, pixels."
+    "image width, pixels"
     height: int = 540
-    "Image height, pixels."
+    "image height, pixels"
     expressions: tuple[str, ...] | None = None
-    "Ids from the script, in order; None is all 60."
+    "ids from the script, in order (default: all 60)"
     frames_per_expression: int = 8
-    "Frames of each cue window, at least 4."
+    "frames of each cue window, at least 4"
     fps: float = 24.0
-    "Frames per second written to the capture."
+    "frames per second that the capture states"
     seed: int = 0
-    "Seed of everything random."
+    "random seed"
     footage: str = "video"
-    "``video`` (H.264, 4:4:4), ``png`` or ``jpg`` frames."
+    "``video`` (H.264, 4:4:4), ``png`` or ``jpg`` frames"
     crf: int = 10
-    "H.264 constant rate factor; lower is closer to lossless."
+    "H.264 constant rate factor; lower is closer to lossless"
     board_frames: int = 24
-    "Synchronised ChArUco poses; 0 leaves the board out."
+    "pictures of the ChArUco board per camera; 0 for none"
     give_calibration: bool = False
-    "Write calibration.json into the capture, so that nothing has to be solved."
+    "write calibration.json into the capture, so that no camera has to be solved"
     plates: bool = True
-    "Write clean background plates."
+    "record plates"
     hair: bool = True
-    "Give subjects hair strands."
+    "give subjects hair strands"
     wear: tuple[str, ...] = ()
-    "What every subject wears or holds: glasses, hand, beard, moustache, fringe, microphone, mask."
+    "what every subject wears or holds: glasses, hand, beard, moustache, fringe, microphone, mask"
     personal: float = 0.0
-    "Movements, wrinkles and reddening of each person's own that no head model has; 1 is lively."
+    "strength of each person's own motions, wrinkles and blushes, which no head model has, 0 to 2"
     noise: float = 1.0
-    "Sensor noise relative to a good studio camera; 0 is none."
+    "sensor noise relative to a good studio camera's; 0 for none"
 
     def __post_init__(self) -> None:
         check_ranges(

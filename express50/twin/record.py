@@ -19,15 +19,14 @@ from pathlib import Path
 from typing import Any
 
 from express50.capture.expressions import select
-from express50.console import count
+from express50.console import add_command, count
 from express50.contract.config import field_documents
 from express50.errors import CaptureError
 from express50.files.atomic import dump_json, link_file, write_json
 from express50.runner.worker import cap_threads
 from express50.twin.config import TwinConfig
 
-_EPILOG = """example:
-  express50 twin record build/twin --subjects 4 --cameras 8 --width 320 --height 320 \\
+_EXAMPLE = """express50 twin record build/twin --subjects 4 --cameras 8 --width 320 --height 320 \\
       --expressions neutral,smile,jaw_open --frames-per-expression 8 --seed 0
 writes build/twin/captures/S001... (for 'express50 ingest') and build/twin/truth/S001..."""
 _NUMBERS = [setting.name for setting in fields(TwinConfig) if setting.type in ("int", "float")]
@@ -40,32 +39,29 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
     """Add ``twin`` with its sub-command ``record``."""
     area = subparsers.add_parser("twin", help="record a synthetic capture with known truth")
     actions = area.add_subparsers(dest="action", metavar="ACTION", required=True)
-    parser = actions.add_parser(
-        "record",
-        help="record subjects of the digital twin",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = add_command(
+        actions, "record", record_command, "record subjects of the digital twin",
+        dataset=False, example=_EXAMPLE,
+    )  # fmt: skip
     words, default = field_documents(TwinConfig), TwinConfig()
     parser.add_argument("out", type=Path, metavar="OUT", help="folder for captures/ and truth/")
     for name in _NUMBERS:
         value = getattr(default, name)
         parser.add_argument(
             f"--{name.replace('_', '-')}", type=type(value), default=value, metavar="N",
-            help=f"{words[name]} [{value}]",
+            help=f"{words[name]} (default: {value:g})",
         )  # fmt: skip
-    parser.add_argument("--head", default=default.head, help=words["head"] + f" [{default.head}]")
+    parser.add_argument("--head", default=default.head, metavar="MODEL",
+                        help=f"{words['head']} (default: {default.head})")  # fmt: skip
     parser.add_argument("--expressions", metavar="ID,ID...", help=words["expressions"])
     parser.add_argument("--wear", metavar="KIND,KIND...", default="", help=words["wear"])
     parser.add_argument("--frames", choices=("png", "jpg"), nargs="?", const="png",
                         help="write single images instead of H.264 videos")  # fmt: skip
     parser.add_argument("--give-calibration", action="store_true", help=words["give_calibration"])
-    parser.add_argument("--no-plates", action="store_true", help="leave clean plates out")
-    parser.add_argument("--no-hair", action="store_true", help="bald subjects")
+    parser.add_argument("--no-plates", action="store_true", help="record no plates")
+    parser.add_argument("--no-hair", action="store_true", help="record bald subjects")
     parser.add_argument("--workers", type=int, default=min(8, os.cpu_count() or 1), metavar="N",
-                        help="processes; they do not change the bytes")  # fmt: skip
-    parser.add_argument("--json", action="store_true", help="print the result as JSON")
-    parser.set_defaults(handler=record_command)
+                        help="processes; their number does not change the result")  # fmt: skip
 
 
 def record_command(args: argparse.Namespace) -> int:

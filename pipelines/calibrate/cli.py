@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from express50.console import FAILED, OK, say, say_json
+from express50.console import FAILED, OK, add_command, say, say_json
 from express50.errors import CalibrationError, ConfigError
 from express50.files.calibration import camera_rows, read_cameras, write_cameras
 from express50.geometry.cameras import Camera
@@ -26,33 +26,32 @@ def add_commands(subparsers: Any) -> None:
     """Add ``cameras import`` and ``cameras check``."""
     parser = subparsers.add_parser("cameras", help="import and check calibrations")
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    importing = actions.add_parser(
-        "import",
-        help="write another tool's calibration as calibration.json",
-        epilog="example: express50 cameras import sparse/0 capture/calibration.json --scale 0.42",
-    )
-    importing.set_defaults(handler=run_import)
-    importing.add_argument("source", type=Path, help="file or folder of the other tool")
-    importing.add_argument("out", type=Path, help="calibration.json to write")
-    importing.add_argument(
-        "--overwrite", action="store_true", help="replace the cameras that OUT holds"
-    )
-    checking = actions.add_parser("check", help="say whether a rig's cameras fit together")
-    checking.set_defaults(handler=run_check)
-    checking.add_argument("source", type=Path, help="calibration in any known format")
-    checking.add_argument(
-        "--footage", type=Path, metavar="CAPTURE", help="also look for cameras that have moved"
-    )
-    checking.add_argument("--frames", type=int, default=4, help="frame sets compared (default: 4)")
+    importing = add_command(
+        actions, "import", run_import, "write another tool's calibration as calibration.json",
+        dataset=False,
+        example="express50 cameras import sparse/0 capture/calibration.json --scale 0.42",
+    )  # fmt: skip
+    words = "file or folder of the other tool"
+    importing.add_argument("source", type=Path, metavar="SOURCE", help=words)
+    importing.add_argument("out", type=Path, metavar="OUT", help="calibration.json to write")
+    words = "replace the cameras that OUT holds"
+    importing.add_argument("--overwrite", action="store_true", help=words)
+    words = "say whether a rig's cameras fit together"
+    checking = add_command(actions, "check", run_check, words, dataset=False)
+    words = "calibration in any known format"
+    checking.add_argument("source", type=Path, metavar="SOURCE", help=words)
+    words = "also look for cameras that have moved since"
+    checking.add_argument("--footage", type=Path, metavar="CAPTURE", help=words)
+    words = "with --footage: number of frame sets to compare (default: 4)"
+    checking.add_argument("--frames", type=int, default=4, metavar="N", help=words)
     for action in (importing, checking):
-        action.add_argument(
-            "--format", choices=FORMATS, help="format of the source (default: guessed)"
-        )
-        action.add_argument("--size", help="WIDTHxHEIGHT of the footage; K is scaled to it")
-        action.add_argument(
-            "--scale", type=float, default=1.0, help="metres per unit of its world (default: 1)"
-        )
-        action.add_argument("--json", action="store_true", help="print JSON")
+        add = action.add_argument
+        words = f"format of SOURCE: {', '.join(FORMATS)} (default: recognised)"
+        add("--format", choices=FORMATS, metavar="NAME", help=words)
+        words = "size of the footage, pixels; K is scaled to it"
+        add("--size", metavar="WIDTHxHEIGHT", help=words)
+        words = "metres per unit of SOURCE's world (default: 1)"
+        add("--scale", type=float, default=1.0, metavar="METRES", help=words)
 
 
 def run_import(args: argparse.Namespace) -> int:

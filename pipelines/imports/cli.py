@@ -54,8 +54,9 @@ WORDS = {
     "depth": "depth maps: 16-bit PNG, EXR or .npy",
 }
 PATTERN = (
-    "path with {subject}, {expression}, {camera}, {frame} (decode index) or {clip_frame} (counted"
-    " from the cue's start) in it, such as 'masks/{subject}/{camera}/{frame:06d}.png'"
+    "path of the files, with {subject}, {expression}, {camera}, {frame} (decode index) or"
+    " {clip_frame} (counted from the cue's start), such as"
+    " 'masks/{subject}/{camera}/{frame:06d}.png'"
 )
 
 TRACKS = (
@@ -78,7 +79,7 @@ def add_commands(subparsers: Any) -> None:
             "--subject",
             action="append",
             metavar="ID",
-            help="subject to import; may be repeated [all included]",
+            help="subject to import; may be repeated (default: all)",
         )
         words = "only warn if the import contradicts the footage"
         add("--trust", action="store_true", help=words)
@@ -87,27 +88,25 @@ def add_commands(subparsers: Any) -> None:
                 "--head",
                 required=True,
                 metavar="MODEL",
-                help="the FLAME .pkl that the track was made with",
+                help="the FLAME .pkl that the subject was tracked with",
             )
-            words = "camera axes of the matrices in transforms.json [opengl]"
+            words = "camera axes of the matrices in transforms.json (default: opengl)"
             add("--axes", choices=("opengl", "opencv"), default="opengl", help=words)
-            words = (
-                "calibration that tracked_flame_params_N.npz was made with, if not the dataset's"
-            )
+            words = "cameras that tracked_flame_params_N.npz was made with (default: the dataset's)"
             add("--cameras", type=Path, metavar="FILE", help=words)
             continue
-        words = "the pictures are of the footage as recorded: undistort them"
+        words = "undistort the pictures, because they were made from the footage as recorded"
         add("--distorted", action="store_true", help=words)
         if action == "depth":
             words = "unit of the values: m, cm, mm, or metres per step, such as 0.0001"
             add("--unit", required=True, type=_metres, dest="metres", metavar="UNIT", help=words)
             add("--ray", action="store_true", help="values are lengths of rays, not camera z")
-    words = "remove imported items, so that their stage makes them"
+    words = "remove imported items, so that the stage makes them itself"
     parser = add_command(actions, "remove", run_remove, words)
-    parser.add_argument("stage", choices=tuple(WORDS))
-    parser.add_argument(
-        "--items", default="*", metavar="GLOB", help="only items that match, such as 'S001*' [all]"
-    )
+    words = f"{', '.join(WORDS)}"
+    parser.add_argument("stage", choices=tuple(WORDS), metavar="STAGE", help=words)
+    words = "only items that match, such as 'S001*' (default: all)"
+    parser.add_argument("--items", default="*", metavar="GLOB", help=words)
 
 
 def run_remove(args: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""``express50 photo`` makes one photograph or video without calibration ready, and tracks it."""
+"""``express50 photo`` tracks the face in a single photograph or video, without calibration."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from express50.console import FAILED, OK, say, say_json, stdout_to_stderr
+from express50.console import FAILED, OK, add_command, say, say_json, stdout_to_stderr
 from express50.contract.layout import Dataset
 from express50.contract.stage import Command, stages
 from express50.errors import ConfigError
@@ -26,32 +26,30 @@ def add_commands(subparsers: Any) -> None:
     """Add the ``photo`` command."""
     from express50.cli.stages import add_config_options
 
-    parser = subparsers.add_parser(
-        "photo", help=WORDS, description=WORDS,
-        epilog="example: express50 photo portrait.jpg out; see out/track/portrait/qc",
+    parser = add_command(
+        subparsers, "photo", run_photo, WORDS, dataset=False,
+        example="express50 photo portrait.jpg out\npictures of the result: out/track/portrait/qc",
     )  # fmt: skip
     parser.add_argument("picture", type=Path, metavar="PICTURE", help="image or video file")
-    parser.add_argument("out", type=Path, metavar="OUT", help="dataset folder to make or extend")
-    parser.add_argument("--subject", metavar="ID", help="subject id [the file's name]")
+    parser.add_argument("out", type=Path, metavar="OUT", help="dataset to make or extend")
+    parser.add_argument("--subject", metavar="ID", help="subject's id (default: the file's name)")
     lens = parser.add_mutually_exclusive_group()
-    lens.add_argument("--focal-px", type=float, metavar="F", help="focal length, pixels")
+    lens.add_argument("--focal-px", type=float, metavar="PX", help="focal length, pixels")
     lens.add_argument(
         "--film-mm", type=float, default=50.0, metavar="MM",
-        help="focal length on 35 mm film to assume if EXIF has none [50]",
+        help="focal length to assume if EXIF has none, mm on 35 mm film (default: 50)",
     )  # fmt: skip
     parser.add_argument(
         "--windows", type=int, default=8, metavar="N",
-        help="parts of a video; one frame of each part fits the shape [8]",
+        help="frames of a video that fit the head's shape, evenly spread (default: 8)",
     )  # fmt: skip
     parser.add_argument(
         "--matte",
         action="store_true",
-        help="also make a matte and fit outlines; by colours around the face, or with your network:"
-        " --set matte.method=salient --set matte.weights=FILE",
+        help="also make a matte and fit outlines: by colours around the face, or with your network"
+        " (--set matte.method=salient --set matte.weights=FILE)",
     )
     add_config_options(parser)
-    parser.add_argument("--json", action="store_true", help="print as JSON")
-    parser.set_defaults(handler=run_photo)
 
 
 def run_photo(args: argparse.Namespace) -> int:

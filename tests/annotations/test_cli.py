@@ -1,4 +1,4 @@
-"""Every verb of ``express50 annotate`` without a screen, through the command line."""
+"""Every action of ``express50 annotate`` without a screen, through the command line."""
 
 import csv
 import json
@@ -22,8 +22,8 @@ def dataset(tmp_path):
 
 @pytest.fixture
 def annotate(dataset, capsys):
-    def call(verb, *words, code=0):
-        assert main(["annotate", verb, str(dataset.root), *words, "--json"]) == code
+    def call(action, *words, code=0):
+        assert main(["annotate", action, str(dataset.root), *words, "--json"]) == code
         return json.loads(capsys.readouterr().out)
 
     return call
@@ -185,8 +185,8 @@ def test_validate_counts_unreadable_lines(annotate, dataset):
 def test_invalid_input_prints_one_line_naming_it(annotate, dataset, capsys, words, named):
     mark(annotate, "ann", "smile", 14)
     before = dataset.labels_file("S001").read_bytes()
-    verb, *rest = words
-    assert main(["annotate", verb, str(dataset.root), *rest]) == 1
+    action, *rest = words
+    assert main(["annotate", action, str(dataset.root), *rest]) == 1
     err = capsys.readouterr().err
     assert named in err and err.count("\n") == 1
     assert dataset.labels_file("S001").read_bytes() == before
@@ -250,7 +250,7 @@ def test_reference_is_the_first_unless_chosen(annotate):
 
 
 @pytest.mark.parametrize(
-    ("verb", "rows"),
+    ("action", "rows"),
     [
         ("status", [["S001", "3", "1", "0", "0", "0", "-"], ["ann", "1", "-", "0.0", "-", "1.0"]]),
         ("labels", [["S001", "smile", "frame", "14", "ann"]]),
@@ -260,12 +260,12 @@ def test_reference_is_the_first_unless_chosen(annotate):
         ("next", [["S001", "neutral", "0.10"], ["S002", "smile", "1.00"]]),
     ],
 )
-def test_verbs_print_tables(annotate, dataset, capsys, verb, rows):
+def test_verbs_print_tables(annotate, dataset, capsys, action, rows):
     mark(annotate, "ann", "smile", 14)
-    if verb == "agree":
+    if action == "agree":
         mark(annotate, "bob", "smile", 18)
-    words = ["--annotator", "ann"] if verb == "next" else []
-    assert main(["annotate", verb, str(dataset.root), *words]) == 0
+    words = ["--annotator", "ann"] if action == "next" else []
+    assert main(["annotate", action, str(dataset.root), *words]) == 0
     printed = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert [row for row in rows if row not in printed] == []
 

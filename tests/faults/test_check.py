@@ -132,7 +132,7 @@ def test_upstream_made_anew_with_other_bytes_blames_what_was_made_of_the_old(dat
     assert toy.run_toy(dataset, word="b").ok
     found, _ = look(dataset)
     assert set(found) == {("outdated", "after S001"), ("outdated", "after S002")}
-    assert "made from a different toy" in found["outdated", "after S001"].what
+    assert "changed since it was made: toy" in found["outdated", "after S001"].what
     assert look(dataset, fix=True)[1].sound
     assert toy.run_stage_of(LATER, dataset).count("done") == 2
     assert look(dataset)[0] == {}

@@ -302,7 +302,7 @@ def test_masks_of_recorded_or_reduced_size_fit_reduced_pictures(dataset, tmp_pat
     failed = run_stage(MATTE, dataset, MATTE.config(), workers=0, progress=False)
     assert failed.count("failed") == 2
     for outcome in failed.outcomes:  # no later stage may read a matte of other pictures
-        assert "imported for another size of pictures" in outcome.reason
+        assert "since then these changed: size of pictures" in outcome.reason
         assert not dataset.item_dir("matte", outcome.item).exists()
 
 

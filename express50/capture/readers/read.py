@@ -99,9 +99,9 @@ def detect(path: Path, name: object = None) -> Layout:
     looks = "; ".join(f"{x.name}: {x.looks}" for x in LAYOUTS if name in (None, x.name))
     held = sorted(p.name for p in path.iterdir()) if path.is_dir() else ["a file"]
     if any((path / name / "capture.toml").is_file() for name in held):
-        raise CaptureError(f"{path}: a folder of captures, expected a capture; name {path}/*")
+        raise CaptureError(f"{path}: a folder of captures, expected a capture; give {path}/*")
     if (path.parent / "capture.toml").is_file():
-        raise CaptureError(f"{path}: a part of the capture {path.parent}; name that")
+        raise CaptureError(f"{path}: part of the capture {path.parent}; give that folder instead")
     raise CaptureError(
         f"{path}: no known layout; got {', '.join(held[:5]) or 'an empty folder'}, expected one "
         f"of: {looks}; {OURS}: capture.toml and cameras/"

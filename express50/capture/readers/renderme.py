@@ -68,7 +68,7 @@ def _parts(file: Path) -> tuple[str, str, str]:
     match = NAME.fullmatch(file.stem)
     if match is None:
         raise CaptureError(
-            f"{file}: name is not a performance of RenderMe-360; expected one like 0026_e0_raw.smc"
+            f"{file}: not the name of a RenderMe-360 performance; expected one like 0026_e0_raw.smc"
         )
     return match[1], match[2], match[3] or ""
 
@@ -122,7 +122,7 @@ def read(path: Path, selection: Selection) -> RawCapture:
     for part, performance in known.items():
         if not selection.has_sequence(part, "*" if path.is_file() else USUAL):
             skipped[f"sequence {part}"] = (
-                "not a scripted expression; name it in sequences to take it"
+                "not a scripted expression; name it in sequences to include it"
             )
             continue
         try:
@@ -133,7 +133,7 @@ def read(path: Path, selection: Selection) -> RawCapture:
         seen |= frames.keys()
         frames = {name: keys for name, keys in frames.items() if selection.has_camera(name)}
         if not frames:
-            skipped[f"sequence {part}"] = "has no picture of the cameras that were asked for"
+            skipped[f"sequence {part}"] = "has no picture of the selected cameras"
             continue
         taken[part] = performance
         for camera, keys in frames.items():

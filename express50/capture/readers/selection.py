@@ -51,7 +51,7 @@ class Selection:
 
     def left_out(self, sequences: Sequence[str]) -> dict[str, str]:
         """Return the sequences that are not selected, with the reason."""
-        return {f"sequence {s}": "not asked for" for s in sequences if not self.has_sequence(s)}
+        return {f"sequence {s}": "not selected" for s in sequences if not self.has_sequence(s)}
 
     def has_camera(self, name: str) -> bool:
         """Return whether a camera is selected."""
@@ -137,8 +137,8 @@ def check_selection(selection: Selection, sequences: Sequence[str], cameras: Seq
             if not fnmatch.filter(known, pattern):
                 some = ", ".join(known[:8]) + (", ..." if len(known) > 8 else "")
                 raise CaptureError(
-                    f"capture.toml: {what} name {pattern!r}, which is not there; the layout has "
-                    f"{some or 'none'}"
+                    f"capture.toml: {what} names {pattern!r}, which matches nothing; expected some"
+                    f" of {some or 'none'}"
                 )
 
 

@@ -102,7 +102,7 @@ def _colours(path: Path, serials: set[str]) -> tuple[dict, dict[str, str]]:
         for serial in sorted(serials & set(table))
     }
     without = sorted(serials - set(found))
-    return found, {f"camera {s}": f"{COLOURS} has no correction of it" for s in without}
+    return found, {f"camera {s}": f"{COLOURS} has no correction for it" for s in without}
 
 
 @dataclass(frozen=True, order=True)
@@ -173,7 +173,7 @@ def read_actor(path: Path, selection: Selection) -> RawCapture:
         if clip is None:
             skipped[f"file {file.name}"] = "its name is not one of RAVDESS"
         elif not selection.has_sequence(clip.sequence):
-            skipped[f"file {file.name}"] = "not asked for"
+            skipped[f"file {file.name}"] = "not selected"
         elif clip.sequence in taken:  # sorted by name: the one with sound came first
             skipped[f"file {file.name}"] = f"the same clip as {taken[clip.sequence][1]}"
         else:

@@ -183,7 +183,7 @@ def test_the_first_ingest_needs_a_capture(run, data):
     data.mkdir()
     for command in ("ingest", "run"):
         code, _, err = run(command, data)
-        assert code == 2 and "has no captures yet; name a CAPTURE" in err
+        assert code == 2 and "has no captures yet; run 'express50" in err
 
 
 def test_one_of_a_thing_is_singular(run, tmp_path):

@@ -97,7 +97,7 @@ def test_space_is_compared_with_what_items_took(dataset, monkeypatch):
     assert found(dataset) == []
     usage.free = 100e6 + 300e3
     (line,) = found(dataset)
-    assert "about 384.1 kB are needed, most of it by toy (2 items of 192.1 kB), and 300.0" in line
+    assert "about 384.1 kB of disk are needed, most by toy (2 items of 192.1 kB), and 300.0" in line
     with pytest.raises(NotReadyError, match="2 items of 192"):
         run_toy(dataset)
     assert not dataset.item_dir("toy", "c").exists()
@@ -125,7 +125,7 @@ def test_memory_of_workers_is_compared_with_the_machine(dataset, monkeypatch):
         ledger.write(dataclasses.replace(receipt, peak_memory=3_000_000_000, made=made))
     monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(total=16_000_000_000))
     monkeypatch.setattr(preflight, "CGROUP_LIMIT", dataset.root / "memory.max")
-    words = "toy: {} workers need 3.0 GB each, as the largest item did, and this machine has {}"
+    words = "toy: {} workers need 3.0 GB each (as the largest item did), and this machine has {}"
     assert found(dataset, workers=4) == []
     assert found(dataset, workers=5) == [words.format(5, "16.0 GB; use --workers 4")]
     (dataset.root / "memory.max").write_text("max\n")
@@ -181,7 +181,7 @@ def test_a_stage_that_was_never_run_warns_after_some_items(tmp_path, monkeypatch
     assert run_toy(dataset).ok
     err = capsys.readouterr().err
     assert f"toy: warning: {dataset.root}: about 960" in err
-    assert "kB are needed, most of it by toy (5 items of 192" in err
+    assert "kB of disk are needed, most by toy (5 items of 192" in err
     usage.free += 1e6
     dataset = make_dataset(tmp_path / "other", list("abcdefgh"))
     assert run_toy(dataset).ok
