@@ -52,8 +52,8 @@ STAGES = (track.STAGE, depth.STAGE, regions.STAGE)
 # What is replaced for `off`.
 OFF: dict[str, object] = {
     "pipelines.track.schedule.under_hair": lambda model, *_: np.zeros(len(model.template), bool),
-    "pipelines.track.schedule.things_before": lambda *_: np.zeros((0, 3)),
-    "pipelines.track.schedule.glasses_on": lambda *_: np.zeros((0, 3)),
+    "pipelines.track.schedule.find_things": lambda *_: np.zeros((0, 3)),
+    "pipelines.track.schedule.find_worn_glasses": lambda *_: np.zeros((0, 3)),
     "pipelines.depth.stage.face_views": lambda *_: [],
     "pipelines.regions.stage.before_face": lambda _, labels, __: np.zeros(labels.shape, bool),
     "pipelines.regions.colour.usual": lambda _, skin: skin,

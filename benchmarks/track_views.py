@@ -28,7 +28,7 @@ from express50.head.model import HeadModel
 from express50.twin.truth import Truth
 from pipelines.track.surface import Visibility, look_up
 
-SLANT = 0.4  # cosine below which a camera's view of a point is not taken
+MIN_COSINE = 0.4  # cosine below which a camera's view of a point is not taken
 LEAST_VIEWS = 2
 LEAST_PIXELS = 200  # of the face, for a PSNR
 
@@ -146,7 +146,7 @@ def median_colours(
     visibility = Visibility(vertices, model.faces.numpy())
     seen = np.full((len(cameras), len(places), 3), np.nan)
     for row, (name, camera) in enumerate(cameras.items()):
-        clear = visibility.weights(camera, places, normals) > SLANT
+        clear = visibility.weights(camera, places, normals) > MIN_COSINE
         if clear.any():
             image = np.sqrt(LIGHT_OF_LEVEL[read_frame(dataset, subject, name, frame)])
             seen[row, clear] = look_up(camera, image, places[clear])

@@ -1,4 +1,4 @@
-"""Describe a face's expression by numbers that compare in time: motion and look.
+"""Describe an expression by numbers that can be compared over time: motion and local contrast.
 
 Every feature is counted in its own noise, which is measured from the footage itself. What a face
 does at rest (fidgets, sway, the detector's drift) is shrunk, so that the curve of an expression
@@ -40,8 +40,8 @@ _CONTROL_GROUPS = {
 }
 CELLS = 24  # cells per side in which the aligned face is compared
 CELL_REACH = 0.12  # of the face's side: a cell further from every landmark shows no face
-LOOK_WEIGHT = 0.5  # of a cell against a landmark's coordinate: there are more of them
-BYSTANDER = 0.3  # weight of features the script does not name: people move more than they should
+CELL_WEIGHT = 0.5  # of a cell, against a landmark's coordinate: there are more cells
+OTHER_WEIGHT = 0.3  # of features that the script does not name: people move more than they should
 LEAST_NOISE = 1e-4  # share of a face's side, or local deviations: the effect of rounding alone
 REST_DIRECTIONS = 20  # number of leading directions of unrest that are shrunk
 
@@ -70,7 +70,7 @@ class Features:
     rest: np.ndarray
 
 
-def watch(index: Index, observations: FaceObservations) -> Features:
+def measure_features(index: Index, observations: FaceObservations) -> Features:
     """Measure the features of a subject by cue window.
 
     Expressions whose window holds no observed frame that shows a face are left out.
@@ -105,9 +105,9 @@ def measure(observations: FaceObservations, windows: dict[str, np.ndarray]) -> F
         points = observations.points[number].astype(np.float64)
         middle = np.median(points[rest], axis=0)
         moved = displacements(points, middle, windows).reshape(len(points), -1)
-        cells, nearest = looks(observations.faces[number], middle)
+        cells, nearest = local_contrast(observations.faces[number], middle)
         cells -= np.median(cells[rest], axis=0)
-        values += [in_noise(moved, windows), LOOK_WEIGHT * in_noise(cells, windows)]
+        values += [in_noise(moved, windows), CELL_WEIGHT * in_noise(cells, windows)]
         owner += [np.repeat(np.arange(68), 2), nearest]
         camera.append(np.full(moved.shape[1] + cells.shape[1], number))
     return Features(
@@ -148,11 +148,11 @@ def displacements(
     return moved / face_side(neutral)
 
 
-def looks(faces: np.ndarray, neutral: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def local_contrast(faces: np.ndarray, neutral: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Measure local contrast (F, N) of aligned faces (F, S, S) uint8; name each cell's landmark.
 
-    Contrast against the surroundings, not brightness, so that light and exposure do not count;
-    cells that show no face are 0.
+    Contrast with the surroundings is independent of light and exposure, unlike brightness. Cells
+    that show no face are 0.
     """
     cells = np.empty((len(faces), CELLS * CELLS), np.float32)
     wide = faces.shape[1] / 8
@@ -174,9 +174,8 @@ def looks(faces: np.ndarray, neutral: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def in_noise(values: np.ndarray, windows: dict[str, np.ndarray]) -> np.ndarray:
     """Divide features (F, N) by their noise, which second differences in time show.
 
-    Motion is smooth from frame to frame, so that what remains of a second difference is noise, with
-    six times its variance. Half of every scale is the median feature's, so that nothing is divided
-    by zero.
+    Motion is smooth from frame to frame, so a second difference is mostly noise, with six times the
+    variance of a frame's noise. Adding the median feature's noise keeps scales above zero.
     """
     bends = [np.diff(values[rows], n=2, axis=0) for rows in windows.values() if len(rows) > 2]
     if not bends:
@@ -190,7 +189,7 @@ def expression_values(
     features: Features, expression: Expression | None, rows: np.ndarray
 ) -> np.ndarray:
     """Weight the features (T, N) of T rows by their part in an expression, and shrink unrest."""
-    weights = np.maximum(landmark_weights(expression)[features.owner], BYSTANDER)
+    weights = np.maximum(landmark_weights(expression)[features.owner], OTHER_WEIGHT)
     still = features.values[features.rest] * weights
     middle = np.median(still, axis=0)
     still -= middle

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from annotations.align.features import Features, watch
+from annotations.align.features import Features, measure_features
 from annotations.align.suggest import PLATEAU_SHARE, STILL, Reference, Suggestion, suggest_all
 from annotations.labels import (
     AUTOMATIC,
@@ -43,7 +43,7 @@ def run(dataset: Dataset, item: str, out: Path, *, accept: float, match: bool) -
         )
     found, dropped = suggest_for(dataset, index, match)
     labels = accept_sure(dataset, index, found, accept)
-    dropped += _not_taken(index, found, labels, accept)
+    dropped += _missing_peaks(index, found, labels, accept)
     peaks = {e: label for e, label in labels.items() if label.frame is not None}
     if not peaks:
         raise StageError(f"{item}: no expression has a frame ({dropped[0].why})")
@@ -108,14 +108,14 @@ def suggest_for(
             if label.annotator != AUTOMATIC
         }
         chosen = {e: label.frame for e, label in people.items() if label.frame is not None}
-        theirs = watch(read_index(dataset, other), read_observations(dataset, other))
+        theirs = measure_features(read_index(dataset, other), read_observations(dataset, other))
         flagged = people.keys() - chosen.keys()
         windows = {e: rows for e, rows in theirs.windows.items() if e not in flagged}
         reference = Reference(replace(theirs, windows=windows), chosen)
     elif other != index.subject:
-        why = f"the reference {other} is not observed; every subject's own peaks were taken"
+        why = f"the reference {other} is not observed, so the subject's own peaks were taken"
         dropped.append(Note("matching", why))
-    features = watch(index, read_observations(dataset, index.subject))
+    features = measure_features(index, read_observations(dataset, index.subject))
     script = {entry.id: entry for entry in load_script()}
     found, canonical = suggest_all(features, script, reference)
     rows = {e: _in_footage(s, features, e, index) for e, s in found.items()}
@@ -161,7 +161,7 @@ def _automatic(labels: list[Label]) -> dict[str, Label]:
     return current_labels(label for label in labels if label.annotator == AUTOMATIC)
 
 
-def _not_taken(
+def _missing_peaks(
     index: Index, found: Mapping[str, Suggested], labels: Mapping[str, Label], threshold: float
 ) -> list[Note]:
     """Note the expressions that have no frame, with the reason."""

@@ -31,7 +31,7 @@ _DRAWS = 24  # random halves of the features that a suggestion is repeated with
 
 @dataclass(frozen=True)
 class Event:
-    """One movement of a clip: its apex (row), how far it is done in each frame (T,), direction."""
+    """One movement of a clip: the row of its apex, its progress (T,) by frame, its direction."""
 
     apex: int
     curve: np.ndarray
@@ -86,7 +86,7 @@ def suggest_all(
         values = expression_values(features, entry, rows)
         if expression == NEUTRAL:
             tops = [  # how far expressions usually move the face from rest, in units of noise
-                unrest(expression_values(features, entry, window)).max()
+                distance_from_rest(expression_values(features, entry, window)).max()
                 for window in features.windows.values()
             ]
             found[expression] = suggest_rest(values, groups, float(np.median(tops)))
@@ -158,10 +158,12 @@ def suggest_rest(values: np.ndarray, groups: np.ndarray, typical: float) -> Sugg
         ValueError: the clip is empty or not finite.
     """
     _check(values)
-    level = unrest(values)
+    level = distance_from_rest(values)
     row = int(np.argmin(level))
     enough = level[row] + 0.1 * typical
-    good = [level[np.argmin(unrest(values[:, kept]))] <= enough for kept in _halves(groups)]
+    good = [
+        level[np.argmin(distance_from_rest(values[:, kept]))] <= enough for kept in _halves(groups)
+    ]
     return Suggestion(
         row, sum(good) / (len(good) + 1), level, None, candidate_rows(row, [], -level)
     )
@@ -184,21 +186,21 @@ def _halves(groups: np.ndarray) -> Iterator[np.ndarray]:
             yield kept
 
 
-def unrest(values: np.ndarray) -> np.ndarray:
+def distance_from_rest(values: np.ndarray) -> np.ndarray:
     """Measure the distance (T,) of features (T, N) from rest, averaged over neighbouring frames."""
     return np.linalg.norm(steady(values), axis=1)
 
 
 def strongest_event(values: np.ndarray) -> Event:
     """Find the strongest movement of a clip (T, N): power iteration from the frames' energies."""
-    curve, direction = _follow(values, (values**2).sum(1), np.ones(len(values)), 8)
+    curve, direction = _iterate_direction(values, (values**2).sum(1), np.ones(len(values)), 8)
     return Event(apex_of(curve), curve, direction)
 
 
-def likest_event(values: np.ndarray, direction: np.ndarray) -> tuple[Event, np.ndarray]:
-    """Find the movement most like a direction (N,), and the likeness (T,) that shows it.
+def most_similar_event(values: np.ndarray, direction: np.ndarray) -> tuple[Event, np.ndarray]:
+    """Find the movement most similar to a direction (N,), and each frame's similarity (T,) to it.
 
-    Likeness is how far a frame goes that way, times the cosine of how much else it does.
+    Similarity is how far a frame moves in the direction, times the cosine between the two.
     """
     shared = direction != 0
     calm = steady(values[:, shared])
@@ -214,7 +216,7 @@ def choose_event(values: np.ndarray, own: Event, canonical: Canonical | None) ->
     """
     if canonical is None or not canonical.direction.any():
         return own, True
-    other, likeness = likest_event(values, canonical.direction)
+    other, likeness = most_similar_event(values, canonical.direction)
     if abs(other.apex - own.apex) <= AGREE_FRAMES:
         return own, True
     if likeness[other.apex] <= OVERRULE * likeness[own.apex]:
@@ -225,7 +227,7 @@ def choose_event(values: np.ndarray, own: Event, canonical: Canonical | None) ->
 
 
 def matching_row(event: Event, canonical: Canonical | None) -> int:
-    """Find the row that matches: the apex, or for a canonical frame off it an equal share of it.
+    """Find the matching row: the apex, or the same share of it as in the canonical frame.
 
     The row lies on the canonical frame's side of the apex if both sides offer one.
     """
@@ -244,7 +246,7 @@ def share_of_apex(event: Event) -> np.ndarray:
 
 
 def _slope(share: np.ndarray, apex: int, side: int) -> np.ndarray:
-    """List rows from the apex to one side while the movement falls, small trembles aside."""
+    """List rows from the apex to one side while the movement falls, apart from small tremors."""
     rows = [apex]
     while 0 <= rows[-1] + side < len(share) and share[rows[-1] + side] <= share[rows[-1]] + 0.05:
         rows.append(rows[-1] + side)
@@ -275,7 +277,7 @@ def canonical_of(values: np.ndarray, row: int, shared: np.ndarray, count: int) -
 def _event_about(values: np.ndarray, weights: np.ndarray, row: int) -> Event:
     """Find the event that a row belongs to; frames about the row give its direction."""
     near = np.exp(-0.5 * ((np.arange(len(values)) - row) / NEAR_FRAMES) ** 2)
-    curve, direction = _follow(values, near * weights, near, 3)
+    curve, direction = _iterate_direction(values, near * weights, near, 3)
     even = steady(curve)
     while True:  # climb to the local maximum
         low = max(0, row - 1)
@@ -310,10 +312,10 @@ def candidate_rows(row: int, others: list[int], curve: np.ndarray) -> list[int]:
     return chosen
 
 
-def _follow(
+def _iterate_direction(
     values: np.ndarray, weights: np.ndarray, near: np.ndarray, rounds: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the curve (T,) and unit direction (N,) that frames weighted by that curve agree on."""
+    """Alternate between a unit direction (N,) and the curve (T,) of progress along it."""
     curve, direction = weights, np.zeros(values.shape[1])
     for _ in range(rounds):
         direction = _unit((near * curve) @ values)

@@ -1,7 +1,7 @@
-"""Choose the cameras that watch a face, find what each sees of it, and write it.
+"""Choose the cameras that see the face best, and write its landmarks and pictures in every frame.
 
-The network looks through one window per clip, and head motion is averaged over time: both keep the
-jitter of single detections out of the curves in which expressions are searched for.
+The network uses one window per clip, and head motion is averaged over time: both keep the jitter of
+single detections out of the curves in which expressions are searched for.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SCHEMA = "express50.observations/1"
 SEEN_SCORE = 0.15  # least score of a frame that shows the face
 TRIES = 8  # number of other frames to search for a face if the frames at rest show none
 FEW = 3  # number of frames to search for a small face, those at rest first
-HELD = 256  # frames of a camera that stay in memory; of longer windows they are decoded twice
+HELD = 256  # frames of a camera kept in memory; those of longer windows are decoded twice
 RANKED_SHARE = 0.8  # share of the best camera's score: worse cameras add mostly noise
 
 
@@ -98,11 +98,11 @@ def run(
     def score(camera: str, frame: int, smallest: float) -> float:
         return detect(net, read_proxy(dataset, item, camera, frame), smallest=smallest).score
 
-    tries = frames_to_try(rest, frames)
-    looks = [(search, frame) for frame in tries]
+    frames_tried = frames_to_try(rest, frames)
+    attempts = [(search, frame) for frame in frames_tried]
     if search > SMALL:  # which takes four times as long, so in fewer frames
-        looks += [(SMALL, frame) for frame in tries[:FEW]]
-    search, middle, ranked = choose_cameras(index, score, looks, min_score)
+        attempts += [(SMALL, frame) for frame in frames_tried[:FEW]]
+    search, middle, ranked = choose_cameras(index, score, attempts, min_score)
     watching = ranked[:cameras]
     rest = np.union1d(rest, [middle])
     views = [_watch(dataset, item, net, camera, seen, rest, search) for camera in watching]
@@ -138,29 +138,29 @@ def frames_to_try(rest: np.ndarray, frames: np.ndarray) -> list[int]:
 def choose_cameras(
     index: Index,
     score: Callable[[str, int, float], float],
-    looks: Sequence[tuple[float, int]],
+    attempts: Sequence[tuple[float, int]],
     min_score: float,
 ) -> tuple[float, int, list[str]]:
-    """Find the first look that shows a face, and rank the cameras that see it best.
+    """Find the first attempt that shows a face, and rank the cameras that see it best.
 
-    A look is the size of the smallest windows that are searched, and a frame; `score` rates a
-    camera's.
+    An attempt is the size of the smallest windows to search, and a frame; `score` rates the face
+    that a camera shows.
 
     Returns:
         The size of the windows that were enough, the frame and the cameras.
 
     Raises:
-        StageError: no camera sees a face in any.
+        StageError: no camera sees a face in any attempt.
     """
     best = 0.0
-    for smallest, frame in looks:
+    for smallest, frame in attempts:
         scores = {camera: score(camera, frame, smallest) for camera in index.cameras}
         ranked = sorted(scores, key=lambda c: (-scores[c], c))
         best = max(best, scores[ranked[0]])
         if scores[ranked[0]] >= min_score:
             enough = max(min_score, RANKED_SHARE * scores[ranked[0]])
             return smallest, frame, [c for c in ranked if scores[c] >= enough]
-    frames = sorted({frame for _, frame in looks})
+    frames = sorted({frame for _, frame in attempts})
     raise StageError(
         f"{index.subject}: no camera sees a face in frames {', '.join(map(str, frames))}"
         f" (best score {best:.2f}, expected {min_score}); check that the face is in view, label it"
@@ -181,7 +181,7 @@ def _watch(
 
     Returns:
         Points (F, 68, 2), scores (F,) and aligned faces (F, FACE, FACE) of all frames of the
-        windows in increasing order. Windows may overlap: a frame keeps what its last window saw.
+        windows, in order. In overlapping windows, the last one counts.
     """
 
     @lru_cache(maxsize=HELD)
@@ -202,7 +202,7 @@ def _watch(
 
 
 class Frames(Sequence[np.ndarray]):
-    """Reads frames by their place in a window: all of a long one may not fit in memory."""
+    """The frames of a window, read when asked for: a long window may not fit in memory."""
 
     def __init__(self, read: Callable[[int], np.ndarray], numbers: np.ndarray) -> None:
         self._read, self._numbers = read, numbers.tolist()
@@ -280,7 +280,7 @@ def align_faces(
 
 
 def face_side(neutral: np.ndarray) -> float:
-    """Return side of the square, pixels, about landmarks (68, 2) that the aligned face shows."""
+    """Return the side, pixels, of the square that an aligned face with landmarks (68, 2) shows."""
     return 1.1 * max(float((neutral.max(0) - neutral.min(0)).max()), LEAST_SIDE)
 
 

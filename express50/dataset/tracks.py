@@ -44,7 +44,7 @@ class HeadPoses:
 
 # Of 327 tracks of people, photographs and mistaken cameras, none exceeded 1.07; two rigs whose
 # mattes and synchronisation were wrong had 1.9 and 2.4.
-STRANGE = 1.2
+LARGEST_SPREAD = 1.2
 
 
 def shape_spread(shape: np.ndarray) -> float:

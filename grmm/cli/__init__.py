@@ -60,9 +60,13 @@ def at_least(low: int, high: int = 1 << 20) -> Callable[[str], int]:
 
 
 def finite(text: str) -> float:
-    """Parse a number that is neither NaN nor infinite; a ValueError if it is not one."""
-    if not math.isfinite(value := float(text)):
-        raise ValueError
+    """Parse a number that is neither NaN nor infinite."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text!r}, expected a finite number")
     return value
 
 

@@ -227,13 +227,13 @@ def _from_board(index: Index, config: CalibrateConfig) -> CalibratedRig:
 
 
 def expected_error(uncertainty: Mapping[str, HeadError]) -> ExpectedError | None:
-    """Return how far cameras probably are off at the head; None for a single camera."""
+    """Return how far cameras are probably off at the head; None for a single camera."""
     stated = np.array([error.mm for error in uncertainty.values()])
     return error_bounds("calibrate", {"stated_mm": stated}).expected
 
 
 def _out_of_step(timing: Mapping[str, CameraTiming]) -> dict[str, str]:
-    """Name cameras whose pictures, or rows of a picture, are not of one instant with the others."""
+    """Warn of cameras whose pictures, or rows of pictures, were not taken when the others' were."""
     found = {}
     for name, camera in timing.items():
         ways = []
@@ -245,7 +245,7 @@ def _out_of_step(timing: Mapping[str, CameraTiming]) -> dict[str, str]:
             ways.append(f"{rows} (rolling shutter)")
         if ways:
             found[name] = (
-                f"{', '.join(ways)}; the calibration allows for it, later stages do not:"
+                f"{', '.join(ways)}; the calibration corrects for this, but later stages do not:"
                 " synchronise the cameras, or let subjects move slowly"
             )
     return found

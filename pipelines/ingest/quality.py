@@ -41,7 +41,7 @@ _CURVE = srgb_to_linear(np.arange(256, dtype=np.float32) / 255.0).astype(np.floa
 
 
 @dataclass(frozen=True)
-class Seen:
+class CameraMeasurements:
     """Measurements of one camera's frames.
 
     Attributes:
@@ -56,7 +56,7 @@ class Seen:
 
 
 def check_quality(
-    seen: Mapping[str, Seen],
+    measured: Mapping[str, CameraMeasurements],
     digests: Mapping[str, str],
     clips: Sequence[int],
     sync_frames: int,
@@ -66,15 +66,15 @@ def check_quality(
 
     ``digests`` are of each camera's files, ``clips`` the frames of each recording.
     """
-    count = min(sum(clips), *(len(s.moves) for s in seen.values()))
-    moves = {name: s.moves[:count] for name, s in seen.items()}
+    count = min(sum(clips), *(len(s.moves) for s in measured.values()))
+    moves = {name: s.moves[:count] for name, s in measured.items()}
     steps, unjudged = find_steps(moves, clips, sync_frames) if sync_frames else ({}, {})
     stuck = find_repeats(moves)
-    drifts = {name: measure_drift(s.cells.astype("float32")) for name, s in seen.items()}
-    widths, blurred = judge_focus({n: s.widths for n, s in seen.items()}, blur_ratio)
+    drifts = {name: measure_drift(s.cells.astype("float32")) for name, s in measured.items()}
+    widths, blurred = judge_focus({n: s.widths for n, s in measured.items()}, blur_ratio)
     first: dict[str, str] = {}
     warnings = {}
-    for name in sorted(seen):
+    for name in sorted(measured):
         words = []
         if (twin := first.setdefault(digests[name], name)) != name:
             words.append(f"has the same files as camera {twin}; remove the copy")
@@ -89,7 +89,7 @@ def check_quality(
         words += [blurred[name]] if name in blurred else []
         if words:
             warnings[f"camera {name}"] = "; ".join(words)
-    if len(unjudged) == len(seen) and all_move(moves, clips):
+    if len(unjudged) == len(measured) and all_move(moves, clips):
         warnings["sync"] = (
             "all cameras see movement, but no two the same: they are out of step by more than"
             f" {sync_frames} frames, or show different things; cut their footage so that all begin"

@@ -22,7 +22,7 @@ from express50.files.digests import file_sha256, text_digest
 from express50.files.images import encode_jpeg, has_alpha, shrink, upright
 from express50.files.video import iterate_video, video_fps
 from express50.geometry.sampling import edge_width
-from pipelines.ingest.quality import Seen, light_cells, movement, small_grey
+from pipelines.ingest.quality import CameraMeasurements, light_cells, movement, small_grey
 
 FPS_SLACK = 0.02  # of the rate: less than from 24 to 25 frames per second
 UNEVEN = 0.1  # share of the steps that differ; a lost frame now and then is counted as a gap
@@ -30,7 +30,7 @@ UNEVEN = 0.1  # share of the steps that differ; a lost frame now and then is cou
 
 def scan_camera(
     raw: RawCapture, camera: RawCamera, folder: Path, proxy: tuple[int, int], focus_every: int
-) -> tuple[CameraSource, Seen]:
+) -> tuple[CameraSource, CameraMeasurements]:
     """Decode one camera and write its proxies; return its frames' identity and measurements.
 
     ``proxy`` is the longer side and the JPEG quality of proxies.
@@ -84,12 +84,12 @@ def scan_camera(
         correction=camera.correction,
         orientation=camera.orientation,
     )
-    return source, Seen(np.array(moves), np.stack(cells), tuple(widths))
+    return source, CameraMeasurements(np.array(moves), np.stack(cells), tuple(widths))
 
 
 def trimmed(
-    source: CameraSource, seen: Seen, counts: tuple[int, ...], table: Path
-) -> tuple[CameraSource, Seen]:
+    source: CameraSource, measured: CameraMeasurements, counts: tuple[int, ...], table: Path
+) -> tuple[CameraSource, CameraMeasurements]:
     """Return a camera and its measurements with the first ``counts`` frames of each clip.
 
     The ``table`` of its proxies is rewritten.
@@ -109,10 +109,10 @@ def trimmed(
         dhash=tuple(source.dhash[i] for i in chosen),
         names=names,
         clips=counts,
-    ), Seen(
-        seen.moves[keep],
-        seen.cells[keep],
-        tuple((number[frame], width) for frame, width in seen.widths if frame in number),
+    ), CameraMeasurements(
+        measured.moves[keep],
+        measured.cells[keep],
+        tuple((number[frame], width) for frame, width in measured.widths if frame in number),
     )
 
 

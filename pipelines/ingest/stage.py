@@ -32,7 +32,7 @@ from express50.files.digests import stat_digest, text_digest
 from express50.files.images import contact_sheet, write_image
 from express50.geometry.cameras import Camera
 from express50.rigs.camera_builder import at_size
-from pipelines.ingest.quality import Seen, check_quality
+from pipelines.ingest.quality import CameraMeasurements, check_quality
 from pipelines.ingest.scan import odd_footage, remove_proxies, scan_camera, time_gaps, trimmed
 
 QC_CAMERAS, QC_COLUMNS = 24, 6
@@ -42,7 +42,7 @@ FILE_ENDINGS = ("head", "confidence", "normals")  # later stages write <camera>_
 def register(dataset: Dataset, captures: list[Path], replace: bool = False) -> list[str]:
     """Add raw captures to the dataset's table; returns their subjects in the given order.
 
-    A subject's other capture that is still there is only given up for them to ``replace`` it.
+    A subject's other capture that still exists is only replaced if ``replace`` is true.
 
     Raises:
         CaptureError: a folder is not a capture, two captures claim one subject, or the subject
@@ -59,15 +59,15 @@ def register(dataset: Dataset, captures: list[Path], replace: bool = False) -> l
             )
         if added.get(subject, str(root)) != str(root):
             raise CaptureError(
-                f"{root}: subject {subject} is also that of {added[subject]}; "
+                f"{root}: has the same subject ({subject}) as {added[subject]}; "
                 "give each capture its own subject id (subject in capture.toml)"
             )
         known = Path(table.get(subject, root))
         if known.exists() and not known.samefile(root) and not replace:
             raise CaptureError(
-                f"{root}: subject {subject} of {dataset.root} has the capture {known}; if {root} is"
-                " another person or session, give it another subject id (subject in capture.toml);"
-                f" to use it in place of {known}, add --replace"
+                f"{root}: subject {subject} of {dataset.root} already has the capture {known}; if"
+                f" {root} is another person or session, give it another subject id (subject in"
+                f" capture.toml); to replace {known} by it, add --replace"
             )
         if not known.exists():
             log(f"{subject}: {known} is gone, its footage is now read from {root}")
@@ -84,7 +84,7 @@ def register(dataset: Dataset, captures: list[Path], replace: bool = False) -> l
 
 
 def inputs(dataset: Dataset, item: str) -> dict[str, Path | str]:
-    """Name the capture by names, sizes and times of its files: hashing terabytes takes hours."""
+    """Identify the capture by its files' names, sizes and times: hashing terabytes takes hours."""
     first, *others = watched(_capture_of(dataset, item))
     found: dict[str, Path | str] = {"capture": stat_digest(first)}
     return found | {f"capture {n}": stat_digest(p) for n, p in enumerate(others, 1)}
@@ -127,9 +127,9 @@ def run(
         )
     check_focals(raw.root / "capture.toml", raw.meta.get("focal_px", {}))
     (out / "proxies").mkdir()
-    cameras, seen, dropped = _scan(raw, out / "proxies", proxy, focus_every)
+    cameras, measured, dropped = _scan(raw, out / "proxies", proxy, focus_every)
     calibration = _calibration(raw, cameras)
-    raw, outside = _with_cues(raw, cameras, seen, dropped, out / "proxies")
+    raw, outside = _with_cues(raw, cameras, measured, dropped, out / "proxies")
     usual = usual_count([camera.frames for camera in cameras.values()])
     cues, beyond = split_cues(raw.cues, usual)
     for name, reason in short_cameras(cameras, cues).items():
@@ -146,7 +146,7 @@ def run(
     write_contact_sheet(index, out)
     digests = {name: camera.sha256 for name, camera in cameras.items()}
     clips = next(iter(cameras.values())).clips or (index.frames,)
-    kept = {name: seen[name] for name in cameras}
+    kept = {name: measured[name] for name in cameras}
     figures, warnings = check_quality(kept, digests, clips, sync_frames, blur_ratio)
     for name, why in odd_footage(raw, cameras).items():
         warnings[name] = "; ".join([why, *filter(None, [warnings.get(name)])])
@@ -158,17 +158,17 @@ def run(
 
 def _scan(
     raw: RawCapture, folder: Path, proxy: tuple[int, int], focus_every: int
-) -> tuple[dict[str, CameraSource], dict[str, Seen], dict[str, str]]:
+) -> tuple[dict[str, CameraSource], dict[str, CameraMeasurements], dict[str, str]]:
     """Scan all cameras; return them, their measurements, and why the others are dropped.
 
     Raises:
         CaptureError: files of one camera would replace those of another in a later stage.
     """
     dropped = dict(raw.dropped)
-    cameras, seen = {}, {}
+    cameras, measured = {}, {}
     for name, camera in raw.cameras.items():
         try:
-            cameras[name], seen[name] = scan_camera(raw, camera, folder, proxy, focus_every)
+            cameras[name], measured[name] = scan_camera(raw, camera, folder, proxy, focus_every)
         except CaptureError as error:
             dropped[name] = str(error)
             remove_proxies(folder, name)
@@ -179,7 +179,7 @@ def _scan(
                 f"{raw.root}: files of cameras {first} and {name} would have the same name;"
                 f" rename {name}"
             )
-    return cameras, seen, dropped
+    return cameras, measured, dropped
 
 
 def _calibration(raw: RawCapture, cameras: Mapping[str, CameraSource]) -> dict[str, Camera] | None:
@@ -197,7 +197,7 @@ def _calibration(raw: RawCapture, cameras: Mapping[str, CameraSource]) -> dict[s
 def _with_cues(
     raw: RawCapture,
     cameras: dict[str, CameraSource],
-    seen: dict[str, Seen],
+    measured: dict[str, CameraMeasurements],
     dropped: dict[str, str],
     folder: Path,
 ) -> tuple[RawCapture, dict[str, str]]:
@@ -218,11 +218,11 @@ def _with_cues(
                 f"has {counts[k]} frames of {raw.clips[k]}, most cameras have {usual[k]}; it "
                 "is unknown which frames it lost"
             )
-            del cameras[name], seen[name]
+            del cameras[name], measured[name]
             remove_proxies(folder, name)
         elif counts != usual:
             path = folder / f"{name}.json"
-            cameras[name], seen[name] = trimmed(cameras[name], seen[name], usual, path)
+            cameras[name], measured[name] = trimmed(cameras[name], measured[name], usual, path)
             longer = [raw.clips[k] for k in range(len(usual)) if counts[k] > usual[k]]
             outside[f"last frames of {', '.join(longer)} in camera {name}"] = (
                 "most cameras have fewer"
@@ -323,7 +323,7 @@ def metrics(
 
 
 def write_contact_sheet(index: Index, out: Path) -> None:
-    """Draw a row per camera with frames from all of the footage, to show dark or stuck cameras."""
+    """Draw a row per camera, with frames from all of its footage, to show dark or stuck cameras."""
     names = list(index.cameras)[:QC_CAMERAS]
     picks = np.unique(np.linspace(0, index.frames - 1, QC_COLUMNS).astype(int))
     rows = [[decode_proxy(out / "proxies", name, int(frame)) for frame in picks] for name in names]

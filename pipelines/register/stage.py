@@ -12,8 +12,8 @@ from express50.capture.frames import read_cameras_of
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
 from express50.dataset.tracks import (
+    LARGEST_SPREAD,
     REGISTRATION_SCHEMA,
-    STRANGE,
     Track,
     existing_track,
     read_track,
@@ -79,7 +79,7 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
         why = f"the surface was found at only {metrics['seen_share']:.0%} of the face's vertices"
         warnings.append(Note(expression, why))
     expected = doubt.expected
-    if shape_spread(track.shape) > STRANGE:  # the error model knows people only
+    if shape_spread(track.shape) > LARGEST_SPREAD:  # the error model knows people only
         expected = None
         why = "the tracked head has a shape that nobody has, so no error is stated; see 'track'"
         warnings.append(Note("head shape", why))

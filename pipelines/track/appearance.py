@@ -27,7 +27,7 @@ from pipelines.track.surface import (
     Visibility,
     flat_barycentrics,
     sample_normals,
-    spread,
+    spread_samples,
     view_colours,
     view_weights,
 )
@@ -220,7 +220,7 @@ def write_texture(
     (E, V, 3) are of the E targets; light and gains are estimated at so many `samples` of the skin;
     the texture has `side` texels per side.
     """
-    skin = spread(model, samples)
+    skin = spread_samples(model, samples)
     some = range(0, len(pictures), -(-len(pictures) // LIGHT_FRAME_SETS))
     seen = [_colours(_scene(model, pictures[k], meshes[k]), skin) for k in some]
     appearance = estimate(seen)

@@ -90,7 +90,7 @@ def vertex_sigma(
         hessian, _ = _normal_equations(basis, _Expression.of(basis, target), pose, state)
         inner = hessian[shared:, shared:]
         inverse = np.linalg.inv(inner + 1e-9 * np.trace(inner) / len(inner) * np.eye(len(inner)))
-        follow = -inverse @ hessian[shared:, :shared]  # how its own unknowns follow the shared ones
+        follow = -inverse @ hessian[shared:, :shared]  # change of its own unknowns per shared one
         precision += hessian[:shared, :shared] + hessian[:shared, shared:] @ follow
         own.append((inverse, follow))
     values, axes = np.linalg.eigh(precision)
@@ -180,7 +180,7 @@ class _Expression:
 
 
 def _shared(state: State) -> np.ndarray:
-    """Concatenate what all expressions have in common: shape, then bias."""
+    """Concatenate the unknowns that all expressions share: shape, then bias."""
     return np.concatenate([state.shape, state.bias.ravel()])
 
 

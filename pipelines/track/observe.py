@@ -61,7 +61,7 @@ class Observation:
         inliers: (views, 68) bool, landmarks that agree with the other views.
         points: (68, 3) triangulated, metres in the world; NaN where under two views agree.
         covariance: (68, 3, 3) of the points, square metres; NaN with them.
-        shut: eyes that are known to be, as indices of `iris.EYES`.
+        shut: eyes that are known to be shut, as indices of `iris.EYES`.
     """
 
     expression: str

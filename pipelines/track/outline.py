@@ -26,7 +26,7 @@ from express50.geometry.sampling import bilinear_slope
 from express50.head.model import HeadModel, vertex_normals
 from pipelines.regions.colour import like_skin
 from pipelines.track.basis import in_regions
-from pipelines.track.surface import FEATURES, SignedDistance, Visibility, behind, look_up
+from pipelines.track.surface import FEATURES, SignedDistance, Visibility, look_up, near_things
 from pipelines.track.terms import MeshPlaces, Residuals, huber
 
 # A head's outline counts as about this many independent points per view.
@@ -185,7 +185,7 @@ def outline_terms(
         pixels, _ = project_pinhole(camera, mesh[ids])
         value, slope = sample_distance(distance, pixels)
         edge = pixels - value[:, None] * slope  # of the matte, which may be a thing's
-        ids = ids[~(behind(things, camera, pixels) | behind(things, camera, edge))]
+        ids = ids[~(near_things(things, camera, pixels) | near_things(things, camera, edge))]
         if len(ids) >= 8:
             terms.append(OutlineTerm.of(distance, ids, mesh[ids], covered[ids], pictures, bald))
     return terms

@@ -1,9 +1,9 @@
 """Search for the surface along the mesh's normals with small patches.
 
 A patch around every sample is moved along the normal; the surface is where the views agree best on
-its appearance. The search is exhaustive, so it works from millimetres off, where gradients of
-colour lead astray. Samples without a clear best height are left out. Scores are means of normalised
-cross-correlations over all pairs of views (as in Goesele et al. 2007).
+its appearance. The search is exhaustive, so it works from several millimetres away, where
+gradients of colour lead astray. Samples without a clear best height are left out. Scores are means
+of normalised cross-correlations over all pairs of views (as in Goesele et al. 2007).
 """
 
 from __future__ import annotations
@@ -24,35 +24,36 @@ from pipelines.track.basis import in_regions
 from pipelines.track.surface import (
     COVERED,
     FEATURES,
-    SEEN,
+    UNCOVERED_SKIN,
     FrameSetCrops,
     Visibility,
     sample_normals,
-    spread,
+    spread_samples,
     view_colours,
     view_weights,
 )
 from pipelines.track.terms import MeshPlaces, NormalTerm
 
-PATCH = 7
-VIEWS = 8
-SPACING_PX = 1.0
-STEP_PX = 0.7
-EVEN = np.full(PATCH * PATCH, 1.0 / (PATCH * PATCH), np.float32)
+PATCH = 7  # samples per side of a patch
+VIEWS = 8  # views that are compared, the best ones; more add little
+SPACING_PX = 1.0  # between the samples of a patch
+STEP_PX = 0.7  # between the heights that are tried
+MEAN_KERNEL = np.full(PATCH * PATCH, 1.0 / (PATCH * PATCH), np.float32)
 GREY = np.full(3, 1.0 / 3.0, np.float32)
 # Noise that a patch's contrast must exceed: root of light, 0..1.
 NOISE = 0.006
-LEAST_SCORE, LEAST_SHARP = 0.3, 0.02
-NEIGHBOURS, ODD_PX, OUTLIER_PX = 24, 1.2, 2.5
-SIGMA_PX = 0.8
+LEAST_SCORE, LEAST_SHARP = 0.3, 0.02  # of a height that counts as found
+NEIGHBOURS, NEIGHBOUR_LIMIT_PX = 24, 1.2  # largest distance from the neighbours' median height
+OUTLIER_PX = 2.5
+SIGMA_PX = 0.8  # of a height with a score of 1
 # Cosine to the camera below which a patch is foreshortened too much to be compared.
-SLANT = 0.4
+MIN_COSINE = 0.4
 # Hair and cloth may cover neck and ears: fewer samples per sample of the face, and less trust.
 COVERED_SHARE, COVERED_TRUST = 0.25, 0.3
 
-# A beard or a fringe covers a place if more than a share of the neighbouring samples, BESIDE of
-# them, is unlike skin; brows and nostrils are narrower.
-BESIDE, COVERING = 40, 0.65
+# A beard or a fringe covers a place if more than this share of so many nearest samples is unlike
+# skin; brows and nostrils are narrower.
+HAIR_NEIGHBOURS, HAIR_SHARE = 40, 0.65
 
 SkinSamples = list[tuple[MeshPlaces, float]]
 """Where the surface is searched for, and the trust in what is found there."""
@@ -60,10 +61,10 @@ SkinSamples = list[tuple[MeshPlaces, float]]
 
 @dataclass(frozen=True)
 class PatchSearch:
-    """The result of a search: heights (S,), metres along the normals.
+    """The heights (S,) that a search found, metres along the normals.
 
     `score` (S,) is the views' mean correlation there, 0 where nothing was found, `sharpness` (S,)
-    its margin over any other height; a pixel is `pixel` metres wide at the samples.
+    its margin over any other height; `pixel` is the width of a pixel at the samples, metres.
     """
 
     height: np.ndarray
@@ -110,7 +111,7 @@ def patch_views(
     for samples in sets:
         places, normals = samples.at(mesh), sample_normals(samples, mesh)
         weights = view_weights(visibility, pictures, places, normals)
-        weights = np.where(weights > SLANT, weights**2, 0.0)
+        weights = np.where(weights > MIN_COSINE, weights**2, 0.0)
         found.append(PatchViews(images, weights, places, normals, mesh, faces))
     return found
 
@@ -131,7 +132,7 @@ def search(views: PatchViews, reach: float) -> PatchSearch:
     shift = np.clip(0.5 * (right - left) / bend, -0.5, 0.5)
     step = heights[1] - heights[0]
     far = np.abs(np.arange(len(heights))[None] - at[:, None]) > 2
-    # A patch that is much the same everywhere, as on a flat cheek, has no clear height.
+    # A patch whose surroundings look like it, as on a flat cheek, has no clear height.
     rival = np.where(far, score, -1.0).max(1)
     return PatchSearch(
         heights[at] + shift * step,
@@ -147,7 +148,7 @@ def agreement(views: PatchViews, heights: np.ndarray) -> np.ndarray:
     Patches are bent to follow the mesh.
     """
     weights, places, normals = views.weights, views.places, views.normals
-    if len(weights) > VIEWS:  # more views add little
+    if len(weights) > VIEWS:
         weights = np.where(weights >= np.sort(weights, axis=0)[-VIEWS], weights, 0.0)
     spacing, centre = SPACING_PX * views.pixel, views.mesh.mean(0)
     scene = mesh_scene(views.mesh - centre, views.faces)
@@ -185,15 +186,17 @@ def _patches(
     """
     centre = places[:, None] + heights[None, :, None] * normals[:, None]
     pixels, _ = project_pinhole(camera, centre)
-    # Heights change how large a patch is seen by less than a hundredth: its slope is that of the
-    # mesh. Image coordinates fit single precision; world coordinates need not.
+    # Heights change a patch's size in the image by less than 1 %, so all use the slope at the mesh.
+    # Image coordinates fit single precision; world coordinates may not.
     _, slope = project_with_slope(camera, places)
-    spread = slope.astype(np.float32) @ shape.astype(np.float32)
+    offsets = slope.astype(np.float32) @ shape.astype(np.float32)
     middle = corner_to_cell(pixels).astype(np.float32)
-    x, y = ((middle[:, :, k, None] + spread[:, None, k]).reshape(len(places), -1) for k in range(2))
+    x, y = (
+        (middle[:, :, k, None] + offsets[:, None, k]).reshape(len(places), -1) for k in range(2)
+    )
     values = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     values = values.reshape(len(places), len(heights), -1)
-    values -= (values @ EVEN)[..., None]
+    values -= (values @ MEAN_KERNEL)[..., None]
     length = np.einsum("sdk,sdk->sd", values, values) + np.float32((NOISE * PATCH) ** 2)
     values /= np.sqrt(length)[..., None]
     return values
@@ -210,7 +213,7 @@ def _shapes(
 
     A nose is too round for flat patches. The scene's origin lies at `origin` (3,) in the world.
     """
-    # The tangent is the same whichever camera looks.
+    # The tangents must not depend on the camera.
     axis = np.where(np.abs(normals[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
     across = np.cross(axis, normals)
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
@@ -222,7 +225,7 @@ def _shapes(
     start = places[:, None] - origin + flat + lift * normals[:, None]
     hit = scene.cast_rays(join_rays(start, -normals[:, None]))["t_hit"].numpy()
     rise = np.where(np.isfinite(hit), lift - hit, 0.0)
-    # Another part of the face under the patch does not continue it.
+    # A hit further away is another part of the face, which does not continue the patch.
     rise = np.where(np.abs(rise) < spacing * PATCH, rise, 0.0)
     return np.swapaxes(flat + rise[..., None] * normals[:, None], 1, 2)
 
@@ -237,7 +240,7 @@ def surface_term(
     # The mesh's error changes slowly along the skin; that of a mismatched patch does not.
     _, near = cKDTree(places[good]).query(places[good], NEIGHBOURS)
     odd = np.abs(found.height[good] - np.median(found.height[good][near], axis=1))
-    good = good[odd < ODD_PX * found.pixel]
+    good = good[odd < NEIGHBOUR_LIMIT_PX * found.pixel]
     if not len(good):
         return None
     goals = places[good] + found.height[good, None] * normals[good]
@@ -248,8 +251,8 @@ def surface_term(
 
 def skin_samples(model: HeadModel, count: int) -> SkinSamples:
     """Spread `count` samples over the face and fewer over neck and ears, which may be covered."""
-    covered = spread(model, round(COVERED_SHARE * count), COVERED)
-    return [(spread(model, count), 1.0), (covered, COVERED_TRUST)]
+    covered = spread_samples(model, round(COVERED_SHARE * count), COVERED)
+    return [(spread_samples(model, count), 1.0), (covered, COVERED_TRUST)]
 
 
 def patch_terms(
@@ -263,8 +266,8 @@ def patch_terms(
 ) -> list[NormalTerm]:
     """Search a frame set's surface about the current mesh (V, 3).
 
-    `reach` is in metres to either side, `weight` the trust in the result; what is `covered` (V,) is
-    left out.
+    `reach` is in metres to either side, `weight` is the trust in the result. Vertices that are
+    `covered` (V,) are left out.
     """
     sets = [samples for samples, _ in skin]
     if covered is not None:
@@ -285,8 +288,8 @@ def under_hair(
 ) -> np.ndarray:
     """Return the vertices (V,) bool of the face that hair hides on the mesh (V, 3), by colour.
 
-    There most of the skin around is unlike the rest of the face: a beard, or a fringe. Views agree
-    on the surface of hair as well as on skin, so that it would be taken for skin.
+    Where most of the neighbouring samples are unlike the rest of the face, there is a beard or a
+    fringe. Views agree on the surface of hair as well as on skin, so it would be taken for skin.
     """
     samples = skin[0][0]
     samples = samples.some(~in_regions(model, FEATURES)[samples.vertices].any(1))
@@ -294,13 +297,13 @@ def under_hair(
     views = view_weights(Visibility(mesh, model.faces.numpy()), pictures, places, normals)
     seen = np.flatnonzero((views > 0).any(0))
     hidden = np.zeros(len(mesh), bool)
-    if len(seen) < 2 * BESIDE:
+    if len(seen) < 2 * HAIR_NEIGHBOURS:
         return hidden
     views = views[:, seen, None]
     logs = np.log(np.maximum(view_colours(pictures.images(), views[..., 0], places[seen]), 0.01))
     middle = np.nanmedian(np.where(views > 0, logs, np.nan), axis=0)
     odd = ~like_skin(middle, middle)
-    face = np.flatnonzero(in_regions(model, SEEN))
-    near = cKDTree(places[seen]).query(mesh[face], BESIDE)[1]
-    hidden[face] = odd[near].mean(1) > COVERING
+    face = np.flatnonzero(in_regions(model, UNCOVERED_SKIN))
+    near = cKDTree(places[seen]).query(mesh[face], HAIR_NEIGHBOURS)[1]
+    hidden[face] = odd[near].mean(1) > HAIR_SHARE
     return hidden

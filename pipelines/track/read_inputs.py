@@ -37,16 +37,17 @@ Read = Callable[[str], np.ndarray]
 """Read a camera's undistorted image (H, W, 3) uint8 by its id; raises CaptureError."""
 
 DETECTOR_PASSES = 3  # crops after the coarse pass; 1 measures the same on the twin
-# Most views in which a followed face is looked for, the most frontal ones; more add nothing.
-FOLLOWED_VIEWS = 10
-LEAST_AHEAD = 0.1  # least cosine between the face's direction and that to a camera, to look there
-MOVED_SHARE = 0.12  # of a crop: a face that is further off its middle is looked at again
-# A face is lost unless more than this share of its views has at least this score.
-KEPT_SHARE, KEPT_SCORE = 0.5, 0.5
+FOLLOWED_VIEWS = (
+    10  # most views in which a face is followed, the most frontal ones; more add nothing
+)
+LEAST_FACING = 0.1  # cosine between the face's direction and that to a camera in which to look
+RECENTRE_SHARE = 0.12  # of a crop: a face further from its middle is looked at again, centred
+# A followed face is lost unless more than this share of its views has at least this score.
+FOLLOWED_SHARE, FOLLOWED_SCORE = 0.5, 0.5
 
 Follow = Callable[[np.ndarray, np.ndarray], Marked]
 """Look at an image (H, W, 3) where landmarks (68, 2), pixels, are expected."""
-Look = Callable[[np.ndarray | None], Observation | None]
+FindFace = Callable[[np.ndarray | None], Observation | None]
 """Find a frame set's face near expected landmarks (68, 3), or anywhere; None if there is none."""
 
 
@@ -71,7 +72,7 @@ def open_follower(
         window = window_about(expected)
         face = look_at(net, image, window)
         middle, side = face_box(face.points)
-        if np.linalg.norm(middle - face_box(expected)[0]) > MOVED_SHARE * side:
+        if np.linalg.norm(middle - face_box(expected)[0]) > RECENTRE_SHARE * side:
             face = look_at(net, image, window_about(face.points))
         return Marked(face, find_irises(image, face), visible_contour=False)
 
@@ -79,11 +80,11 @@ def open_follower(
 
 
 def observe_peaks(
-    dataset: Dataset, subject: str, landmarks: str, search: float, neutral: str, most: int
+    dataset: Dataset, subject: str, landmarks: str, search: float, neutral: str, max_cameras: int
 ) -> tuple[list[Observation], list[Note]]:
     """Detect landmarks at every peak, reject outlying views and find shut eyes.
 
-    With `most` above 0 only so many cameras are used: those that see the neutral frame best.
+    If `max_cameras` is above 0, only the cameras that see the neutral frame best are used.
     """
     follow = open_follower(landmarks, detect_at)
     searches = (search, SMALL) if search > SMALL and follow else (search,)
@@ -98,9 +99,9 @@ def observe_peaks(
         except CaptureError as error:
             dropped.append(Note(expression, str(error)))
             continue
-        if most and len(cameras) > most and len(views) >= most:
+        if max_cameras and len(cameras) > max_cameras and len(views) >= max_cameras:
             views = sorted(views, key=lambda view: float(np.median(view.sigma)) / view.score)
-            views = views[:most]
+            views = views[:max_cameras]
             cameras = {name: cameras[name] for name in sorted(view.camera_id for view in views)}
         if not views:
             dropped.append(Note(expression, "no camera sees a face"))
@@ -125,7 +126,7 @@ def read_clip(
     side: int,
     cue: str,
     frames: Sequence[int],
-) -> Iterator[tuple[Look, CutCrops]]:
+) -> Iterator[tuple[FindFace, CutCrops]]:
     """Yield, per frame set of a clip, functions that find its face and cut its crops.
 
     Each frame is decoded once. Faces are searched for by the source, or followed from where they
@@ -141,11 +142,11 @@ def read_clip(
                     images[camera_id] = footage.read(camera_id, frame)
             seen = {camera_id: cameras[camera_id] for camera_id in images}
             read = images.__getitem__
-            look = partial(_look, read, seen, source, follow, peaks, cue, frame)
+            look = partial(_find_face, read, seen, source, follow, peaks, cue, frame)
             yield look, partial(_frame_crops, seen, images, side)
 
 
-def _look(
+def _find_face(
     read: Read,
     cameras: dict[str, Camera],
     source: Source,
@@ -181,18 +182,18 @@ def _followed(
 ) -> list[LandmarkView]:
     """Return the views with a face near expected landmarks (68, 3); none if it is lost."""
     views = []
-    chosen = _ahead(cameras, expected)
+    chosen = _facing_cameras(cameras, expected)
     for name in chosen:
         camera = cameras[name]
         seen = follow(read(name), project_pinhole(camera, expected)[0])
         if seen.face.score >= MIN_SCORE:
             views.append(_landmark_view(camera, seen))
-    sure = sum(view.score >= KEPT_SCORE for view in views)
-    return views if sure > KEPT_SHARE * len(chosen) else []
+    sure = sum(view.score >= FOLLOWED_SCORE for view in views)
+    return views if sure > FOLLOWED_SHARE * len(chosen) else []
 
 
-def _ahead(cameras: Mapping[str, Camera], marks: np.ndarray) -> list[str]:
-    """Choose the cameras that a face with landmarks (68, 3) looks at and that picture it."""
+def _facing_cameras(cameras: Mapping[str, Camera], marks: np.ndarray) -> list[str]:
+    """Choose the cameras that a face with landmarks (68, 3) is turned to and that picture it."""
     across, up = marks[45] - marks[36], marks[27] - marks[8]
     forward, middle = np.cross(across, up), marks.mean(0)
     facing = {}
@@ -204,7 +205,7 @@ def _ahead(cameras: Mapping[str, Camera], marks: np.ndarray) -> list[str]:
             length = np.linalg.norm(forward) * np.linalg.norm(towards)
             facing[name] = float(forward @ towards) / max(float(length), 1e-12)
     best = sorted(facing, key=lambda name: (-facing[name], name))[:FOLLOWED_VIEWS]
-    return sorted(name for name in best if facing[name] > LEAST_AHEAD)
+    return sorted(name for name in best if facing[name] > LEAST_FACING)
 
 
 def _landmark_view(camera: Camera, seen: Marked) -> LandmarkView:
@@ -251,10 +252,11 @@ def all_face_views(
     read: Read, cameras: dict[str, Camera], frame: int, sources: Sequence[Source],
     follow: Follow | None,
 ) -> list[LandmarkView]:  # fmt: skip
-    """Return `face_views` by the first of `sources`, and of cameras in which it sees no face.
+    """Return the views with a face, searching harder where cameras do not show one.
 
-    The next one searches there if fewer than two cameras show a face. At last the rig says where
-    the face must be: so it is found where it is small or lies on its side.
+    While fewer than two cameras show a face, the next of `sources` searches the other cameras. Then
+    the other cameras are searched where the rig says that the face must be, so that small faces and
+    faces on their side are found.
 
     Raises:
         CaptureError: no camera's footage has the frame.
@@ -275,7 +277,7 @@ def all_face_views(
         scale, rotation, shift = place
         expected = scale * mean_landmarks() @ rotation.T + shift
         rest = {name: cameras[name] for name in cameras if name not in views}
-        for name in _ahead(rest, expected):
+        for name in _facing_cameras(rest, expected):
             with suppress(CaptureError):  # this camera's footage lacks the frame
                 face = follow(read(name), project_pinhole(cameras[name], expected)[0])
                 if face.face.score >= MIN_SCORE:

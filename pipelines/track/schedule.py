@@ -28,20 +28,20 @@ from pipelines.track.photo_consistency import (
 )
 from pipelines.track.skin_flow import FINE, flow_term, skin_map
 from pipelines.track.state import State, Target, all_vertices, rotations
-from pipelines.track.surface import FrameSetCrops, behind, without
+from pipelines.track.surface import FrameSetCrops, mask_things, near_things
 from pipelines.track.terms import NormalTerm, SlideTerm, landmark_anchors
 
 LANDMARK_STEPS = 14  # of the first fit, to landmarks alone; 6 measure the same on the twin
-ROUND_STEPS = 4
-EYE_ROUNDS = 2  # irises and visible jaw lines are found again at least so often
+ROUND_STEPS = 4  # of the fit in each round
+EYE_ROUNDS = 2  # least number of rounds, as irises and visible jaw lines are found in each
 PATCH_REACH_M = 0.008  # of the first search, to either side of the mesh
-NARROWING, NARROWINGS = 0.6, 3  # factor of the reach from round to round, and how often
-IN_HAIR = 30.0  # factor on a landmark's standard deviation where hair surrounds it
-BESIDE_M, BESIDE_THING = 0.02, 6.0  # metres from a thing, and the factor within them
-SEARCHED_SIDE = 320  # pixels, about a millimetre each, of crops in which things are looked for
-APART_M = 0.003  # between the places on a thing that are kept
-SEARCHES = (0, 2)  # rounds in which things are looked for; more find the same
-FOLLOWING = 3  # rounds in which the skin is followed
+NARROWING, NARROWINGS = 0.6, 3  # factor on the reach from round to round, and in how many rounds
+HAIR_FACTOR = 30.0  # on the standard deviation of a landmark in hair
+NEAR_THING_M, NEAR_THING_FACTOR = 0.02, 6.0  # the same for a landmark this close to a thing
+THING_SIDE = 320  # pixels, about a millimetre each, of crops in which things are searched for
+THING_SPACING_M = 0.003  # between the places on a thing that are kept
+THING_ROUNDS = (0, 2)  # rounds in which things are searched for; more find the same
+SKIN_ROUNDS = 3  # rounds in which the skin's texture is followed
 # Trust in patches grows by this factor per round: far from the surface whole groups of them may
 # match wrongly.
 TRUST_GROWTH = 1 / 0.3
@@ -88,7 +88,7 @@ def make_schedule(outline_rounds: int, patch_rounds: int, uv_rounds: int) -> Sch
     )
     if not (patch_rounds and uv_rounds):
         return rounds
-    return rounds + FOLLOWING * (replace(rounds[-1], read_uv=False, follow_skin=True),)
+    return rounds + SKIN_ROUNDS * (replace(rounds[-1], read_uv=False, follow_skin=True),)
 
 
 def schedule_table(schedule: Schedule) -> list[dict[str, object]]:
@@ -147,7 +147,7 @@ def gather(
 def refine(
     basis: Basis, targets: list[Target], state: State, evidence: SubjectEvidence, schedule: Schedule
 ) -> tuple[State, list[Target], list[np.ndarray]]:
-    """Run the rounds; also returns the targets with the last terms, and `glasses_on` each."""
+    """Run the rounds; also return the targets with their last terms, and places on glasses."""
     model, found = basis.model, targets
     slides: list[SlideTerm | None] = [None] * len(targets)
     things = [np.zeros((0, 3)) for _ in targets]
@@ -156,17 +156,17 @@ def refine(
     outlines = sum(len(pictures.distances) for pictures in evidence.pictures)
     for number, current in enumerate(schedule):
         meshes, turns, found = all_vertices(model, state), rotations(state), []
-        clear = [without(*pair) for pair in zip(evidence.pictures, hiding, strict=True)]
+        clear = [mask_things(*pair) for pair in zip(evidence.pictures, hiding, strict=True)]
         flows = skin_flows(model, targets, evidence, clear, meshes) if current.follow_skin else {}
         for index, (target, pictures) in enumerate(zip(targets, evidence.pictures, strict=True)):
             mesh, terms = meshes[index], [*target.terms]
             hidden = under_hair(model, evidence.skin, pictures, mesh)
-            if current.patch_reach_m and number in SEARCHES:
-                things[index] = things_before(model, pictures, mesh, turns[index])
+            if current.patch_reach_m and number in THING_ROUNDS:
+                things[index] = find_things(model, pictures, mesh, turns[index])
                 if index not in glasses:
-                    glasses[index] = glasses_on(model, pictures, mesh, turns[index])
+                    glasses[index] = find_worn_glasses(model, pictures, mesh, turns[index])
                 hiding[index] = np.concatenate([things[index], glasses[index]])
-            pictures = without(pictures, hiding[index])
+            pictures = mask_things(pictures, hiding[index])
             if current.outlines:
                 terms += outline_terms(
                     model, pictures.distances, mesh, outlines, evidence.bald, hidden, hiding[index]
@@ -177,7 +177,7 @@ def refine(
             if current.read_uv and evidence.uv_map is not None:
                 slides[index] = slide_term(model, evidence.uv_map, pictures, mesh, hidden)
             terms += flows.get(index, [])
-            sigma = doubted(model, target, hidden, things[index])
+            sigma = widened_sigma(model, target, hidden, things[index])
             target = replace(target, terms=tuple(terms), sigma=sigma)
             target = with_irises_and_jaw(model, target, mesh, turns[index], evidence.eyes)
             found.append(with_slide(target, slides[index]))
@@ -191,40 +191,42 @@ def refine(
     worn = [glasses[index] for index in sorted(glasses)]  # of all expressions, or never looked for
     for index, places in enumerate(worn):
         if len(places):
-            worn[index] = glasses_on(model, evidence.pictures[index], meshes[index], turns[index])
+            worn[index] = find_worn_glasses(
+                model, evidence.pictures[index], meshes[index], turns[index]
+            )
     return state, found, worn
 
 
-def glasses_on(
+def find_worn_glasses(
     model: HeadModel, pictures: FrameSetCrops, mesh: np.ndarray, rotation: np.ndarray
 ) -> np.ndarray:
-    """Find places (n, 3) on glasses before a mesh (V, 3) whose `rotation` is world from head.
+    """Find places (n, 3) on glasses in front of a mesh (V, 3); `rotation` is world from head.
 
-    Landmarks on them keep their weight: detectors know glasses.
+    Landmarks on them keep their weight, because detectors know glasses.
     """
-    head, seen = make_head(mesh, rotation, head_labels(model)), matted(pictures)
+    head, seen = make_head(mesh, rotation, head_labels(model)), matted_pictures(pictures)
     return find_glasses(head, [s for s in seen if (s[0].center - head.center) @ head.R[:, 2] > 0])
 
 
-def things_before(
+def find_things(
     model: HeadModel, pictures: FrameSetCrops, mesh: np.ndarray, rotation: np.ndarray
 ) -> np.ndarray:
-    """Find places (n, 3) on what else stands before a mesh (V, 3): hands, mostly."""
+    """Find places (n, 3) on other things in front of a mesh (V, 3), mostly hands."""
     head = make_head(mesh, rotation, head_labels(model))
-    views = face_views(head, matted(pictures))
+    views = face_views(head, matted_pictures(pictures))
     places = np.concatenate([np.zeros((0, 3)), *(view.things for view in views)])
-    cells = np.floor((places - head.center) / APART_M)
+    cells = np.floor((places - head.center) / THING_SPACING_M)
     return places[np.unique(cells, axis=0, return_index=True)[1]]
 
 
-def matted(pictures: FrameSetCrops) -> list[Picture]:
-    """Reduce the crops that have mattes."""
+def matted_pictures(pictures: FrameSetCrops) -> list[Picture]:
+    """Return the crops that have mattes, reduced to THING_SIDE pixels."""
     found = []
     for crop in pictures.crops:
         if crop.alpha is not None:
-            rgb = shrink(crop.image, SEARCHED_SIDE)
+            rgb = shrink(crop.image, THING_SIDE)
             camera = resized(crop.camera, rgb.shape[1], rgb.shape[0])
-            alpha = shrink(crop.alpha, SEARCHED_SIDE)
+            alpha = shrink(crop.alpha, THING_SIDE)
             found.append((camera, rgb, alpha.astype(np.float32) / 255))
     return found
 
@@ -235,18 +237,20 @@ def free_modes(targets: list[Target]) -> tuple[str, ...]:
     return tuple(name for kind, name in ((NormalTerm, OFF), (SlideTerm, ALONG)) if kind in kinds)
 
 
-def doubted(model: HeadModel, target: Target, hidden: np.ndarray, things: np.ndarray) -> np.ndarray:
-    """Return landmarks' sigma (views, 68) with those vague that hair or a thing hides.
+def widened_sigma(
+    model: HeadModel, target: Target, hidden: np.ndarray, things: np.ndarray
+) -> np.ndarray:
+    """Return landmarks' sigma (views, 68), larger where hair or a thing hides or may shift them.
 
-    `hidden` (V,) are vertices in hair, `things` places (n, 3) on what else hides the face.
-    Detectors take a beard's rim for the jaw, and shift the mouth within it.
+    `hidden` (V,) are vertices in hair, `things` are places (n, 3) on other things in front of the
+    face. Detectors take a beard's rim for the jaw, and shift the mouth within a beard.
     """
     marks = np.tile(hidden[landmark_anchors(model).vertices].any(1), (len(target.sigma), 1))
     near = np.zeros_like(marks)
     for row, beside, view in zip(marks, near, target.observation.views, strict=True):
-        row |= behind(things, view.camera, view.points)
-        beside |= behind(things, view.camera, view.points, BESIDE_M)
-    factor = np.where(marks, IN_HAIR, np.where(near, BESIDE_THING, 1.0))
+        row |= near_things(things, view.camera, view.points)
+        beside |= near_things(things, view.camera, view.points, NEAR_THING_M)
+    factor = np.where(marks, HAIR_FACTOR, np.where(near, NEAR_THING_FACTOR, 1.0))
     factor[:, :17][marks[:, :17]] = np.inf
     return target.sigma * factor
 

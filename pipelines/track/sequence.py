@@ -30,7 +30,7 @@ from pipelines.track.face_uv import FaceUvMap, slide_term, with_slide
 from pipelines.track.fit import condensed, fit
 from pipelines.track.observe import Observation
 from pipelines.track.photo_consistency import SkinSamples, patch_terms
-from pipelines.track.read_inputs import Look
+from pipelines.track.read_inputs import FindFace
 from pipelines.track.schedule import LANDMARK_STEPS, PATCH_REACH_M, ROUND_STEPS
 from pipelines.track.state import (
     Pose,
@@ -54,7 +54,7 @@ MAX_GAP = 3  # strides beyond which frames do not constrain each other
 # A start from landmarks and the frame before is a millimetre or two off: half of the peaks' reach.
 REACH_SHARE, FIRST_TRUST = 0.5, 0.3
 
-Observed = tuple[Look, CutCrops]
+Observed = tuple[FindFace, CutCrops]
 """How to find a frame's face and to cut its crops, until the next frame is asked for."""
 ReadClip = Callable[[str, Sequence[int]], Iterable[Observed]]
 """Read frames of a cue, one after the other."""

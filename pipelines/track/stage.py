@@ -17,7 +17,7 @@ from express50.capture.frames import read_cameras_of
 from express50.capture.index import read_index
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
-from express50.dataset.tracks import STRANGE, shape_spread
+from express50.dataset.tracks import LARGEST_SPREAD, shape_spread
 from express50.error_model import Bounds, error_bounds, error_models, expect, single_camera_sigma
 from express50.errors import StageError
 from express50.files.digests import path_digest, value_digest
@@ -129,29 +129,29 @@ def run(
     )
     typical = np.concatenate([one.typical for one in bounds])
     expected = expect(error_models()["track"], typical, shared)
-    strange = strange_shape(split_shape(basis.model, state.shape)[0])
-    warnings = lone_views(peaks, read_cameras_of(dataset, item)) + strange
+    strange = shape_warnings(split_shape(basis.model, state.shape)[0])
+    warnings = single_view_warnings(peaks, read_cameras_of(dataset, item)) + strange
     # The error model knows people only: it cannot judge such a head.
     return Result(metrics, dropped, warnings, None if strange else expected)
 
 
-def strange_shape(shape: np.ndarray) -> list[Note]:
+def shape_warnings(shape: np.ndarray) -> list[Note]:
     """Warn of a shape that no person has; its coefficients (K,) are in standard deviations."""
     spread = shape_spread(shape)
-    if spread <= STRANGE:
+    if spread <= LARGEST_SPREAD:
         return []
     why = (
         f"its coefficients are {spread:.1f} standard deviations on average (people's are about 0.5,"
-        f" expected {STRANGE} at most), so cameras, synchronisation, mattes or landmarks are wrong,"
-        " and no error is stated; look at qc/overlay_*.jpg"
+        f" expected {LARGEST_SPREAD} at most), so cameras, synchronisation, mattes or landmarks are"
+        " wrong, and no error is stated; look at qc/overlay_*.jpg"
     )
     return [Note("head shape", why)]
 
 
-def lone_views(peaks: Sequence[Observation], cameras: Mapping[str, Camera]) -> list[Note]:
-    """Warn of peaks whose face is seen by one of several cameras."""
+def single_view_warnings(peaks: Sequence[Observation], cameras: Mapping[str, Camera]) -> list[Note]:
+    """Warn of peaks whose face only one of several cameras sees."""
     why = (
-        "of {} cameras only {} shows the face: its shape and place along that camera's axis are"
+        "only {1} of {0} cameras shows the face, so its shape and its distance from that camera are"
         " guesses; choose a peak in which more cameras see the face, or check the calibration"
     )
     return [
@@ -168,9 +168,10 @@ def clips_identity(
     state: State,
     eyes: EyeOffsets | None,
 ) -> str:
-    """Identify what clips are tracked from: a run reuses windows of a stopped one with the same.
+    """Return a text that changes with everything clips are tracked from.
 
-    The peaks' fit is part of it, because machines round differently.
+    A run reuses the windows of an interrupted one that has the same text. The peaks' fit is part
+    of it, because machines round differently.
     """
     fitted = (shape.tobytes(), state.bias.tobytes(), eyes and vars(eyes))
     digests = {k: path_digest(v) if isinstance(v, Path) else v for k, v in inputs.items()}

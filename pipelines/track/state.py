@@ -23,16 +23,18 @@ from pipelines.track.terms import Term
 # The initial pose. Jaw-line points slide, so a rigid alignment uses brows to mouth only.
 INNER = np.arange(17, 68)
 MIN_TRIANGULATED = 12
-PERSON_M = 0.004  # standard deviation of one person's landmarks about the template's
+PERSON_M = 0.004  # standard deviation of a person's landmarks from the template's
 SCALE_LIMITS = (0.5, 2.0)
-MIN_FACING = 0.05  # cosine to the camera below which a view is one from behind
+MIN_FACING = 0.05  # cosine to the camera below which a view is from behind
 
 # The prior. Few muscles act at a time (Bouaziz et al. 2013 penalise the sum of activations): small
 # activations count squared, larger ones by their size.
 EXPRESSION_MEAN = 0.2  # expected activation
-ACTIVE = 0.05
-NEUTRAL_SHARE = 0.2  # of both, in the neutral frame
-SPREAD = 4.5  # standard deviation of coefficients that are not activations, over EXPRESSION_MEAN
+ACTIVE_WIDTH = 0.05
+NEUTRAL_SHARE = 0.2  # factor on both in the neutral frame
+COEFFICIENT_SPREAD = (
+    4.5  # standard deviation of coefficients that are not activations, over EXPRESSION_MEAN
+)
 # Radians. A single view cannot distinguish a bent neck from a shape: it stays nearer to rest.
 NECK_SIGMA, SINGLE_VIEW_NECK_SIGMA = 0.2, 0.03
 EYE_SIGMA, EYE_DIFFERENCE_SIGMA = 0.3, 0.03
@@ -222,9 +224,12 @@ def prior(
     share = NEUTRAL_SHARE if neutral else 1.0
     size, mean = len(own), share * EXPRESSION_MEAN
     if model.unit_expressions:
-        residual, slope = _few(own[:count], share * ACTIVE, mean)
+        residual, slope = _sparse(own[:count], share * ACTIVE_WIDTH, mean)
     else:
-        residual, slope = own[:count] / (SPREAD * mean), np.full(count, 1.0 / (SPREAD * mean))
+        residual, slope = (
+            own[:count] / (COEFFICIENT_SPREAD * mean),
+            np.full(count, 1.0 / (COEFFICIENT_SPREAD * mean)),
+        )
     sigmas = np.r_[
         np.full(3, SINGLE_VIEW_NECK_SIGMA if single_view else NECK_SIGMA),
         np.array(JAW_SIGMA) * [share, 1.0, 1.0],
@@ -247,8 +252,8 @@ def prior(
     return np.concatenate(residuals), np.concatenate(slopes)
 
 
-def _few(activations: np.ndarray, active: float, mean: float) -> tuple[np.ndarray, np.ndarray]:
-    """Evaluate residuals (X,) whose halved squares are |activation| / mean, smooth at 0; slopes.
+def _sparse(activations: np.ndarray, active: float, mean: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return residuals (X,) whose halved squares are |activation| / mean, smooth at 0; and slopes.
 
     The cost is the pseudo-Huber of width `active`: that of an exponential distribution far from 0.
     """
@@ -264,7 +269,7 @@ def _few(activations: np.ndarray, active: float, mean: float) -> tuple[np.ndarra
 def _wall(
     own: np.ndarray, ids: np.ndarray, limit: float, sigma: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Penalise unknowns beyond a limit; a negative sigma is a wall from below."""
+    """Penalise unknowns above a limit, or below it if sigma is negative."""
     beyond = np.maximum((own[ids] - limit) / sigma, 0.0)
     active = np.flatnonzero(beyond > 0)
     slope = np.zeros((len(active), len(own)))

@@ -18,7 +18,7 @@ from express50.head.model import HeadModel
 from pipelines.track.basis import in_regions
 from pipelines.track.terms import MeshPlaces
 
-SEEN = (
+UNCOVERED_SKIN = (
     "face", "nose", "lips",
     "left_eye_region", "right_eye_region", "left_eyeball", "right_eyeball",
 )  # fmt: skip
@@ -29,13 +29,11 @@ FEATURES = (
 # Skin that hair or cloth may cover: its shape can be searched for, but its colours are not trusted.
 COVERED = ("neck", "left_ear", "right_ear")
 HIDDEN = ("mouth_interior", "boundary", "scalp", "teeth", "tongue")
-# A ray that ends this far before a sample still counts as reaching it.
-TOUCH_M = 3e-4
-# Rays begin this far before a sample, as only the head hides it, but not behind the camera.
-HEAD_M = 0.5
-GRAZING = 0.25
-THING_M = 0.005  # radius that a place on a thing's surface stands for
-MARGIN = 0.15  # about the head in its crop, as a share of the head's size
+TOUCH_M = 3e-4  # a ray that ends this far in front of a sample still reaches it
+HEAD_M = 0.5  # rays begin this far in front of a sample: only the head itself can hide it
+GRAZING = 0.25  # least cosine between a normal and the direction to the camera
+THING_M = 0.005  # radius of the patch of surface that a place on a thing stands for
+MARGIN = 0.15  # around the head in its crop, as a share of the head's size
 
 
 @dataclass(frozen=True)
@@ -66,7 +64,7 @@ class SignedDistance:
 class FrameSetCrops:
     """The pictures of one frame set: distances to its mattes' outlines, and head crops.
 
-    `lit` are the crops' `root_light`, where they are kept: they take twelve times the memory.
+    `lit` are the crops' `root_light`, if they are kept: they take twelve times the memory.
     """
 
     distances: tuple[SignedDistance, ...]
@@ -134,8 +132,8 @@ def matte_weights(crop: HeadCrop, places: np.ndarray) -> np.ndarray:
     return inside * (crop.alpha[row, column] / 255.0)
 
 
-def without(pictures: FrameSetCrops, things: np.ndarray) -> FrameSetCrops:
-    """Take what places (n, 3) on the surface of things hide out of the crops' mattes."""
+def mask_things(pictures: FrameSetCrops, things: np.ndarray) -> FrameSetCrops:
+    """Clear the crops' mattes where places (n, 3) on the surface of things hide the head."""
     if not len(things):
         return pictures
     crops = []
@@ -152,10 +150,10 @@ def without(pictures: FrameSetCrops, things: np.ndarray) -> FrameSetCrops:
     return replace(pictures, crops=tuple(crops))
 
 
-def behind(
+def near_things(
     things: np.ndarray, camera: Camera, pixels: np.ndarray, within: float = THING_M
 ) -> np.ndarray:
-    """Return which pixels (N, 2) of a camera lie `within` metres of places (n, 3) on things."""
+    """Return which pixels (N, 2) of a camera lie `within` metres of things' places (n, 3)."""
     if not len(things):
         return np.zeros(len(pixels), bool)
     shown, ahead = project_pinhole(camera, things)
@@ -168,7 +166,9 @@ def look_up(camera: Camera, image: np.ndarray, places: np.ndarray) -> np.ndarray
     return bilinear_slope(image, project_pinhole(camera, places)[0])[0]
 
 
-def spread(model: HeadModel, count: int, regions: tuple[str, ...] = SEEN) -> MeshPlaces:
+def spread_samples(
+    model: HeadModel, count: int, regions: tuple[str, ...] = UNCOVERED_SKIN
+) -> MeshPlaces:
     """Spread about `count` samples evenly by area over the skin of the template's regions.
 
     The same model, count and regions give the same samples.
@@ -213,15 +213,15 @@ class Visibility:
     """Ray casting against one mesh for many cameras; the ray tree is built once."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
-        # Far from the origin float32 rays are too coarse: all is cast about the mesh's centre.
+        # Far from the origin float32 rays are too coarse: they are relative to the mesh's centre.
         self.centre = vertices.mean(0)
         self.scene = mesh_scene(vertices - self.centre, faces)
 
     def weights(self, camera: Camera, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Weigh a camera's view of points (S, 3): (S,) in 0..1.
 
-        0 where the mesh hides a point or turns it away, else the cosine to the camera; at a
-        grazing angle a pixel covers much of the surface and a small error of shape moves it far.
+        0 where the mesh hides a point or faces away, else the cosine to the camera: at a grazing
+        angle, a pixel covers much of the surface, and a small error of shape moves it far.
         """
         ray = points - camera.center
         distance = np.linalg.norm(ray, axis=1)
@@ -251,7 +251,7 @@ def view_weights(
 def view_colours(
     images: list[tuple[np.ndarray, Camera]], weights: np.ndarray, places: np.ndarray
 ) -> np.ndarray:
-    """Look places (S, 3) up in C pictures of `root_light`: (C, S, 3), 0 where they weigh 0."""
+    """Look up places (S, 3) in C pictures of `root_light`: (C, S, 3), 0 where the weight is 0."""
     values = np.zeros((*weights.shape, 3))
     for value, weight, (image, camera) in zip(values, weights, images, strict=True):
         seen = np.flatnonzero(weight)

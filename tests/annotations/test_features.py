@@ -12,7 +12,7 @@ from annotations.align.features import (
     expression_values,
     in_noise,
     landmark_weights,
-    looks,
+    local_contrast,
     measure,
     shared_columns,
 )
@@ -82,8 +82,8 @@ def test_appearance_alone_reveals_a_peak():
 def test_appearance_features_ignore_brightness():
     rng = np.random.default_rng(2)
     face = rng.integers(0, 100, (1, FACE, FACE)).astype(np.uint8)
-    bright, _ = looks(2 * face + 20, FACE_POINTS)
-    dark, _ = looks(face, FACE_POINTS)
+    bright, _ = local_contrast(2 * face + 20, FACE_POINTS)
+    dark, _ = local_contrast(face, FACE_POINTS)
     np.testing.assert_allclose(bright, dark, atol=0.25)
     assert np.abs(dark).max() > 0.5
 

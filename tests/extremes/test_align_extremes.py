@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from annotations.align.features import expression_values, measure, watch
+from annotations.align.features import expression_values, measure, measure_features
 from annotations.align.suggest import suggest, suggest_all
 from annotations.observe.stage import (
     FACE,
@@ -70,7 +70,7 @@ def test_frames_without_a_face_are_never_a_peak():
     seen = observed(points)
     seen.scores[0, [24, 25, 26, 29]] = 0.02
     cues = [Cue("neutral", 0, 9), Cue("smile", 10, 28), Cue("pucker", 29, 29)]
-    watched = watch(SimpleNamespace(subject="S001", cues=cues), seen)
+    watched = measure_features(SimpleNamespace(subject="S001", cues=cues), seen)
     assert set(watched.windows) == {"neutral", "smile"}
     found, _ = suggest_all(watched, {"smile": SMILE}, None)
     assert 14 <= watched.frames[watched.windows["smile"][found["smile"].row]] <= 17

@@ -203,7 +203,7 @@ def test_capture_that_changed_is_ingested_again(dataset):
 
 def test_register_checks_before_it_writes(dataset, tmp_path):
     make_capture(tmp_path / "other", subject="S001", cameras=1)
-    with pytest.raises(CaptureError, match="subject S001 is also that of"):
+    with pytest.raises(CaptureError, match=r"has the same subject \(S001\) as"):
         ingest.register(dataset, [dataset.captures()["S001"], tmp_path / "other"])
     with pytest.raises(CaptureError, match="no such folder"):
         ingest.register(dataset, [tmp_path / "absent"])

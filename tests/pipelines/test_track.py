@@ -23,7 +23,7 @@ from pipelines.track.basis import Basis, Points, make_basis
 from pipelines.track.config import TrackConfig
 from pipelines.track.fit import consistent_sigma, fit
 from pipelines.track.observe import LandmarkView, agree, landmark_sigma, robust_triangulate
-from pipelines.track.stage import strange_shape
+from pipelines.track.stage import shape_warnings
 from pipelines.track.state import EXPRESSION_MEAN, State, Target, initial_pose, prior, start_state
 from pipelines.track.terms import landmark_anchors
 from tests.express50.head.tiny_head import tiny_head
@@ -391,6 +391,6 @@ def test_missing_footage_and_missing_faces_have_different_messages(
 
 def test_a_shape_that_nobody_has_is_named():
     person = np.random.default_rng(0).normal(size=68)
-    assert strange_shape(0.6 * person) == strange_shape(np.zeros(0)) == []
-    (note,) = strange_shape(2 * person)
+    assert shape_warnings(0.6 * person) == shape_warnings(np.zeros(0)) == []
+    (note,) = shape_warnings(2 * person)
     assert "qc/overlay" in note.why

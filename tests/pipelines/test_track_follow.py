@@ -20,13 +20,13 @@ from pipelines.track.basis import freeze_shape
 from pipelines.track.observe import agree
 from pipelines.track.read_inputs import (
     FOLLOWED_VIEWS,
-    _ahead,
-    _look,
+    _facing_cameras,
+    _find_face,
     all_face_views,
     open_follower,
 )
 from pipelines.track.sequence import ClipTracker, track_window
-from pipelines.track.stage import lone_views
+from pipelines.track.stage import single_view_warnings
 from pipelines.track.state import Target, start_state
 from pipelines.track.terms import landmark_anchors
 from tests.express50.landmarks.test_landmarks import on_canvas
@@ -70,14 +70,14 @@ class Stage:
     def look(self, expected: np.ndarray | None, peaks=(), follow: bool = True):  # noqa: ANN201
         """Images stand for themselves: each is its camera's name."""
         way: Callable | None = self.follow if follow else None
-        return _look(str, CAMERAS, self.search, way, list(peaks), "smile", 7, expected)
+        return _find_face(str, CAMERAS, self.search, way, list(peaks), "smile", 7, expected)
 
 
 def test_a_face_near_its_place_is_followed_in_the_views_it_looks_at() -> None:
     stage = Stage(marks())
     found = stage.look(marks(0.005))
     assert stage.searched == 0 and stage.followed == 5
-    assert {view.camera_id for view in found.views} == set(_ahead(CAMERAS, marks()))
+    assert {view.camera_id for view in found.views} == set(_facing_cameras(CAMERAS, marks()))
     np.testing.assert_allclose(found.points, marks(), atol=1e-6)
 
 
@@ -94,7 +94,7 @@ def test_a_face_that_the_search_misses_is_found_where_the_rig_says(
     # The second source, which takes long, is for rigs that show no more than one face.
     views = all_face_views(str, CAMERAS, 7, [search, search], stage.follow)
     assert stage.searched == searches * len(CAMERAS) - (searches - 1) * len(found)
-    assert {view.camera_id for view in views} == set(_ahead(CAMERAS, marks()))
+    assert {view.camera_id for view in views} == set(_facing_cameras(CAMERAS, marks()))
     observation, refused = agree("smile", 7, views)
     np.testing.assert_allclose(observation.points, marks(), atol=1e-6)
     assert not refused
@@ -111,9 +111,9 @@ def test_a_face_that_one_of_several_cameras_shows_is_warned_of() -> None:
 
     (view,) = all_face_views(str, CAMERAS, 7, [search], None)
     alone, _ = agree("smile", 7, [view])
-    (note,) = lone_views([alone], CAMERAS)
-    assert note.what == "smile" and f"of {len(CAMERAS)} cameras only cam-0.50 shows" in note.why
-    assert lone_views([alone], {"cam-0.50": CAMERAS["cam-0.50"]}) == []
+    (note,) = single_view_warnings([alone], CAMERAS)
+    assert note.what == "smile" and f"only cam-0.50 of {len(CAMERAS)} cameras shows" in note.why
+    assert single_view_warnings([alone], {"cam-0.50": CAMERAS["cam-0.50"]}) == []
 
 
 def test_a_small_face_on_its_side_is_seen_where_it_is_expected() -> None:
@@ -164,11 +164,11 @@ def test_a_frame_without_a_face_is_none() -> None:
 
 def test_no_more_views_are_followed_than_are_of_use() -> None:
     many = {c.id: c for c in (make_camera(a) for a in np.linspace(-1.2, 1.2, 30))}
-    chosen = _ahead(many, marks())
+    chosen = _facing_cameras(many, marks())
     assert len(chosen) == FOLLOWED_VIEWS
     assert max(abs(float(name[3:])) for name in chosen) < 0.6
     # Beyond the frame's edge there is nothing to follow.
-    assert _ahead(many, marks() + [0.0, 3.0, 0.0]) == []
+    assert _facing_cameras(many, marks() + [0.0, 3.0, 0.0]) == []
 
 
 def test_after_a_lost_frame_the_next_is_looked_for_everywhere() -> None:

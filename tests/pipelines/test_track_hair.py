@@ -6,7 +6,7 @@ from express50.geometry.cameras import unproject
 from express50.head.load import load_head
 from pipelines.regions.colour import like_skin
 from pipelines.track.observe import LandmarkView, Observation
-from pipelines.track.schedule import BESIDE_M, BESIDE_THING, IN_HAIR, doubted
+from pipelines.track.schedule import HAIR_FACTOR, NEAR_THING_FACTOR, NEAR_THING_M, widened_sigma
 from pipelines.track.state import Target
 from pipelines.track.terms import landmark_anchors
 from tests.pipelines.textured_scenes import rig
@@ -33,11 +33,11 @@ def test_landmarks_in_a_beard_are_vague_and_its_rim_is_no_jaw():
     model = load_head("procedural")
     hidden, things = np.zeros(len(model.template), bool), np.zeros((0, 3))
     target = target_of(rig()[:2])
-    assert np.array_equal(doubted(model, target, hidden, things), target.sigma)
+    assert np.array_equal(widened_sigma(model, target, hidden, things), target.sigma)
     anchors = landmark_anchors(model).vertices
     hidden[anchors[[8, 57]]] = True
-    found = doubted(model, target, hidden, things)
-    assert np.isinf(found[:, 8]).all() and (found[:, 57] == 2.0 * IN_HAIR).all()
+    found = widened_sigma(model, target, hidden, things)
+    assert np.isinf(found[:, 8]).all() and (found[:, 57] == 2.0 * HAIR_FACTOR).all()
     assert (found[:, 36] == 2.0).all()
 
 
@@ -47,10 +47,10 @@ def test_landmarks_on_a_thing_are_vague_where_it_is_seen_and_those_beside_it_les
     # Before landmark 10 in one camera; the other sees it elsewhere.
     at = target.observation.views[0].points[10]
     thing = unproject(one, at[None], np.array([0.9]))
-    found = doubted(model, target, hidden, thing)
+    found = widened_sigma(model, target, hidden, thing)
     pixel = 0.9 / one.K[0, 0]
-    near = np.flatnonzero(20 * pixel * np.abs(np.arange(68) - 10) < BESIDE_M)
+    near = np.flatnonzero(20 * pixel * np.abs(np.arange(68) - 10) < NEAR_THING_M)
     assert np.isinf(found[0, 10])
-    assert (found[0, near[near != 10]] == 2.0 * BESIDE_THING).all()
+    assert (found[0, near[near != 10]] == 2.0 * NEAR_THING_FACTOR).all()
     assert (np.delete(found[0], near) == 2.0).all()
     assert not np.array_equal(found[0], found[1])

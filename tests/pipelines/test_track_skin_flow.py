@@ -10,7 +10,7 @@ import torch
 from express50.head.load import load_head
 from express50.head.model import pose
 from pipelines.track.face_uv import HEIGHT, WIDTH, make_uv_map
-from pipelines.track.schedule import FOLLOWING, make_schedule
+from pipelines.track.schedule import SKIN_ROUNDS, make_schedule
 from pipelines.track.skin_flow import FINE, SkinMap, flow_term
 
 SIZE = FINE * HEIGHT, FINE * WIDTH
@@ -70,6 +70,6 @@ def test_flat_hidden_or_replaced_texture_gives_no_term(uv_map, mesh):
 
 def test_the_skin_is_followed_last_and_only_where_patches_and_marks_came_before():
     rounds = make_schedule(outline_rounds=3, patch_rounds=6, uv_rounds=6)
-    assert [one.follow_skin for one in rounds] == [False] * 6 + [True] * FOLLOWING
+    assert [one.follow_skin for one in rounds] == [False] * 6 + [True] * SKIN_ROUNDS
     for patch, uv in ((0, 6), (6, 0)):
         assert not any(one.follow_skin for one in make_schedule(3, patch, uv))

@@ -12,7 +12,7 @@ from express50.geometry.cameras import Camera
 from express50.geometry.transforms import look_at
 from express50.head.load import load_head
 from pipelines.track.appearance import robust_mean
-from pipelines.track.surface import COVERED, Visibility, cut_crop, look_up, spread
+from pipelines.track.surface import COVERED, Visibility, cut_crop, look_up, spread_samples
 from tests.pipelines.textured_scenes import (
     RADIUS,
     ball,
@@ -58,7 +58,7 @@ def test_samples_are_deterministic_even_and_on_the_allowed_skin_only() -> None:
     vertices, _ = ball(rings=24)
     face = vertices[:, 1] > -0.03
     model = ball_head(regions={"face": face, "scalp": vertices[:, 1] > 0.08})
-    samples, again = spread(model, 3000), spread(model, 3000)
+    samples, again = spread_samples(model, 3000), spread_samples(model, 3000)
     for one, other in zip(vars(samples).values(), vars(again).values(), strict=True):
         np.testing.assert_array_equal(one, other)
     allowed = face & (vertices[:, 1] <= 0.08)
@@ -75,7 +75,7 @@ def test_samples_are_deterministic_even_and_on_the_allowed_skin_only() -> None:
 
 def test_samples_of_neck_and_ears_lie_there() -> None:
     model = load_head("procedural")
-    samples = spread(model, 900, COVERED)
+    samples = spread_samples(model, 900, COVERED)
     inside = np.any([model.regions[name].numpy() for name in COVERED], axis=0)
     assert inside[samples.vertices].all()
     for name in COVERED:
@@ -85,7 +85,7 @@ def test_samples_of_neck_and_ears_lie_there() -> None:
 def test_a_head_without_regions_is_skin_all_over() -> None:
     model = ball_head()
     bare = replace(model, regions={})
-    assert len(np.unique(spread(bare, 2000).vertices, axis=0)) > 1000
+    assert len(np.unique(spread_samples(bare, 2000).vertices, axis=0)) > 1000
 
 
 @pytest.mark.parametrize("distance", [0.05, 0.3, 0.46, 0.6, 3.0])

@@ -12,8 +12,8 @@ from pipelines.regions.geometry import head_labels, make_head
 from pipelines.regions.things import face_views
 from pipelines.track.outline import outline_terms, sample_distance, signed_distance
 from pipelines.track.photo_consistency import patch_terms, skin_samples
-from pipelines.track.schedule import matted, things_before
-from pipelines.track.surface import FrameSetCrops, HeadCrop, behind, without
+from pipelines.track.schedule import find_things, matted_pictures
+from pipelines.track.surface import FrameSetCrops, HeadCrop, mask_things, near_things
 from tests.pipelines.textured_scenes import ORIGIN, RADIUS, ball_head, paint, picture, rig
 
 SMALL = 0.018
@@ -35,7 +35,7 @@ def shots(thing: bool, mattes: bool = True) -> FrameSetCrops:
 
 
 def found_on(model: HeadModel, pictures: FrameSetCrops) -> np.ndarray:
-    return things_before(model, pictures, model.template.numpy(), np.eye(3))
+    return find_things(model, pictures, model.template.numpy(), np.eye(3))
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def test_a_thing_before_the_face_is_found_and_a_bare_face_has_none(scene) -> Non
 def test_every_view_tells_the_face_from_what_stands_before_it(scene) -> None:
     model, _, pictures, _ = scene
     head = make_head(model.template.numpy(), np.eye(3), head_labels(model))
-    views = face_views(head, matted(pictures))
+    views = face_views(head, matted_pictures(pictures))
     assert [view.camera.id for view in views] == [crop.camera.id for crop in pictures.crops]
     for view in views:
         # Its rim is too near to the face to be told from it.
@@ -73,7 +73,7 @@ def test_every_view_tells_the_face_from_what_stands_before_it(scene) -> None:
 def test_what_a_thing_hides_is_not_looked_at(scene) -> None:
     model, skin, pictures, things = scene
     mesh = model.template.numpy()
-    clear = without(pictures, things)
+    clear = mask_things(pictures, things)
     for crop, before in zip(clear.crops, pictures.crops, strict=True):
         middle = np.floor(project(crop.camera, PLACE[None])[0][0]).astype(int)
         assert crop.alpha[middle[1], middle[0]] == 0
@@ -82,15 +82,15 @@ def test_what_a_thing_hides_is_not_looked_at(scene) -> None:
     found = patch_terms(model, skin, clear, mesh, 0.006, 1.0)
     goals = np.concatenate([term.goals for term in found])
     assert np.quantile(np.abs(np.linalg.norm(goals - ORIGIN, axis=1) - RADIUS), 0.99) < 0.0015
-    assert without(pictures, things[:0]) is pictures
+    assert mask_things(pictures, things[:0]) is pictures
 
 
 def test_pixels_behind_a_thing(scene) -> None:
     _, _, pictures, things = scene
     for crop in pictures.crops:
         pixels = project(crop.camera, np.stack([PLACE, PLACE * (-3, -3, 0.7)]))[0]
-        assert behind(things, crop.camera, pixels).tolist() == [True, False]
-    assert not behind(things[:0], pictures.crops[0].camera, np.zeros((3, 2))).any()
+        assert near_things(things, crop.camera, pixels).tolist() == [True, False]
+    assert not near_things(things[:0], pictures.crops[0].camera, np.zeros((3, 2))).any()
 
 
 def test_an_edge_of_the_matte_that_is_a_things_does_not_pull() -> None:

@@ -127,7 +127,7 @@ def test_bad_item_gives_exit_code_1_and_is_named(run, data, capture, tmp_path):
         (["ingest", "DATA"], 2, "no such dataset"),
         (["status", "DATA"], 2, "no such dataset"),
         (["ingest", "DATA", "CAP", "--set", "ingest.proxy_long=3"], 2, "mean 'proxy_long_side'"),
-        (["ingest", "DATA", "CAP", "--set", "track.x=3"], 2, "runs ingest only"),
+        (["ingest", "DATA", "CAP", "--set", "track.x=3"], 2, "only runs ingest"),
         (["ingest", "DATA", "CAP", "--preset", "fast"], 2, "unknown preset"),
         (["ingest", "DATA", "CAP", "--workers", "-1"], 2, "--workers -1"),
         (["ingest", "DATA", "CAP", "--items", "Z*"], 2, "no item of ingest matches"),
