@@ -132,7 +132,7 @@ def test_bad_item_gives_exit_code_1_and_is_named(run, data, capture, tmp_path):
         (["ingest", "DATA", "CAP", "--workers", "-1"], 2, "--workers -1"),
         (["ingest", "DATA", "CAP", "--items", "Z*"], 2, "no item of ingest matches"),
         (["run", "DATA", "CAP", "--first", "track", "--last", "ingest"], 2, "comes after"),
-        (["run", "DATA", "CAP", "--first", "calibrate"], 2, "takes in captures, such as"),
+        (["run", "DATA", "CAP", "--first", "calibrate"], 2, "read no captures, but"),
         (["config", "trak"], 2, "unknown stage 'trak'"),
         (["ingest"], 2, "required: DATASET"),
         (["nonsense"], 2, "unknown 'nonsense'; expected ingest, "),
