@@ -42,6 +42,15 @@ class Parser(argparse.ArgumentParser):
         super().__init__(*arguments, **options)
         self._negative_number_matcher = re.compile(r"-\.?\d\S*")
 
+    def _get_value(self, action: argparse.Action, text: str) -> Any:
+        try:
+            return super()._get_value(action, text)
+        except argparse.ArgumentError:
+            wanted = {int: "a whole number", float: "a number"}.get(action.type)  # type: ignore[arg-type]
+            if wanted is None:
+                raise
+            raise argparse.ArgumentError(action, f"got {text!r}, expected {wanted}") from None
+
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:
             known = [str(choice) for choice in action.choices]
@@ -129,7 +138,7 @@ def add_command(
 
     Its description, unless given, is its ``help`` as a sentence.
     """
-    options.setdefault("description", f"{help[0].upper()}{help[1:]}.")
+    options.setdefault("description", help and f"{help[0].upper()}{help[1:]}.")
     if example is not None:
         options |= {"epilog": f"example:\n  {example}"}
         options |= {"formatter_class": argparse.RawDescriptionHelpFormatter}

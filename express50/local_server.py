@@ -76,12 +76,15 @@ class PageServer(ThreadingHTTPServer):
 
     def __init__(self, get: Get, post: Post | None, host: str, port: int) -> None:
         """Bind the port without serving yet; ConfigError if it is taken or invalid."""
+        if not 0 <= port <= 65535:
+            raise ConfigError(f"port {port}: expected 0 to 65535 (0: any free port)")
         self.guard, self.get, self.post = RequestGuard(host), get, post
         self._free = BoundedSemaphore(AT_ONCE)
         try:
             super().__init__((host, port), _Handler)
-        except (OSError, OverflowError) as error:
-            raise ConfigError(f"{host}:{port}: {error}; choose another port") from error
+        except OSError as error:
+            why = error.strerror or error
+            raise ConfigError(f"{host}:{port}: {why}; choose another port") from error
 
     @property
     def address(self) -> str:

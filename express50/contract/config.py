@@ -19,6 +19,7 @@ from express50.errors import ConfigError, nearest
 from express50.files.text import read_toml
 
 PRESETS = ("draft", "standard", "reference")
+_KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
 
 
 def resolve_config(
@@ -182,7 +183,7 @@ def _coerce(name: str, value: object, kind: Any) -> object:
     # bool is an int in Python, but true is not a count
     if type(value) is kind:
         return value
-    raise ConfigError(f"{name}: got {value!r} ({type(value).__name__}), expected {kind.__name__}")
+    raise ConfigError(f"{name}: got {value!r}, expected {_KINDS.get(kind, kind.__name__)}")
 
 
 def config_texts(config: Any) -> dict[str, str]:

@@ -33,6 +33,7 @@ from express50.shards.reader import read_entries
 from express50.shards.writer import verify
 
 WRONG_LABELS = ("identity", "window", "unknown", "unreadable")
+REPAIR = "run this check with --fix"
 LabelProblems = Callable[[Dataset, list[str]], Iterable[Any]]
 
 
@@ -129,7 +130,7 @@ def _capture_findings(dataset: Dataset) -> Iterator[Finding]:
     except FormatError as error:
         yield Finding(kind="capture", where="captures.json", what=str(error), fix="restore it")
         return
-    fix = f"express50 ingest {dataset.root} CAPTURE, with the capture's current path"
+    fix = f"run 'express50 ingest {dataset.root} CAPTURE' with the capture's current path"
     for subject, path in captures.items():
         try:
             what = "" if path.exists() and footage_root(path) else f"its capture {path} is missing"
@@ -159,8 +160,8 @@ def _label_findings(dataset: Dataset, problems: LabelProblems) -> Iterator[Findi
         except Express50Error:  # the index is damaged, which is a finding of its own
             continue
         fix = (
-            f"express50 annotate ui {dataset.root}: undo it and mark the frame again (labels are"
-            " made by people, so the audit never changes them)"
+            f"run 'express50 annotate ui {dataset.root}', undo it and mark the frame again (the audit"
+            " never changes labels, because people made them)"
         )
         for one in found:
             yield Finding(kind="label", where=f"{where} {one.expression}", what=one.what, fix=fix)
@@ -168,7 +169,7 @@ def _label_findings(dataset: Dataset, problems: LabelProblems) -> Iterator[Findi
 
 def _ledger_finding(dataset: Dataset, fix: bool, read_only: bool) -> Finding | None:
     """Find a ledger that is missing or damaged; rename it, so that stages start a new one."""
-    again = f"express50 run {dataset.root}: every item is made again, to the same bytes"
+    again = f"run 'express50 run {dataset.root}', which makes every item again, with the same bytes"
     what = "is missing; without it, no output is known to come from a run"
     if dataset.ledger.is_file():
         try:
@@ -182,7 +183,7 @@ def _ledger_finding(dataset: Dataset, fix: bool, read_only: bool) -> Finding | N
             path = dataset.root / f"ledger.sqlite{ending}"
             if path.exists():
                 path.rename(dataset.root / f"{aside}{ending}")
-        again = f"set aside as {aside}; {again}" if fix else f"--fix, then {again}"
+        again = f"set aside as {aside}; {again}" if fix else f"{REPAIR}, then {again}"
     return Finding(kind="ledger", where="ledger.sqlite", what=what, fix=again, fixed=fix)
 
 
@@ -199,8 +200,8 @@ def _person_findings(dataset: Dataset, checkpoints: Sequence[Path]) -> Iterator[
             kind="person",
             where=str(path.relative_to(dataset.root) if inside else path),
             what="names a person who was withdrawn",
-            fix=f"express50 subject withdraw {dataset.root} ID --yes again (--checkpoint for one "
-            "outside the dataset), or delete it",
+            fix=f"run 'express50 subject withdraw {dataset.root} ID --yes' again (with --checkpoint"
+            " if it is outside the dataset), or delete it",
         )
 
 
@@ -328,7 +329,7 @@ class _StageAudit:
 
     def _settle(self, stage: str, fault: Fault, known: bool) -> None:
         """Set a faulty item aside where its stage can make it again."""
-        again, fixed = f"express50 {stage} {self.dataset.root}", False
+        again, fixed = f"run 'express50 {stage} {self.dataset.root}'", False
         receipt = self.receipts[stage].get(fault.item)
         if receipt is not None and receipt.imported:  # no run can make it again
             how = AGAIN
@@ -337,21 +338,23 @@ class _StageAudit:
         elif not known and fault.kind == "unknown":
             how = f"{stage} no longer has such an item; delete it if you do not need it"
         elif self.fix:
-            fixed, how = True, f"set aside; make it again: {again}"
+            fixed, how = True, f"set aside; {again} to make it again"
             set_aside(self.dataset, stage, fault.item)
             self.ledger.forget(stage, [fault.item])
         else:
-            how = f"--fix, then {again}" if known else "--fix (the stage no longer has this item)"
+            how = (
+                f"{REPAIR}, then {again}" if known else f"{REPAIR}; the stage has no such item now"
+            )
         self._find(fault.kind, f"{stage} {fault.item}", fault.what, how, fixed)
 
     def _judge(self, stage: Stage, receipts: dict[str, Receipt]) -> None:
         """Report items that were made from different inputs, settings or code versions."""
         path, name = self.dataset.config_file(stage.name), stage.name
-        again = f"express50 {name} {self.dataset.root}"
+        again = f"run 'express50 {name} {self.dataset.root}'"
         try:
             config = resolve_config(stage, "standard", path, (), [s.name for s in self.stages])
         except ConfigError as error:
-            how = f"{again}, with valid settings"
+            how = f"{again} with valid settings"
             self._find("config", f"config/{path.name}", str(error), how)
             return
         unreadable: dict[str, list[str]] = {}

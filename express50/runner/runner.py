@@ -138,13 +138,21 @@ def select_items(stage: Stage, dataset: Dataset, pattern: str) -> list[str]:
     """Return the items of a stage that match a shell pattern; ConfigError if there are none."""
     known = stage.items(dataset)
     chosen = [item for item in known if fnmatch.fnmatchcase(item, pattern)]
+    if not known:
+        raise ConfigError(
+            f"--items {pattern!r}: {stage.name} has no items yet; {_what_is_missing(dataset)}"
+        )
     if not chosen:
         some = ", ".join(known[:8]) + (", ..." if len(known) > 8 else "")
         raise ConfigError(
             f"--items {pattern!r}: no item of {stage.name} matches{nearest(pattern, known)}; "
-            f"items: {some or 'none'}"
+            f"items: {some}"
         )
     return chosen
+
+
+def _what_is_missing(dataset: Dataset) -> str:
+    return f"'express50 status {dataset.root}' shows which earlier stage must run first"
 
 
 def run_stage(
@@ -184,8 +192,7 @@ def run_stage(
     dataset = Dataset(dataset.root.resolve())
     chosen = list(stage.items(dataset) if items is None else items)
     if not chosen:
-        status = f"'express50 status {dataset.root}' shows which earlier stage must run first"
-        before = "name a CAPTURE" if stage.prepare else status
+        before = "name a CAPTURE" if stage.prepare else _what_is_missing(dataset)
         raise StageError(f"{dataset.root}: {stage.name} has nothing to do; {before}")
     shared = nullcontext(pool) if pool else Pool(workers, scheduler)
     with shared as workers_pool, stage_lock(dataset, stage.name), Ledger(dataset.ledger) as ledger:

@@ -83,9 +83,9 @@ def test_values_are_typed(assignment, key, value):
     [
         ("track.iteratons=5", "unknown key track.iteratons .did you mean 'iterations'"),
         ("trak.iterations=5", "no stage 'trak' in this command .did you mean 'track'"),
-        ("track.iterations=2.5", "got 2.5 .float., expected int"),
-        ("track.iterations=true", "got True .bool., expected int"),
-        ("track.refine=1", "got 1 .int., expected bool"),
+        ("track.iterations=2.5", "got 2.5, expected a whole number"),
+        ("track.iterations=true", "got True, expected a whole number"),
+        ("track.refine=1", "got 1, expected true or false"),
         ("track.rate=nan", "got NaN"),
         ("track.mode=fas", "got 'fas' .did you mean 'fast'.{2}; expected one of 'fast', 'slow'"),
         ("track.sizes=3", "expected a list"),

@@ -115,7 +115,7 @@ def test_options_of_a_file_and_of_one_line(tmp_path):
         ("time=4h,memory=16G", "time is '4h', .*4:00:00"),
         ("time=4,memory=16", "memory is '16', .*16G"),
         ("time=4,memory=16G,core=2", "unknown key slurm.core .did you mean 'cores'"),
-        ("time=4,memory=16G,cores=two", r"slurm.cores: got 'two' \(str\), expected int"),
+        ("time=4,memory=16G,cores=two", r"slurm.cores: got 'two', expected a whole number"),
         ("time=4,memory=16G,gpus=2", "gpus is 2, expected 0 or 1; ask for more jobs"),
         ("time=4,memory=16G,jobs=0", "jobs 0: expected at least 1"),
         ("jobs", "'jobs' is not key=value"),
