@@ -160,8 +160,8 @@ def _label_findings(dataset: Dataset, problems: LabelProblems) -> Iterator[Findi
         except Express50Error:  # the index is damaged, which is a finding of its own
             continue
         fix = (
-            f"run 'express50 annotate ui {dataset.root}', undo it and mark the frame again (the audit"
-            " never changes labels, because people made them)"
+            f"run 'express50 annotate ui {dataset.root}', undo the label and mark again (the"
+            " audit never changes labels, because people made them)"
         )
         for one in found:
             yield Finding(kind="label", where=f"{where} {one.expression}", what=one.what, fix=fix)

@@ -242,10 +242,10 @@ def test_runs_keep_an_import_until_its_cameras_change(original, dataset, capsys)
     other = {n: replace(c, params=(*c.params[:2], 40.0, *c.params[3:])) for n, c in cameras.items()}
     write_cameras(dataset.cameras_file("S001"), other)
     main(["check", str(dataset.root), "--fix"])
-    assert "imported for another cameras" in capsys.readouterr().out and path.is_file()
+    assert "since then these changed: cameras" in capsys.readouterr().out and path.is_file()
     for _ in range(2):  # the second time, too, the stage makes nothing in its place
         failed = run_stage(TRACK, dataset, TRACK.config(), workers=0, progress=False)
-        assert "imported for another cameras" in failed.outcomes[0].reason
+        assert "since then these changed: cameras" in failed.outcomes[0].reason
         assert not path.exists()
     assert (dataset.stale_dir / "track/S001/track.npz").read_bytes() == before
     assert main(["import", "remove", str(dataset.root), "track"]) == 0
