@@ -46,9 +46,9 @@ class Parser(argparse.ArgumentParser):
         try:
             return super()._get_value(action, text)
         except argparse.ArgumentError:
-            wanted = {int: "a whole number", float: "a number"}.get(action.type)  # type: ignore[arg-type]
-            if wanted is None:
+            if action.type not in (int, float):
                 raise
+            wanted = "a whole number" if action.type is int else "a number"
             raise argparse.ArgumentError(action, f"got {text!r}, expected {wanted}") from None
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:

@@ -346,7 +346,7 @@ def test_colour_gains_are_divided_out(dataset, tmp_path) -> None:
         (["--format=gaussian-avatars", "--head-only", "--expression=smile", "--subject=S001"], 1,
          "express50 regions"),
         (["--format=gaussian-avatars", "--test-expression=smile", "--test-expression=neutral"], 2,
-         "leaves none to train on"),
+         "leave some to train on"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_exported_is_one_line(
