@@ -36,6 +36,7 @@ from pipelines.ingest.quality import CameraMeasurements, check_quality
 from pipelines.ingest.scan import odd_footage, remove_proxies, scan_camera, time_gaps, trimmed
 
 QC_CAMERAS, QC_COLUMNS = 24, 6
+BLACK_LIGHT = 1e-3  # linear light, 3 of 255 levels
 FILE_ENDINGS = ("head", "confidence", "normals")  # later stages write <camera>_<ending>.png
 
 
@@ -132,7 +133,7 @@ def run(
     raw, outside = _with_cues(raw, cameras, measured, dropped, out / "proxies")
     usual = usual_count([camera.frames for camera in cameras.values()])
     cues, beyond = split_cues(raw.cues, usual)
-    for name, reason in short_cameras(cameras, cues).items():
+    for name, reason in (black_cameras(seen) | short_cameras(cameras, cues)).items():
         dropped[name] = reason
         del cameras[name]
         remove_proxies(out / "proxies", name)
@@ -276,6 +277,12 @@ def short_cameras(cameras: dict[str, CameraSource], cues: tuple[Cue, ...]) -> di
         for name, camera in cameras.items()
         if camera.frames < needed
     }
+
+
+def black_cameras(seen: Mapping[str, Seen]) -> dict[str, str]:
+    """Return the cameras that show nothing in any frame, with the reason."""
+    why = "all of its frames are black; check its lens cap, cable and recorder"
+    return {name: why for name, one in seen.items() if one.cells.max(initial=0) < BLACK_LIGHT}
 
 
 def make_index(raw: RawCapture, cameras: dict[str, CameraSource], cues: tuple[Cue, ...]) -> Index:

@@ -36,6 +36,9 @@ SPREAD = 0.2  # share by which hair may be brighter or darker than visible hair 
 LOW = 1.2  # deviations at which noise and subject are equally likely; alpha is 0 below
 HIGH = 6.0  # deviations that prove foreground; weaker pixels must be connected to such ones
 FIRM = 0.5  # share of the nearby subject's difference over which a pixel looks opaque
+# Deviations by which a subject differs where its pixels can be told from noise one by one, and how
+# often noisier pictures are blurred (docs/LOG.md, "Underexposed footage").
+PLAIN, SOFTENINGS = 4.8, 2
 CORE = 0.018  # radius of the disc that must fit inside a part of the subject for it to be solid
 OPEN = 1.5  # deviations: an area that differs by less shows the plate
 BLACK, WHITE = 24, 250  # grey levels beyond which two surfaces may look the same
@@ -55,12 +58,16 @@ class Support:
     near: np.ndarray
 
 
-def key_alpha(frame: np.ndarray, plate: np.ndarray, valid: np.ndarray, shadow: float) -> np.ndarray:
+def key_alpha(
+    frame: np.ndarray, plate: np.ndarray, valid: np.ndarray, shadow: float, softened: int = 0
+) -> np.ndarray:
     """Return the opacity (H, W) float32 in [0, 1] of a frame (H, W, 3) uint8 against its plate.
 
     Pixels outside `valid` (H, W) get 0. Darkening of the plate by up to `shadow` is a shadow.
+    Pictures in which the subject hardly exceeds the noise are blurred and keyed again; `softened`
+    counts how often.
     """
-    alpha = np.zeros(valid.shape, np.float32)
+    alpha, given = np.zeros(valid.shape, np.float32), (frame, plate)
     length = max(valid.shape)
     whole = subject_window(frame, plate, valid, shadow)
     model = fit_plate(plate, frame, valid, whole)
@@ -68,6 +75,9 @@ def key_alpha(frame: np.ndarray, plate: np.ndarray, valid: np.ndarray, shadow: f
     dark, difference, unshaded = plate_difference(image, model, shadow, length)
     difference = np.where(valid[whole], difference, 0.0)
     region = subject_region(difference, valid.size)
+    if softened < SOFTENINGS and not (region.any() and np.median(difference[region]) > PLAIN):
+        soft = [cv2.GaussianBlur(image, (0, 0), 2.0**softened) for image in given]
+        return key_alpha(*soft, valid, shadow, softened + 1)
     if not region.any():
         return alpha
     # The remaining steps work around the subject only.

@@ -165,6 +165,14 @@ def test_different_frame_counts_are_reported_and_short_cameras_dropped(dataset):
     assert "has 5 frames, the cues need 8" in dropped["why"]
 
 
+def test_a_camera_that_shows_nothing_is_dropped(dataset):
+    write_video(camera_folder(dataset, "cam01") / "video.mp4", np.zeros((8, 64, 64, 3), np.uint8))
+    assert run(dataset).ok
+    (dropped,) = metrics(dataset)["dropped"]
+    assert dropped["what"] == "camera cam01" and "all of its frames are black" in dropped["why"]
+    assert "cam01" not in read_index(dataset, "S001").cameras
+
+
 def test_a_capture_without_cues_is_ingested_with_a_warning(dataset):
     (dataset.captures()["S001"] / "cues.csv").unlink()
     assert run(dataset).ok

@@ -73,6 +73,19 @@ def test_noise_that_doubles_does_not_reach_the_background() -> None:
     assert mae(alpha, scene) < 0.03
 
 
+def test_a_subject_that_hardly_exceeds_the_noise_is_found() -> None:
+    scene, rng = make_scene(5, "fair"), np.random.default_rng(0)
+
+    def underexposed(image: np.ndarray) -> np.ndarray:
+        light = srgb_to_linear(image / 255.0) / 16 + rng.normal(0, 0.004, image.shape)
+        return np.rint(255 * linear_to_srgb(light.clip(0, 1))).astype(np.uint8)
+
+    dark = replace(scene, frame=underexposed(scene.frame), plate=underexposed(scene.plate))
+    assert mae(key(dark), dark) < 0.02  # an empty matte is 0.24 off
+    empty = replace(dark, frame=underexposed(scene.plate), alpha=np.zeros_like(scene.alpha))
+    assert mae(key(empty), empty) == 0
+
+
 def test_exposure_change_between_plate_and_frame_is_undone() -> None:
     scene = make_scene(6, "dark", gain=0.9)
     gain = exposure_gain(scene.frame, scene.plate)
