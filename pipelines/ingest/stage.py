@@ -133,7 +133,7 @@ def run(
     raw, outside = _with_cues(raw, cameras, measured, dropped, out / "proxies")
     usual = usual_count([camera.frames for camera in cameras.values()])
     cues, beyond = split_cues(raw.cues, usual)
-    for name, reason in (black_cameras(seen) | short_cameras(cameras, cues)).items():
+    for name, reason in (black_cameras(measured) | short_cameras(cameras, cues)).items():
         dropped[name] = reason
         del cameras[name]
         remove_proxies(out / "proxies", name)
@@ -279,10 +279,10 @@ def short_cameras(cameras: dict[str, CameraSource], cues: tuple[Cue, ...]) -> di
     }
 
 
-def black_cameras(seen: Mapping[str, Seen]) -> dict[str, str]:
+def black_cameras(measured: Mapping[str, CameraMeasurements]) -> dict[str, str]:
     """Return the cameras that show nothing in any frame, with the reason."""
     why = "all of its frames are black; check its lens cap, cable and recorder"
-    return {name: why for name, one in seen.items() if one.cells.max(initial=0) < BLACK_LIGHT}
+    return {name: why for name, one in measured.items() if one.cells.max(initial=0) < BLACK_LIGHT}
 
 
 def make_index(raw: RawCapture, cameras: dict[str, CameraSource], cues: tuple[Cue, ...]) -> Index:

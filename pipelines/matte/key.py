@@ -76,8 +76,8 @@ def key_alpha(
     difference = np.where(valid[whole], difference, 0.0)
     region = subject_region(difference, valid.size)
     if softened < SOFTENINGS and not (region.any() and np.median(difference[region]) > PLAIN):
-        soft = [cv2.GaussianBlur(image, (0, 0), 2.0**softened) for image in given]
-        return key_alpha(*soft, valid, shadow, softened + 1)
+        frame, plate = (cv2.GaussianBlur(image, (0, 0), 2.0**softened) for image in given)
+        return key_alpha(frame, plate, valid, shadow, softened + 1)
     if not region.any():
         return alpha
     # The remaining steps work around the subject only.
@@ -253,12 +253,18 @@ def shade_of_plate(dark: np.ndarray, clear: np.ndarray, length: int) -> np.ndarr
     return (blurred(dark * weight, reach) + 1e-3) / (blurred(weight, reach) + 1e-3)
 
 
+def smoothed(difference: np.ndarray) -> np.ndarray:
+    """Return the root mean square (H, W) over 3 x 3 pixels of differences (H, W)."""
+    # Running sums leave values a little under 0 where pixels are equal, as in grey footage.
+    return np.sqrt(np.maximum(cv2.blur(difference**2, (3, 3)), 0))
+
+
 def subject_region(difference: np.ndarray, size: int) -> np.ndarray:
     """Return the pixels (H, W) of large connected parts that differ, each with a certain pixel.
 
     `size` is that of the whole frame, pixels.
     """
-    smooth = np.sqrt(cv2.blur(difference**2, (3, 3)))
+    smooth = smoothed(difference)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(
         (smooth > 2.2).astype(np.uint8), connectivity=8
     )
@@ -280,7 +286,7 @@ def clear_plate(difference: np.ndarray, model: PlateModel, length: int) -> np.nd
     its folds. Black hair in front of a black wall may not differ, nor skin in front of a lamp, so
     black and white plates do not count.
     """
-    smooth = np.sqrt(cv2.blur(difference**2, (3, 3)))
+    smooth = smoothed(difference)
     red, green, blue = cv2.split(model.plate)
     exposed = (cv2.max(cv2.max(red, green), blue) > BLACK) & (
         cv2.min(cv2.min(red, green), blue) < WHITE

@@ -135,6 +135,15 @@ def test_the_difference_is_one_where_only_noise_differs() -> None:
     assert np.sqrt(np.mean(difference**2)) == pytest.approx(1.0, abs=0.1)
 
 
+def test_grey_footage_is_keyed_without_a_warning() -> None:
+    """Grey pixels equal the plate exactly, and OpenCV's running means went under 0 there."""
+    scene = make_scene(6, "dark")
+    images = (scene.frame, scene.plate)
+    grey = [np.repeat(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[..., None], 3, 2) for image in images]
+    scene = replace(scene, frame=grey[0], plate=grey[1])
+    assert mae(key(scene), scene) < 0.03
+
+
 def test_no_gain_leaves_the_plate_as_it_is() -> None:
     plate = np.arange(256, dtype=np.uint8).repeat(3).reshape(16, 16, 3)
     assert np.array_equal(exposed(plate, np.ones(3)), plate)
