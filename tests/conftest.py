@@ -10,7 +10,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
 
-from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from tests.synth import make_capture
 
@@ -48,11 +47,6 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def ingested(tmp_path: Path, capture: Path) -> Dataset:
     """A dataset with S001 ingested."""
-    from express50.runner.runner import run_stage
-    from pipelines import ingest
+    from tests.stages import ingest_captures
 
-    dataset = Dataset(tmp_path / "dataset")
-    ingest.register(dataset, [capture])
-    config = resolve_config(ingest.STAGE, "draft")
-    assert run_stage(ingest.STAGE, dataset, config, workers=0, progress=False).ok
-    return dataset
+    return ingest_captures(tmp_path / "dataset", capture)

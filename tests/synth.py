@@ -9,7 +9,6 @@ from pathlib import Path
 import av
 import numpy as np
 
-from express50.contract.layout import Dataset
 from express50.files.calibration import write_cameras
 from express50.files.images import write_image
 from express50.geometry.cameras import Camera, rays
@@ -148,11 +147,3 @@ def noise_video_images(count: int, size: int = 64) -> list[np.ndarray]:
     blocks = rng.integers(0, 256, (count, 9, 9, 3), dtype=np.uint8)
     scale = -(-size // 9)
     return [np.kron(b, np.ones((scale, scale, 1), np.uint8))[:size, :size] for b in blocks]
-
-
-def write_peak_frames(dataset: Dataset) -> None:
-    """Run the frames stage over every labelled peak."""
-    from express50.runner.runner import run_stage
-    from pipelines.frames import STAGE
-
-    run_stage(STAGE, dataset, STAGE.config(), workers=0, progress=False)

@@ -2,11 +2,9 @@
 
 import pytest
 
-from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
-from express50.runner.runner import run_stage
-from pipelines import ingest
 from tests.annotations.footage import EXPRESSIONS, suggest
+from tests.stages import ingest_captures
 from tests.synth import make_capture
 
 
@@ -21,11 +19,7 @@ def footage(tmp_path_factory):
             captures[-1], subject=subject, cameras=2, frames=48, size=32, plates=False,
             calibration=False, expressions=EXPRESSIONS,
         )  # fmt: skip
-    dataset = Dataset(root / "dataset")
-    ingest.register(dataset, captures)
-    config = resolve_config(ingest.STAGE, "draft")
-    assert run_stage(ingest.STAGE, dataset, config, workers=0, progress=False).ok
-    return dataset
+    return ingest_captures(root / "dataset", *captures)
 
 
 @pytest.fixture

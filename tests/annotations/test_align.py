@@ -19,10 +19,9 @@ from annotations.observe.stage import FACE, SCHEMA, read_observations
 from annotations.suggestions import choose_reference, read_suggestions
 from express50.__main__ import main
 from express50.capture.index import read_index
-from express50.contract.config import build_config
 from express50.errors import ConfigError, FormatError
-from express50.runner.runner import run_stage
 from tests.annotations.footage import EXPRESSIONS, FRAMES_EACH
+from tests.stages import run_here
 
 FACE_POINTS = np.random.default_rng(0).uniform(0, 100, (68, 2))
 SMILE = {"S001": 22, "S002": 26}
@@ -48,8 +47,7 @@ def act(dataset, subject, strength=2.0, stride=1):
 
 
 def run(dataset, items=None, **values):
-    config = build_config(align.STAGE, values)
-    return run_stage(align.STAGE, dataset, config, items, workers=0, progress=False)
+    return run_here(align.STAGE, dataset, items, **values)
 
 
 def peaks(dataset, subject):

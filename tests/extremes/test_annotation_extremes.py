@@ -33,12 +33,10 @@ from annotations.worklist import coverage, worklist
 from benchmarks.replay import cheapest_keys
 from express50.__main__ import main
 from express50.capture.index import read_index
-from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.errors import FormatError
-from express50.runner.runner import run_stage
-from pipelines import ingest
 from tests.annotations.labelled import make_dataset, suggest
+from tests.stages import ingest_captures
 from tests.synth import make_capture
 
 DAY = 60 * 86400  # frames of a day at 60 a second
@@ -180,11 +178,7 @@ def speck(tmp_path_factory):
     captures = [root / subject for subject in ("S001", "S002")]
     for path in captures:
         make_capture(path, subject=path.name, cameras=1, frames=6, size=5, plates=False)
-    dataset = Dataset(root / "dataset")
-    ingest.register(dataset, captures)
-    config = resolve_config(ingest.STAGE, "draft")
-    assert run_stage(ingest.STAGE, dataset, config, workers=0, progress=False).ok
-    return dataset
+    return ingest_captures(root / "dataset", *captures)
 
 
 @pytest.mark.parametrize("cell", [None, Size(7, 15)])

@@ -33,7 +33,6 @@ from express50.head.flame import load_flame
 from express50.landmarks.sources import read_points
 from express50.rigs.read import guess_format, read_rig
 from express50.runner.ledger import Ledger, Receipt
-from express50.runner.runner import run_stage
 from express50.shards.codecs import decode_picture, encode_pictures
 from express50.shards.reader import ShardReader, read_entries, write_offsets, write_registered
 from express50.shards.writer import verify, write_manifest
@@ -52,6 +51,7 @@ from tests.express50.rigs.test_other_tools import SIZE, WRITERS
 from tests.express50.rigs.test_read import make_rig, write_yaml
 from tests.grmm.packed import write_shards
 from tests.grmm.synthetic import EllipsoidSource
+from tests.stages import ingest_captures
 from tests.synth import make_capture, noise_video_images, write_video
 
 AVA = "20220818--1122--ABC123"
@@ -87,10 +87,7 @@ def write_seeds(root: Path) -> None:
 
 
 def _write_dataset(root: Path) -> None:
-    dataset = Dataset(root / "data")
-    ingest.register(dataset, [root / "S001"])
-    config = resolve_config(ingest.STAGE, "draft")
-    run_stage(ingest.STAGE, dataset, config, workers=0, progress=False)
+    dataset = ingest_captures(root / "data", root / "S001")
     index = read_index(dataset, "S001")
     source = index.cameras["cam00"]
     peak = {"frame": 1, "camera": "cam00", "pts": source.pts[1], "dhash": source.dhash[1]}

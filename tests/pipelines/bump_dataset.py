@@ -16,10 +16,9 @@ from express50.files.images import write_image
 from express50.geometry.cameras import Camera
 from express50.head.load import load_head
 from express50.runner.runner import run_stage
-from pipelines.ingest import STAGE as INGEST
-from pipelines.ingest import register
+from pipelines import frames, ingest
 from tests.pipelines.bump_head import render, ring
-from tests.synth import write_peak_frames
+from tests.stages import run_here
 
 EXPRESSIONS = ("neutral", "smile")
 
@@ -34,11 +33,11 @@ def make_dataset(
     for subject in subjects:
         capture = root / "raw" / subject
         _write_capture(capture, subject, rig, shots)
-        register(dataset, [capture])
-    run_stage(INGEST, dataset, INGEST.config(), workers=0, progress=False)
+        ingest.register(dataset, [capture])
+    run_here(ingest.STAGE, dataset)
     for subject in subjects:
         write_given(dataset, subject, rig, shots)
-    write_peak_frames(dataset)
+    run_here(frames.STAGE, dataset)
     return dataset
 
 

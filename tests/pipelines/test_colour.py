@@ -16,14 +16,11 @@ from express50.files.atomic import write_json
 from express50.files.images import scale_light, srgb_to_linear, write_image
 from express50.geometry.cameras import pinhole_camera
 from express50.geometry.transforms import make_transform
-from express50.runner.runner import run_stage
 from pipelines.calibrate import STAGE as CALIBRATE
 from pipelines.calibrate.board import detect_corners, make_detector
 from pipelines.calibrate.colour_gains import WhiteCollector, fit_gains, white_light, white_squares
-from pipelines.calibrate.config import CalibrateConfig
-from pipelines.ingest import STAGE as INGEST
-from pipelines.ingest import IngestConfig, register
 from tests.pipelines.board_rigs import BOARD, render_board
+from tests.stages import ingest_captures, run_here
 from tests.synth import make_capture
 
 FACING = make_transform(np.eye(3), np.array([-0.14, -0.1, 0.55]))
@@ -165,10 +162,8 @@ def test_a_bad_board_beside_given_cameras_leaves_out_the_colours_only(tmp_path):
         (root / "board" / name).mkdir(parents=True)
         write_image(root / "board" / name / "000000.png", np.zeros((20, 30, 3), np.uint8))
     (root / "board" / "board.toml").write_text("\n".join(lines) + "\n")
-    dataset = Dataset(tmp_path / "data")
-    register(dataset, [root])
-    for stage, config in ((INGEST, IngestConfig()), (CALIBRATE, CalibrateConfig())):
-        assert run_stage(stage, dataset, config, progress=False).ok
+    dataset = ingest_captures(tmp_path / "data", root, preset="standard")
+    assert run_here(CALIBRATE, dataset).ok
     metrics = json.loads((dataset.item_dir("calibrate", "S001") / "metrics.json").read_text())
     (warning,) = [row for row in metrics["warnings"] if row["what"] == "board"]
     assert "30x20" in warning["why"]

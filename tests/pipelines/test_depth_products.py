@@ -15,13 +15,13 @@ from express50.geometry.cameras import transform_camera
 from express50.geometry.raycast import mesh_scene
 from express50.geometry.transforms import make_transform
 from express50.head.load import load_head
-from express50.runner.runner import run_stage
 from pipelines.depth import STAGE, DepthConfig
 from pipelines.depth.maps import PhotoErrors, compared_view, photo_errors
 from pipelines.pack import ENCODE
 from pipelines.pack.config import EncodeConfig
 from tests.pipelines.bump_dataset import make_dataset, published
 from tests.pipelines.bump_head import mesh, render, ring
+from tests.stages import run_here
 
 QUICK = {"voxel_mm": 8.0}
 ITEMS = ("S001/neutral", "S001/smile")
@@ -146,8 +146,7 @@ def test_one_camera_gets_the_tracked_heads_depth_at_low_confidence(tmp_path):
     assert published(dataset, ENCODE, EncodeConfig(size=64))["S001"]["kept"] == len(ITEMS)
 
     dataset.track_file("S001").unlink()
-    config = DepthConfig(voxel_mm=3.0)
-    (outcome, _) = run_stage(STAGE, dataset, config, workers=0, progress=False).outcomes
+    (outcome, _) = run_here(STAGE, dataset, voxel_mm=3.0).outcomes
     assert "express50 track" in outcome.reason
 
 
@@ -155,6 +154,5 @@ def test_a_rig_of_which_one_camera_is_left_is_refused(tmp_path):
     dataset = make_dataset(tmp_path, cameras=3, size=48)
     for name in list(read_cameras_of(dataset, "S001"))[1:]:
         dataset.matte_file("S001", "neutral", name).unlink()
-    run = run_stage(STAGE, dataset, DepthConfig(**QUICK), items=[ITEMS[0]], workers=0,
-                    progress=False)  # fmt: skip
+    run = run_here(STAGE, dataset, ITEMS[:1], **QUICK)
     assert "express50 matte" in run.outcomes[0].reason

@@ -30,14 +30,14 @@ from express50.files.images import (
 )
 from express50.geometry.cameras import pinhole, project
 from express50.geometry.sampling import undistort_image
-from express50.runner.runner import run_stage
 from pipelines.frames import STAGE
 from tests.pipelines.test_matte_stage import make_dataset
+from tests.stages import run_here
 from tests.synth import make_capture, make_rig
 
 
 def run(dataset, **settings):
-    return run_stage(STAGE, dataset, STAGE.config(**settings), workers=0, progress=False)
+    return run_here(STAGE, dataset, **settings)
 
 
 def metrics_of(dataset, item):
@@ -103,7 +103,7 @@ def test_each_peak_is_decoded_once_and_only_by_this_stage(dataset, monkeypatch):
     assert run(dataset).ok
     peaks = read_peaks(dataset, "S001")
     assert sorted(read) == sorted((c, f) for c in make_rig() for f in peaks.values())
-    assert run_stage(MATTE, dataset, MATTE.config(), workers=0, progress=False).ok
+    assert run_here(MATTE, dataset).ok
     assert len(read) == 6
 
 
@@ -228,7 +228,7 @@ def test_later_stages_work_at_the_reduced_size_and_rerun_with_it_alone(dataset):
     from pipelines.matte import STAGE as MATTE
 
     def matte():
-        return run_stage(MATTE, dataset, MATTE.config(), workers=0, progress=False)
+        return run_here(MATTE, dataset)
 
     def shape():
         return read_image(dataset.matte_file("S001", "smile", "cam00")).shape

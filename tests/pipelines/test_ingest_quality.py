@@ -6,10 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.files.images import linear_to_srgb, srgb_to_linear
-from express50.runner.runner import run_stage
 from pipelines import ingest
 from pipelines.ingest.quality import (
     describe_steps,
@@ -20,6 +18,7 @@ from pipelines.ingest.quality import (
     movement,
     small_grey,
 )
+from tests.stages import run_here
 from tests.synth import make_rig, render_ball, write_frames
 
 CAMERAS, FRAMES = 5, 90
@@ -151,8 +150,7 @@ def test_ingest_warns_of_all_faults_and_writes_their_figures(footage, tmp_path):
     (capture / "capture.toml").write_text('subject = "S001"\nfps = 24\n')
     dataset = Dataset(tmp_path / "data")
     ingest.register(dataset, [capture])
-    config = resolve_config(ingest.STAGE, "reference")
-    summary = run_stage(ingest.STAGE, dataset, config, workers=0, progress=False)
+    summary = run_here(ingest.STAGE, dataset, preset="reference")
     assert summary.ok
     assert any("warning S001: camera cam02" in line for line in summary.lines())
     folder = dataset.item_dir("ingest", "S001")

@@ -18,19 +18,18 @@ from express50.errors import ConfigError, StageError
 from express50.files.images import read_alpha, write_image
 from express50.geometry.cameras import pinhole
 from express50.head.load import load_head
-from express50.runner.runner import run_stage
 from express50.shards.reader import ShardReader
 from express50.twin.config import TwinConfig
 from express50.twin.truth import Truth
 from pipelines import calibrate, frames, ingest
-from pipelines.calibrate.config import CalibrateConfig
 from pipelines.matte import STAGE as MATTE
 from pipelines.matte.config import MatteConfig
 from pipelines.matte.cutout import cut_out, make_cut_view, parts_of_a_person, soft_alpha
 from pipelines.matte.stage import valid_pixels
 from pipelines.photo.capture import make_photo_capture, open_picture, single_camera
 from pipelines.track.config import TrackConfig
-from tests.synth import write_peak_frames, write_video
+from tests.stages import run_here
+from tests.synth import write_video
 
 data = pytest.importorskip("skimage.data")
 HEAD = [(225, 30), (160, 80), (290, 90), (220, 100), (225, 165), (225, 182)]  # hair, face, neck
@@ -142,7 +141,7 @@ def test_a_frame_without_a_face_fails_alone(tmp_path: Path) -> None:
     make_photo_capture(open_picture(tmp_path / "eva.mp4"), folder, "eva", config, windows=2)
     ingest.register(dataset, [folder])
     for stage in (ingest.STAGE, calibrate.STAGE):
-        assert run_stage(stage, dataset, stage.config(), workers=0, progress=False).ok
+        assert run_here(stage, dataset).ok
     seen = read_index(dataset, "eva").cameras["photo"]
     peaks = {
         name: {"frame": frame, "camera": "photo", "pts": seen.pts[frame],
@@ -151,8 +150,8 @@ def test_a_frame_without_a_face_fails_alone(tmp_path: Path) -> None:
     }  # fmt: skip
     dataset.item_dir("align", "eva").mkdir(parents=True)
     dataset.peaks_file("eva").write_text(json.dumps(peaks))
-    write_peak_frames(dataset)
-    run = run_stage(MATTE, dataset, MatteConfig(method="grabcut"), workers=0, progress=False)
+    assert run_here(frames.STAGE, dataset).ok
+    run = run_here(MATTE, dataset, method="grabcut")
     assert {o.item: o.status for o in run.outcomes} == {
         "eva/clip_00": "done", "eva/clip_01": "failed",
     }  # fmt: skip
@@ -168,13 +167,13 @@ def rig(tmp_path_factory) -> tuple[Dataset, Truth]:
     )  # fmt: skip
     dataset, truth = recorded(twin, tmp_path_factory.mktemp("twin"))
     subject = dataset.subjects()[0]
-    assert run_stage(calibrate.STAGE, dataset, CalibrateConfig(), workers=0, progress=False).ok
+    assert run_here(calibrate.STAGE, dataset).ok
     name, seen = next(iter(read_index(dataset, subject).cameras.items()))
     peak = {"frame": 0, "camera": name, "pts": seen.pts[0], "dhash": seen.dhash[0],
             "confidence": 1.0, "annotator": "test"}  # fmt: skip
     dataset.item_dir("align", subject).mkdir(parents=True)
     dataset.peaks_file(subject).write_text(json.dumps({"neutral": peak}))
-    assert run_stage(frames.STAGE, dataset, frames.STAGE.config(), workers=0, progress=False).ok
+    assert run_here(frames.STAGE, dataset).ok
     return dataset, truth
 
 
@@ -199,14 +198,14 @@ def test_a_rig_without_plates_is_matted_from_all_sides(rig) -> None:
 
     names = list(read_cameras_of(dataset, subject))
     dataset.plate_file(subject, names[3]).unlink()
-    assert run_stage(MATTE, dataset, MatteConfig(), workers=0, progress=False).ok
+    assert run_here(MATTE, dataset).ok
     assert json.loads(metrics.read_text())["without_plate"] == [names[3]]
     beside_plates = mean_errors(dataset, truth)
     assert beside_plates[names[3]] < 0.015
 
     for name in names:
         dataset.plate_file(subject, name).unlink(missing_ok=True)
-    assert run_stage(MATTE, dataset, MatteConfig(), workers=0, progress=False).ok
+    assert run_here(MATTE, dataset).ok
     figures = json.loads(metrics.read_text())
     assert figures["without_plate"] == names and not figures["dropped"]
     without = mean_errors(dataset, truth)

@@ -21,23 +21,23 @@ from express50.contract.layout import Dataset
 from express50.error_model import error_bounds
 from express50.errors import ConfigError
 from express50.files.images import read_image, write_image
-from express50.runner.runner import Summary, run_stage
-from pipelines import calibrate, ingest
+from express50.runner.runner import Summary
+from pipelines import calibrate, frames
 from pipelines.matte import STAGE
-from pipelines.matte.config import MatteConfig
 from pipelines.matte.stage import rim_figures, wall_noise
 from tests.pipelines.bump_dataset import make_dataset as bump_dataset
 from tests.pipelines.matte_rig import SIZE, disc
 from tests.pipelines.matte_scenes import make_scene
 from tests.pipelines.stand_ins import Bad, Difference, onnx_bright, torchscript
-from tests.synth import make_capture, write_peak_frames
+from tests.stages import ingest_captures, run_here
+from tests.synth import make_capture
 
 BACKDROP = np.array([77, 128, 102], np.uint8)
 
 
 def run(dataset: Dataset, **settings) -> Summary:
     """The stage over every item, in this process."""
-    return run_stage(STAGE, dataset, MatteConfig(**settings), workers=0, progress=False)
+    return run_here(STAGE, dataset, **settings)
 
 
 def metrics_of(dataset: Dataset, item: str = "S001/smile") -> dict:
@@ -63,13 +63,11 @@ def align(dataset: Dataset, subject: str) -> None:
 
 def make_dataset(root: Path, captures: list[Path]) -> Dataset:
     """Captures ingested, with given cameras, and labelled."""
-    dataset = Dataset(root / "dataset")
-    ingest.register(dataset, captures)
-    for stage in (ingest.STAGE, calibrate.STAGE):
-        assert run_stage(stage, dataset, stage.config(), workers=0, progress=False).ok
+    dataset = ingest_captures(root / "dataset", *captures, preset="standard")
+    assert run_here(calibrate.STAGE, dataset).ok
     for subject in dataset.subjects():
         align(dataset, subject)
-    write_peak_frames(dataset)
+    run_here(frames.STAGE, dataset)
     return dataset
 
 

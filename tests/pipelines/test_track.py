@@ -27,7 +27,7 @@ from pipelines.track.stage import shape_warnings
 from pipelines.track.state import EXPRESSION_MEAN, State, Target, initial_pose, prior, start_state
 from pipelines.track.terms import landmark_anchors
 from tests.express50.head.tiny_head import tiny_head
-from tests.synth import write_peak_frames
+from tests.stages import run_here
 
 
 def make_camera(angle: float, size: int = 400, name: str = "") -> Camera:
@@ -277,11 +277,10 @@ def tracked_dataset(tmp_path: Path, ingested, monkeypatch: pytest.MonkeyPatch):
 
     from express50.capture.frames import read_cameras_of
     from express50.capture.index import read_index
-    from express50.runner.runner import run_stage
-    from pipelines import calibrate
+    from pipelines import calibrate, frames
     from pipelines.track import read_inputs, stage
 
-    run_stage(calibrate.STAGE, ingested, build_config(calibrate.STAGE, {}), progress=False)
+    run_here(calibrate.STAGE, ingested)
     index = read_index(ingested, "S001")
     camera_id = sorted(index.cameras)[0]
     source = index.cameras[camera_id]
@@ -297,7 +296,7 @@ def tracked_dataset(tmp_path: Path, ingested, monkeypatch: pytest.MonkeyPatch):
     folder = ingested.item_dir("align", "S001")
     folder.mkdir(parents=True)
     (folder / "peaks.json").write_text(json.dumps(peaks))
-    write_peak_frames(ingested)
+    run_here(frames.STAGE, ingested)
     scene = make_scene()
 
     def marked(image: np.ndarray, camera_id: str, frame: int) -> Marked:

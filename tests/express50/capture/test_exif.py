@@ -10,13 +10,11 @@ import pytest
 
 from express50.capture.frames import read_frame, read_proxy
 from express50.capture.index import read_index
-from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.errors import FormatError
 from express50.files.images import read_exif, upright
-from express50.runner.runner import run_stage
-from pipelines import ingest
 from pipelines.calibrate.footage import known_focals
+from tests.stages import ingest_captures
 
 WIDTH, HEIGHT, FILM_MM = 64, 48, 28
 # What a camera stores of the upright picture under each orientation, as EXIF defines them: where
@@ -58,11 +56,7 @@ def dataset(tmp_path_factory) -> Dataset:
             root / "shots" / f"p{number}.jpg", store(scene()),
             Orientation=number, Exif_FocalLengthIn35mmFilm=FILM_MM,
         )  # fmt: skip
-    made = Dataset(root / "data")
-    ingest.register(made, [root / "shots"])
-    config = resolve_config(ingest.STAGE, "draft")
-    assert run_stage(ingest.STAGE, made, config, workers=0, progress=False).ok
-    return made
+    return ingest_captures(root / "data", root / "shots")
 
 
 @pytest.mark.parametrize("number", sorted(STORED))

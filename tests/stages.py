@@ -1,0 +1,33 @@
+"""Run stages in the test's own process."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from express50.contract.config import build_config
+from express50.contract.layout import Dataset
+from express50.contract.stage import Stage
+from express50.runner.runner import Summary, run_stage
+from pipelines import ingest
+
+
+def run_here(
+    stage: Stage,
+    dataset: Dataset,
+    items: Sequence[str] | None = None,
+    preset: str = "standard",
+    **settings: object,
+) -> Summary:
+    """Run a stage with a preset in which some settings are others."""
+    config = build_config(stage, {**stage.presets.get(preset, {}), **settings})
+    return run_stage(stage, dataset, config, items, workers=0, progress=False)
+
+
+def ingest_captures(root: Path, *captures: Path, preset: str = "draft") -> Dataset:
+    """Make a dataset of raw captures."""
+    dataset = Dataset(root)
+    ingest.register(dataset, captures)
+    summary = run_here(ingest.STAGE, dataset, preset=preset)
+    assert summary.ok, summary.lines()
+    return dataset
