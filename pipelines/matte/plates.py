@@ -8,7 +8,8 @@ A pixel is ``alpha * F + (1 - alpha) * B`` in linear light, which lenses average
 known up to noise; F has the mean and the covariance of the subject's colours nearby. The most
 likely alpha is the Bayesian matting of Chuang et al. 2001 with B given. Thanks to the covariance, a
 strand may be lighter or darker than its neighbours and still be as opaque. The deviation of alpha
-is large where F and B are alike.
+is large where F and B are alike. There it is the mean of all alphas, weighted by their likelihood:
+grey hair in front of a grey wall differs from it in every strand, although not on average.
 """
 
 from __future__ import annotations
@@ -40,6 +41,9 @@ MOST_MOVED = 0.03  # share of the longer side; alignments that move the plate fu
 LEAST_SHARE = 0.9  # a plate that explains less shows another set
 ALIGN_SIDE = 1024  # pixels of the pictures that are aligned
 ROUNDS = 3  # of solving, since a pixel's covariance depends on its alpha; 0.01 off after two
+DOUBT = 0.05  # deviation of alpha from which its mean is better than the most likely value
+TRIED = np.linspace(0.0, 1.0, 17)  # values of alpha whose mean is taken
+CERTAIN = 0.1  # probability that only the plate or only the subject shows, over that of a mixture
 OCTAVES = 4  # of distance, in which colours are searched
 TINT = 0.1  # spread in colour, as a share of that in brightness
 SAMPLES = 1e5  # pixels from which exposure and noise are measured
@@ -353,7 +357,9 @@ def solve_opacity(
     covariance: np.ndarray,
     noise: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the most likely alpha (N,), not clipped, its deviation (N,), and that at alpha 0.
+    """Return alpha (N,), not clipped, its deviation (N,), and that at alpha 0.
+
+    It is the most likely alpha, and where that is in DOUBT the mean.
 
     Args:
         seen: (N, 3) light of the pixels.
@@ -374,17 +380,49 @@ def solve_opacity(
             share = np.clip(alpha, 0, 1)[:, None, None] ** 2
             direction, precision = _precision(own + share * covariance[part], reach)
             alpha = np.einsum("ni,ni->n", difference, direction) / np.maximum(precision, 1e-12)
-        out[:2, part] = alpha, 1 / np.sqrt(np.maximum(precision, 1e-12))
+        deviation = 1 / np.sqrt(np.maximum(precision, 1e-12))
+        doubt = deviation > DOUBT
+        alpha[doubt] = _mean_opacity(
+            difference[doubt], reach[doubt], covariance[part][doubt], own[doubt]
+        )
+        out[:2, part] = alpha, deviation
     return out[0], out[1], out[2]
 
 
+def _mean_opacity(
+    difference: np.ndarray, reach: np.ndarray, covariance: np.ndarray, own: np.ndarray
+) -> np.ndarray:
+    """Return the mean alpha (N,) over its likelihood at TRIED.
+
+    Args:
+        difference: (N, 3) light of the pixels minus that of the plate.
+        reach: (N, 3) mean light of the subject minus that of the plate.
+        covariance: (N, 3, 3) of the subject's colours.
+        own: (N, 3, 3) covariance of noise.
+    """
+    weights = np.empty((len(TRIED), len(reach)))
+    for row, alpha in zip(weights, TRIED, strict=True):
+        off = difference - alpha * reach
+        solved, volume = _solved(own + alpha**2 * covariance, off)
+        row[:] = np.einsum("ni,ni->n", off, solved) + np.log(np.maximum(volume, 1e-300))
+    weights = np.exp((weights.min(axis=0) - weights) / 2)
+    weights[[0, -1]] *= CERTAIN * (len(TRIED) - 2)
+    return TRIED @ weights / weights.sum(axis=0)
+
+
 def _precision(covariance: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``C^-1 r`` (N, 3) and ``r' C^-1 r`` (N,): the weights and precision along r.
+    """Return ``C^-1 r`` (N, 3) and ``r' C^-1 r`` (N,): the weights and precision along r."""
+    direction, _ = _solved(covariance, reach.astype(np.float64))
+    return direction, np.einsum("ni,ni->n", reach, direction)
+
+
+def _solved(covariance: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``C^-1 r`` (N, 3) and the determinant (N,) of C.
 
     Solved with cofactors, in a quarter of a general solver's time.
     """
     a, b, c, d, e, f = (covariance[:, i, j] for i, j in _PAIRS)
-    x, y, z = reach.T.astype(np.float64)
+    x, y, z = right.T
     cofactors = (
         d * f - e * e,
         c * e - b * f,
@@ -397,8 +435,8 @@ def _precision(covariance: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, n
     weights = np.stack(
         [p * x + q * y + r * z, q * x + s * y + t * z, r * x + t * y + u * z], axis=1
     )
-    direction = weights / (a * p + b * q + c * r)[:, None]
-    return direction, np.einsum("ni,ni->n", reach, direction)
+    volume = a * p + b * q + c * r
+    return weights / volume[:, None], volume
 
 
 def shrunk(values: np.ndarray, doubt: np.ndarray) -> np.ndarray:

@@ -173,6 +173,19 @@ def test_a_strand_brighter_than_its_neighbours_is_no_less_open() -> None:
     assert np.abs(spread - alpha).max() < 0.03 < 0.1 < (rigid - alpha).max()
 
 
+def test_hair_of_the_walls_mean_colour_is_found_by_its_bright_and_dark_strands() -> None:
+    rng = np.random.default_rng(3)
+    behind = np.full((400, 3), 0.2)
+    strands = behind * rng.normal(1, 0.2, (400, 1))
+    wall, hair = (light + rng.normal(0, 0.004, (400, 3)) for light in (behind, strands))
+    covariance = np.full((400, 3, 3), (0.2 * 0.2) ** 2) + 1e-6 * np.eye(3)
+    noise = np.zeros((400, 3, 3)) + 0.004**2 * np.eye(3)
+    off, on = (
+        solve_opacity(seen, behind, behind + 1e-4, covariance, noise)[0] for seen in (wall, hair)
+    )
+    assert off.mean() < 0.3 and on[np.abs(strands - behind)[:, 0] > 0.03].mean() > 0.75
+
+
 def test_colours_come_from_the_nearest_that_count() -> None:
     light = np.zeros((40, 60, 3), np.float32)
     light[:, :30], light[:, 30:] = (0.8, 0.4, 0.2), (0.1, 0.2, 0.3)
