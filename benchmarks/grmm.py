@@ -37,7 +37,7 @@ from grmm.edit import trained_head
 from grmm.evaluate import REGIONS, evaluate, mean, training_render
 from grmm.identity_evaluation import NOVEL_VIEW, FitProtocol, evaluate_unseen
 from grmm.metrics import PerceptualMetrics
-from grmm.render import around, frontal, orbit, picture, resized
+from grmm.render import draw_views, frontal, orbit, picture, resized
 from grmm.shard_source import open_shards
 from grmm.train_state import prepare
 from grmm.warm_start import warm_start
@@ -169,7 +169,7 @@ def speeds(loaded: Loaded) -> dict[str, float]:
 
     turns = itertools.cycle([TURN_DEGREES * n for n in range(-15, 16)])
     cameras = (orbit(resized(view, 512), turn, centre) for turn in turns)
-    changing, moving = anew(), iter(around(loaded, heads[0], cameras))
+    changing, moving = anew(), iter(draw_views(loaded, heads[0], cameras))
     return {
         "render_fps_cpu_256": frames_per_second(lambda: next(changing)),
         "render_fps_cpu_512_cached": frames_per_second(lambda: next(moving)),

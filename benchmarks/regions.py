@@ -36,7 +36,7 @@ from express50.head.model import landmarks
 from express50.twin.truth import Truth
 from pipelines.regions import STAGE, RegionsConfig
 from pipelines.regions.geometry import head_alpha, head_labels, make_head
-from pipelines.regions.stage import label_view, read_depth_of, read_head, read_pair
+from pipelines.regions.stage import label_view, read_depth_of, read_frame_and_matte, read_head
 
 CHIN = 8  # of the 68 landmarks
 
@@ -117,7 +117,7 @@ def true_mesh_rows(
     head = make_head(truth.vertices(subject, frame), R, labels)
     rows = []
     for name, camera in true_world_cameras(dataset, truth, subject).items():
-        rgb, alpha = read_pair(dataset, item, camera)
+        rgb, alpha = read_frame_and_matte(dataset, item, camera)
         depth = read_depth_of(dataset, item, camera)
         small = label_view(head, camera, rgb, alpha, depth, False, STAGE.config().image_side).labels
         shown = np.where(alpha > 0.5, small, 0)

@@ -77,7 +77,7 @@ def run_handler(
     try:
         with _stop_on_sigterm(), _warnings_on_one_line(program):
             code = handler(args)
-        with readers_may_leave(sys.stdout):
+        with ignoring_closed_pipe(sys.stdout):
             sys.stdout.flush()
         return code
     except Exception as error:  # noqa: BLE001 (a page of a library's files helps no user)
@@ -108,7 +108,7 @@ def _line_of(error: Exception) -> str:
     if isinstance(error, Express50Error):
         return f"{name}: {words}"
     if isinstance(error, OSError):  # not a bug: permissions, a missing folder, a full disk
-        return line_of_system(error)
+        return system_error_line(error)
     last = traceback.extract_tb(error.__traceback__)[-1]
     return (
         f"{name}: {Express50Error(words)} (unexpected, in {Path(last.filename).name} line "
@@ -116,7 +116,7 @@ def _line_of(error: Exception) -> str:
     )
 
 
-def line_of_system(error: OSError) -> str:
+def system_error_line(error: OSError) -> str:
     """Return one line of what the system refused, where, and what to do."""
     place = f" {error.filename}:" if error.filename is not None else ""
     words = error.strerror or " ".join(str(error).split()) or "no reason given"
@@ -152,7 +152,7 @@ def add_command(
 
 
 @contextlib.contextmanager
-def readers_may_leave(stream: IO[str]) -> Iterator[None]:
+def ignoring_closed_pipe(stream: IO[str]) -> Iterator[None]:
     """Ignore that the reader of a stream has closed it."""
     try:
         yield
@@ -182,14 +182,14 @@ def _stop_on_sigterm() -> Iterator[None]:
 
 def say(*lines: str) -> None:
     """Write lines to standard output."""
-    with readers_may_leave(sys.stdout):
+    with ignoring_closed_pipe(sys.stdout):
         for line in lines:
             sys.stdout.write(printable(line) + "\n")
 
 
 def log(line: str) -> None:
     """Write a line of progress to standard error; standard output is for results."""
-    with readers_may_leave(sys.stderr):
+    with ignoring_closed_pipe(sys.stderr):
         sys.stderr.write(printable(line) + "\n")
         sys.stderr.flush()
 

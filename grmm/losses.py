@@ -1,4 +1,4 @@
-"""Define the objective's terms (paper: Training and Losses), each in the unit its name states.
+"""Define the terms of the objective (paper: Training and Losses), each in the unit in its name.
 
 All return 0-d tensors, which are finite for equal and for constant images and 0 if there is nothing
 to compare.

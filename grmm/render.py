@@ -125,11 +125,13 @@ def camera_of(loaded: Loaded, name: str | None, size: int = 0) -> PinholeView:
 
 def picture(loaded: Loaded, head: HeadCodes, view: PinholeView) -> np.ndarray:
     """Draw one head from one view, (H, W, 3) uint8."""
-    return next(iter(around(loaded, head, [view])))
+    return next(iter(draw_views(loaded, head, [view])))
 
 
 @torch.no_grad()
-def around(loaded: Loaded, head: HeadCodes, views: Iterable[PinholeView]) -> Iterable[np.ndarray]:
+def draw_views(
+    loaded: Loaded, head: HeadCodes, views: Iterable[PinholeView]
+) -> Iterable[np.ndarray]:
     """Yield a head from each view; its geometry is decoded once for all of them."""
     model, state = loaded.model, head.state(loaded)
     gaussians = model.geometry(head.z_id, head.z_exp, state)
@@ -145,14 +147,14 @@ def turntable(
     """Yield (H, W, 3) frames of an orbit that starts at ``view``."""
     centre = loaded.model.head_centre
     views = (orbit(view, degrees * number / frames, centre) for number in range(frames))
-    return around(loaded, head, views)
+    return draw_views(loaded, head, views)
 
 
 def novel_views(loaded: Loaded, head: HeadCodes, view: PinholeView) -> list[list[np.ndarray]]:
     """Draw rows of PITCHES and columns of YAWS, degrees, around ``view``."""
     centre = loaded.model.head_centre
     views = (orbit(view, yaw, centre, pitch) for pitch in PITCHES for yaw in YAWS)
-    pictures = list(around(loaded, head, views))
+    pictures = list(draw_views(loaded, head, views))
     return [pictures[i : i + len(YAWS)] for i in range(0, len(pictures), len(YAWS))]
 
 

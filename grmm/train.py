@@ -1,9 +1,9 @@
 """Train GRMM: one loop, read from top to bottom.
 
 One iteration renders ``accumulate`` views (the paper's batch size is 1), sums the objective and
-takes one Adam step. Under ``torchrun`` each process takes other views and DDP averages their
-gradients. On a CPU a resumed run repeats an uninterrupted one bit for bit, unless a time budget
-steers the rate.
+takes one Adam step. Under ``torchrun`` each process takes different views, and DDP averages their
+gradients. On a CPU, a resumed run gives the same bits as an uninterrupted one, unless a time budget
+controls the learning rate.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ from grmm.warm_start import warm_start
 
 LOG_EVERY = 20  # iterations between lines of progress
 SAVING_SHARE = 0.05  # at most this share of the training time
-PATIENT = 10_000  # iterations that a CPU does in a day at most
+PATIENT = 10_000  # most iterations that a CPU does in a day
 GREY_DB = 10.0  # the score of a grey picture
 GLOO_SECONDS = 0.5  # for Gloo's threads to free tensors; 0.2 was enough in every run
 
@@ -71,9 +71,9 @@ def train(
 ) -> dict[str, object]:
     """Train on a source and write OUT/checkpoint.pt, OUT/metrics.json and OUT/preview/*.jpg.
 
-    ``source.head`` is how `load_head` finds ``head`` again. ``resume`` goes on from
-    OUT/checkpoint.pt, whose settings must agree except for the budget. ``own_terms`` adds terms to
-    the objective. Returns what metrics.json holds; nothing in other processes than the first.
+    ``source.head`` is the name by which `load_head` finds ``head`` again. ``resume`` continues from
+    OUT/checkpoint.pt, whose settings must be the same except for the budget. ``own_terms`` adds
+    terms to the objective. Returns the content of metrics.json; empty in processes but the first.
 
     Raises:
         TrainError: nothing to train on, or the objective is not finite.
@@ -134,14 +134,14 @@ def train(
                 save(state, checkpoint, config, source.head, gallery)
                 saved = time.perf_counter() - started
                 cost = saved - state.seconds
-            elif rank == 0 and not spare.exists():  # the size of the first one
+            elif rank == 0 and not spare.exists():  # reserve the size of a checkpoint
                 save(state, spare, config, source.head, gallery)
             if interrupt.is_set():  # only now, after the save
                 raise KeyboardInterrupt
     if world > 1:
         distributed.destroy_process_group()
-        # Gloo's threads outlive the group and take Python's lock to free the tensors of the last
-        # sum. One that does so while the interpreter ends aborts the process: they get some time.
+        # Gloo's threads outlive the group, and take Python's lock to free the tensors of the last
+        # sum. If one does so while the interpreter ends, the process aborts: give them some time.
         time.sleep(GLOO_SECONDS)
 
     # --- The report ----------------------------------------------------------------------------
@@ -280,7 +280,7 @@ def join_processes() -> tuple[int, int, torch.device]:
 
 
 def agree(state: TrainState, interrupt: Event, device: torch.device) -> None:
-    """Give all processes the same clock and the same request to stop, or they would deadlock."""
+    """Give all processes the same clock and request to stop; otherwise they would deadlock."""
     common = torch.tensor([state.seconds, float(interrupt.is_set())], device=device)
     distributed.all_reduce(common, distributed.ReduceOp.MAX)
     state.seconds = float(common[0])

@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 
 SCHEMA = "express50.observations/1"
 SEEN_SCORE = 0.15  # least score of a frame that shows the face
-TRIES = 8  # number of other frames to search for a face if the frames at rest show none
-FEW = 3  # number of frames to search for a small face, those at rest first
-HELD = 256  # frames of a camera kept in memory; those of longer windows are decoded twice
+OTHER_FRAMES = 8  # number of other frames to search for a face if the frames at rest show none
+SMALL_FACE_FRAMES = 3  # number of frames to search for a small face, those at rest first
+CACHED_FRAMES = 256  # frames of a camera kept in memory; those of longer windows are decoded twice
 RANKED_SHARE = 0.8  # share of the best camera's score: worse cameras add mostly noise
 
 
@@ -101,11 +101,11 @@ def run(
     frames_tried = frames_to_try(rest, frames)
     attempts = [(search, frame) for frame in frames_tried]
     if search > SMALL:  # which takes four times as long, so in fewer frames
-        attempts += [(SMALL, frame) for frame in frames_tried[:FEW]]
+        attempts += [(SMALL, frame) for frame in frames_tried[:SMALL_FACE_FRAMES]]
     search, middle, ranked = choose_cameras(index, score, attempts, min_score)
     watching = ranked[:cameras]
     rest = np.union1d(rest, [middle])
-    views = [_watch(dataset, item, net, camera, seen, rest, search) for camera in watching]
+    views = [_observe_camera(dataset, item, net, camera, seen, rest, search) for camera in watching]
     points, scores, faces = (np.stack(part) for part in zip(*views, strict=True))
     np.savez_compressed(
         out / "observations.npz", schema=SCHEMA, cameras=np.array(watching), frames=frames,
@@ -131,7 +131,7 @@ def cue_frames(index: Index, cue: Cue, stride: int = 1) -> np.ndarray:
 def frames_to_try(rest: np.ndarray, frames: np.ndarray) -> list[int]:
     """List the frames in which to search for the face: at rest, then all over the clips."""
     spread = np.linspace(0, len(rest) - 1, 3)[[1, 0, 2]].astype(int)
-    others = np.linspace(0, len(frames) - 1, TRIES).astype(int)
+    others = np.linspace(0, len(frames) - 1, OTHER_FRAMES).astype(int)
     return list(dict.fromkeys([*rest[spread].tolist(), *frames[others].tolist()]))
 
 
@@ -168,7 +168,7 @@ def choose_cameras(
     )
 
 
-def _watch(
+def _observe_camera(
     dataset: Dataset,
     subject: str,
     net: LandmarkNet,
@@ -184,7 +184,7 @@ def _watch(
         windows, in order. In overlapping windows, the last one counts.
     """
 
-    @lru_cache(maxsize=HELD)
+    @lru_cache(maxsize=CACHED_FRAMES)
     def read(number: int) -> np.ndarray:
         return read_proxy(dataset, subject, camera, number)
 

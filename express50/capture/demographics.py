@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 AGE_BANDS = ((0, 17), (18, 29), (30, 44), (45, 59), (60, 200))
-# Smaller counts could identify people: of two subjects, one may be the only woman, or aged 71.
+# Smaller counts could identify people, such as the only woman, or the only person aged 71.
 LEAST_PEOPLE = 5
 OTHERS = "others or not given"
 PUBLIC_KEYS = frozenset(

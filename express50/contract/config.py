@@ -188,7 +188,7 @@ def _coerce(name: str, value: object, kind: Any) -> object:
 
 def config_texts(config: Any) -> dict[str, str]:
     """Return field values of a config dataclass, in order, as TOML has them."""
-    # A number, text, list or truth is written in TOML as in JSON.
+    # TOML writes numbers, texts, lists, true and false as JSON does.
     return {
         field.name: json.dumps(getattr(config, field.name), ensure_ascii=False)
         for field in dataclasses.fields(config)
@@ -196,7 +196,7 @@ def config_texts(config: Any) -> dict[str, str]:
 
 
 def config_toml(name: str, config: Any) -> str:
-    """Return the TOML table of a config, each field under the words that document it."""
+    """Return the TOML table of a config, each field below a comment with its documentation."""
     documents = field_documents(type(config))
     lines = [f"[{name}]"]
     for key, text in config_texts(config).items():
@@ -206,9 +206,9 @@ def config_toml(name: str, config: Any) -> str:
 
 
 def made_with(path: Path, stage: Stage, known: Mapping[str, Any]) -> str | None:
-    """Return the name of the configuration that a file of a stage holds; None of another one.
+    """Return which of the ``known`` configurations a stage's file holds; None if it is another one.
 
-    Its comments, the settings' documentation, may be those of another version.
+    Comments are ignored: the settings' documentation may be that of another version.
     """
     text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
 
@@ -220,7 +220,7 @@ def made_with(path: Path, stage: Stage, known: Mapping[str, Any]) -> str | None:
 
 
 def field_documents(config: type) -> dict[str, str]:
-    """Return documentation strings that stand under the fields of a config dataclass."""
+    """Return the documentation strings below the fields of a config dataclass, by field."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(config)))
     except OSError:  # classes made at run time have no source

@@ -162,17 +162,16 @@ class Stage:
             returns a ``Result`` (the runner writes it to ``metrics.json``). Raises Express50Error
             when the data of this item are bad.
         presets: values of ``draft`` and ``reference`` that differ from the defaults, which are
-            ``standard``; a stage without a trade between time and error has none.
+            ``standard``; none if the stage offers no trade between time and error.
         try_files: opens the files that settings name; commands call it before any stage runs.
             Raises Express50Error where one cannot be used.
-        needs_gpu: whether items of this config may only run where there is a GPU; one at a time
-            runs on each.
+        needs_gpu: whether items of this config need a GPU; one item at a time runs on each.
         help: one line for the command line, in the imperative.
         purpose: one or two sentences for the report.
         runs_first: stages that the command of this one runs before it.
-        prepare: takes captures that the command names into the dataset, if asked to in place of
-            other captures of their subjects, and returns the ids of their items; only a stage that
-            has it accepts captures.
+        prepare: registers captures that the command names, and returns the ids of their items; if
+            its last argument is true, they may replace other captures of their subjects. Only a
+            stage that has it accepts captures.
         account: lines for people about items that were made, printed after the stage's account.
         growth: what its cost is proportional to.
     """

@@ -50,7 +50,7 @@ LARGEST_SPREAD = 1.2
 def shape_spread(shape: np.ndarray) -> float:
     """Return the root mean square of shape coefficients (S,): standard deviations of people.
 
-    About 0.5 for people; no person exceeds STRANGE.
+    About 0.5 for people; no person exceeds LARGEST_SPREAD.
     """
     return float(np.sqrt(np.mean(np.square(shape)))) if len(shape) else 0.0
 

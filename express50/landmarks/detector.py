@@ -35,8 +35,8 @@ from express50.landmarks.network import (
 HALF_CONFIDENCE_SHARE = 0.025
 VAGUE_SHARE = 0.06  # of the face box: median error scale that halves the score; no face is vague
 FOUND_SCORE = 0.5  # the search continues until a face has this score
-# The network finds faces of 0.5 to 1.4 times the trained size, up to a quarter of the window off
-# its middle: windows shrink by SHRINK, and are STEP of their side apart.
+# The network finds faces of 0.5 to 1.4 times the trained size, up to a quarter of the window from
+# its middle. So windows shrink by SHRINK, and lie STEP of their side apart.
 SHRINK, STEP = 0.55, 0.5
 SMALLEST = 0.25
 SMALL = 0.08  # where that finds too little: people fill a rig's pictures, but not all others

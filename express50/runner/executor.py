@@ -1,4 +1,4 @@
-"""Run tasks in worker processes; tasks whose worker died are tried again, then given up."""
+"""Run tasks in worker processes; tasks whose worker died are tried again, then fail."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Pool:
         self.close()
 
     def reach(self) -> None:
-        """Connect to the scheduler where one was given; StageError if it cannot be reached."""
+        """Connect to the scheduler, if one was given; StageError if it cannot be reached."""
         if self.scheduler is not None and self._workers is None:
             self._workers = RemoteWorkers.reach(self.scheduler)
 
@@ -208,8 +208,8 @@ class Pool:
 def _next_size(size: int, batch: list[Task], receipts: list[Receipt]) -> int:
     """Return the size of the next batches: larger while tasks are quick, else one.
 
-    A round trip to a worker costs 10 ms, which quick items share in a batch. Slow items go alone,
-    so that the death of a worker costs one of them at most.
+    A round trip to a worker costs 10 ms, which the items of a batch share. Slow items get batches
+    of their own, so that a worker that dies costs at most one of them.
     """
     if len(receipts) < len(batch):
         return len(receipts)

@@ -180,7 +180,7 @@ class Ledger:
 
     @contextmanager
     def _damage(self) -> Iterator[None]:
-        """Turn what any statement may meet (a damaged page, a full disk, a lock) into one error."""
+        """Turn whatever may go wrong in SQLite (damage, a full disk, a lock) into one error."""
         try:
             yield
         except (sqlite3.DatabaseError, ValueError, TypeError, OverflowError) as error:
@@ -231,7 +231,7 @@ class Ledger:
                 database.execute("INSERT INTO settings VALUES (?, ?, ?, ?)", settings)
 
     def note_attempt(self, last: Receipt) -> None:
-        """Note reason and time of an item's last attempt beside the receipt of what stands."""
+        """Note reason and time of an item's last attempt; the receipt of its output stays."""
         with self._change() as database:
             database.execute(
                 "UPDATE receipts SET reason = ?, time = ? WHERE stage = ? AND item = ?",
@@ -331,7 +331,7 @@ class Ledger:
     def erase(
         self, subject: str, root: Path, paths: Iterable[Path], names: Callable[[bytes], bool]
     ) -> None:
-        """Remove what is of a subject or names it, and overwrite the database's freed pages.
+        """Remove everything that belongs to a subject or names it; overwrite freed pages.
 
         Of ``paths``, which were removed below the dataset's ``root``, receipts and digests go; of
         others the reasons, inputs and footage in which ``names`` finds the subject.

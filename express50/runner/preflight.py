@@ -114,7 +114,7 @@ def expected_bytes(
 def expected_shortage(
     dataset: Dataset, ledger: Ledger, stage: str, items: Iterable[str]
 ) -> str | None:
-    """Say that a stage's outputs will not fit, judged by those measured; None if they will."""
+    """Say that a stage's outputs will not fit, judging by those it made; None if they will."""
     need = expected_bytes(ledger, stage, items)
     return next(_space_problems(dataset, [need]), None) if need else None
 

@@ -1,4 +1,4 @@
-"""Publish outputs safely: an item appears complete, in one rename; a stage runs once at a time."""
+"""Publish outputs safely: items appear complete, in one rename; a stage has one run at a time."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def publishing(
     folder: Path, dataset: Dataset, stage: str, item: str,
     keep: Callable[[Path], None] | None = None,
 ) -> Iterator[Path]:  # fmt: skip
-    """Yield an empty folder aside; on a clean exit it becomes the item's folder in one rename.
+    """Yield a temporary folder; on a clean exit it becomes the item's folder in one rename.
 
-    It is made in a run's ``folder``. When the body raises, the item's former folder stays. A former
+    It is made in a run's ``folder``. If the body raises, the item's former folder stays. A former
     folder that was replaced is deleted, unless ``keep`` moves it to another place.
     """
     aside = folder / f"{quote(item, safe='+')}-{uuid.uuid4().hex}"
@@ -170,5 +170,5 @@ def is_running(dataset: Dataset, stage: str) -> bool:
     if not path.is_file():
         return False
     with path.open("r") as file:
-        # Shared, and let go at once; a stage that starts meanwhile tries again.
+        # The lock is shared and released at once; a stage that starts meanwhile tries again.
         return not _locked(file, fcntl.LOCK_SH)

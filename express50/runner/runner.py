@@ -37,7 +37,7 @@ from express50.runner.replaced import keeping, make_room
 from express50.runner.worker import Task, failed_receipt, failure_reason, fingerprint, input_digests
 
 WARNINGS = 12  # lines; more of them would hide the account
-ALIKE = 3  # if this many first items fail for the same reason, a setting is wrong
+ALIKE = 3  # if the first items, this many, fail for the same reason, a setting is wrong
 KEPT = "imported; the stage does not make it"
 
 
@@ -225,20 +225,20 @@ def run_stage(
 
 @dataclass(frozen=True)
 class _Work:
-    """The items of a stage, sorted by the work that they need."""
+    """The items of a stage, sorted by what has to be done."""
 
     former: Mapping[str, Receipt]  # receipts of former runs
     current: dict[str, Outcome]  # outcomes of items that are up to date
     unreadable: list[Receipt]  # receipts of items whose inputs cannot be read
     tasks: list[Task]  # items to run
     again: dict[str, str]  # why items are run that a former run had made
-    stands: set[str]  # items whose former output stays valid until a new one is complete
+    still_valid: set[str]  # items whose former output stays valid until a new one is complete
 
 
 def _sort_items(
     stage: Stage, dataset: Dataset, config: Any, chosen: list[str], ledger: Ledger, threads: int
 ) -> _Work:
-    """Sort items into those that are up to date, that cannot be read, and that are to do."""
+    """Sort items into those that are up to date, unreadable, or to be run."""
     receipts, made = ledger.read(stage.name), ledger.made(stage.name)
     done = {item: receipt for item, receipt in receipts.items() if receipt.status == "done"}
     work = _Work(receipts, {}, [], [], {}, set())
@@ -264,9 +264,9 @@ def _sort_items(
         except Exception as error:  # noqa: BLE001 (one damaged item must not stop the others)
             reason = failure_reason(dataset, stage.name, item, error)
             work.unreadable.append(failed_receipt(task, reason, 0))
-            # A StageError: an earlier stage has taken back what the item was made of.
+            # A StageError means that an earlier stage no longer has what the item was made from.
             if item in done and not isinstance(error, StageError):
-                work.stands.add(item)
+                work.still_valid.add(item)
             continue
         task = replace(task, fingerprint=fingerprint(stage, config, inputs), inputs=inputs)
         if was_imported:
@@ -301,7 +301,7 @@ def _compare(task: Task, former: Receipt, made: Made | None, ledger: Ledger, wor
     made = made or Made(task.inputs, {})
     work.again[task.item] = why_outdated(task.stage, task.config, made, task.inputs)
     if there and not _other_data(task, made.inputs):
-        work.stands.add(task.item)
+        work.still_valid.add(task.item)
 
 
 def _is_there(task: Task, made: Made | None, ledger: Ledger) -> bool:
@@ -356,7 +356,7 @@ def _run_items(
     with showing(stage.name, total, progress) as show:
 
         def settle(receipt: Receipt) -> None:
-            _record(dataset, ledger, receipt, receipt.item in work.stands)
+            _record(dataset, ledger, receipt, receipt.item in work.still_valid)
             outcomes[receipt.item] = _outcome(receipt, again=work.again.get(receipt.item, ""))
             show(receipt)
             log.settle(receipt.item)
@@ -398,9 +398,9 @@ def _refuse_alike(stage: Stage, ended: list[Receipt], former: Mapping[str, Recei
         )
 
 
-def _record(dataset: Dataset, ledger: Ledger, receipt: Receipt, stands: bool) -> None:
+def _record(dataset: Dataset, ledger: Ledger, receipt: Receipt, still_valid: bool) -> None:
     """Store a receipt; a failed item's former output is set aside, unread, unless it stands."""
-    if receipt.status == "failed" and stands:
+    if receipt.status == "failed" and still_valid:
         ledger.note_attempt(receipt)
         return
     if receipt.status == "failed":

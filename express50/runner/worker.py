@@ -18,7 +18,7 @@ from typing import Any
 
 from threadpoolctl import ThreadpoolController
 
-from express50.console import line_of_system
+from express50.console import system_error_line
 from express50.contract.config import config_texts
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
@@ -29,7 +29,7 @@ from express50.runner.ledger import FileMark, Made, Receipt, mark_file
 from express50.runner.publish import publishing
 from express50.runner.replaced import empty, keeping, restore
 
-BATCH_SECONDS = 0.2  # a batch begins no further item after this long
+BATCH_SECONDS = 0.2  # after this time a batch begins no further item
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Task:
 def input_digests(
     stage: Stage, dataset: Dataset, item: str, config: Any, digest: Callable[[Path], str]
 ) -> dict[str, str]:
-    """Compute the digest of every input of an item, by name; ``digest`` is of a file or folder.
+    """Compute the digest of every input of an item, by name; ``digest`` digests a file or folder.
 
     Raises:
         Express50Error: an input is missing or cannot be read.
@@ -75,7 +75,7 @@ def failure_reason(dataset: Dataset, stage: str, item: str, error: Exception) ->
     if isinstance(error, Express50Error):
         return reason
     if isinstance(error, PermissionError):  # of the footage, most often: not a defect
-        return line_of_system(error)
+        return system_error_line(error)
     log = dataset.log_file(stage, item)
     try:
         write_bytes(log, "".join(traceback.format_exception(error)).encode())
@@ -109,18 +109,18 @@ def run_tasks(tasks: list[Task]) -> list[Receipt]:
 def run_task(task: Task) -> Receipt:
     """Run one item and publish its outputs; any failure of the item becomes a receipt.
 
-    An output that was made from the same and replaced later is published again instead. Only a
-    receipt travels back to the driver, never data.
+    If an output with the same fingerprint was replaced earlier and kept, it is published again
+    instead. Only a receipt travels back to the driver, never data.
 
     Raises:
-        DiskFullError: the disk has no room for the outputs; the other items' would fail alike.
+        DiskFullError: the disk has no room for the outputs; other items would fail as well.
     """
     where = task.folder, task.dataset, task.stage.name, task.item
     if (restored := restore(*where, task.fingerprint, task.former)) is not None:
         return restored
     cap_threads(task.threads)
     if allocator := keep_freed_memory():
-        allocator.malloc_trim(0)  # what the item before left counts neither as its nor as our peak
+        allocator.malloc_trim(0)  # memory that the previous item left must not count for this one
     reset_peak_memory()
     started, cores = time.perf_counter(), core_seconds()
     reason, made = "", None
@@ -132,7 +132,7 @@ def run_task(task: Task) -> Receipt:
     except DiskFullError:
         if not empty(task.dataset.replaced_dir)[0]:
             raise
-        return run_task(task)  # with the space of what was replaced earlier
+        return run_task(task)  # with the space that deleting replaced outputs gave
     except Exception as error:  # noqa: BLE001 (a defect that one item shows must not stop others)
         reason = failure_reason(task.dataset, task.stage.name, task.item, error)
     return Receipt(

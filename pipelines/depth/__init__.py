@@ -13,7 +13,7 @@ from express50.contract.stage import Growth, Result, Stage
 
 @dataclass(frozen=True, kw_only=True)
 class DepthConfig:
-    """The fineness of the surface, and the evidence that counts."""
+    """How fine the surface is, and which evidence counts."""
 
     voxel_mm: float = 1.6
     """Finest voxel of the last level, millimetres, 0.3 to 20."""

@@ -39,10 +39,11 @@ DIRECTIONS = _CELL / np.linalg.norm(_CELL, axis=1, keepdims=True)
 
 @dataclass(frozen=True)
 class TrackedSolid:
-    """A tracked mesh with caps over its holes, and those over large ones (the neck) as `border`.
+    """A tracked mesh whose holes have caps; `border` are those over large holes (the neck).
 
-    `body` goes on below large holes: silhouettes of a torso are not those of a head. `glasses` are
-    places (n, 3) all over frames and lenses. `shown` are views of the face with things before it.
+    `body` continues below large holes, because silhouettes of a torso are not those of a head.
+    `glasses` are places (n, 3) all over frames and lenses, `shown` are views of a face with things
+    in front of it.
     """
 
     scene: o3d.t.geometry.RaycastingScene
@@ -59,7 +60,7 @@ class TrackedSolid:
         return [silhouette_distance(view.bare.astype(np.float32)) for view in self.shown]
 
     def carved(self, points: np.ndarray, hull: np.ndarray) -> np.ndarray:
-        """Take the room before the face that views see away from the hull's distances (N,)."""
+        """Return the hull's distances (N,) without the space before the face that views see through."""
         for view, bare in zip(self.shown, self.bare_px, strict=True):
             pixels, depth = project_fast(view.camera, points)
             inside = in_picture(view.camera, pixels, depth)
@@ -71,10 +72,11 @@ class TrackedSolid:
     def merge(
         self, points: np.ndarray, hull: np.ndarray, outlines: Sequence[DepthView], reach: float
     ) -> np.ndarray:
-        """Blend the solid's distances into those (N,) to the hull, where under ``reach`` metres.
+        """Blend the solid's distances into the hull's (N,), where these are below ``reach`` metres.
 
         Where the hull of the body's own `outlines` lies far above the body, no silhouette shows the
-        surface. There it lies no further before or behind the body than the mattes reach beside it.
+        surface. There it may lie no further in front of or behind the body than the mattes extend
+        to its sides.
         """
         within = hull < reach
         points, own = points[within], hull[within]

@@ -37,7 +37,9 @@ def split_subjects(
         )
     test = set(test_subjects)
     if not test and fraction > 0 and len(subjects) > 1:
-        test = {name for name in subjects if draw(name) < fraction} or {min(subjects, key=draw)}
+        test = {name for name in subjects if split_position(name) < fraction} or {
+            min(subjects, key=split_position)
+        }
     train = sorted(set(subjects) - test)
     if not train:
         raise StageError(
@@ -47,7 +49,7 @@ def split_subjects(
     return {"train": train, "test": sorted(test)}
 
 
-def draw(subject: str) -> float:
+def split_position(subject: str) -> float:
     """Return a subject's place in [0, 1), uniform over ids: a hash of its id."""
     return int.from_bytes(hashlib.sha256(f"0:{subject}".encode()).digest()[:8]) / 2**64
 

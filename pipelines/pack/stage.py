@@ -18,7 +18,7 @@ from express50.files.images import contact_sheet, write_image
 from express50.files.text import read_json_table
 from express50.shards.reader import ShardReader, sample_panels, write_offsets, write_registered
 from express50.shards.writer import ShardWriter, gather_shards, write_manifest
-from pipelines.pack.card import draw, split_subjects, write_card
+from pipelines.pack.card import split_position, split_subjects, write_card
 from pipelines.pack.config import EncodeConfig, PackConfig
 from pipelines.pack.sample import encode_sample, load_sample, read_subject
 
@@ -125,18 +125,20 @@ def pack(dataset: Dataset, config: PackConfig, out: Path) -> Result:
     again = "run 'express50 pack' without a subset"
     mixed = [key for key in ("size", "profile") if "," in totals[key]]
     warnings = [Note(key, f"subjects were encoded with {totals[key]}; {again}") for key in mixed]
-    return Result(metrics, dropped, warnings + warn_of_lent(splits["test"], config))
+    return Result(
+        metrics, dropped, warnings + warn_of_temporary_test_subjects(splits["test"], config)
+    )
 
 
-def warn_of_lent(test: Sequence[str], config: PackConfig) -> list[Note]:
-    """Warn of a test subject that is drawn only for want of an id below the fraction."""
+def warn_of_temporary_test_subjects(test: Sequence[str], config: PackConfig) -> list[Note]:
+    """Warn of a test subject that was chosen only because no id's hash is below the fraction."""
     if config.test_subjects:
         return []
     why = (
-        "is tested on only until somebody with a lower hash of the id joins, and trained on from"
-        " then; name it in pack.test_subjects to keep it"
+        "moves to training as soon as a subject whose id has a lower hash is added; to keep it in"
+        " the test split, name it in pack.test_subjects"
     )
-    return [Note(name, why) for name in test if draw(name) >= config.test_fraction]
+    return [Note(name, why) for name in test if split_position(name) >= config.test_fraction]
 
 
 def _read_accounts(dataset: Dataset) -> tuple[dict[str, dict], list[Note]]:

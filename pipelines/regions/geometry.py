@@ -251,8 +251,8 @@ def place(
     return HeadGeometry(mesh, mesh_depth, mesh[row, column], rim, height, off)
 
 
-def before_face(geometry: HeadGeometry, labels: np.ndarray, metre_px: float) -> np.ndarray:
-    """Find hands (H, W) bool: what stands far off the face, wider than hairs.
+def find_hands(geometry: HeadGeometry, labels: np.ndarray, metre_px: float) -> np.ndarray:
+    """Find hands (H, W) bool: wide things far in front of the face.
 
     Only parts that are clear of the mesh count, without what `labels` (H, W) call hair.
     ``metre_px`` is the number of pixels that a metre spans at the head.

@@ -24,7 +24,7 @@ from pipelines.regions.geometry import (
     HAIR,
     SCALP,
     TrackedHead,
-    before_face,
+    find_hands,
     head_alpha,
     head_labels,
     make_head,
@@ -33,8 +33,11 @@ from pipelines.regions.geometry import (
 )
 from pipelines.regions.things import Picture, find_glasses, shown_before
 
-VOTERS, VOTING_SIDE = 4, 512  # cameras, and their pixels, that show skin colours and bare scalps
-WITNESSES = 10  # cameras, of that size, that show glasses
+STUDIED_CAMERAS, STUDIED_SIDE = (
+    4,
+    512,
+)  # cameras, and their pixels, that show skin colours and bare scalps
+GLASSES_CAMERAS = 10  # cameras, of that size, that show glasses
 AGREEMENT = 0.85  # a camera with less of the tracked mesh inside its matte gets a warning
 SHOWN = 4  # cameras in the contact sheet
 MARGIN = 32  # pixels about the subject: the discs that find hands and glasses are smaller
@@ -67,9 +70,9 @@ def run(
     cv2.setNumThreads(1)  # the runner counts one core per item
     subject, expression = item.split("/")
     head, glasses = read_head(dataset, subject, expression)
-    scalp, skin, frames = study_person(dataset, item, head)
+    scalp, skin, frames = judge_scalp_and_skin(dataset, item, head)
     if glasses is None:
-        glasses = find_glasses(head, facing(dataset, item, head))
+        glasses = find_glasses(head, face_pictures(dataset, item, head))
     if scalp_is != "auto":
         scalp = replace(scalp, is_skin=scalp_is == "skin")
     figures, rows = {}, {}
@@ -77,7 +80,7 @@ def run(
     for name, camera in read_cameras_of(dataset, subject).items():
         try:
             known = frames.pop(name, None)
-            rgb, alpha = known or read_pair(dataset, item, camera)
+            rgb, alpha = known or read_frame_and_matte(dataset, item, camera)
             depth = read_depth_of(dataset, item, camera) if use_depth else None
         except UNREADABLE as error:
             dropped.append(Note(name, str(error)))
@@ -91,7 +94,7 @@ def run(
     doubts = {name: view_warning(row) for name, row in figures.items()}
     warnings = [Note(name, why) for name, why in doubts.items() if why]
     if "torso" in head.labels.missing and not weights:
-        why = "the head model does not mark the neck's end, so that the torso cannot be cut off"
+        why = "the head model does not mark the neck's end, so the torso cannot be cut off"
         warnings.append(Note("torso", why))
     there = [row["mesh_in_matte"] for row in figures.values() if row["mesh_in_frame"]]
     metrics = {
@@ -128,7 +131,9 @@ def read_head(
     return make_head(vertices, track.R[row], labels), track.glasses_in(expression)
 
 
-def read_pair(dataset: Dataset, item: str, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def read_frame_and_matte(
+    dataset: Dataset, item: str, camera: Camera
+) -> tuple[np.ndarray, np.ndarray]:
     """Read the undistorted frame (H, W, 3) uint8 and alpha (H, W) float32 of one camera.
 
     Raises as `read_matted_frame`.
@@ -155,32 +160,32 @@ def read_depth_of(dataset: Dataset, item: str, camera: Camera) -> np.ndarray | N
     return depth
 
 
-def study_person(
+def judge_scalp_and_skin(
     dataset: Dataset, item: str, head: TrackedHead
 ) -> tuple[Scalp, np.ndarray | None, Frames]:
     """Judge the scalp and count the skin's colours in a few cameras; return their frames too."""
     cameras = list(read_cameras_of(dataset, item.split("/")[0]).values())
     votes, colours, frames = [], [], Frames()
-    for k in np.unique(np.linspace(0, len(cameras) - 1, VOTERS).round().astype(int)):
+    for k in np.unique(np.linspace(0, len(cameras) - 1, STUDIED_CAMERAS).round().astype(int)):
         with contextlib.suppress(*UNREADABLE):  # the stage names them
-            rgb, alpha = frames[cameras[k].id] = read_pair(dataset, item, cameras[k])
-            camera, rgb, alpha, _ = _shrunk(cameras[k], rgb, alpha, None, VOTING_SIDE)
+            rgb, alpha = frames[cameras[k].id] = read_frame_and_matte(dataset, item, cameras[k])
+            camera, rgb, alpha, _ = _shrunk(cameras[k], rgb, alpha, None, STUDIED_SIDE)
             mesh, _ = see(head, camera)
             votes.append(scalp_votes(rgb, mesh, alpha))
             colours += [c for c in (face_colours(rgb, alpha, mesh),) if c is not None]
     return decide(votes), sum(colours[1:], colours[0]) if colours else None, frames
 
 
-def facing(dataset: Dataset, item: str, head: TrackedHead) -> list[Picture]:
-    """Read reduced pictures of up to WITNESSES cameras, of those that see the face evenly."""
+def face_pictures(dataset: Dataset, item: str, head: TrackedHead) -> list[Picture]:
+    """Read reduced pictures of up to GLASSES_CAMERAS cameras that see the face, evenly chosen."""
     ahead, cameras = head.R[:, 2], read_cameras_of(dataset, item.split("/")[0]).values()
     seeing = [c for c in cameras if (c.center - head.center) @ ahead > 0]
     found = []
-    count = min(WITNESSES, len(seeing))  # 0 where all cameras stand behind the head
+    count = min(GLASSES_CAMERAS, len(seeing))  # 0 where all cameras stand behind the head
     for k in np.linspace(0, len(seeing) - 1, count).round().astype(int):
         with contextlib.suppress(*UNREADABLE):  # the stage names them
-            pair = read_pair(dataset, item, seeing[k])
-            found.append(_shrunk(seeing[k], *pair, None, VOTING_SIDE)[:3])
+            pair = read_frame_and_matte(dataset, item, seeing[k])
+            found.append(_shrunk(seeing[k], *pair, None, STUDIED_SIDE)[:3])
     return found
 
 
@@ -220,13 +225,13 @@ def label_view(
     labels = by_colour(rgb, alpha, geometry, bare, skin_colours)
     labels = np.where(labels == SCALP, SKIN if bare else HAIR, labels)
     if glasses is not None and len(glasses):
-        # Hair lies over what holds them.
+        # Hair covers the temples of glasses, so nothing on scalp and ears is labelled.
         bearing = (geometry.mesh == SCALP) | (geometry.mesh == EARS)
         worn = shown_before(glasses, camera, geometry.depth) & ~bearing
         labels = np.where(worn, np.uint8(LABELS.index("apparel")), labels)
     if depth is not None:
         distance = np.linalg.norm(head.center - camera.center)
-        hand = before_face(geometry, labels, camera.K[0, 0] / distance)
+        hand = find_hands(geometry, labels, camera.K[0, 0] / distance)
         labels = np.where(hand, np.uint8(LABELS.index("hand")), labels)
     whole.labels[window] = np.where(alpha > 0, labels, np.uint8(0))
     whole.mesh[window] = geometry.mesh > 0

@@ -35,7 +35,7 @@ NOISE_M = 0.0003  # standard deviation of a height that is fully trusted
 # Errors that neighbouring heights share. Set on three synthetic people so that 90 % intervals hold
 # there (docs/LOG.md, Registration).
 SURFACE_M = 0.0004
-STAY_M = 0.003  # standard deviation of the tracked mesh where no surface is found
+UNSEEN_SIGMA_M = 0.003  # standard deviation of the tracked mesh where no surface is found
 FOLD_M = 0.03  # a vertex that faces the mesh itself nearer than this lies in a fold
 NOSTRILS_M = 0.010  # so near to nostrils, depth's surface lies up to 2.5 mm outside the skin
 FINE = ("lips", "left_eye_region", "right_eye_region")  # with few views depth errs by 1 mm here
@@ -50,11 +50,14 @@ NOT_BARE = (
     "lips", "left_eye_region", "right_eye_region", "mouth_interior", "forehead", "boundary",
 )  # fmt: skip
 NEAR_M, LIPS_M = 0.004, 0.01  # a surface this near to the mesh is its skin; this near to lips, lips
-LEAST = 100  # fewest vertices of bare skin that show its colour
+LEAST_SKIN_VERTICES = 100  # fewest vertices of bare skin that show its colour
 # Least standard deviations of the logarithms of red over green, blue over green, brightness.
 SPREADS = (0.05, 0.05, 0.2)
-ODD = 3.0  # standard deviations off skin's colour at which trust is halved
-SURE = (0.5, 1.0)  # confidence, as a share of bare skin's, that gives no trust and full trust
+COLOUR_LIMIT = 3.0  # standard deviations off skin's colour at which trust is halved
+CONFIDENCE_RANGE = (
+    0.5,
+    1.0,
+)  # confidence, as a share of bare skin's, that gives no trust and full trust
 # The rim of hair has colours of skin, so a vertex is trusted only as far as those around it.
 AROUND_M, NEIGHBOURS, EVERY = 0.008, 12, 14
 
@@ -111,7 +114,7 @@ def lay(model: HeadModel, start: np.ndarray, surface: GivenSurface, detail: floa
     residual, trust = search.heights(mesh, normals, ROUNDS[-1][0])
     seen = trust * trusted * ~folded(mesh, normals, faces) > 0.05
     # Tracked vertices share their errors, so the springs between them underestimate these.
-    sigma = np.hypot(plate.sigma(weight), np.where(seen, SURFACE_M, STAY_M))
+    sigma = np.hypot(plate.sigma(weight), np.where(seen, SURFACE_M, UNSEEN_SIGMA_M))
     return LaidMesh(mesh, seen, np.where(seen, residual, 0.0), sigma)
 
 
@@ -159,7 +162,7 @@ class Plate:
         # Bending to a wave of this length and amplitude NOISE_M costs as much as missing it.
         scale = (detail / (2 * np.pi)) ** 2 / (NOISE_M * np.sqrt(np.median(mass)))
         self.bend = sparse.diags(scale * mass**-0.5) @ stiffness
-        self.stay = np.where(free, STAY_M, 1e-6) ** -2.0
+        self.stay = np.where(free, UNSEEN_SIGMA_M, 1e-6) ** -2.0
 
     def factor(self, weight: np.ndarray) -> SuperLU:
         """Factor the normal equations for heights of weights (V,), 1 / square metres."""
@@ -232,7 +235,7 @@ def skin_trust(
     bare = in_regions(model, FACE) & ~in_regions(model, NOT_BARE)
     distance, nearest = cKDTree(vertices).query(mesh[bare])
     reference = np.unique(nearest[distance < NEAR_M])
-    if len(reference) < LEAST:
+    if len(reference) < LEAST_SKIN_VERTICES:
         return confidence.astype(np.float64)
     # Standard deviations that colours are off those of bare skin.
     log = np.log(srgb_to_linear(colors / 255.0) + 0.01)
@@ -243,7 +246,9 @@ def skin_trust(
     _, owner = cKDTree(mesh).query(vertices, distance_upper_bound=LIPS_M)
     odd[np.r_[in_regions(model, ("lips",)), False][owner]] = 0.0
     sure = confidence / max(float(np.median(confidence[reference])), 1e-6)
-    trust = np.clip((sure - SURE[0]) / (SURE[1] - SURE[0]), 0.0, 1.0) / (1.0 + (odd / ODD) ** 4)
+    trust = np.clip(
+        (sure - CONFIDENCE_RANGE[0]) / (CONFIDENCE_RANGE[1] - CONFIDENCE_RANGE[0]), 0.0, 1.0
+    ) / (1.0 + (odd / COLOUR_LIMIT) ** 4)
     # A vertex among untrusted ones is not trusted either; every 14th neighbour is enough.
     some = np.arange(0, len(vertices), EVERY)
     distance, nearest = cKDTree(vertices[some]).query(vertices, min(NEIGHBOURS, len(some)))

@@ -182,7 +182,9 @@ def test_changed_suggestion_replaces_the_old_automatic_mark(watched):
 
 
 def test_align_command_observes_first_and_reports_a_missing_face(dataset, capsys, monkeypatch):
-    monkeypatch.setattr("annotations.observe.stage.FEW", 0)  # searching for small faces takes long
+    monkeypatch.setattr(
+        "annotations.observe.stage.SMALL_FACE_FRAMES", 0
+    )  # searching for small faces takes long
     surer = ["--workers", "0", "--set", "observe.min_score=1.0"]
     code = main(["align", str(dataset.root), *surer])
     lines = capsys.readouterr().out

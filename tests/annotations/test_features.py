@@ -178,13 +178,13 @@ def test_a_long_window_is_not_held_in_memory(dataset, monkeypatch):
 
     def watch_one():
         numbers = np.arange(12)
-        return stage._watch(
+        return stage._observe_camera(
             dataset, "S001", load_network(), "cam00", [numbers], numbers[:1], SMALLEST
         )
 
     whole = watch_one()
     monkeypatch.setattr(stage, "read_proxy", counted)
-    monkeypatch.setattr(stage, "HELD", 2)
+    monkeypatch.setattr(stage, "CACHED_FRAMES", 2)
     monkeypatch.setattr(stage, "BATCH", 2)
     for one, other in zip(watch_one(), whole, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-3)

@@ -30,7 +30,7 @@ from pipelines.pack.card import people_lines, split_subjects
 from pipelines.pack.config import EncodeConfig, PackConfig
 from pipelines.pack.crop import Crop, crop_pinhole, cut_depth, cut_image, cut_labels, head_crop
 from pipelines.pack.sample import nameless, occluded, read_subject
-from pipelines.pack.stage import warn_of_gaps, warn_of_lent
+from pipelines.pack.stage import warn_of_gaps, warn_of_temporary_test_subjects
 from tests.pipelines.bump_dataset import make_dataset, published
 
 SMALL = EncodeConfig(size=64)
@@ -154,9 +154,10 @@ def test_split_is_disjoint_and_stable():
     grown = split_subjects([*names, "S999"], (), 0.2)
     assert set(split["test"]) <= set(grown["test"])
     lent = split_subjects(["A", "B"], (), 0.01)["test"]
-    assert [note.what for note in warn_of_lent(lent, PackConfig(test_fraction=0.01))] == lent != []
-    assert warn_of_lent(split["test"], PackConfig(test_fraction=0.2)) == []
-    assert warn_of_lent(lent, PackConfig(test_subjects=tuple(lent))) == []
+    warned = warn_of_temporary_test_subjects(lent, PackConfig(test_fraction=0.01))
+    assert [note.what for note in warned] == lent != []
+    assert warn_of_temporary_test_subjects(split["test"], PackConfig(test_fraction=0.2)) == []
+    assert warn_of_temporary_test_subjects(lent, PackConfig(test_subjects=tuple(lent))) == []
     assert split_subjects(["A"], (), 0.5) == {"train": ["A"], "test": []}
     assert split_subjects(["A", "B"], ("B",), 0.5) == {"train": ["A"], "test": ["B"]}
     with pytest.raises(StageError, match="A, B"):

@@ -19,7 +19,7 @@ from pipelines.regions import STAGE, RegionsConfig
 from pipelines.regions.colour import decide, face_colours, scalp_votes, usual
 from pipelines.regions.geometry import (
     SCALP,
-    before_face,
+    find_hands,
     head_alpha,
     head_labels,
     make_head,
@@ -310,7 +310,7 @@ def test_what_stands_off_the_face_is_a_hand(off: float, is_hand: bool) -> None:
     nearer = np.where(thing, depth - off, depth)
     geometry = place(head, camera, np.ones(mesh.shape, np.float32), nearer)
     assert (geometry.off[~thing] < 1e-4).all()
-    found = before_face(geometry, geometry.labels(), camera.K[0, 0] / depth[depth > 0].mean())
+    found = find_hands(geometry, geometry.labels(), camera.K[0, 0] / depth[depth > 0].mean())
     assert found.any() == is_hand
     if is_hand:
         assert (found & thing).sum() > 0.6 * (found | thing).sum()

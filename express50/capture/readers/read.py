@@ -27,7 +27,7 @@ from express50.geometry.cameras import Camera
 from express50.rigs.world_frame import judge
 
 OURS = "express50"
-FPS = 24.0  # stands in where only the subject is asked for
+FPS = 24.0  # a placeholder, if only the subject is needed
 
 
 @dataclass(frozen=True)

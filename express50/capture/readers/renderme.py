@@ -26,7 +26,7 @@ from express50.rigs.other_tools import read_renderme
 
 FPS = 30.0
 FULL, KEY_FRAMES = "full", "key frames"
-USUAL = "e*"  # the twelve expressions; speech (s*) and hair (h*) are taken when asked for
+USUAL = "e*"  # the twelve expressions; speech (s*) and hair (h*) are read only if selected
 MOVED_MM = 1.0
 NAME = re.compile(r"([0-9]+)_([ehs].*?)(?:_(raw|anno))?")  # actor, performance, kind
 

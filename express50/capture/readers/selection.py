@@ -21,8 +21,8 @@ from express50.capture.raw import RawCamera
 from express50.errors import CaptureError
 
 EXPRESSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9_]*")
-# Share of the moments beyond which a camera is dropped rather than the moments, unless the camera
-# is a larger share of all cameras: then fewer pictures are lost with the moments.
+# A camera that lacks more than this share of the moments is dropped; otherwise the moments are.
+# With few cameras its own share of all cameras is the limit, so that fewer pictures are lost.
 LACKING = 0.02
 SHOWN = 4  # moments that a reason names
 
