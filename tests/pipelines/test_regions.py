@@ -26,7 +26,7 @@ from pipelines.regions.geometry import (
     place,
     see,
 )
-from pipelines.regions.stage import facing, label_view, read_head
+from pipelines.regions.stage import face_pictures, label_view, read_head
 from tests.pipelines.bump_dataset import make_dataset, published
 from tests.pipelines.region_scenes import COLOURS, RegionScene, camera_at, make_scene, tracked
 from tests.pipelines.stand_ins import Thirds, torchscript
@@ -239,7 +239,9 @@ def test_the_stage_writes_labels_and_heads_of_every_camera(dataset, tmp_path) ->
 def test_a_rig_behind_the_head_shows_no_glasses(dataset) -> None:
     head, _ = read_head(dataset, "S001", "smile")
     before = replace(head, center=head.center + 10 * head.R[:, 2])
-    assert facing(dataset, "S001/smile", head) and not facing(dataset, "S001/smile", before)
+    assert face_pictures(dataset, "S001/smile", head) and not face_pictures(
+        dataset, "S001/smile", before
+    )
 
 
 def test_smaller_working_sizes_give_labels_of_the_full_size(dataset, tmp_path) -> None:
