@@ -60,7 +60,7 @@ class TrackedSolid:
         return [silhouette_distance(view.bare.astype(np.float32)) for view in self.shown]
 
     def carved(self, points: np.ndarray, hull: np.ndarray) -> np.ndarray:
-        """Return the hull's distances (N,) less the space before the face that views see through."""
+        """Return the hull's distances (N,) less the space before the face that views see empty."""
         for view, bare in zip(self.shown, self.bare_px, strict=True):
             pixels, depth = project_fast(view.camera, points)
             inside = in_picture(view.camera, pixels, depth)
