@@ -18,6 +18,8 @@ import numpy as np
 
 from annotations import align, observe
 from benchmarks.common import run_or_stop
+from benchmarks.matte_disturbances import Shot, before_wall
+from benchmarks.matte_scenes import cluttered
 from benchmarks.track import write_peaks
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
@@ -51,7 +53,7 @@ class Condition:
     side: int = 256  # pixels of the pictures' sides
     distance: float = 1.0  # of the cameras, in the rig's usual one; the focal length grows with it
     noise: float = 1.0  # of the sensor, in that of a good studio camera
-    harm: str = ""  # ``blur``, ``light``, ``turned`` or nothing
+    harm: str = ""  # ``blur``, ``light``, ``turned``, ``plates``, ``wall`` or nothing
     preset: str = ""  # settings of all stages; the demo's if it is empty
     head: str = "procedural"  # model of the person
     costly: bool = False  # takes more than ten minutes of a core, and is run only if it is named
@@ -74,6 +76,9 @@ CONDITIONS = (
     Condition(name="blur", harm="blur"),
     Condition(name="wrong light", harm="light"),
     Condition(name="a camera off by a degree", harm="turned"),
+    Condition(name="no plates", harm="plates"),
+    Condition(name="no plates, 4 views", harm="plates", views=4),
+    Condition(name="no plates, cluttered wall", harm="wall"),
     Condition(name="128 px", side=128),
     Condition(name="noise", noise=6.0),
     Condition(name="512 px", side=512),
@@ -105,7 +110,7 @@ def make_row(condition: Condition, number: int, root: Path) -> tuple[Dataset, Tr
     capture = dataset.root / "capture" / subject
     if not capture.is_dir():
         shutil.copytree(film / "captures" / subject, capture)
-        _harm(capture, condition)
+        _harm(capture, condition, truth)
     run_chain(dataset, capture, truth.peaks(subject), condition.preset)
     return dataset, truth
 
@@ -126,8 +131,8 @@ def run_chain(dataset: Dataset, capture: Path, peaks: dict[str, int], preset: st
             return
 
 
-def _harm(capture: Path, condition: Condition) -> None:
-    """Leave cameras out, and spoil pictures or calibration."""
+def _harm(capture: Path, condition: Condition, truth: Truth) -> None:
+    """Leave cameras and plates out, and spoil pictures or calibration."""
     names = sorted(path.name for path in (capture / "cameras").iterdir())
     keep_cameras(capture, [names[k] for k in FRONT.get(condition.views, range(len(names)))])
     if condition.harm == "turned":
@@ -137,6 +142,10 @@ def _harm(capture: Path, condition: Condition) -> None:
         one = cameras[names[3]]
         cameras[names[3]] = replace(one, cam_from_world=turn @ one.cam_from_world)
         write_cameras(capture / "calibration.json", cameras)
+    if condition.harm == "wall":
+        _change_walls(capture, truth)
+    if condition.harm in ("plates", "wall"):
+        shutil.rmtree(capture / "plates")
     for k, folder in enumerate(sorted((capture / "cameras").iterdir())):
         gain = np.random.default_rng([7, k]).uniform(*LIGHT, 3)
         for path in sorted(folder.rglob("*.png")) if condition.harm in ("blur", "light") else ():
@@ -146,6 +155,21 @@ def _harm(capture: Path, condition: Condition) -> None:
             else:
                 picture = np.clip(picture * gain, 0, 255).astype(np.uint8)
             write_image(path, picture)
+
+
+def _change_walls(capture: Path, truth: Truth) -> None:
+    """Put another cluttered wall behind the peak frames of each camera."""
+    subject = capture.name
+    for k, (name, camera) in enumerate(sorted(truth.cameras(subject).items())):
+        for frame in truth.peaks(subject).values() if (capture / "cameras" / name).is_dir() else ():
+            path = capture / "cameras" / name / "frames" / f"{frame:06d}.png"
+            alpha = truth.render_alpha(subject, frame, camera)
+            shot = Shot(
+                camera=camera, frame=read_image(path), true=alpha, depth=0 * alpha,
+                plate=read_image(capture / "plates" / f"{name}.png"),
+                valid=np.ones(alpha.shape, bool),
+            )  # fmt: skip
+            write_image(path, before_wall(shot, cluttered, np.random.default_rng([11, k])).frame)
 
 
 def keep_cameras(capture: Path, kept: Sequence[str]) -> None:

@@ -113,7 +113,9 @@ def walls(shots: list[Shot]) -> dict[str, list[Shot]]:
         "cluttered": cluttered,
     }
     return {
-        name: [_before(shot, make, np.random.default_rng([7, k])) for k, shot in enumerate(shots)]
+        name: [
+            before_wall(shot, make, np.random.default_rng([7, k])) for k, shot in enumerate(shots)
+        ]
         for name, make in makers.items()
     }
 
@@ -150,7 +152,7 @@ def _falling_off(rng: np.random.Generator, size: int, colour: np.ndarray) -> np.
     return (1 + slope[0] * x + slope[1] * y)[..., None] * colour * rng.uniform(0.97, 1.03, 3)
 
 
-def _before(shot: Shot, make: Wall, rng: np.random.Generator) -> Shot:
+def before_wall(shot: Shot, make: Wall, rng: np.random.Generator) -> Shot:
     """Return a shot before another wall; frame and plate have noise of their own."""
     height, width = shot.true.shape
     light = np.clip(make(rng, max(height, width))[:height, :width], 0.01, 0.95)

@@ -251,7 +251,7 @@ def cast_maps(
 
     away = np.linalg.norm(surface.vertices.mean(0) - camera.center)
     pixel = float(away) / camera.K[0, 0]
-    step = max(1, int(surface.grid.voxel / (RAY_PIXELS * pixel)))
+    step = max(1, int(1e-3 * surface.figures["voxel_mm"] / (RAY_PIXELS * pixel)))
     width, height = -(-camera.width // step), -(-camera.height // step)
     wide = crop_camera(camera, 0, 0, width * step, height * step)
     coarse = resized(wide, width, height)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ from express50.head.load import load_head
 from express50.head.model import HeadModel, joint_angles, joint_transforms
 from express50.head.preview import render_preview
 from pipelines.register.lay import (
+    SURFACE_M,
     GivenSurface,
     LaidMesh,
     lay,
@@ -70,6 +72,10 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
     trust = skin_trust(model, start, surface.vertices, surface.colors, surface.confidence)
     trust[too_fine(model, start, surface.vertices)] = 0.0
     laid = lay(model, start, GivenSurface(surface.vertices, surface.faces, trust), DETAIL_M)
+    # Tracking sees lips, eyes and nostrils well: where it alone placed them, its deviations count.
+    fine = too_fine(model, start, start) & ~laid.seen & np.isfinite(track.sigma[row])
+    sigma = np.where(fine, np.hypot(track.sigma[row], SURFACE_M), laid.sigma)
+    laid = replace(laid, sigma=sigma)
     cameras = list(read_cameras_of(dataset, subject).values())
     shared = lone_sigma(laid, cameras, model)
     doubt = error_bounds("register", error_figures(laid, track, row), shared)

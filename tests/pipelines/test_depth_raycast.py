@@ -26,7 +26,8 @@ def ball(centre=0.0, radius=RADIUS) -> LevelSet:
 def surface_of(grid: LevelSet) -> HeadSurface:
     vertices, normals, faces = extract_mesh(grid)
     ones = np.ones(len(vertices), np.float32)
-    return HeadSurface(vertices, normals, faces, ones, np.zeros((len(vertices), 3), np.uint8), grid)
+    colors, figures = np.zeros((len(vertices), 3), np.uint8), {"voxel_mm": 1e3 * grid.voxel}
+    return HeadSurface(vertices, normals, faces, ones, colors, grid, figures)
 
 
 def true_depth(camera: Camera) -> np.ndarray:

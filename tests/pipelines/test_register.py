@@ -22,6 +22,7 @@ from express50.head.load import load_head
 from express50.head.model import joint_angles, pose, rest_vertices, skin
 from pipelines.register import STAGE
 from pipelines.register.lay import (
+    SURFACE_M,
     GivenSurface,
     Plate,
     SurfaceSearch,
@@ -228,6 +229,7 @@ def dataset(tmp_path, model) -> Dataset:
     dataset = Dataset(tmp_path)
     dataset.item_dir("track", "S001").mkdir(parents=True)
     arrays = track_arrays("procedural", offsets_mm=0.0)
+    arrays["sigma"] = np.full(arrays["vertices"].shape[:2], 6e-4, np.float32)
     write_track(dataset.track_file("S001"), arrays)
     dataset.cameras_file("S001").parent.mkdir(parents=True)
     write_cameras(dataset.cameras_file("S001"), make_rig(2))
@@ -265,6 +267,9 @@ def test_the_stage_writes_a_mesh_that_later_stages_take(dataset, tmp_path):
     assert np.array_equal(best, [track.vertices[0], found.vertices])
     assert np.abs(best[1] - track.vertices[1]).max() > 0.001
     assert found.seen.any() and np.isfinite(found.sigma).all()
+    left = load_head("procedural").regions["lips"].numpy() & ~found.seen  # to tracking
+    alone = np.hypot(track.sigma[1], SURFACE_M)[left]
+    assert left.sum() > 100 and found.sigma[left] == pytest.approx(alone, rel=1e-4)
     assert np.isfinite(found.bound).all() and (found.bound > 0).all()
     stated = result.expected_error
     assert stated.unit == "mm" and 0 < stated.low <= stated.value <= stated.high
