@@ -197,6 +197,8 @@ def existing_dataset(path: Path) -> Dataset:
     """Open the dataset of a folder that has a ledger; ConfigError if it has none."""
     dataset = Dataset(path)
     if not dataset.ledger.is_file():
+        if dataset.captures_file.is_file():  # a budgeted run was stopped while it measured
+            raise ConfigError(f"{path}: nothing has been made yet; run 'express50 run {path}'")
         what = "not a dataset (no ledger.sqlite)" if path.is_dir() else "no such dataset"
         raise ConfigError(f"{path}: {what}; run 'express50 ingest {path} CAPTURE'")
     return dataset

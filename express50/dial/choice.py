@@ -17,7 +17,7 @@ import numpy as np
 
 from express50.console import count, format_seconds, format_table
 from express50.contract.stage import Stage
-from express50.dial.budget import Budget, Goal
+from express50.dial.budget import Goal
 from express50.dial.figures import Cost, Footage, PilotFigures, Trial
 from express50.dial.laws import MeasuredSize, typical_seconds
 from express50.dial.pilot import Ladder, standard_of
@@ -293,6 +293,16 @@ def point_of(load: Workload, settings: Mapping[str, str]) -> Point:
     return point
 
 
+def check_unit(kinds: Sequence[ResultKind], goal: Goal) -> None:
+    """Raise ConfigError if no result of a chain has a goal's unit."""
+    by_unit: dict[str, list[str]] = {}
+    for kind in kinds:
+        by_unit.setdefault(kind.unit, []).append(kind.name)
+    if goal.unit not in by_unit:
+        units = "; ".join(f"{unit} ({', '.join(names)})" for unit, names in by_unit.items())
+        raise ConfigError(f"--error {goal.text}: expected one of these units: {units}")
+
+
 def goal_result(load: Workload, goal: Goal) -> str:
     """Return the name of the first result whose error is stated in a goal's unit.
 
@@ -303,7 +313,8 @@ def goal_result(load: Workload, goal: Goal) -> str:
         if kind.unit == goal.unit and remaining_error(load, kind.name) is not None:
             return kind.name
     raise ConfigError(
-        f"--error: no stage states its error in {goal.unit}; give --budget, or another unit"
+        f"--error {goal.text}: no stage could state an error in {goal.unit} on this footage; give"
+        " --budget instead"
     )
 
 
@@ -340,13 +351,13 @@ def expected_lines(point: Point) -> Iterator[str]:
         yield f"{words}: {', '.join(others)}"
 
 
-def choice_lines(
-    load: Workload, point: Point, budget: Budget | None, spent: float
-) -> Iterator[str]:
-    """Yield what is expected of a choice, and why each setting was chosen."""
+def choice_lines(load: Workload, point: Point, asked: str, spent: float) -> Iterator[str]:
+    """Yield what is expected of a choice, and why each setting was chosen.
+
+    `asked` is the budget and the goal, for people.
+    """
     kind = "core time" if load.cores else count(load.width, "worker")
-    whole = f"budget {budget.text}" if budget else "no budget"
-    yield f"{whole}, {kind}: {format_seconds(spent)} spent on measuring"
+    yield f"{asked}, {kind}: {format_seconds(spent)} spent on measuring"
     yield from expected_lines(point)
     yield f"done in {format_seconds(spent + point.seconds)}, measuring included"
     rows = []

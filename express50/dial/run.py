@@ -22,6 +22,7 @@ from express50.dial.budget import Budget, Clock, Goal, budget_text
 from express50.dial.choice import (
     Point,
     Workload,
+    check_unit,
     choice_lines,
     choose,
     error_text,
@@ -42,6 +43,7 @@ from express50.dial.pilot import (
     pilot_dir,
     stated_errors,
 )
+from express50.dial.results import RESULTS
 from express50.errors import ConfigError, FormatError, StageError
 from express50.files.atomic import write_json
 from express50.files.text import read_json_table
@@ -174,6 +176,11 @@ class _Run:
         path = dial_dir(self.chain.dataset) / "run.json"
         write_json(path, asdict(replace(self.state, spent=self.clock.now())))
 
+    def asked(self) -> str:
+        """Write the budget and the goal with the result that it is for."""
+        goal = f"error {self.state.goal} of the {self.wanted[0]}" if self.wanted else ""
+        return ", ".join(filter(None, [self.state.budget and f"budget {self.state.budget}", goal]))
+
     def workload(self) -> Workload:
         """Describe what is left to make; stages that have begun keep their setting."""
         begun = {name: self.state.settings[name] for name in self.state.begun}
@@ -203,12 +210,26 @@ def run_within(
             goal; the sentence says what would.
         StageError: nothing can be measured.
     """
+    if goal is not None:
+        check_unit(chain.kinds, goal)
     state = _resumed(chain, budget, goal)
     again = state.finished  # for captures that were added since: they get the budget anew
     state = replace(state, spent=0.0, finished=False) if again else state
     clock = Clock(budget, spent=state.spent)
     run = _Run(chain, clock, state)
     clock.keep = run.keep
+    try:
+        return _measure_and_run(run, goal, again, ended)
+    except KeyboardInterrupt:
+        run.keep()  # the stopped item took time as well
+        raise
+
+
+def _measure_and_run(
+    run: _Run, goal: Goal | None, again: bool, ended: Callable[[Stage, Summary], None]
+) -> tuple[list[Summary], RunState]:
+    """Measure, choose settings unless they are chosen already, and run the stages."""
+    chain, clock, state, budget = run.chain, run.clock, run.state, run.clock.budget
     allowance = PILOT_SHARE * budget.seconds if budget else math.inf
     run.measured = measured_figures(chain, clock, allowance, chosen=bool(state.settings))
     load = run.workload()
@@ -220,12 +241,12 @@ def run_within(
             state, settings=point.settings, seconds=clock.now() + point.seconds, promised=promised
         )
         keep_for_run(chain.dataset, point.settings)
-        lines = choice_lines(load, point, budget, clock.now())
+        lines = choice_lines(load, point, run.asked(), clock.now())
     else:
         if again:
             run.state = replace(state, seconds=clock.now() + front(load)[0].seconds)
-        spent = format_seconds(clock.now())
-        lines = iter([f"continuing with the chosen settings; {spent} of the budget are spent"])
+        spent = "with the whole budget again" if again else f"{format_seconds(clock.now())} spent"
+        lines = iter([f"continuing with the chosen settings, {spent}"])
     for line in lines:
         chain.tell(line)
     run.keep()
@@ -272,14 +293,14 @@ def _first_choice(run: _Run, load: Workload, goal: Goal | None) -> Point:
         asked = f"--budget {clock.budget.text if clock.budget else ''}"
         if clock.closed():
             raise ConfigError(
-                f"{asked}: the time ended while settings were measured (the measurements are kept);"
-                f" the cheapest need more than {format_seconds(least)} {words}; give several times"
-                " as much"
+                f"{asked}: it ended before every stage was measured at its cheapest setting; the"
+                f" cheapest settings need more than {format_seconds(least)} {words}; give several"
+                " times as much; what was measured is kept"
             )
         raise ConfigError(
             f"{asked}: the cheapest settings need about {format_seconds(least)} {words},"
-            f" {format_seconds(clock.now())} of it already spent on measuring; give --budget"
-            f" {budget_text(1.1 * least, load.cores)} or more"
+            f" {format_seconds(clock.now())} of it already spent on measuring, which is kept; give"
+            f" --budget {budget_text(1.1 * least, load.cores)} or more"
         )
     point = choose(points, left * SAFETY, wanted)
     if goal is not None and wanted is not None and point.errors[wanted[0]].value > goal.value:
@@ -289,7 +310,11 @@ def _first_choice(run: _Run, load: Workload, goal: Goal | None) -> Point:
             need = format_seconds(clock.now() + reaching[0].seconds)
             how = f"takes about {need}, which is more than --budget"
         else:
-            how = f"the most expensive settings give {error_text(name, points[-1].errors[name])}"
+            best = min((p.errors[name] for p in points), key=lambda error: error.value)
+            how = f"the best that any settings give is {error_text(name, best)}"
+            if untried := [f"{n} {' and '.join(more)}" for n, more in run.measured.untried.items()]:
+                how = f"the best of the settings that were tried is {error_text(name, best)};"
+                how += f" there was no time to try {', '.join(untried)}; give a larger --budget"
         raise ConfigError(f"--error {goal.text}: {how}")
     return point
 
@@ -355,9 +380,14 @@ def closing_lines(state: RunState, summaries: Sequence[Summary]) -> Iterator[str
     """Yield time spent, the errors that the stages state, and what is left."""
     whole = f" of {state.budget}" if state.budget else ""
     yield f"spent {format_seconds(state.spent)}{whole}, {format_seconds(state.seconds)} expected"
+    promised = {name: said for name, said in state.promised.items() if said["stated"]}
+    units = {kind.name: kind.unit for kind in RESULTS}
+    units |= {name: said["unit"] for name, said in promised.items()}
     for name, (value, low, high) in state.stated.items():
-        unit, said = state.promised[name]["unit"], state.promised[name]["value"]
-        yield f"{name}: {value:.2g} {unit} ({low:.2g} to {high:.2g}), {said:.2g} promised"
+        said = f"{promised[name]['value']:.2g} promised" if name in promised else "nothing promised"
+        yield f"{name}: {value:.2g} {units[name]} ({low:.2g} to {high:.2g}), {said}"
+    for name in (n for n in promised if n not in state.stated and state.finished):
+        yield f"{name}: no error is stated, {promised[name]['value']:.2g} {units[name]} promised"
     left = [f"{s.count('left')} of {s.stage}" for s in summaries if s.count("left")]
     if not state.finished:
         what = ", ".join(left) or "later stages"

@@ -8,11 +8,11 @@ from dataclasses import replace
 import pytest
 
 from annotations.suggestions import reference_subject
-from express50.contract.layout import Dataset
+from express50.contract.layout import Dataset, existing_dataset
 from express50.dial.budget import Clock, parse_budget, parse_goal
 from express50.dial.figures import Cost, Footage, Trial, dial_dir
 from express50.dial.pilot import Pilot, pilot_dir, spare_seconds, trial_seconds
-from express50.dial.run import closing_lines, reserved, run_within
+from express50.dial.run import RunState, closing_lines, reserved, run_within
 from express50.dial.tune import tune
 from express50.errors import ConfigError, StageError
 from express50.files.atomic import write_json
@@ -120,6 +120,8 @@ def test_a_budget_below_the_cheapest_settings_says_what_the_least_is(tmp_path, c
     with pytest.raises(ConfigError, match=r"the cheapest (settings )?need .*; give"):
         go(tmp_path / "d", captures, "0.2s")
     assert not (tmp_path / "d" / "map").exists()
+    with pytest.raises(ConfigError, match="nothing has been made yet; run 'express50 run"):
+        existing_dataset(tmp_path / "d")
     _, state = go(tmp_path / "d", captures, "5m")  # with what the pilot made
     assert state.finished and state.stated["value"][0] == pytest.approx(error_of(state.settings))
 
@@ -134,10 +136,28 @@ def test_a_goal_is_reached_in_the_least_time_or_refused(tmp_path, captures):
     _, state = go(tmp_path / "d", captures, goal="0.8mm")
     assert error_of(state.settings) <= 0.8
     assert state.settings["solve"] == "standard" and state.settings["map"] == "standard"
-    with pytest.raises(ConfigError, match=r"0\.1mm: the most expensive settings give value 0\.5"):
+    with pytest.raises(ConfigError, match=r"0\.1mm: the best that any settings give is value 0\.5"):
         go(tmp_path / "d", captures, goal="0.1mm")
-    with pytest.raises(ConfigError, match="no stage states its error in px"):
-        go(tmp_path / "d", captures, goal="1px")
+    with pytest.raises(ConfigError, match=r"1px: expected one of these units: mm \(value\)"):
+        go(tmp_path / "other", captures, goal="1px")
+    assert not (tmp_path / "other" / ".staging").exists()  # nothing was measured for it
+
+
+def test_a_goal_that_untried_settings_may_reach_asks_for_more_time(tmp_path, captures, monkeypatch):
+    monkeypatch.setattr("express50.dial.run.PILOT_SHARE", 0.0)
+    monkeypatch.setattr("express50.dial.pilot.SPARE_SHARE", 0.0)
+    with pytest.raises(ConfigError, match=r"no time to try .*solve standard and reference.*larger"):
+        go(tmp_path / "d", captures, "5m", "0.6mm")
+
+
+def test_errors_that_only_trials_or_only_results_state_are_no_broken_promise():
+    said = {"value": 1.0, "low": 0.5, "high": 2.0, "unit": "mm", "stated": True}
+    state = RunState(key="", budget="1h", goal="", finished=True, promised={"track": said},
+                     stated={"depth": [1.0, 0.5, 2.0]})  # fmt: skip
+    lines = list(closing_lines(state, []))
+    assert lines[1:] == [
+        "depth: 1 mm (0.5 to 2), nothing promised", "track: no error is stated, 1 mm promised"
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("place", ["solve S1", "map S2/e1"])
@@ -152,7 +172,7 @@ def test_an_interrupted_run_goes_on_with_its_choices_and_ends_alike(
     said = []
     _, state = go(tmp_path / "d", captures, "5m", said=said)
     assert state.settings == before["settings"] and state.spent > before["spent"] > 0
-    assert any("going on" in line for line in said) and state.finished
+    assert any("continuing with" in line for line in said) and state.finished
     other = chain_of(tmp_path / "other", captures)
     for stage in other.stages:
         config = other.ladders[stage.name][state.settings[stage.name]]
