@@ -19,8 +19,15 @@ from express50.errors import CaptureError
 from express50.files.atomic import dump_json
 from express50.files.containers import WITHIN, inside, read_picture
 from express50.files.digests import file_sha256, text_digest
-from express50.files.images import encode_jpeg, has_alpha, shrink, upright
-from express50.files.video import iterate_video, video_fps
+from express50.files.images import (
+    ORIENTATION,
+    encode_jpeg,
+    has_alpha,
+    read_exif,
+    shrink,
+    upright,
+)
+from express50.files.video import iterate_video, video_fps, video_turn
 from express50.geometry.sampling import edge_width
 from pipelines.ingest.quality import CameraMeasurements, light_cells, movement, small_grey
 
@@ -149,23 +156,32 @@ def _steps(pts: tuple[int, ...], clips: tuple[int, ...]) -> np.ndarray:
 
 
 def odd_footage(raw: RawCapture, cameras: Mapping[str, CameraSource]) -> dict[str, str]:
-    """Return warnings about rate, time stamps and channels, by camera."""
+    """Return warnings about rate, time stamps, channels and orientation, by camera."""
     found = {}
     for name, source in cameras.items():
-        words = []
+        words, camera, orientation = [], raw.cameras[name], 1
         if source.kind == "frames":
-            path = raw.cameras[name].path / raw.cameras[name].names[0]
-            if path.is_file() and has_alpha(path):  # no file: a member of a container
-                words.append("has an alpha channel, which is left out: a later stage makes mattes")
+            path = camera.path / camera.names[0]
+            if path.is_file():  # no file: a member of a container
+                orientation, _ = read_exif(path)
+                if has_alpha(path):
+                    why = "has an alpha channel, which is left out: a later stage makes mattes"
+                    words.append(why)
         else:
-            words += [w for w in (_rate(raw, raw.cameras[name]), _uneven(source)) if w]
+            path = inside(camera.path, camera.names[0]) if camera.names else camera.path
+            orientation = ORIENTATION[video_turn(path)]
+            words += [w for w in (_rate(raw, path), _uneven(source)) if w]
+        if orientation != 1 and camera.orientation == 1:
+            words.append(
+                "asks players to turn or mirror it, but is used as stored; calibration, board and"
+                " plates must be as stored too"
+            )
         if words:
             found[f"camera {name}"] = "; ".join(words)
     return found
 
 
-def _rate(raw: RawCapture, camera: RawCamera) -> str:
-    path: Path = inside(camera.path, camera.names[0]) if camera.names else camera.path
+def _rate(raw: RawCapture, path: Path) -> str:
     with suppress(CaptureError):  # a container without a rate
         fps = video_fps(path)
         if abs(fps - raw.fps) > FPS_SLACK * raw.fps:

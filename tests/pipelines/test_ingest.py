@@ -19,7 +19,7 @@ from express50.runner.runner import run_stage
 from pipelines import ingest
 from pipelines.ingest.scan import time_gaps
 from pipelines.ingest.stage import usual_count
-from tests.synth import make_capture, noise_video_images, write_frames, write_video
+from tests.synth import make_capture, noise_video_images, turn_video, write_frames, write_video
 
 
 def run(dataset, **values):
@@ -274,7 +274,8 @@ def test_real_size_captures(shared, tmp_path):
 def test_footage_unlike_what_is_said_of_it_is_a_warning(tmp_path):
     root = tmp_path / "S001"
     make_capture(root, cameras=3, frames=24, video=True)
-    clear, uneven = (root / "cameras" / name / "video.mp4" for name in ("cam01", "cam02"))
+    turned, clear, uneven = (root / f"cameras/cam0{n}/video.mp4" for n in range(3))
+    turn_video(turned)
     images = [image for _, image in iterate_video(clear)]
     ticks = [4 * n + (n % 3 == 0) * 2 for n in range(24)]
     write_video(uneven, images, b_frames=0, ticks=ticks)
@@ -289,6 +290,7 @@ def test_footage_unlike_what_is_said_of_it_is_a_warning(tmp_path):
     assert run(dataset).ok
     said = {row["what"]: row["why"] for row in metrics(dataset)["warnings"]}
     assert "is a video at 24 fps, the capture says 12" in said["camera cam00"]
+    assert "used as stored" in said["camera cam00"] and "stored" not in said["camera cam01"]
     assert "variable" not in said["camera cam00"]
     assert "has an alpha channel, which is left out" in said["camera cam01"]
     assert "has a variable frame rate" in said["camera cam02"]
