@@ -64,6 +64,8 @@ def measure_calibrate(dataset: Dataset, truth: Truth, out: Path | None = None) -
         for subject in calibrated_subjects(dataset)
     ]
     keys = ("rotation_error_deg_max", "translation_error_mm_max", "head_px")
+    if not rows:
+        return {"rigs": 0}
     return {key: float(np.max([row[key] for row in rows])) for key in keys}
 
 
@@ -143,6 +145,8 @@ def measure_matte(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
             rim.append(error[soft].mean())
         rows.append([_grey(alpha), _grey(true), _grey(error)])
         names.append(f"{subject} {expression} {camera.id}: alpha, truth, error")
+    if not whole:
+        return {"views": 0}
     _sheet(out, "matte_error", rows, names)
     return {
         "mae": float(np.mean(whole)),
@@ -171,6 +175,8 @@ def measure_track(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
             distance = np.linalg.norm(moved - true, axis=1)
             squares.append(float((distance**2).mean()))
             medians.append(float(np.median(distance)))
+    if not squares:
+        return {"meshes": 0}
     return {
         "vertex_rmse_mm": 1e3 * float(np.sqrt(np.mean(squares))),
         "vertex_median_mm": 1e3 * float(np.median(medians)),
@@ -210,12 +216,14 @@ def measure_depth(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
             f"{subject} {expression} {camera.id}: depth, truth, error to {ERROR_RANGE_MM:g} mm,"
             f" normals on skin to {ERROR_RANGE_DEG:g} degrees"
         )
+    if not errors:
+        return {"views": 0}
     _sheet(out, "depth_error", rows, names)
-    every, turns = np.concatenate(errors), np.concatenate(degrees)
+    every, bare, turns = map(np.concatenate, (errors, skin, degrees))
     return {
-        "abs_error_mm_median": float(np.median(every)),
-        "abs_error_mm_p95": float(np.percentile(every, 95)),
-        "skin_error_mm_median": float(np.median(np.concatenate(skin))),
+        "abs_error_mm_median": float(np.median(every)) if len(every) else None,
+        "abs_error_mm_p95": float(np.percentile(every, 95)) if len(every) else None,
+        "skin_error_mm_median": float(np.median(bare)) if len(bare) else None,
         "normal_error_deg_median": float(np.median(turns)) if len(turns) else None,
         "coverage": float(np.mean(covered)),
         "views": len(errors),
@@ -249,6 +257,8 @@ def measure_regions(dataset: Dataset, truth: Truth, out: Path | None = None) -> 
         found.append(view_row(true, true_alpha, alpha, labels))
         rows.append([COLOURS[labels], COLOURS[true], _grey(np.abs(alpha - true_alpha))])
         names.append(f"{subject} {expression} {camera.id}: parts, truth, error of the head's alpha")
+    if not found:
+        return {"views": 0}
     _sheet(out, "regions_error", rows, names)
     return {
         "head_mae": float(np.mean([row["mae"] for row in found])),

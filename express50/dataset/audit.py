@@ -20,9 +20,16 @@ from express50.console import count
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset, footage_root
 from express50.contract.stage import Stage
-from express50.dataset.withdraw import files_that, names_any_of, says, withdrawn
+from express50.dataset.withdraw import (
+    cameras_of,
+    files_that,
+    names_any_of,
+    names_as_subject,
+    says,
+    withdrawn,
+)
 from express50.errors import AnnotationError, ConfigError, Express50Error, FormatError
-from express50.files.digests import file_sha256, files_of
+from express50.files.digests import file_sha256, files_of, text_digest
 from express50.runner.imported import AGAIN, import_trouble
 from express50.runner.ledger import FileMark, Ledger, Receipt
 from express50.runner.outdated import BAD_INPUT, differing, few, published_digest, why_outdated
@@ -193,7 +200,14 @@ def _person_findings(dataset: Dataset, checkpoints: Sequence[Path]) -> Iterator[
     there = set(dataset.subjects())
     with suppress(FormatError):  # which is a finding of its own
         there |= dataset.captures().keys()
-    test = names_any_of(digests, there)
+    # Cameras of others may have a withdrawn id.
+    shared = {one for one in cameras_of(dataset, there) if text_digest(one) in digests}
+    tests = [names_any_of(digests - {text_digest(one) for one in shared}, there)]
+    tests += map(names_as_subject, shared)
+
+    def test(text: bytes) -> bool:
+        return any(one(text) for one in tests)
+
     for path in [*files_that(test, dataset.root), *(p for p in checkpoints if says(p, test))]:
         inside = path.is_relative_to(dataset.root)
         yield Finding(

@@ -6,9 +6,10 @@ A checkpoint loses the person's codes and frames; only retraining removes what i
 learned. The raw capture lies outside the dataset: deleting it is up to its owner.
 
 Ids match as whole words: with letters or digits next to it, it is a different id, and so is a part
-of another subject's id (S001 of S001_2). A number in JSON or TOML is not an id. Archives, arrays of
-text and the ledger are searched; pixels and points are not, as they may contain any four bytes by
-chance.
+of another subject's id (S001 of S001_2). A number in JSON or TOML is not an id. If another subject
+has a camera of the same name, only what calls the id a subject or names its items counts.
+Archives, arrays of text and the ledger are searched; pixels and points are not, as they may contain
+any four bytes by chance.
 """
 
 from __future__ import annotations
@@ -28,8 +29,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any
 
+from express50.capture.index import read_index
 from express50.contract.layout import Dataset
-from express50.errors import FormatError, check_known
+from express50.errors import Express50Error, FormatError, check_known
 from express50.files.atomic import write_json
 from express50.files.digests import files_of, text_digest
 from express50.files.text import NAME, read_json, read_json_table
@@ -210,7 +212,35 @@ def _digest(row: Any) -> Any:
 
 def names_in(dataset: Dataset, subject: str) -> Test:
     """Make a test of whether a text of a dataset names a subject."""
-    return names(subject, {*dataset.captures(), *dataset.subjects()} - {subject})
+    captures = dataset.captures()
+    if subject in cameras_of(dataset, {*dataset.subjects()} - {subject}):
+        return names_as_subject(subject, str(captures.get(subject, "")))
+    return names(subject, {*captures, *dataset.subjects()} - {subject})
+
+
+def cameras_of(dataset: Dataset, subjects: Collection[str]) -> set[str]:
+    """Return the ids of the subjects' cameras."""
+    found: set[str] = set()
+    for subject in subjects:
+        with suppress(Express50Error):  # not ingested, or damaged
+            found |= read_index(dataset, subject).cameras.keys()
+    return found
+
+
+def names_as_subject(subject: str, capture: str = "") -> Test:
+    """Make a test for an id that is a camera's too: it must be called a subject, or own an item.
+
+    Paths below its raw ``capture`` name it as well.
+    """
+    word = re.escape(subject)
+    uses = [
+        rf'(?:subject|reference)\w*"?\s*[:=]\s*(?:\[[^]]*)?"?(?<![\w-]){word}(?![\w-])',
+        rf'(?:^|"){word}(?:$|/[A-Za-z])',  # an item, in a table or quoted
+        rf"^[\w.-]+/(?:[\w.-]+/)?{word}(?:$|/|\.jsonl$)",  # a path in a dataset
+        *([re.escape(capture)] if capture else []),
+    ]
+    found = re.compile("|".join(uses).encode(), re.MULTILINE)
+    return lambda text: found.search(text) is not None
 
 
 def names(subject: str, others: Collection[str] = ()) -> Test:

@@ -5,9 +5,12 @@ from __future__ import annotations
 from dataclasses import fields
 
 import numpy as np
+import pytest
 
+from benchmarks.accuracy import measure_depth, measure_matte, measure_regions, measure_track
 from benchmarks.depth_score import of_surest, summary
 from benchmarks.depth_sweep import AXES
+from express50.contract.layout import Dataset
 from pipelines.depth import DepthConfig
 
 
@@ -38,3 +41,9 @@ def test_the_tail_of_the_surest_pixels_leaves_out_those_of_least_confidence():
     found = of_surest(errors, sure)["abs_error_mm_p95_of_surest"]
     assert found["0.98"] == 20 and found["0.9"] == 1
     assert of_surest(errors, -sure)["abs_error_mm_p95_of_surest"]["0.7"] == 20
+
+
+@pytest.mark.parametrize("measure", [measure_matte, measure_track, measure_depth, measure_regions])
+def test_stages_without_outputs_have_no_figures(measure, tmp_path) -> None:
+    """They were NaN, which is not JSON."""
+    assert set(measure(Dataset(tmp_path), None).values()) == {0}

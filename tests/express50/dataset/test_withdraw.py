@@ -15,6 +15,7 @@ from express50.capture.readers.read import read_people
 from express50.cli.status import read_status
 from express50.contract.layout import Dataset
 from express50.dataset import withdraw as withdraw_module
+from express50.dataset.audit import audit
 from express50.dataset.withdraw import (
     files_that,
     names,
@@ -87,6 +88,38 @@ def test_nothing_of_the_subject_stays_and_the_others_are_untouched(dataset):
     assert dataset.subjects() == ["S002"]
     with Ledger(dataset.ledger) as ledger:
         assert list(ledger.read("ingest")) == ["S002"]
+
+
+def test_a_camera_with_the_persons_id_is_not_the_person(tmp_path):
+    rename = {"cam00": "01", "cam01": "02"}
+    for name in ("01", "02"):
+        raw = tmp_path / "raw" / name
+        make_capture(raw, subject=name, cameras=2, frames=4)
+        for path in (raw / "cameras", raw / "plates"):
+            for file in list(path.iterdir()):
+                file.rename(file.with_name(file.name.replace(file.stem, rename[file.stem])))
+        table = json.loads((raw / "calibration.json").read_text())
+        text = json.dumps({rename[k]: v for k, v in table.items()})
+        (raw / "calibration.json").write_text(text)
+    captures = [str(tmp_path / "raw" / name) for name in ("01", "02")]
+    assert main(["ingest", str(tmp_path / "data"), *captures, "--workers", "0"]) == 0
+    dataset = Dataset(tmp_path / "data")
+    with publishing(dataset, "align", "02") as out:  # peaks that were matched to the other person's
+        (out / "metrics.json").write_text('{"reference": "01"}')
+    with publishing(dataset, "matte", "02/smile") as out:
+        (out / "metrics.json").write_text('{"border_contact": {"01": 0.5}}')
+        (out / "01.png").write_bytes(b"pixels")
+    others = {k: v for k, v in tree(dataset.root).items() if k.startswith(("ingest/02", "matte"))}
+    assert len(others) > 5
+    done = withdraw(dataset, "01")
+    assert done.remaining == () and not dataset.item_dir("ingest", "01").exists()
+    assert not dataset.item_dir("align", "02").exists()
+    assert {k: v for k, v in tree(dataset.root).items() if k in others} == others
+    assert not [found for found in audit(dataset, []).findings if found.kind == "person"]
+    dataset.labels_file("02").parent.mkdir(exist_ok=True)
+    dataset.labels_file("02").write_text('{"camera": "01", "reference": "01"}\n')
+    (found,) = [found for found in audit(dataset, []).findings if found.kind == "person"]
+    assert found.where == "labels/02.jsonl"
 
 
 def test_outputs_that_were_replaced_go_too(dataset):
