@@ -14,11 +14,9 @@ import importlib
 import json
 import os
 import random
-import resource
 import shutil
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -29,7 +27,7 @@ from skimage.data import astronaut
 
 from benchmarks.common import make_parser
 from express50.files.images import resize_area
-from express50.runner.worker import cap_threads
+from express50.runner.worker import cap_threads, core_seconds
 from express50.shards.codecs import (
     ALPHA,
     DEPTH,
@@ -149,16 +147,10 @@ def least(work: Callable[[], object]) -> float:
     """Return the fewest processor seconds of a few passes."""
     spent = []
     for _ in range(PASSES):
-        began = processor_seconds()
+        began = core_seconds()
         work()
-        spent.append(processor_seconds() - began)
+        spent.append(core_seconds() - began)
     return min(spent)
-
-
-def processor_seconds() -> float:
-    """Return the processor seconds of this process and of its children that ended."""
-    children = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return time.process_time() + children.ru_utime + children.ru_stime
 
 
 def measured(
@@ -169,9 +161,9 @@ def measured(
         spent = []
         for _ in range(PASSES):
             shutil.rmtree(folder, ignore_errors=True)
-            began = processor_seconds()
+            began = core_seconds()
             opening = run(given, folder)
-            spent.append(processor_seconds() - began)
+            spent.append(core_seconds() - began)
         passes = opening()
     except (ImportError, OSError, RuntimeError, AttributeError) as error:
         return {"why": f"n/a: {type(error).__name__}: {error}"[:200]}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 
 FEW = 8  # names that a message lists before it says how many more there are
 LIKENESS = 0.75  # of a word and a name that is worth suggesting; 'train' and 'twin' have 0.67
@@ -97,6 +97,12 @@ def nearest(word: str, known: Iterable[str]) -> str:
     """Return `` (did you mean 'x'?)`` if a word is a likely slip of a known name, else nothing."""
     best = max(known, key=lambda name: _likeness(word, name), default="")
     return f" (did you mean {best!r}?)" if _likeness(word, best) >= LIKENESS else ""
+
+
+def few(names: Sequence[str], count: int = 3) -> str:
+    """List the first names, then how many more there are."""
+    more = f" and {len(names) - count} more" if len(names) > count else ""
+    return ", ".join(names[:count]) + more
 
 
 def _likeness(word: str, name: str) -> float:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from express50.contract.segmentation_labels import label_mask
-from express50.errors import FormatError, TrainError
+from express50.errors import FormatError, TrainError, few
 from express50.files.atomic import write_bytes, write_json
 from express50.files.images import read_image, write_image
 from express50.shards.writer import sample_key
@@ -193,9 +193,9 @@ def score(
             missing.append(name)
     if missing and not (partial and paths):
         raise FormatError(
-            f"{folder}: {len(missing)} of {len(indices)} pictures are missing: {_list(missing)}; "
-            "expected SUBJECT_EXPRESSION_CAMERA.png. Score part of them with --partial or choose "
-            "samples with --subjects, --expressions, --cameras"
+            f"{folder}: {len(missing)} of {len(indices)} pictures are missing:"
+            f" {few(missing, NAMED)}; expected SUBJECT_EXPRESSION_CAMERA.png. Score part of them"
+            " with --partial or choose samples with --subjects, --expressions, --cameras"
         )
     rows, wrong = [], []
     for index, path in paths.items():
@@ -209,7 +209,7 @@ def score(
         image = torch.from_numpy(pixels.copy()).permute(2, 0, 1).to(item.target) / 255
         rows.append(compare(image, item, judge))
     if wrong:
-        raise FormatError(f"{folder}: {len(wrong)} pictures do not fit: {_list(wrong)}")
+        raise FormatError(f"{folder}: {len(wrong)} pictures do not fit: {few(wrong, NAMED)}")
     return rows
 
 
@@ -224,11 +224,6 @@ def _read_picture(path: Path, size: tuple[int, int]) -> np.ndarray:
     if pixels.ndim == 2 or pixels.shape[2] < 3:
         pixels = np.repeat(pixels.reshape(*size, -1)[..., :1], 3, axis=2)
     return pixels[..., :3]
-
-
-def _list(names: Sequence[str]) -> str:
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return ", ".join(names[:NAMED]) + more
 
 
 def save_pictures(folder: Path, window: Window, views: HeadViews) -> Callable[[int, Tensor], None]:

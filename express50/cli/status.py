@@ -18,10 +18,11 @@ from rich.filesize import decimal
 from express50.console import FAILED, OK, add_command, answer, format_seconds, format_table, say
 from express50.contract.layout import Dataset, existing_dataset
 from express50.contract.stage import stages, typical_error
+from express50.errors import few
 from express50.files.atomic import write_bytes
 from express50.local_server import NOT_FOUND, PageServer, Reply
 from express50.runner.ledger import COLUMNS, Ledger, Receipt, Run
-from express50.runner.outdated import few, outdated
+from express50.runner.outdated import outdated
 from express50.runner.publish import is_running
 
 PAGE_SECONDS = 3.0  # between two writes of the page during a run

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from express50.errors import CalibrationError
+from express50.errors import CalibrationError, few
 from express50.geometry.cameras import Camera, transform_camera
 from express50.geometry.conventions import FLIP_YZ
 from express50.geometry.transforms import is_rigid, make_transform
@@ -86,9 +86,8 @@ def _describe_behind(depths: Mapping[str, float]) -> str:
     """Describe the result of `depths_behind`; return "" if it is empty."""
     if not depths:
         return ""
-    shown = ", ".join(f"{name} (z = {depth:.3g} m)" for name, depth in list(depths.items())[:4])
-    more = f" and {len(depths) - 4} more" if len(depths) > 4 else ""
-    return f"the point all cameras look at lies behind {shown}{more}; expected z > 0"
+    shown = few([f"{name} (z = {depth:.3g} m)" for name, depth in depths.items()], 4)
+    return f"the point all cameras look at lies behind {shown}; expected z > 0"
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import Any
 from express50.contract.config import config_texts, resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
-from express50.errors import ConfigError, Express50Error
+from express50.errors import ConfigError, Express50Error, few
 from express50.files.digests import path_digest, text_digest
 from express50.runner.ledger import Ledger, Made
 from express50.runner.worker import fingerprint, input_digests
@@ -41,12 +41,6 @@ def other_settings(made: Made, config: Any) -> list[str]:
     then, now = made.settings, config_texts(config)
     names = differing(then, now) if then else []
     return [f"{n} was {then.get(n, 'unknown')}, is {now.get(n, 'gone')}" for n in names]
-
-
-def few(names: Sequence[str], count: int = 3) -> str:
-    """List the first names, then how many more there are."""
-    more = f" and {len(names) - count} more" if len(names) > count else ""
-    return ", ".join(names[:count]) + more
 
 
 def differing(one: Mapping[str, str], other: Mapping[str, str]) -> list[str]:

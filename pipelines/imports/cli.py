@@ -19,7 +19,7 @@ from express50.console import FAILED, OK, add_command, answer, count
 from express50.contract.layout import Dataset, existing_dataset, included_subjects
 from express50.contract.stage import Note, Result, stages
 from express50.dataset.depth_files import write_depth
-from express50.errors import ConfigError, Express50Error, StageError
+from express50.errors import ConfigError, Express50Error, StageError, few
 from express50.files.images import read_alpha, write_image
 from express50.geometry.cameras import Camera
 from express50.head.load import load_head
@@ -239,10 +239,9 @@ def _plan_pictures(
         every.append(PeakPictures(dataset, subject, peak, recorded, cameras, files, args))
     missing = [path for one in every for path in one.files.values() if not path.is_file()]
     if missing:
-        more = f" and {len(missing) - 3} more" if missing[3:] else ""
         raise StageError(
             f"{subject}: {len(missing)} of {len(cameras) * len(peaks)} files are missing:"
-            f" {', '.join(map(str, missing[:3]))}{more}; every camera of every peak frame needs one"
+            f" {few([*map(str, missing)])}; every camera of every peak frame needs one"
         )
     return {one.item: partial(write, one) for one in every}
 

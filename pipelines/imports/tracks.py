@@ -19,7 +19,7 @@ from express50.capture.frames import read_cameras_of
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note
 from express50.dataset.tracks import SCHEMA
-from express50.errors import CalibrationError, ConfigError, FormatError, StageError
+from express50.errors import CalibrationError, ConfigError, FormatError, StageError, few
 from express50.files.arrays import read_arrays
 from express50.files.text import read_json_table
 from express50.geometry.cameras import Camera
@@ -203,9 +203,8 @@ def _choose(keys: list[str], peaks: list[PeakFrame], in_clip: bool, where: str) 
         else:
             found[peak.expression] = key
     if missing:
-        more = f" and {len(missing) - 6} more" if missing[6:] else ""
         raise StageError(
-            f"{where}: has no time step of {', '.join(missing[:6])}{more}; it has"
+            f"{where}: has no time step of {few(missing, 6)}; it has"
             f" {len(keys)}: {', '.join(keys[:3])}{', ...' if keys[3:] else ''}"
         )
     return found

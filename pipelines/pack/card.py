@@ -14,7 +14,7 @@ from express50.capture.demographics import (
     shown_counts,
 )
 from express50.contract.stage import Note
-from express50.errors import StageError
+from express50.errors import StageError, few
 
 
 def split_subjects(
@@ -141,4 +141,4 @@ def _count_table(name: str, counts: Mapping[str, int]) -> list[str]:
 
 def _values(metas: Sequence[Mapping], key: str) -> str:
     found = sorted({str(meta[key]) if meta[key] is not None else "not stated" for meta in metas})
-    return ", ".join(found[:5]) + (f" and {len(found) - 5} more" if len(found) > 5 else "")
+    return few(found, 5)

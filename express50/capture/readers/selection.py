@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from express50.capture.raw import RawCamera
-from express50.errors import CaptureError
+from express50.errors import CaptureError, few
 
 EXPRESSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9_]*")
 # A camera that lacks more than this share of the moments is dropped; otherwise the moments are.
@@ -241,5 +241,4 @@ def _reasons(moments: Collection[Moment], who: str, has: str, kind: str) -> dict
 
 
 def _words(moments: Sequence[Moment]) -> str:
-    shown = ", ".join(f"{sequence} {number}" for sequence, number in moments[:SHOWN])
-    return shown + (f" and {len(moments) - SHOWN} more" if len(moments) > SHOWN else "")
+    return few([f"{sequence} {number}" for sequence, number in moments], SHOWN)
