@@ -189,7 +189,7 @@ class Desk(Screen[None]):
         self.player.stop()
         task = self.session.task
         if task is None:
-            self.say("nothing to label: no expression fits, or nothing is ingested", theme.RED)
+            self.say("nothing to label: no task matches, or nothing is ingested", theme.RED)
             return
         self.scene = scene = load_scene(self.session.dataset, task, self.session.annotator)
         if scene.suggestion is not None:  # else the camera that was chosen last stays
@@ -312,7 +312,7 @@ class Desk(Screen[None]):
             return
         more = self.session.advance()
         self.open_task()
-        done = "" if more else f"all {len(self.session.tasks)} done. q leaves, p looks back. "
+        done = "" if more else f"all {len(self.session.tasks)} done. q quits, p goes back. "
         self.say(done + words.saved(label))
 
     def action_undo(self) -> None:

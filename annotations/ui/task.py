@@ -103,7 +103,7 @@ def _suggestion(dataset: Dataset, task: LabelTask, notes: list[str]) -> Suggeste
         notes.append(str(error))
         return None
     if found is None:
-        notes.append("no suggestion ('express50 align' not run): you start in the window's middle")
+        notes.append("no suggestion ('express50 align' has not run): starting in mid-window")
     return found
 
 

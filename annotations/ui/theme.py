@@ -100,19 +100,22 @@ class KeyAction(NamedTuple):
 
 MOVE = (
     KeyAction("left,comma,h", "← , h", "move('step', -1)", "one frame back"),
-    KeyAction("right,full_stop,l", "→ . l", "move('step', 1)", "one frame on"),
+    KeyAction("right,full_stop,l", "→ . l", "move('step', 1)", "one frame forward"),
     KeyAction(
         "shift+left,pageup,H,less_than_sign", "⇧← PgUp H", "move('step', -10)", "ten frames back"
     ),
     KeyAction(
-        "shift+right,pagedown,L,greater_than_sign", "⇧→ PgDn L", "move('step', 10)", "ten frames on"
+        "shift+right,pagedown,L,greater_than_sign",
+        "⇧→ PgDn L",
+        "move('step', 10)",
+        "ten frames forward",
     ),
     KeyAction("home,0", "Home 0", f"move('step', -{FAR})", "first frame of the cue window"),
     KeyAction("end,dollar_sign", "End $", f"move('step', {FAR})", "last frame of the cue window"),
     KeyAction("tab", "Tab", "candidate(1)", "next suggestion"),
     KeyAction("shift+tab", "⇧Tab", "candidate(-1)", "previous suggestion"),
     KeyAction(
-        "1,2,3,4,5", "1 … 5", "move('pick_candidate', {key})", "that suggestion, 1 the surest"
+        "1,2,3,4,5", "1 … 5", "move('pick_candidate', {key})", "go to a suggestion, 1 is the surest"
     ),
     KeyAction("g", "g", "ask_frame", "go to a frame by number"),
 )
@@ -122,7 +125,7 @@ DECIDE = (
     KeyAction("right_square_bracket", "]", "move('set_plateau', 1)", "the plateau ends here"),
     KeyAction("f", "f", "ask_flag", "flag: no usable peak, with a reason"),
     KeyAction("u", "u", "undo", "undo the last decision"),
-    KeyAction("n", "n", "task(1)", "next task, this one stays open"),
+    KeyAction("n", "n", "task(1)", "next task; this one stays open"),
     KeyAction("p", "p", "task(-1)", "previous task"),
 )
 LOOK = (
@@ -130,13 +133,13 @@ LOOK = (
     KeyAction("Z", "Z", "zoom(-1)", "zoom the other way"),
     KeyAction("c", "c", "camera(1)", "next camera, in both pictures"),
     KeyAction("C", "C", "camera(-1)", "previous camera"),
-    KeyAction("s", "s", "second", "second camera, same moment; or not"),
+    KeyAction("s", "s", "second", "second camera at this moment, on or off"),
     KeyAction("S", "S", "next_second", "another second camera"),
     KeyAction("b", "b", "blink", "blink: reference and frame in one place"),
     KeyAction("space", "Space", "play", "play the window, or stop"),
     KeyAction("question_mark,f1", "?", "help", "this help"),
-    KeyAction("ctrl+z", "Ctrl-Z", "app.suspend_process", "to the shell; fg comes back"),
-    KeyAction("q", "q", "app.quit", "leave; every mark is already saved"),
+    KeyAction("ctrl+z", "Ctrl-Z", "app.suspend_process", "suspend; fg resumes"),
+    KeyAction("q", "q", "app.quit", "quit; every mark is already saved"),
 )
 GROUPS = (MOVE, DECIDE, LOOK)
 HINTS = (

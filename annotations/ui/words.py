@@ -121,7 +121,7 @@ def saved(label: Label) -> str:
     """Report that a decision is on disk."""
     what = f"frame {label.frame}" if label.action == "mark" else f"flagged {label.reason}"
     cost = f"{label.keys} key{'' if label.keys == 1 else 's'}, {label.seconds:.1f} s"
-    return f"saved: {label.subject} {label.expression} {what} ({cost}); u takes it back"
+    return f"saved: {label.subject} {label.expression} {what} ({cost}); u undoes it"
 
 
 SCROLLING = ("up", "down", "pageup", "pagedown", "home", "end")
@@ -137,8 +137,10 @@ class FlagDialog(ModalScreen[str | None]):
         """List the reasons, and a line for another."""
         with Vertical(classes="dialog") as box:
             box.border_title = "flag: why is there no usable peak?"
-            box.border_subtitle = "press a number; Esc: do not flag"
-            for number, reason in enumerate((*FLAG_REASONS, "another reason, in words"), 1):
+            box.border_subtitle = "press a number, or Esc to cancel"
+            for number, reason in enumerate(
+                (*FLAG_REASONS, "another reason, in your own words"), 1
+            ):
                 key = (f" {number} ", f"bold {theme.ACCENT}")
                 yield Static(Text.assemble(key, (f" {reason}", theme.TEXT)))
             line = Input(placeholder="reason, then Enter", max_length=200)
