@@ -1,4 +1,4 @@
-"""Run the benchmarks that need no arguments and share a night; their last lines are kept."""
+"""Run the benchmarks that need no arguments, within one night, and keep their last lines."""
 
 from __future__ import annotations
 

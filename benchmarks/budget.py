@@ -1,4 +1,4 @@
-"""Measure whether budgets are kept: time, error against the best of a grid, and the promise.
+"""Measure budgets: the time used, the error beside the best of a grid, and the error promised.
 
 ``python -m benchmarks.budget build/budget`` records twin captures, runs the chain for five budgets
 from a minute to an hour and with every preset, and measures each run against the truth. ``--quick``

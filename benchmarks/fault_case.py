@@ -1,4 +1,4 @@
-"""Start, strike and check the run of one case: what every fault of `benchmarks.faults` needs."""
+"""Start a run, inject one fault and check the result: a case of `benchmarks.faults`.
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run a stage whose items take a while and note when they were worked on, to be hurt.
+"""A stage for injecting faults: its items take a while, and record when they were worked on.
 
 ``python -m benchmarks.fault_stage ROOT NOTES --workers N [--scheduler ADDRESS]``
 

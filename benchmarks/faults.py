@@ -1,4 +1,4 @@
-"""Hurt runs in every way that we know, at random moments, and measure what is lost.
+"""Inject faults into runs (kills, full disks, damaged files) at random, and measure what is lost.
 
 ``python -m benchmarks.faults --hours 1`` runs one case after the other until the time is over. A
 case makes a dataset, runs a stage of slow items on it, hurts it, and runs it again until it is

@@ -1,4 +1,4 @@
-"""Measure how human the built-in head is: unseen people by its parameters, and its measures.
+"""Measure how well the built-in head fits unseen people, and how human its dimensions are.
 
 ``python -m benchmarks.head --ict ict.npz [--sheet PATH]``: identities are drawn from ICT-FaceKit's
 published model, given as scans without colours (which are turned and moved), and fitted by the

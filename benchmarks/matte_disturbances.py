@@ -1,4 +1,4 @@
-"""Lay what goes wrong on a set, or other walls, on frames for ``benchmarks.matte_views``."""
+"""Add disturbances of a set, or other walls, to frames for ``benchmarks.matte_views``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Draw hair before a plate with known alpha: the scenes of ``benchmarks.matte``.
+"""Draw hair in front of a plate with known alpha: the scenes of ``benchmarks.matte``.
 
 A head with single strands of 0.2 to 1.2 pixels, drawn 8 times finer and averaged in linear light,
 blurred as by a lens, then exposed: shot and read noise, another exposure than the plate's, a soft

@@ -1,4 +1,4 @@
-"""Measure what glasses, hands and hair before the face do: ``python -m benchmarks.occluders``.
+"""Measure what glasses, hands and hair on the face cost: ``python -m benchmarks.occluders``.
 
 The twin records one person bare and with each of the things, and the stages up to ``regions`` are
 run with their defaults; `off` runs ``track``, ``depth`` and ``regions`` without what they do about

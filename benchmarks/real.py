@@ -1,4 +1,4 @@
-"""Measure on real footage that is not ours to ship, beside what a peer's tool made of it.
+"""Measure calibration on real footage that we may not ship, beside another tool's result.
 
 ``--rig4`` names a folder with a session of caliscope: four free-running webcams ``cam_N.mp4``,
 their ``timestamps.csv``, the board they saw (``charuco.toml``) and the rig that caliscope solved

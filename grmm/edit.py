@@ -1,4 +1,4 @@
-"""Make points in the model's space and move between them: all inputs of a picture but the camera.
+"""Make and edit heads in the model's space: everything that a picture needs but the camera.
 
 FLAME's parameters (the tracked mesh) and the residual codes are separate inputs of the model, so
 each can be changed alone: one subject's codes with another's expression, a wider jaw under the

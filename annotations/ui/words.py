@@ -1,4 +1,4 @@
-"""Write the words of the screen: lines around the pictures, and small questions over them."""
+"""Write the screen's text: lines around the pictures, and the dialogs in front of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run the chain within a budget, and ``tune``, which measures what time buys on a dataset."""
+"""``express50 run --budget`` and ``--error``, and ``tune``, which measures error against time."""
 
 from __future__ import annotations
 

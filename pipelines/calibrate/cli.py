@@ -1,4 +1,4 @@
-"""``express50 cameras`` brings in another tool's calibration, and checks any rig."""
+"""``express50 cameras`` imports another tool's calibration, and checks any rig."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Colour gains of cameras against each other, per channel, from the board's white paper.
+"""Measure cameras' colour gains against each other, per channel, on the board's white paper.
 
 Matt paper reflects nearly the same light in all directions, so a camera's gain is the light that it
 records of a square over what the others record at the same instant. Faces do not serve: their gloss

@@ -1,4 +1,4 @@
-"""The light half of ``express50 cameras``: what the list of commands needs of it."""
+"""Declare ``express50 cameras`` for the list of commands, without importing what it needs."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ GRAINS = 7  # every n-th pixel counts for the typical grain of all views
 
 @dataclass(frozen=True)
 class Picture:
-    """One camera's picture, at full size only when it is read: all would take a gigabyte.
+    """One camera's picture; full size is read when needed, as all cameras' would take a gigabyte.
 
     Attributes:
         camera: pinhole, of the full size.

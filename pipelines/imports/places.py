@@ -1,4 +1,4 @@
-"""Fill the places of a path pattern: subject, expression, camera and frame."""
+"""Fill in the placeholders of a path pattern: subject, expression, camera and frame."""
 
 from __future__ import annotations
 
@@ -39,15 +39,17 @@ def peak_frames(dataset: Dataset, subject: str) -> list[PeakFrame]:
 
 
 def check_pattern(pattern: str, needed: tuple[str, ...]) -> set[str]:
-    """Return the names of a pattern's places.
+    """Return the names of a pattern's placeholders.
 
     Raises:
-        ConfigError: it has a place that is not known, or lacks a needed one.
+        ConfigError: a placeholder is unknown, or a needed one is missing.
     """
     found = {match[1] for match in _PLACE.finditer(pattern)}
     known = ", ".join(f"{{{name}}}" for name in PLACES)
     if unknown := sorted(found - set(PLACES)):
-        raise ConfigError(f"{pattern}: unknown place {{{unknown[0]}}}; expected some of {known}")
+        raise ConfigError(
+            f"{pattern}: unknown placeholder {{{unknown[0]}}}; expected some of {known}"
+        )
     if "expression" in needed and found & {"frame", "clip_frame"}:
         needed = tuple(name for name in needed if name != "expression")
     if missing := [name for name in needed if name not in found]:

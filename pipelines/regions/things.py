@@ -1,4 +1,4 @@
-"""Find what stands before the tracked face: glasses by colour, hands by how well views agree.
+"""Find things in front of the tracked face: glasses by colour, hands by how well views agree.
 
 **Glasses.** Frames are too thin for depth maps. But every view sees a place on a frame in a colour
 unlike skin, whereas a place before a bare face has skin behind it in some view. So colours carve

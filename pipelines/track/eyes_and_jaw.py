@@ -1,4 +1,4 @@
-"""Use eyes, lips and jaw line: irises turn the eyes, what is shut meets, the jaw is on the rim.
+"""Fit eyes, lips and jaw line: irises turn the eyes, shut lids and lips meet.
 
 **Irises** are pixels that the iris vertices should project to. An eyeball misplaced by a millimetre
 turns the gaze by five degrees in every expression alike, so the median offset over a subject's

@@ -369,7 +369,7 @@ def test_masks_that_do_not_fit_are_named(dataset, tmp_path, capsys) -> None:
     (folder / "cam01.png").unlink()
     assert "1 of 12 files are missing" in line()
     assert take("matte", dataset, str(tmp_path / "{view}.png")) == 2
-    assert "unknown place {view}" in error_of(capsys)
+    assert "unknown placeholder {view}" in error_of(capsys)
 
 
 def depths_of(dataset: Dataset, folder: Path, write, change=lambda depth, rays: depth) -> str:

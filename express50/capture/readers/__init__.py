@@ -1,1 +1,1 @@
-"""Readers of other datasets' layouts, one module per layout, read captures where they lie."""
+"""Read captures in other datasets' layouts in place, with one module per layout."""
