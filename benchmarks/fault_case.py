@@ -1,4 +1,4 @@
-"""Start a run, inject one fault and check the result: a case of `benchmarks.faults`.
+"""Start a run, inject one fault and check the result: a case of `benchmarks.faults`."""
 
 from __future__ import annotations
 
