@@ -269,7 +269,8 @@ def measure(pilot: Pilot, allowance: float) -> PilotFigures:
     choices = tradable(chain)
     cheapest = {n: next(iter(chain.ladders[n])) if n in choices else standard_of(chain.ladders[n])
                 for n in names}  # fmt: skip
-    chain.tell(f"measuring on {PEAKS} expressions of one subject; every stage at its cheapest")
+    where = f"{PEAKS} expressions of one subject"
+    chain.tell(f"measuring on {where}, every stage at its cheapest setting")
     base = _base(pilot, cheapest, choices)
     cheapest = base.settings
     allowance = max(allowance, SPARE_SHARE * spare_seconds(pilot, base))

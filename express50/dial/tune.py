@@ -92,5 +92,5 @@ def _lines(load: Workload, points: list[Point], presets: Mapping[str, Point]) ->
     beaten = [
         name for name, one in presets.items() if one.settings not in [p.settings for p in points]
     ]
-    note = [f"not on the front: {', '.join(beaten)}"] if beaten else []
-    return [*format_table(head, rows), *note]
+    words = f"not on the front, as another choice is quicker and no worse: {', '.join(beaten)}"
+    return [*format_table(head, rows), *([words] if beaten else [])]
