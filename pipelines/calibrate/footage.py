@@ -133,16 +133,16 @@ def find_points(read: Callable[[], Images], small: bool = False) -> dict[int, Fr
     for frame, name, image in read():
         faces.setdefault(frame, {})[name] = detect(net, image)
         features.setdefault(frame, {})[name] = find_features(image)
-    lacking = {frame for frame, seen in faces.items() if len(_clear(seen)) < 2 <= len(seen)}
+    lacking = {frame for frame, seen in faces.items() if len(_with_face(seen)) < 2 <= len(seen)}
     if small and 2 * len(lacking) > len(faces):
         for frame, name, image in read():
             if frame in lacking and faces[frame][name].score < FACE_SCORE:
                 faces[frame][name] = detect(net, image, smallest=SMALL)
-    landmarks = {frame: _landmarks(_clear(seen)) for frame, seen in faces.items()}
+    landmarks = {frame: _landmarks(_with_face(seen)) for frame, seen in faces.items()}
     return {f: FrameSetPoints(landmarks[f], without_fixed(features[f])) for f in sorted(features)}
 
 
-def _clear(faces: Mapping[str, Detection]) -> dict[str, Detection]:
+def _with_face(faces: Mapping[str, Detection]) -> dict[str, Detection]:
     """Return the cameras that show a face."""
     return {name: face for name, face in faces.items() if face.score >= FACE_SCORE}
 
