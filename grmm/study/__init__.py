@@ -165,7 +165,25 @@ def read_study(out: Path) -> dict:
             f"{path}: format is {study.get('format')!r}, expected {FORMAT!r} with "
             f"{', '.join(kinds)}; make the study again"
         )
+    if not _has_whole_examples(study):
+        raise FormatError(
+            f"{path}: its methods, its seed or an example are not as 'grmm study make' writes them;"
+            " make the study again"
+        )
     return study
+
+
+def _has_whole_examples(study: dict) -> bool:
+    try:
+        first, second = study["methods"]
+        return type(study["seed"]) is int and all(
+            isinstance(example["reference"], str)
+            and example["pictures"].keys() == {first, second}
+            and example["A"] in (first, second)
+            for example in study["examples"]
+        )
+    except (KeyError, TypeError, ValueError, AttributeError):
+        return False
 
 
 def check_answer(study: dict, value: object, where: str = "answer") -> dict:
@@ -332,8 +350,8 @@ class StudyPages:
         if name != "trials":
             return NOT_FOUND
         text, count = parse_qs(url.query).get("participant", [""])[0], self.study["participants"]
-        if not text.isdecimal() or int(text) >= count:
-            message = f"participant is {text!r}, expected 0 to {count - 1}\n"
+        if not text.isdecimal() or len(text) > 9 or int(text) >= count:
+            message = f"participant is {text[:9]!r}, expected 0 to {count - 1}\n"
             return Reply(HTTPStatus.BAD_REQUEST, "text/plain", message.encode())
         number = int(text)
         with self.lock:

@@ -19,6 +19,7 @@ from grmm.study import (
     markdown,
     method_of,
     read_answers,
+    read_study,
     summarise,
     trials,
 )
@@ -173,8 +174,9 @@ def test_page_shows_trials_and_takes_answers_and_nothing_else(study):
             for path in ("study.json", "pictures/../study.json", "answers.jsonl"):
                 with pytest.raises(urllib.error.HTTPError, match="404"):
                     get(path)
-            with pytest.raises(urllib.error.HTTPError, match="400"):
-                get("trials?participant=9")
+            for number in ("9", "9" * 5000):  # Python refuses to convert the latter
+                with pytest.raises(urllib.error.HTTPError, match="400"):
+                    get(f"trials?participant={number}")
             for body, kind in ((b"{}", "application/json"), (b"x" * 9999, "application/json")):
                 with pytest.raises(urllib.error.HTTPError, match="400"):
                     post(body, kind)
@@ -184,6 +186,16 @@ def test_page_shows_trials_and_takes_answers_and_nothing_else(study):
             server.shutdown()
             thread.join()
     assert read_answers(folder, made) == [answer]
+
+
+@pytest.mark.parametrize(
+    "change", [{"methods": ["Ours"]}, {"seed": "0"}, {"examples": [{}]}, {"examples": [1]}]
+)
+def test_a_damaged_study_is_refused(study, change):
+    folder, made = study
+    (folder / "study.json").write_text(json.dumps(made | change))
+    with pytest.raises(FormatError, match="study make"):
+        read_study(folder)
 
 
 def test_commands_make_and_table(folders, tmp_path, capsys):
