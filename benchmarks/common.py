@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import multiprocessing
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -66,6 +67,28 @@ def run_or_stop(stage: Stage, dataset: Dataset, preset: str = "standard", **valu
     summary = run_stage(stage, dataset, config, workers=0, progress=False)
     if not summary.ok:
         sys.exit("\n".join(summary.lines()))
+
+
+def write_peaks(
+    dataset: Dataset, subject: str, peaks: Mapping[str, int], annotator: str = "truth"
+) -> None:
+    """Publish peaks, the frame of each expression, as labels by the first camera."""
+    cameras = read_index(dataset, subject).cameras
+    camera = min(cameras)
+    rows = {
+        name: {
+            "frame": frame,
+            "camera": camera,
+            "pts": cameras[camera].pts[frame],
+            "dhash": cameras[camera].dhash[frame],
+            "confidence": 1.0,
+            "annotator": annotator,
+        }
+        for name, frame in peaks.items()
+    }
+    path = dataset.peaks_file(subject)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(rows))
 
 
 def in_own_process(function: Callable[..., T], *arguments: object) -> T:

@@ -17,10 +17,9 @@ import cv2
 import numpy as np
 
 from annotations import align, observe
-from benchmarks.common import run_or_stop
+from benchmarks.common import run_or_stop, write_peaks
 from benchmarks.matte_disturbances import Shot, before_wall
 from benchmarks.matte_scenes import cluttered
-from benchmarks.track import write_peaks
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
 from express50.files.calibration import read_cameras, write_cameras

@@ -26,7 +26,13 @@ from unittest.mock import patch
 
 import numpy as np
 
-from benchmarks.common import add_twin_options, check_twin_options, make_parser, run_or_stop
+from benchmarks.common import (
+    add_twin_options,
+    check_twin_options,
+    make_parser,
+    run_or_stop,
+    write_peaks,
+)
 from benchmarks.track_truth import Errors, clip_errors, compare, mean, pooled, summary
 from benchmarks.track_views import held_out_views
 from express50.capture.frames import read_cameras_of
@@ -144,27 +150,6 @@ def hold_out(capture: Path, out: Path) -> None:
     cameras = read_cameras(out / "calibration.json")
     (out / "calibration.json").unlink()  # a link to the recording's own
     write_cameras(out / "calibration.json", {k: v for k, v in cameras.items() if k not in held})
-
-
-def write_peaks(dataset: Dataset, subject: str, peaks: dict[str, int]) -> None:
-    """Publish peaks as labels."""
-    index = read_index(dataset, subject)
-    camera = sorted(index.cameras)[0]
-    source = index.cameras[camera]
-    rows = {
-        name: {
-            "frame": frame,
-            "camera": camera,
-            "pts": int(source.pts[frame]),
-            "dhash": source.dhash[frame],
-            "confidence": 1.0,
-            "annotator": "truth",
-        }
-        for name, frame in peaks.items()
-    }
-    folder = dataset.item_dir("align", subject)
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "peaks.json").write_text(json.dumps(rows))
 
 
 def benchmark(source: Reference, presets: tuple[str, ...], count: int, clip: bool) -> dict:

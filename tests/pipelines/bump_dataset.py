@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.capture.index import read_index
+from benchmarks.common import write_peaks
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
 from express50.files.calibration import write_cameras
@@ -59,17 +59,11 @@ def _write_capture(capture: Path, subject: str, rig: list[Camera], shots: dict) 
 
 def write_given(dataset: Dataset, subject: str, rig: list[Camera], shots: dict) -> None:
     """Outputs of calibrate, align, matte and track."""
-    for stage in ("calibrate", "align", "track"):
+    for stage in ("calibrate", "track"):
         dataset.item_dir(stage, subject).mkdir(parents=True)
     cameras = {camera.id: replace(camera) for camera in rig}
     write_cameras(dataset.cameras_file(subject), cameras)
-    source = read_index(dataset, subject).cameras[rig[0].id]
-    peaks = {
-        name: {"frame": k, "camera": rig[0].id, "pts": k, "dhash": source.dhash[k],
-               "confidence": 1.0, "annotator": "tester"}
-        for k, name in enumerate(EXPRESSIONS)
-    }  # fmt: skip
-    dataset.peaks_file(subject).write_text(json.dumps(peaks))
+    write_peaks(dataset, subject, {name: k for k, name in enumerate(EXPRESSIONS)}, "tester")
     for name, (_, alpha, _) in shots.items():
         for expression in EXPRESSIONS:
             path = dataset.matte_file(subject, expression, name)

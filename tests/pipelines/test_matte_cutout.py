@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.common import recorded
+from benchmarks.common import recorded, write_peaks
 from express50.__main__ import main
 from express50.capture.frames import read_cameras_of
-from express50.capture.index import read_index
 from express50.contract.layout import Dataset
 from express50.errors import ConfigError, StageError
 from express50.files.images import read_alpha, write_image
@@ -142,14 +141,7 @@ def test_a_frame_without_a_face_fails_alone(tmp_path: Path) -> None:
     ingest.register(dataset, [folder])
     for stage in (ingest.STAGE, calibrate.STAGE):
         assert run_here(stage, dataset).ok
-    seen = read_index(dataset, "eva").cameras["photo"]
-    peaks = {
-        name: {"frame": frame, "camera": "photo", "pts": seen.pts[frame],
-               "dhash": seen.dhash[frame], "confidence": 1.0, "annotator": "auto"}
-        for name, frame in (("clip_00", 1), ("clip_01", 6))
-    }  # fmt: skip
-    dataset.item_dir("align", "eva").mkdir(parents=True)
-    dataset.peaks_file("eva").write_text(json.dumps(peaks))
+    write_peaks(dataset, "eva", {"clip_00": 1, "clip_01": 6})
     assert run_here(frames.STAGE, dataset).ok
     run = run_here(MATTE, dataset, method="grabcut")
     assert {o.item: o.status for o in run.outcomes} == {
@@ -168,11 +160,7 @@ def rig(tmp_path_factory) -> tuple[Dataset, Truth]:
     dataset, truth = recorded(twin, tmp_path_factory.mktemp("twin"))
     subject = dataset.subjects()[0]
     assert run_here(calibrate.STAGE, dataset).ok
-    name, seen = next(iter(read_index(dataset, subject).cameras.items()))
-    peak = {"frame": 0, "camera": name, "pts": seen.pts[0], "dhash": seen.dhash[0],
-            "confidence": 1.0, "annotator": "test"}  # fmt: skip
-    dataset.item_dir("align", subject).mkdir(parents=True)
-    dataset.peaks_file(subject).write_text(json.dumps({"neutral": peak}))
+    write_peaks(dataset, subject, {"neutral": 0})
     assert run_here(frames.STAGE, dataset).ok
     return dataset, truth
 

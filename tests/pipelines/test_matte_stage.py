@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.common import write_peaks
 from express50.capture.frames import (
-    dhash,
     read_cameras_of,
-    read_frame,
     read_peak_frame,
     write_frame,
 )
@@ -45,28 +44,13 @@ def metrics_of(dataset: Dataset, item: str = "S001/smile") -> dict:
     return json.loads((dataset.item_dir("matte", item) / "metrics.json").read_text())
 
 
-def align(dataset: Dataset, subject: str) -> None:
-    """Label the first frame of every cue."""
-    index = read_index(dataset, subject)
-    rows = {}
-    for cue in index.cues:
-        frame = read_frame(dataset, subject, "cam00", cue.start_frame, undistort=False)
-        rows[cue.expression_id] = {
-            "frame": cue.start_frame, "camera": "cam00",
-            "pts": index.cameras["cam00"].pts[cue.start_frame], "dhash": dhash(frame),
-            "confidence": 1.0, "annotator": "test",
-        }  # fmt: skip
-    folder = dataset.item_dir("align", subject)
-    folder.mkdir(parents=True)
-    (folder / "peaks.json").write_text(json.dumps(rows))
-
-
 def make_dataset(root: Path, captures: list[Path]) -> Dataset:
     """Captures ingested, with given cameras, and labelled."""
     dataset = ingest_captures(root / "dataset", *captures, preset="standard")
     assert run_here(calibrate.STAGE, dataset).ok
     for subject in dataset.subjects():
-        align(dataset, subject)
+        cues = read_index(dataset, subject).cues
+        write_peaks(dataset, subject, {cue.expression_id: cue.start_frame for cue in cues})
     run_here(frames.STAGE, dataset)
     return dataset
 

@@ -273,29 +273,13 @@ def no_irises() -> Irises:
 @pytest.fixture
 def tracked_dataset(tmp_path: Path, ingested, monkeypatch: pytest.MonkeyPatch):
     """A calibrated, labelled dataset whose detector finds the landmarks of a tiny head."""
-    import json
-
+    from benchmarks.common import write_peaks
     from express50.capture.frames import read_cameras_of
-    from express50.capture.index import read_index
     from pipelines import calibrate, frames
     from pipelines.track import read_inputs, stage
 
     run_here(calibrate.STAGE, ingested)
-    index = read_index(ingested, "S001")
-    camera_id = sorted(index.cameras)[0]
-    source = index.cameras[camera_id]
-    peaks = {
-        name: {
-            "frame": frame,
-            "camera": camera_id,
-            "pts": source.pts[frame],
-            "dhash": source.dhash[frame],
-        }
-        for name, frame in (("neutral", 1), ("smile", 4))
-    }
-    folder = ingested.item_dir("align", "S001")
-    folder.mkdir(parents=True)
-    (folder / "peaks.json").write_text(json.dumps(peaks))
+    write_peaks(ingested, "S001", {"neutral": 1, "smile": 4})
     run_here(frames.STAGE, ingested)
     scene = make_scene()
 
