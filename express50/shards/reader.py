@@ -268,7 +268,9 @@ def read_entries(root: Path) -> tuple[Entry, ...]:
     path = root / "index.json"
     if not path.exists():
         what = f"{path}: the index is missing" if root.is_dir() else f"{root}: no such folder"
-        raise FormatError(f"{what}; name the folder that 'pack' wrote, DATASET/pack/shards")
+        packed = root / "pack" / "shards"
+        place = packed if packed.is_dir() else "DATASET/pack/shards"
+        raise FormatError(f"{what}; name the folder that 'pack' wrote, {place}")
     table = read_json(path, FormatError, AGAIN)
     if not isinstance(table, dict) or table.get("schema") != SCHEMA:
         got = table.get("schema") if isinstance(table, dict) else type(table).__name__

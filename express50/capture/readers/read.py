@@ -98,8 +98,10 @@ def detect(path: Path, name: object = None) -> Layout:
             return layout
     looks = "; ".join(f"{x.name}: {x.looks}" for x in LAYOUTS if name in (None, x.name))
     held = sorted(p.name for p in path.iterdir()) if path.is_dir() else ["a file"]
-    if any((path / name / "capture.toml").is_file() for name in held):
-        raise CaptureError(f"{path}: a folder of captures, expected a capture; give {path}/*")
+    for depth in ("*", "*/*"):
+        if below := sorted(path.glob(f"{depth}/capture.toml")):
+            captures = below[0].parent.parent / "*"
+            raise CaptureError(f"{path}: a folder of captures, expected a capture; give {captures}")
     if (path.parent / "capture.toml").is_file():
         raise CaptureError(f"{path}: part of the capture {path.parent}; give that folder instead")
     raise CaptureError(

@@ -295,8 +295,11 @@ def test_nothing_fits_is_one_error_that_names_the_layouts(tmp_path):
         detect(tmp_path)
     (tmp_path / "S001").mkdir()
     (tmp_path / "S001/capture.toml").touch()
-    with pytest.raises(CaptureError, match="a folder of captures, .* give .*/[*]"):
-        detect(tmp_path)
+    for folder, pattern in ((tmp_path, "[*]"), (tmp_path.parent, "[*]/[*]")):
+        with pytest.raises(
+            CaptureError, match=f"a folder of captures, .* give {folder}/{pattern}$"
+        ):
+            detect(folder)
     (tmp_path / "S001/cameras").mkdir()
     for part in ("cameras", "capture.toml"):
         with pytest.raises(CaptureError, match=f"part of the capture {tmp_path / 'S001'}; give"):
