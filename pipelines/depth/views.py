@@ -109,11 +109,12 @@ def silhouette_distance(alpha: np.ndarray) -> np.ndarray:
     mask = (large > INSIDE).astype(np.uint8)
     # Distances are to pixel centres across the contour: half a pixel too long on either side.
     signed = cv2.distanceTransform(1 - mask, cv2.DIST_L2, cv2.DIST_MASK_5)
-    cv2.subtract(0.5, signed, dst=signed)
+    np.subtract(0.5, signed, out=signed)
     x, y, w, h = cv2.boundingRect(mask)
     box = np.s_[max(0, y - 1) : y + h + 1, max(0, x - 1) : x + w + 1]
     part = np.ascontiguousarray(mask[box])
-    signed[box] += cv2.distanceTransform(part, cv2.DIST_L2, cv2.DIST_MASK_5) - part
+    inside = cv2.distanceTransform(part, cv2.DIST_L2, cv2.DIST_MASK_5)
+    signed[box] = np.where(part > 0, inside - 0.5, signed[box])
     signed /= UPSAMPLE
     limit = float(width + height)  # a matte without a contour is infinitely far from one
     np.clip(signed, -limit, limit, out=signed)
