@@ -129,9 +129,9 @@ def _single_cameras(
         good = {view.frame: view for view in board_views(corners, name, points, sizes[name])}
         if len(good) < MIN_FRAMES:
             dropped[name] = (
-                f"the board is seen well (at least {MIN_CORNERS} corners) in {len(good)} "
-                f"images, expected at least {MIN_FRAMES}: show it to this camera and a neighbour"
-                " at the same time"
+                f"at least {MIN_CORNERS} corners of the board are seen in {len(good)} images,"
+                f" expected at least {MIN_FRAMES}: show it to this camera and a neighbour at the"
+                " same time"
             )
             continue
         # Fifteen images are enough to start a lens: 8 to 60 led to the same rig.
@@ -139,8 +139,8 @@ def _single_cameras(
         fitted = fit_intrinsics([good[f] for f in frames], sizes[name], model)
         if fitted is None:
             dropped[name] = (
-                f"no lens explains its {len(frames)} board images: wrong corners, or the board "
-                "was never tilted"
+                f"no lens explains its {len(frames)} board images: tilt the board to every side,"
+                " and check that board.toml describes the printed board"
             )
             continue
         K, dist, used = fitted
@@ -185,11 +185,12 @@ def _why_apart(name: str, others: Collection[str], views: Views) -> str:
             " at the same time"
         )
     apart = (
-        f"its board poses agree with no other camera's though it shares frames with {len(shared)}: "
+        f"it shares board images with {len(shared)} other cameras, but agrees with none on where"
+        " the board was: "
     )
     if not any(seen_from_front(view) for view in views[name].values()):
-        return apart + "its images are mirrored; switch that off where they are recorded"
-    return apart + "not synchronised, or wrong corners"
+        return apart + "its images are mirrored; switch mirroring off where they are recorded"
+    return apart + "synchronise it with the others and record the board again"
 
 
 def _refine(
@@ -232,10 +233,10 @@ def _check_agreement(names: list[str], found: BoardCorners, kept: BoardCorners) 
     usual = float(np.median(fit / every))
     if len(names) > 1 and usual < FITTING:
         raise CalibrationError(
-            f"{', '.join(names)} contradict each other: of the usual camera's corners only"
-            f" {usual:.0%} fit one rig, expected {FITTING:.0%} or more; synchronise the cameras"
-            " and record the board again, or rename its images so that those of one moment have"
-            " one name"
+            f"{', '.join(names)} contradict each other: in the median camera only {usual:.0%} of"
+            f" the board's corners fit one rig, expected {FITTING:.0%} or more; synchronise the"
+            " cameras and record the board again, or rename its images so that those of one moment"
+            " have the same name"
         )
 
 
@@ -314,12 +315,18 @@ def _weak(rig: BoardRig, found: BoardCorners, kept: BoardCorners) -> dict[str, s
         if mine.sum() < FITTING * of:
             weak[name] = (
                 f"only {int(mine.sum())} of its {of} corners fit the other cameras and are used:"
-                " not synchronised, moved during the recording, or wrong corners"
+                " it is out of step or moved during the recording; record the board again"
             )
         elif mine.sum() < WEAK_CORNERS:
-            weak[name] = f"{int(mine.sum())} corners, expected {WEAK_CORNERS} or more"
+            weak[name] = (
+                f"{int(mine.sum())} corners, expected {WEAK_CORNERS} or more: show it the board"
+                " more often"
+            )
         elif len(rig.cameras) > 1 and tied < WEAK_FRAMES:
-            weak[name] = f"{tied} board images shared, expected {WEAK_FRAMES} or more"
+            weak[name] = (
+                f"it shares {tied} board images with other cameras, expected {WEAK_FRAMES} or more:"
+                " show the board to it and a neighbour at the same time"
+            )
         elif (tilts := _tilt_spread(rig, seen[name])) < WEAK_TILTS_DEG:
             weak[name] = (
                 f"the board's tilt differs by {tilts:.1f} degrees in its {len(seen[name])} images,"
@@ -327,7 +334,10 @@ def _weak(rig: BoardRig, found: BoardCorners, kept: BoardCorners) -> dict[str, s
                 " tilt the board to every side"
             )
         elif covered < 0.25:
-            weak[name] = f"corners cover {covered:.0%} of its image, expected 25 % or more"
+            weak[name] = (
+                f"corners cover {covered:.0%} of its image, expected 25 % or more: move the board"
+                " through the whole image"
+            )
     return weak
 
 

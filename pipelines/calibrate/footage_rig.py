@@ -54,10 +54,13 @@ NOMINAL = 2.5  # focal length, in longer sides, at which distances are first est
 INNER = slice(17, 68)  # the jaw's outline is not the same skin from every side
 BY_CHANCE = 0.025  # share of wrong points that fit a wrong pose, at most
 NEAR_DEG = 25.0  # frame sets whose relative pose is further from the mean are wrong
-LONE = "it sees a face, but never together with the cameras of the largest group"
+LONE = (
+    "it sees a face, but never at the same time as the other cameras do: add a camera between it"
+    " and the next, board images or calibration.json"
+)
 BLIND = (
-    "it sees no face well, and too few of its features fit points that other cameras know: add a"
-    " camera between it and the next, board images or calibration.json"
+    "it sees no face well, and too few of its features match other cameras: add a camera between"
+    " it and the next, board images or calibration.json"
 )
 
 
@@ -273,8 +276,8 @@ def _landmark_points(
 def _weak(tracks: PointTracks) -> dict[str, str]:
     features = tracks.select(tracks.features())
     return {
-        name: f"shares {count} features with two others, expected {LEAST_POINTS} or more: its"
-        " pose depends almost only on the face and may be off by degrees"
+        name: f"it shares {count} features with two other cameras, expected {LEAST_POINTS} or more:"
+        " its pose depends almost only on the face"
         for name, count in zip(tracks.names, features.shared_points(), strict=True)
         if count < LEAST_POINTS
     }

@@ -6,7 +6,7 @@ Given cameras are checked and refined; others are solved from a board or from th
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -191,12 +191,7 @@ def _from_board(index: Index, config: CalibrateConfig) -> CalibratedRig:
     corners, points, whites = _read_board(index, config.board_frames)
     solution = solve_rig(corners, points, sizes_of(index), config.camera_model, config.rounds)
     uncertainty = state_uncertainty(solution, points)
-    weak = {
-        name: f"{why}; expect errors of {error.px:.2g} px ({error.mm:.2g} mm) at the head"
-        if (error := uncertainty.get(name))
-        else why
-        for name, why in solution.weak.items()
-    }
+    weak = _with_errors(solution.weak, uncertainty)
     squared, kept = np.sum(solution.errors**2, axis=1), solution.corners
     return CalibratedRig(
         source="board",
@@ -224,6 +219,16 @@ def _from_board(index: Index, config: CalibrateConfig) -> CalibratedRig:
         warnings=(*_notes(weak), *_notes(_out_of_step(solution.timing))),
         expected=expected_error(uncertainty),
     )
+
+
+def _with_errors(weak: Mapping[str, str], stated: Mapping[str, HeadError]) -> dict[str, str]:
+    """Add to the reasons why cameras are weak how far these are probably off at the head."""
+    return {
+        name: f"{why}; expect errors of {error.px:.2g} px ({error.mm:.2g} mm) at the head"
+        if (error := stated.get(name))
+        else why
+        for name, why in weak.items()
+    }
 
 
 def expected_error(uncertainty: Mapping[str, HeadError]) -> ExpectedError | None:
@@ -283,7 +288,10 @@ def _from_footage(index: Index, config: CalibrateConfig) -> CalibratedRig:
         same_lens=has_one_lens(index),
     )
     cameras = {n: at_footage_size(camera, blank[n]) for n, camera in solved.cameras.items()}
-    at_full = {name: camera.width / small[name].width for name, camera in cameras.items()}
+    stated = {
+        name: replace(error, px=error.px * cameras[name].width / small[name].width)
+        for name, error in solved.uncertainty.items()
+    }
     check_meeting(cameras, str(index.capture))
     squared, good = np.sum(solved.errors**2, axis=1), solved.inliers
     scale = (
@@ -305,12 +313,12 @@ def _from_footage(index: Index, config: CalibrateConfig) -> CalibratedRig:
             "eye_frame_sets": solved.eyes.frame_sets,
             "eye_spread": round(solved.eyes.spread, 5),
             "uncertainty": {
-                name: {"px": round(error.px * at_full[name], 4), "mm": round(error.mm, 4)}
-                for name, error in solved.uncertainty.items()
+                name: {"px": round(error.px, 4), "mm": round(error.mm, 4)}
+                for name, error in stated.items()
             },
         },
         dropped=_notes(solved.dropped),
-        warnings=(*_notes(solved.weak), Note("scale", scale)),
+        warnings=(*_notes(_with_errors(solved.weak, stated)), Note("scale", scale)),
     )
 
 

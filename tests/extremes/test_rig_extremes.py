@@ -111,7 +111,7 @@ def test_one_mirrored_camera_before_a_board(boards, tmp_path, capsys) -> None:
     write_boards(tmp_path / "capture", boards | {"cam02": turned})
     lines = [row for row in calibrated(tmp_path, capsys) if "cam02" in row]
     assert len(lines) == 1 and lines[0].startswith("  dropped cam02 of S001: ")
-    assert "mirrored; switch that off" in lines[0]
+    assert "switch mirroring off" in lines[0]
 
 
 def test_one_mirrored_camera_of_a_given_rig(balls, tmp_path, capsys) -> None:

@@ -121,7 +121,7 @@ def test_a_rig_whose_every_camera_is_out_of_step_is_refused_in_one_line() -> Non
     rig = make_rig(4)
     observations = observe(rig, board_motion(24, 7), 0.1)
     late = (observations.frame + 5 * observations.camera) % 24
-    with pytest.raises(CalibrationError, match="cam00, .*, cam03: .* not synchronised") as error:
+    with pytest.raises(CalibrationError, match="cam00, .*, cam03: .* synchronise it") as error:
         solve(rig, replace(observations, frame=late))
     assert "\n" not in str(error.value)
 
@@ -162,7 +162,7 @@ def test_a_camera_out_of_step_is_named() -> None:
     late = observations.camera == 1
     frame[late] = (frame[late] + 3) % 20
     solution = solve(rig, replace(observations, frame=frame))
-    assert "not synchronised" in solution.dropped["cam01"]
+    assert "synchronise it" in solution.dropped["cam01"]
     assert rig_errors(solution.cameras, rig)[0] < 0.1
 
 
@@ -181,7 +181,7 @@ def test_a_camera_that_sees_no_board_is_dropped_and_the_rest_goes_on() -> None:
     rig = make_rig(4)
     observations = observe(rig, board_motion(20, 8), 0.1)
     solution = solve(rig, observations.select(observations.camera != 3))
-    assert "seen well" in solution.dropped["cam03"] and len(solution.cameras) == 3
+    assert "in 0 images" in solution.dropped["cam03"] and len(solution.cameras) == 3
 
 
 def test_a_camera_with_few_corners_is_reported_as_weak() -> None:
@@ -194,7 +194,9 @@ def test_a_camera_with_few_corners_is_reported_as_weak() -> None:
 
 def test_no_board_anywhere_is_one_clear_error() -> None:
     rig = make_rig(2)
-    with pytest.raises(CalibrationError, match="no camera can be calibrated.*cam01: the board"):
+    with pytest.raises(
+        CalibrationError, match="no camera can be calibrated.*cam01: at least 8 corners"
+    ):
         solve(rig, gather([], rig))
 
 
