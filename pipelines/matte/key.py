@@ -75,7 +75,8 @@ def key_alpha(
     dark, difference, unshaded = plate_difference(image, model, shadow, length)
     difference = np.where(valid[whole], difference, 0.0)
     region = subject_region(difference, valid.size)
-    if softened < SOFTENINGS and not (region.any() and np.median(difference[region]) > PLAIN):
+    seen = difference[region & (difference > LOW)]  # without the gaps between strands
+    if softened < SOFTENINGS and not (seen.size and np.median(seen) > PLAIN):
         frame, plate = (cv2.GaussianBlur(image, (0, 0), 2.0**softened) for image in given)
         return key_alpha(frame, plate, valid, shadow, softened + 1)
     if not region.any():

@@ -122,5 +122,5 @@ def test_a_bug_in_a_page_is_one_line(capsys):
 
 
 def test_a_port_out_of_range_is_one_error():
-    with pytest.raises(ConfigError, match="choose another port"):
+    with pytest.raises(ConfigError, match="port 70000: expected 0 to 65535"):
         PageServer(page, None, "127.0.0.1", 70000)

@@ -85,7 +85,7 @@ def test_camera_without_or_with_two_kinds_of_footage_is_dropped(raw):
     (raw / "cameras/cam00/video.mp4").touch()
     (raw / "cameras/cam01/frames").rename(raw / "cameras/cam01/photos")
     dropped = read_capture(raw).dropped
-    assert "holds video.mp4, frames/; expected only one" in dropped["cam00"]
+    assert "holds video.mp4, frames/, expected only one" in dropped["cam00"]
     assert "holds no footage" in dropped["cam01"]
 
 
@@ -97,7 +97,7 @@ def test_cameras_on_one_side_of_the_calibration_only_are_dropped(raw):
     capture = read_capture(raw)
     assert list(capture.cameras) == ["cam01", "cam02"]
     assert "not in calibration.json" in capture.dropped["cam00"]
-    assert "footage is not there" in capture.dropped["cam77"]
+    assert "the capture has no footage of it" in capture.dropped["cam77"]
 
 
 def test_malformed_calibration_is_an_error(raw):

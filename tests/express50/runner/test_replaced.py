@@ -159,7 +159,7 @@ def test_check_says_what_is_kept_and_finds_nothing_wrong_with_it(dataset):
         result = audit(dataset, [toy.STAGE], deep=deep)
         assert result.findings == []
         (note,) = result.notes
-        assert note.startswith(".replaced: 0.4 MB (10 files) of outputs since replaced")
+        assert note.startswith(".replaced: 0.4 MB (10 files) of outputs that were replaced")
     audit(dataset, [toy.STAGE], fix=True)
     assert kept(dataset) == ["S001+b", "a"]
 
