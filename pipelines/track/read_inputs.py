@@ -37,9 +37,7 @@ Read = Callable[[str], np.ndarray]
 """Read a camera's undistorted image (H, W, 3) uint8 by its id; raises CaptureError."""
 
 DETECTOR_PASSES = 3  # crops after the coarse pass; 1 measures the same on the twin
-FOLLOWED_VIEWS = (
-    10  # most views in which a face is followed, the most frontal ones; more add nothing
-)
+FOLLOWED_VIEWS = 10  # the most frontal ones, in which a clip's face is followed; more add nothing
 LEAST_FACING = 0.1  # cosine between the face's direction and that to a camera in which to look
 RECENTRE_SHARE = 0.12  # of a crop: a face further from its middle is looked at again, centred
 # A followed face is lost unless more than this share of its views has at least this score.

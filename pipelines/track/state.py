@@ -32,9 +32,8 @@ MIN_FACING = 0.05  # cosine to the camera below which a view is from behind
 EXPRESSION_MEAN = 0.2  # expected activation
 ACTIVE_WIDTH = 0.05
 NEUTRAL_SHARE = 0.2  # factor on both in the neutral frame
-COEFFICIENT_SPREAD = (
-    4.5  # standard deviation of coefficients that are not activations, over EXPRESSION_MEAN
-)
+# Standard deviation of coefficients that are not activations, over EXPRESSION_MEAN.
+COEFFICIENT_SPREAD = 4.5
 # Radians. A single view cannot distinguish a bent neck from a shape: it stays nearer to rest.
 NECK_SIGMA, SINGLE_VIEW_NECK_SIGMA = 0.2, 0.03
 EYE_SIGMA, EYE_DIFFERENCE_SIGMA = 0.3, 0.03
