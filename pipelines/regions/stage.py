@@ -33,11 +33,9 @@ from pipelines.regions.geometry import (
 )
 from pipelines.regions.things import Picture, find_glasses, shown_before
 
-STUDIED_CAMERAS, STUDIED_SIDE = (
-    4,
-    512,
-)  # cameras, and their pixels, that show skin colours and bare scalps
-GLASSES_CAMERAS = 10  # cameras, of that size, that show glasses
+STUDIED_SIDE = 512  # pixels of the pictures that are studied for a person's colours and glasses
+STUDIED_CAMERAS = 4  # in which skin colours and bare scalps are looked for
+GLASSES_CAMERAS = 10  # in which glasses are looked for
 AGREEMENT = 0.85  # a camera with less of the tracked mesh inside its matte gets a warning
 SHOWN = 4  # cameras in the contact sheet
 MARGIN = 32  # pixels about the subject: the discs that find hands and glasses are smaller

@@ -54,10 +54,8 @@ LEAST_SKIN_VERTICES = 100  # fewest vertices of bare skin that show its colour
 # Least standard deviations of the logarithms of red over green, blue over green, brightness.
 SPREADS = (0.05, 0.05, 0.2)
 COLOUR_LIMIT = 3.0  # standard deviations off skin's colour at which trust is halved
-CONFIDENCE_RANGE = (
-    0.5,
-    1.0,
-)  # confidence, as a share of bare skin's, that gives no trust and full trust
+# Confidences, as shares of bare skin's, that give no trust and full trust.
+CONFIDENCE_RANGE = (0.5, 1.0)
 # The rim of hair has colours of skin, so a vertex is trusted only as far as those around it.
 AROUND_M, NEIGHBOURS, EVERY = 0.008, 12, 14
 
