@@ -18,7 +18,7 @@ import numpy as np
 from scipy.stats import t as student_t
 
 from express50.console import log
-from express50.errors import ConfigError, FormatError, nearest
+from express50.errors import ConfigError, FormatError, check_known
 from express50.files.atomic import dump_json, write_bytes, write_json
 from express50.files.digests import file_sha256
 from express50.files.text import markdown_table, read_json_table
@@ -283,11 +283,7 @@ def variants_of(roots: Sequence[Path], names: Sequence[str] = ()) -> dict[str, V
         for root in roots:
             name = root.parent.parent.name if root.name == "shards" else root.name
             rows[f"without_{name}"] = Variant(label=f"W/o {name}", changes={}, without=root)
-    for name in names:
-        if name not in rows:
-            raise ConfigError(
-                f"row {name!r} is unknown{nearest(name, rows)}; expected {', '.join(rows)}"
-            )
+    check_known("the ablation", "row", names, rows)
     # Rows come after those that they are compared with; no_locality uses the full model's weights.
     wanted = {*names, "full", *(rows[name].against for name in names)}
     return {name: row for name, row in rows.items() if not names or name in wanted}

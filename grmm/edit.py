@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from express50.console import count
-from express50.errors import ConfigError, nearest
+from express50.errors import ConfigError, check_known, nearest
 from express50.geometry.transforms import (
     axis_angle_to_matrix,
     matrix_to_axis_angle,
@@ -67,8 +67,8 @@ def trained_head(loaded: Loaded, subject: str, expression: str) -> HeadCodes:
         ConfigError: the checkpoint has no such subject or expression.
     """
     model, frames = loaded.model, loaded.gallery.frames
-    _known("subject", subject, model.subjects)
-    _known("expression", expression, model.expressions)
+    check_known("the checkpoint", "subject", [subject], model.subjects)
+    check_known("the checkpoint", "expression", [expression], model.expressions)
     tracked = frames.get((subject, expression))
     if tracked is None:
         donor = next(s for s, e in frames if e == expression)
@@ -268,14 +268,6 @@ def _entry(text: str, count: int, name: str, what: str, names: Sequence[str] = (
         return int(text)
     named = nearest(text, names) if names else ""
     raise ConfigError(f"control {name!r}: there are {count} {what}, 0 to {count - 1}{named}")
-
-
-def _known(what: str, name: str, known: Sequence[str]) -> None:
-    if name not in known:
-        raise ConfigError(
-            f"the checkpoint has no {what} {name}{nearest(name, known)}; it has "
-            f"{', '.join(list(known)[:12])}"
-        )
 
 
 def _lerp(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:

@@ -225,25 +225,36 @@ def arkit_targets(loaded: Loaded, head: HeadCodes) -> dict[str, np.ndarray]:
 def with_morph_targets(glb: bytes, positions: np.ndarray, targets: dict[str, np.ndarray]) -> bytes:
     """Add morph targets to a GLB of one mesh, whose P POSITIONs are vertices ``positions``."""
     size = struct.unpack("<I", glb[12:16])[0]
-    document, body = json.loads(glb[20 : 20 + size]), glb[28 + size :]
+    document, body = json.loads(glb[20 : 20 + size]), bytearray(glb[28 + size :])
     (mesh,) = document["meshes"]
     (primitive,) = mesh["primitives"]
-    primitive["targets"] = []
-    for moved in targets.values():
-        table = np.ascontiguousarray(moved[positions], "<f4")
-        view = {"buffer": 0, "byteOffset": len(body), "byteLength": table.nbytes}
-        accessor = {
-            "bufferView": len(document["bufferViews"]), "componentType": FLOAT, "type": "VEC3",
-            "count": len(table), "min": table.min(0).tolist(), "max": table.max(0).tolist(),
-        }  # fmt: skip
-        primitive["targets"].append({"POSITION": len(document["accessors"])})
-        document["bufferViews"].append(view)
-        document["accessors"].append(accessor)
-        body += table.tobytes()
+    primitive["targets"] = [
+        {"POSITION": _add_array(document, body, moved[positions], bounds=True)}
+        for moved in targets.values()
+    ]
     mesh["weights"] = [0.0] * len(targets)
     mesh["extras"] = {"targetNames": list(targets)}
-    document["buffers"][0]["byteLength"] = len(body)
     return glb_bytes(document, body)
+
+
+def _add_array(
+    document: dict, body: bytearray, array: np.ndarray, bounds: bool = False, **view: int
+) -> int:
+    """Append an array (N, 1, 3 or 4) to a glTF document's buffer; returns its accessor's number.
+
+    ``bounds`` states its least and largest values; ``view`` adds entries to its buffer view.
+    """
+    table = np.ascontiguousarray(array, "<f4")
+    kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[table.shape[1]]
+    views, accessors = document["bufferViews"], document["accessors"]
+    accessor = {"bufferView": len(views), "componentType": FLOAT, "type": kind}
+    accessor["count"] = len(table)
+    if bounds:
+        accessor |= {"min": table.min(0).tolist(), "max": table.max(0).tolist()}
+    views.append({"buffer": 0, "byteOffset": len(body), "byteLength": table.nbytes} | view)
+    accessors.append(accessor)
+    body += table.tobytes()
+    return len(accessors) - 1
 
 
 def ply_bytes(gaussians: GaussianCloud) -> bytes:
@@ -280,42 +291,30 @@ def splats_glb(gaussians: GaussianCloud) -> bytes:
         f"{EXTENSION}:OPACITY": gaussians.opacities[:, None],
         f"{EXTENSION}:SH_DEGREE_0_COEF_0": (gaussians.colors - 0.5) / SH_DC,
     }
-    views: list[dict] = []
-    accessors: list[dict] = []
-    parts, offset = [], 0
-    for array in attributes.values():
-        table = np.ascontiguousarray(array, "<f4")
-        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[table.shape[1]]
-        accessor = {"bufferView": len(views), "componentType": FLOAT, "type": kind}
-        accessors.append(accessor | {"count": len(table)})
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": table.nbytes,
-                      "target": ARRAY_BUFFER})  # fmt: skip
-        parts.append(table.tobytes())
-        offset += table.nbytes
-    position = np.ascontiguousarray(gaussians.means, "<f4")
-    accessors[0] |= {"min": position.min(0).tolist(), "max": position.max(0).tolist()}
     kernel = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    primitive = {
-        "mode": POINTS,
-        "attributes": {name: number for number, name in enumerate(attributes)},
-        "extensions": {EXTENSION: kernel},
-    }
-    document = {
+    primitive = {"mode": POINTS, "attributes": {}, "extensions": {EXTENSION: kernel}}
+    document: dict = {
         "asset": {"version": "2.0", "generator": "grmm export"},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": "head"}],
         "meshes": [{"primitives": [primitive]}],
-        "buffers": [{"byteLength": offset}],
-        "bufferViews": views,
-        "accessors": accessors,
+        "buffers": [{}],
+        "bufferViews": [],
+        "accessors": [],
     }
-    return glb_bytes(document, b"".join(parts))
+    body = bytearray()
+    primitive["attributes"] = {
+        name: _add_array(document, body, array, name == "POSITION", target=ARRAY_BUFFER)
+        for name, array in attributes.items()
+    }
+    return glb_bytes(document, body)
 
 
-def glb_bytes(document: dict, body: bytes) -> bytes:
+def glb_bytes(document: dict, body: bytes | bytearray) -> bytes:
     """Encode glTF's JSON and its buffer, whose length is a multiple of 4, as one binary file."""
+    document["buffers"][0]["byteLength"] = len(body)
     text = json.dumps(document, separators=(",", ":")).encode("ascii")
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text

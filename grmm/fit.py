@@ -27,7 +27,7 @@ from grmm.checkpoint import Gallery, Loaded, collect_gallery, save_checkpoint
 from grmm.config import Config
 from grmm.data import NO_OFFSETS, HeadViews, Item, Shuffle, spread
 from grmm.edit import HeadCodes, between, trained_head, transfer
-from grmm.evaluate import Render, evaluate, mean
+from grmm.evaluate import evaluate, mean
 from grmm.metrics import PerceptualMetrics
 from grmm.model import GRMM, PinholeView, Rendering
 from grmm.render import comparison_sheet
@@ -58,6 +58,14 @@ class FitState:
         """Return the settings of the checkpoint fitted from."""
         return self.loaded.config
 
+    def render(self, item: Item, shade_view: PinholeView | None = None) -> Rendering:
+        """Render the person in a view; an expression that is not fitted has its trained code."""
+        name, trained = item.key.expression, self.model.expressions
+        z_exp = self.z_exp[name] if name in self.z_exp else self.model.z_exp[trained.index(name)]
+        return self.model.render(
+            self.z_id, z_exp, item.state, item.view, self.views.background, shade_view
+        )
+
 
 def fit(
     loaded: Loaded, views: HeadViews, given: Sequence[int], held_out: Sequence[int], out: Path
@@ -74,11 +82,10 @@ def fit(
     out.mkdir(parents=True, exist_ok=True)
     check_space(out)
     state = start(loaded, views, list(given))
-    render = fitted_render(state)
     held_out = [i for i in held_out if views.keys[i].expression in state.z_exp]
-    stages, effort = run_stages(state, lambda: _scores(state, held_out, render))
+    stages, effort = run_stages(state, lambda: _scores(state, held_out))
     save_fit(state, out)
-    rows = evaluate(views, held_out or state.given, render, judge)
+    rows = evaluate(views, held_out or state.given, state.render, judge)
     metrics: dict[str, object] = {
         "subject": views.keys[state.given[0]].subject,
         "expressions": sorted(state.z_exp),
@@ -92,9 +99,9 @@ def fit(
         "fid": judge.fid(),
     }
     metrics |= effort | judge.missing()
-    comparison_sheet(out / "given.jpg", views, state.given[:6], render)
+    comparison_sheet(out / "given.jpg", views, state.given[:6], state.render)
     if held_out:
-        comparison_sheet(out / "held_out.jpg", views, held_out[:6], render)
+        comparison_sheet(out / "held_out.jpg", views, held_out[:6], state.render)
     write_json(out / "metrics.json", metrics)
     return metrics
 
@@ -151,19 +158,6 @@ def start(loaded: Loaded, views: HeadViews, given: list[int]) -> FitState:
     )
 
 
-def fitted_render(state: FitState) -> Render:
-    """Make a function that renders the fitted person in fitted and training expressions."""
-    model = state.model
-
-    def render(item: Item) -> Rendering:
-        name = item.key.expression
-        fitted = name in state.z_exp
-        code = state.z_exp[name] if fitted else model.z_exp[model.expressions.index(name)]
-        return model.render(state.z_id, code, item.state, item.view, state.views.background)
-
-    return render
-
-
 def invert_codes(state: FitState, until: float = math.inf) -> int:
     """Optimise z_id and z_exp (stage 1) until this time; returns the iterations done."""
     settings = state.config.fit
@@ -176,10 +170,7 @@ def invert_codes(state: FitState, until: float = math.inf) -> int:
     for number, share, item in _items(state, settings.stage1_iterations, until):
         optimizer.param_groups[0]["lr"] = STAGE1_LR * STAGE1_FINAL_LR**share
         optimizer.zero_grad()
-        z_exp = state.z_exp[item.key.expression]
-        rendering = state.model.render(
-            state.z_id, z_exp, item.state, item.view, state.views.background
-        )
+        rendering, z_exp = state.render(item), state.z_exp[item.key.expression]
         loss = state.config.loss.codes * losses.codes(state.z_id, z_exp)
         _finite(_footage_loss(state, rendering, item) + loss, number, 1).backward()
         optimizer.step()
@@ -197,11 +188,8 @@ def tune_decoders(state: FitState, until: float = math.inf) -> int:
     done = 0
     for number, _, item in _items(state, settings.stage2_iterations, until):
         optimizer.zero_grad()
-        z_exp = state.z_exp[item.key.expression]
         shade = random_camera(state, rng) if rng.random() < settings.shuffle_directions else None
-        rendering = state.model.render(
-            state.z_id, z_exp, item.state, item.view, state.views.background, shade
-        )
+        rendering = state.render(item, shade)
         # Few views do not say where the mesh should be: it stays near the tracked one.
         moved = losses.displacement_mm2(rendering.gaussians.displacement)
         loss = _footage_loss(state, rendering, item) + state.config.loss.displacement * moved
@@ -231,16 +219,11 @@ def _items(state: FitState, iterations: int, until: float) -> Iterator[tuple[int
 
 def _decoder_optimizer(state: FitState) -> torch.optim.Optimizer:
     """Build Adam over the decoders; codes and refinement stay fixed."""
-    model, lr, texels = state.model, state.config.fit.stage2_lr, state.model.texel_parameters()
-    special = {id(parameter) for parameter in texels}
-    modules = [model.transform, model.opacity, model.colour]
-    if model.mesh is not None:
-        modules.append(model.mesh)
-    rest = [p for module in modules for p in module.parameters() if id(p) not in special]
-    for parameter in (*rest, *texels):
+    parameters, lr = state.model.parameter_groups(), state.config.fit.stage2_lr
+    rates = {"decoders": lr, "texels": lr * state.config.train.texel_lr_scale}
+    groups = [{"params": parameters[name], "lr": rate} for name, rate in rates.items()]
+    for parameter in (one for group in groups for one in group["params"]):
         parameter.requires_grad_(True)
-    texel_lr = lr * state.config.train.texel_lr_scale
-    groups = [{"params": rest, "lr": lr}, {"params": texels, "lr": texel_lr}]
     return torch.optim.Adam(groups, fused=True)
 
 
@@ -324,10 +307,10 @@ def _finite(loss: Tensor, iteration: int, stage: int) -> Tensor:
     return loss
 
 
-def _scores(state: FitState, held_out: Sequence[int], render: Render) -> Scores:
+def _scores(state: FitState, held_out: Sequence[int]) -> Scores:
     chosen = {"psnr_given_db": state.given, "psnr_held_out_db": held_out}
     scores = {
-        name: mean(evaluate(state.views, spread(indices, LOOKED_AT), render), "psnr_db")
+        name: mean(evaluate(state.views, spread(indices, LOOKED_AT), state.render), "psnr_db")
         for name, indices in chosen.items()
     }
     log("fit: " + "  ".join(f"{k} {v}" for k, v in scores.items() if v is not None))

@@ -12,7 +12,7 @@ from express50.errors import ConfigError
 from grmm.checkpoint import Loaded
 from grmm.data import HeadViews, spread
 from grmm.evaluate import HELD_IDENTITY, Row, evaluate
-from grmm.fit import fitted_render, run_stages, start
+from grmm.fit import run_stages, start
 from grmm.metrics import PerceptualMetrics
 from grmm.shard_source import select
 
@@ -58,9 +58,7 @@ def evaluate_unseen(
     for kind, fitted in ((NOVEL_VIEW, True), (NOVEL_EXPRESSION, False)):
         chosen = [i for i in own if (views.keys[i].expression in state.z_exp) == fitted]
         chosen = spread(chosen, protocol.images or len(chosen))
-        rows += evaluate(
-            views, chosen, fitted_render(state), judge, lambda key, kind=kind: kind, keep
-        )
+        rows += evaluate(views, chosen, state.render, judge, lambda key, kind=kind: kind, keep)
     cameras = sorted({views.keys[i].camera for i in given})
     return rows, {"subject": subject, "cameras": cameras} | effort
 

@@ -152,10 +152,17 @@ class GRMM(Networks):
         """Return the rows of the code tables: (z_id,) and (z_exp,)."""
         return self.z_id[subject], self.z_exp[expression]
 
-    def texel_parameters(self) -> list[nn.Parameter]:
-        """Return the parameters that belong to one texel each."""
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Return all parameters: codes, those of one texel each, decoders, refinement."""
         ladders = (self.transform, self.opacity, self.colour)
-        return [parameter for ladder in ladders for parameter in ladder.texel_parameters()]
+        groups = {
+            "codes": [self.z_id, self.z_exp],
+            "texels": [one for ladder in ladders for one in ladder.texel_parameters()],
+            "refinement": [] if self.refinement is None else [*self.refinement.parameters()],
+        }
+        named = {id(parameter) for group in groups.values() for parameter in group}
+        rest = [parameter for parameter in self.parameters() if id(parameter) not in named]
+        return groups | {"decoders": rest}
 
     def forward(
         self,

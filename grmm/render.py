@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from express50.dataset.tracks import OF_FRAMES, RIG_RATE, Sequence, read_sequence
-from express50.errors import ConfigError
+from express50.errors import ConfigError, check_known
 from express50.files.images import contact_sheet, write_image
 from grmm.checkpoint import Loaded
 from grmm.data import HeadViews, stacked
@@ -117,9 +117,8 @@ def camera_of(loaded: Loaded, name: str | None, size: int = 0) -> PinholeView:
         ConfigError: the checkpoint has no such camera.
     """
     cameras = loaded.gallery.cameras
-    if name is not None and name not in cameras:
-        raise ConfigError(f"the checkpoint has no camera {name}; it has {', '.join(cameras)}")
-    view = frontal(loaded) if name is None else cameras[name]
+    check_known("the checkpoint", "camera", [name] if name else [], cameras)
+    view = cameras[name] if name else frontal(loaded)
     return resized(view, size) if size else view
 
 
@@ -283,10 +282,8 @@ def read_clips(path: Path, cue: str | None = None) -> Sequence:
     clips = read_sequence(path)
     if cue is None:
         return clips
+    check_known(str(path), "clip of cue", [cue], dict.fromkeys(clips.cues))
     rows = [i for i, name in enumerate(clips.cues) if name == cue]
-    if not rows:
-        known = ", ".join(dict.fromkeys(clips.cues))
-        raise ConfigError(f"--drive-cue {cue}: {path} has no such clip; expected one of {known}")
     parts = {name: getattr(clips, name)[rows] for name in OF_FRAMES}
     return replace(clips, cues=(cue,) * len(rows), **parts)
 

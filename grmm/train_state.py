@@ -147,18 +147,15 @@ def split_samples(keys: Sequence[SampleKey], config: Config) -> tuple[list[int],
 
 
 def make_optimizer(model: GRMM, config: Config) -> torch.optim.Optimizer:
-    """Build Adam with one group each for codes, texel parameters, refinement and the rest."""
-    codes = [model.z_id, model.z_exp]
-    texels = model.texel_parameters()
-    refinement = [] if model.refinement is None else list(model.refinement.parameters())
-    special = {id(parameter) for parameter in codes + texels + refinement}
-    rest = [parameter for parameter in model.parameters() if id(parameter) not in special]
-    groups = [
-        {"params": rest, "scale": 1.0},
-        {"params": codes, "scale": config.train.code_lr_scale},
-        {"params": texels, "scale": config.train.texel_lr_scale},
-        {"params": refinement, "scale": config.train.refine_lr_scale},
-    ]
+    """Build Adam with a rate for each of `GRMM.parameter_groups`."""
+    scales = {  # checkpoints hold the groups in this order
+        "decoders": 1.0,
+        "codes": config.train.code_lr_scale,
+        "texels": config.train.texel_lr_scale,
+        "refinement": config.train.refine_lr_scale,
+    }
+    parameters = model.parameter_groups()
+    groups = [{"params": parameters[name], "scale": scale} for name, scale in scales.items()]
     return torch.optim.Adam(groups, lr=config.train.lr, fused=True)
 
 

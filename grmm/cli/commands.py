@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from express50.console import OK, answer, log, say
 from express50.contract.config import config_toml, known_assignments
-from express50.errors import ConfigError, nearest
+from express50.errors import ConfigError, check_known
 from express50.files.atomic import write_bytes, write_json
 from grmm.config import TABLES, Config, as_tables, choose, from_tables, resolve
 from grmm.deviations import paper_diff
@@ -95,10 +95,8 @@ def config(args: argparse.Namespace) -> int:
     if args.paper_diff:
         say(*paper_diff(resolved))
         return OK
+    check_known("grmm config", "table", args.table, TABLES)
     for table in args.table or TABLES:
-        if table not in TABLES:
-            near = nearest(table, TABLES)
-            raise ConfigError(f"unknown table {table!r}{near}; expected one of {', '.join(TABLES)}")
         say(config_toml(table, getattr(resolved, table)))
     return OK
 

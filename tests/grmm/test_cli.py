@@ -159,7 +159,7 @@ def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
         (["score", "{shards}", "{shards}", "{checkpoint}"], 2, "is a file, expected a folder"),
         (["render", "{out}/absent.pt", "{out}"], 1, "absent.pt: no such file"),
         (["render", "{shards}", "{out}"], 1, "is a folder, expected a file"),
-        (["render", "{checkpoint}", "{out}", "--subject=S9"], 2, "has no subject S9"),
+        (["render", "{checkpoint}", "{out}", "--subject=S9"], 2, "no subject 'S9'"),
         (["export", "{checkpoint}", "{out}/head.obj"], 2, "expected one of .html, .ply, .spz"),
         (["export", "{checkpoint}", "{out}/head.ply", "--control=jaw=3"], 2,
          "got 1 number, expected 3 with commas between, or jaw.0 to jaw.2 with one"),
