@@ -212,7 +212,8 @@ def run_ui(args: argparse.Namespace) -> int:
     AnnotateApp(session, faces=FaceFinder(dataset), sixel_cell=cell).run()
     done, total = session.done, len(session.tasks)
     words = f"{done} of {total} done by {session.annotator}"
-    return answer(args, {"done": done, "tasks": total}, words)
+    after = f"run 'express50 align {dataset.root}' to use the labels"
+    return answer(args, {"done": done, "tasks": total}, f"{words}; {after}")
 
 
 def _check_terminal() -> None:

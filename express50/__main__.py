@@ -16,9 +16,8 @@ from express50.twin import record as twin
 OWN = (stages, dial, status, shards, check, plan, export, twin)
 DESCRIPTION = "From raw multi-view head footage to packed, annotated shards."
 EPILOG = """example:
-  express50 run DATASET CAPTURE... --preset draft
   express50 run DATASET CAPTURE... --budget 2h
-exit codes: 0 all done; 1 an item failed or a budget ended; 2 wrong usage or configuration, or
+exit codes: 0 all done; 1 an item failed or a budget ended; 2 wrong usage or settings, or \
 something that a run needs is missing (nothing was started)"""
 
 
@@ -27,12 +26,7 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
 
     A command of another package is loaded only when it is called; otherwise it is just listed.
     """
-    parser = Parser(
-        prog="express50",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = Parser(prog="express50", description=DESCRIPTION, epilog=EPILOG)
     parser.add_argument("--version", action="version", version=f"express50 {__version__}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for module in OWN:

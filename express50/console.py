@@ -10,6 +10,7 @@ import os
 import re
 import signal
 import sys
+import textwrap
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
@@ -34,12 +35,26 @@ REMEDIES = {
 }
 
 
+class _HelpFormatter(argparse.RawDescriptionHelpFormatter):
+    """Keeps the lines of descriptions, wraps long ones, and aligns lists of sub-commands."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        lines = text.splitlines()
+        return "\n".join(textwrap.fill(line, width, subsequent_indent=indent) for line in lines)
+
+    def add_argument(self, action: argparse.Action) -> None:
+        super().add_argument(action)
+        for choice in self._iter_indented_subactions(action):  # argparse ignores their indent
+            length = self._current_indent + len(self._format_action_invocation(choice))
+            self._action_max_length = max(self._action_max_length, length)
+
+
 class Parser(argparse.ArgumentParser):
     """Parses a command line; suggests the nearest known word for an unknown one."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         """Read ``-4m`` and ``-1e3`` as values, so that the option they belong to refuses them."""
-        super().__init__(*arguments, **options)
+        super().__init__(*arguments, formatter_class=_HelpFormatter, **options)
         self._negative_number_matcher = re.compile(r"-\.?\d\S*")
 
     def _get_value(self, action: argparse.Action, text: str) -> Any:
@@ -59,7 +74,13 @@ class Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, words)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse a command's arguments; refuse those left over here, where its options are known."""
+        """Parse a command's arguments; refuse those left over here, where its options are known.
+
+        Print the whole help if there are none and a sub-command is expected.
+        """
+        if not args and self._subparsers is not None:
+            self.print_help(sys.stderr)
+            self.exit(USAGE)
         found, left = super().parse_known_args(args, namespace)
         if left:
             near = nearest(left[0].partition("=")[0], self._option_string_actions)
@@ -141,7 +162,6 @@ def add_command(
     options.setdefault("description", help and f"{help[0].upper()}{help[1:]}.")
     if example is not None:
         options |= {"epilog": f"example:\n  {example}"}
-        options |= {"formatter_class": argparse.RawDescriptionHelpFormatter}
     parser = subparsers.add_parser(name, help=help, **options)
     parser.set_defaults(handler=handler)
     if dataset:

@@ -19,10 +19,10 @@ def add_commands(subparsers: Any) -> None:
     words = "compare a dataset with its ledger, and repair it"
     check = add_command(
         subparsers, "check", run_check, words,
-        description="Compare every output with what was published (presence and size; SHA-256 if\n"
-        "the modification time differs; --deep reads every byte) and with the present\n"
-        "inputs and settings. Look for unfinished and unknown outputs, labels of frames\n"
-        "that do not exist, missing captures, and traces of withdrawn people.\n"
+        description="Compare every output with what was published (presence and size; SHA-256 if "
+        "the modification time differs; --deep reads every byte) and with the present "
+        "inputs and settings. Look for unfinished and unknown outputs, labels of frames "
+        "that do not exist, missing captures, and traces of withdrawn people. "
         "Exit code 0 if no problem is left, 1 otherwise.",
         example="express50 check DATASET --fix && express50 run DATASET",
     )  # fmt: skip
@@ -42,10 +42,10 @@ def add_commands(subparsers: Any) -> None:
     words = "remove everything that the dataset holds about a subject"
     withdraw = add_command(
         actions, "withdraw", run_withdraw, words,
-        description="Remove a subject's index, derived files, labels and receipts, the packed\n"
-        "shards, and everything else that names the person. Take codes and frames out\n"
-        "of checkpoints, note the time in withdrawn.json, then search the rest for the\n"
-        "subject's id. Without --yes, only list what would be removed.\n"
+        description="Remove a subject's index, derived files, labels and receipts, the packed "
+        "shards, and everything else that names the person. Take codes and frames out "
+        "of checkpoints, note the time in withdrawn.json, then search the rest for the "
+        "subject's id. Without --yes, only list what would be removed. "
         "'express50 check' proves the removal at any later time.",
         example="express50 subject withdraw DATASET S001 --yes",
     )  # fmt: skip

@@ -45,8 +45,8 @@ def add_commands(subparsers: Any) -> None:
     words = "measure the error of the whole chain against its time on this dataset"
     parser = add_command(
         subparsers, "tune", run_tune, words,
-        description="Try every setting of every stage on a few expressions of one subject, print\n"
-        "the choices that no other choice beats in both time and error, and write them to\n"
+        description="Try every setting of every stage on a few expressions of one subject, print "
+        "the choices that no other choice beats in both time and error, and write them to "
         "DATASET/dial/front.csv. Later, 'run --budget' and 'plan' use the measurements.",
         example="express50 tune DATASET && express50 report DATASET",
     )  # fmt: skip

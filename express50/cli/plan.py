@@ -77,9 +77,9 @@ def add_commands(subparsers: Any) -> None:
     words = "estimate what a campaign costs, from measured datasets"
     parser = add_command(
         subparsers, "plan", run_plan, words,
-        description="Scale the time and disk space that every stage took on a dataset to the size\n"
-        "of a campaign. Every figure comes from receipts or from 'express50 tune' on this\n"
-        "machine; stages that were not run are n/a. A second dataset of another size\n"
+        description="Scale the time and disk space that every stage took on a dataset to the size "
+        "of a campaign. Every figure comes from receipts or from 'express50 tune' on this "
+        "machine; stages that were not run are n/a. A second dataset of another size "
         "(--also) separates costs that grow with the footage from constant ones.",
         example="express50 plan DATASET --also OTHER --target express-50 --workers 32",
     )  # fmt: skip

@@ -16,7 +16,19 @@ from express50.errors import ConfigError, nearest
 
 
 def add_commands(subparsers: Any) -> None:
-    """Add one command per stage, ``run`` and ``config``."""
+    """Add ``run``, one command per stage, and ``config``."""
+    names = list(stages())
+    words = f"run all stages in order, from {names[0]} to {names[-1]}"
+    parser = add_command(
+        subparsers, "run", run_all, words,
+        description="Run all stages in order, and skip items that are up to date. With --budget "
+        "or --error, first measure a few expressions, then choose the settings of every stage.",
+        example="express50 run DATASET CAPTURE... --budget 2h\n"
+        "settings of a stage: express50 config STAGE",
+    )  # fmt: skip
+    add_run_options(parser, captures=True)
+    parser.add_argument("--first", metavar="STAGE", choices=names, help="first stage to run")
+    parser.add_argument("--last", metavar="STAGE", choices=names, help="last stage to run")
     for stage in stages().values():
         parser = add_command(
             subparsers, stage.name, run_one, stage.help,
@@ -25,17 +37,6 @@ def add_commands(subparsers: Any) -> None:
         add_run_options(parser, captures=stage.prepare is not None)
         parser.add_argument("--items", metavar="GLOB", help="only items that match, such as 'S00*'")
         parser.set_defaults(stage=stage.name)
-    words, names = "run all stages in order", list(stages())
-    parser = add_command(
-        subparsers, "run", run_all, words,
-        description="Run all stages in order, and skip items that are up to date. With --budget\n"
-        "or --error, first measure a few expressions, then choose the settings of every stage.",
-        example="express50 run DATASET CAPTURE... --budget 2h\n"
-        "settings of a stage: express50 config STAGE",
-    )  # fmt: skip
-    add_run_options(parser, captures=True)
-    parser.add_argument("--first", metavar="STAGE", choices=names, help="first stage to run")
-    parser.add_argument("--last", metavar="STAGE", choices=names, help="last stage to run")
     words = "print the settings of stages as TOML"
     parser = add_command(subparsers, "config", show_config, words, dataset=False, json=False)
     parser.add_argument("stage", nargs="*", metavar="STAGE", help="stages to print (default: all)")

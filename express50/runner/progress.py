@@ -12,7 +12,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import MofNCompleteColumn, Progress
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from express50.console import log
 from express50.errors import FormatError
@@ -28,7 +35,10 @@ def showing(stage: str, total: int, enabled: bool) -> Iterator[Callable[[Receipt
     Yields the function that takes the receipt of each.
     """
     in_terminal = enabled and total > 0 and sys.stderr.isatty()
-    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
+        TimeElapsedColumn(), "elapsed,", TimeRemainingColumn(), "left",
+    )  # fmt: skip
     bar = Progress(*columns, console=Console(stderr=True))  # shows nothing until it is entered
     task, settled = bar.add_task(stage, total=total), itertools.count(1)
 

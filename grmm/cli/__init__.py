@@ -428,12 +428,7 @@ STUDY_ACTIONS = {
 
 def build_parser() -> argparse.ArgumentParser:
     """Build the argument parser with all commands."""
-    parser = Parser(
-        prog="grmm",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = Parser(prog="grmm", description=DESCRIPTION, epilog=EPILOG)
     parser.add_argument("--version", action="version", version=f"grmm {__version__}")
     group = parser.add_subparsers(required=True, metavar="COMMAND")
     for name, command in COMMANDS.items():

@@ -44,6 +44,17 @@ def data(tmp_path):
     return tmp_path / "data"
 
 
+@pytest.mark.parametrize("words", [[], ["annotate"]], ids=["express50", "annotate"])
+def test_without_a_command_the_help_lists_all_in_aligned_columns(run, words):
+    code, out, err = run(*words)
+    assert (code, out) == (2, "")
+    listed = [line for line in err.splitlines() if line.startswith("    ")]
+    names = {line.split()[0] for line in listed if line[4] != " "}
+    assert names > ({"run", "ingest", "annotate"} if not words else {"ui", "reference"})
+    begins = {len(line) - len(line[4:].partition(" ")[2].lstrip()) for line in listed}
+    assert len(begins) == 1
+
+
 def test_ingest_then_skip_then_status(run, data, capture):
     code, out, err = run("ingest", data, capture)
     assert code == 0
