@@ -172,8 +172,11 @@ class Item:
 
     def without_hidden(self, image: Tensor, depth: Tensor) -> Tensor:
         """Return ``image`` (3, H, W) with the background where the torso is before its depth."""
-        behind = (self.torso > 0) & (depth > self.torso)
-        return torch.where(behind, self.background, image)
+        return self.beyond_torso(image, depth, self.background)
+
+    def beyond_torso(self, values: Tensor, depth: Tensor, fill: float) -> Tensor:
+        """Return values (..., H, W) with ``fill`` where the torso is before ``depth`` (H, W)."""
+        return torch.where((self.torso > 0) & (depth > self.torso), fill, values)
 
     def comparable(self, image: Tensor) -> Tensor:
         """Return ``image`` (3, H, W) with the footage where the neck is hidden."""

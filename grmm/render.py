@@ -35,7 +35,8 @@ from grmm.model import PinholeView
 from grmm.networks import normalise_depth
 
 YAWS, PITCHES = (-60, -30, 0, 30, 60), (20, 0, -20)  # degrees of the sheet of novel views
-Sheet = tuple[list[list[np.ndarray]], list[str]]
+Sheet = tuple[list[list[np.ndarray]], list[str], list[str]]
+"""Rows of pictures, a label per row, a caption per column."""
 COLUMNS = "footage, refined, drawn, depth, error times four"  # of comparison sheets
 STEPS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 TURNS = {"neck, yaw": ("neck.1", 0.35), "eyes, yaw": ("eyes", 0.4)}  # radians of a step of 1
@@ -62,11 +63,11 @@ def comparison_sheet(path: Path, views: HeadViews, indices: Many[int], render: R
         item = views.item(index)
         out = item.before_torso(render(item))
         pictures = [to_uint8(image) for image in (item.target, out.image, out.rgb)]
-        pictures.append(depth_picture(out.depth, out.alpha))
+        pictures.append(depth_picture(out.depth, item.beyond_torso(out.alpha, out.depth, 0.0)))
         pictures.append(to_uint8(4 * (out.image - item.target).abs()))
         rows.append(pictures)
         labels.append(f"{item.key.subject} {item.key.expression} {item.key.camera}")
-    write_sheet(path, rows, labels)
+    write_sheet(path, rows, labels, COLUMNS.split(", "))
 
 
 def orbit(view: PinholeView, degrees: float, centre: Tensor, pitch: float = 0.0) -> PinholeView:
@@ -149,25 +150,27 @@ def turntable(
     return draw_views(loaded, head, views)
 
 
-def novel_views(loaded: Loaded, head: HeadCodes, view: PinholeView) -> list[list[np.ndarray]]:
+def novel_views(loaded: Loaded, head: HeadCodes, view: PinholeView) -> Sheet:
     """Draw rows of PITCHES and columns of YAWS, degrees, around ``view``."""
     centre = loaded.model.head_centre
     views = (orbit(view, yaw, centre, pitch) for pitch in PITCHES for yaw in YAWS)
     pictures = list(draw_views(loaded, head, views))
-    return [pictures[i : i + len(YAWS)] for i in range(0, len(pictures), len(YAWS))]
+    rows = [pictures[i : i + len(YAWS)] for i in range(0, len(pictures), len(YAWS))]
+    return rows, [f"pitch {p:+d}" for p in PITCHES], [f"yaw {yaw:+d}" for yaw in YAWS]
 
 
 def expression_grid(
     loaded: Loaded, subjects: Many[str], expressions: Many[str], view: PinholeView
-) -> list[list[np.ndarray]]:
+) -> Sheet:
     """Draw every subject (rows) with every expression (columns).
 
     A subject without a tracked frame of an expression gets it by transfer.
     """
-    return [
+    rows = [
         [picture(loaded, trained_head(loaded, subject, e), view) for e in expressions]
         for subject in subjects
     ]
+    return rows, list(subjects), list(expressions)
 
 
 def interpolation(
@@ -201,7 +204,7 @@ def control_sheet(loaded: Loaded, head: HeadCodes, view: PinholeView) -> Sheet:
         [picture(loaded, controlled(loaded, head, change), view) for change in row]
         for row in changes.values()
     ]
-    return rows, list(changes)
+    return rows, list(changes), []
 
 
 def strongest_coefficients(loaded: Loaded, count: int) -> dict[int, float]:
@@ -228,8 +231,8 @@ def residual_sheet(
         controlled(loaded, both, {"z_exp": (0.0,)}),
         expression,
     ]
-    labels = ["identity | FLAME moved | z_exp moved | both | both, z_exp = 0 | donor"]
-    return [[picture(loaded, head, view) for head in heads]], labels
+    captions = ["identity", "parameters moved", "z_exp moved", "both", "both, z_exp = 0", "donor"]
+    return [[picture(loaded, head, view) for head in heads]], [""], captions
 
 
 def sample_sheet(
@@ -248,7 +251,7 @@ def sample_sheet(
         "both": [sample_expression(loaded, person, rng, spread) for person in people],
     }
     pictures = [[picture(loaded, one, view) for one in row] for row in rows.values()]
-    return pictures, list(rows)
+    return pictures, list(rows), []
 
 
 def driven(
@@ -288,10 +291,12 @@ def read_clips(path: Path, cue: str | None = None) -> Sequence:
     return replace(clips, cues=(cue,) * len(rows), **parts)
 
 
-def write_sheet(path: Path, rows: Many[Many[np.ndarray]], labels: Many[str] | None = None) -> None:
-    """Write rows of pictures of one size as one picture."""
+def write_sheet(
+    path: Path, rows: Many[Many[np.ndarray]], labels: Many[str], captions: Many[str]
+) -> None:
+    """Write rows of pictures of one size as one picture, with labels and captions of columns."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_image(path, contact_sheet(rows, labels, rows[0][0].shape[:2]))
+    write_image(path, contact_sheet(rows, labels, rows[0][0].shape[:2], captions))
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], rate: float = RIG_RATE) -> None:

@@ -453,15 +453,24 @@ def contact_sheet(
     rows: Sequence[Sequence[np.ndarray]],
     labels: Sequence[str] | None = None,
     tile: tuple[int, int] = (160, 160),
+    captions: Sequence[str] = (),
 ) -> np.ndarray:
-    """Lay out rows of images as one picture (H, W, 3) uint8, each row with an optional label."""
+    """Lay out rows of images as one picture (H, W, 3) uint8.
+
+    Each row has an optional label; ``captions`` stand above the columns.
+    """
     columns = max((len(row) for row in rows), default=1)
     blank = np.full((*tile, 3), 24, np.uint8)
     lines = []
+    if captions:
+        head = np.full((20, columns * tile[1], 3), 24, np.uint8)
+        for column, caption in enumerate(captions):
+            cv2.putText(head, caption, (5 + column * tile[1], 14), *_LABEL)
+        lines.append(head)
     for number, row in enumerate(rows):
         tiles = [fit_into(image, *tile) for image in row]
         line = np.concatenate(tiles + [blank] * (columns - len(tiles)), axis=1)
-        if labels is not None:
+        if labels is not None and labels[number]:
             line[:20] //= 3  # a dark band, so that white text is legible on any picture
             cv2.putText(line, labels[number], (5, 14), *_LABEL)
         lines.append(line)

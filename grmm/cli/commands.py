@@ -157,7 +157,7 @@ def render(args: argparse.Namespace) -> int:
         say(f"wrote {args.out / name}.mp4")
     sheets: dict[str, Any] = {}
     if args.views:
-        sheets["views"] = (render.novel_views(loaded, head, view),)
+        sheets["views"] = render.novel_views(loaded, head, view)
     if args.controls:
         sheets["controls"] = render.control_sheet(loaded, head, view)
     if args.expression_of:
@@ -169,7 +169,7 @@ def render(args: argparse.Namespace) -> int:
             loaded, head, view, args.samples, args.seed, args.spread
         )
     expressions = model.expressions[: args.columns]
-    sheets["grid"] = (render.expression_grid(loaded, model.subjects[:8], expressions, view),)
+    sheets["grid"] = render.expression_grid(loaded, model.subjects[:8], expressions, view)
     for name, sheet in sheets.items():
         render.write_sheet(args.out / f"{name}.jpg", *sheet)
         say(f"wrote {args.out / name}.jpg")

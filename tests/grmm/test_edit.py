@@ -162,17 +162,20 @@ def test_pictures_of_another_size_show_the_same(loaded):
 
 def test_sheets_have_a_row_for_everything(loaded):
     head, view = trained_head(loaded, "S000", "e0"), frontal(loaded)
-    rows, labels = control_sheet(loaded, head, view)
+    rows, labels, _ = control_sheet(loaded, head, view)
     assert labels[:3] == ["jaw", "neck, yaw", "eyes, yaw"] and "z_exp.0" in labels
     stretched = rows[labels.index("e0")]
     assert not np.array_equal(stretched[0], stretched[-1])
-    (pictures,), _ = residual_sheet(loaded, head, trained_head(loaded, "S001", "e2"), view)
-    assert len(pictures) == 6
-    rows, _ = sample_sheet(loaded, head, view, 2, seed=1)
-    again, _ = sample_sheet(loaded, head, view, 2, seed=1)
+    (pictures,), _, captions = residual_sheet(
+        loaded, head, trained_head(loaded, "S001", "e2"), view
+    )
+    assert len(pictures) == len(captions) == 6
+    rows, _, _ = sample_sheet(loaded, head, view, 2, seed=1)
+    again, _, _ = sample_sheet(loaded, head, view, 2, seed=1)
     assert [len(row) for row in rows] == [2, 2, 2]
     np.testing.assert_array_equal(rows[2][1], again[2][1])
-    assert len(novel_views(loaded, head, view)) == 3
+    rows, labels, captions = novel_views(loaded, head, view)
+    assert len(rows) == len(labels) == 3 and len(rows[0]) == len(captions) == 5
 
 
 def test_glb_holds_the_mesh_with_its_texture(loaded, tmp_path):

@@ -187,7 +187,8 @@ def test_turntable_grid_and_interpolation(loaded):
     frames = list(turntable(loaded, start, view, frames=3))
     assert len(frames) == 3 and frames[0].shape == (32, 32, 3)
     assert not np.array_equal(frames[0], frames[1])
-    rows = expression_grid(loaded, ["S000", "S001"], ["e0", "e1"], view)
+    rows, *names = expression_grid(loaded, ["S000", "S001"], ["e0", "e1"], view)
+    assert names == [["S000", "S001"], ["e0", "e1"]]
     assert len(rows) == 2 and len(rows[0]) == 2
     blend_frames = list(interpolation(loaded, start, end, view, frames=3))
     np.testing.assert_array_equal(blend_frames[0], rows[0][0])

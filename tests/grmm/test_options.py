@@ -42,14 +42,18 @@ def test_the_captions_name_the_columns_of_comparison_sheets(views, tmp_path, mon
     """Refined and drawn were once swapped in the README."""
     run = prepare(views, tiny_config())
     sheets = []
-    monkeypatch.setattr(render, "write_sheet", lambda path, rows, labels: sheets.append(rows))
+    monkeypatch.setattr(
+        render, "write_sheet", lambda path, rows, *texts: sheets.append((rows, texts))
+    )
     item = views.item(0)
     with torch.no_grad():
         out = run.model(0, 0, item.state, item.view)
     out = replace(out, image=torch.full_like(out.rgb, 0.25), rgb=torch.full_like(out.rgb, 0.75))
     render.comparison_sheet(tmp_path / "x.jpg", views, [0], lambda item: out)
     refined, drawn = (COLUMNS.split(", ").index(name) for name in ("refined", "drawn"))
-    assert sheets[0][0][refined].max() == 64 and sheets[0][0][drawn].min() == 191
+    ((rows, (_, captions)),) = sheets
+    assert rows[0][refined].max() == 64 and rows[0][drawn].min() == 191
+    assert ", ".join(captions) == COLUMNS
     page = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
     words = {"refined": "GRMM", "drawn": "GRMM without its refinement network"}
     caption = ", ".join(words.get(column, column) for column in COLUMNS.split(", "))

@@ -91,6 +91,13 @@ def test_contact_sheet_pads_short_rows():
     assert sheet.shape == (80, 150, 3)
 
 
+def test_contact_sheet_writes_captions_above_its_columns():
+    row = [np.zeros((10, 20, 3), np.uint8)] * 2
+    sheet = images.contact_sheet([row], tile=(40, 50), captions=["", "depth"])
+    assert sheet.shape == (60, 100, 3)
+    assert sheet[:20, :50].max() == 24 and sheet[:20, 50:].max() > 200
+
+
 def test_distances_to_an_edge_are_the_same_wherever_a_mask_lies():
     """OpenCV's own differ in the last bit with the addresses of its arrays."""
     mask = np.hypot(*(np.mgrid[:97, :83] - 45.0)) < 31.0
