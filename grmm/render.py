@@ -232,7 +232,7 @@ def residual_sheet(
         expression,
     ]
     captions = ["identity", "parameters moved", "z_exp moved", "both", "both, z_exp = 0", "donor"]
-    return [[picture(loaded, head, view) for head in heads]], [""], captions
+    return [[picture(loaded, head, view) for head in heads]], [], captions
 
 
 def sample_sheet(

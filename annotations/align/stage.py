@@ -212,6 +212,6 @@ def _write_sheet(dataset: Dataset, index: Index, peaks: Mapping[str, Label], out
             continue
         frames = (cue.start_frame, peak.frame, min(cue.end_frame, index.frames - 1))
         rows.append([read_proxy(dataset, index.subject, peak.camera or "", f) for f in frames])
-        names.append(f"{cue.expression_id}: first, taken {peak.frame}, last")
+        names.append([f"{cue.expression_id}: first", f"taken: {peak.frame}", "last"])
     (out / "qc").mkdir()
     write_image(out / "qc" / "peaks.jpg", contact_sheet(rows, names), quality=85)

@@ -57,7 +57,7 @@ def run(dataset: Dataset, item: str, config: ObserveConfig, out: Path) -> Result
 
 STAGE = Stage(
     name="observe",
-    version=2,
+    version=3,
     config=ObserveConfig,
     presets={"draft": {"cameras": 1, "stride": 2}},
     items=Dataset.subjects,

@@ -113,7 +113,7 @@ def run(
     )  # fmt: skip
     (out / "qc").mkdir()
     row = [read_proxy(dataset, item, camera, middle) for camera in watching]
-    write_image(out / "qc" / "cameras.jpg", contact_sheet([row], [", ".join(watching)]), quality=85)
+    write_image(out / "qc" / "cameras.jpg", contact_sheet([row], [watching]), quality=85)
     metrics = {
         "frames": len(frames),
         "watching_cameras": watching,

@@ -451,35 +451,40 @@ _LABEL = (cv2.FONT_HERSHEY_SIMPLEX, 0.42, (255, 255, 255), 1, cv2.LINE_AA)
 
 def contact_sheet(
     rows: Sequence[Sequence[np.ndarray]],
-    labels: Sequence[str] | None = None,
+    labels: Sequence[str | Sequence[str]] = (),
     tile: tuple[int, int] = (160, 160),
     captions: Sequence[str] = (),
 ) -> np.ndarray:
     """Lay out rows of images as one picture (H, W, 3) uint8.
 
-    Each row has an optional label; ``captions`` stand above the columns.
+    A row's label is one text, or one per image; ``captions`` stand above the columns.
     """
     columns = max((len(row) for row in rows), default=1)
     blank = np.full((*tile, 3), 24, np.uint8)
     lines = []
     if captions:
-        head = np.full((20, columns * tile[1], 3), 24, np.uint8)
-        for column, caption in enumerate(captions):
-            cv2.putText(head, caption, (5 + column * tile[1], 14), *_LABEL)
-        lines.append(head)
+        lines.append(np.full((20, columns * tile[1], 3), 24, np.uint8))
+        _write_texts(lines[0], captions, tile[1])
     for number, row in enumerate(rows):
         tiles = [fit_into(image, *tile) for image in row]
         line = np.concatenate(tiles + [blank] * (columns - len(tiles)), axis=1)
-        if labels is not None and labels[number]:
+        if number < len(labels) and labels[number]:
             line[:20] //= 3  # a dark band, so that white text is legible on any picture
-            cv2.putText(line, labels[number], (5, 14), *_LABEL)
+            label = labels[number]
+            _write_texts(line, [label] if isinstance(label, str) else label, tile[1])
         lines.append(line)
     return np.concatenate(lines, axis=0) if lines else blank
 
 
+def _write_texts(line: np.ndarray, texts: Sequence[str], step: int) -> None:
+    for number, text in enumerate(texts):
+        end = None if len(texts) == 1 else (number + 1) * step
+        cv2.putText(line[:, number * step : end], text, (5, 14), *_LABEL)
+
+
 def tile_sheet(pictures: Mapping[str, np.ndarray], columns: int, side: int) -> np.ndarray:
-    """Lay out named pictures in rows of square tiles, each row with its names as the label."""
+    """Lay out named pictures in rows of square tiles, each with its name above it."""
     names = list(pictures)
     rows = [names[k : k + columns] for k in range(0, len(names), columns)]
     tiles = [[pictures[name] for name in row] for row in rows]
-    return contact_sheet(tiles, ["  ".join(row) for row in rows], (side, side))
+    return contact_sheet(tiles, rows, (side, side))

@@ -52,7 +52,7 @@ def needs_gpu(config: MatteConfig) -> bool:
 
 STAGE = Stage(
     name="matte",
-    version=19,
+    version=20,
     config=MatteConfig,
     presets=PRESETS,
     items=peak_items,

@@ -90,8 +90,9 @@ def key_alpha(
     # The first support only says which colours the subject has nearby.
     support = find_support(difference > 2 * LOW, region, clear, length, eroded_about)
     if support.core.any():
-        firm = firm_pixels(image, difference, support.core, part, length)
-        support = find_support(firm, region, clear, length)
+        own = subject_colour(image, support.core, length)
+        firm = firm_pixels(image, difference, own, support.core, part)
+        support = find_support(firm, region, clear & told_apart(own, part), length)
     alpha[whole][window] = _opacity(frame, difference, dark, support, part, length)
     alpha[~valid] = 0.0
     return alpha
@@ -314,7 +315,8 @@ def find_support(
         (~closed).astype(np.uint8), connectivity=4
     )
     fill = stats[:, cv2.CC_STAT_AREA] < LARGEST_HOLE * firm.size
-    fill[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = False
+    # At its lower border the picture cuts the subject off, so a gap there is enclosed.
+    fill[np.concatenate([labels[0], labels[:, 0], labels[:, -1]])] = False
     fill[0] = False  # the closed part itself
     wall = cv2.copyMakeBorder(clear.astype(np.uint8), *pad, cv2.BORDER_REPLICATE)
     hull = (closed | fill[labels]) & (wall == 0)
@@ -331,16 +333,23 @@ def _space_around(mask: np.ndarray) -> tuple[int, int, int, int]:
     return y, mask.shape[0] - y - height, x, mask.shape[1] - x - width
 
 
+def told_apart(own: np.ndarray, model: PlateModel) -> np.ndarray:
+    """Return the pixels (H, W) bool whose plate is not of the subject's colours (H, W, 3) nearby.
+
+    Elsewhere a wide area that looks like the plate may as well be a shirt of the wall's colour.
+    """
+    return _length(whitened(own - model.plate, model)) > HIGH
+
+
 def firm_pixels(
-    image: np.ndarray, difference: np.ndarray, core: np.ndarray, model: PlateModel, length: int
+    image: np.ndarray, difference: np.ndarray, own: np.ndarray, core: np.ndarray, model: PlateModel
 ) -> np.ndarray:
-    """Return the pixels (H, W) bool that look opaque, given the colours of a first core.
+    """Return the pixels (H, W) bool that look opaque, given a first core and the colours near it.
 
     Thin hair differs less from the plate than dense hair. Skin under dark hair may differ little
     too, but is not a mixture of hair and plate: colours off the line between these are subject.
     """
-    colours = image, subject_colour(image, core, length)
-    off, own = (whitened(colour - model.plate, model) for colour in colours)
+    off, own = (whitened(colour - model.plate, model) for colour in (image, own))
     reach = _length(own)
     firm = difference > np.maximum(FIRM * reach, 2 * LOW)
     along = np.einsum("...i,...i->...", off, own)

@@ -88,7 +88,7 @@ ENCODE = Stage(
 
 STAGE = Stage(
     name="pack",
-    version=12,
+    version=13,
     config=PackConfig,
     presets={"draft": {}, "standard": {}, "reference": {}},
     items=items,

@@ -184,14 +184,15 @@ def _statistics(totals: Mapping[str, Any]) -> dict[str, str]:
 
 def _write_contact_sheet(out: Path, reader: ShardReader) -> float:
     """Draw evenly chosen samples; returns the share of their mattes that has depth."""
-    columns, covered = [], []
+    columns, covered, keys = [], [], []
     for number in np.unique(np.linspace(0, len(reader) - 1, QC_SAMPLES).astype(int)):
         sample = reader.sample(int(number))
         inside = sample["alpha"] > 0.5
         covered.append(float(sample["valid"][inside].mean()) if inside.any() else 0.0)
         columns.append(sample_panels(sample))
+        keys.append(sample["key"])
     (out / "qc").mkdir(exist_ok=True)
     rows = [list(row) for row in zip(*columns, strict=True)]
-    sheet = contact_sheet(rows, ["rgb", "alpha", "depth", "parts"], tile=(160, 160))
+    sheet = contact_sheet(rows, ["rgb", "alpha", "depth", "parts"], (160, 160), keys)
     write_image(out / "qc" / "samples.jpg", sheet, quality=90)
     return round(float(np.mean(covered)), 4)

@@ -371,7 +371,7 @@ def write_picture(out: Path, rows: dict[str, list[np.ndarray]], figures: dict[st
     pairs = [[names[k] for k in chosen[start : start + 2]] for start in range(0, len(chosen), 2)]
     sheet = contact_sheet(
         [[picture for name in pair for picture in rows[name]] for pair in pairs],
-        [", ".join(pair) for pair in pairs],
+        [[text for name in pair for text in (name, "", "")] for pair in pairs],
         tile=TILE,
     )
     legend = np.full((24, sheet.shape[1], 3), 24, np.uint8)

@@ -324,3 +324,40 @@ def test_blank_and_tiny_plates_give_finite_mattes(shape: tuple[int, int], level:
     for valid in (np.ones(shape, bool), np.zeros(shape, bool)):
         matched = match_plate(plate, frame, valid)
         assert 0 <= matched.share <= 1 and matched.plate.shape == frame.shape
+
+
+def shirt_before(wall: tuple[int, int, int], gap: bool = False) -> Scene:
+    """Return a head above a shirt that leaves the picture, before a wall with a patch.
+
+    The patch behind the shirt has the colours of ``wall``; ``gap`` cuts it out of the shirt.
+    """
+    rng = np.random.default_rng(5)
+    plate = np.full((256, 256, 3), 150.0)
+    patch = np.zeros((256, 256), np.uint8)
+    cv2.rectangle(patch, (114, 206), (144, 256), 1, -1)
+    plate[patch > 0] = wall
+    alpha = np.zeros((256, 256), np.float32)
+    cv2.ellipse(alpha, (128, 250), (110, 110), 0, 180, 360, 1.0, -1)
+    alpha[240:] = alpha[240]
+    alpha[gap & (patch > 0)] = 0
+    subject = np.full((256, 256, 3), (70.0, 84.0, 110.0))
+    cv2.circle(subject, (128, 110), 50, (205, 160, 138), -1)
+    cv2.circle(alpha, (128, 110), 50, 1.0, -1)
+    frame = np.where(alpha[..., None] > 0, subject, plate)
+    frame, plate = (
+        np.clip(image + rng.normal(0, 2, image.shape), 0, 255).round().astype(np.uint8)
+        for image in (frame, plate)
+    )
+    return Scene(frame=frame, plate=plate, alpha=alpha)
+
+
+def test_a_shirt_of_the_walls_colour_has_no_hole_at_the_lower_border() -> None:
+    scene = shirt_before(wall=(70, 84, 110))
+    assert mae(key(scene), scene) < 0.003
+    assert key(scene)[195:, 108:150].min() > 0.9
+
+
+def test_a_gap_in_a_shirt_shows_a_wall_of_another_colour() -> None:
+    scene = shirt_before(wall=(96, 112, 140), gap=True)
+    assert mae(key(scene), scene) < 0.006
+    assert key(scene)[216:, 122:136].max() < 0.1

@@ -91,6 +91,15 @@ def test_contact_sheet_pads_short_rows():
     assert sheet.shape == (80, 150, 3)
 
 
+def test_a_tile_sheet_writes_each_name_above_its_own_tile():
+    tiles = {name: np.zeros((60, 60, 3), np.uint8) for name in ("a", "b", "c")}
+    sheet = images.tile_sheet(tiles, 2, 60)
+    assert sheet.shape == (120, 120, 3)
+    for row, column in ((0, 0), (0, 60), (60, 0)):
+        assert sheet[row : row + 20, column : column + 60].max() > 200
+    assert sheet[60:, 60:].max() == 24
+
+
 def test_contact_sheet_writes_captions_above_its_columns():
     row = [np.zeros((10, 20, 3), np.uint8)] * 2
     sheet = images.contact_sheet([row], tile=(40, 50), captions=["", "depth"])
