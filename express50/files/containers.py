@@ -31,6 +31,7 @@ from express50.geometry.shapes import PIXEL_LIMIT
 WITHIN = "!/"
 BYTES_LIMIT = 1 << 28  # per encoded image or array
 NAME_LIMIT = 255  # bytes per path component
+BLOWN = 4.0  # median light two stops above white: values of 0 to 255, say
 OPEN_FILES = 4  # containers a process keeps open
 # What h5py raises on bad files.
 DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, AttributeError)
@@ -40,7 +41,7 @@ def to_srgb(image: np.ndarray) -> np.ndarray:
     """Convert an image (H, W[, C]), linear float or 8- or 16-bit sRGB, to (H, W, 3) uint8 sRGB.
 
     Raises:
-        ValueError: the image holds NaN or infinity.
+        ValueError: the image holds NaN or infinity, or values on another scale than 0 to 1.
     """
     image = image[..., None] if image.ndim == 2 else image
     # Grey is repeated, alpha is dropped.
@@ -48,6 +49,10 @@ def to_srgb(image: np.ndarray) -> np.ndarray:
     if image.dtype.kind == "f":
         if not np.isfinite(image).all():
             raise ValueError("image holds NaN or infinity")
+        if np.median(image) > BLOWN:
+            raise ValueError(
+                f"its median is {np.median(image):.3g}, expected linear light from 0 to 1"
+            )
         image = np.rint(linear_to_srgb(np.clip(image, 0.0, 1.0)) * 255.0)
     elif image.dtype == np.uint16:
         image = np.rint(image / 257.0)

@@ -10,6 +10,7 @@ import os
 from bisect import bisect_left
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
@@ -29,6 +30,8 @@ REORDER = 16
 # Accepted containers. FFmpeg goes by content: a playlist named video.mp4 would make it read other
 # files.
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
+# ITU-T H.273, table 3; their pictures look pale and flat if taken for sRGB.
+HDR_CURVES = {16: "PQ", 18: "HLG"}
 BOXES = 1_000_000  # per file; a fragment of one second has two
 DAMAGE = (av.FFmpegError, OSError, ValueError, MemoryError, OverflowError)
 
@@ -148,6 +151,41 @@ def video_fps(path: Path) -> float:
     return rate
 
 
+@dataclass(frozen=True)
+class VideoTags:
+    """What a video says of its pictures, which are read as stored.
+
+    Attributes:
+        turn: quarter turns counter-clockwise, 0 to 3, that it asks players for.
+        hdr: name of its transfer curve if that is one for high dynamic range, else empty.
+        interlaced: whether a picture holds two half pictures of different moments.
+        aspect: width over height of a pixel.
+    """
+
+    turn: int
+    hdr: str
+    interlaced: bool
+    aspect: float
+
+
+def video_tags(path: Path) -> VideoTags:
+    """Read what a video says of its pictures.
+
+    Raises:
+        CaptureError: the file is not a video, is damaged, or holds no frame.
+    """
+    container, stream = _open(path)
+    with container:
+        for frame in _decode(path, container, stream):
+            return VideoTags(
+                round(frame.rotation / 90) % 4,
+                HDR_CURVES.get(int(frame.color_trc), ""),
+                bool(frame.interlaced_frame),
+                float(stream.codec_context.sample_aspect_ratio or 1),
+            )
+    raise CaptureError(f"{path}: video holds no frame; record or copy it again")
+
+
 def video_turn(path: Path) -> int:
     """Read the rotation that a video's container asks for: 0 to 3 quarter turns counter-clockwise.
 
@@ -157,11 +195,7 @@ def video_turn(path: Path) -> int:
     Raises:
         CaptureError: the file is not a video, is damaged, or holds no frame.
     """
-    container, stream = _open(path)
-    with container:
-        for frame in _decode(path, container, stream):
-            return round(frame.rotation / 90) % 4
-    raise CaptureError(f"{path}: video holds no frame; record or copy it again")
+    return video_tags(path).turn
 
 
 def iterate_video(path: Path) -> Iterator[tuple[int, np.ndarray]]:

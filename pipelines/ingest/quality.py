@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import scipy
 
-from express50.files.images import shrink, srgb_to_linear
+from express50.files.images import linear_to_srgb, shrink, srgb_to_linear
 
 SIDE = 96  # longer side, pixels, of the images in which movement is measured
 FEWEST_CAMERAS, FEWEST_FRAMES = 3, 24
@@ -36,6 +36,7 @@ DARK, BRIGHT = 0.004, 0.85  # linear light between which a cell shows the camera
 DRIFT_SPAN = 9  # frames of the running median: a passing hand is not a drift
 FEWEST_CELLS = 12
 FEWEST_DRIFT_FRAMES = 12  # with fewer, a movement looks like a drift
+DIM = 0.05  # linear light, level 63 of 255, below which nothing in a picture is well exposed
 EXPOSURE_DRIFT, COLOUR_DRIFT = 0.15, 0.06  # stops over the capture from which on it is a warning
 _CURVE = srgb_to_linear(np.arange(256, dtype=np.float32) / 255.0).astype(np.float32)
 
@@ -85,6 +86,7 @@ def check_quality(
             words.append(
                 f"repeats the frame before in {len(frames)} frames ({shown}) while others move"
             )
+        words += describe_dark(measured[name].cells)
         words += describe_drift(drifts[name])
         words += [blurred[name]] if name in blurred else []
         if words:
@@ -302,6 +304,21 @@ class Drift:
 def light_cells(image: np.ndarray) -> np.ndarray:
     """Return the mean linear light (16, 16, 3) float32 of an image (H, W, 3) uint8."""
     return cv2.resize(_CURVE[image], (CELLS, CELLS), interpolation=cv2.INTER_AREA)
+
+
+def describe_dark(cells: np.ndarray) -> list[str]:
+    """Describe a camera whose cells (F, 16, 16, 3) are dark in all frames; empty if they are not.
+
+    Files of 16 bits look like this if they hold a sensor's 10 to 14 bits.
+    """
+    brightest = float(cells.max())
+    if brightest >= DIM:
+        return []
+    level = 255 * float(linear_to_srgb(np.float32(brightest)))
+    return [
+        f"is very dark: its brightest parts have level {level:.0f} of 255; correct its exposure, or"
+        " if its files hold 10 to 14 bits in 16, multiply the values to fill all 16"
+    ]
 
 
 def measure_drift(cells: np.ndarray) -> Drift | None:

@@ -27,7 +27,7 @@ from express50.files.images import (
     shrink,
     upright,
 )
-from express50.files.video import iterate_video, video_fps, video_turn
+from express50.files.video import VideoTags, iterate_video, video_fps, video_tags
 from express50.geometry.sampling import edge_width
 from pipelines.ingest.quality import CameraMeasurements, light_cells, movement, small_grey
 
@@ -169,8 +169,9 @@ def odd_footage(raw: RawCapture, cameras: Mapping[str, CameraSource]) -> dict[st
                     words.append(why)
         else:
             path = inside(camera.path, camera.names[0]) if camera.names else camera.path
-            orientation = ORIENTATION[video_turn(path)]
-            words += [w for w in (_rate(raw, path), _uneven(source)) if w]
+            tags = video_tags(path)
+            orientation = ORIENTATION[tags.turn]
+            words += [w for w in (_rate(raw, path), _uneven(source)) if w] + _odd_pictures(tags)
         if orientation != 1 and camera.orientation == 1:
             words.append(
                 "asks players to turn or mirror it, but is used as stored; calibration, board and"
@@ -187,6 +188,23 @@ def _rate(raw: RawCapture, path: Path) -> str:
         if abs(fps - raw.fps) > FPS_SLACK * raw.fps:
             return f"is a video at {fps:.4g} fps, the capture says {raw.fps:.4g}; correct fps there"
     return ""
+
+
+def _odd_pictures(tags: VideoTags) -> list[str]:
+    words = []
+    if tags.hdr:
+        words.append(
+            f"is HDR ({tags.hdr}), but is read as sRGB, so its colours are wrong; record it"
+            " without HDR, or convert it to BT.709"
+        )
+    if tags.interlaced:
+        words.append("is interlaced: a picture mixes two moments; record progressive frames")
+    if tags.aspect != 1:
+        words.append(
+            f"has pixels {tags.aspect:.3g} times as wide as high, but is used as stored; the"
+            " calibration must be as stored too"
+        )
+    return words
 
 
 def _uneven(source: CameraSource) -> str:

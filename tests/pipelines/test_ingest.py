@@ -297,6 +297,33 @@ def test_footage_unlike_what_is_said_of_it_is_a_warning(tmp_path):
     assert "shares frames 8 to 11 with neutral" in said["expression smile"]
 
 
+def test_videos_whose_pictures_are_not_what_they_seem_are_warned_of(tmp_path):
+    root = tmp_path / "S001"
+    make_capture(root, cameras=3, frames=6, video=True)
+    hdr, interlaced, plain = (root / f"cameras/cam0{n}/video.mp4" for n in range(3))
+    images = [image for _, image in iterate_video(plain)]
+    write_video(hdr, images, options={"x264-params": "transfer=arib-std-b67"})
+    write_video(interlaced, images, options={"x264-params": "interlaced=1:sar=16/15"})
+    dataset = Dataset(tmp_path / "data")
+    ingest.register(dataset, [root])
+    assert run(dataset).ok
+    said = {row["what"]: row["why"] for row in metrics(dataset)["warnings"]}
+    assert "is HDR (HLG)" in said["camera cam00"]
+    assert "is interlaced" in said["camera cam01"]
+    assert "pixels 1.07 times as wide as high" in said["camera cam01"]
+    assert "camera cam02" not in said
+
+
+def test_pictures_of_twelve_bits_in_sixteen_are_warned_of(dataset):
+    source = camera_folder(dataset, "cam01") / "video.mp4"
+    images = [image.astype(np.uint16) * 16 for _, image in iterate_video(source)]
+    source.unlink()
+    write_frames(source.parent / "frames", images)
+    assert run(dataset).ok
+    said = {row["what"]: row["why"] for row in metrics(dataset)["warnings"]}
+    assert "is very dark" in said["camera cam01"] and list(said) == ["camera cam01"]
+
+
 @pytest.mark.parametrize("focal", ["-1", "true", "{cam00 = 0}"])
 def test_a_focal_length_that_is_none_fails_at_once(dataset, focal):
     toml = dataset.captures()["S001"] / "capture.toml"

@@ -192,6 +192,11 @@ def test_nan_pixels_are_refused():
         to_srgb(np.full((2, 2, 3), np.nan, np.float32))
 
 
+def test_floats_from_0_to_255_are_refused():
+    with pytest.raises(ValueError, match="expected linear light from 0 to 1"):
+        to_srgb(np.full((2, 2, 3), 120, np.float32))
+
+
 def test_a_plate_of_another_size_is_one_clear_error(tmp_path):
     make_capture(tmp_path / "raw")
     dataset = ingest_capture(tmp_path / "data", tmp_path / "raw")
