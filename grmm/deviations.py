@@ -56,7 +56,7 @@ ALWAYS = (
         paper="tracking by VHAP, 68 FAN landmarks",
         ours="our own tracker; users may bring FAN's weights",
         reason="VHAP's licence (CONTRIBUTING.md)",
-        effect="face 1.39 mm from the truth on the twin (docs/LOG.md); VHAP was not run",
+        effect="face 1.31 mm from the truth on the twin (docs/LOG.md); VHAP was not run",
     ),
     Deviation(
         paper="depth by ProbeSDF",
