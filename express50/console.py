@@ -78,6 +78,7 @@ class Parser(argparse.ArgumentParser):
 
         Print the whole help if there are none and a sub-command is expected.
         """
+        args = sys.argv[1:] if args is None else args
         if not args and self._subparsers is not None:
             self.print_help(sys.stderr)
             self.exit(USAGE)

@@ -340,3 +340,9 @@ def test_nobody_is_fitted_if_somebody_lacks_the_views(checkpoint, tmp_path, monk
     evaluate = ["evaluate", str(checkpoint), str(root), str(tmp_path / "out")]
     assert main([*evaluate, "--fit-cameras=cam00", "--fit-expression=e0"]) == 2
     assert "S003" in capsys.readouterr().err
+
+
+def test_the_command_reads_its_own_arguments(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["grmm", "config", "--preset", "demo"])
+    assert main() == 0
+    assert "[model]" in capsys.readouterr().out
