@@ -159,8 +159,7 @@ def _column(dataset: Dataset, index: Index, sure: float, notes: list[str]) -> di
         doubts = [tile.words] if tile.state not in ("flagged", "missing") and tile.words else []
         if name in disputes:
             doubts.append(disputes[name])
-        # Not "less than": a NaN confidence must not pass for a sure one.
-        unsure = tile.confidence is not None and not tile.confidence >= sure
+        unsure = tile.confidence is not None and tile.confidence < sure
         words = "; ".join(doubts) or tile.words
         tiles[name] = replace(tile, words=words, doubtful=bool(doubts) or unsure)
     return tiles

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import sys
 import tempfile
 import time
@@ -45,6 +44,7 @@ from express50.dataset.tracks import read_track
 from express50.geometry.cameras import Camera, rays
 from express50.geometry.raycast import camera_rays, mesh_scene
 from express50.head.load import load_head
+from express50.runner.worker import peak_memory
 from express50.twin.truth import Truth
 from pipelines import track
 from pipelines.depth import STAGE
@@ -139,7 +139,7 @@ def measure(dataset_root: Path, truth_root: Path, item: str, name: str) -> dict 
             return None
         mesh = found_mesh
     found["s"] = None if name == "tracked_mesh" else time.process_time() - start
-    found["gib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    found["gib"] = peak_memory() / 2**30
     sure = None
     if name in PRESETS:
         found["raycast"] = both_ways(surface, [picture.camera for picture in pictures[::8]])

@@ -9,6 +9,7 @@ without a CUDA device, and none other asked for, its figures are ``n/a``.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import time
@@ -65,43 +66,40 @@ def scene(device: torch.device, n_g: int, size: int) -> tuple[GRMM, HeadState, P
 
 
 @torch.no_grad()
-def frames_per_second(draw: Callable[[int], object], device: torch.device, seconds: float) -> float:
+def frames_per_second(draw: Callable[[], object], seconds: float = 4.0) -> float:
     """Measure pictures per second by the clock, after five that are not counted."""
-    for number in range(5):
-        draw(number)
-    _wait(device)
+    for _ in range(5):
+        draw()
     count, began = 0, time.perf_counter()
     while time.perf_counter() - began < seconds:
-        draw(count)
+        draw()
         count += 1
-        _wait(device)
     return round(count / (time.perf_counter() - began), 2)
-
-
-def _wait(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 def measure(device: torch.device, n_g: int, size: int, seconds: float) -> dict[str, object]:
     """Measure the frame rates of both ways."""
     model, state, front = scene(device, n_g, size)
     z_id, z_exp = model.z_id[0].detach(), model.z_exp[0].detach()
-    views = [orbit(front, 3.0 * (n % 21 - 10), model.head_centre.cpu()) for n in range(21)]
+    centre = model.head_centre.cpu()
+    views = itertools.cycle([orbit(front, 3.0 * turn, centre) for turn in range(-10, 11)])
+    wait = torch.cuda.synchronize if device.type == "cuda" else lambda: None
 
-    def anew(number: int) -> torch.Tensor:
-        return model.render(z_id, z_exp, state, views[number % 21]).image
+    def anew() -> None:
+        model.render(z_id, z_exp, state, next(views))
+        wait()
 
     with torch.no_grad():
         kept = model.geometry(z_id, z_exp, state)
 
-    def cached(number: int) -> torch.Tensor:
-        view = views[number % 21]
-        return draw_window(model, kept, model.appearance(z_id, state, view), view).image
+    def cached() -> None:
+        view = next(views)
+        draw_window(model, kept, model.appearance(z_id, state, view), view)
+        wait()
 
     rates: dict[str, object] = {
-        "fps": frames_per_second(anew, device, seconds),
-        "fps_with_savings": frames_per_second(cached, device, seconds),
+        "fps": frames_per_second(anew, seconds),
+        "fps_with_savings": frames_per_second(cached, seconds),
     }
     return rates | {"gaussians": len(model.texels)}
 

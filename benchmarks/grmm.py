@@ -15,8 +15,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +23,7 @@ import torch
 
 from benchmarks.common import make_parser
 from benchmarks.demo import record_twin, run_stages, subject_of
+from benchmarks.fps import frames_per_second
 from benchmarks.given_views import given_shards
 from express50.contract.layout import Dataset
 from express50.files.atomic import write_json
@@ -140,16 +140,6 @@ def _fit(loaded: Loaded, shards: Path, cameras: list[str], images: int) -> float
     judge = PerceptualMetrics(loaded.config.metrics)
     rows, _ = evaluate_unseen(loaded, views, subject, protocol, judge)
     return mean([row for row in rows if row["kind"] == NOVEL_VIEW], "psnr_db")
-
-
-def frames_per_second(draw: Callable[[], object], seconds: float = 4.0) -> float:
-    """Measure pictures per second by the clock, after two that are not counted."""
-    draw(), draw()
-    count, began = 0, time.perf_counter()
-    while time.perf_counter() - began < seconds:
-        draw()
-        count += 1
-    return round(count / (time.perf_counter() - began), 2)
 
 
 def speeds(loaded: Loaded) -> dict[str, float]:

@@ -9,8 +9,8 @@ from functools import partial
 import cv2
 import numpy as np
 
-from benchmarks.matte_scenes import READ, SHOT, cluttered
-from express50.files.images import linear_to_srgb, srgb_to_linear
+from benchmarks.matte_scenes import cluttered, exposed, noisy, srgb8
+from express50.files.images import srgb_to_linear
 from express50.geometry.cameras import Camera, pinhole, rays
 
 SHADE = 0.5  # share of linear light that the shadow takes; the key forgives a quarter
@@ -142,7 +142,7 @@ def _shifted(image: np.ndarray) -> np.ndarray:
 def _relit(image: np.ndarray) -> np.ndarray:
     height, width = image.shape[:2]
     y, x = np.mgrid[0:height, 0:width] / max(height, width) - 0.5
-    return _srgb8(srgb_to_linear(image / 255) * (1.15 + 0.35 * x - 0.2 * y)[..., None])
+    return srgb8(srgb_to_linear(image / 255) * (1.15 + 0.35 * x - 0.2 * y)[..., None])
 
 
 def _falling_off(rng: np.random.Generator, size: int, colour: np.ndarray) -> np.ndarray:
@@ -158,23 +158,15 @@ def before_wall(shot: Shot, make: Wall, rng: np.random.Generator) -> Shot:
     light = np.clip(make(rng, max(height, width))[:height, :width], 0.01, 0.95)
     shown = srgb_to_linear(shot.frame / 255)
     share = ((1 - shot.true) * shot.valid)[..., None]
-    shown = shown + share * (_noisy(light, rng) - srgb_to_linear(shot.plate / 255))
-    return replace(shot, frame=_srgb8(shown), plate=_srgb8(_noisy(light, rng)))
-
-
-def _noisy(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    return light + rng.normal(size=light.shape) * np.hypot(READ, SHOT * np.sqrt(light))
+    shown = shown + share * (noisy(light, rng) - srgb_to_linear(shot.plate / 255))
+    return replace(shot, frame=srgb8(shown), plate=exposed(light, rng))
 
 
 def _behind(shot: Shot, light: np.ndarray, cover: np.ndarray) -> Shot:
     """Return the shot with `light` (3,) over its backdrop by `cover` (H, W), behind the subject."""
     plate = srgb_to_linear(shot.plate / 255)
     change = ((1 - shot.true) * cover * shot.valid)[..., None] * (light - plate)
-    return replace(shot, frame=_srgb8(srgb_to_linear(shot.frame / 255) + change))
-
-
-def _srgb8(linear: np.ndarray) -> np.ndarray:
-    return np.rint(255 * linear_to_srgb(np.clip(linear, 0, 1))).astype(np.uint8)
+    return replace(shot, frame=srgb8(srgb_to_linear(shot.frame / 255) + change))
 
 
 def _blob(shot: Shot, rng: np.random.Generator) -> np.ndarray:

@@ -107,9 +107,18 @@ def cluttered(rng: np.random.Generator, size: int) -> np.ndarray:
 
 def exposed(linear: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return the 8-bit sRGB picture of linear light (H, W, 3), with a sensor's noise."""
+    return srgb8(noisy(linear, rng))
+
+
+def noisy(linear: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return linear light (H, W, 3) with a sensor's noise."""
     deviation = np.hypot(READ, SHOT * np.sqrt(np.clip(linear, 0, None)))
-    seen = linear_to_srgb(np.clip(linear + rng.normal(size=linear.shape) * deviation, 0, 1))
-    return np.rint(seen * 255).astype(np.uint8)
+    return linear + rng.normal(size=linear.shape) * deviation
+
+
+def srgb8(linear: np.ndarray) -> np.ndarray:
+    """Return linear light as 8-bit sRGB."""
+    return np.rint(255 * linear_to_srgb(np.clip(linear, 0, 1))).astype(np.uint8)
 
 
 def _linear(srgb: np.ndarray) -> np.ndarray:

@@ -25,15 +25,15 @@ import torch
 from torch import Tensor
 
 from express50 import native
-from express50.geometry.conventions import cell_to_corner, corner_to_cell
+from express50.geometry.conventions import corner_to_cell
 from grmm.rasterize import RenderOutput, rasterize
 from grmm.rasterize.projection import (
-    ALPHA_MAX,
     ALPHA_MIN,
     TRANSMITTANCE_MIN,
     Pinhole,
-    Projection,
     Splats,
+    pair_alphas,
+    pair_offsets,
     project,
 )
 
@@ -229,17 +229,6 @@ def blended_pairs(scene: dict[str, Tensor], size: int) -> tuple[Tensor, Tensor]:
     return gaussians[kept], pixels[kept]
 
 
-def pair_alphas(splats: Projection, gaussians: Tensor, pixels: Tensor, size: int) -> Tensor:
-    """Return the opacity (M,) of each Gaussian at its pixel."""
-    center = cell_to_corner(
-        torch.stack([pixels % size, pixels // size], 1).to(splats.means2d.dtype)
-    )
-    dx, dy = (center - splats.means2d[gaussians]).unbind(1)
-    xx, xy, yy = splats.conics[gaussians].unbind(1)
-    sigma = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
-    return (splats.opacities[gaussians] * torch.exp(-sigma)).clamp(max=ALPHA_MAX)
-
-
 def before(alphas: Tensor, pixels: Tensor) -> Tensor:
     """Return the transmittance (M,) in front of each pair, from its pixel's earlier pairs."""
     # One running sum of logarithms over all pixels; float64 keeps its end as exact as its start.
@@ -257,8 +246,7 @@ def render_pairs(
     splats = project(*records(scene, size))
     alphas = pair_alphas(splats, gaussians, pixels, size)
     weights = alphas * before(alphas, pixels)
-    center = cell_to_corner(torch.stack([pixels % size, pixels // size], 1).to(weights.dtype))
-    delta = center - splats.means2d[gaussians]
+    delta = pair_offsets(splats, gaussians, pixels, size)
     length = splats.planes[gaussians, 0] + (splats.planes[gaussians, 1:] * delta).sum(1)
     colors = scene["colors"]
     image = colors.new_zeros(size * size, colors.shape[1])

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import json
-import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -19,6 +18,7 @@ from express50.contract.config import PRESETS
 from express50.contract.layout import Dataset
 from express50.contract.stage import with_required
 from express50.files.text import markdown_table
+from express50.runner.worker import core_seconds
 from express50.twin.truth import Truth
 from pipelines.stages import STAGES
 
@@ -75,11 +75,11 @@ def sweep_one(base: Dataset, truth: Truth, stage: str, preset: str, out: Path) -
         if not link.exists():
             link.symlink_to((base.root / name).resolve())
     command = [sys.executable, "-m", "express50", stage, str(dataset.root), "--preset", preset]
-    began = children_seconds()
+    began = core_seconds()
     done = subprocess.run(
         [*command, "--workers", "0", "--json"], stdout=subprocess.PIPE, check=False
     )
-    seconds = children_seconds() - began
+    seconds = core_seconds() - began
     if done.returncode == 2:
         sys.exit(f"tradeoff: {stage} {preset} did not start; see the line above")
     measure, key = MEASURES[stage]
@@ -107,12 +107,6 @@ def rows_of_others(doc: Path, stages: list[str]) -> list[dict]:
             row: dict = dict(zip(keys, cells[:5], strict=True))
             rows.append(row | {"seconds_per_item": float(cells[2]), "error": float(cells[3])})
     return rows
-
-
-def children_seconds() -> float:
-    """Measure processor seconds of the finished child processes, whatever else is running."""
-    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return usage.ru_utime + usage.ru_stime
 
 
 def pareto(rows: list[dict]) -> set[tuple[str, str]]:

@@ -221,9 +221,9 @@ def _decoder_optimizer(state: FitState) -> torch.optim.Optimizer:
     """Build Adam over the decoders; codes and refinement stay fixed."""
     parameters, lr = state.model.parameter_groups(), state.config.fit.stage2_lr
     rates = {"decoders": lr, "texels": lr * state.config.train.texel_lr_scale}
-    groups = [{"params": parameters[name], "lr": rate} for name, rate in rates.items()]
-    for parameter in (one for group in groups for one in group["params"]):
+    for parameter in (*parameters["decoders"], *parameters["texels"]):
         parameter.requires_grad_(True)
+    groups = [{"params": parameters[name], "lr": rate} for name, rate in rates.items()]
     return torch.optim.Adam(groups, fused=True)
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from collections.abc import Sequence as Many
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from express50.dataset.tracks import OF_FRAMES, RIG_RATE, Sequence, read_sequence
+from express50.dataset import tracks
 from express50.errors import ConfigError, check_known
 from express50.files.images import contact_sheet, write_image
 from grmm.checkpoint import Loaded
@@ -56,7 +55,7 @@ def depth_picture(depth: Tensor, alpha: Tensor) -> np.ndarray:
 
 
 @torch.no_grad()
-def comparison_sheet(path: Path, views: HeadViews, indices: Many[int], render: Render) -> None:
+def comparison_sheet(path: Path, views: HeadViews, indices: Sequence[int], render: Render) -> None:
     """Write rows of pictures in the order of COLUMNS."""
     rows, labels = [], []
     for index in indices:
@@ -160,7 +159,7 @@ def novel_views(loaded: Loaded, head: HeadCodes, view: PinholeView) -> Sheet:
 
 
 def expression_grid(
-    loaded: Loaded, subjects: Many[str], expressions: Many[str], view: PinholeView
+    loaded: Loaded, subjects: Sequence[str], expressions: Sequence[str], view: PinholeView
 ) -> Sheet:
     """Draw every subject (rows) with every expression (columns).
 
@@ -255,7 +254,7 @@ def sample_sheet(
 
 
 def driven(
-    loaded: Loaded, head: HeadCodes, clips: Sequence, view: PinholeView
+    loaded: Loaded, head: HeadCodes, clips: tracks.Sequence, view: PinholeView
 ) -> Iterable[np.ndarray]:
     """Yield the head with the expression, jaw, neck and eyes of every frame of tracked clips.
 
@@ -270,7 +269,7 @@ def driven(
         yield picture(loaded, replace(head, tracked=replace(head.tracked, **moved)), view)
 
 
-def check_clips(loaded: Loaded, clips: Sequence) -> None:
+def check_clips(loaded: Loaded, clips: tracks.Sequence) -> None:
     """Refuse, with a ConfigError, clips that were tracked with another head model."""
     known = loaded.head.expression_dirs.shape[2]
     if Path(clips.head).name != Path(loaded.head_spec).name or clips.expression.shape[1] > known:
@@ -280,26 +279,26 @@ def check_clips(loaded: Loaded, clips: Sequence) -> None:
         )
 
 
-def read_clips(path: Path, cue: str | None = None) -> Sequence:
+def read_clips(path: Path, cue: str | None = None) -> tracks.Sequence:
     """Read tracked clips, all of them or the one of a cue; ConfigError if no clip has this cue."""
-    clips = read_sequence(path)
+    clips = tracks.read_sequence(path)
     if cue is None:
         return clips
     check_known(str(path), "clip of cue", [cue], dict.fromkeys(clips.cues))
     rows = [i for i, name in enumerate(clips.cues) if name == cue]
-    parts = {name: getattr(clips, name)[rows] for name in OF_FRAMES}
+    parts = {name: getattr(clips, name)[rows] for name in tracks.OF_FRAMES}
     return replace(clips, cues=(cue,) * len(rows), **parts)
 
 
 def write_sheet(
-    path: Path, rows: Many[Many[np.ndarray]], labels: Many[str], captions: Many[str]
+    path: Path, rows: Sequence[Sequence[np.ndarray]], labels: Sequence[str], captions: Sequence[str]
 ) -> None:
     """Write rows of pictures of one size as one picture, with labels and captions of columns."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_image(path, contact_sheet(rows, labels, rows[0][0].shape[:2], captions))
 
 
-def write_video(path: Path, frames: Iterable[np.ndarray], rate: float = RIG_RATE) -> None:
+def write_video(path: Path, frames: Iterable[np.ndarray], rate: float = tracks.RIG_RATE) -> None:
     """Write (H, W, 3) uint8 frames as H.264; an odd last row or column is cut.
 
     ``rate`` is in frames per second.

@@ -27,6 +27,7 @@ from grmm.edit import POSES, HeadCodes
 from grmm.evaluate import SEEN, kind_of
 from grmm.metrics import psnr_db
 from grmm.player.distillation import (
+    ANGLES,
     Avatar,
     Person,
     distil,
@@ -106,7 +107,7 @@ def export_player(
     person, frames = person_of(loaded, head, subject), None
     if clips is not None:
         check_clips(loaded, clips)
-        gap = len(person.own) - 12 - clips.expression.shape[1]
+        gap = len(person.own) - ANGLES - clips.expression.shape[1]
         coefficients = np.pad(clips.expression, ((0, 0), (0, gap)))
         frames = np.concatenate([coefficients, clips.neck, clips.jaw, clips.eyes], 1)
     rate = RIG_RATE if clips is None else clips.rate

@@ -29,6 +29,7 @@ from grmm.rasterize import RenderOutput, rasterize
 from grmm.render import frontal, orbit
 
 POSES, PICTURES = 200, 48  # sampled for the mesh decoder, and to see which Gaussians show
+ANGLES = 12  # last entries of a pose's parameters: neck, jaw, left and right eye
 CODES = 12  # directions of residual expression codes that are kept, at most
 RIDGE = 1e-3  # of the least squares, in deviations of the features
 SPREAD = {"jaw": 0.15, "neck": 0.12, "eyes": 0.2, "coefficients": 0.2}  # of samples about training
@@ -118,18 +119,17 @@ class Person:
 
     def at(self, pose: AvatarPose) -> HeadCodes:
         """Return the head in a pose, for the full model."""
-        values, x = pose.parameters.double().cpu().numpy(), len(self.own) - 12
-        tracked = replace(
-            self.head.tracked, expression=values[:x], neck=values[x : x + 3],
-            jaw=values[x + 3 : x + 6], eyes=values[x + 6 :],
-        )  # fmt: skip
+        values = pose.parameters.double().cpu().numpy()
+        expression, neck, jaw, eyes = np.split(values, [-12, -9, -6])
+        own = self.head.tracked
+        tracked = replace(own, expression=expression, neck=neck, jaw=jaw, eyes=eyes)
         z_exp = self.head.z_exp + pose.weights.to(self.z_changes) @ self.z_changes
         return replace(self.head, tracked=tracked, z_exp=z_exp)
 
     def pose(self, tracked: Tracked, expression: str | None = None) -> AvatarPose:
         """Return the pose of tracked parameters, with a training expression's code if named."""
         weights = [float(name == expression) for name in self.expressions]
-        parameters = _parameters(tracked, len(self.own) - 12).to(self.own)
+        parameters = _parameters(tracked, len(self.own) - ANGLES).to(self.own)
         return AvatarPose(parameters=parameters, weights=self.own.new_tensor(weights))
 
 
@@ -188,8 +188,8 @@ def all_gaussians(person: Person) -> Avatar:
 
 def sampled_poses(person: Person, count: int, generator: torch.Generator) -> list[AvatarPose]:
     """Draw poses between two training expressions each, with jaw, neck, eyes and more moved."""
-    x, poses = len(person.own) - 12, []
-    used = person.changes[:, :x].abs().amax(0) if len(person.changes) else person.own[:x] * 0
+    changes, poses = person.changes[:, :-ANGLES], []
+    used = changes.abs().amax(0) if len(changes) else 0 * person.own[:-ANGLES]
     spread = torch.cat(
         [SPREAD["coefficients"] * used]
         + [used.new_full((n,), SPREAD[name]) for name, n in (("neck", 3), ("jaw", 3), ("eyes", 6))]
@@ -369,8 +369,7 @@ def _with_mesh_decoder(person: Person, avatar: Avatar, poses: list[AvatarPose]) 
 
 def _skinning(avatar: Avatar, pose: AvatarPose) -> tuple[Tensor, Tensor, Tensor]:
     """Return the features (F,), and each vertex's turn (V, 3, 3) and shift (V, 3)."""
-    x = len(avatar.own) - 12
-    coefficients, angles = pose.parameters[:x], pose.parameters[x:].view(4, 3)
+    coefficients, angles = pose.parameters[:-ANGLES], pose.parameters[-ANGLES:].view(4, 3)
     turns = axis_angle_to_matrix(torch.cat([torch.zeros_like(angles[:1]), angles]))
     bent = (turns[1:] - torch.eye(3).to(turns)).flatten()
     features = torch.cat([coefficients, bent, pose.weights @ avatar.codes])

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from express50.geometry.conventions import cell_to_corner
 from grmm.rasterize.projection import (
-    ALPHA_MAX,
     Pinhole,
     Projection,
     RenderOptions,
@@ -22,6 +21,8 @@ from grmm.rasterize.projection import (
     Splats,
     depth_of_rays,
     expected_depth,
+    pair_alphas,
+    pair_offsets,
     project,
 )
 
@@ -124,11 +125,8 @@ def _median_ray_length(
     gsplat's kernels do not report it, but list all pairs of Gaussian and pixel in order.
     """
     gaussians, pixels = _crossings(gsplat, splats, tiles, width, height)
-    center = cell_to_corner(
-        torch.stack([pixels % width, pixels // width], 1).to(splats.means2d.dtype)
-    )
     length, slopes = splats.planes[gaussians, 0], splats.planes[gaussians, 1:]
-    length = length + (slopes * (center - splats.means2d[gaussians])).sum(1)
+    length = length + (slopes * pair_offsets(splats, gaussians, pixels, width)).sum(1)
     empty = length.new_zeros(height * width)
     return empty.index_put((pixels,), length).reshape(height, width)
 
@@ -146,13 +144,7 @@ def _crossings(
         0, batches, through, splats.means2d[None], splats.conics[None].contiguous(),
         splats.opacities[None], width, height, TILE, offsets, ids,
     )  # fmt: skip
-    center = cell_to_corner(
-        torch.stack([pixels % width, pixels // width], 1).to(splats.means2d.dtype)
-    )
-    dx, dy = (center - splats.means2d[gaussians]).unbind(1)
-    xx, xy, yy = splats.conics[gaussians].unbind(1)
-    sigma = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
-    alphas = (splats.opacities[gaussians] * torch.exp(-sigma)).clamp(max=ALPHA_MAX)
+    alphas = pair_alphas(splats, gaussians, pixels, width)
     # One running sum of logarithms over all pixels; float64 keeps its end as exact as its start.
     logs = torch.log1p(-alphas.double())
     after = torch.cumsum(logs, 0)

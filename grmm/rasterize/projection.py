@@ -242,6 +242,23 @@ def expected_depth(weighted_ray_length: Tensor, alpha: Tensor, K: Tensor) -> Ten
     return torch.where(hit, weighted_ray_length / (safe * lengths), torch.zeros_like(alpha))
 
 
+def pair_offsets(splats: Projection, gaussians: Tensor, pixels: Tensor, width: int) -> Tensor:
+    """Return how far (M, 2) each pair's pixel centre lies from its Gaussian, pixels.
+
+    ``pixels`` (M,) are numbered row by row in an image of this width.
+    """
+    places = torch.stack([pixels % width, pixels // width], 1).to(splats.means2d.dtype)
+    return cell_to_corner(places) - splats.means2d[gaussians]
+
+
+def pair_alphas(splats: Projection, gaussians: Tensor, pixels: Tensor, width: int) -> Tensor:
+    """Return the alpha (M,) of each pair of Gaussian and pixel; see `pair_offsets`."""
+    dx, dy = pair_offsets(splats, gaussians, pixels, width).unbind(1)
+    xx, xy, yy = splats.conics[gaussians].unbind(1)
+    sigma = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
+    return (splats.opacities[gaussians] * torch.exp(-sigma)).clamp(max=ALPHA_MAX)
+
+
 def rasterize_reference(
     scene: Splats, camera: Pinhole, background: Tensor | None, options: RenderOptions
 ) -> RenderOutput:

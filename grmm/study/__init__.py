@@ -66,8 +66,6 @@ def make_study(
         raise ConfigError(
             f"{out}: this study already has answers; make a new one in another folder"
         )
-    if examples < 1 or participants < 1:
-        raise ConfigError(f"got {examples} examples and {participants} participants, expected >= 1")
     (first, ours), (second, theirs) = methods
     if first == second:
         raise ConfigError(f"both methods are called {first!r}; give two names with --names")
