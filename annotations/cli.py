@@ -344,8 +344,8 @@ def run_agree(args: argparse.Namespace) -> int:
         return answer(args, data, "no expression was marked by two people yet")
     groups = {"all": overall} | pairs | expressions
     lines = table(("of", *_FIGURES), [{"of": name} | row for name, row in groups.items()])
-    interval = overall["alpha_interval"]
-    return answer(args, data, *lines, f"alpha of all, 95 %: {interval or 'n/a (too few clips)'}")
+    interval = overall["alpha_interval"] or "n/a (too few clips)"
+    return answer(args, data, *lines, f"Krippendorff's alpha of all, 95 % interval: {interval}")
 
 
 def run_review(args: argparse.Namespace) -> int:
@@ -412,7 +412,7 @@ def run_sheet(args: argparse.Namespace) -> int:
     args.file.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(args.file, page)
     counts = sheet.counts()
-    said = ", ".join(f"{name} {count}" for name, count in counts.items() if count)
+    said = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
     data = {"file": str(args.file), "bytes": len(page), "tiles": counts}
     return answer(args, data, f"{args.file} ({len(page):,} bytes): {said}")
 

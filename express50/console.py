@@ -13,7 +13,7 @@ import sys
 import textwrap
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -261,11 +261,22 @@ def count(number: float, noun: str) -> str:
 
 
 def format_table(header: list[str], rows: list[list[str]]) -> Iterator[str]:
-    """Yield the lines of a table with aligned columns."""
-    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
+    """Yield the lines of a table with aligned columns, numbers to the right."""
+    columns = list(zip(header, *rows, strict=True))
+    widths = [max(map(len, column)) for column in columns]
+    right = [_holds_numbers(column[1:]) for column in columns]
     for row in [header, *rows]:
-        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        cells = (
+            cell.rjust(width) if number else cell.ljust(width)
+            for cell, width, number in zip(row, widths, right, strict=True)
+        )
         yield "  ".join(cells).rstrip()
+
+
+def _holds_numbers(cells: Sequence[str]) -> bool:
+    """Return whether all cells that are not empty, ``n/a`` or ``-`` are numbers."""
+    filled = [cell for cell in cells if cell not in ("", "n/a", "-")]
+    return bool(filled) and all(re.fullmatch(r"[+-]?[\d,]*\.?\d+", cell) for cell in filled)
 
 
 def format_seconds(seconds: float) -> str:

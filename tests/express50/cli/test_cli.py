@@ -55,6 +55,14 @@ def test_without_a_command_the_help_lists_all_in_aligned_columns(run, words):
     assert len(begins) == 1
 
 
+def test_arguments_of_the_process_are_read_where_none_are_given(monkeypatch, capsys):
+    from grmm.cli import main as grmm
+
+    monkeypatch.setattr(sys, "argv", ["grmm", "config", "--preset", "demo"])
+    assert grmm() == 0
+    assert "n_g = 128" in capsys.readouterr().out
+
+
 def test_ingest_then_skip_then_status(run, data, capture):
     code, out, err = run("ingest", data, capture)
     assert code == 0

@@ -101,7 +101,7 @@ def test_warnings_are_named(dataset):
     metrics = {"warnings": [{"what": "cam7", "why": "9 corners"}, "no row"]}
     (folder / "metrics.json").write_text(json.dumps(metrics))
     page = render_page(dataset)
-    assert "Parts kept in doubt (1)" in page and "cam7: 9 corners" in re.sub("<[^>]*>", "", page)
+    assert "Warnings (1)" in page and "cam7: 9 corners" in re.sub("<[^>]*>", "", page)
 
 
 def test_truth_and_training_are_silent_where_absent(dataset):
