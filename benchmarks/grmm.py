@@ -30,7 +30,7 @@ from express50.files.atomic import write_json
 from express50.head.load import load_head
 from express50.runner.worker import peak_memory
 from grmm.ablate import Ablation, ablate
-from grmm.checkpoint import Loaded, load_checkpoint
+from grmm.checkpoint import Checkpoint, load_checkpoint
 from grmm.config import Config, resolve
 from grmm.data import HeadViews, spread
 from grmm.edit import trained_head
@@ -111,7 +111,7 @@ def baseline(shards: Path, config: Config, images: int) -> dict[str, float | Non
 
 
 def fit_figures(
-    loaded: Loaded, shards: Path, given: list[str], out: Path, images: int
+    loaded: Checkpoint, shards: Path, given: list[str], out: Path, images: int
 ) -> dict[str, float | None]:
     """Fit the unseen person from one view and from two, by tracks of these and of all cameras.
 
@@ -133,7 +133,7 @@ def fit_figures(
     return found
 
 
-def _fit(loaded: Loaded, shards: Path, cameras: list[str], images: int) -> float | None:
+def _fit(loaded: Checkpoint, shards: Path, cameras: list[str], images: int) -> float | None:
     views = loaded.views(open_shards([shards], "*"))
     subject = next(k.subject for k in views.keys if k.subject not in loaded.model.subjects)
     protocol = FitProtocol(cameras=tuple(cameras), expression="neutral", images=images)
@@ -142,7 +142,7 @@ def _fit(loaded: Loaded, shards: Path, cameras: list[str], images: int) -> float
     return mean([row for row in rows if row["kind"] == NOVEL_VIEW], "psnr_db")
 
 
-def speeds(loaded: Loaded) -> dict[str, float]:
+def speeds(loaded: Checkpoint) -> dict[str, float]:
     """Measure frame rates: all from scratch at 256 px; a resting head, moving camera at 512."""
     model = loaded.model
     view, centre = frontal(loaded), model.head_centre

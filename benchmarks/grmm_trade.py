@@ -117,9 +117,8 @@ def measure(source: Source, base: Config, name: str, budget: float, images: int)
     own = [
         i
         for i, key in enumerate(whole.keys)
-        if key.camera in cameras and f"{key.subject}/{key.expression}" not in
-        config.data.holdout_expressions
-    ]  # fmt: skip
+        if key.camera in cameras and "/".join(key.frame) not in config.data.holdout_expressions
+    ]
     began = time.process_time()
     rows = evaluate(whole, spread(own, images), training_render(model, whole))
     row = {

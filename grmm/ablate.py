@@ -23,7 +23,7 @@ from express50.files.atomic import dump_json, write_bytes, write_json
 from express50.files.digests import file_sha256
 from express50.files.text import markdown_table, read_json_table
 from express50.head.load import load_head
-from grmm.checkpoint import Loaded, load_checkpoint
+from grmm.checkpoint import Checkpoint, load_checkpoint
 from grmm.config import Config, as_tables, from_tables
 from grmm.data import HeadViews, Source, spread
 from grmm.evaluate import (
@@ -184,7 +184,7 @@ def changed(config: Config, variant: Variant, used: Sequence[Path]) -> Config:
     if variant.without is not None:
         keys = open_shards(used, "train").keys
         cameras = {key.camera for key in keys}
-        frames = {f"{key.subject}/{key.expression}" for key in keys}
+        frames = {"/".join(key.frame) for key in keys}
         data = tables["data"]
         data["holdout_cameras"] = [c for c in data["holdout_cameras"] if c in cameras]
         data["holdout_expressions"] = [
@@ -239,7 +239,7 @@ def _train(used: Sequence[Path], folder: Path, settings: Config) -> None:
     train(source, load_head(source.head), folder, settings, resume=checkpoint.exists())
 
 
-def measure(run: Ablation, loaded: Loaded, used: Sequence[Path]) -> dict:
+def measure(run: Ablation, loaded: Checkpoint, used: Sequence[Path]) -> dict:
     """Measure held-out views and expressions of training people, and unseen people."""
     views, kind = loaded.views(open_shards(run.roots, "*")), partial(kind_of, loaded)
     judge, rows, efforts = PerceptualMetrics(loaded.config.metrics), [], []

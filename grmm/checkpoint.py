@@ -74,8 +74,8 @@ class Gallery:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class Loaded:
-    """A checkpoint ready to use; ``loop`` and ``optimizer`` serve `train` alone."""
+class Checkpoint:
+    """A trained model, ready to use; ``loop`` and ``optimizer`` serve `train` alone."""
 
     config: Config
     head_spec: str
@@ -142,7 +142,7 @@ def save_checkpoint(
     write_content(path, content)
 
 
-def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Loaded:
+def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Checkpoint:
     """Read a checkpoint and build its model.
 
     Raises:
@@ -155,7 +155,7 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Loaded:
             _check_finite(path, part, content.get(part, {}))
         config = from_tables(_current_settings(path, content["config"]))
         head = load_head(content["head"]).to(device)
-        return Loaded(
+        return Checkpoint(
             config=config,
             head_spec=content["head"],
             head=head,

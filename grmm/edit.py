@@ -24,7 +24,7 @@ from express50.geometry.transforms import (
     quat_to_matrix,
     slerp,
 )
-from grmm.checkpoint import Loaded
+from grmm.checkpoint import Checkpoint
 from grmm.data import Tracked, padded, pose_state, stacked
 from grmm.model import HeadState
 
@@ -55,12 +55,12 @@ class HeadCodes:
     z_exp: Tensor
     tracked: Tracked
 
-    def state(self, loaded: Loaded) -> HeadState:
+    def state(self, loaded: Checkpoint) -> HeadState:
         """Return the posed mesh in head space."""
         return pose_state(loaded.head, self.tracked)
 
 
-def trained_head(loaded: Loaded, subject: str, expression: str) -> HeadCodes:
+def trained_head(loaded: Checkpoint, subject: str, expression: str) -> HeadCodes:
     """Return a training subject with a training expression, by transfer if it never showed it.
 
     Raises:
@@ -128,7 +128,7 @@ def slerp_axis_angle(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
 
 
 def controlled(
-    loaded: Loaded, head: HeadCodes, controls: Mapping[str, Sequence[float]]
+    loaded: Checkpoint, head: HeadCodes, controls: Mapping[str, Sequence[float]]
 ) -> HeadCodes:
     """Change single parameters of a head; all others stay.
 
@@ -178,7 +178,7 @@ def principal_directions(codes: Tensor) -> Tensor:
 
 
 def sample_identity(
-    loaded: Loaded, head: HeadCodes, rng: np.random.Generator, spread: float
+    loaded: Checkpoint, head: HeadCodes, rng: np.random.Generator, spread: float
 ) -> HeadCodes:
     """Draw a new person with the given head's expression.
 
@@ -199,7 +199,7 @@ def sample_identity(
 
 
 def sample_expression(
-    loaded: Loaded, head: HeadCodes, rng: np.random.Generator, spread: float
+    loaded: Checkpoint, head: HeadCodes, rng: np.random.Generator, spread: float
 ) -> HeadCodes:
     """Draw a new expression for the given person, as `sample_identity` draws people.
 
@@ -232,7 +232,7 @@ def _sample_weights(rows: int, rng: np.random.Generator, spread: float, what: st
 
 
 def _with_parameter(
-    loaded: Loaded, tracked: Tracked, table: str, entry: str, values: Sequence[float], name: str
+    loaded: Checkpoint, tracked: Tracked, table: str, entry: str, values: Sequence[float], name: str
 ) -> Tracked:
     sizes = ANGLES | {
         "shape": loaded.head.shape_dirs.shape[2],

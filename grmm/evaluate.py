@@ -22,7 +22,7 @@ from express50.errors import FormatError, TrainError, few
 from express50.files.atomic import write_bytes, write_json
 from express50.files.images import read_image, write_image
 from express50.shards.writer import sample_key
-from grmm.checkpoint import Loaded
+from grmm.checkpoint import Checkpoint
 from grmm.config import MetricsConfig
 from grmm.data import HeadViews, Item, SampleKey
 from grmm.metrics import PerceptualMetrics, psnr_db, rmse, ssim_score
@@ -61,7 +61,7 @@ def training_render(model: GRMM, views: HeadViews) -> Render:
     return render
 
 
-def kind_of(loaded: Loaded, key: SampleKey) -> str:
+def kind_of(loaded: Checkpoint, key: SampleKey) -> str:
     """Return whether a checkpoint has seen a sample, or how it was held out."""
     if key.subject not in loaded.model.subjects:
         return HELD_IDENTITY

@@ -29,7 +29,7 @@ from express50.files.atomic import write_bytes
 from express50.files.images import srgb_to_linear
 from express50.geometry.shapes import check_finite
 from express50.head.model import HeadModel
-from grmm.checkpoint import Loaded
+from grmm.checkpoint import Checkpoint
 from grmm.config import SCALE_RANGE_MM
 from grmm.edit import HeadCodes, controlled
 from grmm.model import PinholeView
@@ -86,7 +86,9 @@ class GaussianCloud:
             check_finite(name, array)
 
 
-def write_export(path: Path, loaded: Loaded, head: HeadCodes, view: PinholeView, form: str) -> str:
+def write_export(
+    path: Path, loaded: Checkpoint, head: HeadCodes, view: PinholeView, form: str
+) -> str:
     """Write a head in a format; returns a description of what was written.
 
     ``ply`` holds Gaussians in the 3DGS layout, ``spz`` in Niantic's, ``splats`` as GLB with
@@ -110,7 +112,7 @@ def write_export(path: Path, loaded: Loaded, head: HeadCodes, view: PinholeView,
 
 @torch.no_grad()
 def decoded(
-    loaded: Loaded, head: HeadCodes, view: PinholeView
+    loaded: Checkpoint, head: HeadCodes, view: PinholeView
 ) -> tuple[GaussianCloud, np.ndarray, np.ndarray]:
     """Decode a head; colours are those that ``view`` sees, before refinement.
 
@@ -137,7 +139,7 @@ def decoded(
 
 
 def arrays_npz(
-    loaded: Loaded, head: HeadCodes, gaussians: GaussianCloud, vertices: np.ndarray
+    loaded: Checkpoint, head: HeadCodes, gaussians: GaussianCloud, vertices: np.ndarray
 ) -> bytes:
     """Encode everything about one head as .npz."""
     buffer = io.BytesIO()
@@ -202,7 +204,7 @@ def arkit_controls(names: tuple[str, ...]) -> dict[str, list[tuple[str, float]]]
 
 
 @torch.no_grad()
-def arkit_targets(loaded: Loaded, head: HeadCodes) -> dict[str, np.ndarray]:
+def arkit_targets(loaded: Checkpoint, head: HeadCodes) -> dict[str, np.ndarray]:
     """Return what each shape adds to the head's vertices, (V, 3) metres."""
 
     def vertices(codes: HeadCodes) -> np.ndarray:

@@ -23,7 +23,7 @@ from express50.console import log
 from express50.errors import TrainError
 from express50.files.atomic import check_space, write_json
 from grmm import losses
-from grmm.checkpoint import Gallery, Loaded, collect_gallery, save_checkpoint
+from grmm.checkpoint import Checkpoint, Gallery, collect_gallery, save_checkpoint
 from grmm.config import Config
 from grmm.data import NO_OFFSETS, HeadViews, Item, Shuffle, spread
 from grmm.edit import HeadCodes, between, trained_head, transfer
@@ -45,7 +45,7 @@ LOCALITY_T = 0.3  # weight of the fitted subject in the interpolation (paper, su
 class FitState:
     """Everything that a fit changes or reads: the tuned model and the codes sought."""
 
-    loaded: Loaded
+    loaded: Checkpoint
     model: GRMM
     views: HeadViews
     given: list[int]
@@ -68,7 +68,7 @@ class FitState:
 
 
 def fit(
-    loaded: Loaded, views: HeadViews, given: Sequence[int], held_out: Sequence[int], out: Path
+    loaded: Checkpoint, views: HeadViews, given: Sequence[int], held_out: Sequence[int], out: Path
 ) -> dict[str, object]:
     """Fit one subject from the views ``given``; report on them and on ``held_out``.
 
@@ -135,7 +135,7 @@ def run_stages(
     }
 
 
-def start(loaded: Loaded, views: HeadViews, given: list[int]) -> FitState:
+def start(loaded: Checkpoint, views: HeadViews, given: list[int]) -> FitState:
     """Start from the mean codes and a copy of the model; known expressions keep their codes."""
     subjects = sorted({views.keys[i].subject for i in given})
     if len(subjects) != 1:

@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from express50.errors import ConfigError
-from grmm.checkpoint import Loaded
+from grmm.checkpoint import Checkpoint
 from grmm.data import HeadViews, spread
 from grmm.evaluate import HELD_IDENTITY, Row, evaluate
 from grmm.fit import run_stages, start
@@ -36,7 +36,7 @@ class FitProtocol:
 
 
 def evaluate_unseen(
-    loaded: Loaded,
+    loaded: Checkpoint,
     views: HeadViews,
     subject: str,
     protocol: FitProtocol,
@@ -64,7 +64,7 @@ def evaluate_unseen(
 
 
 def unseen_views(
-    loaded: Loaded,
+    loaded: Checkpoint,
     views: HeadViews,
     subject: str,
     protocol: FitProtocol,

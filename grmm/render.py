@@ -16,7 +16,7 @@ from torch import Tensor
 from express50.dataset import tracks
 from express50.errors import ConfigError, check_known
 from express50.files.images import contact_sheet, write_image
-from grmm.checkpoint import Loaded
+from grmm.checkpoint import Checkpoint
 from grmm.data import HeadViews, stacked
 from grmm.edit import (
     HeadCodes,
@@ -103,14 +103,14 @@ def resized(view: PinholeView, longest_px: int) -> PinholeView:
     return replace(view, K=K, width=width, height=height)
 
 
-def frontal(loaded: Loaded) -> PinholeView:
+def frontal(loaded: Checkpoint) -> PinholeView:
     """Choose the training camera that looks at the face most nearly along -z."""
     cameras = loaded.gallery.cameras
     best = max(sorted(cameras), key=lambda name: float(cameras[name].direction()[2]))
     return cameras[best]
 
 
-def camera_of(loaded: Loaded, name: str | None, size: int = 0) -> PinholeView:
+def camera_of(loaded: Checkpoint, name: str | None, size: int = 0) -> PinholeView:
     """Look up a camera of the checkpoint by id, by default the frontal one; ``size`` 0: its own.
 
     Raises:
@@ -122,14 +122,14 @@ def camera_of(loaded: Loaded, name: str | None, size: int = 0) -> PinholeView:
     return resized(view, size) if size else view
 
 
-def picture(loaded: Loaded, head: HeadCodes, view: PinholeView) -> np.ndarray:
+def picture(loaded: Checkpoint, head: HeadCodes, view: PinholeView) -> np.ndarray:
     """Draw one head from one view, (H, W, 3) uint8."""
     return next(iter(draw_views(loaded, head, [view])))
 
 
 @torch.no_grad()
 def draw_views(
-    loaded: Loaded, head: HeadCodes, views: Iterable[PinholeView]
+    loaded: Checkpoint, head: HeadCodes, views: Iterable[PinholeView]
 ) -> Iterable[np.ndarray]:
     """Yield a head from each view; its geometry is decoded once for all of them."""
     model, state = loaded.model, head.state(loaded)
@@ -141,7 +141,7 @@ def draw_views(
 
 
 def turntable(
-    loaded: Loaded, head: HeadCodes, view: PinholeView, frames: int = 72, degrees: float = 360.0
+    loaded: Checkpoint, head: HeadCodes, view: PinholeView, frames: int = 72, degrees: float = 360.0
 ) -> Iterable[np.ndarray]:
     """Yield (H, W, 3) frames of an orbit that starts at ``view``."""
     centre = loaded.model.head_centre
@@ -149,7 +149,7 @@ def turntable(
     return draw_views(loaded, head, views)
 
 
-def novel_views(loaded: Loaded, head: HeadCodes, view: PinholeView) -> Sheet:
+def novel_views(loaded: Checkpoint, head: HeadCodes, view: PinholeView) -> Sheet:
     """Draw rows of PITCHES and columns of YAWS, degrees, around ``view``."""
     centre = loaded.model.head_centre
     views = (orbit(view, yaw, centre, pitch) for pitch in PITCHES for yaw in YAWS)
@@ -159,7 +159,7 @@ def novel_views(loaded: Loaded, head: HeadCodes, view: PinholeView) -> Sheet:
 
 
 def expression_grid(
-    loaded: Loaded, subjects: Sequence[str], expressions: Sequence[str], view: PinholeView
+    loaded: Checkpoint, subjects: Sequence[str], expressions: Sequence[str], view: PinholeView
 ) -> Sheet:
     """Draw every subject (rows) with every expression (columns).
 
@@ -173,14 +173,14 @@ def expression_grid(
 
 
 def interpolation(
-    loaded: Loaded, start: HeadCodes, end: HeadCodes, view: PinholeView, frames: int = 48
+    loaded: Checkpoint, start: HeadCodes, end: HeadCodes, view: PinholeView, frames: int = 48
 ) -> Iterable[np.ndarray]:
     """Yield frames from one head to another."""
     for number in range(frames):
         yield picture(loaded, between(start, end, number / max(1, frames - 1)), view)
 
 
-def control_sheet(loaded: Loaded, head: HeadCodes, view: PinholeView) -> Sheet:
+def control_sheet(loaded: Checkpoint, head: HeadCodes, view: PinholeView) -> Sheet:
     """Draw rows that change one thing each (the paper's figure of disentangled control).
 
     Jaw, neck, eyes; the strongest expression coefficients of training; the first principal
@@ -206,7 +206,7 @@ def control_sheet(loaded: Loaded, head: HeadCodes, view: PinholeView) -> Sheet:
     return rows, list(changes), []
 
 
-def strongest_coefficients(loaded: Loaded, count: int) -> dict[int, float]:
+def strongest_coefficients(loaded: Checkpoint, count: int) -> dict[int, float]:
     """Find the expression coefficients that vary most in training, and how large each gets."""
     rows = stacked([frame.expression for frame in loaded.gallery.frames.values()])
     order = np.argsort(-np.std(rows, axis=0), kind="stable")[:count]
@@ -214,7 +214,7 @@ def strongest_coefficients(loaded: Loaded, count: int) -> dict[int, float]:
 
 
 def residual_sheet(
-    loaded: Loaded, identity: HeadCodes, expression: HeadCodes, view: PinholeView
+    loaded: Checkpoint, identity: HeadCodes, expression: HeadCodes, view: PinholeView
 ) -> Sheet:
     """Take a transfer apart: head-model parameters and residual code, alone and together.
 
@@ -235,7 +235,12 @@ def residual_sheet(
 
 
 def sample_sheet(
-    loaded: Loaded, head: HeadCodes, view: PinholeView, count: int, seed: int, spread: float = 1.0
+    loaded: Checkpoint,
+    head: HeadCodes,
+    view: PinholeView,
+    count: int,
+    seed: int,
+    spread: float = 1.0,
 ) -> Sheet:
     """Draw three rows of samples: new people, new expressions, both."""
     rng = np.random.default_rng(seed)
@@ -254,7 +259,7 @@ def sample_sheet(
 
 
 def driven(
-    loaded: Loaded, head: HeadCodes, clips: tracks.Sequence, view: PinholeView
+    loaded: Checkpoint, head: HeadCodes, clips: tracks.Sequence, view: PinholeView
 ) -> Iterable[np.ndarray]:
     """Yield the head with the expression, jaw, neck and eyes of every frame of tracked clips.
 
@@ -269,7 +274,7 @@ def driven(
         yield picture(loaded, replace(head, tracked=replace(head.tracked, **moved)), view)
 
 
-def check_clips(loaded: Loaded, clips: tracks.Sequence) -> None:
+def check_clips(loaded: Checkpoint, clips: tracks.Sequence) -> None:
     """Refuse, with a ConfigError, clips that were tracked with another head model."""
     known = loaded.head.expression_dirs.shape[2]
     if Path(clips.head).name != Path(loaded.head_spec).name or clips.expression.shape[1] > known:

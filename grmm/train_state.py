@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from express50.console import log
-from express50.errors import ConfigError, TrainError
+from express50.errors import ConfigError, TrainError, check_known
 from express50.files.atomic import write_bytes
 from express50.files.text import read_text
 from grmm import losses
@@ -116,14 +116,9 @@ def split_samples(keys: Sequence[SampleKey], config: Config) -> tuple[list[int],
         ConfigError: a held-out name fits no sample.
         TrainError: nothing is left to train on.
     """
-    cameras = {key.camera for key in keys}
-    unknown = set(config.data.holdout_cameras) - cameras
-    if unknown:
-        raise ConfigError(
-            f"data.holdout_cameras names {', '.join(sorted(unknown))}; "
-            f"the shards have {', '.join(sorted(cameras))}"
-        )
-    frames = {f"{key.subject}/{key.expression}" for key in keys}
+    cameras = config.data.holdout_cameras
+    check_known("data.holdout_cameras", "camera", cameras, sorted({key.camera for key in keys}))
+    frames = {"/".join(key.frame) for key in keys}
     held = {p: set(fnmatch.filter(frames, p)) for p in config.data.holdout_expressions}
     for pattern, found in held.items():
         if not found:
@@ -133,9 +128,7 @@ def split_samples(keys: Sequence[SampleKey], config: Config) -> tuple[list[int],
             )
     unseen = set().union(*held.values())
     holdout = [
-        i
-        for i, key in enumerate(keys)
-        if key.camera in config.data.holdout_cameras or f"{key.subject}/{key.expression}" in unseen
+        i for i, key in enumerate(keys) if key.camera in cameras or "/".join(key.frame) in unseen
     ]
     training = sorted(set(range(len(keys))) - set(holdout))
     if not training:

@@ -27,7 +27,7 @@ from websockets.http11 import Request, Response
 from express50.console import stdout_to_stderr
 from express50.geometry.transforms import invert_transform, make_transform, quat_to_matrix
 from express50.local_server import RequestGuard
-from grmm.checkpoint import Loaded
+from grmm.checkpoint import Checkpoint
 from grmm.edit import POSES, HeadCodes, between, controlled, principal_directions, trained_head
 from grmm.head_crop import draw_window
 from grmm.model import Maps, PinholeView
@@ -48,7 +48,7 @@ class Preview:
     a picture is exactly that of ``grmm render``. State: what was decoded last.
     """
 
-    def __init__(self, loaded: Loaded) -> None:
+    def __init__(self, loaded: Checkpoint) -> None:
         """Draw heads of this checkpoint."""
         self.loaded = loaded
         self._head: HeadCodes | None = None
@@ -149,7 +149,7 @@ def _serve_behind(
 class Viewer:
     """The server, the browsers that watch, and the head that the controls describe."""
 
-    def __init__(self, loaded: Loaded, host: str, port: int, moving: int, still: int) -> None:
+    def __init__(self, loaded: Checkpoint, host: str, port: int, moving: int, still: int) -> None:
         """Start to listen; heights in pixels while things move and once they rest."""
         self.loaded, self.heights = loaded, {True: moving, False: still}
         self.preview = Preview(loaded)

@@ -25,26 +25,39 @@ from express50.errors import Express50Error
 
 @dataclass(frozen=True, kw_only=True)
 class TaskScene:
-    """One task, ready to be shown."""
+    """One task, ready to be shown.
 
-    task: LabelTask  # subject, expression and doubt
-    # name, description: of the expression
+    Attributes:
+        task: subject, expression and doubt.
+        name, description: of the expression.
+        index: the subject's footage; None where it cannot be read.
+        first, last: the cue window, both inside.
+        cameras: ids from the suggestion's on, which sees the face best.
+        suggestion: what align suggested; None where it did not run.
+        reference: the reference's canonical frame of the expression, or None.
+        reference_index: the reference's footage; None where it cannot be read.
+        is_reference: whether this subject is the reference itself.
+        mine: this annotator's label, or None.
+        in_force: the label in force, whoever gave it.
+        problem: why the task cannot be labelled, in plain words.
+        notes: what the annotator should know, in plain words.
+    """
+
+    task: LabelTask
     name: str
     description: str
-    index: Index | None = None  # the subject's footage; None where it cannot be read
-    # first, last: the cue window, both inside
+    index: Index | None = None
     first: int = 0
     last: int = 0
-    cameras: tuple[str, ...] = ()  # camera ids from the suggestion's on, which sees the face best
-    suggestion: Suggested | None = None  # what align suggested; None where it did not run
-    # the reference's canonical frame of the expression, or None
+    cameras: tuple[str, ...] = ()
+    suggestion: Suggested | None = None
     reference: CanonicalFrame | None = None
-    reference_index: Index | None = None  # footage of the reference; None where it cannot be read
-    is_reference: bool = False  # whether this subject is the reference itself
-    mine: Label | None = None  # this annotator's label, or None
-    in_force: Label | None = None  # the label in force, whoever gave it
-    problem: str | None = None  # why the task cannot be labelled, in plain words
-    notes: tuple[str, ...] = ()  # what the annotator should know, in plain words
+    reference_index: Index | None = None
+    is_reference: bool = False
+    mine: Label | None = None
+    in_force: Label | None = None
+    problem: str | None = None
+    notes: tuple[str, ...] = ()
 
 
 def load_scene(dataset: Dataset, task: LabelTask, annotator: str) -> TaskScene:

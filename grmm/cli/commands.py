@@ -20,7 +20,7 @@ from grmm.config import TABLES, Config, as_tables, choose, from_tables, resolve
 from grmm.deviations import paper_diff
 
 if TYPE_CHECKING:
-    from grmm.checkpoint import Loaded
+    from grmm.checkpoint import Checkpoint
     from grmm.data import HeadViews
     from grmm.edit import HeadCodes
     from grmm.identity_evaluation import FitProtocol
@@ -252,7 +252,7 @@ def evaluate(args: argparse.Namespace) -> int:
 
 
 def _split(
-    loaded: Loaded, views: HeadViews, args: argparse.Namespace
+    loaded: Checkpoint, views: HeadViews, args: argparse.Namespace
 ) -> tuple[list[int], dict[str, list[int]]]:
     """Split samples into those with trained codes and, per person, those to fit first."""
     from grmm.shard_source import select
@@ -390,7 +390,7 @@ def _metric_settings(args: argparse.Namespace) -> list[str]:
     return [f"metrics.{name}={path}" for name, path in given.items() if path]
 
 
-def _load(path: Path, assignments: Sequence[str] = (), seconds: float | None = None) -> Loaded:
+def _load(path: Path, assignments: Sequence[str] = (), seconds: float | None = None) -> Checkpoint:
     """Read a checkpoint; ``fit.*``, ``metrics.*`` and ``loss.*`` replace its own settings."""
     from grmm.checkpoint import load_checkpoint
     from grmm.train_state import best_device
@@ -404,7 +404,7 @@ def _load(path: Path, assignments: Sequence[str] = (), seconds: float | None = N
     return replace(loaded, config=from_tables(tables))
 
 
-def _edited_head(loaded: Loaded, args: argparse.Namespace) -> HeadCodes:
+def _edited_head(loaded: Checkpoint, args: argparse.Namespace) -> HeadCodes:
     """Build the head that the arguments describe: a training head, then its edits."""
     from grmm.edit import controlled, trained_head, with_expression
 
@@ -419,7 +419,7 @@ def _edited_head(loaded: Loaded, args: argparse.Namespace) -> HeadCodes:
     return controlled(loaded, head, dict(_control(text) for text in args.control))
 
 
-def _frame_head(loaded: Loaded, text: str, expression: str | None = None) -> HeadCodes:
+def _frame_head(loaded: Checkpoint, text: str, expression: str | None = None) -> HeadCodes:
     """Build the head of ``SUBJECT/EXPRESSION``; ``expression`` replaces a missing second part."""
     from grmm.edit import trained_head
 
@@ -427,7 +427,7 @@ def _frame_head(loaded: Loaded, text: str, expression: str | None = None) -> Hea
     return trained_head(loaded, *_frame(loaded, subject, named or expression))
 
 
-def _frame(loaded: Loaded, subject: str | None, expression: str | None) -> tuple[str, str]:
+def _frame(loaded: Checkpoint, subject: str | None, expression: str | None) -> tuple[str, str]:
     """Choose the subject and expression to draw, by default the first subject's neutral."""
     subject = subject or loaded.model.subjects[0]
     if expression is None:

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from express50.dataset.tracks import RIG_RATE, Sequence
 from express50.files.atomic import write_bytes
-from grmm.checkpoint import Loaded
+from grmm.checkpoint import Checkpoint
 from grmm.data import HeadViews, spread
 from grmm.edit import POSES, HeadCodes
 from grmm.evaluate import SEEN, kind_of
@@ -93,7 +93,7 @@ class PlayerReport:
 
 def export_player(
     path: Path,
-    loaded: Loaded,
+    loaded: Checkpoint,
     head: HeadCodes,
     subject: str,
     views: HeadViews | None = None,

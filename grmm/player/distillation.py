@@ -18,7 +18,7 @@ from express50.geometry.transforms import look_at
 from express50.geometry.transforms_torch import axis_angle_to_matrix, matrix_to_quat
 from express50.head.model import joint_transforms
 from grmm.anchors import interpolate, tangent_frames
-from grmm.checkpoint import Loaded
+from grmm.checkpoint import Checkpoint
 from grmm.config import SCALE_RANGE_MM
 from grmm.data import Tracked, padded
 from grmm.edit import HeadCodes, trained_head
@@ -110,7 +110,7 @@ class Person:
         z_changes: (E, Z) what an expression adds to z_exp.
     """
 
-    loaded: Loaded
+    loaded: Checkpoint
     head: HeadCodes
     expressions: tuple[str, ...]
     own: Tensor
@@ -133,7 +133,7 @@ class Person:
         return AvatarPose(parameters=parameters, weights=self.own.new_tensor(weights))
 
 
-def person_of(loaded: Loaded, head: HeadCodes, subject: str) -> Person:
+def person_of(loaded: Checkpoint, head: HeadCodes, subject: str) -> Person:
     """Collect the changes that a training subject's expressions make to a head."""
     count = len(loaded.head.expression_names)
     others = {name: trained_head(loaded, subject, name) for name in loaded.model.expressions}
@@ -206,7 +206,7 @@ def sampled_poses(person: Person, count: int, generator: torch.Generator) -> lis
     return poses
 
 
-def turning_point(loaded: Loaded) -> Tensor:
+def turning_point(loaded: Checkpoint) -> Tensor:
     """Return the point (3,) of the head model that the player's camera turns about."""
     heights = loaded.head.template[:, 1]
     middle = (heights.amax() + heights.amin()) / 2
@@ -214,7 +214,7 @@ def turning_point(loaded: Loaded) -> Tensor:
     return torch.stack([torch.zeros_like(middle), middle, depth]).double().cpu()
 
 
-def front_view(loaded: Loaded, size: int) -> PinholeView:
+def front_view(loaded: Checkpoint, size: int) -> PinholeView:
     """Return a square view from straight ahead, as far away as the training's frontal camera.
 
     The focal length lets the head model's template fill three quarters of the height.
@@ -231,7 +231,7 @@ def front_view(loaded: Loaded, size: int) -> PinholeView:
     return PinholeView(K=K, cam_from_head=cam_from_head, width=size, height=size)
 
 
-def seen_angles(loaded: Loaded) -> tuple[tuple[float, float], tuple[float, float]]:
+def seen_angles(loaded: Checkpoint) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the ranges of yaw and pitch, degrees, of the training cameras and a little beyond."""
     directions = torch.stack([view.direction() for view in loaded.gallery.cameras.values()])
     x, y, z = directions.double().cpu().unbind(1)
@@ -244,7 +244,7 @@ def seen_angles(loaded: Loaded) -> tuple[tuple[float, float], tuple[float, float
     return limits[0], limits[1]
 
 
-def sampled_views(loaded: Loaded, count: int, generator: torch.Generator) -> list[PinholeView]:
+def sampled_views(loaded: Checkpoint, count: int, generator: torch.Generator) -> list[PinholeView]:
     """Draw views in the range that `seen_angles` gives, denser ahead than behind."""
     front, centre = front_view(loaded, PICTURE_PX), loaded.model.head_centre
     yaws, pitches = seen_angles(loaded)

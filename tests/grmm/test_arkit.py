@@ -9,7 +9,7 @@ import torch
 
 from express50.errors import ConfigError
 from express50.head.load import load_head
-from grmm.checkpoint import Gallery, Loaded
+from grmm.checkpoint import Checkpoint, Gallery
 from grmm.data import Tracked
 from grmm.edit import HeadCodes
 from grmm.export import arkit_controls, arkit_targets, mesh_glb
@@ -22,7 +22,7 @@ def built_in():
     head, config = load_head("procedural"), tiny_config()
     model = GRMM(config.model, head, ("S",), ("neutral",))
     gallery = Gallery(frames={}, cameras={})
-    loaded = Loaded(config=config, head_spec="procedural", head=head, model=model,
+    loaded = Checkpoint(config=config, head_spec="procedural", head=head, model=model,
                     gallery=gallery, optimizer={}, loop={})  # fmt: skip
     zeros = np.zeros
     tracked = Tracked(shape=zeros(3), expression=zeros(71), neck=zeros(3), jaw=zeros(3),

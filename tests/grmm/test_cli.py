@@ -138,7 +138,7 @@ def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
         (["train", "{out}", "{out}", "--budget=9s"], 1, "the index is missing"),
         (["train", "{out}", "{out}"], 1, "the index is missing"),
         (["train", "{out}/absent", "{out}"], 1, "absent: no such folder; name the folder that"),
-        (["train", "{shards}", "{out}", *TINY, "--holdout-cameras=x"], 2, "names x"),
+        (["train", "{shards}", "{out}", *TINY, "--holdout-cameras=x"], 2, "no camera 'x'"),
         (["fit", "{checkpoint}", "{shards}", "{out}", "--subject=S9"], 2, "no subject is"),
         (["fit", "{checkpoint}", "{shards}", "{out}", "--subject=S002", "--set=train.lr=1"], 2,
          "expected fit, metrics, loss"),
