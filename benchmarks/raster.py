@@ -12,7 +12,6 @@ one JSON object.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import platform
@@ -24,6 +23,7 @@ import psutil
 import torch
 from torch import Tensor
 
+from benchmarks.common import make_parser
 from express50 import native
 from express50.geometry.conventions import corner_to_cell
 from grmm.rasterize import RenderOutput, rasterize
@@ -136,7 +136,7 @@ def threads_bit_identical(n: int, size: int, channels: int) -> bool:
 
 def main() -> int:
     """Measure, print one line per case, then one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = make_parser("raster", __doc__)
     parser.add_argument("--quick", action="store_true", help="N 16384 at 256 px only")
     parser.add_argument("--repeats", type=int, default=7, help="runs of each case")
     args = parser.parse_args()

@@ -164,13 +164,18 @@ MIN_SCORE = 0.25
 
 @dataclass(frozen=True)
 class Face:
-    """A face in a picture, in shares of the picture's width."""
+    """A face in a picture, in shares of the picture's width.
 
-    # x, y: middle of the eyes' corners
+    Attributes:
+        x, y: middle of the eyes' corners.
+        unit: distance of the outer corners of the eyes as a frontal view would have it.
+        aspect: height of the picture over its width.
+    """
+
     x: float
     y: float
-    unit: float  # distance of the outer corners of the eyes as a frontal view would have it
-    aspect: float  # height of the picture over its width
+    unit: float
+    aspect: float
 
 
 def zoom_box(face: Face | None, zoom: str, pane_aspect: float, image_aspect: float) -> Box:
