@@ -34,6 +34,10 @@ class Note:
     what: str
     why: str
 
+    def __str__(self) -> str:
+        """Format for people."""
+        return f"{self.what}: {self.why}"
+
 
 Unit = Literal["mm", "px", "frames", "alpha", "dB"]
 

@@ -8,7 +8,6 @@ camera axes (x right, y down, z forward): component c is stored as round(127 c) 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -23,8 +22,6 @@ from express50.files.images import (
 )
 
 NORMAL_STEPS = 127  # from 0 to 1 in one component
-Whole = Callable[[np.ndarray], np.ndarray]
-"""Makes the map of a picture (H, W[, C]) from that of a window in it (h, w[, C])."""
 FARTHEST_M = 1e4  # no rig is this large: beyond this its unit must be wrong
 
 
@@ -34,10 +31,8 @@ def depth_file(folder: Path, camera_id: str) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
-def write_depth(
-    folder: Path, camera_id: str, depth: np.ndarray, valid: np.ndarray, whole: Whole = np.asarray
-) -> Path:
-    """Write a depth map (h, w), metres, of a window or the whole picture; returns the file.
+def encode_depth(depth: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Encode a depth map (H, W), metres: uint16 steps, or float32 metres if these do not suffice.
 
     Raises:
         ValueError: a valid depth is not finite, not positive or over 10 km.
@@ -46,11 +41,14 @@ def write_depth(
     if not ((inside > 0) & (inside < FARTHEST_M)).all():
         raise ValueError(f"valid depth must lie in (0, {FARTHEST_M:g}) m; is the rig in metres?")
     if inside.max(initial=0) < DEPTH_LIMIT_M:
-        path = folder / f"{camera_id}.png"
-        write_image(path, whole(depth_to_uint16(depth, valid)))
-    else:
-        path = folder / f"{camera_id}.exr"
-        write_image(path, whole(np.where(valid, depth, 0).astype(np.float32)))
+        return depth_to_uint16(depth, valid)
+    return np.where(valid, depth, 0).astype(np.float32)
+
+
+def write_depth(folder: Path, camera_id: str, encoded: np.ndarray) -> Path:
+    """Write a camera's depth map (H, W) of `encode_depth` as PNG or EXR; returns the file."""
+    path = folder / f"{camera_id}{'.png' if encoded.dtype == np.uint16 else '.exr'}"
+    write_image(path, encoded)
     return path
 
 
@@ -75,10 +73,8 @@ def read_depth(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return depth, depth > 0
 
 
-def write_normals(
-    path: Path, normals: np.ndarray, valid: np.ndarray, whole: Whole = np.asarray
-) -> None:
-    """Write unit normals (h, w, 3) of a window or the whole picture, camera axes, as 8-bit PNG.
+def encode_normals(normals: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Encode unit normals (H, W, 3), camera axes, as uint8, 0 where not `valid` (H, W).
 
     Raises:
         ValueError: a valid normal is not finite or not of unit length.
@@ -86,10 +82,10 @@ def write_normals(
     known = normals[valid]
     square = np.einsum("ni,ni->n", known, known)
     if square.size and not np.abs(square - 1).max() < 2e-3:  # NaN fails as well
-        raise ValueError(f"{path.name}: valid normals must be finite and of unit length")
+        raise ValueError("valid normals must be finite and of unit length")
     code = np.zeros(normals.shape, np.uint8)
     code[valid] = np.clip(np.rint(known * NORMAL_STEPS) + NORMAL_STEPS + 1, 1, 255)
-    write_image(path, whole(code))
+    return code
 
 
 def read_normals(path: Path) -> tuple[np.ndarray, np.ndarray]:

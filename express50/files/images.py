@@ -434,6 +434,17 @@ def edge_distance(mask: np.ndarray) -> np.ndarray:
     return np.sqrt(np.rint(np.square(rough)))
 
 
+def box_about(mask: np.ndarray, margin: int = 0) -> tuple[slice, slice]:
+    """Return rows and columns of the marked pixels of a mask (H, W), and `margin` more around."""
+    x, y, width, height = cv2.boundingRect(np.asarray(mask, np.uint8))
+    return np.s_[max(0, y - margin) : y + height + margin, max(0, x - margin) : x + width + margin]
+
+
+def disc(radius: int) -> np.ndarray:
+    """Return a disc of a radius in pixels, for morphology."""
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+
+
 def fit_into(image: np.ndarray, height: int, width: int) -> np.ndarray:
     """Scale an image (h, w[, 3]) uint8 to fit, centred on a dark (height, width, 3) tile."""
     if image.ndim == 2:

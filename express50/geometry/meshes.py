@@ -51,6 +51,20 @@ class Surface:
     confidence: np.ndarray
 
 
+def write_surface(
+    path: Path,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    normals: np.ndarray,
+    colors: np.ndarray,
+    confidence: np.ndarray,
+) -> None:
+    """Write ``surface.ply``: a `Surface` with unit normals (N, 3); world, metres."""
+    columns = {f"n{axis}": normals[:, k] for k, axis in enumerate("xyz")}
+    columns |= {name: colors[:, k] for k, name in enumerate(("red", "green", "blue"))}
+    write_ply(path, vertices, faces, columns | {"confidence": confidence})
+
+
 def read_surface(path: Path) -> Surface:
     """Read a surface that the depth stage wrote.
 

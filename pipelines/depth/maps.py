@@ -17,6 +17,7 @@ import numpy as np
 import open3d as o3d
 
 from express50.error_model import PEOPLE_DIFFER, Bounds, error_bounds
+from express50.files.images import box_about
 from express50.geometry.cameras import Camera, crop_camera, rays, resized, unproject
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.raycast import barycentrics, camera_rays, join_rays, mesh_scene
@@ -64,8 +65,7 @@ def picture_of(
     """Describe a frame (H, W, 3) and a matte (H, W), uint8, that `read` returns again."""
     grains = grain(rgb, alpha > 255 * INSIDE)[::GRAINS]
     small = reduced(camera, rgb, alpha, COMPARED_SIDE)
-    x, y, width, height = cv2.boundingRect((small[2] > 255 * INSIDE).astype(np.uint8))
-    part = np.ascontiguousarray(small[1][y : y + height, x : x + width])
+    part = np.ascontiguousarray(small[1][box_about(small[2] > 255 * INSIDE)])
     edge = edge_width(part) if part.size else None
     return Picture(camera, small, grains, np.nan if edge is None else edge, read)
 
@@ -419,8 +419,7 @@ def grain(rgb: np.ndarray, mask: np.ndarray) -> np.ndarray:
     It is the deviation within a window over the light. Hair varies, whose strands no surface
     follows.
     """
-    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
-    box = np.s_[max(0, y - WINDOW) : y + height + WINDOW, max(0, x - WINDOW) : x + width + WINDOW]
+    box = box_about(mask, WINDOW)
     grey = cv2.cvtColor(np.ascontiguousarray(rgb[box]), cv2.COLOR_RGB2GRAY).astype(np.float32)
     mean, square = (cv2.blur(values, (WINDOW, WINDOW))[mask[box]] for values in (grey, grey * grey))
     return (1 + np.sqrt(np.maximum(square - mean * mean, 0))) / (DARK + mean)
@@ -437,11 +436,9 @@ def smoothed_errors(photo: PhotoErrors, valid: np.ndarray, window: int) -> np.nd
         for values in (np.where(known, photo.errors, 0.0), known)
     )
     mean = np.where(count > 0.5 / window**2, total / np.maximum(count, 1e-6), np.nan)
-    x, y, width, height = cv2.boundingRect(valid.astype(np.uint8))
+    box = box_about(valid)
     rows, columns = (
-        np.arange(first, first + length) * small // large
-        for first, length, small, large in zip(
-            (y, x), (height, width), mean.shape, valid.shape, strict=True
-        )
+        np.arange(part.start, part.stop) * small // large
+        for part, small, large in zip(box, mean.shape, valid.shape, strict=True)
     )
-    return 0.5 + mean[np.ix_(rows, columns)][valid[y : y + height, x : x + width]]
+    return 0.5 + mean[np.ix_(rows, columns)][valid[box]]

@@ -11,6 +11,7 @@ import numpy as np
 import open3d as o3d
 from scipy.spatial import cKDTree
 
+from express50.files.images import disc
 from express50.geometry.cameras import inside_frame, rays
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.raycast import camera_rays, join_rays, mesh_scene
@@ -114,9 +115,8 @@ class TrackedSolid:
             column, line = pixels[shown].astype(np.int64).T
             worn[line, column] = 1
             far = float(np.linalg.norm(way, axis=1).mean())
-            size = 2 * int(np.ceil(WORN_M * view.camera.K[0, 0] / far)) + 1
-            disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-            alpha = np.where(cv2.dilate(worn, disc) > 0, np.float32(0), view.alpha)
+            radius = int(np.ceil(WORN_M * view.camera.K[0, 0] / far))
+            alpha = np.where(cv2.dilate(worn, disc(radius)) > 0, np.float32(0), view.alpha)
             found.append(replace(view, alpha=alpha))
         return found
 

@@ -13,12 +13,12 @@ import numpy as np
 from express50.capture.frames import read_cameras_of, read_matted_frame
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
-from express50.dataset.depth_files import write_depth, write_normals
+from express50.dataset.depth_files import encode_depth, encode_normals, write_depth
 from express50.dataset.tracks import read_track
 from express50.error_model import error_models, expect, single_camera_sigma
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.images import contact_sheet, shrink, srgb_to_linear, write_image
-from express50.geometry import meshes
+from express50.geometry.meshes import write_glb, write_surface
 from express50.head.load import load_topology
 from pipelines.depth.maps import (
     DepthMaps,
@@ -51,7 +51,7 @@ def run(
     views, pictures, dropped = read_views(dataset, item, side)
     one_camera = len(views) == 1 and not dropped  # a photograph, or a video of one camera
     if len(views) < 2 and not one_camera:
-        why = "; ".join(f"{note.what}: {note.why}" for note in dropped)
+        why = "; ".join(map(str, dropped))
         raise StageError(
             f"{item}: {len(views)} usable cameras, expected at least 2 with a"
             f" matte of the head ({why or 'no others are calibrated'}); run 'express50 matte'"
@@ -66,8 +66,7 @@ def run(
         surface = tracked_surface(views[0], solid, *fineness)
     else:
         surface = reconstruct(views, solid, *fineness)
-    write_ply(out / "surface.ply", surface)
-    write_glb(out / "surface.glb", surface)
+    write_meshes(out, surface)
     rows, photo, typical = write_views(out, surface, pictures, solid)
     shared = single_camera_sigma([picture.camera for picture in pictures], surface.vertices)
     expected = expect(error_models()["depth"], typical, float(np.median(shared)))
@@ -166,32 +165,27 @@ def write_maps(out: Path, camera_id: str, maps: DepthMaps) -> None:
         StageError: the depth is more than any file holds.
     """
     try:
-        write_depth(out, camera_id, maps.depth, maps.valid, maps.whole)
+        depth = encode_depth(maps.depth, maps.valid)
     except ValueError as error:
         raise StageError(f"{camera_id}: {error}") from None
+    write_depth(out, camera_id, maps.whole(depth))
     confidence = np.rint(maps.confidence * 255).astype(np.uint8)
     write_image(out / f"{camera_id}_confidence.png", maps.whole(confidence))
     known = has_normal(maps.normals)  # the surface has none where its triangles fold back
-    write_normals(out / f"{camera_id}_normals.png", maps.normals, known, maps.whole)
+    normals = encode_normals(maps.normals, known)
+    write_image(out / f"{camera_id}_normals.png", maps.whole(normals))
 
 
-def write_ply(path: Path, surface: HeadSurface) -> None:
-    """Write a binary PLY: position, normal, sRGB colour, confidence; world, metres."""
-    columns = {f"n{axis}": surface.normals[:, k] for k, axis in enumerate("xyz")}
-    columns |= {c: surface.colors[:, k] for k, c in enumerate(("red", "green", "blue"))}
-    columns["confidence"] = surface.confidence
-    meshes.write_ply(path, surface.vertices, surface.faces, columns)
+def write_meshes(out: Path, surface: HeadSurface) -> None:
+    """Write surface.ply and surface.glb; world, metres.
 
-
-def write_glb(path: Path, surface: HeadSurface) -> None:
-    """Write a binary glTF: position, normal, colour; world, metres.
-
-    Colours are linear light in 8 bits: near black they are up to 6 steps of sRGB off.
+    Colours of the glTF are linear light in 8 bits: near black they are up to 6 steps of sRGB off.
     """
+    vertices, faces, normals = surface.vertices, surface.faces, surface.normals
+    write_surface(out / "surface.ply", vertices, faces, normals, surface.colors, surface.confidence)
     light = np.rint(255 * srgb_to_linear(surface.colors / 255.0))
     colours = np.hstack([light, np.full((len(light), 1), 255)]).astype(np.uint8)
-    vertices, normals = surface.vertices, surface.normals
-    meshes.write_glb(path, "surface", vertices, surface.faces, normals=normals, colours=colours)
+    write_glb(out / "surface.glb", "surface", vertices, faces, normals=normals, colours=colours)
 
 
 def figures_of(surface: HeadSurface, rows: dict[str, dict], photo: Sequence[PhotoErrors]) -> dict:

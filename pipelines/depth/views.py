@@ -12,7 +12,7 @@ import numpy as np
 
 from express50.contract.stage import Note
 from express50.errors import StageError
-from express50.files.images import resize_area, shrink
+from express50.files.images import box_about, resize_area, shrink
 from express50.geometry.cameras import Camera, project, resized
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.sampling import bilinear
@@ -110,8 +110,7 @@ def silhouette_distance(alpha: np.ndarray) -> np.ndarray:
     # Distances are to pixel centres across the contour: half a pixel too long on either side.
     signed = cv2.distanceTransform(1 - mask, cv2.DIST_L2, cv2.DIST_MASK_5)
     np.subtract(0.5, signed, out=signed)
-    x, y, w, h = cv2.boundingRect(mask)
-    box = np.s_[max(0, y - 1) : y + h + 1, max(0, x - 1) : x + w + 1]
+    box = box_about(mask, 1)
     part = np.ascontiguousarray(mask[box])
     inside = cv2.distanceTransform(part, cv2.DIST_L2, cv2.DIST_MASK_5)
     signed[box] = np.where(part > 0, inside - 0.5, signed[box])

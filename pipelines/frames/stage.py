@@ -72,7 +72,7 @@ def run(dataset: Dataset, item: str, out: Path, side: int) -> Result:
             warnings.append(Note(name, FOLDS.format(black)))
         tiles[name] = shrink(image, TILE)
     if not tiles and not plates:
-        why = "; ".join(f"{note.what}: {note.why}" for note in dropped[:3])
+        why = "; ".join(map(str, dropped[:3]))
         raise StageError(f"{item}: no camera could be read ({why or 'none is calibrated'})")
     if tiles:
         (out / "qc").mkdir()

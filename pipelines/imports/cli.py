@@ -18,7 +18,7 @@ from express50.capture.frames import read_cameras_of, read_peak_frame, read_reco
 from express50.console import FAILED, OK, add_command, answer, count
 from express50.contract.layout import Dataset, existing_dataset, included_subjects
 from express50.contract.stage import Note, Result, stages
-from express50.dataset.depth_files import write_depth
+from express50.dataset.depth_files import encode_depth, write_depth
 from express50.errors import ConfigError, Express50Error, StageError, few
 from express50.files.images import read_alpha, write_image
 from express50.geometry.cameras import Camera
@@ -278,7 +278,7 @@ def _write_depths(given: PeakPictures, out: Path) -> Result:
         checks["views_agree"] = check_depths(cameras, depths, given.item)
     for name, depth in depths.items():
         known = depth > 0
-        write_depth(out, name, depth, known)
+        write_depth(out, name, encode_depth(depth, known))
         write_image(out / f"{name}_confidence.png", np.where(known, 255, 0).astype(np.uint8))
     vertices = write_fused(out / "surface.ply", cameras, depths, given.footage())
     return Result({"imported": checks | {"surface_vertices": vertices}}, (), notes)

@@ -13,6 +13,7 @@ from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note
 from express50.errors import CaptureError, StageError
+from express50.files.images import disc
 from express50.geometry.cameras import Camera, inside_frame, project_pinhole
 from express50.landmarks import EMBEDDED
 from pipelines.imports.pictures import look_up
@@ -123,16 +124,12 @@ def edge_contrast(picture: np.ndarray, alpha: np.ndarray) -> float:
     away = max(2, int(BESIDE * np.sqrt(mask.sum())))
 
     def level(shape: np.ndarray) -> float:
-        line = cv2.dilate(shape, _disc(1)) > cv2.erode(shape, _disc(1))
+        line = cv2.dilate(shape, disc(1)) > cv2.erode(shape, disc(1))
         line[:RIM], line[-RIM:], line[:, :RIM], line[:, -RIM:] = False, False, False, False
         return float(steep[line].mean()) if line.any() else 0.0
 
-    beside = level(cv2.dilate(mask, _disc(away))) + level(cv2.erode(mask, _disc(away)))
+    beside = level(cv2.dilate(mask, disc(away))) + level(cv2.erode(mask, disc(away)))
     return level(mask) / max(beside / 2, 1e-3)
-
-
-def _disc(radius: int) -> np.ndarray:
-    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
 
 
 def check_outlines(

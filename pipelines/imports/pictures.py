@@ -22,7 +22,7 @@ from express50.geometry.cameras import (
     unproject,
 )
 from express50.geometry.conventions import K_to_opencv, cell_centres, cell_to_corner
-from express50.geometry.meshes import write_ply
+from express50.geometry.meshes import write_surface
 from express50.geometry.sampling import undistort_image, undistort_maps
 
 SAMPLES = 1500  # pixels per view that are compared to the other views
@@ -285,10 +285,9 @@ def write_fused(
     mesh.compute_vertex_normals()
     vertices = mesh.vertex.positions.numpy().astype(np.float64) + centre
     seen, colours = _seen(vertices, cameras, depths, pictures, TRUNCATION * voxel)
-    columns = {f"n{axis}": mesh.vertex.normals.numpy()[:, k] for k, axis in enumerate("xyz")}
-    columns |= {c: colours[:, k] for k, c in enumerate(("red", "green", "blue"))}
-    columns["confidence"] = np.minimum(seen / SURE, 1.0).astype(np.float32)
-    write_ply(path, vertices, mesh.triangle.indices.numpy(), columns)
+    faces, normals = mesh.triangle.indices.numpy(), mesh.vertex.normals.numpy()
+    confidence = np.minimum(seen / SURE, 1.0).astype(np.float32)
+    write_surface(path, vertices, faces, normals, colours, confidence)
     return len(vertices)
 
 

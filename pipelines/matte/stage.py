@@ -16,7 +16,7 @@ from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
 from express50.error_model import error_bounds, error_models, expect
 from express50.errors import CaptureError, NoFaceError, StageError
-from express50.files.images import shrink, tile_sheet, write_image
+from express50.files.images import box_about, shrink, tile_sheet, write_image
 from express50.geometry.cameras import Camera, pinhole, resized
 from express50.geometry.sampling import undistorted_mask
 from pipelines.matte.config import NETWORKS, WITHOUT_PLATE, MatteConfig
@@ -252,13 +252,9 @@ def rim_of(alpha: np.ndarray) -> np.ndarray:
     """Return the pixels (H, W) bool about the outline of an alpha (H, W) uint8."""
     reach = max(1, round(RIM * max(alpha.shape)))
     rim = np.zeros(alpha.shape, bool)
-    x, y, width, height = cv2.boundingRect((alpha > 12).astype(np.uint8))
-    if width:
-        window = np.s_[
-            max(0, y - reach) : y + height + reach, max(0, x - reach) : x + width + reach
-        ]
-        part = alpha[window]
-        rim[window] = dilated(part > 12, reach) & dilated(part < 243, reach)
+    window = box_about(alpha > 12, reach)
+    part = alpha[window]
+    rim[window] = dilated(part > 12, reach) & dilated(part < 243, reach)
     return rim
 
 
@@ -271,11 +267,8 @@ def rim_figures(
     from the wall by little more than noise, keying may miss parts and leave a ragged outline.
     """
     contrast, side = cv2.resize(outline_contrast(alpha, rgb), alpha.shape[::-1]), max(alpha.shape)
-    x, y, width, height = cv2.boundingRect(alpha)
     margin = max(1, round(RIM * side)) + _nearby_side(alpha) + WINDOW  # beyond it all is 0
-    window = np.s_[
-        max(0, y - margin) : y + height + margin, max(0, x - margin) : x + width + margin
-    ]
+    window = box_about(alpha, margin)
     rim, share = rim_of(alpha)[window], alpha[window].astype(np.float32) / 255
     open_part = share * (1 - share)
     inside = (share > 0.5).astype(np.uint8)

@@ -12,7 +12,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from express50.contract.segmentation_labels import HEAD, LABELS, label_mask
-from express50.files.images import edge_distance
+from express50.files.images import disc, edge_distance
 from express50.geometry.cameras import Camera, crop_camera, project, rays, unproject
 from express50.geometry.conventions import opencv_pixels_to_corner
 from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
@@ -258,9 +258,8 @@ def find_hands(geometry: HeadGeometry, labels: np.ndarray, metre_px: float) -> n
     ``metre_px`` is the number of pixels that a metre spans at the head.
     """
     clear = _face(geometry.mesh) & (geometry.off > CLEAR_M) & (labels != HAIR)
-    size = max(3, int(WIDTH_M * metre_px) // 2 * 2 + 1)
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-    solid = cv2.morphologyEx(clear.astype(np.uint8), cv2.MORPH_OPEN, kernel)
+    narrow = disc(max(1, int(WIDTH_M * metre_px) // 2))
+    solid = cv2.morphologyEx(clear.astype(np.uint8), cv2.MORPH_OPEN, narrow)
     count, part = cv2.connectedComponents(solid, connectivity=8)
     far = [k for k in range(1, count) if np.quantile(geometry.off[part == k], 0.9) > HAND_M]
     return np.isin(part, far)

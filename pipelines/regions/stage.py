@@ -16,7 +16,7 @@ from express50.contract.stage import Note, Result
 from express50.dataset.depth_files import depth_file, read_depth
 from express50.dataset.tracks import existing_track, read_track
 from express50.errors import CaptureError, FormatError, StageError
-from express50.files.images import contact_sheet, fit_into, shrink, write_image
+from express50.files.images import box_about, contact_sheet, fit_into, shrink, write_image
 from express50.geometry.cameras import Camera, crop_camera, project, resized
 from express50.head.load import load_topology
 from pipelines.regions.colour import EARS, SKIN, Scalp, by_colour, decide, face_colours, scalp_votes
@@ -86,7 +86,7 @@ def run(
         view = label_view(head, camera, rgb, alpha, depth, scalp.is_skin, side, skin, glasses)
         figures[name], rows[name] = _write_view(out, name, rgb, alpha, view, weights)
     if not figures:
-        why = "; ".join(f"{note.what}: {note.why}" for note in dropped[:3])
+        why = "; ".join(map(str, dropped[:3]))
         raise StageError(f"{item}: no camera has a matte to label ({why}); run 'express50 matte'")
     write_picture(out, rows, figures)
     doubts = {name: view_warning(row) for name, row in figures.items()}
@@ -349,12 +349,11 @@ def picture_row(image: np.ndarray, labels: np.ndarray, alpha: np.ndarray) -> lis
 
 def subject_box(labels: np.ndarray) -> tuple[slice, slice]:
     """Find the window of the labelled pixels with a margin, or the whole image without any."""
-    points = cv2.findNonZero((labels > 0).astype(np.uint8))
-    if points is None:
+    if not labels.any():
         return np.s_[:, :]
-    x, y, width, height = cv2.boundingRect(points)
-    room = max(width, height) // 20 + 1
-    return (slice(max(0, y - room), y + height + room), slice(max(0, x - room), x + width + room))
+    rows, columns = box_about(labels)
+    size = max(rows.stop - rows.start, columns.stop - columns.start)
+    return box_about(labels, size // 20 + 1)
 
 
 def write_picture(out: Path, rows: dict[str, list[np.ndarray]], figures: dict[str, dict]) -> None:

@@ -22,7 +22,7 @@ import open3d as o3d
 from scipy import ndimage
 
 from express50.contract.segmentation_labels import LABELS, label_mask
-from express50.files.images import LIGHT_OF_LEVEL, shrink
+from express50.files.images import LIGHT_OF_LEVEL, box_about, disc, shrink
 from express50.geometry.cameras import (
     Camera,
     crop_camera,
@@ -155,9 +155,7 @@ def shown_before(places: np.ndarray, camera: Camera, depth: np.ndarray) -> np.nd
     metre_px = camera.K[0, 0] / np.median(ahead)
     size = (int(np.ceil(CELL_M * metre_px)) | 1) + 2
     whole = cv2.morphologyEx(found, cv2.MORPH_CLOSE, np.ones((size, size), np.uint8))
-    size = 2 * round(WIDER_M * metre_px) + 1
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-    return cv2.erode(whole, kernel) > 0
+    return cv2.erode(whole, disc(round(WIDER_M * metre_px))) > 0
 
 
 @dataclass(frozen=True)
@@ -280,10 +278,10 @@ def _up_to_edges(view: FaceView, shot: _Shot) -> FaceView:
 
     Patches straddle the border, so that it is sure only within EDGE_M.
     """
-    disc = _disc(view, EDGE_M)
+    around = _disc(view, EDGE_M)
     markers = np.zeros(view.depth.shape, np.int32)
     for number, mask in enumerate((view.bare, view.covered), 1):
-        markers[cv2.erode(mask.astype(np.uint8), disc) > 0] = number
+        markers[cv2.erode(mask.astype(np.uint8), around) > 0] = number
     beside = (view.depth == 0) | (shot.alpha <= 0.5)
     markers[cv2.erode(beside.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0] = 3
     split = cv2.watershed(np.ascontiguousarray(shot.rgb), markers)
@@ -293,8 +291,7 @@ def _up_to_edges(view: FaceView, shot: _Shot) -> FaceView:
 def _disc(view: FaceView | _Sweep, radius_m: float) -> np.ndarray:
     """Make a disc of a radius at the head, for morphology."""
     metre_px = view.camera.K[0, 0] / float(np.median(view.depth[view.depth > 0]))
-    side = 2 * max(1, round(radius_m * metre_px)) + 1
-    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    return disc(max(1, round(radius_m * metre_px)))
 
 
 def _shot(head: TrackedHead, picture: Picture) -> _Shot | None:
@@ -319,9 +316,7 @@ def _shot(head: TrackedHead, picture: Picture) -> _Shot | None:
 def _sweep(head: TrackedHead, shots: Sequence[_Shot], own: int, face: np.ndarray) -> _Sweep:
     """Compare a view, number `own`, with its neighbours where it sees the `face` (H, W)."""
     camera, depth = shots[own].camera, shots[own].depth
-    x, y, width, height = cv2.boundingRect(face.astype(np.uint8))
-    window = np.s_[max(0, y - PATCH_PX) : y + height + PATCH_PX,
-                   max(0, x - PATCH_PX) : x + width + PATCH_PX]  # fmt: skip
+    window = box_about(face, PATCH_PX)
     row, column, _ = nearest(depth[window] > 0)
     shape = row.shape
     cells = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), -1).reshape(-1, 2)

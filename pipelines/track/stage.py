@@ -87,7 +87,7 @@ def run(
     targets, state, lost = fit_landmarks(basis, peaks, config.neutral)
     dropped += lost
     if not targets:
-        reasons = "; ".join(f"{note.what}: {note.why}" for note in dropped[:3])
+        reasons = "; ".join(map(str, dropped[:3]))
         raise StageError(f"{item}: no expression could be tracked ({reasons})")
     meshes = all_vertices(basis.model, state)
     eyes = measure_eyes(basis.model, targets, meshes, rotations(state))

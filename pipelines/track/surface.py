@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from express50.files.images import LIGHT_OF_LEVEL, resize_area
+from express50.files.images import LIGHT_OF_LEVEL, disc, resize_area
 from express50.geometry.cameras import Camera, crop_camera, inside_frame, project_pinhole, resized
 from express50.geometry.raycast import join_rays, mesh_scene
 from express50.geometry.sampling import bilinear_slope
@@ -143,10 +143,9 @@ def mask_things(pictures: FrameSetCrops, things: np.ndarray) -> FrameSetCrops:
         column, row = pixels[inside].astype(np.int64).T
         seen[row, column] = 1
         far = float(np.linalg.norm(things - crop.camera.center, axis=1).mean())
-        size = 2 * max(1, round(THING_M * crop.camera.K[0, 0] / far)) + 1
-        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+        hidden = cv2.dilate(seen, disc(max(1, round(THING_M * crop.camera.K[0, 0] / far)))) > 0
         whole = np.full(seen.shape, 255, np.uint8) if crop.alpha is None else crop.alpha
-        crops.append(replace(crop, alpha=np.where(cv2.dilate(seen, disc) > 0, np.uint8(0), whole)))
+        crops.append(replace(crop, alpha=np.where(hidden, np.uint8(0), whole)))
     return replace(pictures, crops=tuple(crops))
 
 

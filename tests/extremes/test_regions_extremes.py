@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from express50.contract.segmentation_labels import LABELS, label_mask
-from express50.dataset.depth_files import write_depth
+from express50.dataset.depth_files import encode_depth, write_depth
 from express50.errors import FormatError, StageError
 from express50.files.images import write_image
 from express50.geometry.cameras import pinhole_camera, resized, transform_camera
@@ -156,7 +156,7 @@ def test_mattes_and_depth_maps_of_another_size_are_named(tmp_path) -> None:
     write_image(dataset.matte_file("S001", "smile", "cam00"), np.zeros((8, 8), np.uint8))
     folder = dataset.item_dir("depth", "S001/smile")
     folder.mkdir(parents=True)
-    write_depth(folder, "cam01", np.ones((8, 8)), np.ones((8, 8), bool))
+    write_depth(folder, "cam01", encode_depth(np.ones((8, 8)), np.ones((8, 8), bool)))
     result = STAGE.run(dataset, "S001/smile", CONFIG, tmp_path)
     why = {note.what: note.why for note in result.dropped}
     assert "express50 matte" in why["cam00"] and "express50 depth" in why["cam01"]

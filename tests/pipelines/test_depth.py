@@ -15,7 +15,7 @@ from pipelines.depth.blocks import build
 from pipelines.depth.maps import cast_maps, picture_of, surface_maps
 from pipelines.depth.prior import boundary_loops, close_mesh, matte_agreement
 from pipelines.depth.reconstruct import reconstruct
-from pipelines.depth.stage import write_ply
+from pipelines.depth.stage import write_meshes
 from pipelines.depth.surface import advance, extract_mesh
 from pipelines.depth.views import (
     head_box,
@@ -255,7 +255,7 @@ def test_confidence_separates_good_depth_from_bad(surface, shots):
 def test_ply_is_read_by_another_library(surface, tmp_path):
     import trimesh
 
-    write_ply(tmp_path / "surface.ply", surface)
+    write_meshes(tmp_path, surface)
     read = trimesh.load(tmp_path / "surface.ply", process=False)
     assert len(read.faces) == len(surface.faces)
     assert read.is_watertight and read.volume > 0
