@@ -16,6 +16,7 @@ from express50.geometry.cameras import inside_frame, rays
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.raycast import camera_rays, join_rays, mesh_scene
 from express50.geometry.sampling import bilinear
+from express50.geometry.transforms import unit
 from pipelines.depth.views import (
     DepthView,
     hull_distance,
@@ -181,8 +182,7 @@ def _body_below(
     """
     ring = vertices[loop]
     middle = ring.mean(0)
-    ways = (middle - vertices.mean(0), ring - middle)
-    down, outward = (w / np.maximum(np.linalg.norm(w, axis=-1, keepdims=True), 1e-9) for w in ways)
+    down, outward = unit(middle - vertices.mean(0)), unit(ring - middle)
     lower = ring + BODY * (down + outward)
     row = first + np.arange(len(loop))
     wall = np.stack([loop, np.roll(loop, -1), np.roll(row, -1), row], axis=1)

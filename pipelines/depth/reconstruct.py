@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from express50.errors import StageError
 from express50.geometry.raycast import join_rays, mesh_scene
 from express50.geometry.sampling import bilinear
+from express50.geometry.transforms import unit
 from pipelines.depth.blocks import (
     BLOCK,
     HELD,
@@ -252,8 +253,7 @@ def patch_scores(
     ticks = (np.arange(SAMPLES) - (SAMPLES - 1) / 2) * max(spacing, float(pixel))
     flat = np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2)
     axis = np.where(np.abs(normals[:, 1:2]) < 0.8, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
-    first = np.cross(normals, axis)
-    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-9)
+    first = unit(np.cross(normals, axis))
     tangents = np.stack([first, np.cross(normals, first)], axis=1)  # (V, 2, 3), orthonormal
     scores = np.zeros((len(vertices), len(offsets)), np.float32)
     usable = np.flatnonzero((weights > 0).sum(0) >= 2)
@@ -288,9 +288,7 @@ def view_weights(views: Sequence[DepthView], mesh: HeadMesh, lift: float) -> np.
     scene = mesh_scene(vertices, mesh.faces)
     weights = np.zeros((len(views), len(vertices)), np.float32)
     for row, view in zip(weights, views, strict=True):
-        towards = view.camera.center - vertices
-        distance = np.linalg.norm(towards, axis=1, keepdims=True)
-        towards = towards / distance
+        towards = unit(view.camera.center - vertices)
         cosine = (normals * towards).sum(1)
         pixels, depth = project_fast(view.camera, vertices)
         seen = (cosine > GRAZING) & in_picture(view.camera, pixels, depth, inset=2)

@@ -15,6 +15,7 @@ from skimage.measure import marching_cubes
 
 from express50.geometry.cameras import unproject
 from express50.geometry.conventions import cell_to_corner
+from express50.geometry.transforms import unit
 from pipelines.depth.blocks import (
     BLOCK,
     HELD,
@@ -111,8 +112,7 @@ def grid_normals(grid: LevelSet, index: np.ndarray) -> np.ndarray:
         smooth.sample(grid.points(index + e)) - smooth.sample(grid.points(index - e))
         for e in np.eye(3)
     ]
-    normals = np.stack(slope, axis=1).astype(np.float64)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return unit(np.stack(slope, axis=1).astype(np.float64))
 
 
 def graph_laplacian(faces: np.ndarray, count: int) -> sparse.csc_matrix:

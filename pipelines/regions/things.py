@@ -33,6 +33,7 @@ from express50.geometry.cameras import (
 )
 from express50.geometry.conventions import cell_to_corner, corner_to_cell
 from express50.geometry.raycast import join_rays
+from express50.geometry.transforms import unit
 from pipelines.regions.colour import colour_logs, like_skin
 from pipelines.regions.geometry import WIDTH_M, TrackedHead, nearest, see
 
@@ -322,7 +323,7 @@ def _sweep(head: TrackedHead, shots: Sequence[_Shot], own: int, face: np.ndarray
     cells = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), -1).reshape(-1, 2)
     part = crop_camera(camera, window[1].start, window[0].start, shape[1], shape[0])
     places = unproject(part, cell_to_corner(cells), depth[window][row, column].ravel())
-    ways = (places - camera.center) / np.linalg.norm(places - camera.center, axis=1)[:, None]
+    ways = unit(places - camera.center)
     places, ways = (values.reshape(*shape, 3) for values in (places - head.center, ways))
     lines = [_line(shot.camera, head.center, places, ways) for shot in shots]
     free = np.ones((len(HEIGHTS_M), *shape), bool)
@@ -343,8 +344,7 @@ def _sweep(head: TrackedHead, shots: Sequence[_Shot], own: int, face: np.ndarray
 
 def _neighbours(head: TrackedHead, shots: Sequence[_Shot], own: int) -> list[int]:
     """Choose the views that a view is compared with."""
-    ways = np.array([shot.camera.center - head.center for shot in shots])
-    ways /= np.linalg.norm(ways, axis=1)[:, None]
+    ways = unit(np.array([shot.camera.center - head.center for shot in shots]))
     cosine = ways @ ways[own]
     ranked = np.argsort(np.abs(cosine - BEST_APART), kind="stable").tolist()
     return [k for k in ranked if APART[0] < cosine[k] < APART[1]][:NEIGHBOURS]

@@ -28,6 +28,7 @@ import torch
 
 from express50.geometry.cameras import Camera, project_with_slope
 from express50.geometry.raycast import join_rays, mesh_scene
+from express50.geometry.transforms import unit
 from express50.head.model import HeadModel, vertex_normals
 from express50.landmarks.irises import EYES
 from express50.landmarks.network import INNER_LIPS
@@ -305,9 +306,7 @@ def contour_points(model: HeadModel, vertices: np.ndarray, camera: Camera) -> Ja
     corners = faces[model.landmark_faces[:JAW].numpy()].copy()
     bary = model.landmark_bary[:JAW].numpy().astype(np.float64)
     normals = vertex_normals(torch.from_numpy(vertices)[None], model.faces)[0].numpy()
-    towards = camera.center - vertices
-    towards = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
-    facing = (normals * towards).sum(1)
+    facing = (normals * unit(camera.center - vertices)).sum(1)
     own = (vertices[corners] * bary[..., None]).sum(1)
     moved = np.zeros(JAW, dtype=bool)
     for point, line in enumerate(model.contour or ()):

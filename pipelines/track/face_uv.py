@@ -22,6 +22,7 @@ from express50.geometry.cameras import Camera
 from express50.geometry.conventions import cell_to_corner, corner_to_cell
 from express50.geometry.raycast import visible_faces
 from express50.geometry.sampling import bilinear
+from express50.geometry.transforms import unit
 from express50.head.model import HeadModel, landmarks, vertex_normals
 from express50.landmarks.network import CROP, MIRROR, LandmarkNet, load_network
 from pipelines.track.appearance import robust_mean
@@ -125,10 +126,9 @@ def slide_term(
     anchors = anchors.some(good)
     # The map rounds off where landmarks lie, but shows well how far they have moved.
     goals = anchors.at(mesh) + found[good] - home[good]
-    normals = anchors.at(vertex_normals(torch.from_numpy(mesh)[None], model.faces)[0].numpy())
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    normals = vertex_normals(torch.from_numpy(mesh)[None], model.faces)[0].numpy()
     sigma = np.hypot(error[good] * step[good], FLOOR_M) * REDUNDANCY**0.5
-    return SlideTerm(anchors, good + FIRST, goals, normals, sigma)
+    return SlideTerm(anchors, good + FIRST, goals, unit(anchors.at(normals)), sigma)
 
 
 def unwrap(

@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from express50.geometry.cameras import Camera, project_pinhole, project_with_slope, triangulate
-from express50.geometry.transforms import similarity_fit
+from express50.geometry.transforms import similarity_fit, unit
 from express50.landmarks.irises import Irises
 from pipelines.calibrate.footage_rig import INNER, mean_landmarks, pose_of_face
 
@@ -48,6 +48,11 @@ class LandmarkView:
     irises: Irises | None = None
     redundancy: float = 1.0
     visible_contour: bool = False
+
+    @property
+    def doubt(self) -> float:
+        """Return how badly the view shows the face, to compare views: pixels over the score."""
+        return float(np.median(self.sigma)) / self.score
 
 
 @dataclass(frozen=True)
@@ -205,7 +210,7 @@ def _pair_points(views: list[LandmarkView]) -> np.ndarray:
     pairs = list(combinations(range(len(views)), 2))
     if len(pairs) > PAIR_LIMIT:
         # The surest views first: their pairs span the rig well enough.
-        order = np.argsort([np.median(view.sigma) / view.score for view in views])
+        order = np.argsort([view.doubt for view in views])
         rank = np.argsort(order)
         pairs = sorted(pairs, key=lambda pair: rank[pair[0]] + rank[pair[1]])[:PAIR_LIMIT]
     midpoints = np.empty((len(pairs), 68, 3))
@@ -225,5 +230,4 @@ def _rays(view: LandmarkView, pixels: np.ndarray) -> np.ndarray:
     """Return unit world directions (N, 3) of pixels (N, 2) of a pinhole view."""
     K, pose = view.camera.K, view.camera.cam_from_world
     x = (pixels - K[:2, 2]) / K[[0, 1], [0, 1]]
-    directions = np.concatenate([x, np.ones((len(x), 1))], axis=1) @ pose[:3, :3]
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    return unit(np.concatenate([x, np.ones((len(x), 1))], axis=1) @ pose[:3, :3])

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from express50.geometry.cameras import Camera, project_pinhole, project_with_slope
 from express50.geometry.conventions import corner_to_cell
 from express50.geometry.raycast import join_rays, mesh_scene
+from express50.geometry.transforms import unit
 from express50.head.model import HeadModel
 from pipelines.regions.colour import like_skin
 from pipelines.track.basis import in_regions
@@ -215,8 +216,7 @@ def _shapes(
     """
     # The tangents must not depend on the camera.
     axis = np.where(np.abs(normals[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
-    across = np.cross(axis, normals)
-    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+    across = unit(np.cross(axis, normals))
     along = np.cross(normals, across)
     grid = spacing * (np.arange(PATCH) - PATCH // 2)
     v, u = np.meshgrid(grid, grid, indexing="ij")

@@ -98,8 +98,7 @@ def observe_peaks(
             dropped.append(Note(expression, str(error)))
             continue
         if max_cameras and len(cameras) > max_cameras and len(views) >= max_cameras:
-            views = sorted(views, key=lambda view: float(np.median(view.sigma)) / view.score)
-            views = views[:max_cameras]
+            views = sorted(views, key=lambda view: view.doubt)[:max_cameras]
             cameras = {name: cameras[name] for name in sorted(view.camera_id for view in views)}
         if not views:
             dropped.append(Note(expression, "no camera sees a face"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import cv2
@@ -213,8 +213,8 @@ def _width(text: str) -> int:
     return cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.4, 1)[0][0]
 
 
-def _rms(values: object) -> float:
-    return float(np.sqrt(np.mean(np.square(np.fromiter(values, float)))))  # type: ignore[call-overload]
+def _rms(values: Iterable[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(list(values)))))
 
 
 def track_metrics(model: HeadModel, targets: list[Target], vertices: np.ndarray) -> dict:

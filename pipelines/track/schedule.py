@@ -6,7 +6,7 @@ the mesh. The schedule is a table, made once from the settings and written to me
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from pipelines.track.photo_consistency import (
 from pipelines.track.skin_flow import FINE, flow_term, skin_map
 from pipelines.track.state import State, Target, all_vertices, rotations
 from pipelines.track.surface import FrameSetCrops, mask_things, near_things
-from pipelines.track.terms import NormalTerm, SlideTerm, landmark_anchors
+from pipelines.track.terms import NormalTerm, SlideTerm, Term, landmark_anchors
 
 LANDMARK_STEPS = 14  # of the first fit, to landmarks alone; 6 measure the same on the twin
 ROUND_STEPS = 4  # of the fit in each round
@@ -122,6 +122,11 @@ class SubjectEvidence:
     eyes: EyeOffsets | None
     bald: bool
 
+    @property
+    def outlines(self) -> int:
+        """Return the number of mattes that have an outline."""
+        return sum(len(pictures.distances) for pictures in self.pictures)
+
 
 def gather(
     model: HeadModel,
@@ -132,69 +137,124 @@ def gather(
     schedule: Schedule,
 ) -> SubjectEvidence:
     """Prepare what the rounds share; `meshes` (E, V, 3) are of the fit to landmarks."""
-    shown = next((k for k, one in enumerate(pictures) if one.crops), None)
     bald = False
-    if shown is not None:
-        images = pictures[shown].images()
+    first = next((k for k, one in enumerate(pictures) if one.crops), None)
+    if first is not None:
+        images = pictures[first].images()
         # A single picture cannot distinguish fair hair from skin.
-        bald = len(images) > 1 and bare_share(model, images, meshes[shown]) > BALD_SHARE
+        bald = len(images) > 1 and bare_share(model, images, meshes[first]) > BALD_SHARE
     uv_map = reading_map(model) if any(one.read_uv for one in schedule) else None
     fine_map = make_uv_map(model, FINE) if any(one.follow_skin for one in schedule) else None
     skin = skin_samples(model, samples)
     return SubjectEvidence(pictures, skin, uv_map, fine_map, eyes, bald)
 
 
+@dataclass(frozen=True)
+class FoundInRounds:
+    """What the rounds keep of one expression.
+
+    Attributes:
+        things: places (n, 3) on things in front of the face, mostly hands.
+        glasses: places (n, 3) on glasses, which are found once; None before.
+        slide: the last reading of the face UV map.
+    """
+
+    things: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    glasses: np.ndarray | None = None
+    slide: SlideTerm | None = None
+
+    @property
+    def hiding(self) -> np.ndarray:
+        """Return the places (n, 3) on everything that hides the face."""
+        return self.things if self.glasses is None else np.concatenate([self.things, self.glasses])
+
+
 def refine(
     basis: Basis, targets: list[Target], state: State, evidence: SubjectEvidence, schedule: Schedule
 ) -> tuple[State, list[Target], list[np.ndarray]]:
     """Run the rounds; also return the targets with their last terms, and places on glasses."""
-    model, found = basis.model, targets
-    slides: list[SlideTerm | None] = [None] * len(targets)
-    things = [np.zeros((0, 3)) for _ in targets]
-    hiding = list(things)  # the things and glasses, by expression
-    glasses: dict[int, np.ndarray] = {}  # by expression, found once
-    outlines = sum(len(pictures.distances) for pictures in evidence.pictures)
+    model, fitted = basis.model, targets
+    found = [FoundInRounds() for _ in targets]
     for number, current in enumerate(schedule):
-        meshes, turns, found = all_vertices(model, state), rotations(state), []
-        clear = [mask_things(*pair) for pair in zip(evidence.pictures, hiding, strict=True)]
-        flows = skin_flows(model, targets, evidence, clear, meshes) if current.follow_skin else {}
-        for index, (target, pictures) in enumerate(zip(targets, evidence.pictures, strict=True)):
-            mesh, terms = meshes[index], [*target.terms]
-            hidden = under_hair(model, evidence.skin, pictures, mesh)
-            if current.patch_reach_m and number in THING_ROUNDS:
-                things[index] = find_things(model, pictures, mesh, turns[index])
-                if index not in glasses:
-                    glasses[index] = find_worn_glasses(model, pictures, mesh, turns[index])
-                hiding[index] = np.concatenate([things[index], glasses[index]])
-            pictures = mask_things(pictures, hiding[index])
-            if current.outlines:
-                terms += outline_terms(
-                    model, pictures.distances, mesh, outlines, evidence.bald, hidden, hiding[index]
-                )
-            if current.patch_reach_m:
-                reach, weight = current.patch_reach_m, current.patch_weight
-                terms += patch_terms(model, evidence.skin, pictures, mesh, reach, weight, hidden)
+        meshes, turns = all_vertices(model, state), rotations(state)
+        flows = skin_flows(model, targets, evidence, found, meshes) if current.follow_skin else {}
+        if current.patch_reach_m and number in THING_ROUNDS:
+            rows = zip(found, evidence.pictures, meshes, turns, strict=True)
+            found = [with_things(model, *row) for row in rows]
+        fitted = []
+        for index, (target, mesh) in enumerate(zip(targets, meshes, strict=True)):
+            hidden = under_hair(model, evidence.skin, evidence.pictures[index], mesh)
+            pictures = mask_things(evidence.pictures[index], found[index].hiding)
             if current.read_uv and evidence.uv_map is not None:
-                slides[index] = slide_term(model, evidence.uv_map, pictures, mesh, hidden)
-            terms += flows.get(index, [])
-            sigma = widened_sigma(model, target, hidden, things[index])
-            target = replace(target, terms=tuple(terms), sigma=sigma)
+                slide = slide_term(model, evidence.uv_map, pictures, mesh, hidden)
+                found[index] = replace(found[index], slide=slide)
+            own = found[index]
+            terms = round_terms(model, current, evidence, pictures, mesh, hidden, own.hiding)
+            sigma = widened_sigma(model, target, hidden, own.things)
+            terms = (*target.terms, *terms, *flows.get(index, ()))
+            target = replace(target, terms=terms, sigma=sigma)
             target = with_irises_and_jaw(model, target, mesh, turns[index], evidence.eyes)
-            found.append(with_slide(target, slides[index]))
+            fitted.append(with_slide(target, own.slide))
         if current.follow_skin:
             person = freeze_shape(basis, state.shape, state.bias)
-            moved, _ = fit(person, found, State(np.zeros(0), state.poses), ROUND_STEPS)
+            moved, _ = fit(person, fitted, State(np.zeros(0), state.poses), ROUND_STEPS)
             state = replace(state, poses=moved.poses)
         else:
-            state, _ = fit(basis, found, state, ROUND_STEPS, free_modes(found))
+            state, _ = fit(basis, fitted, state, ROUND_STEPS, free_modes(fitted))
+    return state, fitted, final_glasses(model, found, evidence.pictures, state)
+
+
+def round_terms(
+    model: HeadModel,
+    current: Round,
+    evidence: SubjectEvidence,
+    pictures: FrameSetCrops,
+    mesh: np.ndarray,
+    hidden: np.ndarray,
+    hiding: np.ndarray,
+) -> tuple[Term, ...]:
+    """Make a round's terms of outlines and patches on the current mesh (V, 3).
+
+    `hidden` (V,) are vertices in hair, `hiding` are places (n, 3) on what hides the face, which
+    the mattes of the pictures leave out.
+    """
+    terms: list[Term] = []
+    if current.outlines:
+        count, bald = evidence.outlines, evidence.bald
+        terms += outline_terms(model, pictures.distances, mesh, count, bald, hidden, hiding)
+    if current.patch_reach_m:
+        reach, weight = current.patch_reach_m, current.patch_weight
+        terms += patch_terms(model, evidence.skin, pictures, mesh, reach, weight, hidden)
+    return tuple(terms)
+
+
+def with_things(
+    model: HeadModel,
+    found: FoundInRounds,
+    pictures: FrameSetCrops,
+    mesh: np.ndarray,
+    rotation: np.ndarray,
+) -> FoundInRounds:
+    """Look for things in front of a mesh (V, 3) again, and for glasses if that was not done yet."""
+    things, glasses = find_things(model, pictures, mesh, rotation), found.glasses
+    if glasses is None:
+        glasses = find_worn_glasses(model, pictures, mesh, rotation)
+    return replace(found, things=things, glasses=glasses)
+
+
+def final_glasses(
+    model: HeadModel, found: list[FoundInRounds], pictures: list[FrameSetCrops], state: State
+) -> list[np.ndarray]:
+    """Find the glasses (n, 3) of the expressions that have some again, on the final meshes.
+
+    The list is empty if no round looked for glasses.
+    """
+    worn = [one.glasses for one in found if one.glasses is not None]  # of all expressions, or none
     meshes, turns = all_vertices(model, state), rotations(state)
-    worn = [glasses[index] for index in sorted(glasses)]  # of all expressions, or never looked for
     for index, places in enumerate(worn):
         if len(places):
-            worn[index] = find_worn_glasses(
-                model, evidence.pictures[index], meshes[index], turns[index]
-            )
-    return state, found, worn
+            worn[index] = find_worn_glasses(model, pictures[index], meshes[index], turns[index])
+    return worn
 
 
 def find_worn_glasses(
@@ -259,19 +319,21 @@ def skin_flows(
     model: HeadModel,
     targets: list[Target],
     evidence: SubjectEvidence,
-    pictures: list[FrameSetCrops],
+    found: list[FoundInRounds],
     meshes: np.ndarray,
-) -> dict[int, list[SlideTerm]]:
+) -> dict[int, tuple[SlideTerm, ...]]:
     """Follow the skin from the resting face to the other expressions, by their index."""
     rest = next((k for k, target in enumerate(targets) if target.neutral), None)
     uv_map = evidence.fine_map
     if rest is None or uv_map is None:
         return {}
-    still = skin_map(model, uv_map, pictures[rest], meshes[rest])
-    found = {}
-    for index, (own, mesh) in enumerate(zip(pictures, meshes, strict=True)):
-        if index != rest:
-            moved = skin_map(model, uv_map, own, mesh)
-            term = flow_term(uv_map, still, moved, mesh)
-            found[index] = [] if term is None else [term]
-    return found
+    rows = zip(evidence.pictures, found, meshes, strict=True)
+    maps = [
+        skin_map(model, uv_map, mask_things(pictures, own.hiding), mesh)
+        for pictures, own, mesh in rows
+    ]
+    flows = {}
+    for index, (moved, mesh) in enumerate(zip(maps, meshes, strict=True)):
+        term = None if index == rest else flow_term(uv_map, maps[rest], moved, mesh)
+        flows[index] = () if term is None else (term,)
+    return flows

@@ -16,14 +16,14 @@ import torch
 from express50.capture.frames import read_cameras_of
 from express50.capture.index import read_index
 from express50.contract.layout import Dataset
-from express50.contract.stage import Note, Result
+from express50.contract.stage import ExpectedError, Note, Result
 from express50.dataset.tracks import LARGEST_SPREAD, shape_spread
 from express50.error_model import Bounds, error_bounds, error_models, expect, single_camera_sigma
 from express50.errors import StageError
 from express50.files.digests import path_digest, value_digest
 from express50.geometry.cameras import Camera
 from express50.head.load import load_head
-from express50.head.model import landmarks
+from express50.head.model import HeadModel, landmarks
 from pipelines.track.appearance import write_texture
 from pipelines.track.basis import Basis, freeze_shape, make_basis, split_shape, with_modes
 from pipelines.track.config import TrackConfig
@@ -40,6 +40,8 @@ from pipelines.track.read_inputs import (
 from pipelines.track.report import draw_overlays, error_figures, track_metrics, write_sheet
 from pipelines.track.schedule import (
     LANDMARK_STEPS,
+    Schedule,
+    SubjectEvidence,
     free_modes,
     gather,
     make_schedule,
@@ -80,7 +82,7 @@ def run(
     # Only the UV map shows how the skin slides along itself.
     along = round(ALONG_SHARE * config.offset_modes) if config.uv_rounds else 0
     basis = _basis(config.head, config.offset_modes, along)
-    source = open_landmarks(dataset, item, config.landmarks, config.search)
+    model, cameras = basis.model, read_cameras_of(dataset, item)
     peaks, dropped = observe_peaks(
         dataset, item, config.landmarks, config.search, config.neutral, config.cameras
     )
@@ -89,50 +91,74 @@ def run(
     if not targets:
         reasons = "; ".join(map(str, dropped[:3]))
         raise StageError(f"{item}: no expression could be tracked ({reasons})")
-    meshes = all_vertices(basis.model, state)
-    eyes = measure_eyes(basis.model, targets, meshes, rotations(state))
-    pictures = [
-        peak_pictures(dataset, item, config.photo_side, target.observation.expression, mesh)
-        for target, mesh in zip(targets, meshes, strict=True)
-    ]
-    evidence = gather(basis.model, pictures, meshes, eyes, config.samples, schedule)
+    evidence = read_evidence(dataset, item, config, model, targets, state, schedule)
     state, targets, glasses = refine(basis, targets, state, evidence, schedule)
     state = rounded(state, DECIMALS)
-    meshes, turns = all_vertices(basis.model, state), rotations(state)
-    metrics = track_metrics(basis.model, targets, meshes)
+    meshes = all_vertices(model, state)
+    metrics = track_metrics(model, targets, meshes)
     sigma = vertex_sigma(basis, targets, state, free_modes(targets))
-    bounds = stated_bounds(dataset, item, sigma, meshes, metrics)
+    bounds = stated_bounds(cameras, sigma, meshes, metrics)
     doubt = {"sigma": sigma, "bound": 1e-3 * np.stack([one.bound for one in bounds])}
     write_track(out / "track.npz", config.head, basis, targets, state, meshes, doubt, glasses)
     if config.texture_side:
         sides = (config.samples, config.texture_side)
-        write_texture(out, basis.model, targets, meshes, pictures, *sides)
-    tiles = draw_overlays(dataset, item, out / "qc", basis.model, targets, meshes, turns)
+        write_texture(out, model, targets, meshes, evidence.pictures, *sides)
+    tiles = draw_overlays(dataset, item, out / "qc", model, targets, meshes, rotations(state))
     write_sheet(out / "qc", tiles, metrics["landmark_rms_px"])
     metrics["schedule"] = schedule_table(schedule)
     if config.frames == "clips":
-        tracker = ClipTracker(
-            freeze_shape(basis, state.shape, state.bias), config.stride, eyes, evidence.skin,
-            evidence.uv_map, config.clip_rounds,
-        )  # fmt: skip
-        follow = open_follower(config.landmarks)
-        read = partial(read_clip, dataset, item, source, follow, peaks, config.photo_side)
-        shape = split_shape(basis.model, state.shape)[0]
-        index = read_index(dataset, item)
-        metrics["clips"], lost = write_clips(
-            out, tracker, config.head, shape, index.cues, index.fps, read,
-            dataset.windows_dir(item), clips_identity(inputs, config, shape, state, eyes),
-        )  # fmt: skip
+        metrics["clips"], lost = track_clips(
+            dataset, item, config, out, inputs, basis, state, evidence, peaks
+        )
         dropped += lost
-    shared = single_camera_sigma(
-        list(read_cameras_of(dataset, item).values()), meshes.reshape(-1, 3)
-    )
-    typical = np.concatenate([one.typical for one in bounds])
-    expected = expect(error_models()["track"], typical, shared)
-    strange = shape_warnings(split_shape(basis.model, state.shape)[0])
-    warnings = single_view_warnings(peaks, read_cameras_of(dataset, item)) + strange
+    strange = shape_warnings(split_shape(model, state.shape)[0])
     # The error model knows people only: it cannot judge such a head.
-    return Result(metrics, dropped, warnings, None if strange else expected)
+    expected = None if strange else expected_error(cameras, meshes, bounds)
+    return Result(metrics, dropped, single_view_warnings(peaks, cameras) + strange, expected)
+
+
+def read_evidence(
+    dataset: Dataset,
+    item: str,
+    config: TrackConfig,
+    model: HeadModel,
+    targets: list[Target],
+    state: State,
+    schedule: Schedule,
+) -> SubjectEvidence:
+    """Read the pictures about the meshes of the fit to landmarks, and what all rounds share."""
+    meshes = all_vertices(model, state)
+    eyes = measure_eyes(model, targets, meshes, rotations(state))
+    pictures = [
+        peak_pictures(dataset, item, config.photo_side, target.observation.expression, mesh)
+        for target, mesh in zip(targets, meshes, strict=True)
+    ]
+    return gather(model, pictures, meshes, eyes, config.samples, schedule)
+
+
+def track_clips(
+    dataset: Dataset,
+    item: str,
+    config: TrackConfig,
+    out: Path,
+    inputs: Mapping[str, Path | str],
+    basis: Basis,
+    state: State,
+    evidence: SubjectEvidence,
+    peaks: list[Observation],
+) -> tuple[dict, list[Note]]:
+    """Track the cue windows with the shape of the peaks' fit; return metrics and dropped frames."""
+    person = freeze_shape(basis, state.shape, state.bias)
+    eyes, skin, uv_map = evidence.eyes, evidence.skin, evidence.uv_map
+    tracker = ClipTracker(person, config.stride, eyes, skin, uv_map, config.clip_rounds)
+    source = open_landmarks(dataset, item, config.landmarks, config.search)
+    follow = open_follower(config.landmarks)
+    read = partial(read_clip, dataset, item, source, follow, peaks, config.photo_side)
+    shape, index = split_shape(basis.model, state.shape)[0], read_index(dataset, item)
+    return write_clips(
+        out, tracker, config.head, shape, index.cues, index.fps, read,
+        dataset.windows_dir(item), clips_identity(inputs, config, shape, state, eyes),
+    )  # fmt: skip
 
 
 def shape_warnings(shape: np.ndarray) -> list[Note]:
@@ -179,19 +205,26 @@ def clips_identity(
 
 
 def stated_bounds(
-    dataset: Dataset, subject: str, sigma: np.ndarray, meshes: np.ndarray, metrics: dict
+    cameras: Mapping[str, Camera], sigma: np.ndarray, meshes: np.ndarray, metrics: dict
 ) -> list[Bounds]:
     """Bound the vertices' errors of every expression, millimetres, from sigma (E, V), metres."""
-    cameras, outlines = read_cameras_of(dataset, subject), metrics["outline_views"]
     rows = zip(sigma, meshes, metrics["landmark_rms_px"].values(), strict=True)
     return [
         error_bounds(
             "track",
-            error_figures(own, mesh, cameras, marks, outlines),
+            error_figures(own, mesh, cameras, marks, metrics["outline_views"]),
             single_camera_sigma(list(cameras.values()), mesh),
         )
         for own, mesh, marks in rows
     ]
+
+
+def expected_error(
+    cameras: Mapping[str, Camera], meshes: np.ndarray, bounds: list[Bounds]
+) -> ExpectedError | None:
+    """State the error of a subject's vertices (E, V, 3) by their bounds."""
+    shared = single_camera_sigma(list(cameras.values()), meshes.reshape(-1, 3))
+    return expect(error_models()["track"], np.concatenate([one.typical for one in bounds]), shared)
 
 
 def fit_landmarks(

@@ -186,7 +186,7 @@ def initial_pose(observation: Observation, template: np.ndarray) -> tuple[np.nda
 
 def _from_one_view(observation: Observation, template: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find the pose by the view with the smallest expected error."""
-    view = min(observation.views, key=lambda view: float(np.median(view.sigma)) / view.score)
+    view = min(observation.views, key=lambda view: view.doubt)
     best = np.argsort(view.sigma[INNER])[:36]
     best = best[np.isfinite(view.sigma[INNER[best]])]
     if len(best) < MIN_TRIANGULATED:
