@@ -332,7 +332,7 @@ def skin_flows(
         skin_map(model, uv_map, mask_things(pictures, own.hiding), mesh)
         for pictures, own, mesh in rows
     ]
-    flows = {}
+    flows: dict[int, tuple[SlideTerm, ...]] = {}
     for index, (moved, mesh) in enumerate(zip(maps, meshes, strict=True)):
         term = None if index == rest else flow_term(uv_map, maps[rest], moved, mesh)
         flows[index] = () if term is None else (term,)
