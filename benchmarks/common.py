@@ -97,12 +97,6 @@ def in_own_process(function: Callable[..., T], *arguments: object) -> T:
         return pool.submit(function, *arguments).result()
 
 
-def evenly(rows: Sequence[T], count: int) -> list[T]:
-    """Return an even choice of at most ``count`` rows, the first and the last among them."""
-    places = np.linspace(0, len(rows) - 1, min(count, len(rows))).round().astype(int)
-    return [rows[k] for k in np.unique(places)]
-
-
 def true_pictures(
     dataset: Dataset, truth: Truth, subject: str, camera: Camera, frame: int
 ) -> dict[str, np.ndarray]:

@@ -33,7 +33,7 @@ from benchmarks.common import (
     make_parser,
     run_or_stop,
 )
-from benchmarks.depth_fusion import fuse
+from benchmarks.depth_fusion import sweep_and_fuse
 from benchmarks.depth_score import Mesh, score, summary
 from benchmarks.depth_sweep import sweep
 from benchmarks.track import prepare, twin_config
@@ -175,7 +175,7 @@ def baseline(
 ) -> Mesh | None:
     """Make a baseline's surface."""
     if name == "tsdf_fusion":
-        return fuse(views, BASELINE_VOXEL_M)
+        return sweep_and_fuse(views, BASELINE_VOXEL_M)
     if name == "visual_hull":
         box = head_box(views)
         grid = build(*box, BASELINE_VOXEL_M, lambda points: hull_distance(views, points))

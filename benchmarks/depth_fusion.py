@@ -6,38 +6,24 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-import open3d as o3d
 
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_to_opencv
 from pipelines.depth.views import INSIDE, DepthView, head_box
+from pipelines.imports.pictures import fuse
 
 NEIGHBOURS, PLANES, WINDOW = 4, 128, 9
-AGREE, TRUNCATION_VOXELS = 0.5, 4.0
+AGREE = 0.5
 
 
-def fuse(views: Sequence[DepthView], voxel: float) -> tuple[np.ndarray, np.ndarray]:
-    """Fuse the views' sweeps: vertices (V, 3) and faces (F, 3); voxels in metres.
-
-    Source: Curless and Levoy 1996, through Open3D.
-    """
-    volume = o3d.t.geometry.VoxelBlockGrid(
-        ("tsdf", "weight"), (o3d.core.float32, o3d.core.float32), ((1,), (1,)),
-        voxel_size=voxel, block_resolution=16, block_count=20_000,
-    )  # fmt: skip
+def sweep_and_fuse(views: Sequence[DepthView], voxel: float) -> tuple[np.ndarray, np.ndarray]:
+    """Fuse the views' sweeps: vertices (V, 3) and faces (F, 3); voxels in metres."""
     low, high = head_box(views)
-    for view in views:
-        swept = sweep(view, _nearest(view, views), low, high)
-        depth = o3d.t.geometry.Image(o3d.core.Tensor(swept[..., None]))
-        # Open3D's pixel centres lie on whole numbers.
-        pose = (
-            o3d.core.Tensor(K_to_opencv(view.camera.K)),
-            o3d.core.Tensor(view.camera.cam_from_world),
-        )
-        blocks = volume.compute_unique_block_coordinates(depth, *pose, 1.0, 1e3, TRUNCATION_VOXELS)
-        volume.integrate(blocks, depth, *pose, 1.0, 1e3, TRUNCATION_VOXELS)
-    mesh = volume.extract_triangle_mesh(weight_threshold=2.0)
-    return mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy()
+    maps = ((view.camera, sweep(view, _nearest(view, views), low, high)) for view in views)
+    centre = (low + high) / 2
+    mesh = fuse(maps, centre, voxel, least_views=2.0)
+    vertices = mesh.vertex.positions.numpy().astype(np.float64) + centre
+    return vertices, mesh.triangle.indices.numpy()
 
 
 def sweep(

@@ -30,10 +30,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from benchmarks.common import evenly, make_parser, means, recorded, rounded, true_pictures
+from benchmarks.common import make_parser, means, recorded, rounded, true_pictures
 from benchmarks.matte_scenes import Scene, make_scenes
 from express50.contract.layout import Dataset
 from express50.files.images import srgb_to_linear
+from express50.geometry.sampling import evenly
 from express50.twin.config import TwinConfig
 from express50.twin.truth import Truth
 from pipelines.matte.config import MatteConfig

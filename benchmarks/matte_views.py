@@ -43,7 +43,6 @@ import numpy as np
 from benchmarks.common import (
     add_twin_options,
     check_twin_options,
-    evenly,
     make_parser,
     means,
     recorded,
@@ -57,6 +56,7 @@ from express50.contract.layout import Dataset
 from express50.errors import NoFaceError
 from express50.files.images import contact_sheet, write_image
 from express50.geometry.cameras import pinhole
+from express50.geometry.sampling import evenly
 from express50.twin.config import TwinConfig
 from express50.twin.truth import Truth
 from pipelines.matte import STAGE

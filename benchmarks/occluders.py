@@ -56,7 +56,7 @@ OFF: dict[str, object] = {
     "pipelines.track.schedule.find_worn_glasses": lambda *_: np.zeros((0, 3)),
     "pipelines.depth.stage.face_views": lambda *_: [],
     "pipelines.regions.stage.find_hands": lambda _, labels, __: np.zeros(labels.shape, bool),
-    "pipelines.regions.colour.usual": lambda _, skin: skin,
+    "pipelines.regions.colour.bare_skin": lambda _, skin: skin,
 }
 Row = dict[str, float]
 

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.accuracy import true_world_cameras
-from benchmarks.common import evenly, make_parser
+from benchmarks.common import make_parser
 from benchmarks.regions_truth import iou_figures, true_head_alpha, true_labels, view_row
 from express50.capture.frames import read_cameras_of
 from express50.capture.index import read_peaks
@@ -31,6 +31,7 @@ from express50.contract.segmentation_labels import TORSO
 from express50.dataset.tracks import read_track
 from express50.files.images import read_image
 from express50.geometry.cameras import Camera, project
+from express50.geometry.sampling import evenly
 from express50.head.load import load_head
 from express50.head.model import landmarks
 from express50.twin.truth import Truth

@@ -1,14 +1,18 @@
-"""Undistort and sample images, measure their blur; a smooth step and spherical harmonics."""
+"""Undistort and sample images, measure their blur; an even choice, a smooth step, harmonics."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import TypeVar
 
 import cv2
 import numpy as np
 
 from express50.geometry.cameras import Camera, in_field
 from express50.geometry.conventions import K_to_opencv, cell_centres, corner_to_cell
+
+T = TypeVar("T")
 
 # cv2.remap takes at most 32767 rows and columns; this many points per call fit in the cache.
 _COLUMNS, _ROWS = 4096, 2048
@@ -134,6 +138,12 @@ def edge_width(image: np.ndarray) -> float | None:
     widths = height[edges] / (slope[edges] * math.sqrt(2 * math.pi))
     width = float(np.percentile(widths, SHARPEST))
     return math.sqrt(max(width**2 - SMOOTH**2, 0.0))
+
+
+def evenly(rows: Sequence[T], count: int) -> list[T]:
+    """Return an even choice of at most ``count`` rows, the first and the last among them."""
+    places = np.linspace(0, len(rows) - 1, min(count, len(rows))).round().astype(int)
+    return [rows[k] for k in np.unique(places)]
 
 
 def smoothstep(x: np.ndarray, low: float, high: float) -> np.ndarray:

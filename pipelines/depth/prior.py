@@ -44,8 +44,8 @@ class TrackedSolid:
     """A tracked mesh whose holes have caps; `border` are those over large holes (the neck).
 
     `body` continues below large holes, because silhouettes of a torso are not those of a head.
-    `glasses` are places (n, 3) all over frames and lenses, `shown` are views of a face with things
-    in front of it.
+    `glasses` are places (n, 3) all over frames and lenses, `face_views` are those of a face with
+    things in front of it.
     """
 
     scene: o3d.t.geometry.RaycastingScene
@@ -54,16 +54,16 @@ class TrackedSolid:
     low: np.ndarray
     high: np.ndarray
     glasses: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    shown: tuple[FaceView, ...] = ()
+    face_views: tuple[FaceView, ...] = ()
 
     @cached_property
     def bare_px(self) -> list[np.ndarray]:
         """Return the signed distances (H, W), pixels, to the edge of what shows the face."""
-        return [silhouette_distance(view.bare.astype(np.float32)) for view in self.shown]
+        return [silhouette_distance(view.bare.astype(np.float32)) for view in self.face_views]
 
     def carved(self, points: np.ndarray, hull: np.ndarray) -> np.ndarray:
         """Return the hull's distances (N,) less the space before the face that views see empty."""
-        for view, bare in zip(self.shown, self.bare_px, strict=True):
+        for view, bare in zip(self.face_views, self.bare_px, strict=True):
             pixels, depth = project_fast(view.camera, points)
             inside = in_picture(view.camera, pixels, depth)
             before = bilinear(view.depth, pixels[inside]) - NEAR_M - depth[inside]
@@ -84,9 +84,9 @@ class TrackedSolid:
         points, own = points[within], hull[within]
         distance = self.distance(points)
         # The hull's height over the mesh is the same along a normal, so that no shell is left.
-        belief = self.belief(points, distance - own)
+        trust = self.trust(points, distance - own)
         merged = hull.copy()
-        merged[within] += belief * (np.maximum(distance, own) - own)
+        merged[within] += trust * (np.maximum(distance, own) - own)
         apart, beside = signed_distance(self.body, points), hull_distance(outlines, points)
         known = 1 - np.clip((apart - beside) / REACH - 1, 0, 1)
         limit = apart - np.maximum(beside, 0) - known * REACH
@@ -125,7 +125,7 @@ class TrackedSolid:
         """Measure signed distances (N,) float32, metres, negative inside the closed mesh."""
         return signed_distance(self.scene, points)
 
-    def belief(self, points: np.ndarray, height: np.ndarray) -> np.ndarray:
+    def trust(self, points: np.ndarray, height: np.ndarray) -> np.ndarray:
         """Weigh the mesh, (N,) in [0, 1], at points (N, 3); the hull is ``height`` (N,) above."""
         near = np.clip(2.0 - height / REACH, 0, 1)
         if len(self.glasses):

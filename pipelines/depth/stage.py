@@ -19,6 +19,7 @@ from express50.error_model import error_models, expect, single_camera_sigma
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.images import contact_sheet, shrink, srgb_to_linear, write_image
 from express50.geometry.meshes import write_glb, write_surface
+from express50.geometry.sampling import evenly
 from express50.head.load import load_topology
 from pipelines.depth.maps import (
     DepthMaps,
@@ -81,7 +82,7 @@ def write_views(
 
     Returns each camera's figures, its photometric errors, and the typical errors of all pixels.
     """
-    chosen = np.unique(np.linspace(0, len(pictures) - 1, SHOWN).round().astype(int))
+    chosen = evenly(range(len(pictures)), SHOWN)
     rows, photo, typical, columns = {}, [], [], []
     views = surface_maps(surface, pictures, solid)
     for number, (camera_id, seen, errors) in enumerate(views):
@@ -145,16 +146,16 @@ def read_tracked(
         why = f"only {agreement:.0%} of it lies in the mattes, under {AGREEMENT:.0%}"
         return None, {"used": False, "why": why, "agreement": agreement}
     head = make_head(vertices, track.R[track.row(expression)], head_labels(model))
-    shown = face_views(head, [(view.camera, view.rgb, view.alpha) for view in views])
+    found = face_views(head, [(view.camera, view.rgb, view.alpha) for view in views])
     solid, glasses = close_mesh(vertices, faces), track.glasses_in(expression)
-    solid = replace(solid, shown=tuple(shown))
+    solid = replace(solid, face_views=tuple(found))
     if glasses is not None:
         solid = replace(solid, glasses=glasses)
     return solid, {
         "used": True,
         "agreement": agreement,
         "glasses": len(solid.glasses) > 0,
-        "things": len(shown) > 0,
+        "things": len(found) > 0,
     }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import cv2
@@ -254,8 +254,6 @@ def write_fused(
 ) -> int:
     """Write the fused surface of depths (H, W), metres, with colours; returns its vertices.
 
-    Source: Curless and Levoy 1996, through Open3D.
-
     Raises:
         StageError: the maps hold no surface.
     """
@@ -268,18 +266,7 @@ def write_fused(
         raise StageError(f"{path.name}: no depth map has a known pixel")
     voxel = max(LEAST_VOXEL_M, VOXEL_PX * float(np.median(steps)))
     centre = np.mean([camera.center for camera in cameras.values()], axis=0)
-    volume = o3d.t.geometry.VoxelBlockGrid(
-        ("tsdf", "weight"), (o3d.core.float32, o3d.core.float32), ((1,), (1,)),
-        voxel_size=voxel, block_resolution=16, block_count=20_000,
-    )  # fmt: skip
-    for name, depth in depths.items():
-        image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth[..., None])))
-        near = cameras[name].cam_from_world.copy()
-        near[:3, 3] += near[:3, :3] @ centre  # Open3D's world is in single precision
-        pose = o3d.core.Tensor(K_to_opencv(cameras[name].K)), o3d.core.Tensor(near)
-        blocks = volume.compute_unique_block_coordinates(image, *pose, 1.0, FARTHEST_M, TRUNCATION)
-        volume.integrate(blocks, image, *pose, 1.0, FARTHEST_M, TRUNCATION)
-    mesh = volume.extract_triangle_mesh(weight_threshold=1.0)
+    mesh = fuse(((cameras[name], depth) for name, depth in depths.items()), centre, voxel)
     if not len(mesh.vertex.positions):
         raise StageError(f"{path.name}: the depth maps hold no surface")
     mesh.compute_vertex_normals()
@@ -289,6 +276,30 @@ def write_fused(
     confidence = np.minimum(seen / SURE, 1.0).astype(np.float32)
     write_surface(path, vertices, faces, normals, colours, confidence)
     return len(vertices)
+
+
+def fuse(
+    maps: Iterable[tuple[Camera, np.ndarray]],
+    centre: np.ndarray,
+    voxel: float,
+    least_views: float = 1.0,
+) -> o3d.t.geometry.TriangleMesh:
+    """Fuse depth maps (H, W), metres, of pinhole cameras: a mesh about `centre` (3,).
+
+    Source: Curless and Levoy 1996, through Open3D.
+    """
+    volume = o3d.t.geometry.VoxelBlockGrid(
+        ("tsdf", "weight"), (o3d.core.float32, o3d.core.float32), ((1,), (1,)),
+        voxel_size=voxel, block_resolution=16, block_count=20_000,
+    )  # fmt: skip
+    for camera, depth in maps:
+        image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth[..., None])))
+        near = camera.cam_from_world.copy()
+        near[:3, 3] += near[:3, :3] @ centre  # Open3D's world is in single precision
+        pose = o3d.core.Tensor(K_to_opencv(camera.K)), o3d.core.Tensor(near)
+        blocks = volume.compute_unique_block_coordinates(image, *pose, 1.0, FARTHEST_M, TRUNCATION)
+        volume.integrate(blocks, image, *pose, 1.0, FARTHEST_M, TRUNCATION)
+    return volume.extract_triangle_mesh(weight_threshold=least_views)
 
 
 def _seen(

@@ -32,6 +32,7 @@ from express50.files.images import ORIENTATION, encode_png, read_exif, upright, 
 from express50.files.video import VideoFootage, iterate_video, video_fps, video_turn
 from express50.geometry.cameras import Camera, pinhole_camera
 from express50.geometry.conventions import FLIP_YZ
+from express50.geometry.sampling import evenly
 from express50.head.load import load_head
 from express50.head.model import landmarks
 from express50.head.preview import render_preview
@@ -167,7 +168,7 @@ def make_photo_capture(
     _check_folder(folder, picture.path, digest)
     # A video is decoded twice, so that not all of its frames are held.
     frames = sum(1 for _ in upright_frames(picture)) if picture.video else 1
-    probes = set(np.linspace(0, frames - 1, PROBES).round().astype(int).tolist())
+    probes = evenly(range(frames), PROBES)
     images = [image for n, image in enumerate(upright_frames(picture)) if n in probes]
     height, width = images[0].shape[:2]
     low, high = (max(width, height) * limit for limit in FOCAL_LIMITS)

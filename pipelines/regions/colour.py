@@ -65,7 +65,7 @@ def face_colours(rgb: np.ndarray, alpha: np.ndarray, mesh: np.ndarray) -> np.nda
         alpha: (H, W) in [0, 1].
         mesh: (H, W) labels of the mesh alone.
     """
-    skin = usual(rgb, (mesh == SKIN) & (alpha > SOLID))
+    skin = bare_skin(rgb, (mesh == SKIN) & (alpha > SOLID))
     return _counts(_cells(rgb), skin) if _sees_face(mesh) and skin.sum() >= LEAST else None
 
 
@@ -87,7 +87,7 @@ def like_skin(values: np.ndarray, face: np.ndarray) -> np.ndarray:
     return (np.abs(ratios(values) - usual) < WITHIN * np.maximum(spread, LEAST_SPREAD)).all(1)
 
 
-def usual(rgb: np.ndarray, skin: np.ndarray) -> np.ndarray:
+def bare_skin(rgb: np.ndarray, skin: np.ndarray) -> np.ndarray:
     """Leave a beard or a fringe, whose colours are unlike most of it, out of the skin (H, W).
 
     Brows, nostrils and shadows stay: they are a smaller share than COVERED.
@@ -108,7 +108,7 @@ def _sees_face(mesh: np.ndarray) -> bool:
     return bool(features > FEATURES * np.count_nonzero(mesh))
 
 
-def by_colour(
+def label_by_colour(
     rgb: np.ndarray,
     alpha: np.ndarray,
     geometry: HeadGeometry,
@@ -131,7 +131,7 @@ def by_colour(
     if skin.sum() < LEAST:  # the neck, which hair may cover, teaches only where no face does
         skin = skin | (solid & (labels == NECK) & (geometry.height > SURE_ABOVE))
     if _sees_face(geometry.mesh):  # from behind, most of it may be hair
-        skin = usual(rgb, skin)
+        skin = bare_skin(rgb, skin)
     torso = solid & (labels == TORSO) & (geometry.height < SURE_BELOW)
     beyond = IMPOSSIBLE
     if bare:
@@ -233,7 +233,7 @@ def scalp_votes(rgb: np.ndarray, labels: np.ndarray, alpha: np.ndarray) -> tuple
     return len(scalp), int((away < ALIKE).sum())
 
 
-def decide(votes: Sequence[tuple[int, int]]) -> Scalp:
+def judge_scalp(votes: Sequence[tuple[int, int]]) -> Scalp:
     """Call the scalp bare where most of the compared pixels have the face's colours."""
     compared = sum(count for count, _ in votes)
     if not compared:

@@ -140,7 +140,7 @@ def make_head(vertices: np.ndarray, R: np.ndarray, labels: HeadLabels) -> Tracke
     return TrackedHead(vertices, R, labels, NeckEnd(middle, R, heights), center, scene)
 
 
-def see(head: TrackedHead, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def render_head(head: TrackedHead, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Cast a pinhole camera's rays at a head alone.
 
     Returns:
@@ -204,7 +204,7 @@ class HeadGeometry:
         return np.where(self.mesh > 0, self.mesh, np.where(self.height < 0, TORSO, around))
 
 
-def place(
+def head_geometry(
     head: TrackedHead,
     camera: Camera,
     alpha: np.ndarray,
@@ -223,7 +223,7 @@ def place(
         depth: (H, W) camera z, metres, 0 where unknown; or None.
         rim_m: width of the rim, metres.
     """
-    mesh, mesh_depth = see(head, camera)
+    mesh, mesh_depth = render_head(head, camera)
     hit = mesh > 0
     if not hit.any():
         height = np.full(mesh.shape, np.inf if head.end is None else -np.inf, np.float32)

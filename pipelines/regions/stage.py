@@ -18,18 +18,27 @@ from express50.dataset.tracks import existing_track, read_track
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.images import box_about, contact_sheet, fit_into, shrink, write_image
 from express50.geometry.cameras import Camera, crop_camera, project, resized
+from express50.geometry.sampling import evenly
 from express50.head.load import load_topology
-from pipelines.regions.colour import EARS, SKIN, Scalp, by_colour, decide, face_colours, scalp_votes
+from pipelines.regions.colour import (
+    EARS,
+    SKIN,
+    Scalp,
+    face_colours,
+    judge_scalp,
+    label_by_colour,
+    scalp_votes,
+)
 from pipelines.regions.geometry import (
     HAIR,
     SCALP,
     TrackedHead,
     find_hands,
     head_alpha,
+    head_geometry,
     head_labels,
     make_head,
-    place,
-    see,
+    render_head,
 )
 from pipelines.regions.things import Picture, find_glasses, shown_before
 
@@ -164,14 +173,14 @@ def judge_scalp_and_skin(
     """Judge the scalp and count the skin's colours in a few cameras; return their frames too."""
     cameras = list(read_cameras_of(dataset, item.split("/")[0]).values())
     votes, colours, frames = [], [], Frames()
-    for k in np.unique(np.linspace(0, len(cameras) - 1, STUDIED_CAMERAS).round().astype(int)):
+    for camera in evenly(cameras, STUDIED_CAMERAS):
         with contextlib.suppress(*UNREADABLE):  # the stage names them
-            rgb, alpha = frames[cameras[k].id] = read_frame_and_matte(dataset, item, cameras[k])
-            camera, rgb, alpha, _ = _shrunk(cameras[k], rgb, alpha, None, STUDIED_SIDE)
-            mesh, _ = see(head, camera)
+            rgb, alpha = frames[camera.id] = read_frame_and_matte(dataset, item, camera)
+            camera, rgb, alpha, _ = _shrunk(camera, rgb, alpha, None, STUDIED_SIDE)
+            mesh, _ = render_head(head, camera)
             votes.append(scalp_votes(rgb, mesh, alpha))
             colours += [c for c in (face_colours(rgb, alpha, mesh),) if c is not None]
-    return decide(votes), sum(colours[1:], colours[0]) if colours else None, frames
+    return judge_scalp(votes), sum(colours[1:], colours[0]) if colours else None, frames
 
 
 def face_pictures(dataset: Dataset, item: str, head: TrackedHead) -> list[Picture]:
@@ -179,11 +188,10 @@ def face_pictures(dataset: Dataset, item: str, head: TrackedHead) -> list[Pictur
     ahead, cameras = head.R[:, 2], read_cameras_of(dataset, item.split("/")[0]).values()
     seeing = [c for c in cameras if (c.center - head.center) @ ahead > 0]
     found = []
-    count = min(GLASSES_CAMERAS, len(seeing))  # 0 where all cameras stand behind the head
-    for k in np.linspace(0, len(seeing) - 1, count).round().astype(int):
+    for camera in evenly(seeing, GLASSES_CAMERAS):
         with contextlib.suppress(*UNREADABLE):  # the stage names them
-            pair = read_frame_and_matte(dataset, item, seeing[k])
-            found.append(_shrunk(seeing[k], *pair, None, STUDIED_SIDE)[:3])
+            pair = read_frame_and_matte(dataset, item, camera)
+            found.append(_shrunk(camera, *pair, None, STUDIED_SIDE)[:3])
     return found
 
 
@@ -219,8 +227,8 @@ def label_view(
     )
     rgb, alpha = rgb[window], alpha[window]
     depth = None if depth is None else depth[window]
-    geometry = place(head, camera, alpha, depth)
-    labels = by_colour(rgb, alpha, geometry, bare, skin_colours)
+    geometry = head_geometry(head, camera, alpha, depth)
+    labels = label_by_colour(rgb, alpha, geometry, bare, skin_colours)
     labels = np.where(labels == SCALP, SKIN if bare else HAIR, labels)
     if glasses is not None and len(glasses):
         # Hair covers the temples of glasses, so nothing on scalp and ears is labelled.
@@ -332,13 +340,9 @@ def picture_row(image: np.ndarray, labels: np.ndarray, alpha: np.ndarray) -> lis
 
     They show the window of the subject only.
     """
-    rows, columns = subject_box(labels)
-    size = [
-        len(range(*part.indices(n))) for part, n in zip((rows, columns), labels.shape, strict=False)
-    ]
-    step = max(1, min(size) // max(TILE))  # of pixels: tiles show no more
-    box = slice(rows.start, rows.stop, step), slice(columns.start, columns.stop, step)
-    image, labels, alpha = image[box], labels[box], alpha[box]
+    box = subject_box(labels)
+    step = max(1, min(labels[box].shape) // max(TILE))  # of pixels: tiles show no more
+    image, labels, alpha = (whole[box][::step, ::step] for whole in (image, labels, alpha))
     painted = 0.35 * image + 0.65 * COLOURS[labels]
     painted = np.where((labels > 0)[..., None], painted, 0.4 * image).astype(np.uint8)
     # A colour that neither skin nor hair has, so that leftovers of plate and torso show.
@@ -365,9 +369,8 @@ def write_picture(out: Path, rows: dict[str, list[np.ndarray]], figures: dict[st
     def face(name: str) -> float:
         return sum(figures[name]["labels"][part] for part in ("skin", "lips", "eyes"))
 
-    names = sorted(rows, key=lambda name: -face(name))
-    chosen = np.unique(np.linspace(0, len(names) - 1, SHOWN).round().astype(int))
-    pairs = [[names[k] for k in chosen[start : start + 2]] for start in range(0, len(chosen), 2)]
+    names = evenly(sorted(rows, key=lambda name: -face(name)), SHOWN)
+    pairs = [names[start : start + 2] for start in range(0, len(names), 2)]
     sheet = contact_sheet(
         [[picture for name in pair for picture in rows[name]] for pair in pairs],
         [[text for name in pair for text in (name, "", "")] for pair in pairs],

@@ -35,7 +35,7 @@ from express50.geometry.conventions import cell_to_corner, corner_to_cell
 from express50.geometry.raycast import join_rays
 from express50.geometry.transforms import unit
 from pipelines.regions.colour import colour_logs, like_skin
-from pipelines.regions.geometry import WIDTH_M, TrackedHead, nearest, see
+from pipelines.regions.geometry import WIDTH_M, TrackedHead, nearest, render_head
 
 EYES, SKIN = LABELS.index("eyes"), LABELS.index("skin")
 CELL_M = 0.002
@@ -80,7 +80,7 @@ def find_glasses(head: TrackedHead, pictures: Sequence[Picture]) -> np.ndarray:
     eyes = np.array([np.r_[eye.mean(0)[:2], eye[:, 2].max()] for eye in sides])
     axes = [np.arange(low, high, CELL_M) for low, high in BOX_M]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) + eyes.mean(0)
-    odd = _odd(head, pictures, grid.reshape(-1, 3)).reshape(grid.shape[:3])
+    odd = _unlike_skin(head, pictures, grid.reshape(-1, 3)).reshape(grid.shape[:3])
     parts, _ = ndimage.label(odd, np.ones((3, 3, 3)))
     odd &= (np.bincount(parts.ravel()) >= LEAST_CELLS)[parts]
     frame = grid[odd]
@@ -94,7 +94,7 @@ def find_glasses(head: TrackedHead, pictures: Sequence[Picture]) -> np.ndarray:
     return np.concatenate([frame, *lenses]) @ head.R.T + head.center if lenses else nothing
 
 
-def _odd(head: TrackedHead, pictures: Sequence[Picture], grid: np.ndarray) -> np.ndarray:
+def _unlike_skin(head: TrackedHead, pictures: Sequence[Picture], grid: np.ndarray) -> np.ndarray:
     """Mark the places (N,) of a grid (N, 3), about the head's centre, that no view sees as skin."""
     local = (grid @ head.R.T).astype(np.float32)
     apart = head.scene.compute_distance(o3d.core.Tensor(local), nthreads=1).numpy()
@@ -104,7 +104,7 @@ def _odd(head: TrackedHead, pictures: Sequence[Picture], grid: np.ndarray) -> np
         open_still = seen - odd <= len(pictures) // ERRING  # the others are skin, or beside it
         ids, odd, seen = ids[open_still], odd[open_still], seen[open_still]
         places = local[ids]
-        mesh, _ = see(head, camera)
+        mesh, _ = render_head(head, camera)
         skin = (mesh == SKIN) & (alpha > 0.99)
         if skin.sum() < LEAST_SKIN:
             continue
@@ -182,7 +182,7 @@ class FaceView:
 class _Shot:
     """A crop about the head: picture (H, W, 3), matte (H, W), grey root of light (H, W).
 
-    `mesh` and `depth` (H, W) are what `see` says of the head.
+    `mesh` and `depth` (H, W) are what `render_head` says of the head.
     """
 
     camera: Camera
@@ -215,7 +215,7 @@ class _Sweep:
     before: np.ndarray
     free: np.ndarray
 
-    def decide(self, center: np.ndarray) -> FaceView:
+    def face_view(self, center: np.ndarray) -> FaceView:
         """Tell the face from things; the head's `center` (3,) is in the world."""
         asked = self.face & self.free.any(0)
         score = np.where(self.free, self.before, np.float32(-2))
@@ -246,10 +246,10 @@ def face_views(head: TrackedHead, pictures: Sequence[Picture]) -> list[FaceView]
             sweeps.append(_sweep(head, shots, own, face))
     if len(sweeps) < LEAST_VIEWS:
         return []
-    views = [sweep.decide(head.center) for sweep in sweeps]
+    views = [sweep.face_view(head.center) for sweep in sweeps]
     for sweep in sweeps:
         _carve(head, sweep, [view for view in views if view.camera is not sweep.camera])
-    views = [sweep.decide(head.center) for sweep in sweeps]
+    views = [sweep.face_view(head.center) for sweep in sweeps]
     pictured = {shot.camera.id: shot for shot in shots}
     views = [_up_to_edges(view, pictured[view.camera.id]) for view in views]
     hidden = [
@@ -257,10 +257,10 @@ def face_views(head: TrackedHead, pictures: Sequence[Picture]) -> list[FaceView]
     ]
     if sum(hidden) < WITNESSES:
         return []
-    return [replace(view, things=_agreed(view.things, views)) for view in views]
+    return [replace(view, things=_not_before_bare_face(view.things, views)) for view in views]
 
 
-def _agreed(things: np.ndarray, views: Sequence[FaceView]) -> np.ndarray:
+def _not_before_bare_face(things: np.ndarray, views: Sequence[FaceView]) -> np.ndarray:
     """Keep the places (n, 3) before the face that no view sees the face through."""
     for view in views:
         pixels, inside = inside_frame(view.camera, things)
@@ -311,7 +311,7 @@ def _shot(head: TrackedHead, picture: Picture) -> _Shot | None:
     rgb, alpha = (shrink(np.ascontiguousarray(image[window]), SIDE) for image in (rgb, alpha))
     camera = resized(crop_camera(camera, x0, y0, width, height), rgb.shape[1], rgb.shape[0])
     grey = np.sqrt(cv2.GaussianBlur(LIGHT_OF_LEVEL[rgb], (0, 0), 0.7)).mean(2)
-    return _Shot(camera, rgb, alpha, grey, *see(head, camera))
+    return _Shot(camera, rgb, alpha, grey, *render_head(head, camera))
 
 
 def _sweep(head: TrackedHead, shots: Sequence[_Shot], own: int, face: np.ndarray) -> _Sweep:
@@ -329,7 +329,7 @@ def _sweep(head: TrackedHead, shots: Sequence[_Shot], own: int, face: np.ndarray
     free = np.ones((len(HEIGHTS_M), *shape), bool)
     for line, shot in zip(lines, shots, strict=True):
         for room, offset in zip(free, HEIGHTS_M, strict=True):
-            room &= _looked_up(shot.alpha, _at(line, offset), 1.0) > 0.5
+            room &= _sampled(shot.alpha, _pixels_at(line, offset), 1.0) > 0.5
     mine = _patches(shots[own].grey[window])
     near = [(shots[k], lines[k]) for k in _neighbours(head, shots, own)]
     step = STEPS_M[1] - STEPS_M[0]
@@ -360,11 +360,11 @@ def _agreement(
     """
     best, size = np.full(mine[0].shape, np.float32(-1)), (PATCH_PX, PATCH_PX)
     for shot, line in near:
-        point = _at(line, offset)
-        theirs = _patches(_looked_up(shot.grey, point, 0.0, cv2.INTER_LINEAR))
-        hidden = _looked_up(shot.depth, point, 0.0)
+        point = _pixels_at(line, offset)
+        theirs = _patches(_sampled(shot.grey, point, 0.0, cv2.INTER_LINEAR))
+        hidden = _sampled(shot.depth, point, 0.0)
         seen = (hidden == 0) | (point[2] < hidden + HEIGHTS_M[0])
-        seen &= _looked_up(shot.alpha, point, 0.0) > 0.5
+        seen &= _sampled(shot.alpha, point, 0.0) > 0.5
         product = cv2.blur(mine[0] * theirs[0], size) - mine[1] * theirs[1]
         best = np.maximum(best, np.where(seen, product / (mine[2] * theirs[2]), -1))
     return cv2.blur(best, size)
@@ -384,7 +384,7 @@ def _line(camera: Camera, center: np.ndarray, places: np.ndarray, ways: np.ndarr
     return np.ascontiguousarray(first, np.float32), np.ascontiguousarray(second, np.float32)
 
 
-def _at(line: _Line, offset: float) -> np.ndarray:
+def _pixels_at(line: _Line, offset: float) -> np.ndarray:
     """Return x, y and depth (3, h, w) `offset` before; the first pixel's middle is the origin."""
     point = line[0] - np.float32(offset) * line[1]
     point[:2] /= np.maximum(point[2], np.float32(1e-6))
@@ -392,10 +392,10 @@ def _at(line: _Line, offset: float) -> np.ndarray:
     return point
 
 
-def _looked_up(
+def _sampled(
     image: np.ndarray, point: np.ndarray, beyond: float, interpolation: int = cv2.INTER_NEAREST
 ) -> np.ndarray:
-    """Look points (3, h, w) of `_at` up in an image (H, W), which is `beyond` outside."""
+    """Look points (3, h, w) of `_pixels_at` up in an image (H, W), which is `beyond` outside."""
     return cv2.remap(
         image, point[0], point[1], interpolation,
         borderMode=cv2.BORDER_CONSTANT, borderValue=beyond,
@@ -408,5 +408,5 @@ def _carve(head: TrackedHead, sweep: _Sweep, views: Sequence[FaceView]) -> None:
         line = _line(view.camera, head.center, sweep.places, sweep.ways)
         ends = np.where(view.bare, view.depth - np.float32(NEAR_M), 0)
         for room, offset in zip(sweep.free, HEIGHTS_M, strict=True):
-            point = _at(line, offset)
-            room &= point[2] >= _looked_up(ends, point, 0.0)
+            point = _pixels_at(line, offset)
+            room &= point[2] >= _sampled(ends, point, 0.0)

@@ -213,12 +213,12 @@ def write_texture(
     pictures: list[FrameSetCrops],
     samples: int,
     side: int,
-) -> bool:
+) -> None:
     """Estimate light and gains, bake albedo.png and write it with appearance.npz into `out`.
 
-    Nothing is written if no picture shows any of the head; the result says whether one did. Meshes
-    (E, V, 3) are of the E targets; light and gains are estimated at so many `samples` of the skin;
-    the texture has `side` texels per side.
+    Nothing is written if no picture shows any of the head. Meshes (E, V, 3) are of the E targets;
+    light and gains are estimated at so many `samples` of the skin; the texture has `side` texels
+    per side.
     """
     skin = spread_samples(model, samples)
     some = range(0, len(pictures), -(-len(pictures) // LIGHT_FRAME_SETS))
@@ -239,7 +239,6 @@ def write_texture(
     if known.any():
         names = [targets[index].observation.expression for index in used]
         write_appearance(out, albedo, appearance, names)
-    return bool(known.any())
 
 
 def bake_albedo(

@@ -14,7 +14,7 @@ from express50.files.images import write_image
 from express50.geometry.cameras import pinhole_camera, resized, transform_camera
 from express50.geometry.transforms import look_at, make_transform
 from pipelines.regions import STAGE, RegionsConfig
-from pipelines.regions.geometry import SCALP, head_alpha, make_head, place, see
+from pipelines.regions.geometry import SCALP, head_alpha, head_geometry, make_head, render_head
 from pipelines.regions.stage import label_shares, label_view, mesh_fit, subject_box, view_warning
 from tests.pipelines.bump_dataset import make_dataset
 from tests.pipelines.region_scenes import camera_at, make_scene, tracked
@@ -41,17 +41,17 @@ def test_a_camera_that_does_not_see_the_head_has_no_head() -> None:
     aside = replace(SCENE.camera, params=(*SCENE.camera.params[:2], 9000.0, 80.0))
     for camera in (turned_away(), aside):
         full = np.ones((camera.height, camera.width))
-        assert not see(SCENE.head, camera)[0].any()
+        assert not render_head(SCENE.head, camera)[0].any()
         labels = labels_of(camera, full)
         assert label_mask(labels, "torso").all()
-        plain = place(SCENE.head, camera, np.float32(full), None).labels()
+        plain = head_geometry(SCENE.head, camera, np.float32(full), None).labels()
         assert label_mask(plain, "torso").all()
         assert head_alpha(np.float32(full), labels).max() == 0
 
 
 def test_a_camera_inside_the_head_gives_finite_labels() -> None:
     inside = replace(turned_away(), cam_from_world=np.eye(4))
-    labels, depth = see(SCENE.head, inside)
+    labels, depth = render_head(SCENE.head, inside)
     assert np.isfinite(depth).all() and (labels <= SCALP).all()
     assert (labels_of(inside, np.ones((64, 64))) < len(LABELS)).all()
 
@@ -98,7 +98,7 @@ def test_a_subject_a_kilometre_from_the_origin_has_the_same_labels() -> None:
 
 def test_a_camera_a_kilometre_away_sees_a_head_of_a_few_pixels() -> None:
     camera = camera_at(0, 8, distance=1000.0)
-    labels, depth = see(tracked(), camera)
+    labels, depth = render_head(tracked(), camera)
     assert 4 < (labels > 0).sum() < 40 and depth[labels > 0].min() > 999
     wide = replace(camera, params=(50.0, 50.0, 4.0, 4.0))  # the head is far under a pixel
     assert (labels_of(wide, np.ones((8, 8))) < len(LABELS)).all()

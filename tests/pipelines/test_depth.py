@@ -121,7 +121,7 @@ def test_prior_counts_inner_sheets_and_capped_holes_as_inside():
     points = np.array([[0, 0, 0.0], [0, 0.05, 0], [0, 0.2, 0], [0, -0.09, 0.0], [0.1, 0, 0]])
     assert (prior.distance(points) < 0).tolist() == [True, True, False, False, False]
     gap = np.zeros(2)
-    believed = prior.belief(np.array([[0, 0.1, 0.0], [0, -0.06, 0.0]]), gap)
+    believed = prior.trust(np.array([[0, 0.1, 0.0], [0, -0.06, 0.0]]), gap)
     assert believed.tolist() == [1.0, 0.0]
 
 
@@ -155,8 +155,8 @@ def test_what_glasses_hide_is_not_compared_and_the_head_is_believed_behind_them(
         assert 0.005 < hidden < 0.02 if facing else hidden < 0.001
         np.testing.assert_array_equal(clear.silhouette_px, view.silhouette_px)
     points, height = np.array([[0, 0, 0.12], [0, 0.12, 0]]), np.full(2, 0.05)
-    assert bare.belief(points, height).tolist() == [0, 0]
-    assert worn.belief(points, height).tolist() == [1, 0]
+    assert bare.trust(points, height).tolist() == [0, 0]
+    assert worn.trust(points, height).tolist() == [1, 0]
 
 
 def test_room_before_the_face_is_carved_where_a_view_shows_it_bare(shots):
@@ -169,7 +169,7 @@ def test_room_before_the_face_is_carved_where_a_view_shows_it_bare(shots):
     pixels = np.array([[middle + x + 0.5, middle + 0.5] for x in (-12, -12, 12)])
     depth = true[middle, pixels[:, 0].astype(int)] - [0.03, 0.004, 0.03]
     points, hull = unproject(camera, pixels, depth), np.full(3, -0.05, np.float32)
-    air, skin, thing = replace(solid, shown=(view,)).carved(points, hull.copy())
+    air, skin, thing = replace(solid, face_views=(view,)).carved(points, hull.copy())
     assert air > 0.01 and skin < 0 and thing < 0
     np.testing.assert_array_equal(solid.carved(points, hull.copy()), hull)
 

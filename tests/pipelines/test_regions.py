@@ -16,15 +16,15 @@ from express50.files.images import read_image, write_image
 from express50.head.load import load_head
 from express50.head.model import pose
 from pipelines.regions import STAGE, RegionsConfig
-from pipelines.regions.colour import decide, face_colours, scalp_votes, usual
+from pipelines.regions.colour import bare_skin, face_colours, judge_scalp, scalp_votes
 from pipelines.regions.geometry import (
     SCALP,
     find_hands,
     head_alpha,
+    head_geometry,
     head_labels,
     make_head,
-    place,
-    see,
+    render_head,
 )
 from pipelines.regions.stage import face_pictures, label_view, read_head
 from tests.pipelines.bump_dataset import make_dataset, published
@@ -42,7 +42,7 @@ def labels_of(scene: RegionScene, bare: bool = False) -> np.ndarray:
 
 def by_geometry(scene: RegionScene, depth: np.ndarray | None = None) -> np.ndarray:
     """Labels of a scene's one view without its colours."""
-    labels = place(scene.head, scene.camera, scene.alpha, depth).labels()
+    labels = head_geometry(scene.head, scene.camera, scene.alpha, depth).labels()
     labels[labels == SCALP] = LABELS.index("hair")
     return np.where(scene.alpha > 0, labels, 0)
 
@@ -55,22 +55,22 @@ def overlap(labels: np.ndarray, true: np.ndarray, name: str) -> float:
 
 def test_hidden_parts_are_not_seen() -> None:
     head = tracked()
-    front = np.unique(see(head, camera_at(0))[0])
+    front = np.unique(render_head(head, camera_at(0))[0])
     names = {LABELS[label] for label in front if label < SCALP}
     assert {"skin", "lips", "eyes", "ears", "neck"} <= names
     assert "tongue" not in names and "mouth" not in names  # the lips are closed before them
-    back = {LABELS[k] for k in np.unique(see(head, camera_at(180))[0]) if k < SCALP}
+    back = {LABELS[k] for k in np.unique(render_head(head, camera_at(180))[0]) if k < SCALP}
     assert not back & {"eyes", "lips", "teeth", "tongue"}
-    wide = see(tracked(0.35), camera_at(0))[0]
+    wide = render_head(tracked(0.35), camera_at(0))[0]
     assert all(label_mask(wide, name).sum() > 5 for name in ("teeth", "tongue", "mouth"))
 
 
 def test_the_nose_hides_the_cheek_and_lids_hide_the_eyes() -> None:
     model = load_head("procedural")
-    labels, depth = see(tracked(), camera_at(90))
+    labels, depth = render_head(tracked(), camera_at(90))
     assert (
         label_mask(labels, "eyes").sum()
-        < 0.5 * label_mask(see(tracked(), camera_at(0))[0], "eyes").sum()
+        < 0.5 * label_mask(render_head(tracked(), camera_at(0))[0], "eyes").sum()
     )
     assert (depth[labels > 0] > 0.7).all() and (depth[labels == 0] == 0).all()
     names = list(model.expression_names)
@@ -78,8 +78,8 @@ def test_the_nose_hides_the_cheek_and_lids_hide_the_eyes() -> None:
     for side in "LR":
         coefficients[0, names.index(f"eyeBlink_{side}")] = 1.0
     shut = pose(model, torch.zeros(1, 1), coefficients)[0].double().numpy()
-    closed = see(make_head(shut, np.eye(3), head_labels(model)), camera_at(0))[0]
-    opened = see(tracked(), camera_at(0))[0]
+    closed = render_head(make_head(shut, np.eye(3), head_labels(model)), camera_at(0))[0]
+    opened = render_head(tracked(), camera_at(0))[0]
     assert label_mask(closed, "eyes").sum() < 0.3 * label_mask(opened, "eyes").sum()
 
 
@@ -123,9 +123,9 @@ def test_a_rim_beyond_the_mesh_is_as_the_mesh_and_what_is_far_off_is_hair() -> N
     cheek = np.flatnonzero(scene.labels[92])[0]  # leftmost pixel of the head at the mouth's height
     wide = scene.alpha.copy()
     wide[20:60, 10:15] = 1  # something 10 cm beside the head
-    labels = place(small, scene.camera, wide, None, rim_m=0.008).labels()
+    labels = head_geometry(small, scene.camera, wide, None, rim_m=0.008).labels()
     assert LABELS[labels[92, cheek]] in ("skin", "neck") and LABELS[labels[40, 12]] == "hair"
-    none = place(small, scene.camera, wide, None, rim_m=0).labels()
+    none = head_geometry(small, scene.camera, wide, None, rim_m=0).labels()
     assert LABELS[none[92, cheek]] == "hair"
 
 
@@ -145,19 +145,19 @@ def test_the_cut_is_a_pixel_wide_and_keeps_strands() -> None:
 def test_a_bald_scalp_is_recognised_by_its_colours() -> None:
     for hair in (True, False):
         scene = make_scene(0, hair=hair)
-        votes = [scalp_votes(scene.rgb, see(scene.head, scene.camera)[0], scene.alpha)]
-        scalp = decide(votes)
+        votes = [scalp_votes(scene.rgb, render_head(scene.head, scene.camera)[0], scene.alpha)]
+        scalp = judge_scalp(votes)
         assert scalp.is_skin is not hair
         labels = labels_of(scene, bare=scalp.is_skin)
         assert bool(label_mask(labels[:40], "hair").sum() > 100) is hair
-    assert decide([]).skin_coloured is None and not decide([]).is_skin
+    assert judge_scalp([]).skin_coloured is None and not judge_scalp([]).is_skin
 
 
 def test_from_behind_the_skin_is_that_of_the_face() -> None:
     front, back = make_scene(0), make_scene(180)
-    colours = face_colours(front.rgb, front.alpha, see(front.head, front.camera)[0])
+    colours = face_colours(front.rgb, front.alpha, render_head(front.head, front.camera)[0])
     assert colours is not None and colours.sum() > 1000
-    assert face_colours(back.rgb, back.alpha, see(back.head, back.camera)[0]) is None
+    assert face_colours(back.rgb, back.alpha, render_head(back.head, back.camera)[0]) is None
     # Long hair from nape to collar: the view shows no skin at all.
     bare, neck = label_mask(back.labels, "neck", "skin", "ears"), label_mask(back.labels, "neck")
     noise = np.random.default_rng(1).normal(0, 4, back.rgb.shape)
@@ -304,13 +304,13 @@ def test_settings_out_of_range_are_refused() -> None:
 @pytest.mark.parametrize(("off", "is_hand"), [(0.03, True), (0.012, False)])
 def test_what_stands_off_the_face_is_a_hand(off: float, is_hand: bool) -> None:
     head, camera = tracked(), camera_at(0)
-    mesh, depth = see(head, camera)
+    mesh, depth = render_head(head, camera)
     y, x = np.nonzero(mesh == LABELS.index("eyes"))
     box = np.s_[y.min() - 3 : y.max() + 4, x.min() - 3 : x.max() + 4]
     thing = np.zeros(mesh.shape, bool)
     thing[box] = mesh[box] > 0
     nearer = np.where(thing, depth - off, depth)
-    geometry = place(head, camera, np.ones(mesh.shape, np.float32), nearer)
+    geometry = head_geometry(head, camera, np.ones(mesh.shape, np.float32), nearer)
     assert (geometry.off[~thing] < 1e-4).all()
     found = find_hands(geometry, geometry.labels(), camera.K[0, 0] / depth[depth > 0].mean())
     assert found.any() == is_hand
@@ -325,7 +325,7 @@ def test_a_fringe_is_left_out_of_skin_colours_and_brows_are_not(rows: int, left_
     rgb[:rows] = (60, 40, 30)
     skin = np.ones((40, 40), bool)
     skin[:, 0] = False
-    kept = usual(rgb, skin)
+    kept = bare_skin(rgb, skin)
     assert kept[rows:].sum() > 0.99 * skin[rows:].sum() and not kept[:, 0].any()
     assert kept[:rows].any() == (rows > 0 and not left_out)
-    assert not usual(rgb, ~np.ones_like(skin)).any()
+    assert not bare_skin(rgb, ~np.ones_like(skin)).any()

@@ -12,7 +12,7 @@ import pytest
 from express50.contract.segmentation_labels import LABELS, label_mask
 from express50.geometry.cameras import project
 from express50.geometry.conventions import corner_to_cell
-from pipelines.regions.geometry import see
+from pipelines.regions.geometry import render_head
 from pipelines.regions.stage import label_view
 from pipelines.regions.things import CELL_M, Picture, find_glasses, shown_before
 from tests.pipelines.region_scenes import RegionScene, make_scene
@@ -65,7 +65,7 @@ def test_glasses_are_found_with_their_lenses_and_labelled() -> None:
     found = find_glasses(scene.head, pictures(rims()))
     near = np.abs(found[:, None] - eyes() - [0, 0, LIFT_M]).max(-1).min(1)
     assert len(found) > 500 and near.max() < RADIUS + 2 * CELL_M
-    _, depth = see(scene.head, scene.camera)
+    _, depth = render_head(scene.head, scene.camera)
     middle = project(scene.camera, eyes() + [0, 0, LIFT_M])[0]
     true = np.zeros(depth.shape, np.uint8)
     for x, y in corner_to_cell(middle).round().astype(int):
