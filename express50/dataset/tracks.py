@@ -82,6 +82,21 @@ class Track(HeadPoses):
             raise StageError(f"{expression}: it is not tracked; see the track stage's metrics.json")
         return self.expressions.index(expression)
 
+    def mesh(self, expression: str, count: int, path: Path) -> np.ndarray:
+        """Return the vertices (V, 3), float64, of an expression; its head model has `count`.
+
+        Raises:
+            StageError: the expression is not tracked.
+            FormatError: the track, whose file is `path`, has another number of vertices.
+        """
+        vertices = self.vertices[self.row(expression)].astype(np.float64)
+        if len(vertices) != count:
+            raise FormatError(
+                f"{path}: {len(vertices)} vertices, its head model has {count};"
+                " run 'express50 track' again"
+            )
+        return vertices
+
     def glasses_in(self, expression: str) -> np.ndarray | None:
         """Return points (n, 3) on an expression's glasses; None if the file does not say."""
         if self.glasses is None:

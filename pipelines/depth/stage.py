@@ -133,14 +133,8 @@ def read_tracked(
     track = read_track(path)
     if expression not in track.expressions:
         return None, {"used": False, "why": f"{expression} is not tracked"}
-    vertices = track.vertices[track.row(expression)].astype(np.float64)
     model = load_topology(track.head)
-    faces = model.faces
-    if faces.max() >= len(vertices):
-        raise FormatError(
-            f"{path}: {len(vertices)} vertices do not fit the head's {faces.max() + 1};"
-            " run 'express50 track' again"
-        )
+    vertices, faces = track.mesh(expression, len(model.template), path), model.faces
     agreement = matte_agreement(views, vertices, faces)
     if agreement < AGREEMENT:
         why = f"only {agreement:.0%} of it lies in the mattes, under {AGREEMENT:.0%}"

@@ -129,12 +129,7 @@ def read_head(
     path = existing_track(dataset, subject)
     track = read_track(path)
     row, labels = track.row(expression), head_labels(load_topology(track.head))
-    vertices = track.vertices[row].astype(np.float64)
-    if vertices.shape != (len(labels.vertices), 3):
-        raise FormatError(
-            f"{path}: vertices {vertices.shape}, expected ({len(labels.vertices)}, 3) of its head"
-            " model; run 'express50 track' again"
-        )
+    vertices = track.mesh(expression, len(labels.vertices), path)
     return make_head(vertices, track.R[row], labels), track.glasses_in(expression)
 
 

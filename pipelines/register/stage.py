@@ -21,7 +21,7 @@ from express50.dataset.tracks import (
     shape_spread,
 )
 from express50.error_model import error_bounds, single_camera_sigma
-from express50.errors import FormatError, StageError
+from express50.errors import StageError
 from express50.files.digests import file_sha256
 from express50.files.images import contact_sheet, write_image
 from express50.geometry.cameras import Camera
@@ -63,12 +63,7 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
         raise StageError(f"{item}: it has no surface; run 'express50 depth'")
     track, surface = read_track(path), read_surface(file)
     row, model = track.row(expression), load_head(track.head)
-    start = track.vertices[row].astype(np.float64)
-    if len(start) != len(model.template):
-        raise FormatError(
-            f"{path}: {len(start)} vertices, its head model has {len(model.template)};"
-            " run 'express50 track' again"
-        )
+    start = track.mesh(expression, len(model.template), path)
     trust = skin_trust(model, start, surface.vertices, surface.colors, surface.confidence)
     trust[too_fine(model, start, surface.vertices)] = 0.0
     laid = lay(model, start, GivenSurface(surface.vertices, surface.faces, trust), DETAIL_M)
