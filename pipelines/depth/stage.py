@@ -50,23 +50,23 @@ def run(
     """Write every camera's maps, the coloured surface and a contact sheet."""
     cv2.setNumThreads(1)  # the runner counts one core per item
     views, pictures, dropped = read_views(dataset, item, side)
-    one_camera = len(views) == 1 and not dropped  # a photograph, or a video of one camera
-    if len(views) < 2 and not one_camera:
+    # One camera of which nothing was dropped is a photograph, or a video.
+    if not views or (len(views) == 1 and dropped):
         why = "; ".join(map(str, dropped))
         raise StageError(
             f"{item}: {len(views)} usable cameras, expected at least 2 with a"
             f" matte of the head ({why or 'no others are calibrated'}); run 'express50 matte'"
         )
     solid, track = read_tracked(dataset, item, views)
-    if one_camera and solid is None:
+    if len(views) > 1:
+        surface = reconstruct(views, solid, *fineness)
+    elif solid is not None:
+        surface = tracked_surface(views[0], solid, *fineness)
+    else:
         raise StageError(
             f"{item}: with one camera, depth is that of the tracked head, which was not used"
             f" ({track['why']}); run 'express50 track' and look at its overlays"
         )
-    if one_camera and solid is not None:
-        surface = tracked_surface(views[0], solid, *fineness)
-    else:
-        surface = reconstruct(views, solid, *fineness)
     write_meshes(out, surface)
     rows, photo, typical = write_views(out, surface, pictures, solid)
     shared = single_camera_sigma([picture.camera for picture in pictures], surface.vertices)

@@ -54,10 +54,10 @@ def aligning_transform(
     size = _size(our_poses)
     if turn.max() <= TURN_DEG and shift.max() <= SHARE * size:
         return np.eye(4) if np.abs(motion - np.eye(4)).max() < SAME else motion
-    for words, change in _MISREADINGS.items():
+    for advice, change in _MISREADINGS.items():
         _, turned, shifted = _fit([change(pose) for pose in their_poses], our_poses)
         if turned.max() <= TURN_DEG and shifted.max() <= SHARE * max(size, _size(our_poses)):
-            raise CalibrationError(f"{where}: {words}")
+            raise CalibrationError(f"{where}: {advice}")
     _check_unit(their_poses, our_poses, where)
     worst = int((turn / TURN_DEG + shift / (SHARE * max(size, 1e-9))).argmax())
     raise CalibrationError(

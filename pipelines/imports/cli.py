@@ -48,7 +48,7 @@ from pipelines.imports.tracks import TrackSource, read_foreign_track
 from pipelines.track.sequence import write_npz
 
 Write = Callable[[Path], Result]
-WORDS = {
+KINDS = {
     "track": "tracks of VHAP or GaussianAvatars",
     "matte": "masks or opacities",
     "depth": "depth maps: 16-bit PNG, EXR or .npy",
@@ -67,46 +67,50 @@ TRACKS = (
 
 def add_commands(subparsers: Any) -> None:
     """Add ``import track``, ``matte``, ``depth`` and ``remove``."""
-    words = "import tracks, mattes or depth that other tools made"
-    actions = subparsers.add_parser("import", help=words).add_subparsers(
-        dest="action", metavar="ACTION", required=True
-    )
-    for action, what in WORDS.items():
-        parser = add_command(actions, action, run_import, f"import {what}")
-        add = parser.add_argument
+    actions = subparsers.add_parser(
+        "import", help="import tracks, mattes or depth that other tools made"
+    ).add_subparsers(dest="action", metavar="ACTION", required=True)
+    for action, what in KINDS.items():
+        add = add_command(actions, action, run_import, f"import {what}").add_argument
         add("pattern", metavar="PATH", help=TRACKS if action == "track" else PATTERN)
         add(
-            "--subject",
-            action="append",
-            metavar="ID",
+            "--subject", action="append", metavar="ID",
             help="subject to import; may be repeated (default: all)",
-        )
-        words = "only warn if the import contradicts the footage"
-        add("--trust", action="store_true", help=words)
+        )  # fmt: skip
+        add("--trust", action="store_true", help="only warn if the import contradicts the footage")
         if action == "track":
             add(
-                "--head",
-                required=True,
-                metavar="MODEL",
+                "--head", required=True, metavar="MODEL",
                 help="the FLAME .pkl that the subject was tracked with",
-            )
-            words = "camera axes of the matrices in transforms.json (default: opengl)"
-            add("--axes", choices=("opengl", "opencv"), default="opengl", help=words)
-            words = "cameras that tracked_flame_params_N.npz was made with (default: the dataset's)"
-            add("--cameras", type=Path, metavar="FILE", help=words)
+            )  # fmt: skip
+            add(
+                "--axes", choices=("opengl", "opencv"), default="opengl",
+                help="camera axes of the matrices in transforms.json (default: opengl)",
+            )  # fmt: skip
+            add(
+                "--cameras", type=Path, metavar="FILE",
+                help="cameras that tracked_flame_params_N.npz was made with (default: the"
+                " dataset's)",
+            )  # fmt: skip
             continue
-        words = "undistort the pictures, because they were made from the footage as recorded"
-        add("--distorted", action="store_true", help=words)
+        add(
+            "--distorted", action="store_true",
+            help="undistort the pictures, because they were made from the footage as recorded",
+        )  # fmt: skip
         if action == "depth":
-            words = "unit of the values: m, cm, mm, or metres per step, such as 0.0001"
-            add("--unit", required=True, type=_metres, dest="metres", metavar="UNIT", help=words)
+            add(
+                "--unit", required=True, type=_metres, dest="metres", metavar="UNIT",
+                help="unit of the values: m, cm, mm, or metres per step, such as 0.0001",
+            )  # fmt: skip
             add("--ray", action="store_true", help="values are lengths of rays, not camera z")
-    words = "remove imported items, so that the stage makes them itself"
-    parser = add_command(actions, "remove", run_remove, words)
-    words = f"{', '.join(WORDS)}"
-    parser.add_argument("stage", choices=tuple(WORDS), metavar="STAGE", help=words)
-    words = "only items that match, such as 'S001*' (default: all)"
-    parser.add_argument("--items", default="*", metavar="GLOB", help=words)
+    add = add_command(
+        actions, "remove", run_remove, "remove imported items, so that the stage makes them itself"
+    ).add_argument
+    add("stage", choices=tuple(KINDS), metavar="STAGE", help=", ".join(KINDS))
+    add(
+        "--items", default="*", metavar="GLOB",
+        help="only items that match, such as 'S001*' (default: all)",
+    )  # fmt: skip
 
 
 def run_remove(args: argparse.Namespace) -> int:

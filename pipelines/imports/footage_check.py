@@ -105,11 +105,11 @@ def check_masks_show_face(
             covers.append((alpha > 127).mean())
     if not shares or (inside := float(np.median(shares))) >= INSIDE_SHARE:
         return
-    words = "they cut into the face"
+    why = "they cut into the face"
     if inside < 1 - INSIDE_SHARE:
         most = np.median(covers) > 0.5
-        words = "they are inverted" if most else "they are of another subject, frame or camera"
-    raise StageError(f"{where}: its masks hold {inside:.0%} of the face's landmarks: {words}")
+        why = "they are inverted" if most else "they are of another subject, frame or camera"
+    raise StageError(f"{where}: its masks hold {inside:.0%} of the face's landmarks: {why}")
 
 
 def edge_contrast(picture: np.ndarray, alpha: np.ndarray) -> float:

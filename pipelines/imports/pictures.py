@@ -135,12 +135,12 @@ def _camera_of_size(path: Path, image: np.ndarray, recorded: Camera, seen: Camer
         return recorded
     if size == (seen.width, seen.height):
         return resized(recorded, *size)
-    words = "export it at the footage's size"
+    fix = "export it at the footage's size"
     if size == (recorded.height, recorded.width):
-        words = "it is rotated by 90 degrees; rotate it back"
+        fix = "it is rotated by 90 degrees; rotate it back"
     raise FormatError(
         f"{path}: {size[0]}x{size[1]}, expected the {recorded.width}x{recorded.height} of camera"
-        f" {recorded.id}; {words}"
+        f" {recorded.id}; {fix}"
     )
 
 
@@ -188,22 +188,22 @@ def check_depths(
     share = agreement(cameras, depths)
     if share is None:
         return None
-    best, words = share, "its cameras, subject or frame differ"
+    best, why = share, "its cameras, subject or frame differ"
     if share < AGREE_SHARE:
         for factor in FACTORS:
             other = agreement(cameras, {n: factor * depth for n, depth in depths.items()}) or 0.0
             if other > max(best, AGREE_SHARE):
-                best, words = other, f"its unit is {factor:g} times as large as the one given"
+                best, why = other, f"its unit is {factor:g} times as large as the one given"
         raise StageError(
             f"{where}: views agree on {share:.0%} of what they share, expected {AGREE_SHARE:.0%}:"
-            f" {words}"
+            f" {why}"
         )
     closely = agreement(cameras, depths, FINE_M) or 0.0
-    for change, words in ((np.divide, "give --ray"), (np.multiply, "leave --ray out")):
+    for change, fix in ((np.divide, "give --ray"), (np.multiply, "leave --ray out")):
         changed = {n: change(depth, ray_lengths(cameras[n])) for n, depth in depths.items()}
         if (agreement(cameras, changed, FINE_M) or 0.0) > closely + FINER_SHARE:
             raise StageError(
-                f"{where}: views agree better with depth measured the other way; {words}"
+                f"{where}: views agree better with depth measured the other way; {fix}"
             )
     return round(share, 4)
 

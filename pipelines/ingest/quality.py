@@ -76,21 +76,21 @@ def check_quality(
     first: dict[str, str] = {}
     warnings = {}
     for name in sorted(measured):
-        words = []
+        faults = []
         if (twin := first.setdefault(digests[name], name)) != name:
-            words.append(f"has the same files as camera {twin}; remove the copy")
+            faults.append(f"has the same files as camera {twin}; remove the copy")
         if name in steps:
-            words.append(describe_steps(steps[name]))
+            faults.append(describe_steps(steps[name]))
         if frames := stuck.get(name):
             shown = ", ".join(map(str, frames[:6])) + (", ..." if len(frames) > 6 else "")
-            words.append(
+            faults.append(
                 f"repeats the frame before in {len(frames)} frames ({shown}) while others move"
             )
-        words += describe_dark(measured[name].cells)
-        words += describe_drift(drifts[name])
-        words += [blurred[name]] if name in blurred else []
-        if words:
-            warnings[f"camera {name}"] = "; ".join(words)
+        faults += describe_dark(measured[name].cells)
+        faults += describe_drift(drifts[name])
+        faults += [blurred[name]] if name in blurred else []
+        if faults:
+            warnings[f"camera {name}"] = "; ".join(faults)
     if len(unjudged) == len(measured) and all_move(moves, clips):
         warnings["sync"] = (
             "all cameras see movement, but no two the same: they are out of step by more than"
@@ -254,19 +254,19 @@ def _correlation(curve: np.ndarray, rest: np.ndarray, path: np.ndarray) -> float
 
 def describe_steps(steps: Sequence[Step]) -> str:
     """Describe the steps of a camera for people."""
-    words = []
+    parts = []
     before = 0
     for step in steps:
         change = step.lag - before
         frames = f"{abs(change)} frame{'s' if abs(change) > 1 else ''}"
         if step.frame == 0:
             side = "ahead of" if step.lag > 0 else "behind"
-            words.append(f"is {frames} {side} the others from its start")
+            parts.append(f"is {frames} {side} the others from its start")
         else:
             what = "loses" if change > 0 else "repeats or gains"
-            words.append(f"{what} {frames} at about frame {step.frame}")
+            parts.append(f"{what} {frames} at about frame {step.frame}")
         before = step.lag
-    return "; ".join(words) + "; cut its footage so that the cameras show the same moment"
+    return "; ".join(parts) + "; cut its footage so that the cameras show the same moment"
 
 
 def find_repeats(moves: Mapping[str, np.ndarray]) -> dict[str, list[int]]:
@@ -353,8 +353,8 @@ def describe_drift(drift: Drift | None) -> list[str]:
         )
     colours = [(n, v) for n, v in (("red", drift.red), ("blue", drift.blue)) if v > COLOUR_DRIFT]
     if colours:
-        words = " and ".join(f"{name} by {value:.2f} stops" for name, value in colours)
-        wrong.append(f"white balance changes, {words} against green")
+        changes = " and ".join(f"{name} by {value:.2f} stops" for name, value in colours)
+        wrong.append(f"white balance changes, {changes} against green")
     return wrong
 
 

@@ -159,26 +159,26 @@ def odd_footage(raw: RawCapture, cameras: Mapping[str, CameraSource]) -> dict[st
     """Return warnings about rate, time stamps, channels and orientation, by camera."""
     found = {}
     for name, source in cameras.items():
-        words, camera, orientation = [], raw.cameras[name], 1
+        oddities, camera, orientation = [], raw.cameras[name], 1
         if source.kind == "frames":
             path = camera.path / camera.names[0]
             if path.is_file():  # no file: a member of a container
                 orientation, _ = read_exif(path)
                 if has_alpha(path):
                     why = "has an alpha channel, which is left out: a later stage makes mattes"
-                    words.append(why)
+                    oddities.append(why)
         else:
             path = inside(camera.path, camera.names[0]) if camera.names else camera.path
             tags = video_tags(path)
             orientation = ORIENTATION[tags.turn]
-            words += [w for w in (_rate(raw, path), _uneven(source)) if w] + _odd_pictures(tags)
+            oddities += [w for w in (_rate(raw, path), _uneven(source)) if w] + _odd_pictures(tags)
         if orientation != 1 and camera.orientation == 1:
-            words.append(
+            oddities.append(
                 "asks players to turn or mirror it, but is used as stored; calibration, board and"
                 " plates must be as stored too"
             )
-        if words:
-            found[f"camera {name}"] = "; ".join(words)
+        if oddities:
+            found[f"camera {name}"] = "; ".join(oddities)
     return found
 
 

@@ -154,7 +154,7 @@ def run(
     write_json(out / "checks.json", figures)
     lost = {f"camera {k}": why for k, why in sorted(dropped.items())}
     lost |= {f"expression {k}": why for k, why in sorted(beyond.items())} | outside | raw.skipped
-    return metrics(raw, index, usual, lost, raw.warnings | odd_cues(cues) | warnings)
+    return make_result(raw, index, usual, lost, raw.warnings | odd_cues(cues) | warnings)
 
 
 def _scan(
@@ -305,7 +305,7 @@ def make_index(raw: RawCapture, cameras: dict[str, CameraSource], cues: tuple[Cu
     )
 
 
-def metrics(
+def make_result(
     raw: RawCapture, index: Index, usual: int, lost: dict[str, str], warnings: dict[str, str]
 ) -> Result:
     """Return the counts, the cameras with an unusual one, and everything that was left out."""

@@ -47,7 +47,7 @@ class Misfit:
         return max(elsewhere, self.lacking / MOST_LACKING)
 
     @property
-    def words(self) -> str:
+    def reason(self) -> str:
         """Describe the misfit for people."""
         return (
             f"its matte misses {self.lacking:.0%} of the subject that the other cameras see, and"
@@ -86,7 +86,7 @@ def agree(views: Sequence[MatteView], cells: int) -> Agreement:
         worst = max(misfits, key=lambda name: misfits[name].size)
         if misfits[worst].size <= 1 or len(doubted) >= most:
             return Agreement(removed, filled, _named(doubted))
-        doubted[worst] = misfits[worst].words
+        doubted[worst] = misfits[worst].reason
 
 
 def _named(doubted: dict[str, str]) -> list[Note]:

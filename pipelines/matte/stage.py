@@ -62,7 +62,6 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
     cv2.setNumThreads(1)  # the runner counts one core per item
     cameras = read_cameras_of(dataset, item.split("/")[0], undistorted=False)
     ball = ball_of(cameras)
-    compares = config.agree and ball is not None
     mattes, dropped, odd_plates = camera_mattes(dataset, item, config, cameras, ball)
     if not mattes:
         raise StageError(f"{item}: {dropped[0].why if dropped else 'no camera is calibrated'}")
@@ -73,12 +72,12 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
         make_view(cameras[name], place, matte.rgb, matte.alpha, config.side)
         for name, matte in mattes.items()
     ]
+    compares = config.agree and ball is not None
     if compares:
         found = agree(views, config.cells)
-    elif config.agree:
-        found = Agreement(unchanged="the cameras do not look at one place")
     else:
-        found = Agreement(unchanged="matte.agree is off")
+        off = "the cameras do not look at one place" if config.agree else "matte.agree is off"
+        found = Agreement(unchanged=off)
     final = {
         name: corrected(alpha, found.removed.get(name), found.filled.get(name))
         for name, alpha in alphas.items()
@@ -98,11 +97,10 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
     }
     named = {note.what for note in found.warnings}
     odd = [note for note in matte_warnings(final) if note.what not in named]
-    doubt = {}
-    for name, alpha in final.items():
-        own = mattes[name]
-        rim = rim_figures(alpha, own.rgb, own.noise, own.plated, len(mattes))
-        doubt[name] = error_bounds("matte", rim)
+    doubt = {
+        name: error_bounds("matte", rim_figures(alpha, own.rgb, own.noise, own.plated, len(mattes)))
+        for (name, alpha), own in zip(final.items(), mattes.values(), strict=True)
+    }
     figures["expected"] = {name: asdict(e) for name, d in doubt.items() if (e := d.expected)}
     expected = expect(error_models()["matte"], np.concatenate([d.typical for d in doubt.values()]))
     return Result(figures, dropped, [*odd_plates, *found.warnings, *odd], expected)

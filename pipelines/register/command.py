@@ -11,11 +11,15 @@ from express50.errors import ConfigError
 
 def add_options(parser: Any) -> None:
     """Add the options to the parser of the stage's command."""
-    words = "register this scan (.obj, .ply, .glb, .stl), or all scans of this folder, with the"
-    words += " landmark files beside them; DATASET is then the folder to write to; may be repeated"
-    parser.add_argument("--scan", type=Path, action="append", metavar="FILE", help=words)
-    words = "with --scan: head model to fit, as in track.head (default: procedural)"
-    parser.add_argument("--head", default="procedural", metavar="MODEL", help=words)
+    parser.add_argument(
+        "--scan", type=Path, action="append", metavar="FILE",
+        help="register this scan (.obj, .ply, .glb, .stl), or all scans of this folder, with the"
+        " landmark files beside them; DATASET is then the folder to write to; may be repeated",
+    )  # fmt: skip
+    parser.add_argument(
+        "--head", default="procedural", metavar="MODEL",
+        help="with --scan: head model to fit, as in track.head (default: procedural)",
+    )  # fmt: skip
     parser.set_defaults(handler=run)
 
 

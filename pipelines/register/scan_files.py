@@ -63,12 +63,12 @@ def run_scans(args: argparse.Namespace) -> int:
             account: dict = {"name": name, "scan": str(path), "folder": str(out / name)}
             try:
                 account |= register_scan(path, args.head, out / name)
-                words = "current" if account["skipped"] else summary_line(account)
+                line = "current" if account["skipped"] else summary_line(account)
             except Express50Error as error:
-                account["error"] = words = str(error)
+                account["error"] = line = str(error)
             accounts.append(account)
             if not args.json:
-                say(f"{name}: {words}")
+                say(f"{name}: {line}")
     finally:  # an interrupted run lists what it has made
         write_index(out / INDEX, former, accounts)
     failed = sum("error" in account for account in accounts)
@@ -201,7 +201,7 @@ def warnings_of(metrics: dict) -> list[str]:
         f"only {views} of {PICTURES} pictures of the scan show a face": views < PICTURES / 2,
         f"a given landmark is {away} mm from the fitted one": away is not None and away > FAR_MM,
     }
-    return [words for words, holds in found.items() if holds]
+    return [warning for warning, holds in found.items() if holds]
 
 
 def distances(scan: Scan, fitted: FittedScan) -> dict[str, float | None]:
@@ -226,5 +226,5 @@ def summary_line(account: dict) -> str:
         f" {account['landmarks']} landmarks given;"
         f" {account['seen_share']:.0%} of the face found, parameters"
         f" {account['parameters_mm_median']} mm and mesh {account['registered_mm_median']} mm from"
-        f" the scan (medians){''.join('; warning: ' + words for words in account['warnings'])}"
+        f" the scan (medians){''.join('; warning: ' + warning for warning in account['warnings'])}"
     )

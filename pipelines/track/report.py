@@ -24,7 +24,7 @@ from pipelines.track.terms import PixelTerm
 
 TILE = 384
 SHEET_TILE, COLUMNS = 192, 8
-BAND, BAR = 20, 18  # heights of a tile's words and of a camera's row, pixels
+BAND, BAR = 20, 18  # heights of a tile's label and of a camera's row, pixels
 ODD = 1.5  # times the median: such residuals are drawn in ALARM
 PLAIN, ALARM, GROUND, DIM = (225, 225, 225), (255, 120, 90), 24, (110, 160, 210)
 ResidualTable = Mapping[str, Mapping[str, float]]
@@ -178,8 +178,8 @@ def contact_sheet(
         room = SHEET_TILE - 10 - _width(value)
         while len(name) > 1 and _width(name) > room:
             name = name[:-1]
-        _words(cell, value, SHEET_TILE - 4 - _width(value), SHEET_TILE + 14, colour)
-        _words(cell, name, 4, SHEET_TILE + 14, colour)
+        _write(cell, value, SHEET_TILE - 4 - _width(value), SHEET_TILE + 14, colour)
+        _write(cell, name, 4, SHEET_TILE + 14, colour)
     return sheet
 
 
@@ -191,21 +191,21 @@ def camera_bars(table: ResidualTable) -> np.ndarray:
     left, length = 16 + max(map(_width, rows), default=0), 2 * SHEET_TILE
     chart = np.full((BAR * (len(rows) + 1) + 8, left + length + 190, 3), GROUND, np.uint8)
     title = "landmark residual by camera, RMS px" if rows else "no camera has landmarks"
-    _words(chart, title, 6, 14, PLAIN)
+    _write(chart, title, 6, 14, PLAIN)
     scale = length / max([*values, 1e-9])
     for k, (camera, (value, count)) in enumerate(rows.items(), 1):
         y = BAR * k
         odd = value > limit
-        _words(chart, camera, 6, y + 14, ALARM if odd else PLAIN)
+        _write(chart, camera, 6, y + 14, ALARM if odd else PLAIN)
         end = left + max(1, round(value * scale))
         cv2.rectangle(chart, (left, y + 4), (end, y + 14), ALARM if odd else DIM, -1)
-        words = f"{value:.2f}  ({count} expression{'s' if count > 1 else ''})"
-        _words(chart, words, end + 6, y + 14, PLAIN)
+        label = f"{value:.2f}  ({count} expression{'s' if count > 1 else ''})"
+        _write(chart, label, end + 6, y + 14, PLAIN)
     return chart
 
 
-def _words(image: np.ndarray, text: str, x: int, y: int, colour: tuple[int, int, int]) -> None:
-    """Write words with their baseline at (x, y)."""
+def _write(image: np.ndarray, text: str, x: int, y: int, colour: tuple[int, int, int]) -> None:
+    """Write a text with its baseline at (x, y)."""
     cv2.putText(image, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
 
 
