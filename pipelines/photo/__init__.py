@@ -52,6 +52,17 @@ def add_commands(subparsers: Any) -> None:
     add_config_options(parser)
 
 
+def check_options(args: argparse.Namespace) -> None:
+    """Refuse options that no capture can have."""
+    if args.subject is not None and not ID.fullmatch(args.subject):
+        raise ConfigError(f"--subject {args.subject!r}: expected letters, digits, '_' and '-'")
+    for name, value in (("--focal-px", args.focal_px), ("--film-mm", args.film_mm)):
+        if value is not None and not 0 < value < float("inf"):
+            raise ConfigError(f"{name} {value}: expected a number above 0")
+    if args.windows < 1:
+        raise ConfigError(f"--windows {args.windows}: expected at least 1")
+
+
 def run_photo(args: argparse.Namespace) -> int:
     """Make the capture and run the stages on it."""
     # Imported here: the list of commands must not wait for torch.
@@ -62,13 +73,7 @@ def run_photo(args: argparse.Namespace) -> int:
     from pipelines import ingest
     from pipelines.photo.capture import make_photo_capture, open_picture, subject_id, write_panel
 
-    if args.subject is not None and not ID.fullmatch(args.subject):
-        raise ConfigError(f"--subject {args.subject!r}: expected letters, digits, '_' and '-'")
-    for name, value in (("--focal-px", args.focal_px), ("--film-mm", args.film_mm)):
-        if value is not None and not 0 < value < float("inf"):
-            raise ConfigError(f"{name} {value}: expected a number above 0")
-    if args.windows < 1:
-        raise ConfigError(f"--windows {args.windows}: expected at least 1")
+    check_options(args)
     picture = open_picture(args.picture)
     clips = ("track.frames=clips",) if picture.video else ()
     args.set = [*PHOTO_SETTINGS, *clips, *args.set]

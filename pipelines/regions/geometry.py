@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 SCALP = len(LABELS)
 """Skin that may bear hair: a label of the mesh alone, never written."""
 HAIR, TORSO = np.uint8(LABELS.index("hair")), np.uint8(LABELS.index("torso"))
+FACE = ("skin", "lips", "eyes")  # labels of the face; what opens behind lips lies off the mesh
 BEARINGS = 36  # around the neck, at which the height of its lower end is known
 CLEAR_M, HAND_M, WIDTH_M = 0.007, 0.022, 0.006  # off the face; a hand's back; least width
 RIM_M = 0.005  # what juts out this far beyond the mesh is still what the mesh shows there
@@ -123,6 +124,10 @@ class TrackedHead:
     end: NeckEnd | None
     center: np.ndarray
     scene: o3d.t.geometry.RaycastingScene
+
+    def faces_camera(self, camera: Camera) -> bool:
+        """Return whether a camera stands in front of the face, not behind the head."""
+        return bool((camera.center - self.center) @ self.R[:, 2] > 0)
 
 
 def make_head(vertices: np.ndarray, R: np.ndarray, labels: HeadLabels) -> TrackedHead:
@@ -245,7 +250,7 @@ def head_geometry(
         # Nothing is further from the mesh than along its own ray; searching takes long.
         scale = np.linalg.norm(points - camera.center, axis=1) / np.maximum(surface[y, x], 1e-9)
         before = (depth[y, x] > 0) & ((mesh_depth[y, x] - depth[y, x]) * scale > CLEAR_M)
-        before &= _face(mesh)[y, x]
+        before &= label_mask(mesh, *FACE)[y, x]
         places = o3d.core.Tensor((points[before] - head.center).astype(np.float32))
         off[y[before], x[before]] = head.scene.compute_distance(places, nthreads=1).numpy()
     return HeadGeometry(mesh, mesh_depth, mesh[row, column], rim, height, off)
@@ -257,16 +262,12 @@ def find_hands(geometry: HeadGeometry, labels: np.ndarray, metre_px: float) -> n
     Only parts that are clear of the mesh count, without what `labels` (H, W) call hair.
     ``metre_px`` is the number of pixels that a metre spans at the head.
     """
-    clear = _face(geometry.mesh) & (geometry.off > CLEAR_M) & (labels != HAIR)
+    clear = label_mask(geometry.mesh, *FACE) & (geometry.off > CLEAR_M) & (labels != HAIR)
     narrow = disc(max(1, int(WIDTH_M * metre_px) // 2))
     solid = cv2.morphologyEx(clear.astype(np.uint8), cv2.MORPH_OPEN, narrow)
     count, part = cv2.connectedComponents(solid, connectivity=8)
     far = [k for k in range(1, count) if np.quantile(geometry.off[part == k], 0.9) > HAND_M]
     return np.isin(part, far)
-
-
-def _face(mesh: np.ndarray) -> np.ndarray:
-    return label_mask(mesh, "skin", "lips", "eyes")
 
 
 def nearest(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

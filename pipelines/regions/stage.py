@@ -30,6 +30,7 @@ from pipelines.regions.colour import (
     scalp_votes,
 )
 from pipelines.regions.geometry import (
+    FACE,
     HAIR,
     SCALP,
     TrackedHead,
@@ -180,9 +181,8 @@ def judge_scalp_and_skin(
 
 def face_pictures(dataset: Dataset, item: str, head: TrackedHead) -> list[Picture]:
     """Read reduced pictures of up to GLASSES_CAMERAS cameras that see the face, evenly chosen."""
-    ahead, cameras = head.R[:, 2], read_cameras_of(dataset, item.split("/")[0]).values()
-    seeing = [c for c in cameras if (c.center - head.center) @ ahead > 0]
-    found = []
+    cameras, found = read_cameras_of(dataset, item.split("/")[0]).values(), []
+    seeing = [camera for camera in cameras if head.faces_camera(camera)]
     for camera in evenly(seeing, GLASSES_CAMERAS):
         with contextlib.suppress(*UNREADABLE):  # the stage names them
             pair = read_frame_and_matte(dataset, item, camera)
@@ -362,7 +362,7 @@ def write_picture(out: Path, rows: dict[str, list[np.ndarray]], figures: dict[st
     """
 
     def face(name: str) -> float:
-        return sum(figures[name]["labels"][part] for part in ("skin", "lips", "eyes"))
+        return sum(figures[name]["labels"][part] for part in FACE)
 
     names = evenly(sorted(rows, key=lambda name: -face(name)), SHOWN)
     pairs = [names[start : start + 2] for start in range(0, len(names), 2)]

@@ -35,7 +35,7 @@ from express50.geometry.conventions import cell_to_corner, corner_to_cell
 from express50.geometry.raycast import join_rays
 from express50.geometry.transforms import unit
 from pipelines.regions.colour import colour_logs, like_skin
-from pipelines.regions.geometry import WIDTH_M, TrackedHead, nearest, render_head
+from pipelines.regions.geometry import FACE, WIDTH_M, TrackedHead, nearest, render_head
 
 EYES, SKIN = LABELS.index("eyes"), LABELS.index("skin")
 CELL_M = 0.002
@@ -50,7 +50,6 @@ BEARINGS, AROUND = 24, 0.6  # about an eye, and the share of them that shows a r
 EYE_M = 0.015  # radius of an eye with its lashes and shadow, which are not glasses
 WIDER_M = 0.0012  # by which cells are wider than glasses: odd pixels are dilated by one
 
-FACE = ("skin", "lips", "eyes")  # what opens behind lips is not within NEAR_M of the mesh
 SIDE, AROUND_M = 384, 0.1  # most pixels of the crops that are compared, and their margin
 NEAR_M = 0.008  # the face is within so much of the tracked mesh
 HEIGHTS_M = np.arange(0.012, 0.1, 0.006)  # before it, about which things are looked for
@@ -242,7 +241,7 @@ def face_views(head: TrackedHead, pictures: Sequence[Picture]) -> list[FaceView]
     sweeps = []
     for own, shot in enumerate(shots):
         face = label_mask(shot.mesh, *FACE) & (shot.alpha > 0.5)
-        if (shot.camera.center - head.center) @ head.R[:, 2] > 0 and face.sum() >= LEAST_SKIN:
+        if head.faces_camera(shot.camera) and face.sum() >= LEAST_SKIN:
             sweeps.append(_sweep(head, shots, own, face))
     if len(sweeps) < LEAST_VIEWS:
         return []

@@ -265,7 +265,7 @@ def find_worn_glasses(
     Landmarks on them keep their weight, because detectors know glasses.
     """
     head, seen = make_head(mesh, rotation, head_labels(model)), matted_pictures(pictures)
-    return find_glasses(head, [s for s in seen if (s[0].center - head.center) @ head.R[:, 2] > 0])
+    return find_glasses(head, [picture for picture in seen if head.faces_camera(picture[0])])
 
 
 def find_things(
