@@ -26,7 +26,7 @@ from pipelines.track.photo_consistency import (
     skin_samples,
     under_hair,
 )
-from pipelines.track.skin_flow import FINE, flow_term, skin_map
+from pipelines.track.skin_flow import FINE, skin_flows
 from pipelines.track.state import State, Target, all_vertices, rotations
 from pipelines.track.surface import FrameSetCrops, mask_things, near_things
 from pipelines.track.terms import NormalTerm, SlideTerm, Term, landmark_anchors
@@ -175,9 +175,14 @@ def refine(
     """Run the rounds; also return the targets with their last terms, and places on glasses."""
     model, fitted = basis.model, targets
     found = [FoundInRounds() for _ in targets]
+    rest = next((k for k, target in enumerate(targets) if target.neutral), None)
     for number, current in enumerate(schedule):
         meshes, turns = all_vertices(model, state), rotations(state)
-        flows = skin_flows(model, targets, evidence, found, meshes) if current.follow_skin else {}
+        pairs = zip(evidence.pictures, found, strict=True)
+        clear = [mask_things(pictures, own.hiding) for pictures, own in pairs]
+        flows = {}
+        if current.follow_skin and evidence.fine_map is not None:
+            flows = skin_flows(model, evidence.fine_map, clear, meshes, rest)
         if current.patch_reach_m and number in THING_ROUNDS:
             rows = zip(found, evidence.pictures, meshes, turns, strict=True)
             found = [with_things(model, *row) for row in rows]
@@ -313,27 +318,3 @@ def widened_sigma(
     factor = np.where(marks, HAIR_FACTOR, np.where(near, NEAR_THING_FACTOR, 1.0))
     factor[:, :17][marks[:, :17]] = np.inf
     return target.sigma * factor
-
-
-def skin_flows(
-    model: HeadModel,
-    targets: list[Target],
-    evidence: SubjectEvidence,
-    found: list[FoundInRounds],
-    meshes: np.ndarray,
-) -> dict[int, tuple[SlideTerm, ...]]:
-    """Follow the skin from the resting face to the other expressions, by their index."""
-    rest = next((k for k, target in enumerate(targets) if target.neutral), None)
-    uv_map = evidence.fine_map
-    if rest is None or uv_map is None:
-        return {}
-    rows = zip(evidence.pictures, found, meshes, strict=True)
-    maps = [
-        skin_map(model, uv_map, mask_things(pictures, own.hiding), mesh)
-        for pictures, own, mesh in rows
-    ]
-    flows: dict[int, tuple[SlideTerm, ...]] = {}
-    for index, (moved, mesh) in enumerate(zip(maps, meshes, strict=True)):
-        term = None if index == rest else flow_term(uv_map, maps[rest], moved, mesh)
-        flows[index] = () if term is None else (term,)
-    return flows

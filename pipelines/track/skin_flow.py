@@ -54,6 +54,27 @@ def skin_map(
     return SkinMap(np.clip(128.0 + 42.0 * even, 0, 255).astype(np.uint8), seen)
 
 
+def skin_flows(
+    model: HeadModel,
+    uv_map: FaceUvMap,
+    pictures: list[FrameSetCrops],
+    meshes: np.ndarray,
+    rest: int | None,
+) -> dict[int, tuple[SlideTerm, ...]]:
+    """Follow the skin from the resting face, number `rest`, to the other expressions, by index.
+
+    The pictures are of E frame sets with meshes (E, V, 3).
+    """
+    if rest is None:
+        return {}
+    maps = [skin_map(model, uv_map, *pair) for pair in zip(pictures, meshes, strict=True)]
+    flows: dict[int, tuple[SlideTerm, ...]] = {}
+    for index, (moved, mesh) in enumerate(zip(maps, meshes, strict=True)):
+        term = None if index == rest else flow_term(uv_map, maps[rest], moved, mesh)
+        flows[index] = () if term is None else (term,)
+    return flows
+
+
 def flow_term(
     uv_map: FaceUvMap, still: SkinMap, moved: SkinMap, mesh: np.ndarray
 ) -> SlideTerm | None:
