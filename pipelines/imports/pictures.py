@@ -72,15 +72,10 @@ def read_foreign_depth(
 ) -> np.ndarray:
     """Read depth (H, W) float32, metres along z of a pinhole camera's picture; 0 is unknown.
 
-    In the file, NaN and 10 km or more, as some tools write a background, are unknown too.
-
-    Args:
-        path: 16-bit PNG or TIFF, EXR, or .npy, of the size of the footage or of the picture.
-        recorded: camera of the footage, with its distortion.
-        seen: pinhole camera of the picture.
-        metres: per unit of the file.
-        along_ray: whether the file holds the length of the ray.
-        distorted: whether its pixels are those of the footage as recorded.
+    The file, a 16-bit PNG or TIFF, EXR, or .npy, has the size of the footage or of the picture. NaN
+    and 10 km or more, as some tools write a background, are unknown too. It holds lengths of rays
+    if `along_ray`, in units of so many `metres`, at pixels of the footage as `recorded` if
+    `distorted`.
 
     Raises:
         FormatError: it is missing, not a depth map, or of another size.

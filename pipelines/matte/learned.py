@@ -205,14 +205,8 @@ def in_tiles(
 
     Of an overlap, each tile's outer quarter is not used, because the tile does not see what
     surrounds it. In the half between, one tile fades into the other; where they agree, the result
-    is exactly theirs.
-
-    Args:
-        shape: (H, W) of the image.
-        tile: longest side of a tile, pixels; a multiple of 64, so that networks that halve the
-            picture several times sample all tiles alike.
-        overlap: pixels that neighbours share; a multiple of 64, less than ``tile``.
-        compute: returns the values (rows, columns) of one tile.
+    is exactly theirs. The longest side of a tile and the overlap are multiples of 64 pixels, so
+    that networks that halve the picture several times sample all tiles alike.
     """
     whole = np.zeros(shape, np.float32)
     row_end = 0

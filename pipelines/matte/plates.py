@@ -394,11 +394,8 @@ def _mean_opacity(
 ) -> np.ndarray:
     """Return the mean alpha (N,) over its likelihood at TRIED.
 
-    Args:
-        difference: (N, 3) light of the pixels minus that of the plate.
-        reach: (N, 3) mean light of the subject minus that of the plate.
-        covariance: (N, 3, 3) of the subject's colours.
-        own: (N, 3, 3) covariance of noise.
+    `difference` and `reach` (N, 3) are the light of the pixels and the mean light of the subject,
+    both minus the plate's; `covariance` (N, 3, 3) is of the subject's colours, `own` of noise.
     """
     weights = np.empty((len(TRIED), len(reach)))
     for row, alpha in zip(weights, TRIED, strict=True):

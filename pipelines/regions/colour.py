@@ -60,10 +60,7 @@ BARE = 0.7  # share of the scalp in the face's colours that makes it bare
 def face_colours(rgb: np.ndarray, alpha: np.ndarray, mesh: np.ndarray) -> np.ndarray | None:
     """Count (CELLS) the skin's colours in a view of the face; None in other views.
 
-    Args:
-        rgb: (H, W, 3) uint8 sRGB.
-        alpha: (H, W) in [0, 1].
-        mesh: (H, W) labels of the mesh alone.
+    The frame (H, W, 3) is uint8 sRGB, alpha (H, W) in [0, 1], `mesh` (H, W) the mesh's labels.
     """
     skin = bare_skin(rgb, (mesh == SKIN) & (alpha > SOLID))
     return _counts(_cells(rgb), skin) if _sees_face(mesh) and skin.sum() >= LEAST else None
@@ -117,12 +114,8 @@ def label_by_colour(
 ) -> np.ndarray:
     """Label pixels (H, W) uint8 by geometry, and hair, skin, ears, neck and torso by colour too.
 
-    Args:
-        rgb: (H, W, 3) uint8 sRGB.
-        alpha: (H, W) in [0, 1].
-        geometry: places of the pixels.
-        bare: the scalp is skin.
-        skin_colours: sum of the counts of `face_colours` of other views.
+    The frame (H, W, 3) is uint8 sRGB, alpha (H, W) in [0, 1]; `bare` says that the scalp is skin;
+    `skin_colours` is the sum of the counts of `face_colours` of other views.
     """
     labels, cells = geometry.labels(), _cells(rgb)
     solid = alpha > SOLID
@@ -208,12 +201,8 @@ class Scalp:
 def scalp_votes(rgb: np.ndarray, labels: np.ndarray, alpha: np.ndarray) -> tuple[int, int]:
     """Count the pixels of scalp compared with the view's own face, and those of its colours.
 
-    The view's own face is taken, because other cameras differ in gain and light.
-
-    Args:
-        rgb: (H, W, 3) uint8 sRGB.
-        labels: (H, W) of the mesh, SCALP among them.
-        alpha: (H, W) in [0, 1].
+    The view's own face is taken, because other cameras differ in gain and light. The frame
+    (H, W, 3) is uint8 sRGB; `labels` (H, W) are the mesh's, SCALP among them.
     """
 
     def evenly(rows: np.ndarray) -> np.ndarray:

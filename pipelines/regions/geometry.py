@@ -216,17 +216,11 @@ def head_geometry(
     depth: np.ndarray | None,
     rim_m: float = RIM_M,
 ) -> HeadGeometry:
-    """Place a camera's pixels relative to a head.
+    """Place a pinhole camera's pixels relative to a head, with a rim of `rim_m` metres.
 
-    Where depth is unknown, the nearest known pixel of the matte replaces it; without a depth map,
-    the mesh's own depth does. If no pixel shows the mesh, all pixels are far below the neck's end.
-
-    Args:
-        head: the tracked head.
-        camera: pinhole.
-        alpha: (H, W) in [0, 1].
-        depth: (H, W) camera z, metres, 0 where unknown; or None.
-        rim_m: width of the rim, metres.
+    Depth (H, W) is camera z, metres. Where it is 0, unknown, the nearest known pixel of the matte
+    (H, W) replaces it; without a depth map, the mesh's own depth does. If no pixel shows the mesh,
+    all pixels are far below the neck's end.
     """
     mesh, mesh_depth = render_head(head, camera)
     hit = mesh > 0

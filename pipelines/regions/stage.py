@@ -201,18 +201,10 @@ def label_view(
     skin_colours: np.ndarray | None = None,
     glasses: np.ndarray | None = None,
 ) -> ViewLabels:
-    """Label one camera at the working size.
+    """Label a frame (H, W, 3) uint8 with alpha (H, W), reduced to at most `side` pixels.
 
-    Args:
-        head: the tracked head.
-        camera: pinhole.
-        rgb: (H, W, 3) uint8.
-        alpha: (H, W) float32 in [0, 1].
-        depth: (H, W) metres, 0 where unknown; or None.
-        bare: the scalp is skin.
-        side: longest side, pixels, of the labels.
-        skin_colours: of views of the face (``colour.face_colours``).
-        glasses: places (n, 3) of ``glasses.find_glasses``.
+    `depth` (H, W) is in metres, 0 where unknown; `bare` says that the scalp is skin;
+    `skin_colours` are those of `face_colours`, `glasses` the places (n, 3) of `find_glasses`.
     """
     camera, rgb, alpha, depth = _shrunk(camera, rgb, alpha, depth, side)
     whole = ViewLabels(np.zeros(alpha.shape, np.uint8), np.zeros(alpha.shape, bool))
