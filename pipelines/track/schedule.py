@@ -10,13 +10,15 @@ from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
+from express50.contract.layout import Dataset
 from express50.files.images import shrink
 from express50.geometry.cameras import resized
 from express50.head.model import HeadModel
 from pipelines.regions.geometry import head_labels, make_head
 from pipelines.regions.things import Picture, face_views, find_glasses
 from pipelines.track.basis import ALONG, OFF, Basis, freeze_shape
-from pipelines.track.eyes_and_jaw import EyeOffsets, with_irises_and_jaw
+from pipelines.track.config import TrackConfig
+from pipelines.track.eyes_and_jaw import EyeOffsets, measure_eyes, with_irises_and_jaw
 from pipelines.track.face_uv import FaceUvMap, make_uv_map, reading_map, slide_term, with_slide
 from pipelines.track.fit import fit
 from pipelines.track.outline import BALD_SHARE, bare_share, outline_terms
@@ -26,6 +28,7 @@ from pipelines.track.photo_consistency import (
     skin_samples,
     under_hair,
 )
+from pipelines.track.read_inputs import peak_pictures
 from pipelines.track.skin_flow import FINE, skin_flows
 from pipelines.track.state import State, Target, all_vertices, rotations
 from pipelines.track.surface import FrameSetCrops, mask_things, near_things
@@ -128,25 +131,35 @@ class SubjectEvidence:
         return sum(len(pictures.distances) for pictures in self.pictures)
 
 
-def gather(
+def read_evidence(
+    dataset: Dataset,
+    subject: str,
+    config: TrackConfig,
     model: HeadModel,
-    pictures: list[FrameSetCrops],
-    meshes: np.ndarray,
-    eyes: EyeOffsets | None,
-    samples: int,
+    targets: list[Target],
+    state: State,
     schedule: Schedule,
 ) -> SubjectEvidence:
-    """Prepare what the rounds share; `meshes` (E, V, 3) are of the fit to landmarks."""
+    """Read the pictures about the meshes of the fit to landmarks, and what the rounds share."""
+    meshes = all_vertices(model, state)
+    pictures = [
+        peak_pictures(dataset, subject, config.photo_side, target.observation.expression, mesh)
+        for target, mesh in zip(targets, meshes, strict=True)
+    ]
     bald = False
     first = next((k for k, one in enumerate(pictures) if one.crops), None)
     if first is not None:
         images = pictures[first].images()
         # A single picture cannot distinguish fair hair from skin.
         bald = len(images) > 1 and bare_share(model, images, meshes[first]) > BALD_SHARE
-    uv_map = reading_map(model) if any(one.read_uv for one in schedule) else None
-    fine_map = make_uv_map(model, FINE) if any(one.follow_skin for one in schedule) else None
-    skin = skin_samples(model, samples)
-    return SubjectEvidence(pictures, skin, uv_map, fine_map, eyes, bald)
+    return SubjectEvidence(
+        pictures,
+        skin_samples(model, config.samples),
+        reading_map(model) if any(one.read_uv for one in schedule) else None,
+        make_uv_map(model, FINE) if any(one.follow_skin for one in schedule) else None,
+        measure_eyes(model, targets, meshes, rotations(state)),
+        bald,
+    )
 
 
 @dataclass(frozen=True)

@@ -23,28 +23,26 @@ from express50.errors import StageError
 from express50.files.digests import path_digest, value_digest
 from express50.geometry.cameras import Camera
 from express50.head.load import load_head
-from express50.head.model import HeadModel, landmarks
+from express50.head.model import landmarks
 from pipelines.track.appearance import write_texture
 from pipelines.track.basis import Basis, freeze_shape, make_basis, split_shape, with_modes
 from pipelines.track.config import TrackConfig
-from pipelines.track.eyes_and_jaw import EyeOffsets, measure_eyes, shut_terms
+from pipelines.track.eyes_and_jaw import EyeOffsets, shut_terms
 from pipelines.track.fit import consistent_sigma, fit, vertex_sigma
 from pipelines.track.observe import Observation
 from pipelines.track.read_inputs import (
     observe_peaks,
     open_follower,
     open_landmarks,
-    peak_pictures,
     read_clip,
 )
 from pipelines.track.report import draw_overlays, error_figures, track_metrics, write_sheet
 from pipelines.track.schedule import (
     LANDMARK_STEPS,
-    Schedule,
     SubjectEvidence,
     free_modes,
-    gather,
     make_schedule,
+    read_evidence,
     refine,
     schedule_table,
 )
@@ -115,25 +113,6 @@ def run(
     # The error model knows people only: it cannot judge such a head.
     expected = None if strange else expected_error(cameras, meshes, bounds)
     return Result(metrics, dropped, single_view_warnings(peaks, cameras) + strange, expected)
-
-
-def read_evidence(
-    dataset: Dataset,
-    item: str,
-    config: TrackConfig,
-    model: HeadModel,
-    targets: list[Target],
-    state: State,
-    schedule: Schedule,
-) -> SubjectEvidence:
-    """Read the pictures about the meshes of the fit to landmarks, and what all rounds share."""
-    meshes = all_vertices(model, state)
-    eyes = measure_eyes(model, targets, meshes, rotations(state))
-    pictures = [
-        peak_pictures(dataset, item, config.photo_side, target.observation.expression, mesh)
-        for target, mesh in zip(targets, meshes, strict=True)
-    ]
-    return gather(model, pictures, meshes, eyes, config.samples, schedule)
 
 
 def track_clips(
