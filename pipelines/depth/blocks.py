@@ -13,12 +13,7 @@ from functools import cached_property
 from itertools import product
 
 import numpy as np
-from scipy.ndimage import (
-    binary_dilation,
-    generate_binary_structure,
-    maximum_filter,
-    minimum_filter,
-)
+from scipy.ndimage import binary_dilation, generate_binary_structure, maximum_filter, minimum_filter
 
 from express50.errors import StageError
 

@@ -19,14 +19,7 @@ from express50.errors import CaptureError
 from express50.files.atomic import dump_json
 from express50.files.containers import WITHIN, inside, read_picture
 from express50.files.digests import file_sha256, text_digest
-from express50.files.images import (
-    ORIENTATION,
-    encode_jpeg,
-    has_alpha,
-    read_exif,
-    shrink,
-    upright,
-)
+from express50.files.images import ORIENTATION, encode_jpeg, has_alpha, read_exif, shrink, upright
 from express50.files.video import VideoTags, iterate_video, video_fps, video_tags
 from express50.geometry.sampling import edge_width
 from pipelines.ingest.quality import CameraMeasurements, light_cells, movement, small_grey
@@ -200,11 +193,11 @@ def _odd_pictures(tags: VideoTags) -> list[str]:
     if tags.interlaced:
         words.append("is interlaced: a picture mixes two moments; record progressive frames")
     if tags.aspect != 1:
-        words.append(
+        oddities.append(
             f"has pixels {tags.aspect:.3g} times as wide as high, but is used as stored; the"
             " calibration must be as stored too"
         )
-    return words
+    return oddities
 
 
 def _uneven(source: CameraSource) -> str:

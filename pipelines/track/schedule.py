@@ -22,12 +22,7 @@ from pipelines.track.eyes_and_jaw import EyeOffsets, measure_eyes, with_irises_a
 from pipelines.track.face_uv import FaceUvMap, make_uv_map, reading_map, slide_term, with_slide
 from pipelines.track.fit import fit
 from pipelines.track.outline import BALD_SHARE, bare_share, outline_terms
-from pipelines.track.photo_consistency import (
-    SkinSamples,
-    patch_terms,
-    skin_samples,
-    under_hair,
-)
+from pipelines.track.photo_consistency import SkinSamples, patch_terms, skin_samples, under_hair
 from pipelines.track.read_inputs import peak_pictures
 from pipelines.track.skin_flow import FINE, skin_flows
 from pipelines.track.state import State, Target, all_vertices, rotations

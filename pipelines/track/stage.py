@@ -30,12 +30,7 @@ from pipelines.track.config import TrackConfig
 from pipelines.track.eyes_and_jaw import EyeOffsets, shut_terms
 from pipelines.track.fit import consistent_sigma, fit, vertex_sigma
 from pipelines.track.observe import Observation
-from pipelines.track.read_inputs import (
-    observe_peaks,
-    open_follower,
-    open_landmarks,
-    read_clip,
-)
+from pipelines.track.read_inputs import observe_peaks, open_follower, open_landmarks, read_clip
 from pipelines.track.report import draw_overlays, error_figures, track_metrics, write_sheet
 from pipelines.track.schedule import (
     LANDMARK_STEPS,
