@@ -16,10 +16,10 @@ from express50.errors import CaptureError, StageError
 from express50.files.images import disc
 from express50.geometry.cameras import Camera, inside_frame, project_pinhole
 from express50.landmarks import EMBEDDED
-from pipelines.imports.pictures import look_up
+from pipelines.imports.pictures import pixels_showing
 from pipelines.imports.places import PeakFrame
 from pipelines.track.observe import Observation
-from pipelines.track.read_inputs import agreed, face_views, open_landmarks
+from pipelines.track.read_inputs import agreed, open_landmarks, search_views
 
 # Share of a face's height. Tracks of the twin are 0.012 to 0.017 off the landmarks found, those of
 # another person in the same place 0.04 to 0.15.
@@ -42,7 +42,7 @@ def observe_peak(
     source = open_landmarks(dataset, subject, EMBEDDED, SEARCH)
     read, views = partial(read_peak_frame, dataset, subject, peak.expression), []
     with suppress(CaptureError):
-        views = face_views(read, read_cameras_of(dataset, subject), peak.frame, source)
+        views = search_views(read, read_cameras_of(dataset, subject), peak.frame, source)
     found = agreed(peak.expression, peak.frame, views)
     if found is None:
         notes.append(Note(peak.expression, NO_FACE))
@@ -163,7 +163,7 @@ def check_face_depth(
     if observation is None:
         return None
     names = [view.camera_id for view in observation.views]
-    pairs = [look_up(cameras[n], depths[n], observation.points[INNER]) for n in names]
+    pairs = [pixels_showing(cameras[n], depths[n], observation.points[INNER]) for n in names]
     found, z = np.hstack([np.stack(pair)[:, pair[0] > 0] for pair in pairs])
     if len(found) < LEAST_MARKS:
         return None

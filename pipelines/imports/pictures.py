@@ -221,13 +221,15 @@ def agreement(
         for other, there in depths.items():
             facing = cameras[other].cam_from_world[2, :3] @ camera.cam_from_world[2, :3]
             if other != name and facing >= LEAST_COSINE:
-                found, z = look_up(cameras[other], there, points)
+                found, z = pixels_showing(cameras[other], there, points)
                 total += len(points)
                 same += int(((found > 0) & (np.abs(found - z) < near)).sum())
     return same / total if total else None
 
 
-def look_up(camera: Camera, image: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def pixels_showing(
+    camera: Camera, image: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the pixels (N[, C]) of an image that show world points (N, 3); their depth (N,).
 
     The camera is undistorted. Pixels outside the image are 0.
@@ -307,8 +309,8 @@ def _seen(
     """Count the views that show each vertex (N,), and average their colours (N, 3) uint8."""
     count, total = np.zeros(len(vertices)), np.zeros((len(vertices), 3))
     for name, depth in depths.items():
-        found, z = look_up(cameras[name], depth, vertices)
+        found, z = pixels_showing(cameras[name], depth, vertices)
         shown = (found > 0) & (np.abs(found - z) < near)
         count += shown
-        total[shown] += look_up(cameras[name], pictures[name], vertices[shown])[0]
+        total[shown] += pixels_showing(cameras[name], pictures[name], vertices[shown])[0]
     return count, np.rint(total / np.maximum(count, 1)[:, None]).astype(np.uint8)

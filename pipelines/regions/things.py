@@ -264,9 +264,8 @@ def _not_before_bare_face(things: np.ndarray, views: Sequence[FaceView]) -> np.n
     for view in views:
         pixels, inside = inside_frame(view.camera, things)
         column, row = pixels[inside].astype(np.int64).T
-        ahead = (
-            things[inside] @ view.camera.cam_from_world[2, :3] + view.camera.cam_from_world[2, 3]
-        )
+        axis = view.camera.cam_from_world[2]
+        ahead = things[inside] @ axis[:3] + axis[3]
         kept = np.ones(len(things), bool)
         kept[inside] = ~(view.bare[row, column] & (ahead < view.depth[row, column] - NEAR_M))
         things = things[kept]

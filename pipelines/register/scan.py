@@ -139,7 +139,7 @@ def find_landmarks(scan: Scan, template: np.ndarray, given: np.ndarray) -> Obser
     middle, up, ahead = pose
     if painter.picture(place_camera(middle, ahead, up, SPAN_M))[1] > 0.5:
         raise StageError(INWARDS)
-    views = face_views(source, painter, pose)
+    views = views_about_face(source, painter, pose)
     if len(views) >= 2:
         found = agree("scan", 0, views)[0]
     elif known[INNER].sum() >= MIN_TRIANGULATED:
@@ -188,7 +188,7 @@ def pose_of_given(given: np.ndarray, template: np.ndarray) -> FacePose:
     return turn @ (template.mean(0) - [0.0, 0.0, HALF_HEAD_M]) + shift, turn[:, 1], turn[:, 2]
 
 
-def face_views(source: Source, painter: ScanPainter, pose: FacePose) -> list[LandmarkView]:
+def views_about_face(source: Source, painter: ScanPainter, pose: FacePose) -> list[LandmarkView]:
     """Draw a scan from in front of its face and around; return the views that show the face."""
     middle, up, ahead = pose
     right = np.cross(up, ahead)

@@ -91,10 +91,9 @@ def agree(expression: str, frame: int, views: list[LandmarkView]) -> tuple[Obser
         known = np.stack([np.isfinite(view.sigma) for view in views])
         share = (inliers & known).sum(1) / np.maximum(known.sum(1), 1)
         if len(views) <= 2 or share.min() >= MIN_SHARE:
-            covariance = point_covariance(views, points, inliers & known)
-            found = Observation(
-                expression, frame, tuple(views), inliers & known, points, covariance
-            )
+            used = inliers & known
+            covariance = point_covariance(views, points, used)
+            found = Observation(expression, frame, tuple(views), used, points, covariance)
             return found, refused
         worst = int(np.argmin(share))
         refused.append(views[worst].camera_id)

@@ -99,7 +99,7 @@ class OutlineTerm:
     loss = staticmethod(huber)
 
 
-def signed_distance(alpha: np.ndarray, camera: Camera) -> SignedDistance | None:
+def matte_distance(alpha: np.ndarray, camera: Camera) -> SignedDistance | None:
     """Compute the signed distance of a matte (H, W) uint8; None where it is empty or full.
 
     Large mattes are averaged down to about MATTE_SIDE pixels first.

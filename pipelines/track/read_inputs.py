@@ -28,7 +28,7 @@ from express50.landmarks.sources import Marked, Source, open_source
 from pipelines.calibrate.footage_rig import mean_landmarks
 from pipelines.track.eyes_and_jaw import shut_lids
 from pipelines.track.observe import LandmarkView, Observation, agree, place_head
-from pipelines.track.outline import signed_distance
+from pipelines.track.outline import matte_distance
 from pipelines.track.surface import CutCrops, FrameSetCrops, cut_crop, root_light
 
 MIN_SCORE = 0.2  # views with a lower face score are left out
@@ -93,7 +93,7 @@ def observe_peaks(
     for expression in sorted(peaks, key=lambda name: name != neutral):
         read = partial(read_peak_frame, dataset, subject, expression)
         try:
-            views = all_face_views(read, cameras, peaks[expression], sources, follow)
+            views = search_all_views(read, cameras, peaks[expression], sources, follow)
         except CaptureError as error:
             dropped.append(Note(expression, str(error)))
             continue
@@ -161,7 +161,7 @@ def _find_face(
         if follow is not None and found is None and np.isfinite(place).all():
             found = agreed(cue, frame, _followed(read, cameras, follow, place))
     if found is None:
-        found = agreed(cue, frame, face_views(read, cameras, frame, source))
+        found = agreed(cue, frame, search_views(read, cameras, frame, source))
     # A clip may be one long blink: the peaks show what open eyes look like.
     return None if found is None else shut_lids([found], peaks)[0]
 
@@ -222,7 +222,7 @@ def _frame_crops(
     return FrameSetCrops((), crops, tuple(root_light(crop) for crop in crops))
 
 
-def face_views(
+def search_views(
     read: Read, cameras: dict[str, Camera], frame: int, source: Source
 ) -> list[LandmarkView]:
     """Return the views with a face; a camera whose footage lacks the frame is skipped.
@@ -245,7 +245,7 @@ def face_views(
     return views
 
 
-def all_face_views(
+def search_all_views(
     read: Read, cameras: dict[str, Camera], frame: int, sources: Sequence[Source],
     follow: Follow | None,
 ) -> list[LandmarkView]:  # fmt: skip
@@ -263,7 +263,7 @@ def all_face_views(
         if len(views) < min(2, len(cameras)):
             rest = {name: cameras[name] for name in cameras if name not in views}
             try:
-                seen = face_views(read, rest, frame, source)
+                seen = search_views(read, rest, frame, source)
             except CaptureError:
                 if not views:
                     raise
@@ -295,7 +295,7 @@ def peak_pictures(
         path = dataset.matte_file(subject, expression, camera_id)
         alpha = read_alpha(path) if path.is_file() else None
         if alpha is not None:
-            distances.append(signed_distance(alpha, camera))
+            distances.append(matte_distance(alpha, camera))
         with suppress(CaptureError):  # the frames stage left this camera out
             crops.append(cut_crop(camera, read(camera_id), alpha, mesh, side))
     return FrameSetCrops(

@@ -225,10 +225,8 @@ def prior(
     if model.unit_expressions:
         residual, slope = _sparse(own[:count], share * ACTIVE_WIDTH, mean)
     else:
-        residual, slope = (
-            own[:count] / (COEFFICIENT_SPREAD * mean),
-            np.full(count, 1.0 / (COEFFICIENT_SPREAD * mean)),
-        )
+        spread = COEFFICIENT_SPREAD * mean
+        residual, slope = own[:count] / spread, np.full(count, 1.0 / spread)
     sigmas = np.r_[
         np.full(3, SINGLE_VIEW_NECK_SIGMA if single_view else NECK_SIGMA),
         np.array(JAW_SIGMA) * [share, 1.0, 1.0],

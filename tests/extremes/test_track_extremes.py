@@ -10,7 +10,7 @@ import pytest
 from express50.files.images import linear_to_srgb, read_image
 from pipelines.track.appearance import EVEN_LIGHT, Appearance, bake_albedo, write_texture
 from pipelines.track.observe import Observation
-from pipelines.track.outline import outline_terms, outline_vertices, signed_distance
+from pipelines.track.outline import matte_distance, outline_terms, outline_vertices
 from pipelines.track.photo_consistency import patch_terms, skin_samples
 from pipelines.track.state import Target
 from pipelines.track.surface import FrameSetCrops, HeadCrop, Visibility, cut_crop
@@ -142,7 +142,7 @@ def test_empty_mattes_show_nobody(tmp_path) -> None:
     crops = [take(camera, mesh=mesh, alpha=empty) for camera in rig()]
     assert search(crops, mesh) is None
     assert texture(tmp_path, crops, mesh) is None
-    assert signed_distance(empty, rig()[0]) is None
+    assert matte_distance(empty, rig()[0]) is None
     hidden, things = np.zeros(len(mesh), bool), np.zeros((0, 3))
     assert outline_terms(ball_head(), (), mesh, 0, False, hidden, things) == []
 

@@ -22,8 +22,8 @@ from pipelines.track.read_inputs import (
     FOLLOWED_VIEWS,
     _facing_cameras,
     _find_face,
-    all_face_views,
     open_follower,
+    search_all_views,
 )
 from pipelines.track.sequence import ClipTracker, track_window
 from pipelines.track.stage import single_view_warnings
@@ -92,13 +92,13 @@ def test_a_face_that_the_search_misses_is_found_where_the_rig_says(
         return seen if camera_id in found else Stage(None).seen(camera_id)
 
     # The second source, which takes long, is for rigs that show no more than one face.
-    views = all_face_views(str, CAMERAS, 7, [search, search], stage.follow)
+    views = search_all_views(str, CAMERAS, 7, [search, search], stage.follow)
     assert stage.searched == searches * len(CAMERAS) - (searches - 1) * len(found)
     assert {view.camera_id for view in views} == set(_facing_cameras(CAMERAS, marks()))
     observation, refused = agree("smile", 7, views)
     np.testing.assert_allclose(observation.points, marks(), atol=1e-6)
     assert not refused
-    searched = all_face_views(str, CAMERAS, 7, [search], None)
+    searched = search_all_views(str, CAMERAS, 7, [search], None)
     assert {view.camera_id for view in searched} == set(found)
 
 
@@ -109,7 +109,7 @@ def test_a_face_that_one_of_several_cameras_shows_is_warned_of() -> None:
         seen = stage.search(image, camera_id, frame)
         return seen if camera_id == "cam-0.50" else Stage(None).seen(camera_id)
 
-    (view,) = all_face_views(str, CAMERAS, 7, [search], None)
+    (view,) = search_all_views(str, CAMERAS, 7, [search], None)
     alone, _ = agree("smile", 7, [view])
     (note,) = single_view_warnings([alone], CAMERAS)
     assert note.what == "smile" and f"only cam-0.50 of {len(CAMERAS)} cameras shows" in note.why

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipelines.track.outline import OutlineTerm, outline_vertices, sample_distance, signed_distance
+from pipelines.track.outline import OutlineTerm, matte_distance, outline_vertices, sample_distance
 from tests.pipelines.test_track import make_camera
 
 
@@ -16,7 +16,7 @@ def disc_alpha(size: int = 300, radius: float = 80.0) -> np.ndarray:
 
 
 def test_signed_distance_of_a_disc() -> None:
-    distance = signed_distance(disc_alpha(), make_camera(0.0, 300))
+    distance = matte_distance(disc_alpha(), make_camera(0.0, 300))
     assert distance is not None
     angle = np.linspace(0, 6, 40)
     for radius in (60.0, 80.0, 110.0):
@@ -33,7 +33,7 @@ def test_both_directions_of_a_shrunk_matte_keep_their_scale(axis: int) -> None:
     for edge in range(size[axis] - 160, size[axis] - 120, 3):  # edges are known to a cell
         alpha = np.full(size[::-1], 255, np.uint8)
         alpha[(slice(None), slice(edge, None)) if axis == 0 else slice(edge, None)] = 0
-        distance = signed_distance(alpha, make_camera(0.0, 300))
+        distance = matte_distance(alpha, make_camera(0.0, 300))
         assert distance is not None and distance.values.shape == (535, 640)
         pixels = np.tile(size / 2, (41, 1))
         pixels[:, axis] = edge + np.linspace(-10, 10, 41)
@@ -43,7 +43,7 @@ def test_both_directions_of_a_shrunk_matte_keep_their_scale(axis: int) -> None:
 
 @pytest.mark.parametrize("fill", [0, 255])
 def test_a_matte_without_an_edge_has_no_distance(fill: int) -> None:
-    assert signed_distance(np.full((40, 40), fill, np.uint8), make_camera(0.0, 40)) is None
+    assert matte_distance(np.full((40, 40), fill, np.uint8), make_camera(0.0, 40)) is None
 
 
 def test_outline_of_a_sphere_is_its_rim() -> None:
@@ -62,7 +62,7 @@ def test_outline_of_a_sphere_is_its_rim() -> None:
 
 def test_outline_residual_slope_matches_finite_differences() -> None:
     camera = make_camera(0.3, 300)
-    distance = signed_distance(disc_alpha(), camera)
+    distance = matte_distance(disc_alpha(), camera)
     positions = np.random.default_rng(0).normal(size=(12, 3)) * 0.1
     outline = OutlineTerm.of(
         distance, np.arange(12), positions, np.arange(12) % 2 == 0, 3, bald=False

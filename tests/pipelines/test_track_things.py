@@ -10,7 +10,7 @@ from express50.geometry.cameras import project, unproject
 from express50.head.model import HeadModel
 from pipelines.regions.geometry import head_labels, make_head
 from pipelines.regions.things import face_views
-from pipelines.track.outline import outline_terms, sample_distance, signed_distance
+from pipelines.track.outline import matte_distance, outline_terms, sample_distance
 from pipelines.track.photo_consistency import patch_terms, skin_samples
 from pipelines.track.schedule import find_things, matted_pictures
 from pipelines.track.surface import FrameSetCrops, HeadCrop, mask_things, near_things
@@ -99,7 +99,7 @@ def test_an_edge_of_the_matte_that_is_a_things_does_not_pull() -> None:
     rim = np.flatnonzero(alpha[128])[-1]
     alpha[110:146, rim - 5 : rim + 25] = 255  # glasses in profile stick out of the face
     mesh, hidden = model.template.numpy(), np.zeros(len(model.template), bool)
-    distance = signed_distance(alpha, camera)
+    distance = matte_distance(alpha, camera)
     assert distance is not None
     y, x = np.mgrid[112:144:3, rim + 2 : rim + 24 : 3]
     pixels = np.stack([x.ravel(), y.ravel()], axis=1) + 0.5
