@@ -184,14 +184,14 @@ def _rate(raw: RawCapture, path: Path) -> str:
 
 
 def _odd_pictures(tags: VideoTags) -> list[str]:
-    words = []
+    oddities = []
     if tags.hdr:
-        words.append(
+        oddities.append(
             f"is HDR ({tags.hdr}), but is read as sRGB, so its colours are wrong; record it"
             " without HDR, or convert it to BT.709"
         )
     if tags.interlaced:
-        words.append("is interlaced: a picture mixes two moments; record progressive frames")
+        oddities.append("is interlaced: a picture mixes two moments; record progressive frames")
     if tags.aspect != 1:
         oddities.append(
             f"has pixels {tags.aspect:.3g} times as wide as high, but is used as stored; the"
