@@ -54,7 +54,7 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         """Read ``-4m`` and ``-1e3`` as values, so that the option they belong to refuses them."""
-        super().__init__(*arguments, formatter_class=_HelpFormatter, **options)
+        super().__init__(*arguments, **options | {"formatter_class": _HelpFormatter})
         self._negative_number_matcher = re.compile(r"-\.?\d\S*")
 
     def _get_value(self, action: argparse.Action, text: str) -> Any:

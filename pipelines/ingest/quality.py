@@ -314,7 +314,7 @@ def describe_dark(cells: np.ndarray) -> list[str]:
     brightest = float(cells.max())
     if brightest >= DIM:
         return []
-    level = 255 * float(linear_to_srgb(np.float32(brightest)))
+    level = 255 * float(linear_to_srgb(np.array(brightest, np.float32)))
     return [
         f"is very dark: its brightest parts have level {level:.0f} of 255; correct its exposure, or"
         " if its files hold 10 to 14 bits in 16, multiply the values to fill all 16"
