@@ -270,7 +270,7 @@ def _read_board(index: Index, limit: int) -> tuple[BoardCorners, np.ndarray, Whi
 def _from_footage(index: Index, config: CalibrateConfig) -> CalibratedRig:
     if len(index.cameras) == 1:
         raise CalibrationError(
-            f"{index.capture}: has one camera, and solving from footage needs two; track one camera"
+            f"{index.subject}: has one camera, and solving from footage needs two; track one camera"
             " with 'express50 photo FILE OUT', or add calibration.json and run 'express50 ingest'"
             " again"
         )

@@ -102,6 +102,11 @@ def detect(path: Path, name: object = None) -> Layout:
         if below := sorted(path.glob(f"{depth}/capture.toml")):
             captures = below[0].parent.parent / "*"
             raise CaptureError(f"{path}: a folder of captures, expected a capture; give {captures}")
+    if (path / "capture.toml").is_file() and (path / "cameras").is_dir():
+        raise CaptureError(
+            f"{path}: a capture in our own layout, expected one of another layout as 'source'; give"
+            " that folder itself, and leave out what you do not need in its cameras/ and cues.csv"
+        )
     if (path.parent / "capture.toml").is_file():
         raise CaptureError(f"{path}: part of the capture {path.parent}; give that folder instead")
     raise CaptureError(

@@ -267,6 +267,13 @@ def test_a_video_that_one_camera_lacks_costs_the_camera_or_the_video_whichever_i
         assert (len(line.cameras), len(line.sequences)) == (cameras, kept)
 
 
+def test_capture_toml_may_not_point_at_a_capture_in_our_own_layout(tmp_path, capture):
+    (tmp_path / "wishes").mkdir()
+    (tmp_path / "wishes/capture.toml").write_text(f'source = "{capture.as_posix()}"\n')
+    with pytest.raises(CaptureError, match="our own layout"):
+        read_any(tmp_path / "wishes")
+
+
 def test_capture_toml_points_at_read_only_data_and_chooses(tmp_path):
     layouts.write_ava(tmp_path)
     wishes = tmp_path / "wishes"
