@@ -15,7 +15,7 @@ from typing import Any
 from express50.capture.index import Cue
 from express50.errors import CalibrationError, CaptureError
 from express50.files.calibration import read_cameras
-from express50.files.text import ID, TOML_LIMIT, read_text, read_toml
+from express50.files.text import ID, TOML_LIMIT, identifier, read_text, read_toml
 from express50.geometry.cameras import Camera
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr")
@@ -110,6 +110,12 @@ def read_capture(root: Path) -> RawCapture:
     for path in sorted(p for p in folder.iterdir() if not p.name.startswith(".")):
         if not path.is_dir():
             continue
+        if not ID.fullmatch(path.name) and _holds_footage(path):
+            raise CaptureError(
+                f"{path}: camera id {path.name!r}, expected at most 120 letters, digits, '_' and"
+                f" '-'; call it {identifier(path.name)[:120]!r} here, in plates/, board/ and"
+                " calibration.json"
+            )
         try:
             cameras[path.name] = _read_camera(path)
         except CaptureError as error:
@@ -222,13 +228,21 @@ def plain(value: object) -> object:
     return value if isinstance(value, str | int | float) else str(value)
 
 
+def _videos(folder: Path) -> list[Path]:
+    return sorted(
+        path
+        for path in folder.iterdir()
+        if path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".")
+    )
+
+
+def _holds_footage(folder: Path) -> bool:
+    return (folder / "frames").is_dir() or bool(_videos(folder))
+
+
 def _read_camera(folder: Path) -> RawCamera:
-    if not ID.fullmatch(folder.name):
-        raise CaptureError(
-            f"{folder}: camera id {folder.name!r}; expected letters, digits, '_' and '-'"
-        )
-    videos = [folder / f"video{suffix}" for suffix in VIDEO_SUFFIXES]
-    found = [video for video in videos if video.is_file()]
+    videos = _videos(folder)
+    found = [video for video in videos if video.stem.lower() == "video" and video.is_file()]
     frames = folder / "frames"
     if len(found) + frames.is_dir() > 1:
         names = ", ".join([video.name for video in found] + ["frames/"] * frames.is_dir())
@@ -236,7 +250,10 @@ def _read_camera(folder: Path) -> RawCamera:
     if found:
         return RawCamera(id=folder.name, kind="video", path=found[0])
     if not frames.is_dir():
-        raise CaptureError(f"{folder}: holds no footage, expected video.mp4 or frames/000000.png")
+        other = f"; rename {videos[0].name} to video{videos[0].suffix}" if videos else ""
+        raise CaptureError(
+            f"{folder}: holds no footage, expected video.mp4 or frames/000000.png{other}"
+        )
     files = sorted(image_names(frames), key=lambda name: len(Path(name).stem))  # 9 before 10
     if not files:
         raise CaptureError(f"{frames}: holds no image, expected 000000.png and so on")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -11,12 +10,11 @@ import numpy as np
 
 from express50.errors import CalibrationError
 from express50.files.atomic import write_bytes
-from express50.files.text import read_json
+from express50.files.text import ID, identifier, read_json
 from express50.geometry.cameras import MODELS, Camera
 from express50.geometry.shapes import PIXEL_LIMIT
 from express50.geometry.transforms import is_rigid
 
-CAMERA_ID = re.compile(r"\w[\w.+-]{0,119}")
 LARGEST = 1e12  # absolute value in parameters (pixels) and poses (metres)
 
 
@@ -46,8 +44,11 @@ def parse_cameras(table: object, where: str) -> dict[str, Camera]:
 def _parse_camera(path: str, camera_id: str, row: object) -> Camera:
     """Check one camera's entry and build it."""
     where = f"{path}: camera {camera_id}"
-    if not CAMERA_ID.fullmatch(camera_id):  # it becomes a file name
-        raise CalibrationError(f"{where}: expected an id of letters, digits and _ . + -")
+    if not ID.fullmatch(camera_id):  # it becomes a file name
+        raise CalibrationError(
+            f"{where}: expected an id of at most 120 letters, digits, '_' and '-'; call it"
+            f" {identifier(camera_id)[:120]!r} here and in the names of its folder and plate"
+        )
     if not isinstance(row, Mapping):
         raise CalibrationError(f"{where}: expected a table, got {type(row).__name__}")
     missing = [k for k in ("model", "width", "height", "params", "world_to_camera") if k not in row]

@@ -34,6 +34,12 @@ AGAIN = "copy or write it again"
 Kind = type[Express50Error]
 
 
+def identifier(text: str, other: str = "_-") -> str:
+    """Make an id of any text: ``_`` replaces everything but letters, digits and ``other``."""
+    clean = re.sub(rf"[^A-Za-z0-9{re.escape(other)}]+", "_", text).strip("_-")
+    return clean or "unnamed"
+
+
 def read_bytes(path: Path, kind: Kind, limit: int = TEXT_LIMIT, fix: str = AGAIN) -> bytes:
     """Read the bytes of a regular file.
 

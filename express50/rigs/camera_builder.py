@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 
 from express50.errors import CalibrationError
 from express50.files.calibration import camera_rows, parse_cameras
-from express50.files.text import read_bytes
+from express50.files.text import identifier, read_bytes
 from express50.geometry.cameras import Camera, resized
 
 
@@ -70,7 +69,7 @@ def names_from_files(files: Sequence[str]) -> list[str]:
         names = [path.stem for path in paths]
     else:
         names = [path.with_suffix("").as_posix() for path in paths]
-    return [re.sub(r"[^\w.+-]+", "_", name).strip("_.+-") for name in names]
+    return [identifier(name) for name in names]
 
 
 def at_size(camera: Camera, size: tuple[int, int]) -> Camera:

@@ -32,7 +32,7 @@ from express50.errors import CalibrationError, CaptureError
 from express50.files.arrays import read_arrays
 from express50.files.calibration import finite_array
 from express50.files.containers import attribute, child, members, open_hdf5, read_array
-from express50.files.text import read_json_table, read_toml, read_xml, read_yaml
+from express50.files.text import identifier, read_json_table, read_toml, read_xml, read_yaml
 from express50.geometry.cameras import Camera, resized
 from express50.geometry.conventions import FLIP_YZ, K_from_opencv
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
@@ -90,7 +90,8 @@ def _toml_camera(where: str, name: str, row: dict[str, Any]) -> Camera:
     dist = row.get("distortions", [])
     count = len(dist) if isinstance(dist, list) else 0
     dist = finite_array(dist, (count,), f"{where} has distortions")
-    return camera_from_K(name, K, dist, (int(width), int(height)), make_transform(R, t))
+    pose = make_transform(R, t)
+    return camera_from_K(identifier(name), K, dist, (int(width), int(height)), pose)
 
 
 def read_kalibr(path: Path) -> dict[str, Camera]:

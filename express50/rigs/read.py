@@ -14,7 +14,7 @@ import numpy as np
 
 from express50.errors import CalibrationError
 from express50.files.calibration import finite_array, read_cameras
-from express50.files.text import read_json, read_yaml, reason
+from express50.files.text import identifier, read_json, read_yaml, reason
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_from_opencv
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
@@ -182,7 +182,10 @@ def read_opencv_yaml(path: Path, size: tuple[int, int] | None) -> dict[str, Came
                 f"{file}: does not give the images' size; pass --size WIDTHxHEIGHT"
             )
         pose = make_transform(R, t.ravel())
-        found[file.stem] = camera_from_K(file.stem, K_from_opencv(K), dist, shape, pose)
+        name = identifier(file.stem)
+        if name in found:
+            raise CalibrationError(f"{path}: two files become camera {name}; rename one")
+        found[name] = camera_from_K(name, K_from_opencv(K), dist, shape, pose)
     return checked(found, path)
 
 

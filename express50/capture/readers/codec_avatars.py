@@ -26,12 +26,11 @@ from express50.capture.readers.selection import (
     Selection,
     check_selection,
     common_timeline,
-    identifier,
 )
 from express50.errors import CalibrationError, CaptureError
 from express50.files.calibration import finite_array
 from express50.files.containers import WITHIN, open_zip
-from express50.files.text import NAME, read_json_table, read_text
+from express50.files.text import NAME, identifier, read_json_table, read_text
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_from_opencv
 from express50.rigs.camera_builder import camera_from_K, checked, in_metres

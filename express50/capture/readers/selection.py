@@ -19,6 +19,7 @@ from typing import Any
 
 from express50.capture.raw import RawCamera
 from express50.errors import CaptureError, few
+from express50.files.text import identifier
 
 EXPRESSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9_]*")
 # A camera that lacks more than this share of the moments is dropped; otherwise the moments are.
@@ -60,12 +61,6 @@ class Selection:
     def expression(self, sequence: str) -> str:
         """Return the expression id of a sequence: the given one, else one made of its name."""
         return self.expressions.get(sequence) or identifier(sequence, "_")
-
-
-def identifier(text: str, other: str = "_-") -> str:
-    """Make an id of any text: ``_`` replaces everything but letters, digits and ``other``."""
-    clean = re.sub(rf"[^A-Za-z0-9{re.escape(other)}]+", "_", text).strip("_-")
-    return clean or "unnamed"
 
 
 def unique_ids(root: Path, names: Iterable[str], stem: Callable[[str], str]) -> dict[str, str]:

@@ -24,12 +24,11 @@ from express50.capture.readers.selection import (
     check_selection,
     common_timeline,
     folder_id,
-    identifier,
     unique_ids,
 )
 from express50.errors import CalibrationError, CaptureError
 from express50.files.images import ORIENTATION
-from express50.files.text import read_json_table
+from express50.files.text import identifier, read_json_table
 from express50.files.video import video_fps, video_turn
 from express50.rigs.other_tools import read_nersemble
 

@@ -89,6 +89,33 @@ def test_camera_without_or_with_two_kinds_of_footage_is_dropped(raw):
     assert "holds no footage" in dropped["cam01"]
 
 
+@pytest.mark.parametrize("name", ["cam.00", "cam+00", "cam 00", "\u043a\u0430\u043c00"])
+def test_cameras_whose_name_is_no_id_fail_the_capture(raw, name):
+    """Without them the chain would run for hours on half of the rig."""
+    (raw / "cameras" / "cam00").rename(raw / "cameras" / name)
+    with pytest.raises(CaptureError, match="expected at most 120 letters"):
+        read_capture(raw)
+    (raw / "cameras" / name).rename(raw / "cameras" / "cam00")
+    given = raw / "calibration.json"
+    given.write_text(given.read_text().replace("cam00", name))
+    with pytest.raises(CalibrationError, match="expected an id of at most 120 letters"):
+        read_capture(raw)
+
+
+def test_folders_without_footage_may_have_any_name(raw):
+    (raw / "cameras" / "@eaDir").mkdir()
+    assert set(read_capture(raw).dropped) == {"@eaDir"}
+
+
+def test_endings_may_be_upper_case_and_other_names_are_pointed_out(raw):
+    folder = raw / "cameras" / "cam01"
+    shutil.rmtree(folder / "frames")
+    (folder / "GX010001.MP4").touch()
+    assert "rename GX010001.MP4 to video.MP4" in read_capture(raw).dropped["cam01"]
+    (folder / "GX010001.MP4").rename(folder / "VIDEO.MP4")
+    assert read_capture(raw).cameras["cam01"].path.name == "VIDEO.MP4"
+
+
 def test_cameras_on_one_side_of_the_calibration_only_are_dropped(raw):
     path = raw / "calibration.json"
     table = json.loads(path.read_text())

@@ -286,4 +286,5 @@ def test_names_come_from_folders_or_files():
     assert names_from_files(["cam00/0.jpg", "cam01/0.jpg"]) == ["cam00", "cam01"]
     assert names_from_files(["a.jpg", "b.jpg"]) == ["a", "b"]
     assert names_from_files(["images/a b.jpg", "images/c.jpg"]) == ["a_b", "c"]
+    assert names_from_files(["cam.1+.jpg", "cam.2.jpg"]) == ["cam_1", "cam_2"]
     assert names_from_files(["x/a.jpg", "x/b.jpg", "y/a.jpg"]) == ["x_a", "x_b", "y_a"]
