@@ -33,6 +33,10 @@ ON_ITS_SIDE = 0.7
 PARALLEL = 3e-4
 # A rig whose cameras are closer to the head or farther from it than this is not in metres.
 NEAR_M, FAR_M = 0.1, 10.0
+# By these shares of their distance axes miss the point nearest to all of them: rigs that were read
+# right or wrong.
+MEETING, SCATTERED = 0.1, 0.3
+UNKNOWN = "is world_to_camera inverted, or are its axes not OpenCV's (x right, y down, z ahead)?"
 
 
 def meeting_point(cameras: Mapping[str, Camera]) -> np.ndarray | None:
@@ -74,12 +78,9 @@ def check_meeting(cameras: Mapping[str, Camera], where: str) -> None:
                 f"{where}: the pose of {name} is not a rotation and a translation; expected finite"
                 " numbers and det 1: calibrate again"
             )
-    problem = _describe_behind(depths_behind(cameras))
+    problem, remedy = _misreading(cameras)
     if problem:
-        raise CalibrationError(
-            f"{where}: {problem}; "
-            "is world_to_camera inverted, or are its axes not OpenCV's (x right, y down, z ahead)?"
-        )
+        raise CalibrationError(f"{where}: {problem}; {remedy or UNKNOWN}")
 
 
 def _describe_behind(depths: Mapping[str, float]) -> str:
@@ -106,11 +107,11 @@ class RigVerdict:
 
 def judge(cameras: Mapping[str, Camera]) -> RigVerdict:
     """Judge a rig of at least one camera."""
-    problem = _describe_behind(depths_behind(cameras))
+    problem, remedy = _misreading(cameras)
     point = meeting_point(cameras)
     if point is None:
         words = ("the axes are parallel",) if len(cameras) > 1 else ()
-        return RigVerdict(len(cameras), None, None, None, problem, "", words)
+        return RigVerdict(len(cameras), None, None, None, problem, remedy, words)
     gaps = {name: point - camera.center for name, camera in cameras.items()}
     distance = float(np.median([np.linalg.norm(gap) for gap in gaps.values()]))
     axes = {name: camera.cam_from_world[2, :3] for name, camera in cameras.items()}
@@ -118,7 +119,8 @@ def judge(cameras: Mapping[str, Camera]) -> RigVerdict:
     warnings = []
     if not NEAR_M < distance < FAR_M:
         warnings.append(
-            f"cameras are {distance:.3g} m from the point they look at: are the units metres?"
+            f"cameras are {distance:.3g} m from the point they look at: are the calibration's or"
+            " board's lengths in metres?"
         )
     stray = [name for name, miss in misses.items() if miss > 0.35 * distance]
     if stray:
@@ -135,26 +137,52 @@ def judge(cameras: Mapping[str, Camera]) -> RigVerdict:
         distance_m=distance,
         miss_mm=1e3 * float(np.median(list(misses.values()))),
         problem=problem,
-        remedy=_remedy(cameras) if problem else "",
+        remedy=remedy,
         warnings=tuple(warnings),
     )
 
 
-def _remedy(cameras: Mapping[str, Camera]) -> str:
-    """Return how to convert the matrices so that they pass; "" if no other convention does."""
+def _misreading(cameras: Mapping[str, Camera]) -> tuple[str, str]:
+    """Return what is wrong with a rig, and the convention that explains it; "" where unknown.
+
+    Several conventions may put the common point in front of all cameras; the right one is that in
+    which their axes meet best.
+    """
+    problem = _describe_behind(depths_behind(cameras))
+    spread = _scatter(cameras)
+    if not problem and not spread > SCATTERED:
+        return "", ""
     readings = {
         "the matrices are camera to world: invert them": lambda T: np.linalg.inv(T),
         "the axes are OpenGL's: flip y and z": lambda T: FLIP_YZ @ T,
         "the matrices are camera to world with OpenGL axes": lambda T: np.linalg.inv(T @ FLIP_YZ),
     }
+    found = {}
     for words, read in readings.items():
         other = {
             name: replace(camera, cam_from_world=read(camera.cam_from_world))
             for name, camera in cameras.items()
         }
         if meeting_point(other) is not None and not depths_behind(other):
-            return words
-    return ""
+            found[words] = _scatter(other)
+    best = min(found, key=lambda words: found[words], default="")
+    if not problem and found.get(best, np.inf) < MEETING:
+        problem = (
+            "the cameras look at no common point: their axes miss the nearest one by"
+            f" {spread:.0%} of their distance"
+        )
+    return problem, best if problem else ""
+
+
+def _scatter(cameras: Mapping[str, Camera]) -> float:
+    """Return by which share of their distance axes miss their nearest point; 0 if parallel."""
+    point = meeting_point(cameras)
+    if point is None:
+        return 0.0
+    gaps = [point - camera.center for camera in cameras.values()]
+    axes = [camera.cam_from_world[2, :3] for camera in cameras.values()]
+    misses = [np.linalg.norm(g - a * (a @ g)) for g, a in zip(gaps, axes, strict=True)]
+    return float(np.median(misses) / np.median(np.linalg.norm(gaps, axis=1)))
 
 
 def canonical_from_rig(

@@ -58,6 +58,13 @@ def run_import(args: argparse.Namespace) -> int:
     """Write the cameras and say what was found; exit code 1 when they do not fit together."""
     cameras = _read(args)
     verdict = judge(cameras)
+    if args.out.is_dir():
+        raise ConfigError(f"{args.out} is a folder, expected a file such as calibration.json")
+    if args.out.exists() and args.out.samefile(args.source):
+        raise ConfigError(
+            f"{args.out} is both SOURCE and OUT, and a second import would scale it again; write"
+            " to another file"
+        )
     if args.out.exists() and not args.overwrite:
         try:
             same = camera_rows(read_cameras(args.out)) == camera_rows(cameras)

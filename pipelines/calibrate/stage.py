@@ -24,7 +24,7 @@ from express50.files.atomic import write_json
 from express50.files.calibration import read_cameras, write_cameras
 from express50.files.images import write_image
 from express50.geometry.cameras import Camera, pinhole, unproject
-from express50.rigs.world_frame import check_meeting, meeting_point
+from express50.rigs.world_frame import check_meeting, judge, meeting_point
 from pipelines.calibrate.board import BoardCorners, board_from_table, board_points, read_corners
 from pipelines.calibrate.board_rig import BoardSolution, solve_rig
 from pipelines.calibrate.colour_gains import ColourGains, WhiteCollector
@@ -78,6 +78,7 @@ def run(dataset: Dataset, item: str, config: CalibrateConfig, out: Path) -> Resu
         rig = _from_footage(index, config)
     check = None
     if rig.source != "footage":  # there the same footage would judge itself
+        rig = replace(rig, warnings=(*rig.warnings, *_odd_rig(rig.cameras)))
         check = _check_footage(index, rig.cameras, config.check_frame_sets)
     return _write(rig, check, out)
 
@@ -122,6 +123,12 @@ def _write(rig: CalibratedRig, check: FootageCheck | None, out: Path) -> Result:
         **figures,
     }
     return Result(metrics, rig.dropped, (*rig.warnings, *_notes(moved)), rig.expected)
+
+
+def _odd_rig(cameras: Mapping[str, Camera]) -> tuple[Note, ...]:
+    """Warn of a rig that is not in metres, or of cameras that look elsewhere."""
+    words = "; ".join(judge(cameras).warnings)
+    return (Note("cameras", words),) if words else ()
 
 
 def _rounded(value: float | None, digits: int) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,9 @@ import pytest
 from express50.errors import CalibrationError
 from express50.files.calibration import read_cameras, write_cameras
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
+from express50.rigs.camera_builder import in_metres
 from express50.rigs.world_frame import canonical_from_rig, meeting_point, move_cameras
+from pipelines import calibrate
 from pipelines.calibrate.board import (
     BoardCorners,
     board_from_table,
@@ -32,6 +35,8 @@ from tests.pipelines.board_rigs import (
     rig_errors,
     sizes_of,
 )
+from tests.stages import ingest_captures, run_here
+from tests.synth import make_capture
 
 
 def solve(rig, observations: BoardCorners, model: str = "auto"):
@@ -283,6 +288,17 @@ def test_inverted_given_cameras_are_refused() -> None:
     for wrong in (inverted, turned):
         with pytest.raises(CalibrationError, match="lies behind"):
             check_given(wrong, sizes_of(wrong), "calibration.json")
+
+
+def test_given_cameras_in_millimetres_are_warned_of(tmp_path) -> None:
+    rig = make_capture(tmp_path / "S001")
+    write_cameras(tmp_path / "S001" / "calibration.json", in_metres(rig, 1000.0))
+    dataset = ingest_captures(tmp_path / "data", tmp_path / "S001")
+    assert run_here(calibrate.STAGE, dataset, check_frame_sets=0).ok
+    (row,) = json.loads(dataset.cameras_file("S001").with_name("metrics.json").read_text())[
+        "warnings"
+    ]
+    assert row["what"] == "cameras" and "in metres?" in row["why"]
 
 
 def test_a_malformed_calibration_file_is_refused(tmp_path) -> None:

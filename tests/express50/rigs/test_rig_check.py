@@ -9,8 +9,11 @@ import pytest
 from express50.__main__ import main
 from express50.files.calibration import read_cameras, write_cameras
 from express50.geometry.conventions import FLIP_YZ
+from express50.geometry.transforms import look_at
 from express50.rigs.world_frame import judge
 from tests.express50.rigs.test_read import make_rig, write_transforms
+
+UP = np.array([0, 1.0, 0])
 
 
 def changed(rig, change):
@@ -34,6 +37,31 @@ def test_a_good_rig_has_no_problem():
 )
 def test_misread_matrices_are_named(change, words):
     verdict = judge(changed(make_rig(), change))
+    assert verdict.problem and words in verdict.remedy
+
+
+def rig_around_the_origin():
+    rig = make_rig()
+    places = zip(list(rig), (-0.9, -0.2, 0.3, 1.2), (0.1, -0.1, 0.2, 0.0), strict=True)
+    for camera, angle, lift in places:
+        eye = 1.1 * np.array([np.sin(angle), lift, np.cos(angle)])
+        rig[camera] = replace(rig[camera], cam_from_world=look_at(eye, np.zeros(3), UP))
+    return rig
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda T: np.linalg.inv(T), "camera to world: invert"),
+        (lambda T: FLIP_YZ @ T, "OpenGL's: flip"),
+        (lambda T: np.linalg.inv(T) @ FLIP_YZ, "camera to world with OpenGL"),
+    ],
+)
+def test_misread_matrices_of_a_rig_around_the_origin_are_named(change, words):
+    """Inverted, its common point lies in front of all cameras, but the axes do not meet there."""
+    rig = rig_around_the_origin()
+    assert judge(rig).problem == ""
+    verdict = judge(changed(rig, change))
     assert verdict.problem and words in verdict.remedy
 
 
@@ -71,6 +99,8 @@ def test_import_writes_a_calibration_that_is_read_again(tmp_path, capsys):
     assert "--overwrite" in capsys.readouterr().err
     assert main([*again, "--overwrite"]) == 0
     capsys.readouterr()
+    assert main(["cameras", "import", str(out), str(out), "--scale", "2", "--overwrite"]) == 2
+    assert "both SOURCE and OUT" in capsys.readouterr().err
     assert main(["cameras", "check", str(out), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["format"] == "express50"
 
