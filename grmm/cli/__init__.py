@@ -62,224 +62,176 @@ def at_least(low: int, high: int = 1 << 20) -> Callable[[str], int]:
 def finite(text: str) -> float:
     """Parse a number that is neither NaN nor infinite."""
     try:
-        value = float(text)
+        number = float(text)
     except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
+        number = math.nan
+    if not math.isfinite(number):
         raise argparse.ArgumentTypeError(f"{text!r}, expected a finite number")
-    return value
+    return number
 
 
-FLAG: dict[str, Any] = {"action": "store_true"}
+def value(metavar: str, words: str, **settings: Any) -> dict[str, Any]:
+    """Describe an argument with a value: its name in the help, and what it is."""
+    return {"metavar": metavar, "help": words} | settings
+
+
+def flag(words: str) -> dict[str, Any]:
+    """Describe an argument that is either given or not."""
+    return {"action": "store_true", "help": words}
+
+
 REPEATED: dict[str, Any] = {"action": "append", "default": []}
 OPTIONS: dict[str, dict[str, Any]] = {
     # Positional
-    "checkpoint": {
-        "type": Path, "metavar": "CHECKPOINT",
-        "help": "checkpoint.pt of 'grmm train' or 'grmm fit'",
-    },
-    "renders": {
-        "type": Path, "metavar": "PICTURES",
-        "help": "folder of SUBJECT_EXPRESSION_CAMERA.png, in the samples' size",
-    },
-    "shards": {"type": Path, "metavar": "SHARDS", "help": "folder of shards (DATASET/pack/shards)"},
-    "out": {
-        "type": Path, "metavar": "OUT", "help": "folder for evaluation.csv and evaluation.json",
-    },
-    "table": {
-        "nargs": "*", "metavar": "TABLE", "help": f"{', '.join(TABLES)} (default: all)",
-    },
+    "checkpoint": value("CHECKPOINT", "checkpoint.pt of 'grmm train' or 'grmm fit'", type=Path),
+    "renders": value(
+        "PICTURES", "folder of SUBJECT_EXPRESSION_CAMERA.png, in the samples' size", type=Path
+    ),
+    "shards": value("SHARDS", "folder of shards (DATASET/pack/shards)", type=Path),
+    "out": value("OUT", "folder for evaluation.csv and evaluation.json", type=Path),
+    "table": value("TABLE", f"{', '.join(TABLES)} (default: all)", nargs="*"),
     # Training
-    "--preset": {
-        "default": "paper",
-        "metavar": "PRESET",
-        "help": f"{', '.join(PRESETS)}, or {commands.AUTO}, which chooses one for the machine and"
+    "--preset": value(
+        "PRESET",
+        f"{', '.join(PRESETS)}, or {commands.AUTO}, which chooses one for the machine and"
         " the --budget (default: %(default)s)",
-    },
-    "--config": {
-        "type": Path, "metavar": "FILE", "help": "TOML file of settings, one table per part",
-    },
-    "--set": REPEATED | {
-        "metavar": "TABLE.KEY=VALUE",
-        "help": "change one setting, such as train.lr=1e-3; may be repeated",
-    },
-    "--also": REPEATED | {
-        "type": Path, "metavar": "SHARDS", "help": "another folder of shards; may be repeated",
-    },
-    "--budget": {"type": parse_seconds, "dest": "seconds", "metavar": "TIME",
-                 "help": "stop after this time: 60s, 4m, 2h"},
-    "--holdout-cameras": {
-        "default": "", "metavar": "ID,...", "help": "cameras to hold out for testing: cam02,cam05",
-    },
-    "--holdout-expressions": {
-        "default": "", "metavar": "SUBJECT/EXPRESSION,...",
-        "help": "expressions to hold out for testing: S002/smile",
-    },
-    "--paper-diff": FLAG | {"help": "print the differences from the paper instead"},
-    "--overwrite": FLAG | {"help": "start over even if OUT has a checkpoint"},
+        default="paper",
+    ),
+    "--config": value("FILE", "TOML file of settings, one table per part", type=Path),
+    "--set": value(
+        "TABLE.KEY=VALUE", "change one setting, such as train.lr=1e-3; may be repeated", **REPEATED
+    ),
+    "--also": value("SHARDS", "another folder of shards; may be repeated", type=Path, **REPEATED),
+    "--budget": value(
+        "TIME", "stop after this time: 60s, 4m, 2h", type=parse_seconds, dest="seconds"
+    ),
+    "--holdout-cameras": value(
+        "ID,...", "cameras to hold out for testing: cam02,cam05", default=""
+    ),
+    "--holdout-expressions": value(
+        "SUBJECT/EXPRESSION,...", "expressions to hold out for testing: S002/smile", default=""
+    ),
+    "--paper-diff": flag("print the differences from the paper instead"),
+    "--overwrite": flag("start over even if OUT has a checkpoint"),
     # Measuring
-    "--alexnet": {
-        "default": "", "metavar": "FILE", "help": "torchvision's alexnet state dict, for LPIPS",
-    },
-    "--inception": {
-        "default": "", "metavar": "FILE", "help": "Inception as TorchScript, for FID",
-    },
-    "--subjects": {
-        "default": "*", "metavar": "ID,...", "help": "only these, ids or patterns: S001,S002",
-    },
-    "--expressions": {
-        "default": "*", "metavar": "ID,...", "help": "only these, ids or patterns: smile,jaw*",
-    },
-    "--cameras": {
-        "default": "*", "metavar": "ID,...", "help": "only these, ids or patterns: cam02,cam05",
-    },
-    "--images": {
-        "type": at_least(0), "default": 0, "metavar": "N",
-        "help": "measure at most this many images, evenly spread (default: all)",
-    },
-    "--heldout": FLAG | {"help": "leave out samples that training saw"},
-    "--save": {
-        "type": Path, "metavar": "FOLDER",
-        "help": "also write the pictures, as 'grmm score' reads them",
-    },
-    "--fit-subjects": {
-        "default": "", "metavar": "ID,...",
-        "help": "people to fit (default: everyone that training did not see)",
-    },
-    "--fit-cameras": {
-        "default": "", "metavar": "ID,...",
-        "help": "fit people that training did not see from these cameras",
-    },
-    "--fit-expression": {
-        "default": "neutral", "metavar": "ID",
-        "help": "fit them from this expression (default: %(default)s)",
-    },
-    "--fit-budget": {"type": parse_seconds, "metavar": "TIME", "help": "time per fit: 60s, 5m"},
-    "--background": {
-        "type": finite, "default": 0.0, "metavar": "GREY",
-        "help": "grey behind the pictures, 0 to 1 (default: 0)",
-    },
-    "--partial": FLAG | {"help": "score only the pictures that exist"},
-    "--seeds": {
-        "type": at_least(1), "default": 1, "metavar": "N",
-        "help": "train each row this many times (default: 1)",
-    },
-    "--test": REPEATED | {
-        "type": Path, "metavar": "SHARDS",
-        "help": "shards whose people are fitted, not trained on; may be repeated",
-    },
-    "--rows": {
-        "default": "", "metavar": "ROW,...",
-        "help": "rows of the table, such as full,no_residuals (default: all)",
-    },
-    "--json": FLAG | {"help": "print as JSON"},
+    "--alexnet": value("FILE", "torchvision's alexnet state dict, for LPIPS", default=""),
+    "--inception": value("FILE", "Inception as TorchScript, for FID", default=""),
+    "--subjects": value("ID,...", "only these, ids or patterns: S001,S002", default="*"),
+    "--expressions": value("ID,...", "only these, ids or patterns: smile,jaw*", default="*"),
+    "--cameras": value("ID,...", "only these, ids or patterns: cam02,cam05", default="*"),
+    "--images": value(
+        "N",
+        "measure at most this many images, evenly spread (default: all)",
+        type=at_least(0),
+        default=0,
+    ),
+    "--heldout": flag("leave out samples that training saw"),
+    "--save": value("FOLDER", "also write the pictures, as 'grmm score' reads them", type=Path),
+    "--fit-subjects": value(
+        "ID,...", "people to fit (default: everyone that training did not see)", default=""
+    ),
+    "--fit-cameras": value(
+        "ID,...", "fit people that training did not see from these cameras", default=""
+    ),
+    "--fit-expression": value(
+        "ID", "fit them from this expression (default: %(default)s)", default="neutral"
+    ),
+    "--fit-budget": value("TIME", "time per fit: 60s, 5m", type=parse_seconds),
+    "--background": value(
+        "GREY", "grey behind the pictures, 0 to 1 (default: 0)", type=finite, default=0.0
+    ),
+    "--partial": flag("score only the pictures that exist"),
+    "--seeds": value(
+        "N", "train each row this many times (default: 1)", type=at_least(1), default=1
+    ),
+    "--test": value(
+        "SHARDS",
+        "shards whose people are fitted, not trained on; may be repeated",
+        type=Path,
+        **REPEATED,
+    ),
+    "--rows": value(
+        "ROW,...", "rows of the table, such as full,no_residuals (default: all)", default=""
+    ),
+    "--json": flag("print as JSON"),
     # The head to draw and the view of it
-    "--subject": {
-        "metavar": "ID", "help": "person to show (default: the first of the checkpoint)",
-    },
-    "--expression": {
-        "metavar": "ID", "help": "expression to show (default: neutral, else the first)",
-    },
-    "--expression-of": {
-        "metavar": "SUBJECT/EXPRESSION",
-        "help": "show another person's expression, from training",
-    },
-    "--z-id-of": {
-        "metavar": "SUBJECT", "help": "take the residual identity code alone from this person",
-    },
-    "--z-exp-of": {
-        "metavar": "EXPRESSION", "help": "take the residual code alone from this expression",
-    },
-    "--control": REPEATED | {
-        "metavar": "NAME=NUMBERS",
-        "help": "change a parameter: jaw=0.3,0,0 (radians), neck.1=0.2, eyes=0,0.3,0,"
+    "--subject": value("ID", "person to show (default: the first of the checkpoint)"),
+    "--expression": value("ID", "expression to show (default: neutral, else the first)"),
+    "--expression-of": value(
+        "SUBJECT/EXPRESSION", "show another person's expression, from training"
+    ),
+    "--z-id-of": value("SUBJECT", "take the residual identity code alone from this person"),
+    "--z-exp-of": value("EXPRESSION", "take the residual code alone from this expression"),
+    "--control": value(
+        "NAME=NUMBERS",
+        "change a parameter: jaw=0.3,0,0 (radians), neck.1=0.2, eyes=0,0.3,0,"
         " expression.NAME=1, shape.0=2, z_exp=0 (a factor on the code), z_id.0=1.5 (standard"
         " deviations along a principal direction); may be repeated",
-    },
-    "--camera": {"metavar": "ID", "help": "camera of the checkpoint (default: a frontal one)"},
-    "--size": {
-        "type": at_least(0, 8192), "default": 0, "metavar": "N",
-        "help": "longer side, pixels (default: as trained)",
-    },
-    "--yaw": {
-        "type": finite, "default": 0.0, "metavar": "DEG",
-        "help": "move the camera around the head, degrees",
-    },
-    "--pitch": {"type": finite, "default": 0.0, "metavar": "DEG", "help": "move it up, degrees"},
-    "--turntable": FLAG | {"help": "write turntable.mp4"},
-    "--degrees": {
-        "type": finite, "default": 360.0, "metavar": "DEG",
-        "help": "angle that the turntable covers (default: 360)",
-    },
-    "--frames": {
-        "type": at_least(1), "default": 72, "metavar": "N",
-        "help": "number of frames of a video (default: %(default)s)",
-    },
-    "--to": {
-        "metavar": "SUBJECT/EXPRESSION", "help": "write interpolation.mp4, which ends there",
-    },
-    "--drive": {
-        "type": Path, "metavar": "SEQUENCE.NPZ",
-        "help": "write driven.mp4: the head moves as in these tracked clips",
-    },
-    "--drive-cue": {"metavar": "ID", "help": "use only this clip of --drive"},
-    "--views": FLAG | {"help": "write views.jpg: novel views"},
-    "--controls": FLAG | {"help": "write controls.jpg: one control changed at a time"},
-    "--samples": {
-        "type": at_least(0), "default": 0, "metavar": "N",
-        "help": "write samples.jpg with this many new heads",
-    },
-    "--spread": {
-        "type": finite, "default": 1.0, "metavar": "FACTOR",
-        "help": "spread of the samples (default: 1, as in training)",
-    },
-    "--seed": {
-        "type": at_least(0), "default": 0, "metavar": "N", "help": "random seed (default: 0)",
-    },
-    "--columns": {
-        "type": at_least(1), "default": 8, "metavar": "N",
-        "help": "number of expressions in grid.jpg (default: %(default)s)",
-    },
+        **REPEATED,
+    ),
+    "--camera": value("ID", "camera of the checkpoint (default: a frontal one)"),
+    "--size": value(
+        "N", "longer side, pixels (default: as trained)", type=at_least(0, 8192), default=0
+    ),
+    "--yaw": value("DEG", "move the camera around the head, degrees", type=finite, default=0.0),
+    "--pitch": value("DEG", "move it up, degrees", type=finite, default=0.0),
+    "--turntable": flag("write turntable.mp4"),
+    "--degrees": value(
+        "DEG", "angle that the turntable covers (default: 360)", type=finite, default=360.0
+    ),
+    "--frames": value(
+        "N", "number of frames of a video (default: %(default)s)", type=at_least(1), default=72
+    ),
+    "--to": value("SUBJECT/EXPRESSION", "write interpolation.mp4, which ends there"),
+    "--drive": value(
+        "SEQUENCE.NPZ", "write driven.mp4: the head moves as in these tracked clips", type=Path
+    ),
+    "--drive-cue": value("ID", "use only this clip of --drive"),
+    "--views": flag("write views.jpg: novel views"),
+    "--controls": flag("write controls.jpg: one control changed at a time"),
+    "--samples": value(
+        "N", "write samples.jpg with this many new heads", type=at_least(0), default=0
+    ),
+    "--spread": value(
+        "FACTOR", "spread of the samples (default: 1, as in training)", type=finite, default=1.0
+    ),
+    "--seed": value("N", "random seed (default: 0)", type=at_least(0), default=0),
+    "--columns": value(
+        "N", "number of expressions in grid.jpg (default: %(default)s)", type=at_least(1), default=8
+    ),
     "--format": {"choices": commands.FORMATS, "help": "format (default: by FILE's name)"},
-    "--shards": {
-        "type": Path, "metavar": "SHARDS", "help": "with .html: measure its loss on this footage",
-    },
-    "--still": {
-        "type": at_least(16), "default": 512, "metavar": "N",
-        "help": "height of still pictures, pixels (default: %(default)s)",
-    },
-    "--host": {
-        "default": "127.0.0.1", "metavar": "ADDRESS",
-        "help": "address to listen on (default: this machine alone)",
-    },
-    "--port": {
-        "type": at_least(1, 65535), "default": 8080, "metavar": "N",
-        "help": "port to listen on (default: %(default)s)",
-    },
+    "--shards": value("SHARDS", "with .html: measure its loss on this footage", type=Path),
+    "--still": value(
+        "N",
+        "height of still pictures, pixels (default: %(default)s)",
+        type=at_least(16),
+        default=512,
+    ),
+    "--host": value(
+        "ADDRESS", "address to listen on (default: this machine alone)", default="127.0.0.1"
+    ),
+    "--port": value(
+        "N", "port to listen on (default: %(default)s)", type=at_least(1, 65535), default=8080
+    ),
     # Studies
-    "--reference": {
-        "type": Path, "required": True, "metavar": "FOLDER", "help": "true pictures",
-    },
-    "--ours": {
-        "type": Path, "required": True, "metavar": "FOLDER",
-        "help": "one method's pictures, with the same names",
-    },
-    "--theirs": {
-        "type": Path, "required": True, "metavar": "FOLDER", "help": "the other method's pictures",
-    },
-    "--names": {
-        "nargs": 2, "default": ["Ours", "Theirs"], "metavar": "NAME",
-        "help": "names of the two methods (default: Ours Theirs)",
-    },
-    "--examples": {
-        "type": at_least(1), "default": 15, "metavar": "N",
-        "help": "examples per participant (default: %(default)s)",
-    },
-    "--participants": {
-        "type": at_least(1), "default": 20, "metavar": "N",
-        "help": "number of participants (default: %(default)s)",
-    },
-}  # fmt: skip
+    "--reference": value("FOLDER", "true pictures", type=Path, required=True),
+    "--ours": value(
+        "FOLDER", "one method's pictures, with the same names", type=Path, required=True
+    ),
+    "--theirs": value("FOLDER", "the other method's pictures", type=Path, required=True),
+    "--names": value(
+        "NAME",
+        "names of the two methods (default: Ours Theirs)",
+        nargs=2,
+        default=["Ours", "Theirs"],
+    ),
+    "--examples": value(
+        "N", "examples per participant (default: %(default)s)", type=at_least(1), default=15
+    ),
+    "--participants": value(
+        "N", "number of participants (default: %(default)s)", type=at_least(1), default=20
+    ),
+}
 ALIASES = {"--budget": ["--seconds"]}
 
 METRICS = "--alexnet --inception"
