@@ -16,7 +16,7 @@ import io
 import json
 import math
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +32,7 @@ from express50.head.model import HeadModel
 from grmm.checkpoint import Checkpoint
 from grmm.config import SCALE_RANGE_MM
 from grmm.edit import HeadCodes, controlled
+from grmm.head_crop import neck_cut
 from grmm.model import PinholeView
 
 SIDED = (
@@ -92,10 +93,12 @@ def write_export(
     """Write a head in a format; returns a description of what was written.
 
     ``ply`` holds Gaussians in the 3DGS layout, ``spz`` in Niantic's, ``splats`` as GLB with
-    KHR_gaussian_splatting; ``glb`` the textured mesh, ``arkit`` with morph targets; ``npz`` the
-    arrays of `GaussianCloud`, mesh, codes and parameters.
+    KHR_gaussian_splatting; these three cut the neck. ``glb`` is the textured mesh, ``arkit`` has
+    morph targets; ``npz`` holds all Gaussians' arrays, mesh, codes and parameters.
     """
     gaussians, vertices, texture = decoded(loaded, head, view)
+    if form in ("ply", "spz", "splats"):
+        gaussians = with_neck_cut(loaded.head, vertices, gaussians)
     if form == "ply":
         content = ply_bytes(gaussians)
     elif form in ("spz", "splats"):
@@ -108,6 +111,14 @@ def write_export(
         return f"mesh of {len(vertices)} vertices, texture {len(texture)} px"
     write_bytes(path, content)
     return f"{len(gaussians.means)} Gaussians"
+
+
+def with_neck_cut(head: HeadModel, vertices: np.ndarray, gaussians: GaussianCloud) -> GaussianCloud:
+    """Apply `neck_cut` to the Gaussians of a deformed mesh (V, 3)."""
+    arrays = (vertices, gaussians.means, gaussians.quats, gaussians.scales)
+    share = neck_cut(head, *map(torch.from_numpy, arrays)).numpy()
+    smaller = replace(gaussians, scales=gaussians.scales * share[:, None])
+    return GaussianCloud(**{name: array[share > 0] for name, array in vars(smaller).items()})
 
 
 @torch.no_grad()

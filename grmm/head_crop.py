@@ -1,4 +1,4 @@
-"""Find the window around the head, draw in it, and find the neck that a torso hides.
+"""Find the window around the head, draw in it, and find the neck that a torso hides or cuts.
 
 Training and drawing are limited to the window; outside of it nothing is rasterised or refined.
 """
@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from express50.geometry.conventions import corner_to_cell
+from express50.geometry.transforms_torch import quat_to_matrix
 from express50.head.model import HeadModel
 from grmm.config import SCALE_RANGE_MM
 from grmm.model import GRMM, Gaussians, PinholeView, Rendering
@@ -23,6 +24,9 @@ CROP_MARGIN_PX = 16  # of the window that training and drawing take
 WINDOW_STEP = 32  # pixels; windows have sides of whole steps
 NEAR_VERTEX_M = 1e-3
 GROW_PX, FAR_PX = 2, 1e5  # of a silhouette's blurred border; off the picture
+CUT_M = 0.02  # above the neck's open end, which collars hide in most footage
+CUT_SIGMAS = 2.0  # deviations by which a Gaussian reaches down
+CUT_LEAST = 0.5  # share of its size under which a Gaussian at the cut is left out
 
 
 def draw_window(
@@ -148,6 +152,39 @@ def behind_torso(
         cv2.fillConvexPoly(found, corners, 1)
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     return torso & (cv2.dilate(found, cross, iterations=GROW_PX) > 0)
+
+
+def neck_cut(
+    head: HeadModel, vertices: Tensor, means: Tensor, quats: Tensor, scales: Tensor
+) -> Tensor:
+    """Return the share (N,) of its size that each Gaussian keeps at a straight cut of the neck.
+
+    Below it, training hardly sees the neck, and what it left there ends in a fringe: the share is
+    0. Gaussians that reach across are made smaller. The cut is parallel to the plane of the neck's
+    open end, the head model's region ``boundary``; without it all shares are 1. ``vertices`` (V, 3)
+    of the deformed mesh, ``means`` (N, 3) and standard deviations ``scales`` (N, 3) are in metres,
+    ``quats`` (N, 4) wxyz.
+    """
+    end = head.regions.get("boundary")
+    if end is None or int(end.sum()) < 3:
+        return torch.ones_like(means[:, 0])
+    loop = vertices[end].double()
+    centre = loop.mean(0)
+    up = torch.linalg.svd(loop - centre, full_matrices=False)[2][2]
+    up = up * torch.sign(up @ (vertices.double().mean(0) - centre))
+    along = torch.einsum("nij,i->nj", quat_to_matrix(quats.double()), up) * scales
+    height = (means.double() - centre) @ up - CUT_M
+    share = (height / (CUT_SIGMAS * along.norm(dim=1)).clamp_min(1e-9)).clamp(0, 1)
+    return torch.where(share < CUT_LEAST, 0.0, share).to(means.dtype)
+
+
+def without_neck_end(head: HeadModel, vertices: Tensor, gaussians: Gaussians) -> Gaussians:
+    """Apply `neck_cut` to a tracked mesh's (V, 3) Gaussians; those left out turn transparent."""
+    scales = gaussians.scales_mm.clamp(*SCALE_RANGE_MM)
+    deformed = vertices + gaussians.displacement
+    share = neck_cut(head, deformed, gaussians.means, gaussians.quats, 1e-3 * scales)
+    opacities = torch.where(share > 0, gaussians.opacities, 0.0)
+    return replace(gaussians, scales_mm=scales * share[:, None], opacities=opacities)
 
 
 def crop_view(view: PinholeView, rows: slice, columns: slice) -> PinholeView:

@@ -29,7 +29,7 @@ from grmm.edit import (
     with_expression,
 )
 from grmm.evaluate import Render
-from grmm.head_crop import draw_window
+from grmm.head_crop import draw_window, without_neck_end
 from grmm.model import PinholeView
 from grmm.networks import normalise_depth
 
@@ -131,9 +131,10 @@ def picture(loaded: Checkpoint, head: HeadCodes, view: PinholeView) -> np.ndarra
 def draw_views(
     loaded: Checkpoint, head: HeadCodes, views: Iterable[PinholeView]
 ) -> Iterable[np.ndarray]:
-    """Yield a head from each view; its geometry is decoded once for all of them."""
+    """Yield a head from each view, its neck cut; its geometry is decoded once for all of them."""
     model, state = loaded.model, head.state(loaded)
     gaussians = model.geometry(head.z_id, head.z_exp, state)
+    gaussians = without_neck_end(loaded.head, state.vertices, gaussians)
     for view in views:
         colours = model.appearance(head.z_id, state, view)
         background = loaded.config.data.background

@@ -29,7 +29,7 @@ from express50.geometry.transforms import invert_transform, make_transform, quat
 from express50.local_server import RequestGuard
 from grmm.checkpoint import Checkpoint
 from grmm.edit import POSES, HeadCodes, between, controlled, principal_directions, trained_head
-from grmm.head_crop import draw_window
+from grmm.head_crop import draw_window, without_neck_end
 from grmm.model import Maps, PinholeView
 from grmm.render import frontal, strongest_coefficients, to_uint8
 
@@ -85,7 +85,8 @@ class Preview:
         if not same_codes:
             known = self._maps.opacities if same_person and self._maps is not None else None
             self._maps = model.decode(head.z_id, head.z_exp, self._state, known)
-        self._gaussians = model.geometry(head.z_id, head.z_exp, self._state, self._maps)
+        gaussians = model.geometry(head.z_id, head.z_exp, self._state, self._maps)
+        self._gaussians = without_neck_end(self.loaded.head, self._state.vertices, gaussians)
         self._head = head
 
     def _needs_colours(self, view: PinholeView, moving: bool) -> bool:

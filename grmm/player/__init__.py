@@ -39,6 +39,7 @@ from grmm.player.distillation import (
     sampled_views,
     seen_angles,
     turning_point,
+    with_neck_cut,
 )
 from grmm.render import check_clips
 
@@ -101,6 +102,8 @@ def export_player(
 ) -> PlayerReport:
     """Write the page; the loss is measured on footage of the subject in ``views``, if given.
 
+    Loss and agreement include the end of the neck, which the page leaves out.
+
     Raises:
         ConfigError: the clips were tracked with another head model.
     """
@@ -111,10 +114,12 @@ def export_player(
         coefficients = np.pad(clips.expression, ((0, 0), (0, gap)))
         frames = np.concatenate([coefficients, clips.neck, clips.jaw, clips.eyes], 1)
     rate = RIG_RATE if clips is None else clips.rate
-    content, shown = player_page(person, distil(person), subject, frames, rate)
+    avatar = distil(person)
+    content, page = player_page(person, with_neck_cut(person, avatar), subject, frames, rate)
     write_bytes(path, content)
+    shown, _, _ = stored(avatar)
     report = PlayerReport(
-        gaussians=len(shown.opacities),
+        gaussians=len(page.opacities),
         megabytes=len(content) / 1e6,
         agreement_db=_agreement(person, shown),
     )

@@ -22,7 +22,7 @@ from grmm.checkpoint import Checkpoint
 from grmm.config import SCALE_RANGE_MM
 from grmm.data import Tracked, padded
 from grmm.edit import HeadCodes, trained_head
-from grmm.head_crop import draw_window
+from grmm.head_crop import draw_window, neck_cut
 from grmm.model import PinholeView, Rendering, quat_multiply
 from grmm.networks import DISPLACEMENT_M
 from grmm.rasterize import RenderOutput, rasterize
@@ -184,6 +184,18 @@ def all_gaussians(person: Person) -> Avatar:
     """Distil a person with every Gaussian of the model."""
     poses = sampled_poses(person, POSES, torch.Generator().manual_seed(0))
     return _with_mesh_decoder(person, _exact_parts(person), poses)
+
+
+@torch.no_grad()
+def with_neck_cut(person: Person, avatar: Avatar) -> Avatar:
+    """Apply `neck_cut` in the head's own pose."""
+    loaded, head = person.loaded, person.head
+    pose = person.pose(head.tracked)
+    state = head.state(loaded)
+    moved = loaded.model.geometry(head.z_id, head.z_exp, state).displacement
+    share = neck_cut(loaded.head, state.vertices + moved, *posed(avatar, pose))
+    maps = torch.cat([avatar.maps[..., :7], avatar.maps[..., 7:] * share[:, None]], -1)
+    return replace(avatar, maps=maps).kept(share > 0)
 
 
 def sampled_poses(person: Person, count: int, generator: torch.Generator) -> list[AvatarPose]:

@@ -6,8 +6,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from express50.geometry.transforms_torch import axis_angle_to_matrix, matrix_to_quat
+from express50.head.load import load_head
 from grmm.data import HeadViews
-from grmm.head_crop import crop_view, draw_window, gaussian_window, head_window
+from grmm.head_crop import crop_view, draw_window, gaussian_window, head_window, neck_cut
 from grmm.model import GRMM
 from grmm.render import orbit
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
@@ -129,3 +131,21 @@ def test_crop_moves_the_principal_point(views):
     whole = views.item(0).view
     assert (view.width, view.height) == (35, 17)
     assert float(whole.K[0, 2] - view.K[0, 2]) == 5 and float(whole.K[1, 2] - view.K[1, 2]) == 3
+
+
+def test_gaussians_end_at_a_straight_cut_of_the_neck_whatever_the_pose():
+    head = load_head("procedural")
+    end = head.template[head.regions["boundary"]].mean(0)
+    heights = torch.tensor([-0.02, 0.015, 0.0205, 0.027, 0.06])
+    means = end + heights[:, None] * torch.tensor([0.0, 1.0, -0.0462])
+    quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(5, 4)
+    scales = torch.tensor([[0.002, 0.005, 0.001]]).expand(5, 3)
+    share = neck_cut(head, head.template, means, quats, scales)
+    assert share[:3].tolist() == [0, 0, 0] and float(share[4]) == 1
+    assert 0.6 < float(share[3]) < 0.8  # 7 of the 10 mm that two deviations reach down
+    turn = axis_angle_to_matrix(torch.tensor([[0.4, -0.8, 0.3]]))
+    moved = (points @ turn[0].T + 0.2 for points in (head.template, means))
+    again = neck_cut(head, *moved, matrix_to_quat(turn).expand(5, 4), scales)
+    torch.testing.assert_close(again, share, atol=1e-3, rtol=0)
+    bare = replace(head, regions={})
+    assert bool((neck_cut(bare, head.template, means, quats, scales) == 1).all())

@@ -35,6 +35,7 @@ from grmm.player.distillation import (
     sampled_poses,
     sampled_views,
     seen_angles,
+    with_neck_cut,
 )
 from grmm.render import orbit
 from grmm.train import train
@@ -120,6 +121,20 @@ def test_stored_arrays_lose_next_to_nothing(person, avatar):
         ours, exact = (drawn(one, pose, view).colors.permute(2, 0, 1) for one in (back, avatar))
         assert psnr_db(ours.detach(), exact.detach()) > 45
         assert psnr_db(ours.detach(), full_rendering(person, pose, view).image.detach()) > 25
+
+
+def test_the_page_leaves_the_end_of_the_neck_out(person, avatar):
+    head = person.loaded.head
+    heights = head.template[:, 1]
+    ring = (1e4 * heights).round().unique()[1]  # the one above the pole
+    boundary = (1e4 * heights).round() == ring
+    with_end = replace(head, regions=head.regions | {"boundary": boundary})
+    cut = with_neck_cut(replace(person, loaded=replace(person.loaded, head=with_end)), avatar)
+    still = AvatarPose(parameters=person.own, weights=torch.zeros(1))
+    assert 0 < len(cut.opacities) < len(avatar.opacities)
+    end = float(heights[boundary].mean())
+    assert posed(avatar, still)[0][:, 1].min() < end + 0.01 < posed(cut, still)[0][:, 1].min()
+    assert len(with_neck_cut(person, avatar).opacities) == len(avatar.opacities)
 
 
 def test_the_page_is_closed_and_names_are_escaped(person, avatar):
