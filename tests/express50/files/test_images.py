@@ -116,3 +116,12 @@ def test_distances_to_an_edge_are_the_same_wherever_a_mask_lies():
         placed = room[offset : offset + mask.size].reshape(mask.shape)
         placed[:] = mask
         assert images.edge_distance(placed).tobytes() == expected.tobytes()
+
+
+def test_a_box_holds_the_marked_pixels_and_a_margin_within_the_image():
+    mask = np.zeros((6, 9), bool)
+    mask[1:3, 6] = True
+    assert images.box_about(mask) == np.s_[1:3, 6:7]
+    assert images.box_about(mask, 2) == np.s_[0:5, 4:9]
+    assert mask[images.box_about(mask, 20)].shape == mask.shape
+    assert mask[images.box_about(~(mask | True))].size == 0

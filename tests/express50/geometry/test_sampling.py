@@ -6,7 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from express50.geometry.sampling import bilinear, bilinear_slope, edge_width, sh_polynomials
+from express50.geometry.sampling import (
+    bilinear,
+    bilinear_slope,
+    edge_width,
+    evenly,
+    sh_polynomials,
+)
 
 PLANE = np.fromfunction(lambda y, x: 3 * (x + 0.5) - 2 * (y + 0.5) + 7, (20, 30))
 POINTS = np.random.default_rng(0).uniform([0.5, 0.5], [29.4, 19.4], (9000, 2))
@@ -68,3 +74,11 @@ def test_blur_is_measured_in_pixels_whatever_the_noise(sigma: float) -> None:
     width = edge_width(noisy)
     assert width == pytest.approx(sigma, rel=0.35)
     assert edge_width(np.full((64, 64, 3), 90, np.uint8)) is None
+
+
+@pytest.mark.parametrize("count", [1, 2, 4, 9, 10, 30])
+def test_an_even_choice_holds_both_ends_and_nothing_twice(count):
+    chosen = evenly(range(10), count)
+    assert len(chosen) == min(count, 10) and chosen[0] == 0
+    assert count == 1 or (chosen[-1] == 9 and np.ptp(np.diff(chosen)) <= 1)
+    assert evenly([], count) == []
