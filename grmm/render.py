@@ -117,8 +117,8 @@ def camera_of(loaded: Checkpoint, name: str | None, size: int = 0) -> PinholeVie
         ConfigError: the checkpoint has no such camera.
     """
     cameras = loaded.gallery.cameras
-    check_known("the checkpoint", "camera", [name] if name else [], cameras)
-    view = cameras[name] if name else frontal(loaded)
+    check_known("the checkpoint", "camera", [] if name is None else [name], cameras)
+    view = frontal(loaded) if name is None else cameras[name]
     return resized(view, size) if size else view
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from express50.errors import ConfigError
+from express50.errors import ConfigError, UnknownNameError
 from grmm.checkpoint import load_checkpoint
 from grmm.edit import (
     between,
@@ -15,6 +15,7 @@ from grmm.edit import (
 )
 from grmm.export import decoded, write_export
 from grmm.render import (
+    camera_of,
     control_sheet,
     frontal,
     novel_views,
@@ -149,6 +150,13 @@ def test_orbit_keeps_its_distance_and_sees_from_above(loaded):
     seen = up.cam_from_head[:3, :3] @ centre + up.cam_from_head[:3, 3]
     before = view.cam_from_head[:3, :3] @ centre + view.cam_from_head[:3, 3]
     torch.testing.assert_close(seen, before)
+
+
+@pytest.mark.parametrize("name", ["cam09", ""])
+def test_a_camera_that_the_checkpoint_lacks_is_refused(loaded, name):
+    with pytest.raises(UnknownNameError, match="cam00"):
+        camera_of(loaded, name)
+    assert camera_of(loaded, None) is frontal(loaded)
 
 
 def test_pictures_of_another_size_show_the_same(loaded):
