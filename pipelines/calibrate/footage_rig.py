@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, permutations
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -54,6 +55,13 @@ NOMINAL = 2.5  # focal length, in longer sides, at which distances are first est
 INNER = slice(17, 68)  # the jaw's outline is not the same skin from every side
 BY_CHANCE = 0.025  # share of wrong points that fit a wrong pose, at most
 NEAR_DEG = 25.0  # frame sets whose relative pose is further from the mean are wrong
+MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
+TURNS, TURNED = 5, 0.75
+"""Frame sets in which two cameras must see the face for its turns to be compared, and the share of
+the disagreement as recorded that is left if a camera is mirrored. Twin, heads turning by 4 degrees:
+0.44 to 0.70 for mirrored cameras, 1.45 to 2.48 for others."""
+FacePoses: TypeAlias = dict[str, dict[int, tuple[np.ndarray, float]]]
+"""Poses cam_from_head (4, 4) and their weights, by camera and frame."""
 LONE = (
     "it sees a face, but never at the same time as the other cameras do: add a camera between it"
     " and the next, board images or calibration.json"
@@ -131,7 +139,15 @@ def solve_footage(
     guesses = {n: focals.get(n, share * max(size)) for n, size in sizes.items()}
     lens = "SIMPLE_RADIAL" if model == AUTO else model
     start = {n: as_model(start_camera(n, sizes[n], focal), lens) for n, focal in guesses.items()}
-    rig = face_rig(start, seen, head)
+    poses = face_poses(start, seen, head)
+    if turned := mirrored_by_faces(poses):
+        mirrored |= turned
+        seen = {frame: points.without(turned) for frame, points in seen.items()}
+        sizes, start, poses = (
+            {n: value for n, value in table.items() if n not in turned}
+            for table in (sizes, start, poses)
+        )
+    rig = face_rig(start, poses)
     faces = {name for points in seen.values() for name, _, _ in points.landmarks}
     if len(rig) < 2:
         raise CalibrationError(
@@ -338,16 +354,63 @@ def pose_of_face(
     return pose, float(np.sqrt(np.mean((off / sigma[INNER]) ** 2)))
 
 
-def face_rig(
+def face_poses(
     cameras: Mapping[str, Camera], seen: Mapping[int, FrameSetPoints], head: np.ndarray
-) -> dict[str, Camera]:
-    """Pose the largest group of cameras that see faces in common frame sets."""
-    poses: dict[str, dict[int, tuple[np.ndarray, float]]] = {}
+) -> FacePoses:
+    """Estimate the faces' poses in each camera that sees any."""
+    poses: FacePoses = {}
     for frame, points in seen.items():
         for name, pixels, sigma in points.landmarks:
             pose, error = pose_of_face(pixels, sigma, cameras[name], head)
             if np.isfinite(error):
                 poses.setdefault(name, {})[frame] = (pose, 1 / (1 + error**2))
+    return poses
+
+
+def mirrored_by_faces(poses: FacePoses) -> dict[str, str]:
+    """Return which cameras see heads turn the other way than others do, with the reason.
+
+    While heads turn, the rotation from one camera to another stays the same only if both or neither
+    are mirrored. Nothing is found if heads keep still, or if half of the cameras would be named.
+    """
+    found = {}
+    spreads = _face_spreads(poses)
+    for name, (recorded, turned) in spreads.items():
+        usual = np.median([spread[0] for other, spread in spreads.items() if other != name])
+        if turned < TURNED * recorded and usual < TURNED * recorded:
+            found[name] = (
+                "heads turn the other way in its pictures than in other cameras' (they disagree by"
+                f" {recorded:.1f} degrees as recorded, by {turned:.1f} if mirrored): switch"
+                " mirroring off where they are recorded, or mirror the files"
+            )
+    return found if 2 * len(found) < len(spreads) else {}
+
+
+def _face_spreads(poses: FacePoses) -> dict[str, np.ndarray]:
+    """Return by how many degrees (2,) each camera's rotation to others varies over frame sets.
+
+    The values are for its pictures as recorded and mirrored, medians over two or more cameras.
+    """
+    found: dict[str, list[np.ndarray]] = {}
+    for name, other in permutations(sorted(poses), 2):
+        shared = sorted(set(poses[name]) & set(poses[other]))
+        if len(shared) < TURNS:
+            continue
+        own, theirs = (np.stack([poses[n][frame][0] for frame in shared]) for n in (name, other))
+        ways = [own @ np.linalg.inv(theirs), MIRROR @ own @ MIRROR @ np.linalg.inv(theirs)]
+        turns = [_turns(votes, mean_transform(votes, np.ones(len(votes)))) for votes in ways]
+        found.setdefault(name, []).append(np.sqrt(np.mean(np.square(turns), axis=1)))
+    return {name: np.median(rows, axis=0) for name, rows in found.items() if len(rows) >= 2}
+
+
+def _turns(transforms: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """Return the angles (N,), degrees, between rotations of transforms (N, 4, 4) and of one."""
+    traces = np.trace(transforms[:, :3, :3] @ mean[:3, :3].T, axis1=1, axis2=2)
+    return np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
+
+
+def face_rig(cameras: Mapping[str, Camera], poses: FacePoses) -> dict[str, Camera]:
+    """Pose the largest group of cameras that see faces in common frame sets."""
     edges = {}
     for a, b in combinations(sorted(poses), 2):
         shared = sorted(set(poses[a]) & set(poses[b]))
@@ -356,8 +419,7 @@ def face_rig(
         votes = np.stack([poses[b][f][0] @ invert_transform(poses[a][f][0]) for f in shared])
         weights = np.array([poses[a][f][1] * poses[b][f][1] for f in shared])
         mean = mean_transform(votes, weights)
-        traces = np.trace(votes[:, :3, :3] @ mean[:3, :3].T, axis1=1, axis2=2)
-        near = np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1))) < NEAR_DEG
+        near = _turns(votes, mean) < NEAR_DEG
         if near.any():
             mean = mean_transform(votes[near], weights[near])
         edges[a, b] = mean, float(max(weights[near].sum(), 1e-9))

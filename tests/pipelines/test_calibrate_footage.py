@@ -24,7 +24,9 @@ from express50.rigs.camera_builder import in_metres
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.footage import has_one_lens
 from pipelines.calibrate.footage_rig import (
+    MIRROR,
     _showing_head,
+    mirrored_by_faces,
     pose_of_face,
     resect,
     solve_footage,
@@ -244,3 +246,24 @@ def test_a_camera_that_looks_away_from_the_head_is_not_placed():
     away = replace(rig["cam02"], cam_from_world=turned @ rig["cam02"].cam_from_world)
     assert set(_showing_head(rig, rig, see(rig))) == set(rig)
     assert set(_showing_head({**rig, "cam02": away}, rig, see(rig))) == set(rig) - {"cam02"}
+
+
+@pytest.mark.parametrize(("turn_rad", "mirrored", "named"), [
+    (0.05, ("cam01",), {"cam01"}),
+    (0.05, (), set()),
+    (0.05, ("cam00", "cam01"), set()),  # which half is mirrored cannot be told
+    (0.0, ("cam01",), set()),
+])  # fmt: skip
+def test_a_mirrored_camera_is_named_where_heads_turn(turn_rad, mirrored, named):
+    rng = np.random.default_rng(0)
+
+    def turned(scale):
+        return make_transform(axis_angle_to_matrix(rng.normal(size=3) * scale), np.zeros(3))
+
+    heads = [turned(turn_rad) for _ in range(6)]
+    poses = {}
+    for name, camera in face_cameras(count=4).items():
+        seen = [camera.cam_from_world @ head @ turned(0.01) for head in heads]
+        ways = [MIRROR @ pose @ MIRROR if name in mirrored else pose for pose in seen]
+        poses[name] = {frame: (pose, 1.0) for frame, pose in enumerate(ways)}
+    assert set(mirrored_by_faces(poses)) == named
