@@ -27,6 +27,7 @@ from express50.dataset.tracks import read_track
 from express50.errors import Express50Error
 from express50.files.images import contact_sheet, read_image, write_image
 from express50.geometry.cameras import Camera, pinhole, transform_camera
+from express50.geometry.transforms import transform_points
 from express50.twin.truth import Truth, align_worlds
 
 VIEWS_PER_PEAK = 2  # views measured of every peak; they walk around the rig from peak to peak
@@ -165,7 +166,7 @@ def measure_track(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
         motion = align_worlds(read_cameras_of(dataset, subject), truth.cameras(subject))
         track = read_track(path)
         for vertices, frame in zip(track.vertices, track.frames, strict=True):
-            moved = vertices @ motion[:3, :3].T + motion[:3, 3]
+            moved = transform_points(motion, vertices)
             true = truth.vertices(subject, int(frame))
             if true.shape != moved.shape:
                 raise Express50Error(

@@ -42,6 +42,7 @@ from express50.contract.config import PRESETS
 from express50.contract.layout import Dataset
 from express50.files.images import write_image
 from express50.files.text import markdown_table
+from express50.geometry.transforms import transform_points
 from express50.twin.config import TwinConfig
 from express50.twin.truth import Truth
 from pipelines import ingest
@@ -194,9 +195,7 @@ def farthest_frames(dataset: Dataset, subject: str) -> Iterator[tuple[str, int]]
     neutral = np.median(points[windows[NEUTRAL]], axis=0)
     for expression, rows in windows.items():
         moves = [similarity_2d(p[STABLE], neutral[STABLE]) for p in points[rows]]
-        moved = [
-            p @ A[:, :2].T + A[:, 2] - neutral for p, A in zip(points[rows], moves, strict=True)
-        ]
+        moved = [transform_points(A, p) - neutral for p, A in zip(points[rows], moves, strict=True)]
         if expression != NEUTRAL:
             yield expression, int(seen.frames[rows[np.argmax([(m**2).sum() for m in moved])]])
 

@@ -27,12 +27,13 @@ from benchmarks.fps import frames_per_second
 from benchmarks.given_views import given_shards
 from express50.contract.layout import Dataset
 from express50.files.atomic import write_json
+from express50.geometry.sampling import evenly
 from express50.head.load import load_head
 from express50.runner.worker import peak_memory
 from grmm.ablate import Ablation, ablate
 from grmm.checkpoint import Checkpoint, load_checkpoint
 from grmm.config import Config, resolve
-from grmm.data import HeadViews, spread
+from grmm.data import HeadViews
 from grmm.edit import trained_head
 from grmm.evaluate import REGIONS, evaluate, mean, training_render
 from grmm.identity_evaluation import NOVEL_VIEW, FitProtocol, evaluate_unseen
@@ -87,7 +88,7 @@ def held_out(shards: Path, config: Config) -> tuple[Config, list[str]]:
             facing[key.camera] = float(views.item(index).view.direction()[2])
     order = sorted(facing, key=lambda camera: -facing[camera])
     frames = sorted({(k.subject, k.expression) for k in views.keys if k.expression != "neutral"})
-    subjects = spread(sorted({person for person, _ in frames}), HELD_FRAMES)
+    subjects = evenly(sorted({person for person, _ in frames}), HELD_FRAMES)
     chosen = []
     for number, subject in enumerate(subjects):  # another expression of each
         own = [f"{s}/{e}" for s, e in frames if s == subject]
@@ -106,7 +107,7 @@ def baseline(shards: Path, config: Config, images: int) -> dict[str, float | Non
     run = prepare(views, config)
     warm_start(run.model, views, run.training)
     own = [i for i in run.holdout if views.keys[i].camera in config.data.holdout_cameras]
-    rows = evaluate(views, spread(own, images), training_render(run.model, views))
+    rows = evaluate(views, evenly(own, images), training_render(run.model, views))
     return {name: mean(rows, name) for name in ("psnr_db", "psnr_head_db", "ssim", "depth_mm")}
 
 

@@ -25,9 +25,10 @@ from benchmarks.common import make_parser, replace_section
 from benchmarks.grmm import held_out
 from express50.files.atomic import write_json
 from express50.files.text import markdown_table
+from express50.geometry.sampling import evenly
 from express50.head.load import load_head
 from grmm.config import Config, as_tables, from_tables, resolve
-from grmm.data import HeadViews, Place, Sample, SampleKey, Source, spread
+from grmm.data import HeadViews, Place, Sample, SampleKey, Source
 from grmm.evaluate import evaluate, mean, training_render
 from grmm.shard_source import open_shards
 from grmm.train import step
@@ -120,7 +121,7 @@ def measure(source: Source, base: Config, name: str, budget: float, images: int)
         if key.camera in cameras and "/".join(key.frame) not in config.data.holdout_expressions
     ]
     began = time.process_time()
-    rows = evaluate(whole, spread(own, images), training_render(model, whole))
+    rows = evaluate(whole, evenly(own, images), training_render(model, whole))
     row = {
         "setting": name,
         "budget_s": budget,

@@ -32,6 +32,7 @@ from express50.error_model import (
 from express50.files.images import read_alpha, shrink
 from express50.geometry.cameras import Camera, transform_camera
 from express50.geometry.meshes import read_surface
+from express50.geometry.transforms import transform_points
 from express50.head.load import load_head
 from express50.twin.truth import Truth, align_worlds
 from pipelines.depth.maps import picture_of, surface_maps
@@ -133,7 +134,7 @@ class _Peak:
         return transform_camera(self.cameras[name], self.motion)
 
     def moved(self, points: np.ndarray) -> np.ndarray:
-        return points @ self.motion[:3, :3].T + self.motion[:3, 3]
+        return transform_points(self.motion, points)
 
     def alpha(self, name: str) -> np.ndarray:
         return read_alpha(self.dataset.matte_file(self.subject, self.expression, name))

@@ -40,6 +40,7 @@ from express50.dataset.depth_files import depth_file, read_depth
 from express50.dataset.tracks import read_track
 from express50.files.images import read_image
 from express50.geometry.raycast import visible_faces
+from express50.geometry.transforms import transform_points
 from express50.twin.config import TwinConfig
 from express50.twin.truth import Truth, align_worlds
 from pipelines import depth, regions, track
@@ -134,7 +135,7 @@ def figures_of(dataset: Dataset, truth: Truth, seconds: float, label: str) -> Ro
     mesh_errors, depth_errors = [], []
     for expression, frame in read_peaks(dataset, subject).items():
         true = truth.vertices(subject, frame)
-        moved = tracked.vertices[tracked.row(expression)] @ motion[:3, :3].T + motion[:3, 3]
+        moved = transform_points(motion, tracked.vertices[tracked.row(expression)])
         mesh_errors.append(np.linalg.norm(moved - true, axis=1)[on_face])
         item = f"{subject}/{expression}"
         for name, camera in cameras.items():

@@ -34,6 +34,7 @@ from express50.contract.layout import Dataset
 from express50.dataset.tracks import read_registration, read_track
 from express50.geometry.cameras import pinhole
 from express50.geometry.raycast import join_rays, mesh_scene
+from express50.geometry.transforms import transform_points
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.twin.truth import Truth, align_worlds
@@ -120,7 +121,7 @@ def cases(dataset: Dataset, truth: Truth) -> Iterator[tuple[Case, np.ndarray, np
                 continue
             registered = read_registration(path)
             mesh, laid = (
-                vertices.astype(np.float64) @ motion[:3, :3].T + motion[:3, 3]
+                transform_points(motion, vertices.astype(np.float64))
                 for vertices in (found.vertices[row], registered.vertices)
             )
             frame = int(found.frames[row])

@@ -19,7 +19,7 @@ from express50.contract.layout import Dataset
 from express50.dataset.tracks import Track, read_track
 from express50.errors import Express50Error
 from express50.geometry.cameras import Camera, pinhole, project, transform_camera
-from express50.geometry.transforms import axis_angle_to_matrix, rigid_fit
+from express50.geometry.transforms import axis_angle_to_matrix, rigid_fit, transform_points
 from express50.head.load import load_head
 from express50.head.model import HeadModel, landmarks, pose
 from express50.twin.truth import Truth, align_worlds
@@ -98,7 +98,7 @@ def frame_errors(
 ) -> Errors:
     """Return errors of one row of a track; `cameras` are the estimated ones in the true world."""
     frame = int(track.frames[row])
-    moved = track.vertices[row].astype(np.float64) @ motion[:3, :3].T + motion[:3, 3]
+    moved = transform_points(motion, track.vertices[row].astype(np.float64))
     true = truth.vertices(subject, frame)
     parameters = truth.parameters(subject, frame)
     R, t = rigid_fit(marks_of(model, model.template.double().numpy()), marks_of(model, true))
@@ -231,7 +231,7 @@ def clip_errors(dataset: Dataset, truth: Truth, subject: str, cue: str, folder: 
         return {"jitter_mm": None, "clip_face_rmse_mm": None, "jitter_reason": why}
     motion = align_worlds(read_cameras_of(dataset, subject), truth.cameras(subject))
     model = load_head(track.head)
-    meshes = clip_meshes(model, track, rows) @ motion[:3, :3].T + motion[:3, 3]
+    meshes = transform_points(motion, clip_meshes(model, track, rows))
     true = np.stack([truth.vertices(subject, int(frame)) for frame in rows["frames"]])
     error = 1e3 * (meshes - true)[:, face_of(model)]
     return {

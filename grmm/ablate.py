@@ -22,10 +22,11 @@ from express50.errors import ConfigError, FormatError, check_known
 from express50.files.atomic import dump_json, write_bytes, write_json
 from express50.files.digests import file_sha256
 from express50.files.text import markdown_table, read_json_table
+from express50.geometry.sampling import evenly
 from express50.head.load import load_head
 from grmm.checkpoint import Checkpoint, load_checkpoint
 from grmm.config import Config, as_tables, from_tables
-from grmm.data import HeadViews, Source, spread
+from grmm.data import HeadViews, Source
 from grmm.evaluate import (
     HELD_EXPRESSION,
     HELD_VIEW,
@@ -249,7 +250,7 @@ def measure(run: Ablation, loaded: Checkpoint, used: Sequence[Path]) -> dict:
         drawn = [i for i, key in enumerate(views.keys) if key.expression in expressions]
         for held in (HELD_VIEW, HELD_EXPRESSION):
             own = [i for i in drawn if kind(views.keys[i]) == held]
-            chosen = spread(own, run.protocol.images or len(own))
+            chosen = evenly(own, run.protocol.images or len(own))
             rows += evaluate(views, chosen, render, judge, kind)
     source, people = run.unseen()
     strangers = loaded.views(source)

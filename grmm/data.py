@@ -29,7 +29,6 @@ CACHE_BYTES = 512 << 20  # of decoded samples: a few hundred of 512 px
 DEFAULTS = DataConfig()  # black behind the head
 Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
-Choice = TypeVar("Choice")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -423,11 +422,3 @@ class Shuffle:
     def restore(self, state: dict[str, int]) -> None:
         """Resume after the last sample taken when ``state`` was saved."""
         self.taken = state["epoch"] * len(self.indices) + state["position"]
-
-
-def spread(items: Sequence[Choice], count: int) -> list[Choice]:
-    """Return at most ``count`` of the items, evenly chosen (first and last included)."""
-    if len(items) <= count:
-        return list(items)
-    steps = np.linspace(0, len(items) - 1, count).round().astype(int)
-    return [items[i] for i in steps]

@@ -22,10 +22,11 @@ from torch import Tensor
 from express50.console import log
 from express50.errors import TrainError
 from express50.files.atomic import check_space, write_json
+from express50.geometry.sampling import evenly
 from grmm import losses
 from grmm.checkpoint import Checkpoint, Gallery, collect_gallery, save_checkpoint
 from grmm.config import Config
-from grmm.data import NO_OFFSETS, HeadViews, Item, Shuffle, spread
+from grmm.data import NO_OFFSETS, HeadViews, Item, Shuffle
 from grmm.edit import HeadCodes, between, trained_head, transfer
 from grmm.evaluate import evaluate, mean
 from grmm.metrics import PerceptualMetrics
@@ -310,7 +311,7 @@ def _finite(loss: Tensor, iteration: int, stage: int) -> Tensor:
 def _scores(state: FitState, held_out: Sequence[int]) -> Scores:
     chosen = {"psnr_given_db": state.given, "psnr_held_out_db": held_out}
     scores = {
-        name: mean(evaluate(state.views, spread(indices, LOOKED_AT), state.render), "psnr_db")
+        name: mean(evaluate(state.views, evenly(indices, LOOKED_AT), state.render), "psnr_db")
         for name, indices in chosen.items()
     }
     log("fit: " + "  ".join(f"{k} {v}" for k, v in scores.items() if v is not None))

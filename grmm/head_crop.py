@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from express50.geometry.conventions import corner_to_cell
+from express50.geometry.transforms import transform_points
 from express50.geometry.transforms_torch import quat_to_matrix
 from express50.head.model import HeadModel
 from grmm.config import SCALE_RANGE_MM
@@ -144,7 +145,7 @@ def behind_torso(
     neck = torch.stack(regions).any(0)
     faces = head.faces[neck[head.faces].any(1)].cpu().numpy()
     K, camera = view.K.cpu().numpy(), view.cam_from_head.cpu().numpy()
-    points = vertices.detach().cpu().double().numpy() @ camera[:3, :3].T + camera[:3, 3]
+    points = transform_points(camera, vertices.detach().cpu().double().numpy())
     ahead = (points[:, 2] > NEAR_M)[faces].all(1)
     with np.errstate(all="ignore"):  # points behind the camera are in no face that is drawn
         places = corner_to_cell((points @ K.T)[:, :2] / points[:, 2:])

@@ -9,8 +9,9 @@ from typing import Any
 from torch import Tensor
 
 from express50.errors import ConfigError
+from express50.geometry.sampling import evenly
 from grmm.checkpoint import Checkpoint
-from grmm.data import HeadViews, spread
+from grmm.data import HeadViews
 from grmm.evaluate import HELD_IDENTITY, Row, evaluate
 from grmm.fit import run_stages, start
 from grmm.metrics import PerceptualMetrics
@@ -57,7 +58,7 @@ def evaluate_unseen(
     rows = []
     for kind, fitted in ((NOVEL_VIEW, True), (NOVEL_EXPRESSION, False)):
         chosen = [i for i in own if (views.keys[i].expression in state.z_exp) == fitted]
-        chosen = spread(chosen, protocol.images or len(chosen))
+        chosen = evenly(chosen, protocol.images or len(chosen))
         rows += evaluate(views, chosen, state.render, judge, lambda key, kind=kind: kind, keep)
     cameras = sorted({views.keys[i].camera for i in given})
     return rows, {"subject": subject, "cameras": cameras} | effort

@@ -24,11 +24,12 @@ from express50 import native
 from express50.console import count, log
 from express50.errors import NotReadyError, TrainError
 from express50.files.atomic import check_space, write_json
+from express50.geometry.sampling import evenly
 from express50.head.model import HeadModel
 from grmm import losses
 from grmm.checkpoint import collect_gallery
 from grmm.config import Config
-from grmm.data import HeadViews, Item, Source, spread
+from grmm.data import HeadViews, Item, Source
 from grmm.evaluate import REGIONS, component_effects, evaluate, mean, training_render
 from grmm.metrics import PerceptualMetrics
 from grmm.model import Rendering
@@ -230,9 +231,9 @@ def report(
     trained = {views.keys[i].frame for i in state.training}
     held = [i for i in state.holdout if views.keys[i].frame in trained]
     new = [i for i in state.holdout if views.keys[i].frame not in trained]
-    training = evaluate(views, spread(state.training, count), render)
-    holdout = evaluate(views, spread(held, count), render, perceptual)
-    expressions = evaluate(views, spread(new, count), render)
+    training = evaluate(views, evenly(state.training, count), render)
+    holdout = evaluate(views, evenly(held, count), render, perceptual)
+    expressions = evaluate(views, evenly(new, count), render)
     metrics: dict[str, object] = {
         "psnr_train_db": mean(training, "psnr_db"),
         "psnr_heldout_view_db": mean(holdout, "psnr_db"),
@@ -242,7 +243,7 @@ def report(
         },
         "components_gain_on": "held-out views" if held else "training views",
         "components_gain_db": component_effects(
-            model, views, spread(held or state.training, count)
+            model, views, evenly(held or state.training, count)
         ),
         "psnr_heldout_expression_db": mean(expressions, "psnr_db"),
         "ssim": mean(holdout or training, "ssim"),
@@ -266,7 +267,7 @@ def report(
     metrics |= perceptual.missing()
     for name, indices in (("training", state.training), ("heldout", state.holdout)):
         if indices:
-            comparison_sheet(out / "preview" / f"{name}.jpg", views, spread(indices, 6), render)
+            comparison_sheet(out / "preview" / f"{name}.jpg", views, evenly(indices, 6), render)
     write_json(out / "metrics.json", metrics)
     return metrics
 

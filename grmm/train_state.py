@@ -20,10 +20,11 @@ from express50.console import log
 from express50.errors import ConfigError, TrainError, check_known
 from express50.files.atomic import write_bytes
 from express50.files.text import read_text
+from express50.geometry.sampling import evenly
 from grmm import losses
 from grmm.checkpoint import Gallery, load_checkpoint, save_checkpoint
 from grmm.config import Config, as_tables
-from grmm.data import HeadViews, Item, SampleKey, Shuffle, spread
+from grmm.data import HeadViews, Item, SampleKey, Shuffle
 from grmm.model import GRMM, Rendering
 
 COVERED_TEXELS = 0.75  # of a map that head models' layouts use
@@ -84,7 +85,7 @@ def with_map_size(config: Config, views: HeadViews) -> Config:
     if config.model.n_g:
         return config
     training, _ = split_samples(views.keys, config)
-    areas = [int(views.item(i).mask.sum()) for i in spread(training, 16)]
+    areas = [int(views.item(i).mask.sum()) for i in evenly(training, 16)]
     step = 2 ** (len(config.model.ladder) + 1)
     side = step * math.ceil(math.sqrt(2 * max(areas) / COVERED_TEXELS) / step)
     n_g = max(2 * step, min(side, LARGEST_MAP))

@@ -11,8 +11,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from express50.geometry.sampling import evenly
 from grmm.anchors import tangent_frames
-from grmm.data import HeadViews, Item, spread
+from grmm.data import HeadViews, Item
 from grmm.model import GRMM, Gaussians
 
 IMAGES_PER_SUBJECT = 96  # more hardly change the mean texture
@@ -35,7 +36,7 @@ def warm_start(
     textures, known = [], []
     for subject in model.subjects:
         own = [i for i in indices if views.keys[i].subject == subject]
-        colours, weight = project_texture(model, views, spread(own, images))
+        colours, weight = project_texture(model, views, evenly(own, images))
         textures.append(colours)
         known.append(weight > 0)
     stack, seen = torch.stack(textures), torch.stack(known)[..., None]  # (S, N, 3), (S, N, 1)

@@ -24,7 +24,7 @@ from express50.contract.stage import Note, Result
 from express50.errors import FormatError, StageError
 from express50.files.arrays import read_arrays
 from express50.files.images import contact_sheet, write_image
-from express50.geometry.transforms import similarity_fit
+from express50.geometry.transforms import similarity_fit, transform_points
 
 if TYPE_CHECKING:
     from express50.landmarks.network import LandmarkNet
@@ -254,7 +254,7 @@ def find_points(
         direct, mirrored = output.points.double().numpy().reshape(2, len(crops), -1, 2)
         mirrored = np.stack([CROP - mirrored[:, MIRROR, 0], mirrored[:, MIRROR, 1]], axis=-1)
         batch = slice(start, start + len(crops))
-        points[batch] = 0.5 * (direct + mirrored) @ window[:, :2].T + window[:, 2]
+        points[batch] = transform_points(window, 0.5 * (direct + mirrored))
         scores[batch] = torch.sigmoid(output.logit).double().numpy().reshape(2, -1).mean(0)
     for row in range(len(images)):
         away = np.linalg.norm(face_box(points[row])[0] - centre)

@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
+from express50.files.text import is_number
+
 AGE_BANDS = ((0, 17), (18, 29), (30, 44), (45, 59), (60, 200))
 # Smaller counts could identify people, such as the only woman, or the only person aged 71.
 LEAST_PEOPLE = 5
@@ -69,6 +71,5 @@ def mean_age(metas: Sequence[Mapping], least: int = LEAST_PEOPLE) -> tuple[float
 def _age(meta: Mapping) -> float | None:
     """Return the age in years; None if it is not given or out of range."""
     age = meta.get("age")
-    if isinstance(age, bool) or not isinstance(age, int | float):
-        return None
-    return age if AGE_BANDS[0][0] <= age < AGE_BANDS[-1][1] + 1 else None
+    known = is_number(age) and AGE_BANDS[0][0] <= age < AGE_BANDS[-1][1] + 1
+    return age if known else None

@@ -19,7 +19,7 @@ from express50.capture.colour_correction import correct_srgb
 from express50.capture.index import CameraSource, Index, read_index
 from express50.capture.raw import RawCamera
 from express50.contract.layout import Dataset
-from express50.errors import CaptureError, FormatError, StageError
+from express50.errors import CaptureError, FormatError, StageError, check_known
 from express50.files.calibration import read_cameras
 from express50.files.containers import inside, read_picture, read_srgb
 from express50.files.digests import cached_by_file
@@ -65,11 +65,7 @@ class FrameReader:
     """Reads full-resolution frames of one camera; reading forward is quick."""
 
     def __init__(self, index: Index, camera_id: str) -> None:
-        if camera_id not in index.cameras:
-            raise CaptureError(
-                f"{index.subject}: no camera {camera_id!r}; "
-                f"expected one of {', '.join(index.cameras)}"
-            )
+        check_known(index.subject, "camera", [camera_id], index.cameras, CaptureError)
         self.camera_id = camera_id
         self.source = index.cameras[camera_id]
         self.path = index.capture / self.source.source
@@ -165,11 +161,8 @@ class FootageReader:
         image = self._readers[camera_id].read(frame)
         if self._cameras is None:
             return image
-        if camera_id not in self._cameras:
-            raise StageError(
-                f"{self._index.subject}: camera {camera_id!r} is not calibrated; expected one of "
-                f"{', '.join(self._cameras)}"
-            )
+        subject = self._index.subject
+        check_known(subject, "calibrated camera", [camera_id], self._cameras, StageError)
         camera = self._cameras[camera_id]
         return make_picture(image, camera, self._sizes.get(camera_id, _size_of(camera)))
 
@@ -325,7 +318,7 @@ def read_recorded_cameras(dataset: Dataset, subject: str) -> dict[str, Camera]:
     """
     path = dataset.cameras_file(subject)
     try:
-        return dict(_cameras_cached(path))
+        return dict(sorted(_read_cameras(path).items()))
     except FileNotFoundError as error:
         raise StageError(
             f"{path}: subject {subject!r} is not calibrated; "
@@ -373,10 +366,7 @@ def _size_of(camera: Camera) -> tuple[int, int]:
     return camera.width, camera.height
 
 
-@cached_by_file(64)
-def _cameras_cached(path: Path) -> dict[str, Camera]:
-    cameras = read_cameras(path)
-    return {name: cameras[name] for name in sorted(cameras)}
+_read_cameras = cached_by_file(64)(read_cameras)
 
 
 def read_gains(dataset: Dataset, subject: str) -> dict[str, np.ndarray]:

@@ -15,19 +15,14 @@ from typing import Any
 from express50.capture.index import Cue
 from express50.errors import CalibrationError, CaptureError
 from express50.files.calibration import read_cameras
-from express50.files.text import ID, TOML_LIMIT, identifier, read_text, read_toml
+from express50.files.text import ID, TOML_LIMIT, identifier, is_number, read_text, read_toml
 from express50.geometry.cameras import Camera
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 # Windows reserves these names for devices, in any letter case.
-RESERVED = {
-    "CON",
-    "PRN",
-    "AUX",
-    "NUL",
-    *(f"{port}{n}" for port in ("COM", "LPT") for n in range(1, 10)),
-}
+RESERVED = {"CON", "PRN", "AUX", "NUL"}
+RESERVED |= {f"{port}{n}" for port in ("COM", "LPT") for n in range(1, 10)}
 CUE_COLUMNS = ("expression_id", "start_frame", "end_frame")
 
 
@@ -203,7 +198,7 @@ def check_identity(path: Path, subject: object, fps: object) -> None:
             f"{path}: subject is {subject!r}, a name that Windows reserves for a device; expected"
             " another, such as 'S001'"
         )
-    if isinstance(fps, bool) or not isinstance(fps, int | float):
+    if not is_number(fps):
         raise CaptureError(f"{path}: fps is {fps!r}, expected a number such as 24")
     if not (math.isfinite(fps) and 0 < fps <= 10_000):
         raise CaptureError(f"{path}: fps is {fps!r}, expected more than 0 and at most 10000")
@@ -212,8 +207,7 @@ def check_identity(path: Path, subject: object, fps: object) -> None:
 def check_focals(path: Path, given: Any) -> None:
     """Raise CalibrationError unless ``focal_px`` is positive: a number, or a table per camera."""
     for name, value in (given if isinstance(given, dict) else {"all cameras": given}).items():
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not (number and 0 < float(value) < math.inf):
+        if not (is_number(value) and 0 < value < math.inf):
             raise CalibrationError(
                 f"{path}: focal_px of {name} is {value!r}, expected a positive number of pixels"
             )

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from pathlib import Path
 from typing import Any
 
-from express50.console import OK, add_command, count, say, say_json
+from express50.console import OK, add_command, answer, count, say, say_json
 from express50.contract.layout import Dataset
 from express50.errors import ConfigError, StageError
 
@@ -140,9 +139,8 @@ def run_report(args: argparse.Namespace) -> int:
     path = (args.out or dataset.report_dir) / "index.html"
     page = render_page(dataset, args.title).encode()
     write_bytes(path, page)
-    account = json.dumps({"report": str(path), "bytes": len(page)})
-    say(account if args.json else f"{path} ({len(page):,} bytes)")
-    return OK
+    data = {"report": str(path), "bytes": len(page)}
+    return answer(args, data, f"{path} ({len(page):,} bytes)")
 
 
 def run_preview(args: argparse.Namespace) -> int:

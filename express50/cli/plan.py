@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -99,19 +99,7 @@ def run_plan(args: argparse.Namespace) -> int:
     """Print one row per stage, and the sum."""
     if args.workers < 1:
         raise ConfigError(f"--workers {args.workers}: expected at least 1")
-    sizes = {name: getattr(args, name) for name in SIZES if getattr(args, name) is not None}
-    if "cameras" in sizes:
-        sizes["views"] = sizes.pop("cameras")
-    if args.size is not None:
-        try:
-            width, height = (int(part) for part in args.size.lower().split("x"))
-        except ValueError:
-            raise ConfigError(
-                f"--size {args.size!r}: expected WIDTHxHEIGHT, such as 3840x2160"
-            ) from None
-        sizes["pixels"] = width * height
-        sizes["shape"] = min(width, height) / max(width, height, 1)
-    dataset = Dataset(args.dataset)
+    dataset, sizes = Dataset(args.dataset), _given_sizes(args)
     with stdout_to_stderr():
         known = list(stages().values())
         datasets = [dataset, *map(Dataset, args.also)]
@@ -125,16 +113,10 @@ def run_plan(args: argparse.Namespace) -> int:
         "target": vars(target), "measured": [vars(f) for f, _ in measured], "total": total,
         "workers": args.workers, "stages": [vars(row) for row in rows], "replaced": replaced,
     }  # fmt: skip
-    columns = ["stage", "items", "s per item", "core hours", f"days on {args.workers}", "disk"]
-    columns += ["peak memory", "preset", "sizes", "times what was measured"]
-    hours = _hours(total["core_hours"], total["core_hours_low"], total["core_hours_high"])
-    days = f"{total['days']:.2f}"
-    cells = [_cells(row) for row in rows]
-    cells.append(["sum", "", "", hours, days, decimal(int(total["disk"])), "", "", "", ""])
     lines = [
         f"target   {args.target or 'as given'}: {_words(target)}",
         *dict.fromkeys(f"measured {_words(size)}" for size, _ in measured),
-        *format_table(columns, cells),
+        *_table(rows, total, args.workers),
         "core hours: with a 90 % interval; part of a stage's time or disk may be constant, which "
         "only a second dataset of another size can show (--also DATASET)",
         "s per item: of one core; stages one after the other, no item split over workers",
@@ -147,6 +129,33 @@ def run_plan(args: argparse.Namespace) -> int:
             f"the sum leaves out what was not measured: {', '.join(total['not_measured'])}"
         )
     return answer(args, data, *lines)
+
+
+def _given_sizes(args: argparse.Namespace) -> dict[str, float]:
+    """Return the campaign's sizes that options give, by their names in `target_of`."""
+    sizes = {name: getattr(args, name) for name in SIZES if getattr(args, name) is not None}
+    if "cameras" in sizes:
+        sizes["views"] = sizes.pop("cameras")
+    if args.size is not None:
+        try:
+            width, height = (int(part) for part in args.size.lower().split("x"))
+        except ValueError:
+            raise ConfigError(
+                f"--size {args.size!r}: expected WIDTHxHEIGHT, such as 3840x2160"
+            ) from None
+        sizes["pixels"] = width * height
+        sizes["shape"] = min(width, height) / max(width, height, 1)
+    return sizes
+
+
+def _table(rows: Sequence[Row], total: Mapping[str, Any], workers: int) -> Iterator[str]:
+    columns = ["stage", "items", "s per item", "core hours", f"days on {workers}", "disk"]
+    columns += ["peak memory", "preset", "sizes", "times what was measured"]
+    hours = _hours(total["core_hours"], total["core_hours_low"], total["core_hours_high"])
+    days = f"{total['days']:.2f}"
+    cells = [_cells(row) for row in rows]
+    cells.append(["sum", "", "", hours, days, decimal(int(total["disk"])), "", "", "", ""])
+    return format_table(columns, cells)
 
 
 def _cells(row: Row) -> list[str]:

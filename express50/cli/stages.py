@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from express50.console import FAILED, OK, USAGE, add_command, log, say, say_json
 from express50.contract.config import PRESETS, config_toml, resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage, stages, with_required
-from express50.errors import ConfigError, nearest
+from express50.errors import ConfigError, check_known
 
 
 def add_commands(subparsers: Any) -> None:
@@ -128,13 +128,8 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
     refuse_swapped(dataset, getattr(args, "captures", ()), args.command)
     slurm = slurm_jobs(args)
     if slurm is not None and args.print_job:
-        from express50.runner.slurm import job_script
-
-        logs = Dataset(dataset.root.resolve()).slurm_dir
-        for job in dict.fromkeys(slurm[stage.name] for stage in chosen):
-            address = "tcp://ADDRESS-OF-THE-RUN"
-            say(job_script(job, address, "express50-N", args.threads, logs).rstrip())
-        return OK
+        jobs = dict.fromkeys(slurm[stage.name] for stage in chosen)
+        return _say_scripts(jobs, args.threads, Dataset(dataset.root.resolve()).slurm_dir)
     summaries: list[Summary] = []
     with (
         stdout_to_stderr() if args.json else nullcontext(),
@@ -162,6 +157,15 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
         say_json(accounts if args.command == "run" else accounts[-1] | before)
     dropped = args.strict and any(o.dropped for summary in summaries for o in summary.outcomes)
     return OK if all(summary.ok for summary in summaries) and not dropped else FAILED
+
+
+def _say_scripts(jobs: Iterable[Any], threads: int, logs: Path) -> int:
+    """Print the scripts of SLURM jobs."""
+    from express50.runner.slurm import job_script
+
+    for job in jobs:
+        say(job_script(job, "tcp://ADDRESS-OF-THE-RUN", "express50-N", threads, logs).rstrip())
+    return OK
 
 
 def refuse_swapped(dataset: Dataset, captures: Sequence[Path], command: str) -> None:
@@ -242,12 +246,7 @@ def _items(
 def show_config(args: argparse.Namespace) -> int:
     """Print resolved configurations; the output can be given to --config."""
     names = args.stage or list(stages())
-    for name in names:
-        if name not in stages():
-            near = nearest(name, stages())
-            raise ConfigError(
-                f"unknown stage {name!r}{near}; expected one of {', '.join(stages())}"
-            )
+    check_known("express50 config", "stage", names, stages())
     tables = [config_toml(name, config_of(stages()[name], args)) for name in names]
     say("\n".join(tables).rstrip())
     return OK

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from express50.contract.stage import Stage
 from express50.errors import ConfigError, nearest
-from express50.files.text import read_toml
+from express50.files.text import is_number, read_toml
 
 PRESETS = ("draft", "standard", "reference")
 _KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
@@ -176,7 +176,7 @@ def _coerce(name: str, value: object, kind: Any) -> object:
         if not isinstance(value, list | tuple):
             raise ConfigError(f"{name}: got {value!r}, expected a list such as [1, 2]")
         return tuple(_coerce(f"{name}[{i}]", one, arguments[0]) for i, one in enumerate(value))
-    if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+    if kind is float and is_number(value):
         if math.isnan(value):
             raise ConfigError(f"{name}: got NaN, expected a number")
         return float(value)

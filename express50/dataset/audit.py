@@ -21,11 +21,11 @@ from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset, footage_root
 from express50.contract.stage import Stage
 from express50.dataset.withdraw import (
+    any_id_finder,
     cameras_of,
-    files_that,
-    names_any_of,
-    names_as_subject,
-    says,
+    files_naming,
+    mentions,
+    subject_id_finder,
     withdrawn,
 )
 from express50.errors import AnnotationError, ConfigError, Express50Error, FormatError, few
@@ -202,13 +202,14 @@ def _person_findings(dataset: Dataset, checkpoints: Sequence[Path]) -> Iterator[
         there |= dataset.captures().keys()
     # Cameras of others may have a withdrawn id.
     shared = {one for one in cameras_of(dataset, there) if text_digest(one) in digests}
-    tests = [names_any_of(digests - {text_digest(one) for one in shared}, there)]
-    tests += map(names_as_subject, shared)
+    finders = [any_id_finder(digests - {text_digest(one) for one in shared}, there)]
+    finders += map(subject_id_finder, shared)
 
-    def test(text: bytes) -> bool:
-        return any(one(text) for one in tests)
+    def finder(text: bytes) -> bool:
+        return any(one(text) for one in finders)
 
-    for path in [*files_that(test, dataset.root), *(p for p in checkpoints if says(p, test))]:
+    found = [*files_naming(finder, dataset.root)]
+    for path in [*found, *(path for path in checkpoints if mentions(path, finder))]:
         inside = path.is_relative_to(dataset.root)
         yield Finding(
             kind="person",

@@ -24,7 +24,7 @@ from express50.capture.frames import read_cameras_of, read_gains, read_matte, re
 from express50.contract.layout import Dataset
 from express50.dataset.export import META, Head, write_head_obj
 from express50.dataset.tracks import Track
-from express50.errors import CaptureError, ConfigError, FormatError, StageError
+from express50.errors import CaptureError, ConfigError, FormatError, StageError, check_known
 from express50.files.atomic import dump_json
 from express50.files.images import encode_png, resize_area, scale_light
 from express50.geometry.cameras import Camera, pinhole_camera, scale_camera, transform_camera
@@ -115,19 +115,12 @@ def _check_options(track: Track, cameras: dict[str, Camera], options: AvatarOpti
         raise ConfigError(
             f"--downscale {options.downscale}: expected 1 (full size) to the images' shorter side"
         )
-    unknown = sorted(set(options.test_expressions or ()) - set(track.expressions))
-    if unknown:
-        raise ConfigError(
-            f"--test-expression: unknown {', '.join(unknown)}; expected some of"
-            f" {', '.join(track.expressions)}"
-        )
-    if set(options.test_expressions or ()) >= set(track.expressions):
+    held_out = options.test_expressions or ()
+    check_known("--test-expression", "expression", held_out, track.expressions)
+    if set(held_out) >= set(track.expressions):
         raise ConfigError("--test-expression: all expressions are held out; leave some to train on")
-    if options.validation_camera not in (None, *cameras):
-        raise ConfigError(
-            f"--validation-camera {options.validation_camera!r}: expected one of"
-            f" {', '.join(cameras)}"
-        )
+    if options.validation_camera is not None:
+        check_known("--validation-camera", "camera", [options.validation_camera], cameras)
 
 
 def _write_view(

@@ -6,7 +6,6 @@ import base64
 import io
 from contextlib import suppress
 from pathlib import Path
-from typing import TypeVar
 
 import jinja2
 import matplotlib as mpl
@@ -18,13 +17,13 @@ from express50.contract.stage import stages, typical_error
 from express50.errors import CaptureError, FormatError
 from express50.files.containers import read_srgb
 from express50.files.images import encode_jpeg, resize_area
-from express50.files.text import parse_json, read_json_table, read_text
+from express50.files.text import is_number, parse_json, read_json_table, read_text
+from express50.geometry.sampling import evenly
 from express50.runner.ledger import Ledger, Receipt
 
 mpl.use("Agg")
 from matplotlib.figure import Figure  # noqa: E402  the backend is chosen first
 
-T = TypeVar("T")
 Picture = tuple[Path, str]  # a file and its caption
 
 AGAIN = "run its stage again"
@@ -56,7 +55,7 @@ def render_page(dataset: Dataset, title: str | None = None) -> str:
     measured = _table(accuracy_dir / "accuracy.json")
     accuracy = None
     if measured:
-        pictures = spread(_pictures_below(accuracy_dir, 24), PICTURES)
+        pictures = evenly(_pictures_below(accuracy_dir, 24), PICTURES)
         accuracy = {"rows": _rows(measured), "pictures": [_embed(p) for p in pictures]}
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("express50.dataset", "."), autoescape=True
@@ -84,11 +83,7 @@ def _stage_view(dataset: Dataset, stage: str, receipts: list[Receipt]) -> dict:
         for path in sorted((root / item / "qc").glob(f"*.{ending}"))
     ]
     figures = {
-        item: {
-            key: float(value)
-            for key, value in table.items()
-            if isinstance(value, int | float) and not isinstance(value, bool)
-        }
+        item: {key: float(value) for key, value in table.items() if is_number(value)}
         for item, table in metrics.items()
     }
     columns = list(dict.fromkeys(key for row in figures.values() for key in row))[:COLUMNS]
@@ -108,7 +103,7 @@ def _stage_view(dataset: Dataset, stage: str, receipts: list[Receipt]) -> dict:
         ],
         "more_rows": len(figures) - len(shown),
         "plot": _metric_bars(figures, columns) if len(figures) > 1 else "",
-        "pictures": [_embed(p) for p in spread(pictures, PICTURES)],
+        "pictures": [_embed(p) for p in evenly(pictures, PICTURES)],
         "picture_count": len(pictures),
     }
 
@@ -187,7 +182,7 @@ def _pictures_below(root: Path, limit: int) -> list[Picture]:
     """List pictures anywhere below a folder, captioned by their relative path."""
     paths = sorted(p for p in root.rglob("*") if p.suffix in (".jpg", ".png"))
     names = [_words(str(p.relative_to(root).with_suffix(""))).replace("/", ": ") for p in paths]
-    return spread(list(zip(paths, names, strict=True)), limit)
+    return evenly(list(zip(paths, names, strict=True)), limit)
 
 
 def _embed(picture: Picture) -> dict[str, object]:
@@ -216,18 +211,11 @@ def number(value: object) -> str:
     """Format a figure for readers; n/a if it was not measured."""
     if value is None:
         return "n/a"
-    if isinstance(value, bool) or not isinstance(value, int | float):
+    if not is_number(value):
         return str(value)
     if isinstance(value, int) or float(value).is_integer() and abs(value) < 1e6:
         return f"{int(value):,}"
     return f"{value:.3g}" if abs(value) < 100 else f"{value:,.0f}"
-
-
-def spread(values: list[T], count: int) -> list[T]:
-    """Return at most ``count`` of the values, evenly spaced."""
-    if len(values) <= count:
-        return values
-    return [values[round(i * (len(values) - 1) / (count - 1))] for i in range(count)]
 
 
 def _svg(figure: Figure) -> Markup:

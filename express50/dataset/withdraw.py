@@ -26,6 +26,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import IO, Any
 
@@ -39,7 +40,8 @@ from express50.runner.ledger import Ledger
 from express50.runner.publish import hold_stages
 
 Redact = Callable[[Path, str], bool]
-Test = Callable[[bytes], bool]
+Finder = Callable[[bytes], bool]
+"""Tells whether a text names a subject."""
 
 # What damaged archives and databases raise.
 DAMAGED = (
@@ -84,17 +86,17 @@ def plan(dataset: Dataset, subject: str) -> list[Path]:
     # Reject all other names: '', '..' or 'shards' would name folders that are not a person's.
     if not (subject in known or labelled or text_digest(subject) in withdrawn(dataset)):
         check_known(str(dataset.root), "subject", [subject], sorted(known))
-    found_paths = [*sorted(_own_paths(dataset, subject)), *sorted(_mixed_paths(dataset))]
-    paths = list(dict.fromkeys(found_paths))  # what came back of a person who was withdrawn is both
+    found = [*sorted(_own_paths(dataset, subject)), *sorted(_mixed_paths(dataset))]
+    paths = list(dict.fromkeys(found))  # what came back of a person who was withdrawn is both
     # Other subjects' outputs that name this one, such as peaks matched to the reference person's.
     gone, naming = set(paths), []
-    for path in files_that(names_in(dataset, subject), dataset.root):
+    for path in files_naming(dataset_id_finder(dataset, subject), dataset.root):
         parts = path.relative_to(dataset.root).parts
         items = [dataset.root.joinpath(*parts[:depth]) for depth in (3, 2)]
-        found = next((item for item in items if (item / "metrics.json").is_file()), None)
-        if found is not None and gone.isdisjoint([path, *path.parents]):
-            naming.append(found)
-            gone.add(found)
+        item = next((item for item in items if (item / "metrics.json").is_file()), None)
+        if item is not None and gone.isdisjoint([path, *path.parents]):
+            naming.append(item)
+            gone.add(item)
     return paths + sorted(naming)
 
 
@@ -108,9 +110,9 @@ def _own_paths(dataset: Dataset, subject: str) -> Iterator[Path]:
         with suppress(FormatError):
             if subject in map(str, read_json_table(reference, FormatError).values()):
                 yield reference  # the next subject becomes the reference
-    test = names_in(dataset, subject)
+    finder = dataset_id_finder(dataset, subject)
     # Settings such as pack.test_subjects; the stage's next run writes its own.
-    yield from (p for p in (dataset.root / "config").glob("*.toml") if says(p, test))
+    yield from (p for p in (dataset.root / "config").glob("*.toml") if mentions(p, finder))
     for path in (dataset.root / "logs").glob("*/*.txt"):
         if path.stem.split("+")[0] == subject:
             yield path
@@ -149,7 +151,7 @@ def withdraw(
         StageError: a stage is running.
         FormatError: the ledger is damaged; nothing was removed.
     """
-    test = names_in(dataset, subject)
+    finder = dataset_id_finder(dataset, subject)
     with hold_stages(dataset, sorted(p.stem for p in (dataset.root / "config").glob("*.toml"))):
         paths = plan(dataset, subject)
         if dataset.ledger.is_file():
@@ -171,15 +173,15 @@ def withdraw(
         write_json(dataset.captures_file, {name: str(path) for name, path in captures.items()})
         if dataset.ledger.is_file():
             with Ledger(dataset.ledger) as ledger:
-                ledger.erase(subject, dataset.root, paths, test)
+                ledger.erase(subject, dataset.root, paths, finder)
         changed, own = [], sorted((dataset.root / "grmm").rglob("*.pt"))
         for path in [*own, *(path for path in checkpoints if path.is_file())]:
             with suppress(FormatError):  # not a GRMM checkpoint; it is searched for the id below
                 if redact(path, subject):
                     changed.append(path)
     remaining = [
-        *files_that(test, dataset.root),
-        *(path for path in checkpoints if path.is_file() and says(path, test)),
+        *files_naming(finder, dataset.root),
+        *(path for path in checkpoints if path.is_file() and mentions(path, finder)),
     ]
     return Withdrawal(subject, capture, tuple(paths), tuple(changed), tuple(remaining), files)
 
@@ -210,12 +212,12 @@ def _digest(row: Any) -> Any:
     return row.get("id_sha256") if isinstance(row, dict) else row
 
 
-def names_in(dataset: Dataset, subject: str) -> Test:
-    """Make a test of whether a text of a dataset names a subject."""
+def dataset_id_finder(dataset: Dataset, subject: str) -> Finder:
+    """Make a finder of a subject's id in texts of a dataset."""
     captures = dataset.captures()
     if subject in cameras_of(dataset, {*dataset.subjects()} - {subject}):
-        return names_as_subject(subject, str(captures.get(subject, "")))
-    return names(subject, {*captures, *dataset.subjects()} - {subject})
+        return subject_id_finder(subject, str(captures.get(subject, "")))
+    return id_finder(subject, {*captures, *dataset.subjects()} - {subject})
 
 
 def cameras_of(dataset: Dataset, subjects: Collection[str]) -> set[str]:
@@ -227,8 +229,8 @@ def cameras_of(dataset: Dataset, subjects: Collection[str]) -> set[str]:
     return found
 
 
-def names_as_subject(subject: str, capture: str = "") -> Test:
-    """Make a test for an id that is a camera's too: it must be called a subject, or own an item.
+def subject_id_finder(subject: str, capture: str = "") -> Finder:
+    """Make a finder of an id that is a camera's too: it must be called a subject, or own an item.
 
     Paths below its raw ``capture`` name it as well.
     """
@@ -243,16 +245,16 @@ def names_as_subject(subject: str, capture: str = "") -> Test:
     return lambda text: found.search(text) is not None
 
 
-def names(subject: str, others: Collection[str] = ()) -> Test:
-    """Make a test of whether a text names a subject, and not just ``others`` with longer ids."""
+def id_finder(subject: str, others: Collection[str] = ()) -> Finder:
+    """Make a finder of a subject's id that does not take longer ids of ``others`` for it."""
     longer = sorted((other for other in others if subject in other), key=len, reverse=True)
     word, number = _words([*longer, subject]), subject.isdigit()
 
-    def says_it(text: bytes) -> bool:
+    def found(text: bytes) -> bool:
         text = _without_numbers(text) if number else text
         return any(m[0] == subject.encode() for m in word.finditer(text))
 
-    return says_it
+    return found
 
 
 def _without_numbers(text: bytes) -> bytes:
@@ -265,14 +267,13 @@ def _words(ids: Sequence[str]) -> re.Pattern[bytes]:
     return re.compile(rf"(?<![A-Za-z0-9])(?:{choice})(?![A-Za-z0-9])".encode())
 
 
-def names_any_of(digests: Collection[str], others: Collection[str] = ()) -> Test:
-    """Make a test of whether a text holds an id whose SHA-256 is among the given ones.
+def any_id_finder(digests: Collection[str], others: Collection[str] = ()) -> Finder:
+    """Make a finder of any id whose SHA-256 is among the given ones.
 
     Ids of ``others``, who were not withdrawn, may have such an id as a part.
     """
-    seen: dict[bytes, bool] = {}
 
-    def says_one(run: bytes) -> bool:
+    def is_wanted(run: bytes) -> bool:
         # Any part, and any run of adjacent parts, may be an id: ``S001_smile`` names S001.
         spans = [match.span() for match in PART.finditer(run)]
         words = (
@@ -283,26 +284,25 @@ def names_any_of(digests: Collection[str], others: Collection[str] = ()) -> Test
         return any(text_digest(word.decode()) in digests for word in (run, *words))
 
     there = (other for other in others if text_digest(other) not in digests)
-    longer = _words(sorted((o for o in there if says_one(o.encode())), key=len, reverse=True))
+    longer = _words(sorted((o for o in there if is_wanted(o.encode())), key=len, reverse=True))
 
+    @cache
     def hit(run: bytes) -> bool:
-        if run not in seen:
-            seen[run] = any(map(says_one, longer.sub(b" ", run).split()))
-        return seen[run]
+        return any(map(is_wanted, longer.sub(b" ", run).split()))
 
     return lambda text: any(hit(run) for run in set(RUN.findall(_without_numbers(text))))
 
 
-def files_that(test: Test, root: Path) -> Iterator[Path]:
-    """Yield files below a folder whose path or content passes a test."""
+def files_naming(finder: Finder, root: Path) -> Iterator[Path]:
+    """Yield files below a folder whose path or content names a subject."""
     for path in files_of(root, hidden=True):
-        if test(str(path.relative_to(root)).encode()) or says(path, test):
+        if finder(str(path.relative_to(root)).encode()) or mentions(path, finder):
             yield path
 
 
-def says(path: Path, test: Test) -> bool:
-    """Return True if a file's content passes a test."""
-    return any(map(test, texts_of(path)))
+def mentions(path: Path, finder: Finder) -> bool:
+    """Return True if a file's content names a subject."""
+    return any(map(finder, texts_of(path)))
 
 
 def texts_of(path: Path) -> Iterator[bytes]:

@@ -72,9 +72,9 @@ class Workload:
 
 def cost_at(load: Workload, name: str, label: str) -> tuple[Cost, Trial] | None:
     """Find what a stage cost in the pilot, and in which trial; None where it was not measured."""
-    base, *others = load.measured.trials
-    for trial in [base, *others]:
-        whole = trial.footage.expressions == base.footage.expressions
+    trials = load.measured.trials
+    for trial in trials:
+        whole = trial.footage.expressions == trials[0].footage.expressions
         ran = trial.settings[name] == label and name not in trial.failed
         if whole and ran and name in trial.costs:
             return trial.costs[name], trial
@@ -93,21 +93,18 @@ def labels_of(load: Workload, name: str) -> list[str]:
 
 def item_seconds(load: Workload, stage: Stage, label: str) -> tuple[int, float]:
     """Return how many items a stage has, and seconds of one at a setting."""
-    found = cost_at(load, stage.name, label) or cost_at(
-        load, stage.name, load.measured.trials[0].settings[stage.name]
-    )
+    name, first = stage.name, load.measured.trials[0]
+    found = cost_at(load, name, label) or cost_at(load, name, first.settings[name])
     if found is None:
         return max(1, round(load.footage.items(stage.growth))), 0.0
     cost, trial = found
-    share = cost.items / max(trial.footage.items(stage.growth), 1e-9)
-    first = load.measured.trials[0]
-    if stage.name in first.costs and first is not trial:  # a trial makes only what changes
-        share = first.costs[stage.name].items / max(first.footage.items(stage.growth), 1e-9)
+    whole = first if name in first.costs else trial  # other trials make only what changes
+    share = whole.costs[name].items / max(whole.footage.items(stage.growth), 1e-9)
     count = max(1, round(share * load.footage.items(stage.growth)))
     samples = sizes_of(load.measured, stage)
     # What reduced pictures save was measured, see `size_factor`.
-    whole = replace(load.footage, side=trial.footage.side)
-    work = [footage.time(stage.growth) for footage in (whole, trial.footage)]
+    recorded = replace(load.footage, side=trial.footage.side)
+    work = [footage.time(stage.growth) for footage in (recorded, trial.footage)]
     grown = typical_seconds(samples, work[0]) / typical_seconds(samples, work[1])
     return count, (cost.core_seconds if load.cores else cost.seconds) * grown
 
@@ -148,9 +145,8 @@ def stage_seconds(load: Workload, stage: Stage, label: str, left: float = 1.0) -
     count = math.ceil(count * left)
     if count == 0 or load.cores:
         return count * seconds
-    extra = max((t.costs[stage.name].extra for t in load.measured.trials[:1]
-                 if stage.name in t.costs), default=0.0)  # fmt: skip
-    return count * seconds / min(load.width, count) + extra
+    first = load.measured.trials[0].costs.get(stage.name)
+    return count * seconds / min(load.width, count) + (first.extra if first else 0.0)
 
 
 def remaining_error(load: Workload, result: str) -> tuple[float, float, float] | None:

@@ -27,6 +27,7 @@ from express50.errors import ConfigError, DiskFullError, Express50Error, FormatE
 from express50.files.atomic import link_file, write_json
 from express50.files.digests import files_of, value_digest
 from express50.files.text import read_json_table
+from express50.geometry.sampling import evenly
 from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger, Receipt
 from express50.runner.replaced import keeping
@@ -86,21 +87,13 @@ class Pilot:
         record = root / "trial.json"
         if record.is_file():
             return trial_of(json.loads(record.read_text(encoding="utf-8")))
-        if source is None:
-            if not root.is_dir():  # otherwise items of a trial that was stopped are kept
-                given = chain.dataset
-                capture = str(given.captures()[self.subject].resolve())
-                root.mkdir(parents=True)
-                write_json(root / "captures.json", {self.subject: capture})
-                labels = given.labels_file(self.subject)  # those that people gave
-                if labels.is_file():  # the reference may be somebody whom the trial lacks
-                    Dataset(root).labels_file(self.subject).parent.mkdir()
-                    shutil.copy2(labels, Dataset(root).labels_file(self.subject))
-        else:
+        dataset = Dataset(root)
+        if source is not None:
             shutil.rmtree(root, ignore_errors=True)
             shutil.copytree(source.folder, root, copy_function=_link)
-            (root / "trial.json").unlink()
-        dataset = Dataset(root)
+            record.unlink()
+        elif not root.is_dir():  # otherwise items of a trial that was stopped are kept
+            self._begin(dataset)
         costs, failed = dict(source.costs) if source else {}, {}
         for stage in chain.stages:
             config = chain.ladders[stage.name][settings[stage.name]]
@@ -130,6 +123,17 @@ class Pilot:
         if not self.clock.closed():
             write_json(record, asdict(done))
         return done
+
+    def _begin(self, dataset: Dataset) -> None:
+        """Make a dataset of the subject's capture alone, and the labels that people gave."""
+        given = self.chain.dataset
+        dataset.root.mkdir(parents=True)
+        capture = str(given.captures()[self.subject].resolve())
+        write_json(dataset.captures_file, {self.subject: capture})
+        labels, target = (one.labels_file(self.subject) for one in (given, dataset))
+        if labels.is_file():  # the reference may be somebody whom the trial lacks
+            target.parent.mkdir()
+            shutil.copy2(labels, target)
 
     def _run(
         self, stage: Stage, dataset: Dataset, config: Any, anew: bool
@@ -215,8 +219,8 @@ def _cut_peaks(dataset: Dataset, subject: str, count: int) -> None:
     rows = _rows(whole)
     order = [cue.expression_id for cue in read_index(dataset, subject).cues]
     names = sorted(rows, key=lambda name: order.index(name) if name in order else len(order))
-    kept = {names[round(k * (len(names) - 1) / max(1, count - 1))] for k in range(count)} & {*names}
-    if kept != _rows(path).keys():
+    kept = evenly(names, count)
+    if set(kept) != _rows(path).keys():
         write_json(path, {name: rows[name] for name in rows if name in kept})
 
 

@@ -55,7 +55,7 @@ def read_image(path: Path) -> np.ndarray:
             raise FormatError(f"{path}: {size}, deep or a volume; expected a flat image")
         if spec.width * spec.height > PIXEL_LIMIT:
             raise FormatError(f"{path}: {size}, expected at most {PIXEL_LIMIT}; store it smaller")
-        kind = {"uint8": "uint8", "uint16": "uint16"}.get(str(spec.format), "float")
+        kind = _pixel_kind(spec.format)
         channels = min(spec.nchannels, 4)
         pixels = source.read_image(0, 0, 0, channels, kind)
         if pixels is None:
@@ -101,6 +101,11 @@ def open_image(path: Path) -> oiio.ImageInput:
         why = _error_text(oiio.geterror) or "it cannot be opened"
         raise FormatError(f"{path}: cannot be read as an image ({why}); copy it again")
     return source
+
+
+def _pixel_kind(given: object) -> str:
+    """Return what OpenImageIO calls the type of an image's pixels."""
+    return str(given) if str(given) in ("uint8", "uint16") else "float"
 
 
 def _error_text(geterror: Callable[[], str]) -> str:
@@ -167,7 +172,7 @@ def write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:
     if image.dtype == np.float64:
         image = image.astype(np.float32)
     channels = 1 if image.ndim == 2 else image.shape[2]
-    kind = {"uint8": "uint8", "uint16": "uint16"}.get(str(image.dtype), "float")
+    kind = _pixel_kind(image.dtype)
     ending = Path(path).suffix.lower()
     if ending == ".png" and kind != "float":
         try:

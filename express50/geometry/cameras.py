@@ -15,7 +15,7 @@ from numpy.polynomial import Polynomial
 
 from express50.geometry.conventions import cell_centres
 from express50.geometry.shapes import check_shape
-from express50.geometry.transforms import invert_transform
+from express50.geometry.transforms import invert_transform, transform_points
 
 # What each COLMAP parameter is; distortion terms have OpenCV's names k1 k2 p1 p2 k3 k4 k5 k6.
 MODELS: dict[str, tuple[str, ...]] = {
@@ -248,7 +248,7 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     points = np.asarray(points, dtype=np.float64)
     check_shape("points", points, (None, 3))
     points = np.where(np.isfinite(points), points, np.nan)  # 0 * inf would be an invalid value
-    p = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    p = transform_points(camera.cam_from_world, points)
     depth = p[:, 2]
     ahead = depth > 0
     xy = p[:, :2] / np.where(ahead, depth, np.nan)[:, None]
@@ -366,7 +366,7 @@ def project_with_slope(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, 
 
 def _rays(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return coordinates (..., 2) at unit depth, depth (...), and depth kept away from zero."""
-    local = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    local = transform_points(camera.cam_from_world, points)
     depth = local[..., 2]
     safe = np.where(np.abs(depth) > NEAREST_M, depth, NEAREST_M)
     return local[..., :2] / safe[..., None], depth, safe

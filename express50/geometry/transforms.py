@@ -75,6 +75,15 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
 
 
+def transform_points(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return points (..., D) under an affine map, whose first D rows are its matrix and shift.
+
+    These are the rows of a transform (4, 4) for points in space, of a map (2, 3) for pixels.
+    """
+    size = points.shape[-1]
+    return points @ matrix[:size, :size].T + matrix[:size, size]
+
+
 def invert_transform(T: np.ndarray) -> np.ndarray:
     """Return the inverse (4, 4) of a rigid transform (4, 4)."""
     R, t = T[:3, :3], T[:3, 3]

@@ -19,6 +19,7 @@ from skimage.measure import points_in_poly
 from express50.errors import HeadModelError
 from express50.files.arrays import read_arrays
 from express50.files.text import read_text
+from express50.geometry.meshes import check_faces
 from express50.geometry.sampling import smoothstep
 from express50.head.model import PARENTS, HeadModel, check_head
 
@@ -185,8 +186,7 @@ def _check_mesh(points: np.ndarray, faces: np.ndarray) -> None:
         raise ValueError("a coordinate is NaN or infinite")
     if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
         raise ValueError(f"faces have shape {faces.shape}, expected (F, 3)")
-    if faces.min() < 0 or faces.max() >= len(points):
-        raise ValueError(f"faces name points {faces.min()} to {faces.max()} of {len(points)}")
+    check_faces(faces, len(points))
 
 
 def build_ict_head(arrays: IctArrays) -> HeadModel:

@@ -54,11 +54,8 @@ def load_topology(spec: str | Path) -> HeadTopology:
     path = BUILTIN if str(spec) == "procedural" else Path(spec).expanduser()
     if path.suffix == ".npz" and path.is_file() and is_stored(path):
         arrays = read_arrays(path, HeadModelError, "a stored head model", FIELDS)
-        regions: dict[str, np.ndarray] = {}
-        if "regions" in arrays and "region_names" in arrays:
-            names, masks = arrays["region_names"].tolist(), arrays["regions"].astype(bool)
-            regions = dict(zip(names, masks, strict=True))
-        return HeadTopology(arrays["template"], arrays["faces"].astype(np.int64), regions)
+        faces = arrays["faces"].astype(np.int64)
+        return HeadTopology(arrays["template"], faces, _region_masks(arrays))
     model = load_head(spec)
     regions = {name: mask.numpy() for name, mask in model.regions.items()}
     return HeadTopology(model.template.numpy(), model.faces.numpy(), regions)
@@ -128,9 +125,8 @@ def load_stored(path: Path, name: str) -> HeadModel:
         if "contour" in arrays and "contour_counts" in arrays:
             lines = np.split(arrays["contour"], np.cumsum(arrays["contour_counts"])[:-1])
             fields["contour"] = tuple(torch.from_numpy(line) for line in lines)
-        if "regions" in arrays and "region_names" in arrays:
-            masks = [torch.from_numpy(mask) for mask in arrays["regions"].astype(bool)]
-            fields["regions"] = dict(zip(arrays["region_names"].tolist(), masks, strict=True))
+        masks = _region_masks(arrays)
+        fields["regions"] = {name: torch.from_numpy(mask) for name, mask in masks.items()}
         if "unit_expressions" in arrays:
             fields["unit_expressions"] = bool(arrays["unit_expressions"])
         return check_head(HeadModel(name=name, **fields))
@@ -138,6 +134,13 @@ def load_stored(path: Path, name: str) -> HeadModel:
         raise HeadModelError(
             f"{path}: not a stored head model ({error}); see docs/RECIPES.md"
         ) from error
+
+
+def _region_masks(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the masks (V,) bool of a stored head model's regions; none if it has no regions."""
+    if not {"regions", "region_names"} <= arrays.keys():
+        return {}
+    return dict(zip(arrays["region_names"].tolist(), arrays["regions"].astype(bool), strict=True))
 
 
 def is_stored(path: Path) -> bool:

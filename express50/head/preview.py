@@ -10,7 +10,8 @@ import torch
 
 from express50.errors import HeadModelError
 from express50.geometry.conventions import cell_centres
-from express50.geometry.raycast import barycentrics, mesh_scene
+from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
+from express50.geometry.transforms import unit
 from express50.head.model import HeadModel, pose, vertex_normals
 
 Array = np.ndarray
@@ -72,8 +73,7 @@ def render_preview(
     faces = model.faces.cpu().numpy()
     scene = mesh_scene(points, faces)
     origin, directions, axes = _camera(yaw, 2 * size)
-    rays = np.concatenate([np.broadcast_to(origin, directions.shape), directions], -1)
-    hits = scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))
+    hits = scene.cast_rays(join_rays(origin, directions))
     distance = hits["t_hit"].numpy()
     seen = np.isfinite(distance)
     corner = faces[hits["primitive_ids"].numpy()[seen]]
@@ -102,8 +102,7 @@ def _camera(yaw: float, side: int) -> tuple[Array, Array, tuple[Array, Array, Ar
     origin = np.array(_CENTER) + _AWAY * back
     step = cell_centres(side) / side * _SPAN - _SPAN / 2
     x, y = np.meshgrid(step, -step)
-    directions = x[..., None] * right + y[..., None] * up - _AWAY * back
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    directions = unit(x[..., None] * right + y[..., None] * up - _AWAY * back)
     return origin, directions, (right, up, back)
 
 
@@ -119,10 +118,8 @@ def _shade(
         (0.8 * right + 0.15 * up + 0.5 * back, 0.24),
     ):
         light = light / np.linalg.norm(light)
-        rays = np.concatenate([place + 8e-4 * n, np.broadcast_to(light, n.shape)], 1)
-        dark = scene.test_occlusions(o3d.core.Tensor(rays.astype(np.float32))).numpy()
-        half = light + view
-        half /= np.linalg.norm(half, axis=1, keepdims=True)
+        dark = scene.test_occlusions(join_rays(place + 8e-4 * n, light)).numpy()
+        half = unit(light + view)
         lit = power * np.where(dark, 0.0, 1.0)
         total = total + lit * np.clip(n @ light, 0, 1)
         gloss += 0.07 * lit * np.clip((n * half).sum(1), 0, 1) ** 28

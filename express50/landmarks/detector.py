@@ -21,6 +21,7 @@ import numpy as np
 import torch
 
 from express50.geometry.conventions import affine_to_opencv
+from express50.geometry.transforms import transform_points
 from express50.landmarks.network import (
     CROP,
     LEFT_EYE,
@@ -127,27 +128,24 @@ def detect_many(
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or 0 in image.shape:
             raise ValueError(f"image is {image.dtype} {image.shape}, expected uint8 (H, W, 3)")
     pyramids = [make_pyramid(image) for image in images]
-    best: list[_Place | None] = [None] * len(images)
+    best: dict[int, _Place] = {}
+    left = list(range(len(images)))  # those in which no face was found yet
     searches = [_searches(image.shape[1], image.shape[0], smallest) for image in images]
-    left = dict(enumerate(searches))
-    while left:
-        windows = {one: next(search, None) for one, search in left.items()}
-        left = {one: search for one, search in left.items() if windows[one] is not None}
-        looks = [Look(pyramids[one], window) for one in left for window in windows[one] or ()]
+    for windows in zip(*searches, strict=True):
+        looks = [Look(pyramids[one], window) for one in left for window in windows[one]]
         places = iter(_run(net, looks))
         coarse = [
-            max(islice(places, len(windows[one] or ())), key=lambda place: place.score)
-            for one in left
+            max(islice(places, len(windows[one])), key=lambda place: place.score) for one in left
         ]
         found = _refined(net, [pyramids[one] for one in left], coarse, refinements)
-        for one, place in zip(list(left), found, strict=True):
-            held = best[one]
-            if held is None or place.score > held.score:
-                best[one] = held = place
-            if held.score >= FOUND_SCORE:
-                del left[one]
-    found = [place for place in best if place is not None]
-    return [_detection(place) for place in _with_close_ups(net, pyramids, found)]
+        for one, place in zip(left, found, strict=True):
+            if one not in best or place.score > best[one].score:
+                best[one] = place
+        left = [one for one in left if best[one].score < FOUND_SCORE]
+        if not left:
+            break
+    faces = [best[one] for one in range(len(images))]
+    return [_detection(place) for place in _with_close_ups(net, pyramids, faces)]
 
 
 def detect_at(
@@ -169,8 +167,9 @@ def _detection(place: _Place) -> Detection:
 def _searches(width: int, height: int, smallest: float) -> Iterator[list[np.ndarray]]:
     """Yield windows to look in: the whole frame, then turned and smaller ones, then smaller yet.
 
-    If smaller windows than usual are allowed, turned ones of the second size come last, because a
-    photograph may lie on its side; of a rig's footage this is known.
+    Frames of any size have the same number of rounds. If smaller windows than usual are allowed,
+    turned ones of the second size come last, because a photograph may lie on its side; of a rig's
+    footage this is known.
     """
     longer = float(max(width, height))
     turned = [np.pi / 2, np.pi, 1.5 * np.pi]
@@ -280,7 +279,7 @@ def cut_crop(image: np.ndarray, window: np.ndarray, size: int) -> np.ndarray:
 def points_in_crop(window: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return crop pixels of image pixels (N, 2), for a placed crop (2, 3)."""
     inverse = np.linalg.inv(np.vstack([window, [0.0, 0.0, 1.0]]))
-    return points @ inverse[:2, :2].T + inverse[:2, 2]
+    return transform_points(inverse, points)
 
 
 def window_about(points: np.ndarray) -> np.ndarray:
@@ -334,7 +333,7 @@ def _looked_closer(
     for (ids, _), window, at, scale in zip(looks, windows, found, np.exp(scales), strict=True):
         scale = scale * np.sqrt(abs(np.linalg.det(window[:, :2])))
         surer = scale < place.sigma[ids]
-        points[ids[surer]] = (at @ window[:, :2].T + window[:, 2])[surer]
+        points[ids[surer]] = transform_points(window, at)[surer]
         sigma[ids[surer]] = scale[surer]
     return replace(place, points=points, sigma=sigma)
 
@@ -388,7 +387,7 @@ def _placed(
     score: float,
 ) -> _Place:
     """Return the face that a crop showed, in pixels of its image."""
-    points, outline = (part @ window[:, :2].T + window[:, 2] for part in (found, edge))
+    points, outline = (transform_points(window, part) for part in (found, edge))
     determinant = np.linalg.det(window[:, :2])
     sigma = sigma * np.sqrt(abs(determinant))
     if determinant < 0:

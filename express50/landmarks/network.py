@@ -187,11 +187,11 @@ class LandmarkNet(nn.Module):
     Only a network for pictures of `whole` heads finds the outline, and has `eyes` and `mouth`.
     """
 
-    def __init__(self, whole: bool = False, mouth: bool = True) -> None:
+    def __init__(self, whole: bool = False) -> None:
         super().__init__()
         self.outline = OutlinePart(48, 128) if whole else None
         self.eyes = eye_net() if whole else None
-        self.mouth = mouth_net() if whole and mouth else None
+        self.mouth = mouth_net() if whole else None
         self.stem1, self.stem2 = _conv(3, 16, 5, 2), _conv(16, 32, 3, 2)
         self.block32 = Residual(32)
         self.down16, self.block16 = _conv(32, 64, 3, 2), Residual(64)
@@ -309,7 +309,7 @@ def trainable_network(path: Path = WEIGHTS) -> LandmarkNet:
     """
     names = [key for key in LandmarkNet().state_dict() if not key.endswith(COUNTERS)]
     arrays = read_arrays(path, FormatError, "landmark weights", names)
-    net = LandmarkNet("outline.spread" in arrays, "mouth.first.weight" in arrays)
+    net = LandmarkNet("outline.spread" in arrays)
     names = [key for key in net.state_dict() if not key.endswith(COUNTERS)]
     try:
         state = {key: torch.from_numpy(arrays[key].astype(np.float32)) for key in names}

@@ -22,6 +22,7 @@ from express50.files.arrays import DAMAGE, read_arrays
 from express50.files.text import read_json
 from express50.geometry.cameras import Camera, normalised
 from express50.geometry.conventions import cell_to_corner
+from express50.geometry.transforms import transform_points
 from express50.landmarks import source_files
 from express50.landmarks.detector import SMALLEST, Detection, cut_crop, detect, place_crop
 from express50.landmarks.irises import Irises, find_irises
@@ -292,7 +293,7 @@ def find_with_fan(fan: torch.jit.ScriptModule, image: np.ndarray, face: Detectio
     found = [_peak(one) for one in heat]
     cells, spread, height = (np.array(part) for part in zip(*found, strict=True))
     step = FAN_CROP / HEAT
-    points = (cells * step) @ window[:, :2].T + window[:, 2]
+    points = transform_points(window, cells * step)
     scale = float(np.sqrt(abs(np.linalg.det(window[:, :2]))))
     confidence = np.clip(height, 0.0, 1.0)
     sigma = np.maximum(spread, 0.5) * step * scale / np.maximum(confidence, 0.05)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from express50.errors import CalibrationError
-from express50.files.calibration import camera_rows, parse_cameras
+from express50.files.calibration import camera_rows, finite_array, parse_cameras
 from express50.files.text import identifier, read_bytes
 from express50.geometry.cameras import Camera, resized
 
@@ -53,6 +53,16 @@ def camera_from_K(
     numbers = tuple(float(x) for x in [*params, *d[:count]])
     pose = np.asarray(cam_from_world, dtype=np.float64)
     return Camera(camera_id, int(size[0]), int(size[1]), model, numbers, pose)
+
+
+def size_from(value: object, what: str) -> tuple[int, int]:
+    """Return width and height of pictures, pixels, that a file states.
+
+    Raises:
+        CalibrationError: they are not two numbers; the message begins with ``what``.
+    """
+    width, height = finite_array(value, (2,), what)
+    return int(width), int(height)
 
 
 def names_from_files(files: Sequence[str]) -> list[str]:

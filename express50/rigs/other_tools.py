@@ -41,6 +41,7 @@ from express50.rigs.camera_builder import (
     camera_from_K,
     checked,
     names_from_files,
+    size_from,
 )
 
 SUBPIXELS = 64  # Qualisys' units per pixel
@@ -85,13 +86,13 @@ def _toml_camera(where: str, name: str, row: dict[str, Any]) -> Camera:
     else:
         R = finite_array(rotation, (3, 3), f"{where} has rotation")
     t = finite_array(row["translation"], (3,), f"{where} has translation")
-    width, height = finite_array(row.get("size"), (2,), f"{where} has size")
+    size = size_from(row.get("size"), f"{where} has size")
     K = K_from_opencv(finite_array(row.get("matrix"), (3, 3), f"{where} has matrix"))
     dist = row.get("distortions", [])
     count = len(dist) if isinstance(dist, list) else 0
     dist = finite_array(dist, (count,), f"{where} has distortions")
     pose = make_transform(R, t)
-    return camera_from_K(identifier(name), K, dist, (int(width), int(height)), pose)
+    return camera_from_K(identifier(name), K, dist, size, pose)
 
 
 def read_kalibr(path: Path) -> dict[str, Camera]:
@@ -117,13 +118,13 @@ def read_kalibr(path: Path) -> dict[str, Camera]:
             step = row.get("T_cn_cnm1")
             pose = finite_array(step, (4, 4), f"{where} has T_cn_cnm1") @ pose
         fx, fy, cx, cy = finite_array(row.get("intrinsics"), (4,), f"{where} has intrinsics")
-        width, height = finite_array(row.get("resolution"), (2,), f"{where} has resolution")
+        size = size_from(row.get("resolution"), f"{where} has resolution")
         K = K_from_opencv(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
         dist = np.zeros(0)
         if model.endswith("radtan"):
             terms = row.get("distortion_coeffs")
             dist = finite_array(terms, (4,), f"{where} has distortion_coeffs")
-        cameras.append(camera_from_K(name, K, dist, (int(width), int(height)), pose))
+        cameras.append(camera_from_K(name, K, dist, size, pose))
     return as_rig(cameras, path)
 
 
@@ -218,15 +219,14 @@ def _metashape_camera(
             " p2; optimise the cameras without other terms"
         )
     f, cx, cy, b1, b2, *dist = (value.get(key, 0.0) for key in TERMS[:10])
-    sides = {} if (size := lens.find("resolution")) is None else size.attrib
-    width, height = finite_array(
-        [sides.get("width"), sides.get("height")], (2,), f"{where} has width and height"
-    )
+    resolution = lens.find("resolution")
+    stated = [None if resolution is None else resolution.get(side) for side in ("width", "height")]
+    width, height = size = size_from(stated, f"{where} has width and height")
     K = np.array([[f + b1, b2, width / 2 + cx], [0, f, height / 2 + cy], [0, 0, 1]])
     pose = motion @ _numbers(where, camera, "transform", 16).reshape(4, 4)
     turn = pose[:3, :3].T / max(np.cbrt(np.linalg.det(motion[:3, :3])), 1e-9)
     place = make_transform(turn, -turn @ pose[:3, 3])
-    return camera_from_K(name, K, dist, (int(width), int(height)), place)
+    return camera_from_K(name, K, dist, size, place)
 
 
 def _numbers(where: str, element: Element, child: str, count: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from express50.errors import CalibrationError
-from express50.files.calibration import finite_array, read_cameras
+from express50.files.calibration import read_cameras
 from express50.files.text import identifier, read_json, read_yaml, reason
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_from_opencv
@@ -24,6 +24,7 @@ from express50.rigs.camera_builder import (
     checked,
     holds,
     in_metres,
+    size_from,
 )
 from express50.rigs.colmap import is_colmap, read_colmap_images
 from express50.rigs.other_tools import (
@@ -174,9 +175,7 @@ def read_opencv_yaml(path: Path, size: tuple[int, int] | None) -> dict[str, Came
         pair = next((pair for pair in _SIZES if table.keys() >= {*pair}), None)
         shape = size
         if pair is not None:
-            sides = [table[side] for side in pair]
-            width, height = finite_array(sides, (2,), f"{file} has {' and '.join(pair)}")
-            shape = int(width), int(height)
+            shape = size_from([table[side] for side in pair], f"{file} has {' and '.join(pair)}")
         if shape is None:
             raise CalibrationError(
                 f"{file}: does not give the images' size; pass --size WIDTHxHEIGHT"

@@ -196,8 +196,7 @@ class Pool:
             StageError: the scheduler cannot be reached.
         """
         if self.slurm:
-            each = (job.jobs * max(1, job.cores // self.threads) for job in self.slurm.values())
-            return min(each)
+            return min(job.jobs * job.processes(self.threads) for job in self.slurm.values())
         if self.scheduler is None:
             return max(1, self.workers)
         if self._workers is None:

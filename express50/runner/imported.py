@@ -18,7 +18,7 @@ from express50.contract.stage import NoSettings, Result, Stage
 from express50.errors import Express50Error
 from express50.files.digests import path_digest, value_digest
 from express50.runner.ledger import IMPORTED, Ledger, Made, Receipt
-from express50.runner.publish import discard_stale, run_folder, set_aside
+from express50.runner.publish import record_published, run_folder, set_aside
 from express50.runner.worker import Task, run_task
 
 Digest = Callable[[Path], str]
@@ -52,10 +52,7 @@ def publish_import(
 
     An item whose receipt has a reason was not published; the previous output stays.
     """
-    inputs = import_inputs(dataset, item)
-    former = ledger.read(stage.name, item).get(item)
-    if former is not None:
-        former = replace(former, made=ledger.made(stage.name, item).get(item))
+    inputs, former = import_inputs(dataset, item), ledger.read_whole(stage.name, item)
     writer = replace(stage, run=lambda *given: write(given[-1]), needs_gpu=lambda config: False)
     # Every import counts as new: a replaced output of an earlier import must not come back.
     fingerprint = IMPORTED + value_digest([inputs, time.time_ns()])
@@ -65,11 +62,7 @@ def publish_import(
             Task(writer, dataset, item, settings, fingerprint, inputs, 1, former, folder)
         )
     if not receipt.reason:
-        discard_stale(dataset, stage.name, item)
-        dataset.log_file(stage.name, item).unlink(missing_ok=True)
-        ledger.write(receipt)
-        if receipt.made is not None:
-            ledger.know(dataset.item_dir(stage.name, item), receipt.made.files)
+        record_published(dataset, ledger, receipt)
     return receipt
 
 

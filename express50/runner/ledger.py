@@ -10,7 +10,7 @@ import sqlite3
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -277,6 +277,11 @@ class Ledger:
                 marks = {name: FileMark(*mark) for name, mark in files.items()}
                 found[row["item"]] = Made(dict(inputs), marks, *settings.get(row["item"], ()))
         return found
+
+    def read_whole(self, stage: str, item: str) -> Receipt | None:
+        """Read the receipt of one item with what its output was made from; None without one."""
+        receipt = self.read(stage, item).get(item)
+        return receipt and replace(receipt, made=self.made(stage, item).get(item))
 
     def write_run(self, run: Run) -> None:
         """Store a run; it replaces the stage's former one."""

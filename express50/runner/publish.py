@@ -17,6 +17,7 @@ from urllib.parse import quote, unquote
 from express50.contract.layout import Dataset
 from express50.errors import StageError
 from express50.files.atomic import FORMER, folder_in_one_step, put_back, sync_directory
+from express50.runner.ledger import Ledger, Receipt
 
 ASIDE = re.compile(rf"(.+)-[0-9a-f]{{32}}({re.escape(FORMER)})?")
 
@@ -77,6 +78,15 @@ def set_aside(
 def discard_stale(dataset: Dataset, stage: str, item: str) -> None:
     """Delete the stale output that an earlier failure of an item left."""
     shutil.rmtree(dataset.stale_dir / stage / item, ignore_errors=True)
+
+
+def record_published(dataset: Dataset, ledger: Ledger, receipt: Receipt) -> None:
+    """Store the receipt of a published item; what its earlier failures left is deleted."""
+    discard_stale(dataset, receipt.stage, receipt.item)
+    dataset.log_file(receipt.stage, receipt.item).unlink(missing_ok=True)
+    ledger.write(receipt)
+    if receipt.made is not None:
+        ledger.know(dataset.item_dir(receipt.stage, receipt.item), receipt.made.files)
 
 
 def leftovers(dataset: Dataset, stage: str) -> list[Path]:

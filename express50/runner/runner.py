@@ -17,7 +17,7 @@ from express50.console import log as write
 from express50.contract.config import config_toml
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Stage
-from express50.errors import ConfigError, NotReadyError, StageError, nearest
+from express50.errors import ConfigError, NotReadyError, StageError, few, nearest
 from express50.files.atomic import check_space, write_bytes
 from express50.files.digests import file_version, path_digest
 from express50.runner.executor import Pool
@@ -28,7 +28,7 @@ from express50.runner.preflight import expected_shortage
 from express50.runner.progress import RunLog, showing
 from express50.runner.publish import (
     clean_leftovers,
-    discard_stale,
+    record_published,
     run_folder,
     set_aside,
     stage_lock,
@@ -143,10 +143,9 @@ def select_items(stage: Stage, dataset: Dataset, pattern: str) -> list[str]:
             f"--items {pattern!r}: {stage.name} has no items yet; {_what_is_missing(dataset)}"
         )
     if not chosen:
-        some = ", ".join(known[:8]) + (", ..." if len(known) > 8 else "")
         raise ConfigError(
             f"--items {pattern!r}: no item of {stage.name} matches{nearest(pattern, known)}; "
-            f"items: {some}"
+            f"items: {few(known, 8)}"
         )
     return chosen
 
@@ -246,16 +245,14 @@ def _sort_items(
     digest_of = functools.cache(lambda path: path_digest(path, ledger.sha256))
     for item in chosen:
         task = Task(stage, dataset, item, config, "", {}, threads)
-        was_imported = item in receipts and receipts[item].imported
-        if was_imported:
-            why = import_trouble(dataset, receipts[item], made.get(item), digest_of)
-            if why:
-                imported = replace(task, fingerprint=receipts[item].fingerprint)
-                work.unreadable.append(failed_receipt(imported, why, 0))
+        imported = receipts[item] if item in receipts and receipts[item].imported else None
+        if imported is not None:
+            if why := import_trouble(dataset, imported, made.get(item), digest_of):
+                former = replace(task, fingerprint=imported.fingerprint)
+                work.unreadable.append(failed_receipt(former, why, 0))
                 continue
             if _is_there(task, made.get(item), ledger):
-                kept = _outcome(receipts[item], status="skipped")
-                work.current[item] = replace(kept, reason=KEPT)
+                work.current[item] = replace(_outcome(imported, status="skipped"), reason=KEPT)
                 continue
         try:
             inputs = input_digests(stage, dataset, item, config, digest_of)
@@ -269,20 +266,23 @@ def _sort_items(
                 work.still_valid.add(item)
             continue
         task = replace(task, fingerprint=fingerprint(stage, config, inputs), inputs=inputs)
-        if was_imported:
-            work.tasks.append(task)
-            work.again[item] = "its import is gone"
-        elif item in done:
+        if item in done and imported is None:
             _compare(task, done[item], made.get(item), ledger, work)
-        else:
-            work.tasks.append(task)
+            continue
+        work.tasks.append(task)
+        if imported is not None:
+            work.again[item] = "its import is gone"
     ledger.keep_digests()
-    reasons = {receipt.reason for receipt in work.unreadable}
-    made_here = not any(receipt.imported for receipt in work.unreadable)  # imports have no settings
-    if len(work.unreadable) == len(chosen) > 1 and len(reasons) == 1 and made_here:
-        # A setting is wrong rather than all items: former outputs stay.
-        raise StageError(f"{stage.name}: no item can be made: {reasons.pop()}")
+    _refuse_all_unreadable(stage, work.unreadable, len(chosen))
     return work
+
+
+def _refuse_all_unreadable(stage: Stage, unreadable: list[Receipt], count: int) -> None:
+    """Raise StageError if one reason keeps all items from being made: former outputs then stay."""
+    reasons = {receipt.reason for receipt in unreadable}
+    made_here = not any(receipt.imported for receipt in unreadable)  # imports have no settings
+    if len(unreadable) == count > 1 and len(reasons) == 1 and made_here:
+        raise StageError(f"{stage.name}: no item can be made: {reasons.pop()}")
 
 
 def _compare(task: Task, former: Receipt, made: Made | None, ledger: Ledger, work: _Work) -> None:
@@ -400,29 +400,23 @@ def _refuse_alike(stage: Stage, ended: list[Receipt], former: Mapping[str, Recei
 
 def _record(dataset: Dataset, ledger: Ledger, receipt: Receipt, still_valid: bool) -> None:
     """Store a receipt; a failed item's former output is set aside, unread, unless it stands."""
-    if receipt.status == "failed" and still_valid:
+    if receipt.status != "failed":
+        record_published(dataset, ledger, receipt)
+    elif still_valid:
         ledger.note_attempt(receipt)
-        return
-    if receipt.status == "failed":
-        _retire(dataset, ledger, receipt.stage, receipt.item)
     else:
-        discard_stale(dataset, receipt.stage, receipt.item)
-        dataset.log_file(receipt.stage, receipt.item).unlink(missing_ok=True)
-    ledger.write(receipt)
-    if receipt.made is not None:
-        ledger.know(dataset.item_dir(receipt.stage, receipt.item), receipt.made.files)
+        _retire(dataset, ledger, receipt.stage, receipt.item)
+        ledger.write(receipt)
 
 
 def _retire(dataset: Dataset, ledger: Ledger, stage: str, item: str) -> None:
     """Set an output aside that no later stage may read; kept in case it becomes valid again."""
     if not dataset.item_dir(stage, item).exists():
         return
-    former = ledger.read(stage, item).get(item)
-    if former is not None and not former.imported:
-        keep = keeping(dataset, replace(former, made=ledger.made(stage, item).get(item)))
-    else:  # the store may be emptied, and an import cannot be made again
-        keep = None
-    set_aside(dataset, stage, item, keep)
+    former = ledger.read_whole(stage, item)
+    if former is not None and former.imported:  # the store may be emptied, and no run makes it
+        former = None
+    set_aside(dataset, stage, item, keeping(dataset, former))
 
 
 def _outcome(receipt: Receipt, status: str = "", again: str = "") -> Outcome:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from express50.geometry.sampling import smoothstep
-from express50.geometry.transforms import rigid_fit
+from express50.geometry.transforms import rigid_fit, transform_points
 from express50.head.model import HeadModel, landmarks, pose
 from express50.twin.alive import own_offsets
 from express50.twin.hair import HairMesh, grow_hair, join_hair
@@ -207,8 +207,7 @@ def pose_body(body: Body, play: TwinPerformance, frame: int) -> Posed:
         skin, held = moves >= 0, moves == WITH_HAND
         out[skin] += (own - body.rest)[moves[skin]]
         if held.any():
-            hand = extras.hand[frame]
-            out[held] = out[held] @ hand[:3, :3].T + hand[:3, 3]
+            out[held] = transform_points(extras.hand[frame], out[held])
         return out @ turn.T + shift
 
     cloth = extras.cloth_vertices @ play.R[frame].T + play.t[frame]

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from express50.capture.expressions import select
-from express50.console import add_command, count
+from express50.console import add_command, answer, count
 from express50.contract.config import field_documents
 from express50.errors import CaptureError
 from express50.files.atomic import dump_json, link_file, write_json
@@ -81,13 +81,10 @@ def record_command(args: argparse.Namespace) -> int:
         hair=not args.no_hair,
     )
     recorded = record(config, args.out, max(1, args.workers), print_progress())
-    if args.json:
-        print(json.dumps({"captures": str(args.out / "captures"), "recorded": recorded}))
-    else:
-        kept = args.subjects - len(recorded)
-        rest = f"; {kept} recorded before" if kept else ""
-        print(f"{count(len(recorded), 'subject')} recorded in {args.out / 'captures'}{rest}")
-    return 0
+    captures, kept = args.out / "captures", args.subjects - len(recorded)
+    rest = f"; {kept} recorded before" if kept else ""
+    line = f"{count(len(recorded), 'subject')} recorded in {captures}{rest}"
+    return answer(args, {"captures": str(captures), "recorded": recorded}, line)
 
 
 def record(

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
 from express50.geometry.sampling import smoothstep
-from express50.geometry.transforms import make_transform
+from express50.geometry.transforms import make_transform, unit
 from express50.head.model import HeadModel, landmarks
 from express50.landmarks.training.scene import RING, glasses_lines
 from express50.twin.hair import HairMesh, grow_hair
@@ -83,7 +83,7 @@ def wear(
     look: PersonLook, rng: np.random.Generator,
 ) -> WornMesh:  # fmt: skip
     """Make what a head with rest vertices (V, 3) wears and holds, except for hair."""
-    marks = landmarks(model, torch.from_numpy(rest[None]).to(model.template))[0].double().numpy()
+    marks = _marks_on(model, rest)
     shade = rng.uniform(0.02, 0.35, 3)
     found = [bare()]
     if "glasses" in kinds:
@@ -107,7 +107,7 @@ def grow_worn(
     look: PersonLook, detail: float, seed: list[int],
 ) -> list[HairMesh]:  # fmt: skip
     """Grow beards, moustaches and fringes on a head with rest vertices (V, 3)."""
-    marks = landmarks(model, torch.from_numpy(rest[None]).to(model.template))[0].double().numpy()
+    marks = _marks_on(model, rest)
     x, y, z = rest.T
     nose, lip, mouth, chin = marks[33], marks[51], marks[[48, 54]].mean(0), marks[8]
     cheek = np.abs(x - mouth[0]) / 0.06
@@ -149,8 +149,7 @@ def hold(
     for name, first, last in cues:
         rng = np.random.default_rng([*seed, *name.encode()])
         vertices, normals = heads(peaks[name])
-        marks = landmarks(model, torch.from_numpy(vertices[None]).to(model.template))
-        marks = marks[0].double().numpy()
+        marks = _marks_on(model, vertices)
         mirror = rng.choice([-1.0, 1.0])
         side = 54 if mirror > 0 else 48  # the corner of the mouth nearer to the hand
         target = marks[[[side, 33], [side, 8], [side, 57], [side, 27]][rng.integers(4)]].mean(0)
@@ -176,14 +175,18 @@ def hold(
     return poses
 
 
+def _marks_on(model: HeadModel, vertices: np.ndarray) -> np.ndarray:
+    """Return the landmarks (68, 3) of a head with these vertices (V, 3)."""
+    return landmarks(model, torch.from_numpy(vertices[None]).to(model.template))[0].double().numpy()
+
+
 def _tube(path: np.ndarray, radius: np.ndarray | float, colour: np.ndarray, closed: bool = False):
     """Make a round rod along points (n, 3)."""
     sides, count = 8, len(path)
     ahead = np.roll(path, -1, 0) - np.roll(path, 1, 0) if closed else np.gradient(path, axis=0)
-    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    ahead = unit(ahead)
     helper = np.where(np.abs(ahead[:, 1:2]) < 0.8, [[0.0, 1.0, 0.0]], [[0.0, 0.0, 1.0]])
-    across = np.cross(helper, ahead)
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    across = unit(np.cross(helper, ahead))
     angle = np.linspace(0, 2 * np.pi, sides, endpoint=False)[:, None]
     ring = np.cos(angle) * across[:, None] + np.sin(angle) * np.cross(ahead, across)[:, None]
     vertices = path[:, None] + np.broadcast_to(radius, count)[:, None, None] * ring

@@ -216,7 +216,7 @@ def view(args: argparse.Namespace) -> int:
 
 def evaluate(args: argparse.Namespace) -> int:
     """Measure a checkpoint on people it has codes for, and on people fitted first."""
-    from grmm.data import spread
+    from express50.geometry.sampling import evenly
     from grmm.evaluate import SEEN, evaluate, kind_of, save_pictures, training_render
     from grmm.identity_evaluation import evaluate_unseen, unseen_views
     from grmm.metrics import PerceptualMetrics
@@ -233,7 +233,7 @@ def evaluate(args: argparse.Namespace) -> int:
     known, unseen = _split(loaded, views, args)
     if args.heldout:
         known = [i for i in known if kind(views.keys[i]) != SEEN]
-    known = spread(known, args.images or len(known))
+    known = evenly(known, args.images or len(known))
     if not known and not unseen:
         raise ConfigError(
             f"{args.shards}: training saw every chosen sample; drop --heldout, or train with "
@@ -275,9 +275,10 @@ def _split(
 
 def score(args: argparse.Namespace) -> int:
     """Measure pictures that another method made."""
+    from express50.geometry.sampling import evenly
     from express50.head.load import load_head
     from grmm.config import DataConfig, MetricsConfig
-    from grmm.data import HeadViews, spread
+    from grmm.data import HeadViews
     from grmm.evaluate import score
     from grmm.metrics import PerceptualMetrics
     from grmm.shard_source import ShardSource, select
@@ -288,7 +289,7 @@ def score(args: argparse.Namespace) -> int:
     source = ShardSource(args.shards, "*")
     views = HeadViews(source, load_head(source.head), data)
     chosen = select(views.keys, args.subjects, args.expressions, args.cameras)
-    chosen = spread(chosen, args.images or len(chosen))
+    chosen = evenly(chosen, args.images or len(chosen))
     judge = PerceptualMetrics(MetricsConfig(alexnet=args.alexnet, inception=args.inception))
     rows = score(args.renders, source.window, views, chosen, judge, args.partial)
     _report(args, rows, judge)

@@ -21,8 +21,9 @@ from torch import Tensor
 
 from express50.dataset.tracks import RIG_RATE, Sequence
 from express50.files.atomic import write_bytes
+from express50.geometry.sampling import evenly
 from grmm.checkpoint import Checkpoint
-from grmm.data import HeadViews, spread
+from grmm.data import HeadViews
 from grmm.edit import POSES, HeadCodes
 from grmm.evaluate import SEEN, kind_of
 from grmm.metrics import psnr_db
@@ -153,7 +154,7 @@ def _loss(person: Person, avatar: Avatar, subject: str, views: HeadViews) -> dic
         if key.subject == subject and key.expression in loaded.model.expressions
     ]  # fmt: skip
     unseen = [i for i in own if kind_of(loaded, keys[i]) != SEEN]
-    chosen = spread(unseen or own, FOOTAGE)
+    chosen = evenly(unseen or own, FOOTAGE)
     full, ours = [], []
     for index in chosen:
         item = views.item(index)

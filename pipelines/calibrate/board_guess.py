@@ -16,7 +16,12 @@ import numpy as np
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from express50.geometry.cameras import MODELS, Camera
-from express50.geometry.transforms import invert_transform, make_transform, matrix_to_axis_angle
+from express50.geometry.transforms import (
+    invert_transform,
+    make_transform,
+    matrix_to_axis_angle,
+    transform_points,
+)
 from pipelines.calibrate.board import BoardCorners, even
 
 MIN_CORNERS = 8  # that a board image needs to count
@@ -162,7 +167,7 @@ def board_poses(view: BoardView) -> list[np.ndarray]:
         refined = cv2.solvePnPRefineLM(centred, view.ideal, eye, None, rotation, translation)
         pose = make_transform(cv2.Rodrigues(refined[0])[0], refined[1].ravel())
         pose[:3, 3] -= pose[:3, :3] @ middle
-        placed = view.points @ pose[:3, :3].T + pose[:3, 3]
+        placed = transform_points(pose, view.points)
         if np.isfinite(placed).all() and placed[:, 2].min() > 0:
             error = placed[:, :2] / placed[:, 2:] - view.ideal
             found.append((float(np.sqrt(np.mean(error**2))), pose))
@@ -235,7 +240,7 @@ def _predictor(
     stacks = [
         np.concatenate(
             [
-                v.points @ p[min(i, len(p) - 1)][:3, :3].T + p[min(i, len(p) - 1)][:3, 3]
+                transform_points(p[min(i, len(p) - 1)], v.points)
                 for v, p in zip(views, poses, strict=True)
             ]
         )
@@ -245,7 +250,7 @@ def _predictor(
     def predict(pose: np.ndarray) -> np.ndarray:
         errors = []
         for stack in stacks:
-            placed = stack @ pose[:3, :3].T + pose[:3, 3]
+            placed = transform_points(pose, stack)
             ahead = np.where(placed[:, 2:] > 0, placed[:, 2:], 1e-9)
             squared = np.sum((placed[:, :2] / ahead - ideal) ** 2, axis=1)
             errors.append(np.sqrt(np.add.reduceat(squared, starts) / counts) * focal)
@@ -318,7 +323,7 @@ def rig_from_boards(
 
 def _view_error(cam_from_board: np.ndarray, view: BoardView) -> float:
     """Return a view's rms error under a pose, normalised; infinite behind the camera."""
-    placed = view.points @ cam_from_board[:3, :3].T + cam_from_board[:3, 3]
+    placed = transform_points(cam_from_board, view.points)
     if placed[:, 2].min() <= 0:
         return float("inf")
     error = placed[:, :2] / placed[:, 2:] - view.ideal

@@ -18,7 +18,12 @@ import numpy as np
 
 from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera, pinhole, project, triangulate
-from express50.geometry.transforms import invert_transform, make_transform, rigid_fit
+from express50.geometry.transforms import (
+    invert_transform,
+    make_transform,
+    rigid_fit,
+    transform_points,
+)
 from express50.rigs.camera_builder import in_metres
 from express50.rigs.world_frame import canonical_from_rig, move_cameras
 from pipelines.calibrate.adjuster import AdjustedRig, RigPriors, adjust_rig, triangulate_tracks
@@ -347,7 +352,7 @@ def pose_of_face(
     except cv2.error:  # landmarks on one spot
         return np.eye(4), float("inf")
     pose = make_transform(cv2.Rodrigues(turn)[0], shift.ravel())
-    placed = shape @ pose[:3, :3].T + pose[:3, 3]
+    placed = transform_points(pose, shape)
     if not (np.isfinite(pose).all() and placed[:, 2].min() > 0):
         return np.eye(4), float("inf")
     off = np.linalg.norm(placed[:, :2] / placed[:, 2:] - xy, axis=1) * camera.K[0, 0]

@@ -26,6 +26,7 @@ from express50.errors import NoFaceError
 from express50.files.images import edge_distance, shrink
 from express50.geometry.cameras import Camera, resized
 from express50.geometry.conventions import corner_to_cell
+from express50.geometry.transforms import transform_points
 from pipelines.matte.plates import blurred, local_colours, to_light
 from pipelines.matte.visual_hull import (
     Ball,
@@ -117,7 +118,7 @@ class HeadPlace:
     def pixels(self, points: np.ndarray, camera: Camera) -> np.ndarray:
         """Project the points (N, 3), head space, in front of a camera to its pixels (M, 2)."""
         world = self.scale * points @ self.rotation.T + self.shift
-        seen = world @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+        seen = transform_points(camera.cam_from_world, world)
         seen = seen[seen[:, 2] > LEAST_DEPTH * self.scale] @ camera.K.T
         return seen[:, :2] / seen[:, 2:]
 

@@ -16,6 +16,7 @@ from express50.files.images import fit_into, write_image
 from express50.geometry.cameras import Camera, pinhole_camera, project_pinhole
 from express50.geometry.conventions import affine_to_opencv
 from express50.geometry.raycast import camera_rays, mesh_scene
+from express50.geometry.transforms import transform_points
 from express50.head.model import HeadModel, landmarks
 from pipelines.track.observe import facing
 from pipelines.track.outline import OutlineTerm
@@ -93,9 +94,9 @@ def draw_column(
     crop = cv2.warpAffine(frame, affine_to_opencv(matrix), (tile, tile), flags=flags)
     shaded = _wireframe(crop, camera, matrix, model, mesh)
     marks = landmarks(model, torch.from_numpy(mesh)[None])[0].numpy()
-    _dots(shaded, project_pinhole(camera, marks)[0] @ matrix[:, :2].T + matrix[:, 2], FITTED_COLOR)
+    _dots(shaded, transform_points(matrix, project_pinhole(camera, marks)[0]), FITTED_COLOR)
     for points in seen:
-        _dots(shaded, points @ matrix[:, :2].T + matrix[:, 2], SEEN_COLOR)
+        _dots(shaded, transform_points(matrix, points), SEEN_COLOR)
     cv2.putText(shaded, camera.id, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1)
     return np.concatenate([crop, shaded])
 

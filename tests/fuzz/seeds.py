@@ -23,7 +23,7 @@ from express50.capture.readers.read import read_any
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.dataset.tracks import read_track
-from express50.dataset.withdraw import files_that, names
+from express50.dataset.withdraw import files_naming, id_finder
 from express50.errors import FormatError, TrainError
 from express50.files.arrays import read_weights
 from express50.files.containers import read_picture
@@ -178,7 +178,7 @@ def _points(root: Path, name: str) -> None:
 
 
 def _verified(shards: Path) -> None:
-    list(files_that(names("S001"), shards))
+    list(files_naming(id_finder("S001"), shards))
     if faults := verify(shards):
         raise FormatError("; ".join(faults))
 

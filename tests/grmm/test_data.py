@@ -8,7 +8,7 @@ import torch
 from express50.errors import FormatError
 from grmm import data
 from grmm.config import DataConfig
-from grmm.data import HeadViews, Shuffle, pose_state, spread
+from grmm.data import HeadViews, Shuffle, pose_state
 from tests.grmm.synthetic import STRETCH, EllipsoidSource, ellipsoid_head
 
 
@@ -115,11 +115,6 @@ def test_ranks_share_one_order_without_overlap():
     ranks = [Shuffle(range(7), seed=3, rank=r, world=3) for r in range(3)]
     together = [rank.next() for _ in range(6) for rank in ranks]
     assert together == [alone.next() for _ in range(18)]
-
-
-def test_spread_takes_both_ends():
-    assert spread(range(10), 4) == [0, 3, 6, 9]
-    assert spread([1, 2], 4) == [1, 2]
 
 
 def test_the_next_sample_is_decoded_beside_the_step():

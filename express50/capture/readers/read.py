@@ -22,7 +22,7 @@ from express50.capture.raw import (
 from express50.capture.readers import codec_avatars, pictures, renderme, videos
 from express50.capture.readers.selection import Selection, folder_id, parse_selection
 from express50.contract.layout import Dataset, footage_source
-from express50.errors import CalibrationError, CaptureError, Express50Error
+from express50.errors import CalibrationError, CaptureError, Express50Error, check_known
 from express50.geometry.cameras import Camera
 from express50.rigs.world_frame import judge
 
@@ -90,9 +90,9 @@ def detect(path: Path, name: object = None) -> Layout:
     """
     if not path.exists():
         raise CaptureError(f"{path}: no such folder or file; expected a capture")
-    names = [layout.name for layout in LAYOUTS]
-    if name is not None and name not in names:
-        raise CaptureError(f"{path}: layout {name!r}, expected one of {OURS}, {', '.join(names)}")
+    if name is not None:
+        names = [OURS, *(layout.name for layout in LAYOUTS)]
+        check_known(str(path), "layout", [str(name)], names, CaptureError)
     for layout in LAYOUTS:
         if name in (None, layout.name) and layout.fits(path):
             return layout

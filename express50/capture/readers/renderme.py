@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
@@ -114,69 +114,89 @@ def read(path: Path, selection: Selection) -> RawCapture:
         CaptureError: a file is damaged, or none can be used.
         CalibrationError: the cameras are malformed.
     """
-    known = performances(path)
-    root = path if path.is_dir() else path.parent
-    skipped, taken, lengths = {}, {}, {}
-    pictures: dict[str, dict[Moment, str]] = {}
-    seen: set[str] = set()
-    for part, performance in known.items():
-        if not selection.has_sequence(part, "*" if path.is_file() else USUAL):
-            skipped[f"sequence {part}"] = (
-                "not a scripted expression; name it in sequences to include it"
-            )
-            continue
-        try:
-            frames, lengths[part] = _frames(performance)
-        except CaptureError as error:
-            skipped[f"sequence {part}"] = str(error)
-            continue
-        seen |= frames.keys()
-        frames = {name: keys for name, keys in frames.items() if selection.has_camera(name)}
-        if not frames:
-            skipped[f"sequence {part}"] = "has no picture of the selected cameras"
-            continue
-        taken[part] = performance
-        for camera, keys in frames.items():
-            prefix = f"{performance.raw.name}{WITHIN}Camera/{camera.removeprefix('cam')}/color"
-            table = pictures.setdefault(camera, {})
-            table |= {(part, key): f"{prefix}/{key}" for key in keys}
-    check_selection(selection, list(known), sorted(seen) or list(selection.cameras))
-    if not taken:
+    known, root = performances(path), path if path.is_dir() else path.parent
+    clips, skipped = _selected_clips(path, known, selection)
+    if not clips:
         reasons = "; ".join(f"{what}: {why}" for what, why in sorted(skipped.items()))
         raise CaptureError(f"{path}: no performance can be used: {reasons}")
-    last = {part: max(k for t in pictures.values() for p, k in t if p == part) for part in taken}
-    line = common_timeline(root, pictures, list(taken), required=last.items())
-    calibration, warnings = _calibration(taken.values(), line.cameras.keys())
+    pictures: dict[str, dict[Moment, str]] = {}
+    for part, clip in clips.items():
+        for camera, keys in clip.frames.items():
+            prefix = f"{known[part].raw.name}{WITHIN}Camera/{camera.removeprefix('cam')}/color"
+            table = pictures.setdefault(camera, {})
+            table |= {(part, key): f"{prefix}/{key}" for key in keys}
+    last = {part: max(map(max, clip.frames.values())) for part, clip in clips.items()}
+    line = common_timeline(root, pictures, list(clips), required=last.items())
+    taken = [known[part] for part in clips]
+    calibration, warnings = _calibration(taken, line.cameras.keys())
     expressions = {"e0": "neutral"} | dict(selection.expressions)
-    clips = {part: expressions.get(part) or selection.expression(part) for part in line.sequences}
+    names = {part: expressions.get(part) or selection.expression(part) for part in line.sequences}
     facts = {
-        clip: {
+        name: {
             "performance": part,
-            "release": taken[part].release,
-            "num_frame": lengths[part],
+            "release": known[part].release,
+            "num_frame": clips[part].count,
             "last_frame": last[part],
         }
-        for part, clip in clips.items()
+        for part, name in names.items()
     }
     return RawCapture(
         root=root,
         subject=subject_of(path),
         fps=FPS,
         meta={"licence": "research only, see the terms of RenderMe-360"}
-        | _person(next(iter(taken.values())))
+        | _person(taken[0])
         | {"renderme360": facts},
         cameras=line.cameras,
         dropped=line.dropped,
         calibration=calibration,
-        clips=tuple(clips.values()),
+        clips=tuple(names.values()),
         skipped=skipped | line.skipped,
-        found={"releases": sorted({p.release for p in taken.values()})},
+        found={"releases": sorted({performance.release for performance in taken})},
         warnings=warnings,
     )
 
 
-def _frames(performance: Performance) -> tuple[dict[str, list[int]], int]:
-    """Read the frame numbers by camera, and the clip's number of frames as the file states it.
+@dataclass(frozen=True)
+class PerformanceClip:
+    """The frame numbers by camera, and the number of frames as the file states it."""
+
+    frames: dict[str, list[int]]
+    count: int
+
+
+def _selected_clips(
+    path: Path, known: dict[str, Performance], selection: Selection
+) -> tuple[dict[str, PerformanceClip], dict[str, str]]:
+    """Read the selected performances' clips of the selected cameras; say why others are skipped.
+
+    Raises:
+        CaptureError: a selected camera is in no clip.
+    """
+    usual = "*" if path.is_file() else USUAL
+    clips, skipped, seen = {}, {}, set[str]()
+    for part, performance in known.items():
+        what = f"sequence {part}"
+        if not selection.has_sequence(part, usual):
+            skipped[what] = "not a scripted expression; name it in sequences to include it"
+            continue
+        try:
+            clip = _read_clip(performance)
+        except CaptureError as error:
+            skipped[what] = str(error)
+            continue
+        seen |= clip.frames.keys()
+        frames = {name: keys for name, keys in clip.frames.items() if selection.has_camera(name)}
+        if frames:
+            clips[part] = replace(clip, frames=frames)
+        else:
+            skipped[what] = "has no picture of the selected cameras"
+    check_selection(selection, list(known), sorted(seen) or list(selection.cameras))
+    return clips, skipped
+
+
+def _read_clip(performance: Performance) -> PerformanceClip:
+    """Read a performance's frame numbers.
 
     Raises:
         CaptureError: the file is damaged, or a scripted clip lacks its end, where its peak is.
@@ -205,7 +225,7 @@ def _frames(performance: Performance) -> tuple[dict[str, list[int]], int]:
             f"{performance.raw}: has {len(have)} frames up to number {max(have)}, num_frame is "
             f"{count}: the end of the clip, where the expression is, is missing; copy it again"
         )
-    return found, count
+    return PerformanceClip(found, count)
 
 
 def _person(performance: Performance) -> dict[str, object]:

@@ -19,7 +19,7 @@ from typing import Any
 
 from express50.capture.raw import RawCamera
 from express50.errors import CaptureError, few
-from express50.files.text import identifier
+from express50.files.text import identifier, is_number
 
 EXPRESSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9_]*")
 # A camera that lacks more than this share of the moments is dropped; otherwise the moments are.
@@ -92,8 +92,7 @@ def parse_selection(meta: Mapping[str, Any], where: Path) -> Selection:
         CaptureError: a value is of another type, or an expression id cannot be one.
     """
     scale = meta.get("metres_per_unit")
-    usable = isinstance(scale, int | float) and not isinstance(scale, bool)
-    if scale is not None and not (usable and math.isfinite(scale) and scale > 0):
+    if scale is not None and not (is_number(scale) and 0 < scale < math.inf):
         raise CaptureError(f"{where}: metres_per_unit is {scale!r}, expected a number above 0")
     names = meta.get("expressions", {})
     if not isinstance(names, dict) or not all(
@@ -130,10 +129,9 @@ def check_selection(selection: Selection, sequences: Sequence[str], cameras: Seq
     ):
         for pattern in patterns:
             if not fnmatch.filter(known, pattern):
-                some = ", ".join(known[:8]) + (", ..." if len(known) > 8 else "")
                 raise CaptureError(
                     f"capture.toml: {what} names {pattern!r}, which matches nothing; expected some"
-                    f" of {some or 'none'}"
+                    f" of {few(known, 8) or 'none'}"
                 )
 
 

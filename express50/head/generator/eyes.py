@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from express50.geometry.transforms import unit
 from express50.head.generator.field import EYE_CENTER, EYE_RADIUS, LID_RADIUS, cast, labels
 from express50.head.generator.mesh import HalfMesh, WholeMesh
 
@@ -50,9 +51,8 @@ def add_eye_rings(half: HalfMesh) -> Array:
     points = rings[0]
     away = points - EYE_CENTER
     edge = EYE_CENTER + away * (EYE_RADIUS + 0.15) / np.linalg.norm(away, axis=1, keepdims=True)
-    xy = points[:, :2] - points[:, :2].mean(0)
-    xy = xy / np.linalg.norm(xy, axis=1, keepdims=True)
-    hidden = edge + np.pad(xy * 4.0, ((0, 0), (0, 1))) - EYE_CENTER
+    away_xy = unit(points[:, :2] - points[:, :2].mean(0))
+    hidden = edge + np.pad(away_xy * 4.0, ((0, 0), (0, 1))) - EYE_CENTER
     hidden = EYE_CENTER + hidden * (EYE_RADIUS + 0.2) / np.linalg.norm(hidden, axis=1)[:, None]
     middle = margin_label.mean(0)
     rows = [indices[0]]

@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 
+from express50.geometry.transforms import unit
+
 Array = np.ndarray
 
 EYE_CENTER = np.array([31.5, 20.0, 70.0])
@@ -149,7 +151,7 @@ def skin_field(points: Array) -> Array:
 
 def cast(origins: Array, directions: Array) -> Array:
     """Find the outermost hits (N,3) of rays with the skin, marching inwards from 170 mm."""
-    d = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    d = unit(directions)
     t, active = np.full(len(origins), 170.0), np.arange(len(origins))
     for _ in range(70):
         value = skin_field(origins[active] + t[active, None] * d[active])
@@ -162,7 +164,7 @@ def cast(origins: Array, directions: Array) -> Array:
 
 def cast_out(origins: Array, directions: Array) -> Array:
     """Find where (N,3) rays that start inside the skin first leave it."""
-    d = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    d = unit(directions)
     t = np.zeros(len(origins))
     for _ in range(30):
         t = t - 0.8 * skin_field(origins + t[:, None] * d)

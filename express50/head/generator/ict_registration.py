@@ -18,6 +18,7 @@ from scipy.sparse.linalg import LinearOperator, cg, splu
 from scipy.spatial import cKDTree
 
 from express50.geometry.meshes import cotangent_laplacian
+from express50.geometry.transforms import unit
 from express50.head.generator.eyes import LID_SEGMENTS
 from express50.head.generator.mesh import WholeMesh
 from express50.head.generator.regions import embed_landmarks
@@ -297,6 +298,5 @@ def sample_skin(skin: IctSkin, count: int = 300_000) -> SkinSample:
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     corners = skin.faces[rng.choice(len(area), count, p=area / area.sum())]
     weights = rng.dirichlet((1, 1, 1), count)
-    normals = (skin.normals[corners] * weights[..., None]).sum(1)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = unit((skin.normals[corners] * weights[..., None]).sum(1))
     return SkinSample((skin.points[corners] * weights[..., None]).sum(1), normals, corners, weights)

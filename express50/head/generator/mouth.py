@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from express50.geometry.transforms import unit
 from express50.head.generator.eyes import from_front
 from express50.head.generator.field import gradient, labels, skin_field
 from express50.head.generator.mesh import HalfMesh
@@ -123,7 +124,7 @@ def _arch(upper: bool) -> tuple[Array, Array, Array]:
     xs, zs = np.interp(along, length, x), np.interp(along, length, z)
     ahead = along + 1
     tangent = np.stack([np.interp(ahead, length, x) - xs, np.interp(ahead, length, z) - zs], 1)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    tangent = unit(tangent)
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], 1)
     normal[0] = (0.0, 1.0)
     return np.stack([xs, zs], 1), normal, phase

@@ -12,6 +12,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import ConvexHull, cKDTree
 from skimage.measure import points_in_poly
 
+from express50.geometry.transforms import unit
 from express50.head.generator.eyes import add_eye_rings
 from express50.head.generator.field import (
     BOTTOM_LATITUDE,
@@ -63,8 +64,7 @@ def add_skin(half: HalfMesh) -> None:
         points[filled] = project(points[filled], 1)
         direction[filled] += 0.6 * (neighbour_mean(direction, faces) - direction)[filled]
     points[filled] = project(points[filled], 3)
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    x, y, z = direction[filled].T
+    x, y, z = unit(direction[filled]).T
     half.labels[filled] = np.stack([np.arctan2(x, z), np.degrees(np.arcsin(y))], 1)
 
 
@@ -267,8 +267,7 @@ def add_ear(half: HalfMesh) -> Array:
     x = side(canal) + _flare(canal) + _relief(canal, np.ones(1), rim[:1]) - 1.0
     center = half.add(_place(canal, x), "ear")
     half.fan("ear", center, rows[-1], closed=True)
-    turn = rim - _CONCHA
-    turn /= np.linalg.norm(turn, axis=1, keepdims=True)
+    turn = unit(rim - _CONCHA)
     for k, row in enumerate(rows):
         half.set_uv("ear", row, turn * (1 - k / len(rows)))
     half.set_uv("ear", center, np.zeros((1, 2)))

@@ -24,7 +24,7 @@ from express50.landmarks.network import (
     eye_net,
     mouth_net,
 )
-from express50.landmarks.training.descent import descend
+from express50.landmarks.training.descent import descend, laplace_loss
 from express50.landmarks.training.random_heads import BLINKS, random_head
 from express50.landmarks.training.scene import HeadScene
 from express50.landmarks.training.views import composite, degrade, made_once, make_backgrounds
@@ -131,9 +131,7 @@ def train_part(part: Part, models: list[HeadModel], folder: Path, seed: int) -> 
         crops, points = zip(*(close_crop(part, net, views[k], rng) for k in picks), strict=True)
         images = torch.from_numpy(np.stack(crops)).permute(0, 3, 1, 2).float() / 255.0
         found, log_scale = net(images)
-        # The added 0.01 px^2 bounds the slope at zero distance.
-        distance = (found - torch.from_numpy(np.stack(points))).square().sum(-1).add(0.01).sqrt()
-        return (0.2 * distance + 2 * log_scale + distance * torch.exp(-log_scale)).mean()
+        return laplace_loss(found, log_scale, torch.from_numpy(np.stack(points)))[0].mean()
 
     names = "-".join(model.name for model in models)
     state = folder / f"{part.name}-training-{names}-{seed}.pt"

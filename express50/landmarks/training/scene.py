@@ -13,7 +13,7 @@ import numpy as np
 import open3d as o3d
 
 from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
-from express50.geometry.transforms import make_transform, unit
+from express50.geometry.transforms import make_transform, transform_points, unit
 from express50.head.model import HeadModel
 from express50.landmarks.training.places import face_front
 from express50.landmarks.training.random_heads import LASHES, Canvas, RandomHead, paint, waves
@@ -224,7 +224,7 @@ def glasses_lines(
 
 def project(projection: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return the pixels (N, 2) of points (N, 3) under a projection (3, 4)."""
-    pixels = points @ projection[:, :3].T + projection[:, 3]
+    pixels = transform_points(projection, points)
     return pixels[:, :2] / pixels[:, 2:]
 
 

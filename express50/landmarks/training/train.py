@@ -38,7 +38,7 @@ from express50.landmarks.network import (
 )
 from express50.landmarks.training.close_ups import PARTS as CLOSE_UPS
 from express50.landmarks.training.close_ups import train_part
-from express50.landmarks.training.descent import descend
+from express50.landmarks.training.descent import descend, laplace_loss
 from express50.landmarks.training.scene import TrainingView
 from express50.landmarks.training.views import (
     FILE_VIEWS,
@@ -188,10 +188,8 @@ def place_loss(
     found: torch.Tensor, log_scale: torch.Tensor, heat: torch.Tensor, points: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return losses and distances (B, N) of found points (B, N, 2), see `point_loss`."""
-    # The added 0.01 px^2 bounds the slope at zero distance.
-    distance = ((found - points).square().sum(-1) + 0.01).sqrt()
-    likelihood = 2 * log_scale + distance * torch.exp(-log_scale)
-    return 0.2 * distance + likelihood + heat_loss(heat, points), distance
+    loss, distance = laplace_loss(found, log_scale, points)
+    return loss + heat_loss(heat, points), distance
 
 
 def crop_loss(net: LandmarkNet, crops: list[TrainingCrop]) -> torch.Tensor:

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from express50.geometry.conventions import affine_to_opencv
+from express50.geometry.transforms import transform_points
 from express50.head.model import HeadModel
 from express50.landmarks.network import (
     CROP,
@@ -98,22 +99,9 @@ def random_crop(
 ) -> TrainingCrop:
     """Draw one training crop of a view, (size, size) pixels."""
     points = view.points.astype(np.float64)
-    centre, side = face_box(points[:POINTS])
     empty = rng.random() < 0.08
-    if rng.random() < 0.8:
-        side *= np.exp(rng.uniform(-0.18, 0.25))
-        centre = centre + rng.normal(size=2) * 0.05 * side
-    else:
-        side *= np.exp(rng.uniform(0.0, 1.15))
-        centre = centre + rng.uniform(-0.3, 0.3, 2) * side * (1 - CROP_MARGIN / 3)
-    angle = rng.normal() * 0.2
-    # From view pixels to crop pixels, corner origin.
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    turn = CROP / side * turn
-    if rng.random() < 0.5:
-        turn = np.diag([-1.0, 1.0]) @ turn
-    matrix = np.concatenate([turn, (CROP / 2 - turn @ centre)[:, None]], axis=1)
-    points = points @ matrix[:, :2].T + matrix[:, 2]
+    matrix = _random_placement(points[:POINTS], rng)
+    points = transform_points(matrix, points)
     visible = view.visible
     if np.linalg.det(matrix[:, :2]) < 0:
         points, visible = points[MIRROR_WITH_OUTLINE], visible[MIRROR]
@@ -142,6 +130,23 @@ def random_crop(
     shown[shown] = covered[row[shown], column[shown]] == 0
     visible = (visible & shown).astype(np.float32)
     return TrainingCrop(degrade(image, rng), points.astype(np.float32), visible, score, weight)
+
+
+def _random_placement(points: np.ndarray, rng: Rng) -> np.ndarray:
+    """Draw the map (2, 3) from pixels of a view with landmarks (68, 2) to those of a crop."""
+    centre, side = face_box(points)
+    if rng.random() < 0.8:
+        side *= np.exp(rng.uniform(-0.18, 0.25))
+        centre = centre + rng.normal(size=2) * 0.05 * side
+    else:
+        side *= np.exp(rng.uniform(0.0, 1.15))
+        centre = centre + rng.uniform(-0.3, 0.3, 2) * side * (1 - CROP_MARGIN / 3)
+    angle = rng.normal() * 0.2
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    turn = CROP / side * turn
+    if rng.random() < 0.5:
+        turn = np.diag([-1.0, 1.0]) @ turn
+    return np.concatenate([turn, (CROP / 2 - turn @ centre)[:, None]], axis=1)
 
 
 def composite(rgba: np.ndarray, matrix: np.ndarray, background: np.ndarray) -> np.ndarray:

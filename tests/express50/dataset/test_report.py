@@ -9,7 +9,7 @@ import pytest
 
 from express50.__main__ import main
 from express50.contract.layout import Dataset
-from express50.dataset.report import number, render_page, spread
+from express50.dataset.report import number, render_page
 from express50.files.images import decode_image, write_image
 from express50.runner.ledger import Ledger, Receipt
 
@@ -141,7 +141,3 @@ def test_figures_read_as_a_person_would():
         "12,346",
         "True",
     ]
-
-
-def test_spread_keeps_both_ends():
-    assert spread(list(range(30)), 4) == [0, 10, 19, 29]

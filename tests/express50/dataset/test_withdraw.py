@@ -17,9 +17,9 @@ from express50.contract.layout import Dataset
 from express50.dataset import withdraw as withdraw_module
 from express50.dataset.audit import audit
 from express50.dataset.withdraw import (
-    files_that,
-    names,
-    names_any_of,
+    any_id_finder,
+    files_naming,
+    id_finder,
     withdraw,
     withdrawn,
     withdrawn_file,
@@ -78,10 +78,10 @@ def test_nothing_of_the_subject_stays_and_the_others_are_untouched(dataset):
     dataset.slurm_dir.mkdir(parents=True)
     (dataset.slurm_dir / "1000.out").write_text("S001: chatter of a library")
     others = {k: v for k, v in tree(dataset.root).items() if "S002" in k}
-    assert len(list(files_that(names("S001"), dataset.root))) > 5
+    assert len(list(files_naming(id_finder("S001"), dataset.root))) > 5
     done = withdraw(dataset, "S001")
     assert done.remaining == ()
-    assert list(files_that(names("S001"), dataset.root)) == []
+    assert list(files_naming(id_finder("S001"), dataset.root)) == []
     assert b"S001" not in dataset.ledger.read_bytes()
     assert {k: v for k, v in tree(dataset.root).items() if "S002" in k} == others
     assert not dataset.item_dir("pack", "shards").exists()
@@ -140,7 +140,7 @@ def test_outputs_that_were_replaced_go_too(dataset):
     entry.mkdir(parents=True)
     (entry / "cam00.png").write_bytes(b"pixels")
     digests = withdrawn(dataset)
-    assert list(files_that(names_any_of(digests), dataset.root)) == [entry / "cam00.png"]
+    assert list(files_naming(any_id_finder(digests), dataset.root)) == [entry / "cam00.png"]
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "../..", "S001/", "S001/cam00", "shards", "S009"])
@@ -258,7 +258,7 @@ def test_no_subject_is_withdrawn_while_a_stage_runs(dataset):
     assert after == before
 
 
-@pytest.mark.parametrize("test", [names("104"), names_any_of({text_digest("104")})])
+@pytest.mark.parametrize("test", [id_finder("104"), any_id_finder({text_digest("104")})])
 def test_a_number_is_not_an_id_of_digits(test):
     for text in (
         '{"frame": 104, "x": 0.104}', '[103,104]', '[["smile", 104, 111]]', "x = 104\n",
@@ -274,7 +274,7 @@ def test_ids_at_the_joint_of_two_blocks_are_whole_words(tmp_path, monkeypatch):
     monkeypatch.setattr(withdraw_module, "CHUNK", 8)
     for text, found in (("abc S0012 x", []), ("abc S001 x", [True]), ("xyz1 S001", [True])):
         (tmp_path / "a.txt").write_text(text)
-        assert [True for _ in files_that(names("S001"), tmp_path)] == found
+        assert [True for _ in files_naming(id_finder("S001"), tmp_path)] == found
 
 
 def test_texts_in_arrays_and_archives_are_read_and_numbers_are_not(tmp_path):
@@ -282,9 +282,9 @@ def test_texts_in_arrays_and_archives_are_read_and_numbers_are_not(tmp_path):
     np.savez(tmp_path / "chance.npz", values=np.frombuffer(b"\0S001\0\0\0", np.uint8))
     (tmp_path / "S001_smile.txt").write_text("")
     (tmp_path / "S0011.txt").write_text("S0011 xS001 S001x")
-    found = {path.name for path in files_that(names("S001"), tmp_path)}
+    found = {path.name for path in files_naming(id_finder("S001"), tmp_path)}
     assert found == {"who.npz", "S001_smile.txt"}
-    by_digest = files_that(names_any_of({text_digest("S001")}), tmp_path)
+    by_digest = files_naming(any_id_finder({text_digest("S001")}), tmp_path)
     assert {path.name for path in by_digest} == found
 
 
@@ -317,8 +317,8 @@ def test_another_subject_whose_id_holds_the_persons_keeps_everything(dataset, tm
     assert main(["check", str(dataset.root)]) == 1
     assert "notes.txt: names a person" in capsys.readouterr().out
     # The other way round: the longer id is withdrawn, the shorter one stays.
-    assert names("S1_b", {"S1"})(b"S1_b_smile") and not names("S1_b", {"S1"})(b"S1_smile")
-    test = names_any_of({text_digest("S1_b")}, {"S1"})
+    assert id_finder("S1_b", {"S1"})(b"S1_b_smile") and not id_finder("S1_b", {"S1"})(b"S1_smile")
+    test = any_id_finder({text_digest("S1_b")}, {"S1"})
     assert test(b"S1_b_smile") and not test(b"S1_smile")
 
 
@@ -327,7 +327,7 @@ def test_what_came_back_is_withdrawn_again(dataset):
     with publishing(dataset, "track", "S001") as out:  # from a backup
         (out / "metrics.json").write_text("{}")
     assert withdraw(dataset, "S001").removed == (dataset.item_dir("track", "S001"),)
-    assert list(files_that(names("S001"), dataset.root)) == []
+    assert list(files_naming(id_finder("S001"), dataset.root)) == []
 
 
 PERSON = 'name = "Jane Roe"\nage = 4711e-2\ngender = "feminine"\nconsent_id = "C-77"\n'

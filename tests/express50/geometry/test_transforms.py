@@ -110,3 +110,15 @@ def test_look_at_puts_the_target_ahead_with_up_upwards():
     np.testing.assert_allclose(T @ [0, 1, 0, 1], [0, 0, 2, 1], atol=1e-12)
     assert (T @ [0, 2, 0, 1])[1] < 0  # up in the world is -y in an OpenCV camera
     np.testing.assert_allclose(transforms.invert_transform(T) @ T, np.eye(4), atol=1e-12)
+
+
+def test_points_move_in_space_and_in_pixels():
+    T = transforms.make_transform(
+        transforms.axis_angle_to_matrix(np.array([0.0, 0.0, np.pi / 2])), np.array([1.0, 2.0, 3.0])
+    )
+    moved = transforms.transform_points(T, np.array([[[1.0, 0.0, 0.0]]]))
+    np.testing.assert_allclose(moved, [[[1.0, 3.0, 3.0]]], atol=1e-12)
+    window = np.array([[2.0, 0.0, 5.0], [0.0, 2.0, 6.0]])
+    np.testing.assert_array_equal(
+        transforms.transform_points(window, np.ones((1, 2))), [[7.0, 8.0]]
+    )

@@ -94,6 +94,12 @@ def test_gpu_job_asks_for_one_device_and_works_at_one_item(tmp_path):
     assert "--resources GPU=1" in script
 
 
+def test_jobs_work_at_as_many_items_as_they_have_workers():
+    jobs = {"cores": small(cores=8, jobs=3), "gpu": small(cores=8, jobs=3, gpus=1)}
+    assert Pool(threads=2, slurm={"depth": jobs["cores"]}).width() == 12
+    assert Pool(threads=2, slurm={"depth": jobs["gpu"]}).width() == 3
+
+
 def test_options_of_a_file_and_of_one_line(tmp_path):
     line = read_slurm("partition=cpu,time=4:00:00,memory=16G,cores=4", STAGES)
     assert line["depth"] == SlurmJob(partition="cpu", time="4:00:00", memory="16G", cores=4)
