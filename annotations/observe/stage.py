@@ -6,6 +6,7 @@ single detections out of the curves in which expressions are searched for.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -163,8 +164,8 @@ def choose_cameras(
     frames = sorted({frame for _, frame in attempts})
     raise StageError(
         f"{index.subject}: no camera sees a face in frames {', '.join(map(str, frames))}"
-        f" (best score {best:.2f}, expected {min_score}); check that the face is in view, label it"
-        " with 'express50 annotate mark', or lower observe.min_score"
+        f" (best score {math.floor(100 * best) / 100:.2f}, expected {min_score}); check that the"
+        " face is in view, label it with 'express50 annotate mark', or lower observe.min_score"
     )
 
 

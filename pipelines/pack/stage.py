@@ -100,7 +100,7 @@ def pack(dataset: Dataset, config: PackConfig, out: Path) -> Result:
     """
     accounts, dropped = _read_accounts(dataset)
     if not accounts:
-        why = "; ".join(map(str, dropped[:3]))
+        why = "; ".join(f"{note.what}: {note.why}" for note in dropped[:3])
         raise StageError(f"shards: no subject can be packed ({why}); run the earlier stages")
     splits = split_subjects(list(accounts), config.test_subjects, config.test_fraction)
     sources = [(dataset.item_dir("encode", n), split) for split in splits for n in splits[split]]

@@ -229,7 +229,7 @@ def find_faces(path: Path, images: list[np.ndarray], config: TrackConfig) -> lis
     seen = [detect(net, image, DETECTOR_PASSES, config.search) for image in images]
     faces = [face for face in seen if face.score >= FACE_SCORE]
     if not faces:
-        best = max(face.score for face in seen)
+        best = math.floor(100 * max(face.score for face in seen)) / 100
         raise CaptureError(
             f"{path}: no face found (best score {best:.2f}, expected {FACE_SCORE} or more); use a "
             "picture that shows the whole face from the front or the side, at "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from express50.head.preview import render_preview
 from express50.landmarks.detector import Detection, detect
 from express50.landmarks.irises import find_irises
 from express50.landmarks.network import load_network
+from pipelines.photo import capture
 from pipelines.photo.capture import find_faces, single_camera, weigh_focal
 from pipelines.track.basis import Basis, Points, make_basis
 from pipelines.track.config import TrackConfig
@@ -111,6 +113,13 @@ def test_a_profile_is_found_and_fitted(basis, yaw: float) -> None:
 def test_the_back_of_a_head_is_no_face(yaw: float) -> None:
     with pytest.raises(CaptureError, match=r"back.png: no face found \(best score 0.0"):
         find_faces(Path("back.png"), [head_from(yaw)], TrackConfig())
+
+
+def test_a_score_just_too_low_is_not_rounded_up(monkeypatch) -> None:
+    almost = SimpleNamespace(score=0.1999)
+    monkeypatch.setattr(capture, "detect", lambda *unused: almost)
+    with pytest.raises(CaptureError, match=r"best score 0.19, expected 0.2 or more"):
+        find_faces(Path("dim.png"), [head_from(0.0)], TrackConfig())
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 300), (3000, 2)])

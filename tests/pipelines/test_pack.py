@@ -252,6 +252,12 @@ def test_a_subject_without_peak_frames_is_told_to_align_first(ingested):
         read_subject(ingested, "S001")
 
 
+def test_packing_without_samples_says_why_in_words(ingested, tmp_path):
+    with pytest.raises(StageError, match=r"no subject can be packed \(S001: not encoded; run") as e:
+        PACK.run(ingested, "shards", SPLIT, tmp_path)
+    assert "Note(" not in str(e.value)
+
+
 def test_packing_twice_gives_the_same_bytes(dataset, packed, tmp_path):
     for stage, item, config in ((ENCODE, "S001", SMALL), (PACK, "shards", SPLIT)):
         out = tmp_path / stage.name
