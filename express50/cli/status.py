@@ -82,6 +82,10 @@ def add_commands(subparsers: Any) -> None:
 
 def show_status(args: argparse.Namespace) -> int:
     """Print or publish the progress of the stages; return exit code 1 if an item failed."""
+    trials = list(_trial_lines(Dataset(args.dataset)))
+    if trials and not Dataset(args.dataset).ledger.is_file():  # the first run still measures
+        answer(args, {}, *trials)
+        return OK
     dataset = existing_dataset(args.dataset)
     if args.serve is not None:
         return _serve(dataset, args.serve)
@@ -99,7 +103,7 @@ def show_status(args: argparse.Namespace) -> int:
             ]
             for s in table
         }
-        answer(args, rows, *_lines(table), *_outdated_lines(why))
+        answer(args, rows, *_lines(table), *trials, *_outdated_lines(why))
     return FAILED if any(row.failed for row in table) else OK
 
 
@@ -154,6 +158,20 @@ def _lines(table: list[StageStatus]) -> Iterator[str]:
     for row in table:
         for receipt in row.failed:
             yield f"failed {receipt.stage} {receipt.item}: {receipt.reason}"
+
+
+def _trial_lines(dataset: Dataset) -> Iterator[str]:
+    """Say which stages a pilot is trying; its trials are datasets of their own."""
+    # Imported here: the page and the other commands do not need it.
+    from express50.dial.pilot import pilot_dir
+
+    for root in sorted(pilot_dir(dataset).glob("*/ledger.sqlite")):
+        for row in _read(Dataset(root.parent)):
+            if row.state == "running":
+                yield (
+                    f"running {row.stage}: a trial that measures its settings on a few expressions,"
+                    " for 'run --budget' or 'tune'"
+                )
 
 
 def _outdated_lines(why: Mapping[tuple[str, str], str]) -> Iterator[str]:

@@ -20,8 +20,11 @@ from express50.__main__ import main
 from express50.cli import status as status_cli
 from express50.cli.status import SILENT_SECONDS, UNLOCKED_SECONDS, read_status, status_page
 from express50.console import format_seconds
+from express50.contract.layout import Dataset
+from express50.dial.pilot import pilot_dir
 from express50.runner.ledger import Ledger, Receipt, Run
 from express50.runner.publish import is_running
+from pipelines import ingest
 from tests.faults import toy
 from tests.synth import make_capture
 
@@ -63,6 +66,23 @@ def test_a_run_states_what_is_done_running_and_missing_and_when_it_ends(tmp_path
     assert row.rate == pytest.approx(6 / 20)
     assert row.left_s == pytest.approx((14 - 2 - 6) / (6 / 20))
     assert (row.seconds, row.peak_memory) == (14.0, 7)
+
+
+def test_a_trial_of_a_budgeted_run_is_shown(tmp_path, capsys):
+    """It works in a dataset of its own, so that the table alone shows nothing for minutes."""
+    make_capture(tmp_path / "S001", cameras=1)
+    dataset = Dataset(tmp_path / "data")
+    ingest.register(dataset, [tmp_path / "S001"])
+    trial = pilot_dir(dataset) / "abc"
+    trial.mkdir(parents=True)
+    now = time.time()
+    with Ledger(trial / "ledger.sqlite") as ledger:
+        ledger.write_run(Run(stage="observe", items=1, begun=now, seen=now, running={"S001": now}))
+    assert main(["status", str(dataset.root)]) == 0
+    assert "running observe: a trial" in capsys.readouterr().out
+    Ledger(dataset.ledger).__exit__()
+    assert main(["status", str(dataset.root)]) == 0
+    assert "running observe: a trial" in capsys.readouterr().out
 
 
 def test_an_item_that_has_ended_since_the_last_sign_is_not_running(tmp_path):
