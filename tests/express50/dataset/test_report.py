@@ -141,3 +141,8 @@ def test_figures_read_as_a_person_would():
         "12,346",
         "True",
     ]
+
+
+def test_wide_contact_sheets_take_the_whole_width(dataset):
+    page = render_page(dataset)
+    assert page.count('<figure class="wide"><img') == 4
