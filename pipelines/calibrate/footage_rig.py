@@ -148,10 +148,9 @@ def solve_footage(
     if turned := mirrored_by_faces(poses):
         mirrored |= turned
         seen = {frame: points.without(turned) for frame, points in seen.items()}
-        sizes, start, poses = (
-            {n: value for n, value in table.items() if n not in turned}
-            for table in (sizes, start, poses)
-        )
+        sizes = {n: size for n, size in sizes.items() if n not in turned}
+        start = {n: start[n] for n in sizes}
+        poses = {n: found for n, found in poses.items() if n in sizes}
     rig = face_rig(start, poses)
     faces = {name for points in seen.values() for name, _, _ in points.landmarks}
     if len(rig) < 2:
