@@ -224,6 +224,7 @@ def agreement(clips: Sequence[MarkedClip]) -> dict[str, object]:
         ``slip_rate``, ``alpha`` and ``alpha_interval`` (95 %, bootstrap over clips); figures are
         None where there is nothing to compare.
     """
+    clips = [clip for clip in clips if len(clip.frames) > 1]
     pairs = [pair for clip in clips for pair in combinations(clip.frames.values(), 2)]
     distances = np.abs(np.diff(np.array(pairs).reshape(-1, 2), axis=1))
     units = [clip_times(clip) for clip in clips]

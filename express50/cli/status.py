@@ -162,10 +162,7 @@ def _lines(table: list[StageStatus]) -> Iterator[str]:
 
 def _trial_lines(dataset: Dataset) -> Iterator[str]:
     """Say which stages a pilot is trying; its trials are datasets of their own."""
-    # Imported here: the page and the other commands do not need it.
-    from express50.dial.pilot import pilot_dir
-
-    for root in sorted(pilot_dir(dataset).glob("*/ledger.sqlite")):
+    for root in sorted(dataset.pilot_dir.glob("*/ledger.sqlite")):
         for row in _read(Dataset(root.parent)):
             if row.state == "running":
                 yield (

@@ -169,6 +169,11 @@ class Dataset:
         """Return the folder of unfinished outputs; nothing below it is ever read."""
         return self.root / ".staging"
 
+    @property
+    def pilot_dir(self) -> Path:
+        """Return the folder of the trials of `run --budget` and `tune`, each a small dataset."""
+        return self.staging_dir / "pilot"
+
     def windows_dir(self, subject: str) -> Path:
         """Return the folder of a subject's finished clip parts, deleted once the clips are done."""
         return self.root / ".windows" / subject

@@ -83,7 +83,7 @@ class Pilot:
         """Run one trial, or read it if it ran before."""
         chain = self.chain
         name = value_digest([chain.key(), dict(settings), peaks, self.subject])[:12]
-        root = pilot_dir(chain.dataset) / name
+        root = chain.dataset.pilot_dir / name
         record = root / "trial.json"
         if record.is_file():
             return trial_of(json.loads(record.read_text(encoding="utf-8")))
@@ -173,18 +173,13 @@ def cost_of(dataset: Dataset, stage: str, receipts: Sequence[Receipt], extra: fl
     )
 
 
-def pilot_dir(dataset: Dataset) -> Path:
-    """Return the folder of a dataset's trials."""
-    return dataset.staging_dir / "pilot"
-
-
 def keep_for_run(dataset: Dataset, settings: Mapping[str, str]) -> None:
     """Move what trials made at chosen settings to the store of replaced outputs.
 
     The run takes an output from there where it would make the same.
     """
     moved: set[tuple[str, str]] = set()
-    for record in sorted(pilot_dir(dataset).glob("*/trial.json")):
+    for record in sorted(dataset.pilot_dir.glob("*/trial.json")):
         trial, folder = trial_of(json.loads(record.read_text("utf-8"))), Dataset(record.parent)
         for subject in folder.subjects():
             with suppress(FileNotFoundError):  # the peaks before they were cut

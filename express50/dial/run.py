@@ -40,7 +40,6 @@ from express50.dial.pilot import (
     broken_stage,
     keep_for_run,
     measure,
-    pilot_dir,
     stated_errors,
 )
 from express50.dial.results import RESULTS
@@ -264,7 +263,7 @@ def _measure_and_run(
     run.state = replace(run.state, spent=clock.now())
     run.keep(finished=whole, stated=stated)
     if whole:
-        shutil.rmtree(pilot_dir(chain.dataset), ignore_errors=True)
+        shutil.rmtree(chain.dataset.pilot_dir, ignore_errors=True)
     return summaries, run.state
 
 

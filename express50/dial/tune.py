@@ -15,7 +15,7 @@ from express50.contract.config import PRESETS
 from express50.dial.budget import Clock
 from express50.dial.choice import Point, Workload, error_text, front, labels_of, point_of
 from express50.dial.figures import dial_dir
-from express50.dial.pilot import Chain, pilot_dir, standard_of
+from express50.dial.pilot import Chain, standard_of
 from express50.dial.run import measured_figures, workload
 from express50.files.atomic import write_bytes, write_json
 
@@ -42,7 +42,7 @@ def tune(chain: Chain) -> tuple[dict[str, Any], list[str]]:
     folder = dial_dir(chain.dataset)
     write_json(folder / "front.json", table)
     write_bytes(folder / "front.csv", _csv(points, presets).encode())
-    shutil.rmtree(pilot_dir(chain.dataset), ignore_errors=True)
+    shutil.rmtree(chain.dataset.pilot_dir, ignore_errors=True)
     return table, [*_lines(load, points, presets), f"wrote {folder}/front.json and front.csv"]
 
 

@@ -21,7 +21,6 @@ from express50.cli import status as status_cli
 from express50.cli.status import SILENT_SECONDS, UNLOCKED_SECONDS, read_status, status_page
 from express50.console import format_seconds
 from express50.contract.layout import Dataset
-from express50.dial.pilot import pilot_dir
 from express50.runner.ledger import Ledger, Receipt, Run
 from express50.runner.publish import is_running
 from pipelines import ingest
@@ -73,7 +72,7 @@ def test_a_trial_of_a_budgeted_run_is_shown(tmp_path, capsys):
     make_capture(tmp_path / "S001", cameras=1)
     dataset = Dataset(tmp_path / "data")
     ingest.register(dataset, [tmp_path / "S001"])
-    trial = pilot_dir(dataset) / "abc"
+    trial = dataset.pilot_dir / "abc"
     trial.mkdir(parents=True)
     now = time.time()
     with Ledger(trial / "ledger.sqlite") as ledger:

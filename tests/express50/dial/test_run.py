@@ -11,7 +11,7 @@ from annotations.suggestions import reference_subject
 from express50.contract.layout import Dataset, existing_dataset
 from express50.dial.budget import Clock, parse_budget, parse_goal
 from express50.dial.figures import Cost, Footage, Trial, dial_dir
-from express50.dial.pilot import Pilot, pilot_dir, spare_seconds, trial_seconds
+from express50.dial.pilot import Pilot, spare_seconds, trial_seconds
 from express50.dial.run import RunState, closing_lines, reserved, run_within
 from express50.dial.tune import tune
 from express50.errors import ConfigError, StageError
@@ -60,7 +60,7 @@ def test_much_time_buys_the_dearest_settings_and_the_promise_is_the_error(tmp_pa
     assert promised["low"] < error_of(state.settings) < promised["high"]
     assert any("expected error: value 0.5" in line for line in said)
     assert any("draft:" in line and "less, value +" in line for line in said)
-    assert not pilot_dir(Dataset(tmp_path / "d")).exists()
+    assert not Dataset(tmp_path / "d").pilot_dir.exists()
     for path in dial_dir(Dataset(tmp_path / "d")).iterdir():  # figures name nobody
         assert "S0" not in path.read_text() and "S1" not in path.read_text()
 
