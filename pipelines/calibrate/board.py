@@ -20,6 +20,7 @@ import numpy as np
 from express50.errors import CalibrationError
 from express50.files.containers import read_picture
 from express50.geometry.conventions import mirror_opencv_pixels, opencv_pixels_to_corner
+from express50.geometry.sampling import evenly
 
 REQUIRED = ("squares_x", "squares_y", "square_length_m", "marker_length_m", "dictionary")
 ENOUGH = 4  # corners that show an image's reading direction
@@ -273,7 +274,7 @@ def read_corners(
     """
     by_name = {camera: {path.stem: path for path in paths} for camera, paths in files.items()}
     names = sorted(set().union(*by_name.values()))
-    names = [names[i] for i in even(len(names), limit or len(names))]
+    names = evenly(names, limit or len(names))
     detector = make_detector(board)
     found = []
     for camera, paths in sorted(by_name.items()):
@@ -291,10 +292,3 @@ def read_corners(
             if look is not None:
                 look(camera, name, image, ids, pixels)
     return gather(found, by_name)
-
-
-def even(count: int, limit: int) -> list[int]:
-    """Choose at most `limit` indices below `count`, evenly spaced."""
-    if count <= limit:
-        return list(range(count))
-    return [int(i) for i in np.linspace(0, count - 1, limit).round()]

@@ -16,13 +16,14 @@ import numpy as np
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from express50.geometry.cameras import MODELS, Camera
+from express50.geometry.sampling import evenly
 from express50.geometry.transforms import (
     invert_transform,
     make_transform,
     matrix_to_axis_angle,
     transform_points,
 )
-from pipelines.calibrate.board import BoardCorners, even
+from pipelines.calibrate.board import BoardCorners
 
 MIN_CORNERS = 8  # that a board image needs to count
 MIN_FRAMES = 4  # board images that a camera needs; one with fewer is dropped
@@ -213,11 +214,11 @@ def relative_pose(
     ]
     if not candidates:
         return None
-    tested = [shared[i] for i in even(len(shared), 30)]
+    tested = evenly(shared, 30)
     near = NEAR * float(np.hypot(camera.width, camera.height))
     predict = _predictor([views[f] for f in tested], [from_poses[f] for f in tested], camera)
     # Candidates are similar between frames: a fixed, even sample keeps the search small.
-    sample = [candidates[i] for i in even(len(candidates), 80)]
+    sample = evenly(candidates, 80)
     errors = np.stack([predict(candidate) for candidate in sample])
     best = int(np.argmin(np.minimum(errors, near).sum(1)))
     agreed = float(np.mean(errors[best] < near))

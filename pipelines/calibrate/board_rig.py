@@ -10,9 +10,10 @@ import numpy as np
 
 from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera
+from express50.geometry.sampling import evenly
 from express50.geometry.shapes import check_finite
 from express50.rigs.world_frame import canonical_from_rig, move_cameras
-from pipelines.calibrate.board import BoardCorners, even
+from pipelines.calibrate.board import BoardCorners
 from pipelines.calibrate.board_adjust import BoardRig, adjust_board_rig, corner_errors
 from pipelines.calibrate.board_guess import (
     MIN_CORNERS,
@@ -135,7 +136,7 @@ def _single_cameras(
             )
             continue
         # Fifteen images are enough to start a lens: 8 to 60 led to the same rig.
-        frames = [sorted(good)[i] for i in even(len(good), 15)]
+        frames = evenly(sorted(good), 15)
         fitted = fit_intrinsics([good[f] for f in frames], sizes[name], model)
         if fitted is None:
             dropped[name] = (

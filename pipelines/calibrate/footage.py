@@ -25,9 +25,9 @@ from express50.files.images import read_exif
 from express50.files.video import iterate_video
 from express50.geometry.cameras import Camera, resized
 from express50.geometry.conventions import opencv_pixels_to_corner
+from express50.geometry.sampling import evenly
 from express50.landmarks.detector import SMALL, Detection, detect
 from express50.landmarks.network import load_network
-from pipelines.calibrate.board import even
 from pipelines.calibrate.config import LONG_SIDE
 from pipelines.calibrate.tracks import FEATURE_SIGMA_PX, Features, FrameSetPoints
 
@@ -70,7 +70,7 @@ def read_footage(index: Index, cameras: Mapping[str, Camera], count: int) -> Ima
     per second, reading it takes a tenth of the time.
     """
     cues = [cue for cue in index.cues if cue.end_frame < index.frames]
-    spread = even(index.frames, count)
+    spread = evenly(range(index.frames), count)
     starts = _middles(cues, count) or dict(zip(spread, [0, *(f + 1 for f in spread)], strict=False))
     wanted: list[int] = []
     for name in sorted(cameras):
@@ -92,7 +92,7 @@ def read_raw_footage(root: Path, cameras: Mapping[str, Camera], count: int) -> I
     """
     capture = read_capture(root)
     lengths = [len(camera.names) for camera in capture.cameras.values() if camera.names]
-    wanted = sorted(_middles(capture.cues, count)) or even(min(lengths, default=1), count)
+    wanted = sorted(_middles(capture.cues, count)) or evenly(range(min(lengths, default=1)), count)
     for name in sorted(set(capture.cameras) & set(cameras)):
         for frame, image in _read_raw(capture.cameras[name], wanted):
             yield frame, name, _reduced(cameras[name], image, frame)
@@ -101,7 +101,7 @@ def read_raw_footage(root: Path, cameras: Mapping[str, Camera], count: int) -> I
 def _middles(cues: Iterable[Cue], count: int) -> dict[int, int]:
     """Return the middle frames of up to `count` cues, evenly chosen, each with its cue's start."""
     middles = sorted(((cue.start_frame + cue.end_frame) // 2, cue.start_frame) for cue in cues)
-    return dict(middles[i] for i in even(len(middles), count))
+    return dict(evenly(middles, count))
 
 
 def _read_raw(camera: RawCamera, wanted: list[int]) -> Iterator[tuple[int, np.ndarray]]:
