@@ -13,6 +13,7 @@ import numpy as np
 
 Places = TypeVar("Places")
 FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
+MIRROR_X = np.diag([-1.0, 1.0, 1.0, 1.0])  # pose of a camera whose pictures are mirrored
 
 
 def opencv_pixels_to_corner(pixels: np.ndarray) -> np.ndarray:

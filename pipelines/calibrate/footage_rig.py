@@ -18,6 +18,7 @@ import numpy as np
 
 from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera, pinhole, project, triangulate
+from express50.geometry.conventions import MIRROR_X
 from express50.geometry.transforms import (
     invert_transform,
     make_transform,
@@ -60,7 +61,6 @@ NOMINAL = 2.5  # focal length, in longer sides, at which distances are first est
 INNER = slice(17, 68)  # the jaw's outline is not the same skin from every side
 BY_CHANCE = 0.025  # share of wrong points that fit a wrong pose, at most
 NEAR_DEG = 25.0  # frame sets whose relative pose is further from the mean are wrong
-MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 TURNS, TURNED = 5, 0.75
 """Frame sets in which two cameras must see the face for its turns to be compared, and the share of
 the disagreement as recorded that is left if a camera is mirrored. Twin, heads turning by 4 degrees:
@@ -401,7 +401,7 @@ def _face_spreads(poses: FacePoses) -> dict[str, np.ndarray]:
         if len(shared) < TURNS:
             continue
         own, theirs = (np.stack([poses[n][frame][0] for frame in shared]) for n in (name, other))
-        ways = [own @ np.linalg.inv(theirs), MIRROR @ own @ MIRROR @ np.linalg.inv(theirs)]
+        ways = [own @ np.linalg.inv(theirs), MIRROR_X @ own @ MIRROR_X @ np.linalg.inv(theirs)]
         turns = [_turns(votes, mean_transform(votes, np.ones(len(votes)))) for votes in ways]
         found.setdefault(name, []).append(np.sqrt(np.mean(np.square(turns), axis=1)))
     return {name: np.median(rows, axis=0) for name, rows in found.items() if len(rows) >= 2}

@@ -15,6 +15,7 @@ from express50.contract.layout import Dataset
 from express50.errors import CalibrationError, ConfigError
 from express50.files.calibration import camera_rows
 from express50.files.images import write_image
+from express50.geometry.conventions import MIRROR_X
 from express50.geometry.transforms import (
     axis_angle_to_matrix,
     make_transform,
@@ -24,7 +25,6 @@ from express50.rigs.camera_builder import in_metres
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.footage import has_one_lens
 from pipelines.calibrate.footage_rig import (
-    MIRROR,
     _showing_head,
     mirrored_by_faces,
     pose_of_face,
@@ -264,6 +264,6 @@ def test_a_mirrored_camera_is_named_where_heads_turn(turn_rad, mirrored, named):
     poses = {}
     for name, camera in face_cameras(count=4).items():
         seen = [camera.cam_from_world @ head @ turned(0.01) for head in heads]
-        ways = [MIRROR @ pose @ MIRROR if name in mirrored else pose for pose in seen]
+        ways = [MIRROR_X @ pose @ MIRROR_X if name in mirrored else pose for pose in seen]
         poses[name] = {frame: (pose, 1.0) for frame, pose in enumerate(ways)}
     assert set(mirrored_by_faces(poses)) == named
