@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import re
 from collections.abc import Collection, Iterable, Sequence
 
@@ -103,6 +104,11 @@ def few(names: Sequence[str], count: int = 3) -> str:
     """List the first names, then how many more there are."""
     more = f" and {len(names) - count} more" if len(names) > count else ""
     return ", ".join(names[:count]) + more
+
+
+def rounded_down(value: float) -> str:
+    """Format a value that is too low, so that it never reads like its limit."""
+    return f"{math.floor(100 * value) / 100:.2f}"
 
 
 def _likeness(word: str, name: str) -> float:

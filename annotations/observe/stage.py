@@ -6,7 +6,6 @@ single detections out of the curves in which expressions are searched for.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -22,7 +21,7 @@ from express50.capture.frames import read_proxy
 from express50.capture.index import Cue, Index, read_index
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
-from express50.errors import FormatError, StageError
+from express50.errors import FormatError, StageError, rounded_down
 from express50.files.arrays import read_arrays
 from express50.files.images import contact_sheet, write_image
 from express50.geometry.transforms import similarity_fit, transform_points
@@ -164,7 +163,7 @@ def choose_cameras(
     frames = sorted({frame for _, frame in attempts})
     raise StageError(
         f"{index.subject}: no camera sees a face in frames {', '.join(map(str, frames))}"
-        f" (best score {math.floor(100 * best) / 100:.2f}, expected {min_score}); check that the"
+        f" (best score {rounded_down(best)}, expected {min_score}); check that the"
         " face is in view, label it with 'express50 annotate mark', or lower observe.min_score"
     )
 

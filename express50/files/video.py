@@ -153,7 +153,10 @@ def video_fps(path: Path) -> float:
 
 @dataclass(frozen=True)
 class VideoTags:
-    """What a video says of its pictures, which are read as stored.
+    """What a video says of its pictures.
+
+    They are read as stored, also if a phone stored upright footage lying on its side: a calibration
+    refers to stored pixels.
 
     Attributes:
         turn: quarter turns counter-clockwise, 0 to 3, that it asks players for.
@@ -184,18 +187,6 @@ def video_tags(path: Path) -> VideoTags:
                 float(stream.codec_context.sample_aspect_ratio or 1),
             )
     raise CaptureError(f"{path}: video holds no frame; record or copy it again")
-
-
-def video_turn(path: Path) -> int:
-    """Read the rotation that a video's container asks for: 0 to 3 quarter turns counter-clockwise.
-
-    Phones store upright footage as pictures lying on their side. A rig's videos are used as stored,
-    since a calibration refers to stored pixels.
-
-    Raises:
-        CaptureError: the file is not a video, is damaged, or holds no frame.
-    """
-    return video_tags(path).turn
 
 
 def iterate_video(path: Path) -> Iterator[tuple[int, np.ndarray]]:

@@ -120,7 +120,7 @@ class Person:
     def at(self, pose: AvatarPose) -> HeadCodes:
         """Return the head in a pose, for the full model."""
         values = pose.parameters.double().cpu().numpy()
-        expression, neck, jaw, eyes = np.split(values, [-12, -9, -6])
+        expression, neck, jaw, eyes = np.split(values, [-ANGLES, -9, -6])
         own = self.head.tracked
         tracked = replace(own, expression=expression, neck=neck, jaw=jaw, eyes=eyes)
         z_exp = self.head.z_exp + pose.weights.to(self.z_changes) @ self.z_changes

@@ -127,8 +127,8 @@ def _write(rig: CalibratedRig, check: FootageCheck | None, out: Path) -> Result:
 
 def _odd_rig(cameras: Mapping[str, Camera]) -> tuple[Note, ...]:
     """Warn of a rig that is not in metres, or of cameras that look elsewhere."""
-    words = "; ".join(judge(cameras).warnings)
-    return (Note("cameras", words),) if words else ()
+    oddities = "; ".join(judge(cameras).warnings)
+    return (Note("cameras", oddities),) if oddities else ()
 
 
 def _rounded(value: float | None, digits: int) -> float | None:

@@ -23,13 +23,13 @@ from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.capture.raw import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from express50.contract.layout import Dataset
 from express50.dataset.tracks import read_track
-from express50.errors import CaptureError, FormatError, StageError
+from express50.errors import CaptureError, FormatError, StageError, rounded_down
 from express50.files.atomic import dump_json, write_bytes
 from express50.files.calibration import camera_rows
 from express50.files.containers import read_picture
 from express50.files.digests import file_sha256
 from express50.files.images import ORIENTATION, encode_png, read_exif, upright, write_image
-from express50.files.video import VideoFootage, iterate_video, video_fps, video_turn
+from express50.files.video import VideoFootage, iterate_video, video_fps, video_tags
 from express50.geometry.cameras import Camera, pinhole_camera
 from express50.geometry.conventions import FLIP_YZ
 from express50.geometry.sampling import evenly
@@ -99,8 +99,8 @@ def open_picture(path: Path) -> PhotoSource:
         raise CaptureError(f"{path}: no such file; expected a photograph or a video")
     suffix = path.suffix.lower()
     if suffix in VIDEO_SUFFIXES:
-        turns = video_turn(path)
-        return PhotoSource(path, video=True, orientation=ORIENTATION[turns])
+        orientation = ORIENTATION[video_tags(path).turn]
+        return PhotoSource(path, video=True, orientation=orientation)
     if suffix not in PHOTO_SUFFIXES:
         raise CaptureError(
             f"{path}: not a photograph or video; expected a file name that ends in "
@@ -229,9 +229,9 @@ def find_faces(path: Path, images: list[np.ndarray], config: TrackConfig) -> lis
     seen = [detect(net, image, DETECTOR_PASSES, config.search) for image in images]
     faces = [face for face in seen if face.score >= FACE_SCORE]
     if not faces:
-        best = math.floor(100 * max(face.score for face in seen)) / 100
+        best = rounded_down(max(face.score for face in seen))
         raise CaptureError(
-            f"{path}: no face found (best score {best:.2f}, expected {FACE_SCORE} or more); use a "
+            f"{path}: no face found (best score {best}, expected {FACE_SCORE} or more); use a "
             "picture that shows the whole face from the front or the side, at "
             f"least {config.search / 3:.0%} of the picture wide, or lower track.search"
         )

@@ -29,7 +29,7 @@ from express50.capture.readers.selection import (
 from express50.errors import CalibrationError, CaptureError
 from express50.files.images import ORIENTATION
 from express50.files.text import identifier, read_json_table
-from express50.files.video import video_fps, video_turn
+from express50.files.video import video_fps, video_tags
 from express50.rigs.other_tools import read_nersemble
 
 CAMERAS = Path("calibration/camera_params.json")
@@ -226,7 +226,7 @@ def read_video(path: Path, selection: Selection) -> RawCapture:
 
 
 def _one_video(camera: str, path: Path) -> RawCamera:
-    turn = ORIENTATION[video_turn(path)]
+    turn = ORIENTATION[video_tags(path).turn]
     return RawCamera(
         id=camera, kind="videos", path=path.parent, names=(path.name,), orientation=turn
     )
