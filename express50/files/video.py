@@ -17,6 +17,7 @@ from pathlib import Path
 from types import TracebackType
 
 import av
+import cv2
 import numpy as np
 
 from express50.errors import CaptureError
@@ -32,6 +33,9 @@ REORDER = 16
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 # ITU-T H.273, table 3; their pictures look pale and flat if taken for sRGB.
 HDR_CURVES = {16: "PQ", 18: "HLG"}
+# Weights of red and blue in luma by H.273's matrix coefficients: BT.709, BT.601 (two), BT.2020.
+LUMA = {1: (0.2126, 0.0722), 5: (0.299, 0.114), 6: (0.299, 0.114), 9: (0.2627, 0.0593)}
+LIMITED = 1  # colour range of 16 to 235 and 16 to 240, as cameras record
 BOXES = 1_000_000  # per file; a fragment of one second has two
 DAMAGE = (av.FFmpegError, OSError, ValueError, MemoryError, OverflowError)
 
@@ -107,10 +111,30 @@ def _pixels(path: Path, frame: av.VideoFrame) -> np.ndarray:
             f"{path}: a frame is {frame.width}x{frame.height} pixels, expected at most"
             f" {PIXEL_LIMIT} in total; encode it smaller"
         )
+    weights = LUMA.get(int(frame.colorspace))
     try:
+        if frame.format.name == "yuv444p" and frame.color_range == LIMITED and weights:
+            return _full_chroma(frame, *weights)
         return frame.to_ndarray(format="rgb24")
     except DAMAGE as error:
         raise CaptureError(f"{path}: a frame cannot be converted ({reason(error)})") from error
+
+
+def _full_chroma(frame: av.VideoFrame, red: float, blue: float) -> np.ndarray:
+    """Convert a frame of three full planes, given the weights of red and blue in its luma.
+
+    FFmpeg takes five to nine times as long for these, as it has no fast path from them to RGB.
+    Source: ITU-T H.273, equations 28 to 33 and 38 to 42.
+    """
+    planes = [
+        np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: frame.height, : frame.width]
+        for plane in frame.planes
+    ]
+    green, of_red, of_blue = 1 - red - blue, 2 - 2 * red, 2 - 2 * blue
+    chroma = [[0, of_red], [-of_blue * blue / green, -of_red * red / green], [of_blue, 0]]
+    matrix = 255 * np.column_stack([np.full(3, 1 / 219), np.divide(chroma, 224)])
+    offset = -matrix @ (16, 128, 128)
+    return cv2.transform(cv2.merge(planes), np.column_stack([matrix, offset]))
 
 
 def _decode(
@@ -324,7 +348,7 @@ class VideoFootage:
         context = stream.codec_context
         context.thread_count, context.gop_size = 1, 24
         context.colorspace = context.color_primaries = context.color_trc = _BT709
-        context.color_range = 1  # limited range, as cameras record
+        context.color_range = LIMITED
         self._stream = stream
 
     def __enter__(self) -> VideoFootage:

@@ -68,7 +68,7 @@ def run(dataset: Dataset, item: str, config: FramesConfig, out: Path) -> Result:
 
 STAGE = Stage(
     name="frames",
-    version=4,
+    version=5,
     config=FramesConfig,
     items=items,
     inputs=inputs,

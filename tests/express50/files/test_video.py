@@ -41,6 +41,20 @@ def test_random_reads_give_the_sequential_frames(video):
     reader.close()
 
 
+@pytest.mark.parametrize(("matrix", "space"), [(1, "ITU709"), (5, "ITU601"), (6, "ITU601"), (9, 9)])
+@pytest.mark.parametrize("shape", [(1, 1), (77, 101), (48, 64)])
+def test_full_chroma_gives_ffmpegs_colours(monkeypatch, shape, matrix, space):
+    image = np.random.default_rng(matrix).integers(0, 256, (*shape, 3), dtype=np.uint8)
+    frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+    frame = frame.reformat(format="yuv444p", dst_colorspace=space)
+    frame.colorspace, frame.color_range = matrix, video_module.LIMITED
+    ours = video_module._pixels("video.mp4", frame)
+    monkeypatch.setattr(video_module, "LUMA", {})
+    ffmpegs = video_module._pixels("video.mp4", frame)
+    assert np.abs(ours.astype(int) - ffmpegs).max() <= 1
+    assert (ours == ffmpegs).mean() > 0.9 or ours.size < 10
+
+
 def test_a_read_decodes_from_the_nearest_key_frame(tmp_path, monkeypatch):
     path, decoded = tmp_path / "video.mp4", []
     write_video(path, noise_video_images(FRAMES), gop=12, b_frames=2)
