@@ -19,7 +19,7 @@ PUBLIC_KEYS = frozenset(
     {
         "subject", "fps", "session", "units", "color_space", "metres_per_unit", "synthetic",
         "consent_id", "consent", "licence", "license",
-        "camera_model", "rig", "focal_px", "focal_source", "focal_range_px",
+        "camera_model", "rig", "same_lens", "focal_px", "focal_source", "focal_range_px",
         "layout", "sequences", "cameras", "expressions", "renderme360",
     }
 )  # fmt: skip

@@ -15,7 +15,16 @@ from typing import Any
 from express50.capture.index import Cue
 from express50.errors import CalibrationError, CaptureError
 from express50.files.calibration import read_cameras
-from express50.files.text import ID, TOML_LIMIT, identifier, is_number, read_text, read_toml
+from express50.files.text import (
+    ID,
+    TOML_LIMIT,
+    check_links,
+    identifier,
+    is_number,
+    not_fetched,
+    read_text,
+    read_toml,
+)
 from express50.geometry.cameras import Camera
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr")
@@ -104,6 +113,8 @@ def read_capture(root: Path) -> RawCapture:
     cameras, dropped = {}, {}
     for path in sorted(p for p in folder.iterdir() if not p.name.startswith(".")):
         if not path.is_dir():
+            if not path.exists():
+                dropped[path.name] = f"{path}: {not_fetched(path)}"
             continue
         if not ID.fullmatch(path.name) and _holds_footage(path):
             raise CaptureError(
@@ -143,6 +154,7 @@ def read_calibration(
         CalibrationError: it is malformed.
     """
     given = root / "calibration.json"
+    check_links(given)
     if not given.is_file():
         return None
     calibration = read_cameras(given)
@@ -178,6 +190,7 @@ def read_capture_toml(root: Path) -> dict:
         CaptureError: it cannot be read or is not TOML.
     """
     path = root / "capture.toml"
+    check_links(path)
     table = read_toml(path, CaptureError) if path.is_file() else {}
     return {key: plain(value) for key, value in table.items()}
 
@@ -236,7 +249,7 @@ def _holds_footage(folder: Path) -> bool:
 
 def _read_camera(folder: Path) -> RawCamera:
     videos = _videos(folder)
-    found = [video for video in videos if video.stem.lower() == "video" and video.is_file()]
+    found = [video for video in videos if video.stem.lower() == "video" and not video.is_dir()]
     frames = folder / "frames"
     if len(found) + frames.is_dir() > 1:
         names = ", ".join([video.name for video in found] + ["frames/"] * frames.is_dir())
@@ -277,6 +290,7 @@ def _read_board(root: Path, cameras: dict[str, RawCamera]) -> dict | None:
     if not folder.is_dir():
         return None
     path = folder / "board.toml"
+    check_links(path)
     if not path.is_file():
         raise CaptureError(
             f"{folder}: has no board.toml; write one that describes the ChArUco board, see"
@@ -297,6 +311,7 @@ def read_cues(path: Path) -> tuple[Cue, ...]:
         CaptureError: a column is missing, a value is not a frame number, a cue ends before it
             starts, or an expression appears twice.
     """
+    check_links(path)
     if not path.is_file():
         return ()
     text = read_text(path, CaptureError, TOML_LIMIT)

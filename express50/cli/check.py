@@ -113,11 +113,11 @@ def run_withdraw(args: argparse.Namespace) -> int:
     for path in args.checkpoint:  # refuses other files before anything is removed
         hook("read_checkpoint")(path)
     if not args.yes:
-        paths = [str(path) for path in plan(dataset, args.subject)]
+        paths = {str(path): why for path, why in plan(dataset, args.subject).items()}
         models = [*sorted((dataset.root / "grmm").rglob("*.pt")), *args.checkpoint]
-        lines = [f"would remove {path}" for path in paths]
+        lines = [f"would remove {p}" + (f" ({why})" if why else "") for p, why in paths.items()]
         lines += [f"would take codes and frames out of {path}" for path in models]
-        data = {"subject": args.subject, "would_remove": paths}
+        data = {"subject": args.subject, "would_remove": list(paths), "why": paths}
         return answer(args, data, *lines, "add --yes to remove")
     done = withdraw(dataset, args.subject, args.checkpoint, hook("redact_checkpoint"))
     data = {

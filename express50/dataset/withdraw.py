@@ -75,8 +75,10 @@ class Withdrawal:
     files: int
 
 
-def plan(dataset: Dataset, subject: str) -> list[Path]:
-    """List the files and folders to remove so that nothing of a subject remains in a dataset.
+def plan(dataset: Dataset, subject: str) -> dict[Path, str]:
+    """Return the files and folders to remove so that nothing of a subject remains in a dataset.
+
+    Each comes with the reason, which is empty for the subject's own.
 
     Raises:
         UnknownNameError: the dataset has no such subject.
@@ -86,10 +88,11 @@ def plan(dataset: Dataset, subject: str) -> list[Path]:
     # Reject all other names: '', '..' or 'shards' would name folders that are not a person's.
     if not (subject in known or labelled or text_digest(subject) in withdrawn(dataset)):
         check_known(str(dataset.root), "subject", [subject], sorted(known))
-    found = [*sorted(_own_paths(dataset, subject)), *sorted(_mixed_paths(dataset))]
-    paths = list(dict.fromkeys(found))  # what came back of a person who was withdrawn is both
+    paths = dict.fromkeys(sorted(_own_paths(dataset, subject)), "")
+    mixed = set(_mixed_paths(dataset)) - paths.keys()  # what came back of the withdrawn is both
+    paths |= dict.fromkeys(sorted(mixed), "may hold several people's data")
     # Other subjects' outputs that name this one, such as peaks matched to the reference person's.
-    gone, naming = set(paths), []
+    gone, naming, why = set(paths), [], f"made with data of {subject}; the next run makes it again"
     for path in files_naming(dataset_id_finder(dataset, subject), dataset.root):
         parts = path.relative_to(dataset.root).parts
         items = [dataset.root.joinpath(*parts[:depth]) for depth in (3, 2)]
@@ -97,7 +100,7 @@ def plan(dataset: Dataset, subject: str) -> list[Path]:
         if item is not None and gone.isdisjoint([path, *path.parents]):
             naming.append(item)
             gone.add(item)
-    return paths + sorted(naming)
+    return paths | dict.fromkeys(sorted(naming), why)
 
 
 def _own_paths(dataset: Dataset, subject: str) -> Iterator[Path]:

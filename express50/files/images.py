@@ -20,7 +20,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from express50.errors import FormatError
-from express50.files.text import reason
+from express50.files.text import not_fetched, reason
 from express50.geometry.shapes import PIXEL_LIMIT
 
 CUT = "truncated: the JPEG has no end marker; copy it again"
@@ -99,7 +99,8 @@ def open_image(path: Path) -> oiio.ImageInput:
     source = oiio.ImageInput.open(str(path), straight) if Path(path).is_file() else None
     if source is None:
         why = _error_text(oiio.geterror) or "it cannot be opened"
-        raise FormatError(f"{path}: cannot be read as an image ({why}); copy it again")
+        why = not_fetched(Path(path)) or f"cannot be read as an image ({why}); copy it again"
+        raise FormatError(f"{path}: {why}")
     return source
 
 

@@ -20,7 +20,7 @@ from xml.etree import ElementTree
 
 import yaml
 
-from express50.errors import Express50Error
+from express50.errors import CaptureError, Express50Error
 
 TEXT_LIMIT = 1 << 28  # bytes; the index of 100,000 samples takes 40 MB
 TOML_LIMIT = 1 << 20  # bytes; these files are written by hand
@@ -30,6 +30,10 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,199}")
 ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,119}")
 """Pattern of a subject's or expression's id: a file name without a dot, as shard keys require."""
 AGAIN = "copy or write it again"
+POINTERS = (
+    (b"version https://git-lfs", "Git LFS", "git lfs pull"),
+    (b"/annex/objects/", "git-annex", "git annex get FOLDER"),
+)
 
 Kind = type[Express50Error]
 
@@ -56,7 +60,41 @@ def read_bytes(path: Path, kind: Kind, limit: int = TEXT_LIMIT, fix: str = AGAIN
             raise kind(f"{path}: {status.st_size} bytes, expected at most {limit}; {fix}")
         return path.read_bytes()
     except (OSError, ValueError) as error:  # ValueError: a name with a null byte
-        raise kind(f"{path}: cannot be read ({reason(error)}); {fix}") from None
+        why = not_fetched(path) or f"cannot be read ({reason(error)}); {fix}"
+        raise kind(f"{path}: {why}") from None
+
+
+def not_fetched(path: Path) -> str:
+    """Return what to do about a file whose content is elsewhere; "" for any other file.
+
+    git-annex keeps links to contents that are fetched one by one. It and Git LFS also write small
+    files that only name the content.
+    """
+    try:
+        if path.is_symlink() and not path.exists():
+            return (
+                f"is a link to {path.readlink()}, which is not there; fetch it (of git-annex or"
+                " DataLad: 'git annex get FOLDER'), or copy the file itself"
+            )
+        with path.open("rb") as file:
+            start = file.read(64)
+    except (OSError, ValueError):
+        return ""
+    for mark, name, fetch in POINTERS:
+        if start.startswith(mark):
+            return f"holds only a note of {name} that names its content; fetch it ('{fetch}')"
+    return ""
+
+
+def check_links(*paths: Path) -> None:
+    """Refuse links to files that are not there, which would pass for files that nobody wrote.
+
+    Raises:
+        CaptureError: one of them is such a link.
+    """
+    for path in paths:
+        if path.is_symlink() and not path.exists():
+            raise CaptureError(f"{path}: {not_fetched(path)}")
 
 
 def read_text(path: Path, kind: Kind, limit: int = TEXT_LIMIT, fix: str = AGAIN) -> str:

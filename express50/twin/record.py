@@ -240,14 +240,14 @@ def _check_settings(config: TwinConfig, out: Path) -> None:
 def print_progress() -> Callable[[int, int], None]:
     """Return a reporter for `record` that prints to standard error, on a terminal in one line."""
     start = last = time.monotonic()
-    live = sys.stderr.isatty()
+    live, printed = sys.stderr.isatty(), -1
 
     def report(done: int, total: int) -> None:
-        nonlocal last
+        nonlocal last, printed
         now = time.monotonic()
-        if not live and now - last < 10.0 and done < total:
+        if done == printed or (not live and now - last < 10.0 and done < total):
             return
-        last = now
+        last, printed = now, done
         rate = done / max(now - start, 1e-3)
         left = f"{(total - done) / rate:.0f} s left" if done else "starting"
         line = f"twin {done}/{total} pictures {rate:.1f}/s {left}"

@@ -93,7 +93,7 @@ def account(dataset: Dataset, subjects: Sequence[str]) -> Iterator[str]:
 
 STAGE = Stage(
     name="ingest",
-    version=7,
+    version=8,
     config=IngestConfig,
     presets=PRESETS,
     items=items,

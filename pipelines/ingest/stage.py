@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.capture.demographics import public_meta
+from express50.capture.demographics import PUBLIC_KEYS, public_meta
 from express50.capture.frames import decode_proxy
 from express50.capture.index import TRANSLATED, CameraSource, Cue, Index, index_to_json
 from express50.capture.raw import RawCapture, check_calibrated_sizes, check_focals
@@ -25,7 +25,7 @@ from express50.console import log
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
 from express50.dataset.withdraw import withdrawn
-from express50.errors import CaptureError, StageError
+from express50.errors import CaptureError, StageError, few, nearest
 from express50.files.atomic import dump_json, write_json
 from express50.files.calibration import write_cameras
 from express50.files.digests import stat_digest, text_digest
@@ -37,6 +37,11 @@ from pipelines.ingest.scan import odd_footage, remove_proxies, scan_camera, time
 
 QC_CAMERAS, QC_COLUMNS = 24, 6
 BLACK_LIGHT = 1e-3  # linear light, 3 of 255 levels
+SAMPLE_NAME = 80  # characters of subject_expression_camera, as shards take it
+KNOWN_KEYS = PUBLIC_KEYS | {"gender", "age"}  # of capture.toml
+CHOICES = {"sequences", "cameras", "expressions"}  # of parts, in all layouts but ours
+UNITLESS = ("colmap", "transforms")  # layouts that do not state their unit
+METRES = ("m", "metre", "metres", "meter", "meters")
 FILE_ENDINGS = ("head", "confidence", "normals")  # later stages write <camera>_<ending>.png
 
 
@@ -127,6 +132,7 @@ def run(
             "ingest the capture again"
         )
     check_focals(raw.root / "capture.toml", raw.meta.get("focal_px", {}))
+    check_sample_names(raw)
     (out / "proxies").mkdir()
     cameras, measured, dropped = _scan(raw, out / "proxies", proxy, focus_every)
     calibration = _calibration(raw, cameras)
@@ -154,7 +160,9 @@ def run(
     write_json(out / "checks.json", figures)
     lost = {f"camera {k}": why for k, why in sorted(dropped.items())}
     lost |= {f"expression {k}": why for k, why in sorted(beyond.items())} | outside | raw.skipped
-    return make_result(raw, index, usual, lost, raw.warnings | odd_cues(cues) | warnings)
+    return make_result(
+        raw, index, usual, lost, raw.warnings | odd_keys(raw) | odd_cues(raw, cues) | warnings
+    )
 
 
 def _scan(
@@ -251,11 +259,55 @@ def split_cues(cues: tuple[Cue, ...], frames: int) -> tuple[tuple[Cue, ...], dic
     return tuple(cue for cue in cues if cue.expression_id not in outside), outside
 
 
-def odd_cues(cues: tuple[Cue, ...]) -> dict[str, str]:
+def check_sample_names(raw: RawCapture) -> None:
+    """Raise CaptureError if ids are too long to name samples of: found before hours of decoding."""
+    expressions = [*(cue.expression_id for cue in raw.cues), *raw.clips]
+    longest = [max(names, key=len, default="") for names in (expressions, raw.cameras)]
+    ids = dict(zip(("subject", "expression", "camera"), (raw.subject, *longest), strict=True))
+    name = "_".join(ids.values())
+    if len(name) > SAMPLE_NAME:
+        lengths = ", ".join(f"{what} {len(text)}" for what, text in ids.items())
+        raise CaptureError(
+            f"{raw.root}: samples would be called like {name!r} ({lengths} characters), expected"
+            f" at most {SAMPLE_NAME} together; shorten an id"
+        )
+
+
+def odd_keys(raw: RawCapture) -> dict[str, str]:
+    """Return what is odd about capture.toml: keys that nothing reads, units, unknown cameras."""
+    found = []
+    misplaced = sorted(CHOICES & raw.meta.keys()) if raw.layout == OURS else []
+    if misplaced:
+        found.append(
+            f"{', '.join(misplaced)}: read for other layouts only; in our own, leave out folders of"
+            " cameras/ and rows of cues.csv instead"
+        )
+    if "metres_per_unit" in raw.meta and raw.layout not in UNITLESS:
+        found.append(
+            f"metres_per_unit: read for {' and '.join(UNITLESS)} only; scale the calibration with"
+            " 'express50 cameras import --scale'"
+        )
+    valid = sorted(KNOWN_KEYS - (CHOICES if raw.layout == OURS else set()))
+    if unknown := sorted(raw.meta.keys() - KNOWN_KEYS):
+        words = ", ".join(f"{key!r}{nearest(key, valid)}" for key in unknown)
+        found.append(f"nothing reads {words}; keys are {', '.join(valid)}")
+    units = raw.meta.get("units", "m")
+    if str(units).lower() not in METRES:
+        found.append(f"units is {units!r}, but lengths are taken as metres: convert them")
+    focals = raw.meta.get("focal_px")
+    if isinstance(focals, dict) and (strange := sorted(focals.keys() - raw.cameras.keys())):
+        known = few(list(raw.cameras), 8)
+        found.append(f"focal_px names {', '.join(strange)}, but cameras are {known}")
+    return {"capture.toml": "; ".join(found)} if found else {}
+
+
+def odd_cues(raw: RawCapture, cues: tuple[Cue, ...]) -> dict[str, str]:
     """Return which expressions share frames with one before them; say so if there are none."""
     if not cues:
+        what = "names no expression inside the footage" if raw.cues else "names none"
+        what = what if (raw.root / "cues.csv").is_file() else "is missing"
         return {
-            "expressions": "cues.csv names none, and later stages need one; add rows expression_id,"
+            "expressions": f"cues.csv {what}, and later stages need one; add rows expression_id,"
             "start_frame,end_frame, then run 'express50 ingest' again"
         }
     found = {}

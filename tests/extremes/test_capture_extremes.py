@@ -7,11 +7,17 @@ import h5py
 import numpy as np
 import pytest
 
+from express50.capture.index import read_index
 from express50.capture.readers.read import detect, read_any
+from express50.contract.layout import Dataset
 from express50.errors import CalibrationError, CaptureError
 from express50.files.containers import BYTES_LIMIT, inside, read_picture
 from express50.files.images import PIXEL_LIMIT, encode_png
+from express50.files.text import read_json
+from pipelines import ingest
 from tests.express50.capture import layouts
+from tests.stages import run_here
+from tests.synth import make_capture
 
 
 @pytest.fixture
@@ -89,19 +95,66 @@ def test_names_cannot_lead_out(tmp_path, name):
         inside(tmp_path, name)
 
 
-def test_a_link_out_of_the_folder_is_refused(tmp_path):
+def test_a_link_is_followed_out_of_the_folder(tmp_path):
     (tmp_path / "outside.png").write_bytes(encode_png(layouts.picture(0, 0)))
     folder = tmp_path / "set"
     folder.mkdir()
     (folder / "a.png").symlink_to(tmp_path / "outside.png")
-    with pytest.raises(CaptureError, match="leads out"):
-        read_picture(folder, "a.png")
+    np.testing.assert_array_equal(read_picture(folder, "a.png"), layouts.picture(0, 0))
 
 
-def test_a_link_to_itself_is_named(tmp_path):
-    (tmp_path / "a.png").symlink_to("a.png")
-    with pytest.raises(CaptureError, match="'a.png'"):
+@pytest.mark.parametrize("target", ["a.png", "../.git/annex/objects/K/K.png"])
+def test_a_link_to_nothing_says_what_to_do(tmp_path, target):
+    (tmp_path / "a.png").symlink_to(target)
+    with pytest.raises(CaptureError, match=f"a link to {target}, which is not there.*annex get"):
         read_picture(tmp_path, "a.png")
+
+
+@pytest.mark.parametrize(
+    ("note", "fetch"),
+    [
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"),
+        (b"/annex/objects/SHA256E-s1--0.png\n", "git annex get"),
+    ],
+)
+def test_a_note_in_place_of_a_file_says_what_to_do(tmp_path, note, fetch):
+    (tmp_path / "a.png").write_bytes(note)
+    with pytest.raises(CaptureError, match=fetch):
+        read_picture(tmp_path, "a.png")
+    (tmp_path / "a.mp4").write_bytes(note)
+    with pytest.raises(CaptureError, match=fetch):
+        read_any(tmp_path / "a.mp4")
+
+
+@pytest.mark.parametrize("name", ["capture.toml", "calibration.json", "cues.csv"])
+def test_a_lost_link_does_not_pass_for_a_file_nobody_wrote(tmp_path, name):
+    make_capture(tmp_path / "S001")
+    (tmp_path / "S001" / name).unlink()
+    (tmp_path / "S001" / name).symlink_to("gone")
+    with pytest.raises(CaptureError, match=f"{name}: is a link to gone"):
+        read_any(tmp_path / "S001")
+
+
+def test_cameras_of_links_are_read_where_the_content_is_there(tmp_path):
+    make_capture(tmp_path / "S001")
+    cameras = tmp_path / "S001" / "cameras"
+    frames = cameras / "cam00" / "frames"
+    frames.rename(tmp_path / "objects")
+    frames.mkdir()
+    for path in (tmp_path / "objects").iterdir():
+        (frames / path.name).symlink_to(path)
+    (cameras / "cam01" / "frames" / "000002.png").unlink()
+    (cameras / "cam01" / "frames" / "000002.png").symlink_to("gone")
+    (cameras / "cam02").rename(tmp_path / "cam02")
+    (cameras / "cam02").symlink_to("gone")
+    dataset = Dataset(tmp_path / "data")
+    ingest.register(dataset, [tmp_path / "S001"])
+    result = run_here(ingest.STAGE, dataset)
+    assert result.ok and list(read_index(dataset, "S001").cameras) == ["cam00"]
+    metrics = read_json(dataset.item_dir("ingest", "S001") / "metrics.json", CaptureError)
+    lost = {note["what"]: note["why"] for note in metrics["dropped"]}
+    assert lost.keys() == {"camera cam01", "camera cam02"}
+    assert all("git annex get" in why for why in lost.values())
 
 
 def test_transforms_with_paths_out_of_the_folder(tmp_path):

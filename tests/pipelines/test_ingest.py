@@ -17,6 +17,7 @@ from express50.files.images import read_image
 from express50.files.video import iterate_video
 from express50.runner.runner import run_stage
 from pipelines import ingest
+from pipelines.calibrate.footage import has_one_lens
 from pipelines.ingest.scan import time_gaps
 from pipelines.ingest.stage import usual_count
 from tests.synth import make_capture, noise_video_images, turn_video, write_frames, write_video
@@ -174,9 +175,49 @@ def test_a_camera_that_shows_nothing_is_dropped(dataset):
 
 
 def test_a_capture_without_cues_is_ingested_with_a_warning(dataset):
-    (dataset.captures()["S001"] / "cues.csv").unlink()
+    cues = dataset.captures()["S001"] / "cues.csv"
+    cues.unlink()
     assert run(dataset).ok
-    assert [w["what"] for w in metrics(dataset)["warnings"]] == ["expressions"]
+    (warning,) = metrics(dataset)["warnings"]
+    assert warning["what"] == "expressions" and "cues.csv is missing" in warning["why"]
+    for rows, what in (("", "names none"), ("anger,90,95\n", "names no expression inside")):
+        cues.write_text(f"expression_id,start_frame,end_frame\n{rows}")
+        assert run(dataset).ok
+        assert what in metrics(dataset)["warnings"][0]["why"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('cameras = ["cam00"]', "cameras: read for other layouts only"),
+        ("metres_per_unit = 0.001", "metres_per_unit: read for colmap and transforms only"),
+        ('licens = "CC0"', "'licens' (did you mean 'license'?); keys are"),
+        ('units = "mm"', "units is 'mm', but lengths are taken as metres"),
+        ("focal_px = {cam09 = 900}", "focal_px names cam09, but cameras are cam00, cam01, cam02"),
+    ],
+)
+def test_keys_that_nothing_reads_are_named(dataset, text, words):
+    with (dataset.captures()["S001"] / "capture.toml").open("a") as file:
+        file.write(text + "\n")
+    assert run(dataset).ok
+    (warning,) = metrics(dataset)["warnings"]
+    assert warning["what"] == "capture.toml" and words in warning["why"]
+
+
+def test_a_lens_that_cameras_share_is_known_after_ingest(dataset):
+    with (dataset.captures()["S001"] / "capture.toml").open("a") as file:
+        file.write("same_lens = true\n")
+    assert run(dataset).ok and metrics(dataset)["warnings"] == []
+    assert has_one_lens(read_index(dataset, "S001"))
+
+
+def test_ids_too_long_for_shards_are_refused_before_anything_is_decoded(dataset):
+    path = dataset.captures()["S001"]
+    (path / "cameras" / "cam01").rename(path / "cameras" / ("c" * 76))
+    (path / "calibration.json").unlink()
+    (outcome,) = run(dataset).outcomes
+    assert outcome.status == "failed"
+    assert "(subject 4, expression 7, camera 76 characters), expected at most 80" in outcome.reason
 
 
 def test_cues_outside_the_footage_are_dropped_and_reported(dataset):

@@ -22,7 +22,7 @@ from express50.capture.readers.selection import (
 from express50.errors import CalibrationError, CaptureError, FormatError
 from express50.files.containers import inside
 from express50.files.images import read_exif
-from express50.files.text import read_json_table
+from express50.files.text import not_fetched, read_json_table
 from express50.geometry.cameras import Camera
 from express50.rigs.camera_builder import in_metres
 from express50.rigs.colmap import is_colmap, read_colmap_images
@@ -134,7 +134,11 @@ def _read_posed(
         ids[name]: {moment: file for moment, file in table.items() if _is_picture(root, file)}
         for name, table in pictures.items()
     }
-    without = {name: "its picture is not there" for name, table in there.items() if not table}
+    without = {
+        ids[name]: not_fetched(root / next(iter(table.values()))) or "its picture is not there"
+        for name, table in pictures.items()
+        if not there[ids[name]]
+    }
     wanted = {ids[n]: there[ids[n]] for n in ids if there[ids[n]] and selection.has_camera(n)}
     line = common_timeline(root, wanted, [MOMENT], dropped=without)
     scale, warnings = selection.metres_per_unit, {}

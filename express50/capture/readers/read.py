@@ -23,6 +23,7 @@ from express50.capture.readers import codec_avatars, pictures, renderme, videos
 from express50.capture.readers.selection import Selection, folder_id, parse_selection
 from express50.contract.layout import Dataset, footage_source
 from express50.errors import CalibrationError, CaptureError, Express50Error, check_known
+from express50.files.text import check_links
 from express50.geometry.cameras import Camera
 from express50.rigs.world_frame import judge
 
@@ -96,6 +97,7 @@ def detect(path: Path, name: object = None) -> Layout:
     for layout in LAYOUTS:
         if name in (None, layout.name) and layout.fits(path):
             return layout
+    check_links(*(path.iterdir() if path.is_dir() else ()))
     looks = "; ".join(f"{x.name}: {x.looks}" for x in LAYOUTS if name in (None, x.name))
     held = sorted(p.name for p in path.iterdir()) if path.is_dir() else ["a file"]
     for depth in ("*", "*/*"):

@@ -202,7 +202,8 @@ def read_actor(path: Path, selection: Selection) -> RawCapture:
 def fits_video(path: Path) -> bool:
     """Return whether a path is a video file."""
     usual = path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".")
-    return usual and path.is_file()
+    # A link to nothing counts: reading it says what to do.
+    return usual and (path.is_file() or path.is_symlink())
 
 
 def video_id(path: Path) -> str:

@@ -201,7 +201,10 @@ def test_nothing_is_removed_without_yes(dataset, capsys):
     before = tree(dataset.root)
     assert main(["subject", "withdraw", str(dataset.root), "S001"]) == 0
     assert tree(dataset.root) == before
-    assert "would remove" in capsys.readouterr().out
+    lines = capsys.readouterr().out.splitlines()
+    assert f"would remove {dataset.item_dir('ingest', 'S001')}" in lines
+    shards = dataset.item_dir("pack", "shards")
+    assert f"would remove {shards} (may hold several people's data)" in lines
 
 
 def test_withdrawn_subject_is_not_taken_in_again(dataset):

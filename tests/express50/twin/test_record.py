@@ -17,7 +17,7 @@ from express50.errors import CaptureError, ConfigError
 from express50.files.images import read_image
 from express50.files.video import VideoFootage, iterate_video
 from express50.twin.config import TwinConfig
-from express50.twin.record import record
+from express50.twin.record import print_progress, record
 from express50.twin.studio import film_board, film_subject
 
 
@@ -148,3 +148,10 @@ def test_wrong_settings_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="even sizes"):
         TwinConfig(width=321)
     assert main(["twin", "record", str(tmp_path), "--subjects", "0"]) == USAGE
+
+
+def test_no_line_of_progress_is_printed_twice(capsys):
+    report = print_progress()
+    for done in (0, 5, 10, 10, 10):
+        report(done, 10)
+    assert len(capsys.readouterr().err.splitlines()) == 1
