@@ -184,7 +184,7 @@ def _ledger_finding(dataset: Dataset, fix: bool, read_only: bool) -> Finding | N
                 ledger.check_whole()
             return None
         except FormatError as error:
-            what = str(error)
+            what = f"is damaged ({error.__cause__ or error})"
         aside = f"ledger.sqlite.unreadable-{int(time.time())}"
         for ending in ("", "-wal", "-shm") if fix else ():
             path = dataset.root / f"ledger.sqlite{ending}"
@@ -344,7 +344,7 @@ class _StageAudit:
 
     def _settle(self, stage: str, fault: Fault, known: bool) -> None:
         """Set a faulty item aside where its stage can make it again."""
-        again, fixed = f"run 'express50 {stage} {self.dataset.root}'", False
+        again, fixed = self._again(stage), False
         receipt = self.receipts[stage].get(fault.item)
         if receipt is not None and receipt.imported:  # no run can make it again
             how = AGAIN
@@ -353,7 +353,7 @@ class _StageAudit:
         elif not known and fault.kind == "unknown":
             how = f"{stage} no longer has such an item; delete it if you do not need it"
         elif self.fix:
-            fixed, how = True, f"set aside; {again} to make it again"
+            fixed, how = True, f"set aside; to make it again, {again}"
             set_aside(self.dataset, stage, fault.item)
             self.ledger.forget(stage, [fault.item])
         else:
@@ -365,11 +365,10 @@ class _StageAudit:
     def _judge(self, stage: Stage, receipts: dict[str, Receipt]) -> None:
         """Report items that were made from different inputs, settings or code versions."""
         path, name = self.dataset.config_file(stage.name), stage.name
-        again = f"run 'express50 {name} {self.dataset.root}'"
         try:
             config = resolve_config(stage, "standard", path, (), [s.name for s in self.stages])
         except ConfigError as error:
-            how = f"{again} with valid settings"
+            how = f"run 'express50 {name} {self.dataset.root}' with valid settings"
             self._find("config", f"config/{path.name}", str(error), how)
             return
         unreadable: dict[str, list[str]] = {}
@@ -399,9 +398,13 @@ class _StageAudit:
         for reason, items in unreadable.items():
             if not all(self._waits(item) for item in items):
                 what = f"its inputs cannot be read: {reason}"
-                self._find("unreadable", f"{name} {few(items, 1)}", what, again)
+                self._find("unreadable", f"{name} {few(items, 1)}", what, self._again(name))
         for why, items in to_make.items():
             self._note(stage, f"outdated {few(items, 1)}: {why}; the next run makes them again")
+
+    def _again(self, stage: str) -> str:
+        """Say how to make a stage's items again; a run with other settings makes all of them."""
+        return f"run 'express50 {stage} {self.dataset.root}' with the same settings as before"
 
     def _waits(self, item: str) -> bool:
         """Return True if something that the item may read is broken."""

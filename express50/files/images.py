@@ -23,6 +23,8 @@ from express50.errors import FormatError
 from express50.files.text import not_fetched, reason
 from express50.geometry.shapes import PIXEL_LIMIT
 
+DAMAGED = "truncated or damaged"
+REPAIR = "copy it again, or run 'express50 check --fix' if a stage wrote it"
 CUT = "truncated: the JPEG has no end marker; copy it again"
 DEPTH_UNIT_M = 5e-5  # one step of a 16-bit depth map; 3.28 m at most, 0.025 mm rounding
 DEPTH_LIMIT_M = DEPTH_UNIT_M * 65535
@@ -59,7 +61,7 @@ def read_image(path: Path) -> np.ndarray:
         channels = min(spec.nchannels, 4)
         pixels = source.read_image(0, 0, 0, channels, kind)
         if pixels is None:
-            raise FormatError(f"{path}: truncated or damaged ({_error_text(source.geterror)})")
+            raise FormatError(f"{path}: {DAMAGED} ({_error_text(source.geterror)}); {REPAIR}")
     finally:
         source.close()
     with (
@@ -75,15 +77,23 @@ def read_image(path: Path) -> np.ndarray:
 def _plain_png(path: Path) -> np.ndarray | None:
     """Read a PNG of 8 or 16 bits without a palette, in half of OpenImageIO's time.
 
-    None if it is another file or damaged, which OpenImageIO describes.
+    None if it is another file, or one that OpenImageIO has to describe.
+
+    Raises:
+        FormatError: it is damaged. OpenImageIO's decoder would print that as well.
     """
-    with suppress(OSError, FormatError, imagecodecs.PngError), path.open("rb") as file:
+    with suppress(OSError), path.open("rb") as file:
         head = file.read(26)
-        width, height = image_size(head, str(path)) if head.startswith(PNG_START) else (0, 0)
+        if len(head) < 26 or not head.startswith(PNG_START):
+            return None
+        width, height = image_size(head, str(path))
         if not 0 < width * height <= PIXEL_LIMIT or head[24] not in (8, 16):
             return None
         channels = {0: (), 2: (3,), 4: (2,), 6: (4,)}.get(head[25])
-        pixels = imagecodecs.png_decode(head + file.read())
+        try:
+            pixels = imagecodecs.png_decode(head + file.read())
+        except imagecodecs.PngError as error:
+            raise FormatError(f"{path}: {DAMAGED} ({error}); {REPAIR}") from error
         return pixels if channels is not None and pixels.shape[2:] == channels else None
     return None
 

@@ -185,7 +185,8 @@ class Ledger:
             yield
         except (sqlite3.DatabaseError, ValueError, TypeError, OverflowError) as error:
             if self._read_only:  # a reader must not be advised to delete
-                words = f"cannot be read as a ledger ({error})"
+                check = f"run 'express50 check {self._path.parent}'"
+                words = f"cannot be read as a ledger ({error}); {check}"
             elif isinstance(error, sqlite3.OperationalError) and "no such" not in str(error):
                 words = (
                     f"the ledger cannot be used ({error}); fix that and run the same command again"

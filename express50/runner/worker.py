@@ -22,7 +22,7 @@ from express50.console import system_error_line
 from express50.contract.config import config_texts
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
-from express50.errors import DiskFullError, Express50Error, StageError
+from express50.errors import CaptureError, DiskFullError, Express50Error, StageError
 from express50.files.atomic import dump_json, naming_full_disk, write_bytes
 from express50.files.digests import files_of, value_digest
 from express50.runner.ledger import FileMark, Made, Receipt, mark_file
@@ -56,12 +56,17 @@ def input_digests(
     """Compute the digest of every input of an item, by name; ``digest`` digests a file or folder.
 
     Raises:
+        CaptureError: footage cannot be reached: its disk may be away for a while.
         Express50Error: an input is missing or cannot be read.
     """
-    return {
-        name: digest(value) if isinstance(value, Path) else value
-        for name, value in stage.inputs(dataset, item, config).items()
-    }
+    found = stage.inputs(dataset, item, config)
+    for path in found.values():
+        if isinstance(path, Path) and not (path.is_relative_to(dataset.root) or path.exists()):
+            raise CaptureError(
+                f"{path}: no such file; if the capture has moved, run 'express50 ingest"
+                f" {dataset.root} CAPTURE' with its new path"
+            )
+    return {name: digest(at) if isinstance(at, Path) else at for name, at in found.items()}
 
 
 def fingerprint(stage: Stage, config: Any, inputs: dict[str, str]) -> str:

@@ -137,6 +137,7 @@ def render(args: argparse.Namespace) -> int:
     _goes_with(args, "drive", "drive_cue")
     loaded = _load(args.checkpoint)
     model, head = loaded.model, _edited_head(loaded, args)
+    clips = render.read_clips(args.drive, args.drive_cue) if args.drive else None
     view = render.camera_of(loaded, args.camera, args.size)
     view = render.orbit(view, args.yaw, model.head_centre, args.pitch)
     args.out.mkdir(parents=True, exist_ok=True)
@@ -149,8 +150,7 @@ def render(args: argparse.Namespace) -> int:
     if args.to:
         end = _frame_head(loaded, args.to, args.expression)
         videos["interpolation"] = render.interpolation(loaded, head, end, view, args.frames)
-    if args.drive:
-        clips = render.read_clips(args.drive, args.drive_cue)
+    if clips is not None:
         videos["driven"], rates["driven"] = render.driven(loaded, head, clips, view), clips.rate
     for name, frames in videos.items():
         render.write_video(args.out / f"{name}.mp4", frames, rates.get(name, RIG_RATE))

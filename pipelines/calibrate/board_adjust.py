@@ -7,14 +7,22 @@ rig, and each board frame is one pose of the rig. There are no 3D points to esti
 
 from __future__ import annotations
 
+import ctypes
+import signal
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pycolmap
 
 from express50.geometry.cameras import Camera, project
 from pipelines.calibrate.adjuster import Normal, move_pose
 from pipelines.calibrate.board import BoardCorners
+
+_ACTION = ctypes.create_string_buffer(512)  # a struct sigaction and more
+ctypes.CDLL(None).sigaction(signal.SIGTERM, None, _ACTION)
+import pycolmap  # noqa: E402 (its logging takes SIGTERM over, and would print a stack trace)
+
+# Python's own function works in the main thread alone, and workers import this in another.
+ctypes.CDLL(None).sigaction(signal.SIGTERM, _ACTION, None)
 
 ITERATIONS = 60  # of Levenberg-Marquardt; rigs before boards settle in fewer than 15
 POSE, LENS = 6, 8  # unknowns of a camera: of its pose, and of the lens with the most parameters

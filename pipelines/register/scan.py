@@ -80,7 +80,7 @@ def fit_scan(scan: Scan, head: str, given: np.ndarray | None = None) -> FittedSc
     template = landmarks(basis.model, basis.model.template[None])[0].numpy()
     given = np.full((68, 3), np.nan) if given is None else given
     observation = find_landmarks(scan, template, given)
-    check_face(observation.points, template, "the face that is seen")
+    check_face(observation.points, template, "the landmarks of the face that is seen")
     terms = given_terms(basis.model, given)
     # The scan may show any expression: none counts as neutral.
     targets, state, lost = fit_landmarks(basis, [observation], "", terms)

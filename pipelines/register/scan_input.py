@@ -209,13 +209,14 @@ def check_face(points: np.ndarray, template: np.ndarray, what: str) -> None:
     scale = similarity_fit(ours, theirs)[0]
     if not SIZES[0] < scale < SIZES[1]:
         raise StageError(
-            f"{what}: they measure {scale:.3g} times a human face in the scan's unit, expected"
-            f" {SIZES[0]:g} to {SIZES[1]:g}; give the scan alone, in one unit"
+            f"{what} are {scale:.3g} times as far apart as those of a human face, expected"
+            f" {SIZES[0]:g} to {SIZES[1]:g}; give the scan alone, in metres, centimetres or"
+            " millimetres"
         )
     off, mirrored = _misfit(ours, theirs), _misfit(ours * [-1, 1, 1], theirs)
     if mirrored < MIRRORED * off:
         raise StageError(
-            f"{what}: they form a mirrored face; mirror the scan back, flip its triangles, or swap"
+            f"{what} form a mirrored face; mirror the scan back, flip its triangles, or swap"
             " left and right in your landmarks"
         )
     if off > MISFIT_M:

@@ -287,7 +287,8 @@ def test_a_head_is_driven_by_tracked_clips(checkpoint, tmp_path, capsys):
     donor = type(head)(z_id=head.z_id, z_exp=head.z_exp, tracked=donor.tracked)
     np.testing.assert_array_equal(first, picture(loaded, donor, view))
 
-    assert main([*render, "--drive-cue=c"]) == 2
+    assert main([*render[:2], str(tmp_path / "c"), *render[3:], "--drive-cue=c"]) == 2
+    assert not (tmp_path / "c").exists()
     assert "expected one of a, b" in capsys.readouterr().err
     np.savez(path, schema="express50.sequence/1", head="flame2023.pkl", **arrays)
     assert main(render) == 2

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -350,3 +352,12 @@ def test_a_board_that_is_never_tilted_is_named(moved):
     solved = solve_rig(observe(rig, boards, 0.3), POINTS, dict.fromkeys(rig, (640, 480)))
     assert set(solved.weak) == set(rig)
     assert all("tilt" in why and "focal length" in why for why in solved.weak.values())
+
+
+def test_the_adjuster_leaves_the_handling_of_sigterm_as_it_was():
+    code = (
+        "import os, signal; signal.signal(signal.SIGTERM, lambda *_: print('ours'))\n"
+        "import pipelines.calibrate.board_adjust; os.kill(os.getpid(), signal.SIGTERM)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "ours\n", "")

@@ -124,6 +124,15 @@ def test_a_camera_whose_footage_changed_is_dropped(tmp_path):
     assert read_plate_image(dataset, "S001", "cam02") is None
 
 
+def test_plates_stand_while_the_capture_is_away(tmp_path):
+    make_capture(tmp_path / "raw")
+    dataset = make_dataset(tmp_path, [tmp_path / "raw"])
+    (tmp_path / "raw").rename(tmp_path / "away")
+    summary = run(dataset)
+    assert [o.item for o in summary.outcomes if o.status == "failed"] == [f"S001/{PLATES}"]
+    assert read_plate_image(dataset, "S001", "cam02") is not None
+
+
 def test_a_label_on_other_footage_fails_its_expression_alone(dataset):
     path = dataset.peaks_file("S001")
     rows = json.loads(path.read_text())

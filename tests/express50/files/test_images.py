@@ -43,6 +43,15 @@ def test_an_unwritable_path_says_why(tmp_path):
         images.write_image(tmp_path / "absent" / "a.jpg", np.zeros((2, 2, 3), np.uint8))
 
 
+@pytest.mark.parametrize("kept", [4, 26, 60, -20])
+def test_a_cut_png_is_one_error_and_the_decoder_is_silent(tmp_path, capfd, kept):
+    whole = images.encode_png((RNG.random((9, 9, 3)) * 255).astype(np.uint8))
+    (tmp_path / "a.png").write_bytes(whole[:kept])
+    with pytest.raises(FormatError):
+        images.read_image(tmp_path / "a.png")
+    assert capfd.readouterr().err == ""
+
+
 def test_a_picture_below_our_limit_is_read_without_a_warning():
     small = images.encode_png(np.zeros((1, 1), np.uint8))
     head = b"IHDR" + struct.pack(">II", 9600, 9600) + small[24:29]

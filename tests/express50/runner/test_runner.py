@@ -245,6 +245,22 @@ def test_outputs_stand_where_footage_is_out_of_reach(tmp_path):
     assert statuses(run_toy(dataset)) == {"a": "skipped", "b": "skipped"}
 
 
+def test_outputs_stand_where_a_file_of_the_footage_is_out_of_reach(tmp_path):
+    dataset, given = make_dataset(tmp_path / "data", ["a", "b"]), tmp_path / "calibration.json"
+    given.write_text("{}")
+
+    def naming(dataset, item, config):
+        return toy.inputs(dataset, item, config) | ({"given": given} if item == "a" else {})
+
+    stage = dataclasses.replace(toy.STAGE, inputs=naming)
+    run = functools.partial(run_stage, stage, dataset, toy.ToyConfig(), workers=0, progress=False)
+    assert run().ok
+    given.rename(tmp_path / "away")
+    assert statuses(run()) == {"a": "failed", "b": "skipped"}
+    (tmp_path / "away").rename(given)
+    assert statuses(run()) == {"a": "skipped", "b": "skipped"}
+
+
 def test_a_defect_in_naming_inputs_is_one_items(tmp_path):
     dataset = make_dataset(tmp_path / "data", ["a", "b"])
 
