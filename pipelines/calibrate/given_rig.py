@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from express50.errors import CalibrationError
-from express50.geometry.cameras import Camera, pinhole, project
+from express50.geometry.cameras import MODELS, Camera, pinhole, project
 from express50.geometry.transforms import matrix_to_axis_angle
 from pipelines.calibrate.adjuster import (
     AdjustedRig,
@@ -23,6 +23,7 @@ from pipelines.calibrate.adjuster import (
     triangulate_tracks,
 )
 from pipelines.calibrate.footage import at_footage_size, reduced_camera
+from pipelines.calibrate.footage_rig import EYES
 from pipelines.calibrate.tracks import (
     LEAST_POINTS,
     FrameSetPoints,
@@ -47,6 +48,11 @@ CLEARLY = 0.8
 """Held-out errors must fall below this share of those before; true rigs gain up to 6 %, too."""
 REFINE_BAND = 0.03  # of features about the given rig's epipolar lines, as a share of the diagonal
 REFINE_SCALES = (3.0, 1.5)
+EYES_MM, USUAL_EYES_MM = (46.0, 80.0), 63.0
+"""Pupils of adults are 54 to 74 mm apart, of six-year-olds 50 mm; landmarks err by up to 4 %."""
+ODD_FACES, EXPLAINED, WORST = 0.6, 0.6, 10.0
+"""Mean error of a face's landmarks over its expected one: true rigs have 0.2 to 0.3, and odd ones
+more than the first. What explains it leaves less than this share. Views count up to the last."""
 LENS = RigPriors(focal=0.005, focal_spread=0.005, centre=0.002, bend=0.005)  # of given lenses
 
 
@@ -68,7 +74,8 @@ class FootageCheck:
 
     `error_px` is the median reprojection error, None without points. `moved` lists the surest
     first; `cameras` have the corrected poses. `unchecked` gives a reason per camera, and `mirrored`
-    the reason to believe that a camera's pictures are.
+    the reason to believe that a camera's pictures are. `exchanged` are pairs of cameras that fit
+    each other's footage, `size` says what is odd about the size of heads, and is empty otherwise.
     """
 
     points: int
@@ -76,6 +83,8 @@ class FootageCheck:
     moved: dict[str, CameraMove]
     unchecked: dict[str, str]
     mirrored: dict[str, str]
+    exchanged: tuple[tuple[str, str], ...]
+    size: str
     cameras: dict[str, Camera]
 
 
@@ -94,6 +103,7 @@ def check_footage(
             f"{len(cameras)} cameras; three or more are needed to say which one has moved"
         )
     now = {name: reduced_camera(camera) for name, camera in cameras.items()}
+    now, exchanged, size = _judge_faces(now, seen)
     moved: list[str] = []
     for band, least_shift in MOVE_BANDS:
         tracks = join_tracks(now, seen, band, verified=False)
@@ -120,8 +130,86 @@ def check_footage(
             if count < LEAST_POINTS
         },
         mirrored=mirrored_cameras(seen, widths, neighbours(cameras)),
+        exchanged=exchanged,
+        size=size,
         cameras=corrected,
     )
+
+
+def _judge_faces(
+    cameras: dict[str, Camera], seen: Mapping[int, FrameSetPoints]
+) -> tuple[dict[str, Camera], tuple[tuple[str, str], ...], str]:
+    """Find exchanged cameras and wrong focal lengths by the faces that cameras see together.
+
+    Returns the cameras without these faults, the pairs, and what is odd about the heads' size.
+    """
+    faces = {frame: FrameSetPoints(points.landmarks, {}) for frame, points in seen.items()}
+    tracks = join_tracks(cameras, faces, 1.0, verified=False)
+    if len(np.unique(tracks.camera)) < 3:
+        return cameras, (), ""
+    showing = [tracks.names[i] for i in np.unique(tracks.camera)]
+    error, eyes_mm = _fit_faces(cameras, tracks)
+    pairs: list[tuple[str, str]] = []
+    while error > ODD_FACES:
+        tried = {
+            (min(a, b), max(a, b)): _exchange(cameras, a, b)
+            for a in showing
+            for b in cameras
+            if a != b
+            and cameras[a].width == cameras[b].width
+            and cameras[a].height == cameras[b].height
+        }
+        fits = {pair: _fit_faces(rig, tracks) for pair, rig in tried.items()}
+        best = min(fits, key=lambda pair: fits[pair], default=None)
+        if best is None or fits[best][0] > EXPLAINED * error:
+            break
+        cameras, (error, eyes_mm) = tried[best], fits[best]
+        pairs.append(best)
+    if EYES_MM[0] < eyes_mm < EYES_MM[1]:
+        return cameras, tuple(pairs), ""
+    factor = eyes_mm / USUAL_EYES_MM
+    other = {name: _with_focal(camera, factor) for name, camera in cameras.items()}
+    share = _fit_faces(other, tracks)[0] / error
+    focal = share < 1 / EXPLAINED and f"the focal lengths {_times(1 / factor)}"
+    lengths = share > EXPLAINED and f"the rig's lengths {_times(factor)}"
+    words = (
+        f"faces have their eyes {eyes_mm:.0f} mm apart, people 54 to 74 mm; probably"
+        f" {' or '.join(filter(None, (focal, lengths)))}: give focal lengths in pixels of the"
+        " footage, and the calibration, or square_length_m in board.toml, in metres"
+    )
+    return other if not lengths else cameras, tuple(pairs), words
+
+
+def _times(ratio: float) -> str:
+    """Describe a length that is `ratio` times the right one."""
+    long = ratio > 1
+    return f"are {float(f'{max(ratio, 1 / ratio):.2g}'):g} times too {'long' if long else 'short'}"
+
+
+def _fit_faces(cameras: Mapping[str, Camera], tracks: PointTracks) -> tuple[float, float]:
+    """Return the mean error of views of faces, over the expected one, and eyes' distance in mm."""
+    points = triangulate_tracks(cameras, tracks)
+    errors = []
+    for number in np.unique(tracks.camera):
+        mine = tracks.camera == number
+        pixels = project(cameras[tracks.names[number]], points[tracks.point[mine]])[0]
+        off = np.linalg.norm(pixels - tracks.pixels[mine], axis=1) / tracks.sigma[mine]
+        errors += np.median(np.nan_to_num(off, nan=WORST).reshape(-1, 68), axis=1).tolist()
+    eyes = np.stack([points.reshape(-1, 68, 3)[:, side].mean(1) for side in EYES])
+    gap = float(np.median(np.linalg.norm(eyes[0] - eyes[1], axis=1)))
+    return float(np.minimum(errors, WORST).mean()), 1e3 * gap
+
+
+def _exchange(cameras: Mapping[str, Camera], a: str, b: str) -> dict[str, Camera]:
+    """Return cameras of which two have each other's lens and pose."""
+    return {**cameras, a: replace(cameras[b], id=a), b: replace(cameras[a], id=b)}
+
+
+def _with_focal(camera: Camera, factor: float) -> Camera:
+    """Return a camera whose focal length is multiplied."""
+    named = zip(MODELS[camera.model], camera.params, strict=True)
+    params = tuple(p * factor if name in ("f", "fx", "fy") else p for name, p in named)
+    return replace(camera, params=params)
 
 
 def _free_moved_cameras(

@@ -110,6 +110,13 @@ def _write(rig: CalibratedRig, check: FootageCheck | None, out: Path) -> Result:
         for name, move in (check.moved.items() if check else ())
     }
     moved |= check.mirrored if check else {}
+    for a, b in check.exchanged if check else ():
+        moved[f"{a} and {b}"] = (
+            "look exchanged: faces agree if each has the other's calibration; exchange their names"
+            " in the calibration, or their folders in cameras/, plates/ and board/"
+        )
+    if check and check.size:
+        moved["size"] = check.size
     figures["footage"] = check and {
         "points": check.points,
         "error_px": _rounded(check.error_px, 4),

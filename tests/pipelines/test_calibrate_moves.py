@@ -33,6 +33,7 @@ from pipelines.calibrate.tracks import (
     mirror_features,
     mirrored_cameras,
 )
+from tests.pipelines.face_rigs import face_cameras, see
 
 TURN, SHIFT = np.radians(0.3), 5e-3
 
@@ -286,3 +287,47 @@ def test_calibrate_warns_of_the_camera_and_goes_on(footage, tmp_path, capsys):
     quiet = ["--workers", "0", "--set", "calibrate.check_frame_sets=0"]
     assert main(["calibrate", str(dataset.root), *quiet]) == 0
     assert json.loads(path.read_text())["footage"] is None
+
+
+@pytest.fixture(scope="module")
+def faces():
+    rig = face_cameras()
+    return rig, see(rig, features=60, landmark_px=0.2)
+
+
+def test_faces_find_nothing_odd_about_a_true_rig(faces):
+    verdict = check_footage(*faces)
+    assert verdict.exchanged == () and verdict.size == "" and verdict.moved == {}
+
+
+@pytest.mark.parametrize(
+    "pairs",
+    [(("cam01", "cam04"),), (("cam02", "cam03"),), (("cam00", "cam02"), ("cam03", "cam05"))],
+)
+def test_exchanged_cameras_are_both_named(faces, pairs):
+    rig, seen = faces
+    wrong = dict(rig)
+    for a, b in pairs:
+        wrong |= {a: replace(rig[b], id=a), b: replace(rig[a], id=b)}
+    verdict = check_footage(wrong, seen)
+    assert sorted(verdict.exchanged) == sorted(pairs) and verdict.moved == {}
+
+
+@pytest.mark.parametrize(
+    ("focal", "scale", "words"),
+    [
+        (2.0, 1.0, "probably the focal lengths are 2 times too long"),
+        (0.5, 1.0, "times too short: give focal lengths in pixels"),
+        (1.0, 1000.0, "probably the rig's lengths are 1000 times too long"),
+    ],
+)
+def test_a_face_shows_that_focal_lengths_or_units_are_wrong(faces, focal, scale, words):
+    rig, seen = faces
+    wrong = {}
+    for name, camera in rig.items():
+        pose = camera.cam_from_world.copy()
+        pose[:3, 3] *= scale
+        params = (camera.params[0] * focal, *camera.params[1:])
+        wrong[name] = replace(camera, params=params, cam_from_world=pose)
+    verdict = check_footage(wrong, seen)
+    assert words in verdict.size and verdict.moved == {} and verdict.exchanged == ()
