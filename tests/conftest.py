@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import numpy as np
 import pytest
 
 from express50.contract.layout import Dataset
@@ -44,9 +47,32 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture
-def ingested(tmp_path: Path, capture: Path) -> Dataset:
-    """A dataset with S001 ingested."""
+@pytest.fixture(scope="session")
+def ingested_once(tmp_path_factory: pytest.TempPathFactory, capture: Path) -> Dataset:
+    """A dataset with S001 ingested; only copied."""
     from tests.stages import ingest_captures
 
-    return ingest_captures(tmp_path / "dataset", capture)
+    return ingest_captures(tmp_path_factory.mktemp("ingested") / "dataset", capture)
+
+
+@pytest.fixture
+def ingested(tmp_path: Path, ingested_once: Dataset) -> Dataset:
+    """A dataset with S001 ingested."""
+    return Dataset(shutil.copytree(ingested_once.root, tmp_path / "dataset"))
+
+
+@pytest.fixture(scope="module")
+def no_faces() -> Iterator[None]:
+    """Footage of toys shows no face: say so without asking the landmark network everywhere."""
+    from express50.geometry.transforms import transform_points
+    from express50.landmarks import detector
+
+    grid = detector.CROP * np.random.default_rng(0).uniform(0.2, 0.8, (68, 2))
+
+    def nothing(net: object, looks: list[detector.Look]) -> list[detector._Place]:
+        found = [transform_points(look.window, grid) for look in looks]
+        return [detector._Place(p, p[:17], np.full(68, 99.0), np.zeros(68), 0.0) for p in found]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(detector, "_run", nothing)
+        yield

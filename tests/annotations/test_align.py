@@ -181,14 +181,9 @@ def test_changed_suggestion_replaces_the_old_automatic_mark(watched):
     assert peaks(watched, "S001")["smile"]["frame"] == pytest.approx(22, abs=1)
 
 
-def test_align_command_observes_first_and_reports_a_missing_face(dataset, capsys, monkeypatch):
-    monkeypatch.setattr(
-        "annotations.observe.stage.SMALL_FACE_FRAMES", 0
-    )  # searching for small faces takes long
-    surer = ["--workers", "0", "--set", "observe.min_score=1.0"]
-    code = main(["align", str(dataset.root), *surer])
+def test_align_command_observes_first_and_reports_a_missing_face(dataset, capsys, no_faces):
+    assert main(["align", str(dataset.root), "--workers", "0"]) == 1
     lines = capsys.readouterr().out
-    assert code == 1
     assert "no camera sees a face" in lines
     assert "Traceback" not in lines
     assert main(["align", str(dataset.root), "--set", "matte.method=key"]) == 2

@@ -106,7 +106,7 @@ def mirrored(observations: BoardCorners, *cameras: str) -> BoardCorners:
 def test_mirrored_images_are_named() -> None:
     rig = make_rig(4)
     solution = solve(rig, mirrored(observe(rig, board_motion(20, 5), 0.1), "cam02"))
-    assert "mirrored" in solution.dropped["cam02"]
+    assert "switch mirroring off" in solution.dropped["cam02"]
     assert sorted(solution.cameras) == ["cam00", "cam01", "cam03"]
     assert rig_errors(solution.cameras, rig)[0] < 0.1
 
@@ -131,14 +131,6 @@ def test_a_rig_whose_every_camera_is_out_of_step_is_refused_in_one_line() -> Non
     with pytest.raises(CalibrationError, match="cam00, .*, cam03: .* synchronise it") as error:
         solve(rig, replace(observations, frame=late))
     assert "\n" not in str(error.value)
-
-
-def test_a_board_that_two_cameras_see_calibrates_these_and_names_the_others() -> None:
-    rig = make_rig(4)
-    observations = observe(rig, board_motion(24, 7), 0.1)
-    solution = solve(rig, observations.select(np.isin(observations.camera, [1, 2])))
-    assert sorted(solution.cameras) == ["cam01", "cam02"]
-    assert all("in 0 images" in solution.dropped[name] for name in ("cam00", "cam03"))
 
 
 def test_a_camera_stays_where_some_of_its_images_fit() -> None:

@@ -213,7 +213,7 @@ def test_settings_that_are_none_are_refused(settings, message):
         CalibrateConfig(**settings)
 
 
-def test_one_image_a_camera_without_faces_is_refused_by_the_stage(tmp_path, capsys):
+def test_one_image_a_camera_without_faces_is_refused_by_the_stage(tmp_path, capsys, no_faces):
     root = tmp_path / "capture"
     for name in ("a", "b", "c"):
         (root / "cameras" / name / "frames").mkdir(parents=True)

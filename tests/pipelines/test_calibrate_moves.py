@@ -35,6 +35,7 @@ from pipelines.calibrate.tracks import (
 )
 from tests.pipelines.face_rigs import face_cameras, see
 
+pytestmark = pytest.mark.usefixtures("no_faces")
 TURN, SHIFT = np.radians(0.3), 5e-3
 
 

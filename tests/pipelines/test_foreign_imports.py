@@ -41,6 +41,7 @@ from tests.express50.head.flame_files import write_flame
 from tests.pipelines.bump_dataset import make_dataset
 from tests.pipelines.bump_head import render
 
+pytestmark = pytest.mark.usefixtures("no_faces")
 CAMERAS, SIZE = 6, 96
 FIELDS = ("shape", "expression", "neck", "jaw", "eyes", "R", "t", "vertices", "offsets")
 

@@ -31,6 +31,7 @@ from tests.pipelines.stand_ins import Bad, Difference, onnx_bright, torchscript
 from tests.stages import ingest_captures, run_here
 from tests.synth import make_capture
 
+pytestmark = pytest.mark.usefixtures("no_faces")
 BACKDROP = np.array([77, 128, 102], np.uint8)
 
 
@@ -55,10 +56,15 @@ def make_dataset(root: Path, captures: list[Path]) -> Dataset:
     return dataset
 
 
+@pytest.fixture(scope="module")
+def labelled(tmp_path_factory, capture) -> Dataset:
+    """S001 with three cameras, two expressions and plates; only copied."""
+    return make_dataset(tmp_path_factory.mktemp("labelled"), [capture])
+
+
 @pytest.fixture
-def aligned(tmp_path, capture) -> Dataset:
-    """S001 with three cameras, two expressions and plates."""
-    return make_dataset(tmp_path, [capture])
+def aligned(tmp_path, labelled) -> Dataset:
+    return Dataset(shutil.copytree(labelled.root, tmp_path / "dataset"))
 
 
 def unplated(root: Path) -> Path:
@@ -116,10 +122,7 @@ def test_a_salient_network_needs_no_plate(tmp_path) -> None:
 @pytest.mark.parametrize(("how", "message"), [("nan", "gave NaN"), ("pair", "takes 2")])
 def test_a_bad_network_fails_items_in_one_line_each(aligned, tmp_path, how, message) -> None:
     path = tmp_path / "net.pt"
-    if how == "nan":
-        torchscript(Bad(how), path)
-    if how == "pair":
-        torchscript(Difference(), path)
+    torchscript(Bad(how) if how == "nan" else Difference(), path)
     summary = run(aligned, method="salient", weights=str(path))
     assert summary.count("failed") == 2
     for outcome in summary.outcomes:

@@ -271,7 +271,7 @@ def no_irises() -> Irises:
 
 
 @pytest.fixture
-def tracked_dataset(tmp_path: Path, ingested, monkeypatch: pytest.MonkeyPatch):
+def tracked_dataset(ingested, no_faces, monkeypatch: pytest.MonkeyPatch):
     """A calibrated, labelled dataset whose detector finds the landmarks of a tiny head."""
     from benchmarks.common import write_peaks
     from express50.capture.frames import read_cameras_of
