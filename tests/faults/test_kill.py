@@ -126,15 +126,6 @@ def test_interrupt_stops_soon_and_is_resumable(tmp_path):
     assert summary.count("skipped") >= len(finished) - 2
 
 
-def test_second_run_on_the_same_stage_is_refused(tmp_path):
-    from express50.errors import StageError
-    from express50.runner.publish import stage_lock
-
-    dataset = toy.make_dataset(tmp_path / "data", ["item0"])
-    with stage_lock(dataset, "toy"), pytest.raises(StageError, match="another 'toy' runs"):
-        toy.run_toy(dataset)
-
-
 def test_a_glance_at_a_lock_keeps_no_stage_from_starting(tmp_path, monkeypatch):
     import fcntl
 

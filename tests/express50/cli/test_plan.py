@@ -150,13 +150,13 @@ def test_two_sizes_tell_what_does_not_grow_and_the_interval_holds_a_third():
 
 def test_intervals_hold_nine_times_in_ten():
     rng, kept = np.random.default_rng(1), 0
-    for _ in range(200):
+    for _ in range(80):
         samples = [
             MeasuredSize(w, rng.normal(2 + w, 0.2 * (2 + w), 8).tolist()) for w in (1.0, 4.0, 9.0)
         ]
         found = forecast(samples, 16.0)
         kept += found.low <= 18.0 <= found.high
-    assert 170 <= kept <= 192
+    assert 67 <= kept <= 77
 
 
 def test_a_dataset_that_was_only_tuned_is_planned(tmp_path, capsys):

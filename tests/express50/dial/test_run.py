@@ -49,6 +49,7 @@ def outputs(root):
 
 
 def test_much_time_buys_the_dearest_settings_and_the_promise_is_the_error(tmp_path, captures):
+    """What the pilot made is not made twice, and a finished run has nothing more to do."""
     said = []
     summaries, state = go(tmp_path / "d", captures, "5m", said=said)
     assert state.finished and all(summary.ok for summary in summaries)
@@ -63,6 +64,10 @@ def test_much_time_buys_the_dearest_settings_and_the_promise_is_the_error(tmp_pa
     assert not Dataset(tmp_path / "d").pilot_dir.exists()
     for path in dial_dir(Dataset(tmp_path / "d")).iterdir():  # figures name nobody
         assert "S0" not in path.read_text() and "S1" not in path.read_text()
+    restored = {s.stage: sum(o.restored for o in s.outcomes) for s in summaries}
+    assert restored["ingest"] == 1 and restored["align"] == 1
+    summaries, state = go(tmp_path / "d", captures, "5m")
+    assert state.finished and all(s.count("done") == 0 for s in summaries)
 
 
 def test_the_front_is_the_one_that_trying_everything_gives(tmp_path, captures, monkeypatch):
@@ -180,12 +185,6 @@ def test_an_interrupted_run_goes_on_with_its_choices_and_ends_alike(
     assert outputs(tmp_path / "d") == outputs(tmp_path / "other")
 
 
-def test_a_finished_run_has_nothing_more_to_do(tmp_path, captures):
-    go(tmp_path / "d", captures, "5m")
-    summaries, state = go(tmp_path / "d", captures, "5m")
-    assert state.finished and all(s.count("done") == 0 for s in summaries)
-
-
 def test_captures_that_come_after_a_finished_run_get_the_budget_anew(
     tmp_path, captures, monkeypatch
 ):
@@ -196,12 +195,6 @@ def test_captures_that_come_after_a_finished_run_get_the_budget_anew(
     summaries, state = go(tmp_path / "d", captures, "5m")
     assert state.finished and summaries[0].count("done") == 1
     assert state.settings == before.settings and state.seconds < 100
-
-
-def test_outputs_of_the_pilot_are_not_made_twice(tmp_path, captures):
-    summaries, state = go(tmp_path / "d", captures, "5m")
-    restored = {s.stage: sum(o.restored for o in s.outcomes) for s in summaries}
-    assert restored["ingest"] == 1 and restored["align"] == 1
 
 
 def test_a_larger_budget_tries_what_a_small_one_had_no_time_for(tmp_path, captures, monkeypatch):
