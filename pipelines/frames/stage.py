@@ -32,6 +32,13 @@ FOLDS = (
     " calibrate again, or check that the coefficients belong to this image size"
 )
 
+LEAST_SIDE = 100  # pixels; on smaller pictures no face can be told
+FACE_SCORE = 0.4  # plates of an empty set have 0.00, with a person 0.5 to 1 if the face shows
+FACE = (
+    "its plate shows a face, so the person is missing from mattes: photograph the set without"
+    " people, or delete the plate, and run 'express50 ingest' again"
+)
+
 Read = Callable[[str], np.ndarray]
 """Camera id to its recorded image (H, W, 3); raises CaptureError."""
 
@@ -71,6 +78,8 @@ def run(dataset: Dataset, item: str, out: Path, side: int) -> Result:
         if (black := 1 - pictured_share(camera)) > LEAST_BLACK:
             warnings.append(Note(name, FOLDS.format(black)))
         tiles[name] = shrink(image, TILE)
+    if plates:
+        warnings += [Note(name, FACE) for name in _with_face(tiles)]
     if not tiles and not plates:
         why = "; ".join(map(str, dropped[:3]))
         raise StageError(f"{item}: no camera could be read ({why or 'none is calibrated'})")
@@ -79,6 +88,18 @@ def run(dataset: Dataset, item: str, out: Path, side: int) -> Result:
         sheet = tile_sheet(tiles, COLUMNS, TILE)
         write_image(out / "qc" / "frames.jpg", sheet, quality=88)
     return Result({"frames": len(tiles)}, dropped, warnings)
+
+
+def _with_face(images: dict[str, np.ndarray]) -> list[str]:
+    """Return the cameras whose picture (H, W, 3) uint8 shows a large face."""
+    from express50.landmarks.detector import detect_many
+    from express50.landmarks.network import load_network
+
+    images = {name: image for name, image in images.items() if max(image.shape) >= LEAST_SIDE}
+    if not images:
+        return []
+    found = detect_many(load_network(), list(images.values()), refinements=1, smallest=0.9)
+    return [name for name, face in zip(images, found, strict=True) if face.score > FACE_SCORE]
 
 
 def _reader(dataset: Dataset, subject: str, expression: str) -> Read:

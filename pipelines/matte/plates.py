@@ -39,6 +39,7 @@ RIM, ODD_STEPS, GOOD_SHARE, LEAST_GAIN = 0.06, 12.0, 0.97, 0.01
 WIDE_RIM = 0.15  # width of the rim by which a plate is aligned
 MOST_MOVED = 0.03  # share of the longer side; alignments that move the plate further are rejected
 LEAST_SHARE = 0.9  # a plate that explains less shows another set
+WHITE, MOST_WHITE = 250, 0.3  # level, and share of a rim, from which nothing tells the exposure
 ALIGN_SIDE = 1024  # pixels of the pictures that are aligned
 ROUNDS = 3  # of solving, since a pixel's covariance depends on its alpha; 0.01 off after two
 DOUBT = 0.05  # deviation of alpha from which its mean is better than the most likely value
@@ -138,6 +139,12 @@ def _rim(shape: tuple[int, ...], share: float) -> np.ndarray:
     rim[:edge] = True
     rim[: round(0.6 * height), :edge] = rim[: round(0.6 * height), width - edge :] = True
     return rim
+
+
+def white_share(image: np.ndarray, valid: np.ndarray) -> float:
+    """Return the share of an image's top and sides that is too bright to compare."""
+    rim = valid & _rim(valid.shape, RIM)
+    return float((image[rim] >= WHITE).any(-1).mean()) if rim.any() else 0.0
 
 
 def _explained(plate: np.ndarray, frame: np.ndarray, rim: np.ndarray) -> float:

@@ -23,7 +23,14 @@ from pipelines.matte.config import NETWORKS, WITHOUT_PLATE, MatteConfig
 from pipelines.matte.consensus import Agreement, agree
 from pipelines.matte.cutout import CutView, cut_out, make_cut_view, soft_alpha
 from pipelines.matte.key import dilated, key_alpha
-from pipelines.matte.plates import LEAST_SHARE, exposed, exposure_gain, match_plate
+from pipelines.matte.plates import (
+    LEAST_SHARE,
+    MOST_WHITE,
+    exposed,
+    exposure_gain,
+    match_plate,
+    white_share,
+)
 from pipelines.matte.visual_hull import INSIDE, Ball, MatteView, ball_of, projection_of
 
 COLUMNS = 6  # of the picture
@@ -168,6 +175,14 @@ def _plate(
     matched = match_plate(plate, frame, valid)
     if matched.share >= LEAST_SHARE:
         return matched.plate, ""
+    white = {"frame": white_share(frame, valid), "plate": white_share(plate, valid)}
+    which = max(white, key=lambda name: white[name])
+    if white[which] > MOST_WHITE:
+        return None, (
+            f"{white[which]:.0%} of its {which}'s top and sides is white: the {which} is"
+            " overexposed, so the camera was matted without the plate; record both with the same"
+            " exposure, below white"
+        )
     return None, (
         f"its plate explains {matched.share:.0%} of the frame's top and sides, expected"
         f" {LEAST_SHARE:.0%}: it shows another set or place, so the camera was matted without it;"

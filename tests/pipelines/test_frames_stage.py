@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import skimage.data
 
 from express50.capture import frames as frames_module
 from express50.capture.frames import (
@@ -25,6 +26,7 @@ from express50.files.images import (
     LIGHT_OF_LEVEL,
     read_image,
     reduce_light,
+    shrink,
     shrunk_size,
     write_image,
 )
@@ -259,3 +261,13 @@ def test_unreadable_sizes_of_pictures_are_one_clear_line(dataset):
         path.write_text(text)
         with pytest.raises(FormatError, match=r"pictures\.json"):
             frames_module.read_cameras_of(dataset, "S001")
+
+
+def test_a_plate_that_shows_a_face_is_named(tmp_path):
+    make_capture(tmp_path / "S001", size=128)
+    face = shrink(skimage.data.astronaut()[:256, 100:356], 128)
+    write_image(tmp_path / "S001" / "plates" / "cam01.png", face)
+    dataset = make_dataset(tmp_path, [tmp_path / "S001"])
+    (outcome,) = run_here(STAGE, dataset, ["S001/_plates"], preset="draft", image_side=120).outcomes
+    (note,) = outcome.warnings
+    assert note.what == "cam01" and "its plate shows a face" in note.why
