@@ -251,7 +251,7 @@ def restore(state: TrainState, path: Path, config: Config, device: torch.device)
     if finished(state, config):
         log(
             f"{path}: already has all of its {state.iteration} iterations; to train on, raise "
-            "train.iterations or --seconds"
+            "train.iterations or --budget"
         )
     else:
         log(f"{path}: resuming at iteration {state.iteration}")
