@@ -165,13 +165,14 @@ def _judge_faces(
             break
         cameras, (error, eyes_mm) = tried[best], fits[best]
         pairs.append(best)
-    if EYES_MM[0] < eyes_mm < EYES_MM[1]:
+    nowhere = not 1e-3 < eyes_mm < np.inf  # cameras of one place do not triangulate
+    if nowhere or EYES_MM[0] < eyes_mm < EYES_MM[1]:
         return cameras, tuple(pairs), ""
     factor = eyes_mm / USUAL_EYES_MM
     other = {name: _with_focal(camera, factor) for name, camera in cameras.items()}
-    share = _fit_faces(other, tracks)[0] / error
-    focal = share < 1 / EXPLAINED and f"the focal lengths {_times(1 / factor)}"
-    lengths = share > EXPLAINED and f"the rig's lengths {_times(factor)}"
+    share = _fit_faces(other, tracks)[0] / max(error, 1e-9)
+    focal = f"the focal lengths {_times(1 / factor)}" if share < 1 / EXPLAINED else ""
+    lengths = f"the rig's lengths {_times(factor)}" if share > EXPLAINED else ""
     words = (
         f"faces have their eyes {eyes_mm:.0f} mm apart, people 54 to 74 mm; probably"
         f" {' or '.join(filter(None, (focal, lengths)))}: give focal lengths in pixels of the"
