@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from express50.console import OK, add_command, answer, count, say, say_json
-from express50.contract.layout import Dataset
+from express50.contract.layout import existing_dataset
 from express50.errors import ConfigError, StageError
 
 FORMATS = ("gaussian-avatars", "obj", "ply", "glb")
@@ -92,7 +92,7 @@ def run_export(args: argparse.Namespace) -> int:
         even_colour=args.even_colour, validation_camera=args.validation_camera,
         test_expressions=None if held is None else tuple(held),
     )  # fmt: skip
-    dataset, accounts = Dataset(args.dataset), []
+    dataset, accounts = existing_dataset(args.dataset), []
     for subject in tracked_subjects(dataset, args.subject):
         head = read_tracked(dataset, subject, args.expression)
         if args.frames == "clips":
@@ -133,7 +133,7 @@ def run_report(args: argparse.Namespace) -> int:
     from express50.dataset.report import render_page
     from express50.files.atomic import write_bytes
 
-    dataset = Dataset(args.dataset)
+    dataset = existing_dataset(args.dataset)
     if not dataset.subjects():
         raise StageError(f"{args.dataset}: nothing is ingested; run 'express50 ingest' first")
     path = (args.out or dataset.report_dir) / "index.html"

@@ -77,7 +77,7 @@ def read_scan(path: Path) -> Scan:
         raise FormatError(f"{path}: cannot be read as a mesh ({error}); export it again") from None
     if len(faces) < LEAST_FACES:
         raise FormatError(
-            f"{path}: {len(faces)} triangles, expected at least {LEAST_FACES} for a face;"
+            f"{path}: expected at least {LEAST_FACES} triangles for a face, got {len(faces)};"
             " export the scan as a triangle mesh"
         )
     if not np.isfinite(vertices[faces]).all():

@@ -129,8 +129,8 @@ def test_plots_do_not_grow_with_the_items(tmp_path):
 def test_command_writes_the_page_and_refuses_an_empty_folder(dataset, tmp_path, capsys):
     assert main(["report", str(dataset.root), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["bytes"] > 1000
-    assert main(["report", str(tmp_path / "nothing")]) == 1
-    assert "nothing is ingested" in capsys.readouterr().err
+    assert main(["report", str(tmp_path / "nothing")]) == 2
+    assert "no such dataset" in capsys.readouterr().err
 
 
 def test_figures_read_as_a_person_would():
