@@ -29,6 +29,7 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,199}")
 """Pattern of a name that may become a file or folder."""
 ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,119}")
 """Pattern of a subject's or expression's id: a file name without a dot, as shard keys require."""
+KEY_LENGTH = 80  # characters of a sample's key, ``subject_expression_camera``
 AGAIN = "copy or write it again"
 POINTERS = (
     (b"version https://git-lfs", "Git LFS", "git lfs pull"),
@@ -65,7 +66,7 @@ def read_bytes(path: Path, kind: Kind, limit: int = TEXT_LIMIT, fix: str = AGAIN
 
 
 def not_fetched(path: Path) -> str:
-    """Return what to do about a file whose content is elsewhere; "" for any other file.
+    """Return what to do about a file that lacks its content; "" for any other file.
 
     git-annex keeps links to contents that are fetched one by one. It and Git LFS also write small
     files that only name the content.
@@ -82,15 +83,15 @@ def not_fetched(path: Path) -> str:
         return ""
     for mark, name, fetch in POINTERS:
         if start.startswith(mark):
-            return f"holds only a note of {name} that names its content; fetch it ('{fetch}')"
+            return f"is a placeholder of {name}, not the content; fetch it ('{fetch}')"
     return ""
 
 
 def check_links(*paths: Path) -> None:
-    """Refuse links to files that are not there, which would pass for files that nobody wrote.
+    """Refuse broken links: they would be treated as optional files that do not exist.
 
     Raises:
-        CaptureError: one of them is such a link.
+        CaptureError: a link's target does not exist.
     """
     for path in paths:
         if path.is_symlink() and not path.exists():

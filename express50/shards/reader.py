@@ -31,14 +31,14 @@ from express50.contract.segmentation_labels import COLOURS
 from express50.errors import FormatError, check_known
 from express50.files.arrays import read_arrays, read_npy
 from express50.files.images import contact_sheet
-from express50.files.text import parse_json, read_json
+from express50.files.text import KEY_LENGTH, parse_json, read_json
 from express50.geometry.shapes import check_finite, check_shape
 from express50.shards.codecs import AGAIN, ALPHA, DEPTH, PARTS, RGB, crc32, decode_picture
 
 SCHEMA = "express50.shards/1"
 _COPY_AGAIN = f"copy the shards again or {AGAIN}"
 SUBJECT_FILES = ("offsets.npy", "registered.npz")  # beside the shards, if `track` in meta says so
-KEY = re.compile(r"[A-Za-z0-9_-]{1,80}")
+KEY = re.compile(rf"[A-Za-z0-9_-]{{1,{KEY_LENGTH}}}")
 SHARD_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*-[0-9]{6}\.tar")
 
 

@@ -17,7 +17,7 @@ from typing import BinaryIO
 from express50.errors import FormatError
 from express50.files.atomic import folder_in_one_step, link_file, write_json
 from express50.files.digests import file_sha256
-from express50.files.text import NAME, read_json
+from express50.files.text import KEY_LENGTH, NAME, read_json
 from express50.shards.codecs import AGAIN, crc32
 from express50.shards.reader import (
     KEY,
@@ -54,7 +54,7 @@ def sample_key(subject: str, expression: str, camera: str) -> str:
 
     Raises:
         FormatError: an id has other characters than letters, digits, ``_`` and ``-``, or the key
-            has over 80 characters.
+            has over `KEY_LENGTH`.
     """
     for name, value in (("subject", subject), ("expression", expression), ("camera", camera)):
         if not KEY.fullmatch(value):
@@ -65,7 +65,7 @@ def sample_key(subject: str, expression: str, camera: str) -> str:
     key = f"{subject}_{expression}_{camera}"
     if not KEY.fullmatch(key):
         raise FormatError(
-            f"key {key!r} has {len(key)} characters, expected at most 80; shorten an id"
+            f"key {key!r} has {len(key)} characters, expected at most {KEY_LENGTH}; shorten an id"
         )
     return key
 

@@ -30,6 +30,7 @@ from express50.files.atomic import dump_json, write_json
 from express50.files.calibration import write_cameras
 from express50.files.digests import stat_digest, text_digest
 from express50.files.images import contact_sheet, write_image
+from express50.files.text import KEY_LENGTH
 from express50.geometry.cameras import Camera
 from express50.rigs.camera_builder import at_size
 from pipelines.ingest.quality import CameraMeasurements, check_quality
@@ -37,7 +38,6 @@ from pipelines.ingest.scan import odd_footage, remove_proxies, scan_camera, time
 
 QC_CAMERAS, QC_COLUMNS = 24, 6
 BLACK_LIGHT = 1e-3  # linear light, 3 of 255 levels
-SAMPLE_NAME = 80  # characters of subject_expression_camera, as shards take it
 KNOWN_KEYS = PUBLIC_KEYS | {"gender", "age"}  # of capture.toml
 CHOICES = {"sequences", "cameras", "expressions"}  # of parts, in all layouts but ours
 UNITLESS = ("colmap", "transforms")  # layouts that do not state their unit
@@ -260,16 +260,16 @@ def split_cues(cues: tuple[Cue, ...], frames: int) -> tuple[tuple[Cue, ...], dic
 
 
 def check_sample_names(raw: RawCapture) -> None:
-    """Raise CaptureError if ids are too long to name samples of: found before hours of decoding."""
+    """Raise CaptureError, before hours of decoding, if keys of samples would be too long."""
     expressions = [*(cue.expression_id for cue in raw.cues), *raw.clips]
     longest = [max(names, key=len, default="") for names in (expressions, raw.cameras)]
     ids = dict(zip(("subject", "expression", "camera"), (raw.subject, *longest), strict=True))
     name = "_".join(ids.values())
-    if len(name) > SAMPLE_NAME:
+    if len(name) > KEY_LENGTH:
         lengths = ", ".join(f"{what} {len(text)}" for what, text in ids.items())
         raise CaptureError(
             f"{raw.root}: samples would be called like {name!r} ({lengths} characters), expected"
-            f" at most {SAMPLE_NAME} together; shorten an id"
+            f" at most {KEY_LENGTH} together; shorten an id"
         )
 
 
@@ -304,8 +304,10 @@ def odd_keys(raw: RawCapture) -> dict[str, str]:
 def odd_cues(raw: RawCapture, cues: tuple[Cue, ...]) -> dict[str, str]:
     """Return which expressions share frames with one before them; say so if there are none."""
     if not cues:
-        what = "names no expression inside the footage" if raw.cues else "names none"
-        what = what if (raw.root / "cues.csv").is_file() else "is missing"
+        if not (raw.root / "cues.csv").is_file():
+            what = "is missing"
+        else:
+            what = "names no expression inside the footage" if raw.cues else "names none"
         return {
             "expressions": f"cues.csv {what}, and later stages need one; add rows expression_id,"
             "start_frame,end_frame, then run 'express50 ingest' again"
