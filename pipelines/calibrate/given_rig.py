@@ -142,13 +142,23 @@ def _judge_faces(
     """Find exchanged cameras and wrong focal lengths by the faces that cameras see together.
 
     Returns the cameras without these faults, the pairs, and what is odd about the heads' size.
+    With under three cameras that see faces, nothing is judged.
     """
     faces = {frame: FrameSetPoints(points.landmarks, {}) for frame, points in seen.items()}
     tracks = join_tracks(cameras, faces, 1.0, verified=False)
     if len(np.unique(tracks.camera)) < 3:
         return cameras, (), ""
+    cameras, pairs = _find_exchanged(cameras, tracks)
+    cameras, size = _judge_size(cameras, tracks)
+    return cameras, pairs, size
+
+
+def _find_exchanged(
+    cameras: dict[str, Camera], tracks: PointTracks
+) -> tuple[dict[str, Camera], tuple[tuple[str, str], ...]]:
+    """Exchange pairs of cameras while that explains most of the error; return cameras and pairs."""
     showing = [tracks.names[i] for i in np.unique(tracks.camera)]
-    error, eyes_mm = _fit_faces(cameras, tracks)
+    error, _ = _fit_faces(cameras, tracks)
     pairs: list[tuple[str, str]] = []
     while error > ODD_FACES:
         tried = {
@@ -159,15 +169,24 @@ def _judge_faces(
             and cameras[a].width == cameras[b].width
             and cameras[a].height == cameras[b].height
         }
-        fits = {pair: _fit_faces(rig, tracks) for pair, rig in tried.items()}
-        best = min(fits, key=lambda pair: fits[pair], default=None)
-        if best is None or fits[best][0] > EXPLAINED * error:
+        errors = {pair: _fit_faces(rig, tracks)[0] for pair, rig in tried.items()}
+        best = min(errors, key=lambda pair: errors[pair], default=None)
+        if best is None or errors[best] > EXPLAINED * error:
             break
-        cameras, (error, eyes_mm) = tried[best], fits[best]
+        cameras, error = tried[best], errors[best]
         pairs.append(best)
+    return cameras, tuple(pairs)
+
+
+def _judge_size(cameras: dict[str, Camera], tracks: PointTracks) -> tuple[dict[str, Camera], str]:
+    """Compare the distance between the eyes with people's; return mended cameras and a warning.
+
+    Cameras are mended where other focal lengths alone explain it.
+    """
+    error, eyes_mm = _fit_faces(cameras, tracks)
     nowhere = not 1e-3 < eyes_mm < np.inf  # cameras of one place do not triangulate
     if nowhere or EYES_MM[0] < eyes_mm < EYES_MM[1]:
-        return cameras, tuple(pairs), ""
+        return cameras, ""
     factor = eyes_mm / USUAL_EYES_MM
     other = {name: _with_focal(camera, factor) for name, camera in cameras.items()}
     share = _fit_faces(other, tracks)[0] / max(error, 1e-9)
@@ -178,7 +197,7 @@ def _judge_faces(
         f" {' or '.join(filter(None, (focal, lengths)))}: give focal lengths in pixels of the"
         " footage, and the calibration, or square_length_m in board.toml, in metres"
     )
-    return other if not lengths else cameras, tuple(pairs), words
+    return cameras if lengths else other, words
 
 
 def _times(ratio: float) -> str:
