@@ -63,8 +63,8 @@ def inside(root: Path, name: str) -> Path:
     """Return the path of a name relative to a folder.
 
     Raises:
-        CaptureError: the name is absolute, or leads out of the folder. A link is followed: whoever
-            made it, as git-annex does, wants what it points to.
+        CaptureError: the name is absolute or leads out of the folder. Links may lead out of it, as
+            those of git-annex do.
     """
     pure = PurePosixPath(name)
     out = pure.is_absolute() or ".." in pure.parts or not name.isprintable()
