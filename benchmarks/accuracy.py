@@ -1,7 +1,7 @@
 """Measure a dataset against the twin's truth, which is opened here, after the stages have run.
 
-A rig solved from a board lies in a world of its own: it is laid on the true one by one rigid motion
-a subject, fitted to the cameras; what is left of calibration error stays in every figure.
+A rig solved from a board has a world of its own. One rigid motion per subject, fitted to the
+cameras, takes it to the true world; what is left of the calibration error stays in every figure.
 """
 
 from __future__ import annotations

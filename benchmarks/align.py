@@ -59,7 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = make_parser("align", __doc__)
     add_twin_options(parser)
     parser.add_argument("--subjects", type=int, default=6)
-    parser.add_argument("--frames", type=int, default=12, help="frames an expression")
+    parser.add_argument("--frames", type=int, default=12, help="frames per expression")
     parser.add_argument("--preset", default="standard", choices=PRESETS)
     parser.add_argument("--doc", type=Path, help="write the acceptance table into this document")
     options = parser.parse_args(arguments)
@@ -243,8 +243,9 @@ def twin_config(subjects: int, frames: int) -> TwinConfig:
     )  # fmt: skip
 
 
-def record_4k(scratch: Path, dataset: Dataset, cameras: int = 24, frames: int = 12) -> Dataset:
-    """Ingest a capture of 24 cameras at 3840 x 2160: frames of the dataset, blown up."""
+def record_4k(scratch: Path, dataset: Dataset) -> Dataset:
+    """Ingest a capture of 24 cameras at 3840 x 2160: frames of the dataset, enlarged."""
+    cameras, frames = 24, 12  # frames per expression
     capture, subject = scratch / "big", dataset.subjects()[0]
     camera = next(iter(read_index(dataset, subject).cameras))
     for number in range(cameras):

@@ -1,17 +1,17 @@
 """Measure calibration against the twin's true rig.
 
 The stage's solution stands beside a baseline from the same corners: OpenCV's calibration of every
-camera alone, then relative poses averaged and chained, without a joint adjustment. Rigs are laid
-on the true one by a rigid motion. ``head_px`` is what matters further on: how far, in pixels,
-points in the head's place project from where the true camera has them. The last line is one JSON
-object. Without a dataset named, 24 cameras before a ChArUco board and one neutral face are
-recorded first (some minutes). Then one camera of the solved rig after another is turned by
-``BUMP_DEG`` and must be found in the footage, and nothing may be found in the rig as solved.
-``sfm`` and ``refine`` are rigs solved from footage alone, and perturbed ones put right, on the twin
-and on the foreign heads of ``../shared/captures`` where they are.
-``stated_to_true_error`` is the uncertainty that the solution states over its true error, in the
-head's place. ``colour_gain_error_percent`` is of linear light a channel;
-``colour_gain_unevened_percent`` leaves the cameras' colours as they are.
+camera alone, then relative poses averaged and chained, without a joint adjustment. Rigs are laid on
+the true one by a rigid motion. ``head_px`` is what matters further on: how far, in pixels, points
+in the head's place are projected from where the true camera has them. If no dataset is named, 24
+cameras before a ChArUco board and one neutral face are recorded first (some minutes). Then one
+camera of the solved rig after another is turned by ``BUMP_DEG`` and must be found in the footage;
+in the rig as solved, none may be found. ``sfm`` and ``refine`` are rigs solved from footage alone,
+and perturbed ones put right, on the twin and on the foreign heads of ``../shared/captures`` if
+there are any. ``stated_to_true_error`` is the uncertainty that the solution states over its true
+error, in the head's place. ``colour_gain_error_percent`` is of linear light per channel;
+``colour_gain_unevened_percent`` leaves the cameras' colours as they are. The last line is one JSON
+object.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from benchmarks.common import (
     add_twin_options,
     check_twin_options,
     make_parser,
+    named_or_recorded,
     recorded,
     rms,
     rounded,
 )
 from express50.capture.index import Index, read_index
 from express50.contract.config import resolve_config
-from express50.contract.layout import Dataset
 from express50.files.calibration import read_cameras
 from express50.geometry.cameras import Camera, transform_camera
 from express50.geometry.transforms import (
@@ -51,13 +51,13 @@ from express50.geometry.transforms import (
 from express50.rigs.world_frame import meeting_point
 from express50.twin.config import TwinConfig
 from express50.twin.rig import make_rig, make_sensor
-from express50.twin.truth import Truth, align_worlds
+from express50.twin.truth import align_worlds
 from pipelines.calibrate import STAGE
 from pipelines.calibrate.board import BoardCorners, board_from_table, board_points, read_corners
 from pipelines.calibrate.board_adjust import BoardRig, corner_errors
 from pipelines.calibrate.board_guess import (
     BoardView,
-    board_poses,
+    all_board_poses,
     camera_params,
     fit_intrinsics,
     join_rig,
@@ -74,16 +74,9 @@ from pipelines.calibrate.uncertainty import camera_errors, head_points, state_un
 
 BUMP_DEG = 0.3
 RIG = TwinConfig(
-    subjects=1,
-    cameras=24,
-    width=540,
-    height=540,
-    expressions=("neutral",),
-    frames_per_expression=4,
-    footage="jpg",
-    board_frames=60,
-    plates=False,
-)
+    subjects=1, cameras=24, width=540, height=540, expressions=("neutral",),
+    frames_per_expression=4, footage="jpg", board_frames=60, plates=False,
+)  # fmt: skip
 """60 board poses, so that the outermost cameras, too, see it some fifteen times."""
 FACES = ("neutral", "smile_open", "surprise", "laugh", "sadness", "pucker")
 APART = replace(RIG, cameras=8, expressions=FACES, board_frames=0)  # neighbours 40 degrees apart
@@ -102,10 +95,7 @@ def main() -> int:
     args = parser.parse_args()
     check_twin_options(parser, args)
     cv2.setNumThreads(1)
-    if args.dataset is None:
-        dataset, truth = recorded(RIG, args.recording)
-    else:
-        dataset, truth = Dataset(args.dataset), Truth(args.truth)
+    dataset, truth = named_or_recorded(args, RIG, args.recording)
     config = resolve_config(STAGE, args.preset, None, args.assignments)
     subject = dataset.subjects()[0]
     index, true = read_index(dataset, subject), truth.cameras(subject)
@@ -168,10 +158,8 @@ def footage_figures(
     """
     shared = Path(os.environ.get("EXPRESS50_SHARED", Path(__file__).parents[2] / "shared"))
     seen = see_capture(index.capture, true, config.solve_frame_sets)
-    sfm, refine = (
-        {"twin": sfm_figures(seen, true, config)},
-        {"twin": refine_figures(seen, true, figures)},
-    )
+    sfm = {"twin": sfm_figures(seen, true, config)}
+    refine = {"twin": refine_figures(seen, true, figures)}
     for name, scene in SCENES.items():
         dataset, truth = recorded(scene, folder / name)
         subject = dataset.subjects()[0]
@@ -186,12 +174,10 @@ def footage_figures(
     return {"sfm": sfm, "refine": refine}
 
 
-def bump_figures(
-    cameras: Mapping[str, Camera], index: Index, bumps: int, frame_sets: int = 2
-) -> dict[str, object]:
+def bump_figures(cameras: Mapping[str, Camera], index: Index, bumps: int) -> dict[str, object]:
     """Return whether turned cameras, and no others, are found in the footage."""
     # One expression was recorded; without its cue the instants are spread over all frames.
-    seen = find_points(partial(read_footage, replace(index, cues=()), cameras, frame_sets))
+    seen = find_points(partial(read_footage, replace(index, cues=()), cameras, 2))
     names, rng = sorted(cameras), np.random.default_rng(0)
     quiet = check_footage(cameras, seen)
     accused = {}
@@ -224,21 +210,13 @@ def figures(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> dict
     """Return errors of a rig after a rigid motion onto the true one."""
     motion = align_worlds(estimated, true)
     moved = {name: transform_camera(camera, motion) for name, camera in estimated.items()}
-    turns = [
-        np.degrees(
-            np.linalg.norm(
-                matrix_to_axis_angle(
-                    camera.cam_from_world[:3, :3] @ true[name].cam_from_world[:3, :3].T
-                )
-            )
-        )
-        for name, camera in moved.items()
-    ]
+    turns = [c.cam_from_world[:3, :3] @ true[n].cam_from_world[:3, :3].T for n, c in moved.items()]
+    degrees = np.degrees(np.linalg.norm(matrix_to_axis_angle(np.stack(turns)), axis=1))
     focals = [100 * abs(c.K[0, 0] / true[n].K[0, 0] - 1) for n, c in moved.items()]
     shifts = [1e3 * np.linalg.norm(c.center - true[n].center) for n, c in moved.items()]
     return {
-        "rotation_error_deg": float(np.mean(turns)),
-        "rotation_error_deg_max": float(np.max(turns)),
+        "rotation_error_deg": float(degrees.mean()),
+        "rotation_error_deg_max": float(degrees.max()),
         "translation_error_mm": float(np.mean(shifts)),
         "translation_error_mm_max": float(np.max(shifts)),
         "focal_error_percent": float(np.mean(focals)),
@@ -303,8 +281,8 @@ def chained(
         lone[name] = Camera(name, *sizes[name], "OPENCV", params, np.eye(4))
         views[name] = {found[k].frame: with_ideal(lone[name], found[k]) for k in fitted[2]}
     poses = {
-        name: {f: best[:1] for f, view in mine.items() if (best := board_poses(view))}
-        for name, mine in views.items()
+        name: {frame: found[:1] for frame, found in mine.items()}
+        for name, mine in all_board_poses(views).items()
     }
     edges = {}
     for a in sorted(lone):

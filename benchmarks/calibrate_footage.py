@@ -24,7 +24,7 @@ from pipelines.calibrate.adjuster import move_pose
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.footage import find_points, read_raw_footage, reduced_camera
 from pipelines.calibrate.footage_rig import FootageSolution, solve_footage
-from pipelines.calibrate.given_rig import RefinedRig, refine_by_footage
+from pipelines.calibrate.given_rig import refine_by_footage
 from pipelines.calibrate.tracks import FrameSetPoints
 from pipelines.calibrate.uncertainty import camera_errors, head_points
 
@@ -118,36 +118,24 @@ def refine_figures(
 
     `judge` compares a rig with the true one.
     """
-    config = CalibrateConfig()
-    bumped = perturbed(true)
-
-    def by_footage(rig: Mapping[str, Camera]) -> RefinedRig:
-        return refine_by_footage(
-            rig, seen,
-            turn_deg=config.refine_turn_deg, move_mm=config.refine_move_mm, lenses=False,
-        )  # fmt: skip
-
-    return {"before": _of(judge(bumped, true)), "footage": _row(by_footage, bumped, true, judge)}
-
-
-def _row(
-    refine: Callable[[Mapping[str, Camera]], RefinedRig],
-    bumped: Mapping[str, Camera],
-    true: Mapping[str, Camera],
-    judge: RigJudge,
-) -> dict[str, object]:
+    config, bumped = CalibrateConfig(), perturbed(true)
+    refine = partial(
+        refine_by_footage, seen=seen, turn_deg=config.refine_turn_deg,
+        move_mm=config.refine_move_mm, lenses=False,
+    )  # fmt: skip
     started = time.process_time()
     found = refine(bumped)
     seconds = time.process_time() - started
     quiet = refine(true)
-    row = {
+    row: dict[str, object] = {
         "kept_given": bool(found.kept),
         "held_out_before_px": float(found.before_px),
         "held_out_after_px": float(found.after_px),
         "true_rig_left": bool(quiet.kept),
         "true_rig_head_px": judge(quiet.cameras, true)["head_px"],
     }
-    return _of(judge(found.cameras, true)) | rounded(row) | {"seconds": round(seconds, 2)}
+    row = _of(judge(found.cameras, true)) | rounded(row) | {"seconds": round(seconds, 2)}
+    return {"before": _of(judge(bumped, true)), "footage": row}
 
 
 def _of(row: Mapping[str, float]) -> dict[str, object]:

@@ -61,6 +61,15 @@ def recorded(config: TwinConfig, folder: Path, preset: str = "draft") -> tuple[D
     return dataset, Truth(folder / "truth")
 
 
+def named_or_recorded(
+    options: argparse.Namespace, config: TwinConfig, folder: Path, preset: str = "draft"
+) -> tuple[Dataset, Truth]:
+    """Return what the options of `add_twin_options` name, or else a recording (`recorded`)."""
+    if options.dataset is None:
+        return recorded(config, folder, preset)
+    return Dataset(options.dataset), Truth(options.truth)
+
+
 def run_or_stop(stage: Stage, dataset: Dataset, preset: str = "standard", **values: Any) -> None:
     """Run a stage in this process; stop the benchmark when an item fails."""
     config = build_config(stage, {**stage.presets.get(preset, {}), **values})
@@ -134,10 +143,10 @@ def rounded(row: Mapping[str, object]) -> dict[str, object]:
 
 
 def replace_section(path: Path, heading: str, lines: list[str]) -> None:
-    """Write a section of second level into a document; the others stay, a new one comes last."""
+    """Replace a second-level section of a document, or append it; other sections stay."""
     text = path.read_text(encoding="utf-8") if path.is_file() else TITLE
     front, *parts = text.split("\n## ")
     sections = dict(part.split("\n", 1) for part in parts)
     sections[heading] = "\n" + "\n".join(lines).strip() + "\n"
-    whole = [front.rstrip() + "\n", *(f"## {name}\n{body}" for name, body in sections.items())]
-    path.write_text("\n".join(whole), encoding="utf-8")
+    parts = [front.rstrip() + "\n", *(f"## {name}\n{body}" for name, body in sections.items())]
+    path.write_text("\n".join(parts), encoding="utf-8")

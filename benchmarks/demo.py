@@ -32,6 +32,11 @@ EXPRESSIONS = ("neutral", "smile", "jaw_open", "pucker", "brow_raise", "wink_lef
 TWIN = {"subjects": 4, "cameras": 8, "width": 320, "height": 320, "frames-per-expression": 6}
 TRAIN_SECONDS = 120
 FIT_SECONDS = 45
+# Figures of `benchmarks.accuracy` that the summary has.
+SHOWN = (
+    "align.peak_error_frames_median", "matte.mae", "track.vertex_rmse_mm",
+    "depth.abs_error_mm_median", "depth.abs_error_mm_p95", "regions.head_mae", "regions.iou_mean",
+)  # fmt: skip
 
 
 @dataclass
@@ -207,13 +212,7 @@ def summarise(dataset: Path, truth: Path | None, steps: list[Step]) -> dict:
         "seconds_total": round(sum(step.seconds for step in steps), 1),
         "peak_memory_gib": round(max(step.peak_bytes for step in steps) / 2**30, 2),
         "calibrate.reprojection_px": max(reprojection) if reprojection else None,
-        "align.peak_error_frames_median": accuracy.get("align.peak_error_frames_median"),
-        "matte.mae": accuracy.get("matte.mae"),
-        "track.vertex_rmse_mm": accuracy.get("track.vertex_rmse_mm"),
-        "depth.abs_error_mm_median": accuracy.get("depth.abs_error_mm_median"),
-        "depth.abs_error_mm_p95": accuracy.get("depth.abs_error_mm_p95"),
-        "regions.head_mae": accuracy.get("regions.head_mae"),
-        "regions.iou_mean": accuracy.get("regions.iou_mean"),
+        **{name: accuracy.get(name) for name in SHOWN},
         "train.psnr_heldout_view_db": metric("grmm/train", "psnr_heldout_view_db"),
         "train.iterations_per_second": metric("grmm/train", "iterations_per_second"),
         "fit.psnr_db": metric("grmm/fit", "psnr_db"),

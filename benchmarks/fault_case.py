@@ -16,7 +16,7 @@ from pathlib import Path
 
 import psutil
 
-from benchmarks.fault_stage import STAGE, expected, items
+from benchmarks.fault_stage import STAGE, expected, items, write_inputs
 from express50.contract.layout import Dataset
 from express50.dataset.audit import audit
 
@@ -48,13 +48,10 @@ class Case:
 
 
 def make_dataset(case: Case, name: str = "data") -> Dataset:
-    """Make a dataset of a few small inputs."""
-    root = case.scratch / name
-    (root / "in").mkdir(parents=True)
+    """Make a dataset of a few small inputs, and the folder of notes."""
+    dataset = write_inputs(case.scratch / name, ITEMS)
     case.notes.mkdir()
-    for number in range(ITEMS):
-        (root / "in" / f"item{number:04d}.txt").write_text(f"{number + 10}")
-    return Dataset(root)
+    return dataset
 
 
 @contextlib.contextmanager

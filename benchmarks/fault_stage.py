@@ -49,12 +49,20 @@ class FaultConfig:
     """Folder for the times of the work, outside the dataset."""
 
 
+def write_inputs(root: Path, count: int) -> Dataset:
+    """Make a dataset of so many small inputs, one per item."""
+    (root / "in").mkdir(parents=True)
+    for number in range(count):
+        (root / "in" / f"item{number:05d}.txt").write_text(f"{number + 10}")
+    return Dataset(root)
+
+
 def items(dataset: Dataset) -> list[str]:
     """List the names of the input files."""
     return sorted(path.stem for path in (dataset.root / "in").glob("*.txt"))
 
 
-def inputs(dataset: Dataset, item: str, config: FaultConfig) -> dict[str, Path | str]:
+def inputs(dataset: Dataset, item: str, config: object) -> dict[str, Path | str]:
     """Return the item's file."""
     return {"text": dataset.root / "in" / f"{item}.txt"}
 

@@ -1,10 +1,11 @@
 """Measure GRMM's frame rate: ``python -m benchmarks.fps [--device cpu --n-g 128 --size 256]``.
 
 Decode, rasterise and refine, features and depth on, at the paper's size (N_g 512, 1024 x 1024) with
-random weights, which cost what trained ones do. Two ways: everything again for every picture, as
-the paper's 75 frames per second are counted; and with what a moving camera leaves alone kept (mesh,
-transforms, opacity) and the picture drawn in the head's window. The last line is one JSON object;
-without a CUDA device, and none other asked for, its figures are ``n/a``.
+random weights, which cost what trained ones do. It is measured in two ways: everything is computed
+again for every picture, as the paper counts its 75 frames per second; or mesh, transforms and
+opacity, which a moving camera does not change, are kept, and the head's window alone is drawn. The
+last line is one JSON object; without a CUDA device, and none other asked for, its figures are
+``n/a``.
 """
 
 from __future__ import annotations
@@ -110,7 +111,7 @@ def main() -> None:
     parser.add_argument("--device", help="cuda where there is one")
     parser.add_argument("--n-g", type=int, default=512)
     parser.add_argument("--size", type=int, default=1024)
-    parser.add_argument("--seconds", type=float, default=5.0, help="a way")
+    parser.add_argument("--seconds", type=float, default=5.0, help="of each way")
     args = parser.parse_args()
     name = args.device or ("cuda" if torch.cuda.is_available() else "")
     report: dict[str, object] = {"benchmark": "fps", "n_g": args.n_g, "size": args.size}

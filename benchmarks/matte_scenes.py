@@ -56,7 +56,9 @@ def make_scenes(size: int) -> Iterator[Scene]:
 def make_scene(hair: str, backdrop: str, size: int, rng: np.random.Generator) -> Scene:
     """Return one scene."""
     labels = _draw(hair, size, rng)
-    colours = _linear(_palette(HAIR[hair][0], rng))
+    shades = np.array(HAIR[hair][0]) * rng.uniform(0.75, 1.25, (SHADES, 1))
+    palette = np.concatenate([[(0, 0, 0), SKIN, SHIRT], np.clip(shades, 0, 255)])  # by label
+    colours = srgb_to_linear(palette / 255.0).astype(np.float32)
     opaque = (labels > 0).astype(np.float32)
     alpha = _lens(cv2.resize(opaque, (size, size), interpolation=cv2.INTER_AREA))
     front = np.stack(
@@ -121,10 +123,6 @@ def srgb8(linear: np.ndarray) -> np.ndarray:
     return np.rint(255 * linear_to_srgb(np.clip(linear, 0, 1))).astype(np.uint8)
 
 
-def _linear(srgb: np.ndarray) -> np.ndarray:
-    return srgb_to_linear(np.asarray(srgb) / 255.0).astype(np.float32)
-
-
 def _lens(image: np.ndarray) -> np.ndarray:
     return cv2.GaussianBlur(image, (0, 0), LENS)
 
@@ -133,12 +131,6 @@ def _shadow(size: int) -> np.ndarray:
     """Return the share of light (size, size) that a broad soft shadow beside the head takes."""
     y, x = np.mgrid[0:size, 0:size] / size
     return SHADOW * np.exp(-(((x - 0.85) / 0.12) ** 2) - ((y - 0.6) / 0.25) ** 2)
-
-
-def _palette(hair: tuple[int, int, int], rng: np.random.Generator) -> np.ndarray:
-    """Return colours (3 + SHADES, 3), sRGB, by label: none, skin, shirt, hair."""
-    shades = np.array(hair) * rng.uniform(0.75, 1.25, (SHADES, 1))
-    return np.concatenate([[(0, 0, 0), SKIN, SHIRT], np.clip(shades, 0, 255)])
 
 
 def _draw(hair: str, size: int, rng: np.random.Generator) -> np.ndarray:

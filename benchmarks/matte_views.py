@@ -6,7 +6,7 @@ the cameras have agreed, with all cameras and with every third:
 
 - ``undisturbed``: nothing may get worse (``sad_ratio_to_key`` at most 1.01);
 - ``shadow``: three cameras in eight see a shadow, too deep for the key, on the backdrop;
-- ``object``: a quarter see a stand with a cable behind the subject;
+- ``object``: a quarter of the cameras see a stand with a cable behind the subject;
 - ``patch``: a patch of the skin has one colour in all views, and two have the same behind it;
 - ``bumped``: one camera was turned after calibration, its matte is right where it now looks.
 
@@ -16,14 +16,15 @@ recorded, bland and cluttered walls, and walls of the skin's and the shirt's col
 (``sad_alone``). ``sad_ratio_to_plate`` and ``worst_ratio``, that of the worst camera, are printed
 per scene and of all scenes together.
 
-``plates`` says the same of plates that were shifted, taken in other light or elsewhere, before the
-recorded and the cluttered set: ``sad`` as `match_plate` brings them to the frame, ``sad_untouched``
-as they are, ``sad_right`` with the right plate, and the share that is ``refused``.
+``plates`` has the same figures for plates that were shifted, or taken in other light or elsewhere,
+in front of the recorded and the cluttered set: ``sad`` as `match_plate` brings them to the frame,
+``sad_untouched`` as they are, ``sad_right`` with the right plate, and the share that is
+``refused``.
 
 Disturbances are laid on the recorded frames in linear light with the true alpha, and keyed again.
 ``sad`` is the summed absolute error in thousands, ``mae`` its mean, both means over cameras and
-peaks; ``*_key`` is each camera alone. ``named`` counts the cameras that were found wrong, of which
-``bumped`` has one a peak. ``seconds_per_moment`` is processor time, reading and keying excluded.
+peaks; ``*_key`` is each camera alone. ``named`` counts the cameras that were found wrong;
+``bumped`` has one per peak. ``seconds_per_moment`` is processor time, reading and keying excluded.
 The last line is one JSON object.
 """
 
@@ -45,7 +46,7 @@ from benchmarks.common import (
     check_twin_options,
     make_parser,
     means,
-    recorded,
+    named_or_recorded,
     rounded,
     true_pictures,
 )
@@ -70,17 +71,10 @@ from pipelines.matte.visual_hull import ball_of
 
 PRESETS = ("draft", "standard")
 RIG = TwinConfig(
-    subjects=1,
-    first_subject=61,
-    cameras=24,
-    width=384,
-    height=384,
-    footage="jpg",
-    expressions=("neutral", "jaw_open"),
-    frames_per_expression=4,
-    board_frames=0,
+    subjects=1, first_subject=61, cameras=24, width=384, height=384, footage="jpg",
+    expressions=("neutral", "jaw_open"), frames_per_expression=4, board_frames=0,
     give_calibration=True,
-)
+)  # fmt: skip
 Figures = dict[str, float]
 
 
@@ -105,10 +99,8 @@ def main() -> int:
     args = parser.parse_args()
     check_twin_options(parser, args)
     cv2.setNumThreads(1)
-    if args.dataset is None:
-        dataset, truth = recorded(replace(RIG, first_subject=args.subject), args.recording)
-    else:
-        dataset, truth = Dataset(args.dataset), Truth(args.truth)
+    twin = replace(RIG, first_subject=args.subject)
+    dataset, truth = named_or_recorded(args, twin, args.recording)
     configs = {name: resolve_config(STAGE, name, None, args.assignments) for name in PRESETS}
     rows: dict[tuple[int, str, str], list[Figures]] = {}
     bare: dict[tuple[int, str], list[Figures]] = {}

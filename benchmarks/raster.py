@@ -3,8 +3,8 @@
 For every N, image size and channel count it prints the CPU seconds of one thread, the least of
 several runs so that other work on the machine disturbs them little: forward, and forward and
 backward with the projection and the gradients of every input. The same is measured once for
-autograd over explicit Gaussian-pixel pairs in torch, whose pairs are handed over for nothing; where
-they would take more than half of the free memory it is ``n/a`` with the reason. Errors are the
+autograd over explicit Gaussian-pixel pairs in torch, not counting the time to find the pairs; it is
+``n/a`` with the reason where they would take more than half of the free memory. Errors are the
 kernel's, in float32 and in float64, against the float64 reference. ``prototype_s`` holds figures to
 stay within 1.25x of; an AVX-512 Xeon at 2.1 GHz took them, without the projection. The last line is
 one JSON object.
@@ -171,7 +171,7 @@ def head(n: int, size: int, channels: int) -> dict[str, Tensor]:
     """
     side = math.isqrt(n)
     if side * side != n:
-        raise ValueError(f"n is {n}, expected a square: one Gaussian a texel")
+        raise ValueError(f"n is {n}, expected a square: one Gaussian per texel")
     generator = torch.Generator().manual_seed(0)
 
     def uniform(*shape: int) -> Tensor:

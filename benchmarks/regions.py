@@ -30,7 +30,7 @@ from express50.contract.layout import Dataset
 from express50.contract.segmentation_labels import TORSO
 from express50.dataset.tracks import read_track
 from express50.files.images import read_image
-from express50.geometry.cameras import Camera, project
+from express50.geometry.cameras import project
 from express50.geometry.sampling import evenly
 from express50.head.load import load_head
 from express50.head.model import landmarks
@@ -142,18 +142,14 @@ def baselines(dataset: Dataset, item: str) -> dict[str, Callable[[str], np.ndarr
 
     def above(name: str, points: np.ndarray) -> np.ndarray:
         row = float(project(cameras[name], points.reshape(-1, 3))[0][:, 1].mean())
-        return matte(name) * _rows_above(cameras[name], row)
+        shares = np.clip(row - np.arange(cameras[name].height), 0, 1)  # of each row of pixels
+        return matte(name) * shares[:, None]
 
     return {
         "no_cut": matte,
         "chin_line": lambda name: above(name, chin),
         "neck_line": lambda name: above(name, end),
     }
-
-
-def _rows_above(camera: Camera, row: float) -> np.ndarray:
-    """Measure the share (H, 1) of each row of pixels above an image row."""
-    return np.clip(row - np.arange(camera.height), 0, 1)[:, None]
 
 
 def summary(items: list[dict]) -> dict:

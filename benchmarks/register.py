@@ -2,8 +2,8 @@
 
 ``python -m benchmarks.register``: the twin records subjects that nothing was tuned on, and the
 stages up to ``register`` are run with their defaults. `standard` is registered on the surface of
-``depth``, `scan` on the true surface of the head, `tracked` is not registered. `foreign` says the
-same of a head of another model (``--foreign`` names one that the twin can play, such as an
+``depth``, `scan` on the true surface of the head, `tracked` is not registered. `foreign` has the
+same figures for a head of another model (``--foreign`` names one that the twin can play, such as an
 ICT-FaceKit file) that the built-in head is tracked and registered on; ``n/a`` without one.
 
 Point to surface is the distance of the face's vertices that two cameras see on the true head, to

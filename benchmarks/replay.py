@@ -10,6 +10,7 @@ import asyncio
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,10 +29,6 @@ SIZE = (120, 40)
 Move = Callable[[CueView], CueView]
 
 
-def _pick(rank: int) -> Move:
-    return lambda view: moves.pick_candidate(view, rank)
-
-
 MOVES: dict[str, Move] = {
     "right": lambda view: moves.step(view, 1),
     "left": lambda view: moves.step(view, -1),
@@ -40,7 +37,7 @@ MOVES: dict[str, Move] = {
     "tab": lambda view: moves.next_candidate(view, 1),
     "home": lambda view: moves.go_to(view, view.first),
     "end": lambda view: moves.go_to(view, view.last),
-    **{str(rank): _pick(rank) for rank in range(1, 6)},
+    **{str(rank): partial(moves.pick_candidate, rank=rank) for rank in range(1, 6)},
 }
 MEASURED_KEYS = ("left", "right", "pageup", "pagedown")
 
@@ -94,10 +91,8 @@ def replay(
     dataset: Dataset,
     truth: Mapping[tuple[str, str], int],
     tolerance: int = 1,
-    annotator: str = "replay",
     *,
     order: str = "doubt",
-    faces: bool = False,
     size: tuple[int, int] = SIZE,
 ) -> ReplayResult:
     """Label every task whose truth is known through the real app, without a terminal.
@@ -106,9 +101,7 @@ def replay(
         dataset: an ingested dataset; align may have run or not.
         truth: true peak frame by (subject, expression).
         tolerance: frames off that the annotator lets pass.
-        annotator: the name under which the labels are stored.
         order: of the tasks.
-        faces: crop to the faces, as people see it; loads the landmark network.
         size: of the terminal, columns and rows.
 
     Raises:
@@ -116,14 +109,14 @@ def replay(
     """
     session = Session(
         dataset,
-        annotator,
+        "replay",
         subjects=sorted({subject for subject, _ in truth}),
         expressions=sorted({expression for _, expression in truth}),
         order=order,
     )
     if not any((t.subject, t.expression) in truth and session.is_open(t) for t in session.tasks):
-        raise AnnotationError(f"{dataset.root}: no open task of {annotator!r} has a known truth")
-    app = MeasuredApp(session, faces=FaceFinder(dataset) if faces else None)
+        raise AnnotationError(f"{dataset.root}: no open task has a known truth")
+    app = MeasuredApp(session, faces=None)
     return asyncio.run(_label_all(app, truth, tolerance, size))
 
 
@@ -207,26 +200,23 @@ async def _settle(app: MeasuredApp, pilot: Pilot) -> None:
 
 def measure_steps(
     dataset: Dataset,
-    presses: int = 200,
+    presses: int,
     *,
-    subjects: list[str] | None = None,
     faces: bool = True,
     size: tuple[int, int] = (160, 48),
-    seed: int = 0,
 ) -> list[float]:
     """Return seconds of each of so many steps through a dataset, tasks, cameras and zooms mixed in.
 
     From the key to the picture encoded for the terminal, decoding included where it was not done
     ahead.
     """
-    session = Session(dataset, "measure", subjects=subjects)
+    session = Session(dataset, "measure")
     app = MeasuredApp(session, faces=FaceFinder(dataset) if faces else None)
-    return asyncio.run(_scrub(app, presses, size, np.random.default_rng(seed)))
+    return asyncio.run(_scrub(app, presses, size))
 
 
-async def _scrub(
-    app: MeasuredApp, presses: int, size: tuple[int, int], rng: np.random.Generator
-) -> list[float]:
+async def _scrub(app: MeasuredApp, presses: int, size: tuple[int, int]) -> list[float]:
+    rng = np.random.default_rng(0)
     steps: list[float] = []
     async with app.run_test(size=size) as pilot:
         await _settle(app, pilot)

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import express50.runner.executor
 from benchmarks.common import make_parser
+from benchmarks.fault_stage import inputs, items, write_inputs
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Result, Stage
@@ -27,16 +28,6 @@ from express50.runner.runner import run_stage
 @dataclass(frozen=True, kw_only=True)
 class EmptyConfig:
     """Nothing to set."""
-
-
-def items(dataset: Dataset) -> list[str]:
-    """List the names of the input files."""
-    return sorted(path.stem for path in (dataset.root / "in").glob("*.txt"))
-
-
-def inputs(dataset: Dataset, item: str, config: EmptyConfig) -> dict[str, Path | str]:
-    """Return the item's file."""
-    return {"text": dataset.root / "in" / f"{item}.txt"}
 
 
 def run(dataset: Dataset, item: str, config: EmptyConfig, out: Path) -> Result:
@@ -54,7 +45,7 @@ def main(arguments: list[str] | None = None) -> int:
     count = parser.parse_args(arguments).items
     with tempfile.TemporaryDirectory(dir=Path.cwd()) as scratch:
         names = ("inline", "alone", "workers")
-        inline, alone, workers = (make_dataset(Path(scratch) / name, count) for name in names)
+        inline, alone, workers = (write_inputs(Path(scratch) / name, count) for name in names)
         result = {
             "milliseconds_per_item": timed(inline, Pool(0), count),
             "milliseconds_per_current_item": timed(inline, Pool(0), count),
@@ -67,18 +58,10 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def make_dataset(root: Path, count: int) -> Dataset:
-    """Make a dataset of `count` small inputs."""
-    (root / "in").mkdir(parents=True)
-    for number in range(count):
-        (root / "in" / f"item{number:05d}.txt").write_text(f"{number}")
-    return Dataset(root)
-
-
 def with_workers(dataset: Dataset, count: int, batch: int) -> float:
     """Return milliseconds per item in two running workers, in batches of at most so many."""
     express50.runner.executor.LARGEST_BATCH = batch
-    first = make_dataset(dataset.root / "first", 4)
+    first = write_inputs(dataset.root / "first", 4)
     with Pool(2) as pool:
         timed(first, pool, 4)
         return timed(dataset, pool, count)

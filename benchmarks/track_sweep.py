@@ -13,7 +13,12 @@ import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks.common import make_parser, replace_section
+from benchmarks.common import (
+    add_twin_options,
+    check_twin_options,
+    make_parser,
+    replace_section,
+)
 from benchmarks.track import narrowed, prepare, track, twin_config
 from benchmarks.track_truth import summary
 from benchmarks.track_views import held_out_views
@@ -46,15 +51,12 @@ KNOBS: tuple[tuple[str, dict[str, object]], ...] = (
 def main(arguments: list[str] | None = None) -> int:
     """Run the sweep and write its table."""
     parser = make_parser("track_sweep", __doc__)
-    parser.add_argument("--dataset", type=Path)
-    parser.add_argument("--truth", type=Path)
-    parser.add_argument("--captures", type=Path)
+    add_twin_options(parser)
+    parser.add_argument("--captures", type=Path, help="its captures, with the held-out cameras")
     parser.add_argument("--knobs", nargs="+", choices=[name for name, _ in KNOBS], metavar="KNOB")
     parser.add_argument("--doc", type=Path, help="file to write the table into")
     options = parser.parse_args(arguments)
-    given = [options.dataset, options.truth, options.captures]
-    if any(given) and not all(given):
-        parser.error("give --dataset, --truth and --captures, or none of them")
+    check_twin_options(parser, options)
     with tempfile.TemporaryDirectory() as scratch:
         if options.dataset is None:
             dataset, truth, captures = prepare(twin_config(1, 18, 512), Path(scratch) / "twin")

@@ -1,6 +1,7 @@
 """Measure tracked meshes against the twin's truth: millimetres, pixels, coefficients, views.
 
-All is compared in the true world, where the estimated one is laid by one rigid motion a subject.
+Everything is compared in the true world. One rigid motion per subject takes the estimated world
+there.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ class Errors:
     # motion, true_motion: (3 F,) how far these coefficients move the face's vertices, metres
     motion: np.ndarray
     true_motion: np.ndarray
-    ious: list[float]  # of the head's mask, one a held-out camera
-    psnrs: list[float]  # decibels, one a held-out camera that shows enough of the face
+    ious: list[float]  # of the head's mask, one per held-out camera
+    psnrs: list[float]  # decibels, one per held-out camera that shows enough of the face
     true_psnrs: list[float]  # of the true mesh in their place: highlights, noise and gains alone
 
 
@@ -76,7 +77,7 @@ def compare(
 
 
 def check_topology(model: HeadModel, truth: Truth, subject: str) -> None:
-    """Refuse what has no vertex to vertex errors."""
+    """Refuse a track whose mesh has another number of vertices than the truth."""
     got, expected = len(model.template), len(truth.head_model(subject).template)
     if got != expected:
         raise Express50Error(
