@@ -99,7 +99,8 @@ class FrameReader:
         if found != expected:
             raise CaptureError(
                 f"{file}: frame {frame} has hash {found}, but the index has {expected}; "
-                "the footage changed since it was ingested: run 'express50 ingest' again"
+                "the footage, or how this version reads it, changed since it was ingested: run"
+                " 'express50 ingest' again"
             )
         return corrected(image, self.source)
 

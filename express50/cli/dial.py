@@ -27,7 +27,7 @@ from express50.console import (
     stdout_to_stderr,
 )
 from express50.contract.config import distinct_settings, resolve_config
-from express50.contract.layout import Dataset
+from express50.contract.layout import Dataset, check_folder
 from express50.contract.stage import Stage, stages
 from express50.errors import ConfigError
 
@@ -130,6 +130,8 @@ def _chain(args: argparse.Namespace) -> Iterator[Any]:
                 log(f"express50: {line}")
             yield None
             return
+        if not args.captures:
+            check_folder(dataset)
         for stage in known:
             if stage.prepare is not None and args.captures:
                 stage.prepare(dataset, args.captures, args.replace)

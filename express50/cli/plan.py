@@ -19,7 +19,7 @@ from rich.filesize import decimal
 
 from express50.console import add_command, answer, count, format_table, stdout_to_stderr
 from express50.contract.config import PRESETS, made_with, resolve_config
-from express50.contract.layout import Dataset
+from express50.contract.layout import Dataset, check_folder
 from express50.contract.stage import Stage, stages
 from express50.dial.figures import Footage, dial_dir, footage_of, read_measured
 from express50.errors import ConfigError, StageError
@@ -103,6 +103,8 @@ def run_plan(args: argparse.Namespace) -> int:
     with stdout_to_stderr():
         known = list(stages().values())
         datasets = [dataset, *map(Dataset, args.also)]
+        for one in datasets:
+            check_folder(one)
         measured = [pair for one in datasets for pair in measure_sizes(one, known)]
     footage = measured[0][0]
     target = target_of(args.target, sizes, footage)

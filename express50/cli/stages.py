@@ -10,7 +10,7 @@ from typing import Any
 
 from express50.console import FAILED, OK, USAGE, add_command, log, say, say_json, stdout_to_stderr
 from express50.contract.config import PRESETS, config_toml, resolve_config
-from express50.contract.layout import Dataset
+from express50.contract.layout import Dataset, check_folder
 from express50.contract.stage import Stage, stages, with_required
 from express50.errors import ConfigError, check_known
 
@@ -226,13 +226,11 @@ def _items(
         prepared = stage.prepare(dataset, args.captures, args.replace)
         if args.command != "run" and pattern is None:
             return prepared
-    elif not dataset.root.is_dir():
-        raise ConfigError(
-            f"{dataset.root}: no such dataset; run 'express50 ingest {dataset.root} CAPTURE'"
-        )
-    elif stage.prepare is not None and not stage.items(dataset):
-        call = f"express50 {args.command} {dataset.root} CAPTURE"
-        raise ConfigError(f"{dataset.root}: has no captures yet; run '{call}'")
+    else:
+        check_folder(dataset)
+        if stage.prepare is not None and not stage.items(dataset):
+            call = f"express50 {args.command} {dataset.root} CAPTURE"
+            raise ConfigError(f"{dataset.root}: has no captures yet; run '{call}'")
     if pattern is None:
         return None
     # A stage that runs first in another's command may have other items; take the same subjects'.

@@ -15,7 +15,16 @@ from typing import Any
 
 from rich.filesize import decimal
 
-from express50.console import FAILED, OK, add_command, answer, format_seconds, format_table, say
+from express50.console import (
+    FAILED,
+    OK,
+    add_command,
+    answer,
+    count,
+    format_seconds,
+    format_table,
+    say,
+)
 from express50.contract.layout import Dataset, existing_dataset
 from express50.contract.stage import stages, typical_error
 from express50.errors import few
@@ -155,6 +164,13 @@ def _lines(table: list[StageStatus]) -> Iterator[str]:
     for row in table:
         if imported := sum(receipt.imported for receipt in row.receipts):
             yield f"imported {row.stage}: {imported} of its items were made by another tool"
+    for row in table:
+        notes = [
+            (note["what"], r.item) for r in row.receipts for note in r.metrics.get("dropped", ())
+        ]
+        if notes:
+            parts = few([f"{what} of {item}" for what, item in notes])
+            yield f"dropped {row.stage}: {count(len(notes), 'part')}, {parts}; 'report' says why"
     for row in table:
         for receipt in row.failed:
             yield f"failed {receipt.stage} {receipt.item}: {receipt.reason}"

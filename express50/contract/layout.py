@@ -204,9 +204,19 @@ def existing_dataset(path: Path) -> Dataset:
     if not dataset.ledger.is_file():
         if dataset.captures_file.is_file():  # a budgeted run was stopped while it measured
             raise ConfigError(f"{path}: nothing has been made yet; run 'express50 run {path}'")
-        what = "not a dataset (no ledger.sqlite)" if path.is_dir() else "no such dataset"
-        raise ConfigError(f"{path}: {what}; run 'express50 ingest {path} CAPTURE'")
+        check_folder(dataset)
+        raise ConfigError(
+            f"{path}: not a dataset (no ledger.sqlite); run 'express50 ingest {path} CAPTURE'"
+        )
     return dataset
+
+
+def check_folder(dataset: Dataset) -> None:
+    """Raise ConfigError if the dataset's folder does not exist."""
+    if not dataset.root.is_dir():
+        raise ConfigError(
+            f"{dataset.root}: no such dataset; run 'express50 ingest {dataset.root} CAPTURE'"
+        )
 
 
 def exclusion_reason(dataset: Dataset, subject: str) -> str | None:

@@ -40,6 +40,10 @@ COLUMNS = (
     "registered_mm_median", "registered_mm_p95", "unit", "metres_per_unit", "landmarks",
     "warnings", "error",
 )  # fmt: skip
+REFUSED = (
+    "its name becomes a folder's; expected letters, digits, _ and -, and every name once; rename"
+    " the file"
+)
 PICTURES, FAR_MM = len(YAWS) * len(PITCHES), 10.0
 # Options that only runs on datasets use, with their defaults.
 DATASET_OPTIONS: dict[str, object] = {
@@ -57,11 +61,18 @@ def run_scans(args: argparse.Namespace) -> int:
             )
     load_head(args.head)  # refuse a wrong name before any work
     out, accounts = args.dataset, []
-    scans, former = list_scans(args.scan), read_index(out / INDEX)
+    files, former = list_scans(args.scan), read_index(out / INDEX)
+    taken: set[str] = set()
     try:
-        for name, path in scans.items():
+        for path in files:
+            # A refused name may be another scan's; with its ending it is no folder's.
+            refused = not ID.fullmatch(path.stem) or path.stem in taken
+            name = path.name if refused else path.stem
+            taken.add(name)
             account: dict = {"name": name, "scan": str(path), "folder": str(out / name)}
             try:
+                if refused:
+                    raise ConfigError(REFUSED)
                 account |= register_scan(path, args.head, out / name)
                 line = "current" if account["skipped"] else summary_line(account)
             except Express50Error as error:
@@ -99,7 +110,7 @@ def write_index(path: Path, former: dict[str, dict[str, str]], accounts: list[di
     rows: dict[str, dict] = {
         name: row
         for name, row in former.items()
-        if row["error"] or (path.parent / (row["mesh"] or "")).is_file()
+        if Path(row["scan"] if row["error"] else path.parent / row["mesh"]).is_file()
     }
     for account in accounts:
         name, row = account["name"], {key: account.get(key) for key in COLUMNS}
@@ -114,12 +125,8 @@ def write_index(path: Path, former: dict[str, dict[str, str]], accounts: list[di
     write_bytes(path, text.getvalue().encode())
 
 
-def list_scans(paths: list[Path]) -> dict[str, Path]:
-    """List scan files, and those in folders, by the names of the folders to write.
-
-    Raises:
-        ConfigError: a scan is missing, two have the same name, or a name cannot be a folder's.
-    """
+def list_scans(paths: list[Path]) -> list[Path]:
+    """List scan files, and those in folders; ConfigError if one is missing."""
     files: list[Path] = []
     for path in paths:
         folder = path.is_dir()
@@ -132,15 +139,7 @@ def list_scans(paths: list[Path]) -> dict[str, Path]:
             f"--scan {missing or paths[0]}: no scan there; expected a file, one of"
             f" {', '.join(KINDS)}, or a folder of them"
         )
-    found: dict[str, Path] = {}
-    for file in files:
-        if not ID.fullmatch(file.stem) or file.stem in found:
-            raise ConfigError(
-                f"--scan {file}: its name becomes a folder's; expected letters, digits, _ and -,"
-                " and every name once; rename the file"
-            )
-        found[file.stem] = file
-    return found
+    return files
 
 
 def register_scan(path: Path, head: str, folder: Path) -> dict:

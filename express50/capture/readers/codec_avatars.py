@@ -30,7 +30,7 @@ from express50.capture.readers.selection import (
 from express50.errors import CalibrationError, CaptureError
 from express50.files.calibration import finite_array
 from express50.files.containers import WITHIN, open_zip
-from express50.files.text import NAME, identifier, read_json_table, read_text
+from express50.files.text import NAME, check_links, identifier, read_json_table, read_text
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_from_opencv
 from express50.rigs.camera_builder import camera_from_K, checked, in_metres
@@ -160,6 +160,7 @@ def _ava256_cameras(path: Path) -> dict[str, Camera]:
 def _ava256_pictures(path: Path, name: str, wanted: list[Moment]) -> dict[Moment, str]:
     """Name each wanted picture in a camera's zip."""
     archive = f"decoder/image/{name}.zip"
+    check_links(path / "decoder/image", path / archive)
     if not (path / archive).is_file():
         raise CaptureError(f"{path / archive}: no such file; download it")
     members = open_zip(path / archive).namelist()

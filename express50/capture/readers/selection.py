@@ -180,7 +180,7 @@ def common_timeline(
         skipped |= _reasons(shared - table.keys(), camera, "has no", kind)
         shared = shared & table.keys()
     if not shared:
-        reasons = "; ".join(f"{what}: {why}" for what, why in (lost | skipped).items())
+        reasons = few([f"{what}: {why}" for what, why in (lost | skipped).items()], SHOWN)
         raise CaptureError(
             f"{root}: its cameras share no {kind} ({reasons or 'it has no cameras'}); "
             "copy or download them again"

@@ -28,7 +28,7 @@ from express50.capture.readers.selection import (
 )
 from express50.errors import CalibrationError, CaptureError
 from express50.files.images import ORIENTATION
-from express50.files.text import identifier, read_json_table
+from express50.files.text import check_links, identifier, read_json_table
 from express50.files.video import video_fps, video_tags
 from express50.rigs.other_tools import read_nersemble
 
@@ -60,16 +60,24 @@ def read_participant(path: Path, selection: Selection) -> RawCapture:
         CalibrationError: cameras or colours are malformed.
     """
     calibration = read_nersemble(path / CAMERAS)
+    check_links(*(path / "sequences").iterdir())
     sequences = sorted(
         p.name for p in (path / "sequences").iterdir() if p.is_dir() and p.name != BACKGROUND
     )
     check_selection(selection, sequences, sorted(calibration))
     wanted = [name for name in sequences if selection.has_sequence(name)]
     videos: dict[str, dict[Moment, str]] = {}
+    dropped: dict[str, str] = {}
     for serial in filter(selection.has_camera, sorted(calibration)):
         names = {s: f"sequences/{s}/images/cam_{serial}.mp4" for s in wanted}
         videos[serial] = {(s, 0): name for s, name in names.items() if (path / name).is_file()}
-    line = common_timeline(path, videos, wanted, "videos")
+        try:  # of a part that was not fetched, the timeline says what is missing
+            check_links(*(path / name for name in names.values() if not videos[serial]))
+        except CaptureError as error:
+            dropped[serial] = str(error)
+            del videos[serial]
+    listed = [(name, 0) for name in wanted]
+    line = common_timeline(path, videos, wanted, "videos", listed=listed, dropped=dropped)
     colours, warnings = _colours(path, set(line.cameras))
     plates = {serial: f"sequences/{BACKGROUND}/image_{serial}.jpg" for serial in line.cameras}
     return RawCapture(

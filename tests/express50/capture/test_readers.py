@@ -156,6 +156,27 @@ def test_nersemble_cameras_of_unequal_length(tmp_path):
     assert lost["last frames of EMO_1_shout_laugh in camera 222200036"]
 
 
+def test_links_to_videos_that_are_not_there_are_named(tmp_path):
+    path = layouts.write_nersemble(tmp_path, write_video)
+    videos = sorted(path.glob("sequences/E*/images/*.mp4"))
+    for video in (*videos[:3], videos[4]):  # one sequence, and one camera of the other
+        video.unlink()
+        video.symlink_to("../.git/annex/objects/x.mp4")
+    raw = read_any(path)
+    assert sorted(raw.cameras) == ["222200036", "222200038"] and raw.clips == ("EXP_1_head",)
+    assert "is a link to" in raw.dropped["222200037"]
+    assert "no camera has a picture of EMO-1-shout+laugh 0" in raw.skipped.values()
+    for video in (videos[3], videos[5]):
+        video.unlink()
+        video.symlink_to("../.git/annex/objects/x.mp4")
+    with pytest.raises(CaptureError, match="222200036.*is a link to .* which is not there"):
+        read_any(path)
+    archive = layouts.write_ava(tmp_path) / "decoder/image/cam400981.zip"
+    archive.unlink()
+    archive.symlink_to("nowhere.zip")
+    assert "is a link to" in read_any(archive.parents[2]).dropped["cam400981"]
+
+
 def noise_frames(count):
     return [image[:, :110] for image in noise_video_images(count, 160)]
 

@@ -167,3 +167,10 @@ def test_a_dataset_that_was_only_tuned_is_planned(tmp_path, capsys):
     capsys.readouterr()
     assert main(["plan", str(tmp_path / "data"), "--target", "express-50"]) == 0
     assert "ingest" in (text := capsys.readouterr().out) and "was not run" in text
+
+
+def test_a_folder_that_is_not_there_is_named_as_such(tmp_path, capsys):
+    for command in (["plan"], ["tune"], ["run", "--budget", "1h"]):
+        assert main([command[0], str(tmp_path / "lost"), *command[1:]]) == 2
+        assert "no such dataset" in capsys.readouterr().err
+    assert not (tmp_path / "lost").exists()

@@ -307,3 +307,11 @@ def test_outdated_outputs_are_listed_with_what_changed(tmp_path, capsys):
     footage.write_bytes(footage.read_bytes() + b"x")
     assert main(["status", str(root)]) == 0
     assert "outdated ingest S001: inputs changed: " in capsys.readouterr().out
+
+
+def test_dropped_parts_are_counted(tmp_path, capsys):
+    notes = [{"what": f"camera {n}", "why": "it is dark"} for n in range(5)]
+    with Ledger(tmp_path / "ledger.sqlite") as ledger:
+        ledger.write(receipt("S001", 1.0, stage="ingest", metrics={"dropped": notes}))
+    assert main(["status", str(tmp_path)]) == 0
+    assert "dropped ingest: 5 parts, camera 0 of S001, " in capsys.readouterr().out
