@@ -101,7 +101,10 @@ def frame_camera(where: str, name: str, row: dict, size: tuple[int, int] | None)
     if "w" in row and "h" in row:
         size = int(row["w"]), int(row["h"])
     if size is None:
-        raise CalibrationError(f"{where}: has no w and h; pass --size WIDTHxHEIGHT")
+        raise CalibrationError(
+            f"{where}: has no w and h (pixels); add them, or pass --size WIDTHxHEIGHT to"
+            " 'express50 cameras'"
+        )
     fx, fy = _focal(row, "x", size[0]), _focal(row, "y", size[1])
     if fx is None:
         raise CalibrationError(f"{where}: has neither fl_x nor camera_angle_x; add one")

@@ -23,7 +23,7 @@ from typing import Any
 from express50.contract.config import build_dataclass
 from express50.errors import ConfigError, StageError, nearest
 from express50.files.text import read_toml
-from express50.runner.clusters import GPU, RemoteWorkers, no_gpu, start_cluster
+from express50.runner.clusters import GPU, RemoteWorkers, close_within, no_gpu, start_cluster
 from express50.runner.worker import thread_environment
 
 QUEUE_SECONDS = 10.0  # between two looks at the queue
@@ -249,7 +249,7 @@ class SlurmWorkers(RemoteWorkers):
             _call("scancel", *sorted(self._names))
         self._names.clear()
         super().close()
-        self._cluster.close(timeout=10)
+        close_within(10, self._cluster)
 
 
 def _call(*command: str) -> subprocess.CompletedProcess:

@@ -275,16 +275,21 @@ def _write_depths(given: PeakPictures, out: Path) -> Result:
         matte = given.dataset.matte_file(given.subject, given.peak.expression, name)
         # Depth of the set would become part of the head.
         depths[name] = depth * (read_alpha(matte) > 127) if matte.is_file() else depth
+    known = {name: depth for name, depth in depths.items() if depth.any()}
+    if not known:
+        raise StageError(f"{given.item}: its depth maps know nothing inside the mattes")
     notes, checks = list[Note](), dict[str, object]()
+    if empty := [name for name in depths if name not in known]:
+        notes.append(Note(few(empty), "depth is unknown everywhere inside the matte"))
     found = observe_peak(given.dataset, given.subject, given.peak, notes)
     with trusting(args.trust, notes):
         checks["off_the_face_m"] = check_face_depth(found, cameras, depths, given.item)
         checks["views_agree"] = check_depths(cameras, depths, given.item)
     for name, depth in depths.items():
-        known = depth > 0
-        write_depth(out, name, encode_depth(depth, known))
-        write_image(out / f"{name}_confidence.png", np.where(known, 255, 0).astype(np.uint8))
-    vertices = write_fused(out / "surface.ply", cameras, depths, given.footage())
+        valid = depth > 0
+        write_depth(out, name, encode_depth(depth, valid))
+        write_image(out / f"{name}_confidence.png", np.where(valid, 255, 0).astype(np.uint8))
+    vertices = write_fused(out / "surface.ply", cameras, known, given.footage())
     return Result({"imported": checks | {"surface_vertices": vertices}}, (), notes)
 
 

@@ -56,8 +56,8 @@ def check_in_view(cameras: Mapping[str, Camera], vertices: np.ndarray, where: st
     if 2 * seen <= len(cameras):
         raise StageError(
             f"{where}: {seen} of {len(cameras)} cameras have the head in their picture: the track"
-            " has another world frame than the cameras; name the calibration it was made with"
-            " (--cameras)"
+            " is not in metres, or not in the world of its cameras; name those that"
+            " tracked_flame_params_N.npz was made with (--cameras)"
         )
 
 

@@ -149,9 +149,9 @@ def check_masks(cameras: Mapping[str, Camera], masks: Mapping[str, np.ndarray], 
     for name, alpha in masks.items():
         inside = alpha > 127
         if not inside.any() or inside.all():
+            what = f"is {'full' if inside.any() else 'empty'} ({alpha.min()} to {alpha.max()})"
             raise StageError(
-                f"{where}: the mask of {name} is {'full' if inside.any() else 'empty'}; expected"
-                " the subject"
+                f"{where}: the mask of {name} {what}; expected 255 on the subject and 0 elsewhere"
             )
         y, x = np.nonzero(inside)
         middles.append([x.mean() + 0.5, y.mean() + 0.5])
@@ -183,7 +183,8 @@ def check_depths(
     share = agreement(cameras, depths)
     if share is None:
         return None
-    best, why = share, "its cameras, subject or frame differ"
+    best = share
+    why = "its cameras, subject or frame differ, or it is relative depth, which has no unit"
     if share < AGREE_SHARE:
         for factor in FACTORS:
             other = agreement(cameras, {n: factor * depth for n, depth in depths.items()}) or 0.0
@@ -251,16 +252,14 @@ def write_fused(
 ) -> int:
     """Write the fused surface of depths (H, W), metres, with colours; returns its vertices.
 
+    Each map knows some pixels.
+
     Raises:
         StageError: the maps hold no surface.
     """
     steps = [
-        float(np.median(depth[depth > 0])) / cameras[name].K[0, 0]
-        for name, depth in depths.items()
-        if depth.any()
+        float(np.median(depth[depth > 0])) / cameras[name].K[0, 0] for name, depth in depths.items()
     ]
-    if not steps:
-        raise StageError(f"{path.name}: no depth map has a known pixel")
     voxel = max(LEAST_VOXEL_M, VOXEL_PX * float(np.median(steps)))
     centre = np.mean([camera.center for camera in cameras.values()], axis=0)
     mesh = fuse(((cameras[name], depth) for name, depth in depths.items()), centre, voxel)

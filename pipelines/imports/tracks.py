@@ -28,7 +28,7 @@ from express50.geometry.transforms import axis_angle_to_matrix
 from express50.head.load import load_head
 from express50.head.model import HeadModel, pose, rest_vertices
 from express50.rigs.read import read_rig
-from express50.rigs.transforms_json import frame_camera, is_transforms
+from express50.rigs.transforms_json import frame_camera
 from pipelines.imports.cameras import aligning_transform
 from pipelines.imports.places import PeakFrame, fill
 
@@ -36,6 +36,7 @@ WHAT = "FLAME parameters of a tracker"
 # Names and widths of the arrays with one row per time step.
 POSES = {"translation": 3, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6}
 ROWS = (*POSES, "expr")
+OFFSETS = ("static_offset", "dynamic_offset")
 NUMBER = re.compile(r"(\d+)$")
 SAME = 1e-5  # metres and coefficients: what the steps must share may be rounded
 
@@ -108,8 +109,9 @@ def _read_steps(
     source: TrackSource,
 ) -> dict[str, FlameStep]:  # fmt: skip
     """Read the time steps of peaks, by expression."""
-    if is_transforms(path):
-        return _steps_of_transforms(path, subject, peaks, ours, source)
+    table = path / "transforms.json" if path.is_dir() else path
+    if table.suffix == ".json" and table.is_file():
+        return _steps_of_transforms(table, subject, peaks, ours, source)
     if path.is_dir():
         # VHAP writes one per epoch; the last is the best.
         files = sorted(path.glob("tracked_flame_params*.npz"), key=lambda p: (len(p.name), p.name))
@@ -119,7 +121,8 @@ def _read_steps(
             )
         path = files[-1]
     if path.suffix != ".npz":
-        raise ConfigError(f"{path}: no such file; expected a folder or {WHAT} (.npz)")
+        found = "is another kind of file" if path.is_file() else "no such file"
+        raise ConfigError(f"{path}: {found}; expected a folder or {WHAT} (.npz)")
     arrays = read_arrays(path, FormatError, WHAT, ROWS)
     if "focal_length" in arrays and source.cameras is None:
         raise CalibrationError(
@@ -137,11 +140,15 @@ def _read_steps(
 
 
 def _steps_of_transforms(
-    path: Path, subject: str, peaks: list[PeakFrame], ours: Mapping[str, Camera],
+    file: Path, subject: str, peaks: list[PeakFrame], ours: Mapping[str, Camera],
     source: TrackSource,
 ) -> dict[str, FlameStep]:  # fmt: skip
-    file = path / "transforms.json" if path.is_dir() else path
-    folder, frames = file.parent, read_json_table(file, FormatError)["frames"]
+    if source.cameras is not None:
+        raise ConfigError(f"{file}: has cameras of its own; leave --cameras out")
+    folder, table = file.parent, read_json_table(file, FormatError)
+    frames = table.get("frames")
+    if not frames or not isinstance(frames, list) or not all(isinstance(f, dict) for f in frames):
+        raise FormatError(f"{file}: has no frames; expected the transforms.json of a tracker")
     other = folder / "export.json"
     if other.is_file() and (named := read_json_table(other, FormatError).get("subject")) != subject:
         raise StageError(f"{folder}: is of subject {named}, expected {subject}")
@@ -150,7 +157,9 @@ def _steps_of_transforms(
     for number, row in enumerate(frames):
         where = f"{file}: frame {number}"
         name = str(row.get("camera_id", row.get("camera_index", "")))
-        cameras.setdefault(name, _camera_of(where, name, row, source.axes))
+        if not name:
+            raise FormatError(f"{where}: has no camera_id; expected the id that the dataset uses")
+        cameras.setdefault(name, _camera_of(where, name, table | row, source.axes))
         rows.setdefault(str(row.get("timestep_id", row.get("timestep_index", number))), row)
     motion = aligning_transform(cameras, ours, str(file))
     chosen = _choose(list(rows), peaks, source.in_clip, str(file))
@@ -166,7 +175,7 @@ def _steps_of_transforms(
                 f"{file}: {expression} is of frame {frame}, its peak is frame {peak.frame} now;"
                 " track that frame"
             )
-        member = folder / row["flame_param_path"]
+        member = folder / str(row["flame_param_path"])
         if not member.resolve().is_relative_to(folder.resolve()):
             raise FormatError(
                 f"{file}: flame_param_path {row['flame_param_path']} points outside the folder"
@@ -215,19 +224,24 @@ def _step(path: Path, arrays: Mapping[str, np.ndarray], row: int, motion: np.nda
     where = f"{path}: row {row}"
     if missing := [name for name in (*ROWS, "shape") if name not in arrays]:
         raise FormatError(f"{where}: has no {', '.join(missing)}; expected {WHAT}")
+    for name in {*ROWS, "shape", *OFFSETS} & set(arrays):
+        if arrays[name].dtype.kind not in "fiu":
+            raise FormatError(f"{where}: {name} is {arrays[name].dtype}, expected numbers")
     found: dict[str, np.ndarray] = {}
     for name in ROWS:
-        array, width = np.asarray(arrays[name]), POSES.get(name)
+        array, width = arrays[name], POSES.get(name)
         if array.ndim != 2 or row >= len(array) or width not in (None, array.shape[1]):
             raise FormatError(f"{where}: {name} is {array.shape}, expected (T, {width or 'X'})")
         found[name] = array[row].astype(np.float64)
     shared: dict[str, np.ndarray] = {"shape": np.ravel(arrays["shape"]).astype(np.float64)}
-    offset = np.asarray(arrays.get("static_offset", np.zeros((0, 3))), np.float64)
-    shared["static_offset"] = offset.reshape(-1, 3)
+    static, dynamic = (arrays.get(name, np.zeros((0, 3))) for name in OFFSETS)
+    if static.size and static.shape[-1] != 3:
+        raise FormatError(f"{where}: static_offset is {static.shape}, expected (1, V, 3)")
+    shared["static_offset"] = static.reshape(-1, 3).astype(np.float64)
+    moving = np.abs(dynamic).max(initial=0)
     for name, array in (*found.items(), *shared.items()):
         if not np.isfinite(array).all():
-            raise FormatError(f"{where}: {name} holds NaN or Inf")
-    moving = np.abs(np.asarray(arrays.get("dynamic_offset", 0.0))).max(initial=0)
+            raise FormatError(f"{where}: {name} holds NaN or Inf; track the sequence again")
     return FlameStep(
         where=where, arrays=found, shared=shared, motion=motion, dynamic_mm=1e3 * float(moving)
     )

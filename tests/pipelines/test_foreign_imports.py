@@ -224,6 +224,52 @@ def test_another_head_model_is_refused(dataset, avatar, capsys) -> None:
     assert "300 shape coefficients, the head model has 6" in error_of(capsys)
 
 
+def change_parameters(**arrays: np.ndarray):
+    def change(avatar: Path) -> None:
+        for path in (avatar / "flame_param").iterdir():
+            with np.load(path) as file:
+                np.savez(path, **dict(file) | arrays)
+
+    return change
+
+
+DAMAGED = {
+    "cut off": (
+        lambda avatar: (avatar / "transforms.json").write_text('{"frames": ['),
+        "transforms.json: not JSON",
+    ),
+    "no frames": (
+        lambda avatar: (avatar / "transforms.json").write_text('{"frames": {}}'),
+        "transforms.json: has no frames",
+    ),
+    "no ids": (
+        lambda avatar: change_table(
+            avatar, lambda row: [row.pop(key) for key in ("camera_id", "camera_index")]
+        ),
+        "frame 0: has no camera_id",
+    ),
+    "two axes": (
+        change_parameters(static_offset=np.zeros((1, 120, 2))),
+        "static_offset is (1, 120, 2), expected (1, V, 3)",
+    ),
+    "words": (change_parameters(dynamic_offset=np.array(["none"])), "expected numbers"),
+}
+
+
+@pytest.mark.parametrize("case", sorted(DAMAGED))
+def test_damaged_tracks_are_named_in_one_line(original, dataset, avatar, capsys, case) -> None:
+    change, words = DAMAGED[case]
+    change(avatar)
+    assert take("track", dataset, avatar, f"--head={original[2]}") == 1
+    assert words in error_of(capsys)
+
+
+def test_cameras_beside_those_of_the_export_are_refused(original, dataset, avatar, capsys) -> None:
+    options = [f"--head={original[2]}", "--cameras=camera_params.json"]
+    assert take("track", dataset, avatar, *options) == 1
+    assert "has cameras of its own; leave --cameras out" in error_of(capsys)
+
+
 def test_runs_keep_an_import_until_its_cameras_change(original, dataset, capsys) -> None:
     assert take("track", dataset, original[1], f"--head={original[2]}") == 0
     path = dataset.track_file("S001")
@@ -449,6 +495,19 @@ def test_depth_with_a_wrong_unit_or_measure_is_named(dataset, tmp_path, capsys) 
     pattern = depths_of(dataset, tmp_path / "rays", as_exr, lambda depth, rays: depth * rays)
     assert take("depth", dataset, pattern, "--unit=m", "--ray") == 0
     assert take("depth", dataset, pattern, "--unit=inch") == 2
+
+
+def test_an_empty_map_is_named_and_the_others_are_fused(dataset, tmp_path, capsys) -> None:
+    pattern = depths_of(dataset, tmp_path / "depth", as_npy)
+    blank = np.full((SIZE, SIZE), np.nan)
+    np.save(pattern.format(expression="smile", camera="cam02"), blank)
+    for camera in read_cameras_of(dataset, "S001"):
+        np.save(pattern.format(expression="neutral", camera=camera), blank)
+    assert take("depth", dataset, pattern, "--unit=mm") == 1
+    said = capsys.readouterr().out
+    assert "= 1 done + 1 failed" in said and "unexpected" not in said
+    assert "warning S001/smile: cam02: depth is unknown everywhere inside the matte" in said
+    assert "S001/neutral: its depth maps know nothing inside the mattes" in said
 
 
 def face(cameras: dict, points: np.ndarray) -> Observation:

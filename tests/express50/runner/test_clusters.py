@@ -56,6 +56,16 @@ def test_devices_are_those_that_the_driver_lists_and_the_environment_leaves(devi
     assert cuda_devices() == []
 
 
+def test_workers_that_a_busy_machine_stops_slowly_do_not_fail_the_run():
+    class Slow:
+        def close(self, timeout):
+            raise TimeoutError(f"timed out after {timeout} s.")
+
+    workers = object.__new__(LocalWorkers)
+    workers.client = workers._cluster = Slow()
+    workers.close()
+
+
 def test_one_item_at_a_time_on_each_device(devices):
     devices(1)
     workers = LocalWorkers(2, threads=1)
