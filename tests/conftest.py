@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from express50.contract.layout import Dataset
+from express50.head.load import load_builtin
 from tests.synth import make_capture
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -37,6 +38,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def shared():
     """Look up material beside the repository by name."""
     return shared_folder
+
+
+@pytest.fixture(scope="session")
+def head():
+    """The built-in head; do not change it."""
+    return load_builtin()
 
 
 @pytest.fixture(scope="session")

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from express50.geometry.cameras import Camera
 from express50.geometry.transforms import look_at
-from express50.head.load import load_head
 from express50.head.model import landmarks, pose, vertex_normals
 from pipelines.track.basis import split_shape, with_modes
 from pipelines.track.face_uv import (
@@ -88,11 +87,6 @@ def test_the_map_takes_trust_from_the_landmarks_it_reads() -> None:
     np.testing.assert_array_equal(made.sigma[:, ~read], target.sigma[:, ~read])
     np.testing.assert_array_equal(made.sigma[:, read], DISTRUST * target.sigma[:, read])
     assert np.nanmax(target.sigma[np.isfinite(target.sigma)]) == 1.5, "not changed in place"
-
-
-@pytest.fixture(scope="module")
-def head():
-    return load_head("procedural")
 
 
 @pytest.fixture(scope="module")

@@ -49,11 +49,6 @@ SHORT = 0.75
 
 
 @pytest.fixture(scope="module")
-def head():
-    return load_head("procedural")
-
-
-@pytest.fixture(scope="module")
 def chart(head):
     return make_uv_map(head)
 

@@ -7,18 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from express50.head.load import load_head
 from express50.head.model import pose
 from pipelines.track.face_uv import HEIGHT, WIDTH, make_uv_map
 from pipelines.track.schedule import SKIN_ROUNDS, make_schedule
 from pipelines.track.skin_flow import FINE, SkinMap, flow_term
 
 SIZE = FINE * HEIGHT, FINE * WIDTH
-
-
-@pytest.fixture(scope="module")
-def head():
-    return load_head("procedural")
 
 
 @pytest.fixture(scope="module")

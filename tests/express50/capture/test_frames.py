@@ -187,14 +187,10 @@ def test_any_image_becomes_8_bit_srgb(image, expected):
     assert set(result.reshape(-1).tolist()) == {expected}
 
 
-def test_nan_pixels_are_refused():
-    with pytest.raises(ValueError, match="NaN"):
-        to_srgb(np.full((2, 2, 3), np.nan, np.float32))
-
-
-def test_floats_from_0_to_255_are_refused():
-    with pytest.raises(ValueError, match="expected linear light from 0 to 1"):
-        to_srgb(np.full((2, 2, 3), 120, np.float32))
+@pytest.mark.parametrize(("value", "message"), [(np.nan, "NaN"), (120, "light from 0 to 1")])
+def test_light_that_is_not_finite_or_on_another_scale_is_refused(value, message):
+    with pytest.raises(ValueError, match=message):
+        to_srgb(np.full((2, 2, 3), value, np.float32))
 
 
 def test_a_plate_of_another_size_is_one_clear_error(tmp_path):

@@ -94,16 +94,14 @@ def test_forward_reads_do_not_seek(video, monkeypatch):
         reader.read(frame)
 
 
-def test_frame_outside_is_refused(video):
-    pts = tuple(stamp for stamp, _ in iterate_video(video))
-    with pytest.raises(CaptureError, match="frame 61 does not exist, expected 0 to 60"):
-        VideoReader(video, pts).read(FRAMES)
-
-
-def test_foreign_time_stamps_are_refused(video):
-    pts = tuple(stamp + 1 for stamp, _ in iterate_video(video))
-    with pytest.raises(CaptureError, match="no frame with time stamp"):
-        VideoReader(video, pts).read(5)
+@pytest.mark.parametrize(
+    ("shift", "frame", "message"),
+    [(0, FRAMES, "frame 61 does not exist, expected 0 to 60"), (1, 5, "no frame with time stamp")],
+)
+def test_frames_outside_and_foreign_time_stamps_are_refused(video, shift, frame, message):
+    pts = tuple(stamp + shift for stamp, _ in iterate_video(video))
+    with pytest.raises(CaptureError, match=message):
+        VideoReader(video, pts).read(frame)
 
 
 def test_frame_count_is_decoded_not_believed(tmp_path):

@@ -19,7 +19,7 @@ from express50.geometry.raycast import mesh_scene
 from express50.geometry.transforms import rigid_fit
 from express50.head.flame import load_flame, read_flame
 from express50.head.load import BUILTIN, load_head
-from express50.head.model import HeadModel, landmarks, pose
+from express50.head.model import HeadModel, landmarks, pose, vertex_normals
 from express50.head.mouth import (
     CORNERS,
     LOWER_RING,
@@ -301,3 +301,30 @@ def test_readers_of_the_layout_get_5143_vertices(path, model, tmp_path) -> None:
         assert stored["shape"].shape == (300,) and stored["expr"].shape == (1, 100)
         found = flame_vertices(model, dict(stored))
     np.testing.assert_allclose(found[:5143], arrays["vertices"][1, :5143], atol=5e-6)
+
+
+@pytest.mark.parametrize("scale", [1e3, 1e-3, 0.0])
+def test_heads_in_other_units_are_named(bare, scale) -> None:
+    with pytest.raises(HeadModelError, match="rings are .* mm apart, expected 2 to 30") as caught:
+        add_mouth(replace(bare, template=bare.template * scale))
+    assert "\n" not in str(caught.value)
+
+
+def test_vertices_in_another_order_are_named(bare) -> None:
+    """5023 vertices of something else: the ids mean nothing there."""
+    order = torch.from_numpy(np.random.default_rng(0).permutation(5023))
+    with pytest.raises(HeadModelError, match="rings are .* mm apart|no open loop"):
+        add_mouth(replace(bare, template=bare.template[order]))
+    cut = replace(bare, faces=bare.faces[4000:], uv_faces=bare.uv_faces[4000:])
+    with pytest.raises(HeadModelError, match="no open loop of 32 vertices"):
+        add_mouth(cut)
+
+
+@pytest.mark.parametrize("deviations", [-6.0, 6.0])
+def test_far_identities_and_wide_jaws_stay_finite(model, deviations) -> None:
+    shape = torch.full((1, model.shape_dirs.shape[2]), deviations)
+    expression = torch.full((1, model.expression_dirs.shape[2]), deviations)
+    jaw = torch.tensor([[np.pi, 0.0, 0.0]], dtype=torch.float32)
+    vertices = pose(model, shape, expression, jaw=jaw)
+    assert torch.isfinite(vertices).all()
+    assert torch.isfinite(vertex_normals(vertices, model.faces)).all()

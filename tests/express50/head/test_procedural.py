@@ -7,14 +7,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from express50.head.generator.head import procedural_mesh, stored_people, write_builtin
-from express50.head.load import BUILTIN, load_builtin
+from express50.head.load import BUILTIN
 from express50.head.model import REGIONS, landmarks
 from tests.express50.head.test_mouth import covered
-
-
-@pytest.fixture(scope="module")
-def head():
-    return load_builtin()
 
 
 @pytest.fixture(scope="module")

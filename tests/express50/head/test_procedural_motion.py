@@ -11,14 +11,8 @@ from express50.geometry.cameras import pinhole_camera
 from express50.geometry.raycast import visible_faces
 from express50.geometry.transforms import look_at
 from express50.head.generator.head import procedural_mesh
-from express50.head.load import load_builtin
 from express50.head.model import landmarks, pose
 from express50.head.preview import expression_vector
-
-
-@pytest.fixture(scope="module")
-def head():
-    return load_builtin()
 
 
 def posed(head, controls=None, jaw=0.0):
