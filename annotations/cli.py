@@ -8,6 +8,7 @@ import getpass
 import os
 import sys
 import time
+import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -175,7 +176,7 @@ def person(text: str) -> str:
     """Parse a person's name: neither the align stage's, nor a rule's, nor empty."""
     if not text.strip() or not is_person(text):
         raise argparse.ArgumentTypeError(f"{text!r} is not a valid annotator name; give yours")
-    return text
+    return unicodedata.normalize("NFC", text.strip())  # one person, however the name was typed
 
 
 def chosen_subjects(dataset: Dataset, wanted: list[str] | None) -> list[str] | None:
@@ -296,11 +297,12 @@ def run_undo(args: argparse.Namespace) -> int:
     index = _index(args)
     undo = make_event(index, args.expression, "undo", args.annotator)
     events = read_labels(args.dataset, args.subject)
-    if last_event(events, args.expression, args.annotator) is None:
+    last = last_event(events, args.expression, args.annotator)
+    if last is None:
         raise AnnotationError(
             f"{args.subject} {args.expression}: {args.annotator} has no label on it to undo"
         )
-    return _keep(args, undo, "last event undone")
+    return _keep(args, undo, f"{describe(last)} undone")
 
 
 def _keep(args: argparse.Namespace, label: Label, said: str) -> int:
@@ -365,7 +367,8 @@ def run_review(args: argparse.Namespace) -> int:
         said = ", ".join(f"{who} {what}" for who, what in row.said.items())
         settled = f" -> {row.settled}" if row.settled else ""
         lines.append(f"{row.subject} {row.expression}: {said}{settled}")
-    return answer(args, [asdict(row) for row in queue], *lines, f"{len(queue)} to review")
+    words = f"{len(queue)} to review (marks at most {count(args.beyond, 'frame')} apart agree)"
+    return answer(args, [asdict(row) for row in queue], *lines, words)
 
 
 def run_coverage(args: argparse.Namespace) -> int:

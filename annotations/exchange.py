@@ -14,7 +14,7 @@ import io
 import json
 import re
 from collections.abc import Collection, Iterable
-from dataclasses import MISSING, asdict, fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from annotations.labels import (
     ACTIONS,
     EXCLUSION_ACTIONS,
     KINDS,
+    REQUIRED,
     RULE_PREFIX,
     Label,
     append_label,
@@ -39,7 +40,6 @@ from express50.files.text import NAME, parse_json, read_text
 LARGEST = 2**63
 _FORMULA = re.compile(r"'*[=+\-@\t\r]")  # quotes before it too, so that reading is exact
 _FIELDS = tuple(field.name for field in fields(Label))
-_REQUIRED = tuple(field.name for field in fields(Label) if field.default is MISSING)
 
 
 def export_labels(labels: Iterable[Label], path: Path) -> None:
@@ -130,7 +130,7 @@ def _label(row: object, where: str) -> Label:
     if given.get("action") in EXCLUSION_ACTIONS:
         given.setdefault("expression", "")
     unknown = sorted(set(map(str, given)) - set(_FIELDS))
-    missing = sorted(set(_REQUIRED) - set(given))
+    missing = sorted(set(REQUIRED) - set(given))
     if unknown or missing:
         raise AnnotationError(f"{where}: unknown columns {unknown}, missing {missing}")
     if not NAME.fullmatch(str(given["subject"])):  # it becomes a file name

@@ -13,7 +13,7 @@ import json
 import os
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import MISSING, asdict, dataclass, fields, replace
 from typing import get_type_hints
 
 from express50 import __version__
@@ -73,6 +73,8 @@ KINDS = {
     name: int | float if kind is float else kind | int if kind == float | None else kind
     for name, kind in get_type_hints(Label).items()
 }
+REQUIRED = [field.name for field in fields(Label) if field.default is MISSING]
+MEND = "correct or remove the line"
 
 
 def make_mark(
@@ -222,19 +224,25 @@ def _lines(dataset: Dataset, subject: str) -> Iterator[tuple[int, Label | None]]
     for number, line in enumerate(data.decode("utf-8", errors="replace").split("\n"), 1):
         if not line.strip():
             continue
-        try:
-            row = parse_json(line, str(path), AnnotationError)
-        except AnnotationError:  # the torn end of a write that a crash cut short
-            yield number, None
-            continue
         where = f"{path}: line {number}"
         try:
-            label = Label(**{k: v for k, v in row.items() if k in KINDS})
-        except (TypeError, AttributeError) as error:
-            raise AnnotationError(f"{where} is not a label event ({error})") from None
+            row = parse_json(line, where, AnnotationError, MEND)
+        except AnnotationError:
+            if line.rstrip().endswith("}"):  # somebody edited it
+                raise
+            yield number, None  # a crash cut it short
+            continue
+        if not isinstance(row, dict):
+            raise AnnotationError(f"{where}: {line[:60]!r} is not a label event; {MEND}")
+        if missing := [name for name in REQUIRED if name not in row]:
+            raise AnnotationError(f"{where}: has no {' and no '.join(missing)}; {MEND}")
+        label = Label(**{k: v for k, v in row.items() if k in KINDS})
         for name, kind in KINDS.items():
             if not isinstance(found := getattr(label, name), kind):
-                raise AnnotationError(f"{where}: {name} is {found!r}, not {kind}; remove the line")
+                raise AnnotationError(f"{where}: {name} is {found!r}, not {kind}; {MEND}")
+        check_known(where, "action", [label.action], ACTIONS, AnnotationError)
+        if label.action == "mark" and label.frame is None:
+            raise AnnotationError(f"{where}: a mark needs a frame; {MEND}")
         yield number, label
 
 

@@ -143,7 +143,7 @@ LOOK = (
 )
 GROUPS = (MOVE, DECIDE, LOOK)
 HINTS = (
-    ("←→", "frame"), ("⇧←→", "ten"), ("Tab", "suggestion"), ("Enter", "mark, next"),
+    ("←→", "frame"), ("Enter", "mark"), ("⇧←→", "ten"), ("Tab", "suggestion"),
     ("[ ]", "plateau"), ("f", "flag"), ("u", "undo"), ("n p", "task"), ("z", "zoom"),
     ("c", "camera"), ("s", "second camera"), ("b", "blink"), ("Space", "play"), ("g", "go to"),
     ("?", "help"), ("q", "quit"),

@@ -138,9 +138,7 @@ class FlagDialog(ModalScreen[str | None]):
         with Vertical(classes="dialog") as box:
             box.border_title = "flag: why is there no usable peak?"
             box.border_subtitle = "press a number, or Esc to cancel"
-            for number, reason in enumerate(
-                (*FLAG_REASONS, "another reason, in your own words"), 1
-            ):
+            for number, reason in enumerate((*FLAG_REASONS, "another, in your own words"), 1):
                 key = (f" {number} ", f"bold {theme.ACCENT}")
                 yield Static(Text.assemble(key, (f" {reason}", theme.TEXT)))
             line = Input(placeholder="reason, then Enter", max_length=200)

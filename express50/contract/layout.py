@@ -203,7 +203,10 @@ def existing_dataset(path: Path) -> Dataset:
     dataset = Dataset(path)
     if not dataset.ledger.is_file():
         if dataset.captures_file.is_file():  # a budgeted run was stopped while it measured
-            raise ConfigError(f"{path}: nothing has been made yet; run 'express50 run {path}'")
+            raise ConfigError(
+                f"{path}: nothing but trials has been made yet; run the command that was stopped"
+                f" again, or 'express50 run {path}'"
+            )
         check_folder(dataset)
         raise ConfigError(
             f"{path}: not a dataset (no ledger.sqlite); run 'express50 ingest {path} CAPTURE'"

@@ -145,7 +145,9 @@ class Pilot:
         if not stage.items(dataset):
             return None, "an earlier stage made nothing for it"
         pool = self.chain.pool
-        summary = run_stage(stage, dataset, config, pool=pool, progress=False, monitor=self.clock)
+        summary = run_stage(
+            stage, dataset, config, pool=pool, progress=not anew, monitor=self.clock
+        )
         counted = ("done",) if anew else ("done", "skipped")
         made = {o.item for o in summary.outcomes if o.status in counted}
         failures = [o.reason for o in summary.outcomes if o.status == "failed"]

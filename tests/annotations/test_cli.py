@@ -172,6 +172,44 @@ def test_validate_counts_unreadable_lines(annotate, dataset):
 
 
 @pytest.mark.parametrize(
+    ("before", "after", "named"),
+    [
+        (', "expression"', ' "expression"', "not JSON"),
+        ('"annotator"', '"anotator"', "no annotator"),
+        ('"frame": 14', '"frame": "14"', "frame is '14'"),
+        ('"frame"', '"fame"', "needs a frame"),
+        ('"mark"', '"mrk"', "'mrk'"),
+    ],
+)
+def test_a_line_that_was_edited_wrongly_is_an_error(
+    annotate, dataset, capsys, before, after, named
+):
+    mark(annotate, "ann", "smile", 14)
+    path = dataset.labels_file("S001")
+    assert before in path.read_text()
+    path.write_text(path.read_text().replace(before, after))
+    assert main(["annotate", "labels", str(dataset.root)]) != 0
+    error = capsys.readouterr().err
+    assert "line 1" in error and named in error and error.count("\n") == 1
+
+
+def test_one_person_is_one_annotator_however_the_name_is_typed(annotate):
+    mark(annotate, "Zoë ", "smile", 14)
+    assert mark(annotate, "Zoe\u0308", "smile", 15)["annotator"] == "Zoë"
+    assert annotate("agree")["expressions"] == {}
+
+
+def test_undo_and_review_say_what_they_mean(annotate, dataset, capsys):
+    mark(annotate, "ann", "smile", 14)
+    mark(annotate, "ann", "smile", 15)
+    words = ["--annotator", "ann"]
+    assert main(["annotate", "undo", str(dataset.root), "S001", "smile", *words]) == 0
+    assert "frame 15 undone" in capsys.readouterr().out
+    assert main(["annotate", "review", str(dataset.root)]) == 0
+    assert "at most 2 frames apart agree" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
     ("words", "named"),
     [
         (["review", "--settle", "S001", "smile", "nobody"], "'nobody'"),

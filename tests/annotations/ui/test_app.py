@@ -163,6 +163,7 @@ def test_narrow_lines_keep_the_essential_parts():
     assert fit(Text("x" * 50), Text("cam05"), 40).plain == "x" * 39 + "…"
     for width in (40, 60, 80, 200):
         assert hint_line(width).plain.rstrip().endswith("? help  q quit")
+    assert "Enter mark" in hint_line(40).plain
 
 
 def test_help_scrolls_in_a_low_terminal(suggested, make_app):

@@ -125,7 +125,7 @@ def test_a_budget_below_the_cheapest_settings_says_what_the_least_is(tmp_path, c
     with pytest.raises(ConfigError, match=r"the cheapest (settings )?need .*; give"):
         go(tmp_path / "d", captures, "0.2s")
     assert not (tmp_path / "d" / "map").exists()
-    with pytest.raises(ConfigError, match="nothing has been made yet; run 'express50 run"):
+    with pytest.raises(ConfigError, match="nothing but trials has been made yet"):
         existing_dataset(tmp_path / "d")
     _, state = go(tmp_path / "d", captures, "5m")  # with what the pilot made
     assert state.finished and state.stated["value"][0] == pytest.approx(error_of(state.settings))
