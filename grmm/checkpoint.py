@@ -177,7 +177,8 @@ def read_content(path: Path) -> dict[str, Any]:
     Raises:
         FormatError: no such file, or not a checkpoint of this format.
     """
-    remedy = "'grmm train' writes checkpoints"
+    remedy = "name the checkpoint.pt of 'grmm train' or 'grmm fit'; if it is damaged, copy it again"
+    remedy += " or make it again with --overwrite"
     content = read_weights(path, FormatError, str(path), "a checkpoint", remedy)
     found = content.get("format") if isinstance(content, dict) else None
     if found != FORMAT:

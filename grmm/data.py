@@ -133,7 +133,7 @@ class Source(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Item:
+class HeadView:
     """One training view.
 
     Attributes:
@@ -203,7 +203,7 @@ class Cache(Generic[Key, Value]):
 
 
 class HeadViews:
-    """Samples of a source as items, with bounded caches of slow results."""
+    """Samples of a source as head views, with bounded caches of slow results."""
 
     def __init__(self, source: Source, head: HeadModel, data: DataConfig = DEFAULTS) -> None:
         """Wrap a source tracked with ``head``; items are put on the head's device."""
@@ -222,7 +222,7 @@ class HeadViews:
         """Return the ids of all samples."""
         return self.source.keys
 
-    def item(self, index: int, *, crop: bool = False) -> Item:
+    def item(self, index: int, *, crop: bool = False) -> HeadView:
         """Return one sample as tensors on the device.
 
         Shoulders and clothes are background, where the shards leave them out or label them. With
@@ -250,7 +250,7 @@ class HeadViews:
         weight = (self._tensor(matte[rows, columns]) / 255)[..., None]
         image = self._tensor(sample.image[rows, columns]) / 255
         target = image * weight + self.background * (1 - weight)
-        return Item(
+        return HeadView(
             key=self.keys[index],
             state=state,
             view=view,
@@ -350,8 +350,8 @@ def check_tracked(where: str, tracked: Tracked, head: HeadModel) -> None:
         # Trailing coefficients may be missing; offsets are either complete or absent.
         if got > count or (what == "offsets" and got not in (0, count)):
             raise FormatError(
-                f"{where}: {got} {what}, head model {head.name!r} has {count}; name the head model "
-                "that the dataset was tracked with"
+                f"{where}: {got} {what}, head model {head.name!r} has {count}; was "
+                "the dataset tracked with another head model? If not, pack it again"
             )
 
 

@@ -190,7 +190,7 @@ def sample_identity(
     """
     model, frames = loaded.model, loaded.gallery.frames
     own = [next(t for (s, _), t in frames.items() if s == subject) for subject in model.subjects]
-    weights = _sample_weights(len(own), rng, spread, "subjects")
+    weights = _sample_weights(len(own), rng, spread, "subject")
     shape = np.tensordot(weights, stacked([frame.shape for frame in own]), 1)
     offsets = np.tensordot(weights, stacked([frame.offsets for frame in own]), 1)
     z_id = torch.as_tensor(weights).to(model.z_id) @ model.z_id.detach()
@@ -206,7 +206,7 @@ def sample_expression(
     Coefficients and jaw stay within what training showed: activations have bounds.
     """
     model, frames = loaded.model, loaded.gallery.frames
-    weights = _sample_weights(len(model.expressions), rng, spread, "expressions")
+    weights = _sample_weights(len(model.expressions), rng, spread, "expression")
     length = max(len(frame.expression) for frame in frames.values())
 
     def drawn(name: str, size: int) -> np.ndarray:
@@ -226,7 +226,7 @@ def sample_expression(
 def _sample_weights(rows: int, rng: np.random.Generator, spread: float, what: str) -> np.ndarray:
     """Return weights (rows,) that sum to 1; a weighted sum has the rows' mean and covariance."""
     if rows < 2:
-        raise ConfigError(f"the checkpoint has {rows} {what}, too few to draw new ones from")
+        raise ConfigError(f"the checkpoint has {count(rows, what)}, too few to draw new ones from")
     noise = spread * rng.standard_normal(rows) / np.sqrt(rows - 1)
     return 1 / rows + noise - noise.mean()
 

@@ -17,18 +17,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from express50.console import count
 from express50.contract.segmentation_labels import label_mask
 from express50.errors import FormatError, TrainError, few
 from express50.files.atomic import write_bytes, write_json
 from express50.files.images import read_image, write_image
+from express50.files.text import is_number
 from express50.shards.writer import sample_key
 from grmm.checkpoint import Checkpoint
 from grmm.config import MetricsConfig
-from grmm.data import HeadViews, Item, SampleKey
+from grmm.data import HeadView, HeadViews, SampleKey
 from grmm.metrics import PerceptualMetrics, psnr_db, rmse, ssim_score
 from grmm.model import GRMM, Rendering
 
-Render = Callable[[Item], Rendering]
+Render = Callable[[HeadView], Rendering]
 Row = dict[str, str | float]
 Window = Callable[[int], tuple[slice, slice, tuple[int, int]]]
 """Rows and columns of a sample's picture that its camera saw, and the picture's (H, W)."""
@@ -55,7 +57,7 @@ NAMED = 5  # most files that an error names
 def training_render(model: GRMM, views: HeadViews) -> Render:
     """Make a function that renders training subjects by their rows of the code tables."""
 
-    def render(item: Item) -> Rendering:
+    def render(item: HeadView) -> Rendering:
         return model(*model.rows(*item.key.frame), item.state, item.view, views.background)
 
     return render
@@ -99,7 +101,7 @@ def evaluate(
     return rows
 
 
-def compare(image: Tensor, item: Item, judge: PerceptualMetrics, kind: str = "") -> Row:
+def compare(image: Tensor, item: HeadView, judge: PerceptualMetrics, kind: str = "") -> Row:
     """Compare one picture (3, H, W) in [0, 1] with its footage; the judge remembers it for FID.
 
     ``psnr_db``, ``ssim``, ``rmse``, ``lpips`` count every pixel in which no torso hides the neck;
@@ -287,6 +289,6 @@ def summary_lines(summary: dict) -> list[str]:
     names = ("psnr_db", "psnr_head_db", "ssim", "rmse", "lpips")
     lines = []
     for kind, numbers in (summary["by_kind"] or {"all": summary}).items():
-        values = "  ".join(f"{name} {numbers[name]}" for name in names if numbers[name] is not None)
-        lines.append(f"{kind} ({numbers['images']} images): {values}")
+        values = "  ".join(f"{name} {numbers[name]}" for name in names if is_number(numbers[name]))
+        lines.append(f"{kind} ({count(numbers['images'], 'image')}): {values}")
     return lines + [f"{k}: {summary[k]}" for k in ("lpips", "fid") if "n/a" in str(summary[k])]

@@ -26,7 +26,7 @@ from express50.geometry.sampling import evenly
 from grmm import losses
 from grmm.checkpoint import Checkpoint, Gallery, collect_gallery, save_checkpoint
 from grmm.config import Config
-from grmm.data import NO_OFFSETS, HeadViews, Item, Shuffle
+from grmm.data import NO_OFFSETS, HeadView, HeadViews, Shuffle
 from grmm.edit import HeadCodes, between, trained_head, transfer
 from grmm.evaluate import evaluate, mean
 from grmm.metrics import PerceptualMetrics
@@ -59,7 +59,7 @@ class FitState:
         """Return the settings of the checkpoint fitted from."""
         return self.loaded.config
 
-    def render(self, item: Item, shade_view: PinholeView | None = None) -> Rendering:
+    def render(self, item: HeadView, shade_view: PinholeView | None = None) -> Rendering:
         """Render the person in a view; an expression that is not fitted has its trained code."""
         name, trained = item.key.expression, self.model.expressions
         z_exp = self.z_exp[name] if name in self.z_exp else self.model.z_exp[trained.index(name)]
@@ -144,6 +144,11 @@ def start(loaded: Checkpoint, views: HeadViews, given: list[int]) -> FitState:
             f"got views of {len(subjects)} subjects ({', '.join(subjects) or 'none'}), "
             "expected one; check --subject, --expression and --cameras"
         )
+    if not any(bool(views.item(i).mask.any()) for i in given):
+        raise TrainError(
+            f"{subjects[0]}: the mattes of the given views are empty; check them with 'express50"
+            " report' and pack again, or give other views"
+        )
     model = loaded.model
     codes = model.z_exp.detach()
     known = dict(zip(model.expressions, codes, strict=True))
@@ -204,7 +209,7 @@ def tune_decoders(state: FitState, until: float = math.inf) -> int:
     return done
 
 
-def _items(state: FitState, iterations: int, until: float) -> Iterator[tuple[int, float, Item]]:
+def _items(state: FitState, iterations: int, until: float) -> Iterator[tuple[int, float, HeadView]]:
     """Yield given views in shuffled order until iterations or time run out; at least one.
 
     Each comes with its number and the share of the iterations or of the time that is used up.
@@ -263,13 +268,13 @@ def reconstruction(state: FitState, *pairs: tuple[Tensor, Tensor]) -> Tensor:
     return torch.stack(terms).sum()
 
 
-def _footage_loss(state: FitState, rendering: Rendering, item: Item) -> Tensor:
+def _footage_loss(state: FitState, rendering: Rendering, item: HeadView) -> Tensor:
     rendering = item.before_torso(rendering)
     images = (rendering.rgb, rendering.image)
     return reconstruction(state, *((item.comparable(image), item.target) for image in images))
 
 
-def locality_loss(state: FitState, item: Item, rng: np.random.Generator) -> Tensor:
+def locality_loss(state: FitState, item: HeadView, rng: np.random.Generator) -> Tensor:
     """Compare the tuned model and the loaded one between a training identity and the subject.
 
     Codes and coefficients are blended at a fixed t (weight of the subject), jaw and neck by SLERP

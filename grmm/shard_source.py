@@ -41,7 +41,10 @@ class ShardSource:
             for entry in self.reader.entries
         ]
         first = self.reader.meta(0)
-        self.head = str(first.get("head"))
+        if not isinstance(head := first.get("head"), str):
+            where = f"{root}: {self.reader.entries[0].key}"
+            raise FormatError(f"{where}: meta names no head model; rerun 'express50 pack'")
+        self.head = head
         if first.get("torso") != "removed" and not first.get("parts"):
             log(
                 f"{root}: has no part labels, so shoulders count as head; to leave them out, run"
@@ -125,6 +128,9 @@ class MixedSource:
         """
         self.head = sources[0].head
         owners: dict[str, ShardSource] = {}
+        roots = [source.reader.root.resolve() for source in sources]
+        if len(set(roots)) < len(roots):
+            raise FormatError(f"{sources[-1].reader.root}: named twice; name each folder once")
         for source in sources:
             if source.head != self.head:
                 raise FormatError(

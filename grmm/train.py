@@ -29,7 +29,7 @@ from express50.head.model import HeadModel
 from grmm import losses
 from grmm.checkpoint import collect_gallery
 from grmm.config import Config
-from grmm.data import HeadViews, Item, Source
+from grmm.data import HeadView, HeadViews, Source
 from grmm.evaluate import REGIONS, component_effects, evaluate, mean, training_render
 from grmm.metrics import PerceptualMetrics
 from grmm.model import Rendering
@@ -170,7 +170,7 @@ def step(state: TrainState, parallel: torch.nn.Module, config: Config) -> None:
 
 
 def _add_gradients(
-    state: TrainState, parallel: torch.nn.Module, item: Item, config: Config
+    state: TrainState, parallel: torch.nn.Module, item: HeadView, config: Config
 ) -> None:
     """Render one view and add its share of the step's gradient."""
     try:
@@ -194,7 +194,7 @@ def _add_gradients(
 
 
 def objective(
-    state: TrainState, rendering: Rendering, item: Item, config: Config
+    state: TrainState, rendering: Rendering, item: HeadView, config: Config
 ) -> dict[str, Tensor]:
     """Compute the weighted terms of the objective by name (paper: Training and Losses)."""
     weights, model = config.loss, state.model

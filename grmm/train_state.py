@@ -24,7 +24,7 @@ from express50.geometry.sampling import evenly
 from grmm import losses
 from grmm.checkpoint import Gallery, load_checkpoint, save_checkpoint
 from grmm.config import Config, as_tables
-from grmm.data import HeadViews, Item, SampleKey, Shuffle
+from grmm.data import HeadView, HeadViews, SampleKey, Shuffle
 from grmm.model import GRMM, Rendering
 
 COVERED_TEXELS = 0.75  # of a map that head models' layouts use
@@ -32,7 +32,7 @@ LARGEST_MAP = 512  # the paper's
 CHANGEABLE = {"iterations", "seconds", "save_seconds", "evaluate_images"}  # when a run is resumed
 
 
-Terms = Callable[["TrainState", Rendering, Item], dict[str, Tensor]]
+Terms = Callable[["TrainState", Rendering, HeadView], dict[str, Tensor]]
 """Terms of one's own in the objective, 0-d tensors by name, weights included."""
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from express50.geometry.sampling import evenly
 from grmm.anchors import tangent_frames
-from grmm.data import HeadViews, Item
+from grmm.data import HeadView, HeadViews
 from grmm.model import GRMM, Gaussians
 
 IMAGES_PER_SUBJECT = 96  # more hardly change the mean texture
@@ -87,7 +87,7 @@ def project_texture(
     return total / weight.clamp_min(1e-8)[:, None], weight
 
 
-def _seen_colours(model: GRMM, gaussians: Gaussians, item: Item) -> tuple[Tensor, Tensor]:
+def _seen_colours(model: GRMM, gaussians: Gaussians, item: HeadView) -> tuple[Tensor, Tensor]:
     """Sample colours (N, 3) under the means; weights (N,) are squared cosines, 0 if hidden."""
     view = item.view
     camera = view.cam_from_head.to(gaussians.means.dtype)

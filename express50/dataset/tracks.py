@@ -167,7 +167,7 @@ def _arrays_of(
     command = f"'express50 {stage}'"
     if not path.is_file():
         raise StageError(f"{path}: the {what} is missing; run {make or command}")
-    again = f"run {command} again"
+    again = f"run {make or command}{'' if make else ' again'}"
     arrays = read_arrays(path, FormatError, f"a {what}", fix=again)
     try:
         if str(arrays["schema"]) != schema:

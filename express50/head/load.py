@@ -76,7 +76,10 @@ def load_head(spec: str | Path) -> HeadModel:
         return load_builtin()
     path = Path(spec).expanduser()
     if not path.exists():
-        raise HeadModelError(f"head model {str(spec)!r}: no such file or folder; expected {_KINDS}")
+        raise HeadModelError(
+            f"head model {str(spec)!r}: no such file or folder; expected {_KINDS}. Tracks and"
+            " shards keep the path of their model: it has to be there"
+        )
     if path.suffix == ".npz" and is_stored(path):
         return load_stored(path, path.stem)
     if path.is_dir() or path.suffix == ".npz":

@@ -293,8 +293,8 @@ def _shard_entries(root: Path, shard: dict) -> Iterator[Entry]:
     path = root / name
     size = path.stat().st_size if path.is_file() else -1
     if size != shard["bytes"]:
-        got = "is missing" if size < 0 else f"has {size} bytes"
-        raise FormatError(f"{path}: {got}, expected {shard['bytes']}; copy the shard again")
+        got = "is missing" if size < 0 else f"has {size:,} bytes"
+        raise FormatError(f"{path}: {got}, expected {shard['bytes']:,} bytes; copy the shard again")
     for row in shard["samples"]:
         members = {str(k): (int(a), int(b), int(c)) for k, (a, b, c) in row["members"].items()}
         if any(a < 0 or b < 0 or a + b > size for a, b, _ in members.values()):

@@ -118,6 +118,8 @@ def fit(args: argparse.Namespace) -> int:
             f"{args.checkpoint} is a fit of {loaded.model.subjects[0]}: it knows one person only; "
             "fit people from a checkpoint of 'grmm train'"
         )
+    elif args.subject in loaded.model.subjects:
+        log(f"{args.subject} was trained on, so the figures are not those of an unseen person")
     views = loaded.views(ShardSource(args.shards, "*"))
     given = select(views.keys, args.subject, args.expression, args.cameras)
     rest = sorted({*select(views.keys, args.subject, args.expression, "*")} - {*given})
@@ -181,10 +183,13 @@ def export(args: argparse.Namespace) -> int:
     from grmm.export import write_export
     from grmm.render import camera_of, read_clips
 
-    form = args.format or args.out.suffix[1:]
+    form = args.format or args.out.suffix[1:].lower()
     if form not in FORMATS:
         expected = ", ".join(f".{name}" for name in FORMATS if name not in ("splats", "arkit"))
         raise ConfigError(f"{args.out}: unknown kind of file, expected one of {expected}")
+    ending = ".glb" if form in ("splats", "arkit") else f".{form}"
+    if args.out.suffix.lower() != ending:
+        raise ConfigError(f"{args.out}: --format {form} writes {ending}; name the file so")
     if form != "html" and (unused := [n for n in ("drive", "shards") if getattr(args, n)]):
         raise ConfigError(f"--{unused[0]} goes with a .html page, not with {args.out.name}")
     _goes_with(args, "drive", "drive_cue")
@@ -270,6 +275,8 @@ def _split(
             f"{args.shards}: the model was not trained on {', '.join(unseen) or args.expressions}; "
             "give --fit-cameras to fit such people first"
         )
+    if unseen:
+        log(f"left out {', '.join(unseen)}, whom training did not see: --fit-cameras fits them")
     return known, {}
 
 

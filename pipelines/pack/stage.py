@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from express50.capture.readers.read import read_people
+from express50.console import count
 from express50.contract.layout import Dataset, exclusion_reason
 from express50.contract.stage import Note, Result
 from express50.errors import CaptureError, FormatError, StageError
@@ -39,6 +40,7 @@ def encode(dataset: Dataset, name: str, config: EncodeConfig, out: Path) -> Resu
     writer = ShardWriter(out, SHARD_BYTES)
     metas: list[dict] = []
     dropped: list[Note] = []
+    without_depth = 0
     for expression in sorted(subject.peaks):
         group = []
         for camera_id, camera in sorted(subject.cameras.items()):
@@ -50,6 +52,7 @@ def encode(dataset: Dataset, name: str, config: EncodeConfig, out: Path) -> Resu
                 continue
             group.append(sample)
             metas.append(meta)
+            without_depth += not loaded.valid.any()
         if group:
             writer.add_group("subject", group)
     writer.close()
@@ -72,7 +75,13 @@ def encode(dataset: Dataset, name: str, config: EncodeConfig, out: Path) -> Resu
         "size": config.size,
         "profile": config.profile,
     }
-    return Result(metrics, dropped, warn_of_gaps(metas) + subject.notes)
+    warnings = warn_of_gaps(metas) + subject.notes
+    if without_depth:
+        why = f"{without_depth} of {count(len(metas), 'sample')} know no depth"
+        if config.min_confidence > 0:
+            why += f"; lower encode.min_confidence, which is {config.min_confidence:g}"
+        warnings.append(Note("depth", why))
+    return Result(metrics, dropped, warnings)
 
 
 def warn_of_gaps(metas: list[dict]) -> list[Note]:

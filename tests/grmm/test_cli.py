@@ -13,6 +13,7 @@ from express50.files.images import read_image
 from express50.shards.writer import PackedSample, ShardWriter
 from grmm.cli import build_parser, main
 from grmm.cli.commands import train_config
+from grmm.evaluate import IDS, NUMBERS, summarise, summary_lines
 from grmm.shard_source import ShardSource, seen_window
 from tests.grmm.packed import TINY, packed, write_shards
 from tests.grmm.synthetic import EllipsoidSource
@@ -121,6 +122,25 @@ def test_evaluate_counts_its_images_on_standard_output(checkpoint, shards, tmp_p
     assert json.loads(capsys.readouterr().out)["images"] == 4, "two kinds by two cameras"
 
 
+def test_who_is_no_stranger_or_is_left_out_is_said(checkpoint, shards, tmp_path, capsys):
+    fit = ["fit", str(checkpoint), str(shards), str(tmp_path / "f"), "--subject=S001"]
+    short = ["--set=fit.stage1_iterations=0", "--set=fit.stage2_iterations=0"]
+    assert main([*fit, "--cameras=cam00", *short]) == 0
+    assert "S001 was trained on" in capsys.readouterr().err
+    evaluate = ["evaluate", str(checkpoint), str(shards), str(tmp_path / "e"), "--images=1"]
+    assert main(evaluate) == 0
+    said = capsys.readouterr()
+    assert "left out S002, whom training did not see" in said.err
+    assert "(1 image): psnr_db" in said.out
+
+
+def test_a_summary_names_a_metric_that_is_missing_once():
+    row = dict.fromkeys(NUMBERS, 1.0) | dict.fromkeys(IDS, "")
+    lines = summary_lines(summarise([row]))
+    assert lines[0].startswith("all (1 image): psnr_db 1.0")
+    assert sum("lpips" in line for line in lines) == 1
+
+
 def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
     for name in ("head.ply", "head.npz"):
         assert main(["export", str(checkpoint), str(tmp_path / name)]) == 0
@@ -161,6 +181,9 @@ def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
         (["render", "{shards}", "{out}"], 1, "is a folder, expected a file"),
         (["render", "{checkpoint}", "{out}", "--subject=S9"], 2, "no subject 'S9'"),
         (["export", "{checkpoint}", "{out}/head.obj"], 2, "expected one of .html, .ply, .spz"),
+        (["export", "{checkpoint}", "{out}/head.html", "--format=splats"], 2,
+         "--format splats writes .glb"),
+        (["train", "{shards}", "{out}", *TINY, "--also", "{shards}"], 1, "named twice"),
         (["export", "{checkpoint}", "{out}/head.ply", "--control=jaw=3"], 2,
          "got 1 number, expected 3 with commas between, or jaw.0 to jaw.2 with one"),
     ],
@@ -244,6 +267,18 @@ def test_both_commands_run_as_modules():
 def test_help_needs_no_torch():
     code = "import sys, grmm.cli as c; c.build_parser(); sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_samples_without_a_head_model_are_refused(tmp_path):
+    sample = packed(EllipsoidSource(size=16), 0)
+    meta = json.loads(sample.members["meta.json"])
+    del meta["head"]
+    members = dict(sample.members) | {"meta.json": json.dumps(meta).encode()}
+    writer = ShardWriter(tmp_path, 1 << 24)
+    writer.add_group("train", [PackedSample("S000", "e0", "cam00", members)])
+    writer.close()
+    with pytest.raises(FormatError, match="meta names no head model"):
+        ShardSource(tmp_path)
 
 
 def test_mixed_head_models_are_refused(tmp_path):

@@ -181,6 +181,15 @@ def test_views_of_two_subjects_are_refused(loaded, views, tmp_path):
         fit(loaded, views, [0, len(views.keys) - 1], [], tmp_path)
 
 
+def test_views_with_empty_mattes_are_refused(loaded, views, tmp_path, monkeypatch):
+    read = views.source.read
+    monkeypatch.setattr(
+        views.source, "read", lambda i: replace(read(i), alpha=np.zeros_like(read(i).alpha))
+    )
+    with pytest.raises(TrainError, match="S002: the mattes of the given views are empty"):
+        fit(loaded, views, unseen(views), [], tmp_path)
+
+
 def test_turntable_grid_and_interpolation(loaded):
     start, end = (trained_head(loaded, *frame) for frame in (("S000", "e0"), ("S001", "e1")))
     view = frontal(loaded)

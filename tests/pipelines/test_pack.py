@@ -300,6 +300,13 @@ def test_unsure_depth_can_be_left_out(dataset, packed, tmp_path):
     assert strict.sample(0)["valid"].sum() < loose.sample(0)["valid"].sum()
 
 
+def test_samples_without_any_depth_are_named(dataset, tmp_path):
+    encoded, _ = pack_into(dataset, tmp_path, EncodeConfig(size=64, min_confidence=1.0))
+    why = {row["what"]: row["why"] for row in encoded["S001"]["warnings"]}
+    words = "know no depth; lower encode.min_confidence, which is 1"
+    assert why["depth"].endswith(words)
+
+
 def test_lossless_profile_keeps_pixels(dataset, tmp_path):
     pack_into(dataset, tmp_path, EncodeConfig(size=64, profile="lossless"))
     reader = ShardReader(tmp_path)

@@ -51,6 +51,16 @@ def test_the_page_needs_no_other_file(dataset):
     assert page.count("data:image/jpeg;base64,") == 4
 
 
+def test_figures_have_readable_names_and_units(dataset):
+    summary = {"train.psnr_heldout_view_db": 26.6, "peak_memory_gib": 1.2}
+    (dataset.root / "summary.json").write_text(json.dumps(summary))
+    path = dataset.root / "matte" / "S1" / "cam0" / "metrics.json"
+    path.write_text(json.dumps({"abs_error_mm_median": 1.5}))
+    page = render_page(dataset)
+    for label in ("train: PSNR held-out view, dB", "peak memory, GiB", "abs error median, mm"):
+        assert label in page
+
+
 def test_failures_and_drops_are_named_and_escaped(dataset):
     page = render_page(dataset)
     assert "S1/cam2" in page
