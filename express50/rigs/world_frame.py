@@ -83,14 +83,6 @@ def check_meeting(cameras: Mapping[str, Camera], where: str) -> None:
         raise CalibrationError(f"{where}: {problem}; {remedy or UNKNOWN}")
 
 
-def _describe_behind(depths: Mapping[str, float]) -> str:
-    """Describe the result of `depths_behind`; return "" if it is empty."""
-    if not depths:
-        return ""
-    shown = few([f"{name} (z = {depth:.3g} m)" for name, depth in depths.items()], 4)
-    return f"the point all cameras look at lies behind {shown}; expected z > 0"
-
-
 @dataclass(frozen=True)
 class RigVerdict:
     """Figures and warnings about a rig."""
@@ -112,10 +104,7 @@ def judge(cameras: Mapping[str, Camera]) -> RigVerdict:
     if point is None:
         words = ("the axes are parallel",) if len(cameras) > 1 else ()
         return RigVerdict(len(cameras), None, None, None, problem, remedy, words)
-    gaps = {name: point - camera.center for name, camera in cameras.items()}
-    distance = float(np.median([np.linalg.norm(gap) for gap in gaps.values()]))
-    axes = {name: camera.cam_from_world[2, :3] for name, camera in cameras.items()}
-    misses = {n: np.linalg.norm(gap - axes[n] * (axes[n] @ gap)) for n, gap in gaps.items()}
+    misses, distance = _misses(cameras, point)
     warnings = []
     if not NEAR_M < distance < FAR_M:
         warnings.append(
@@ -148,8 +137,10 @@ def _misreading(cameras: Mapping[str, Camera]) -> tuple[str, str]:
     Several conventions may put the common point in front of all cameras; the right one is that in
     which their axes meet best.
     """
-    problem = _describe_behind(depths_behind(cameras))
-    spread = _scatter(cameras)
+    problem, spread = "", _scatter(cameras)
+    if behind := depths_behind(cameras):
+        shown = few([f"{name} (z = {depth:.3g} m)" for name, depth in behind.items()], 4)
+        problem = f"the point all cameras look at lies behind {shown}; expected z > 0"
     if not problem and not spread > SCATTERED:
         return "", ""
     readings = {
@@ -179,10 +170,16 @@ def _scatter(cameras: Mapping[str, Camera]) -> float:
     point = meeting_point(cameras)
     if point is None:
         return 0.0
-    gaps = [point - camera.center for camera in cameras.values()]
-    axes = [camera.cam_from_world[2, :3] for camera in cameras.values()]
-    misses = [np.linalg.norm(g - a * (a @ g)) for g, a in zip(gaps, axes, strict=True)]
-    return float(np.median(misses) / np.median(np.linalg.norm(gaps, axis=1)))
+    misses, distance = _misses(cameras, point)
+    return float(np.median(list(misses.values()))) / distance
+
+
+def _misses(cameras: Mapping[str, Camera], point: np.ndarray) -> tuple[dict[str, float], float]:
+    """Return by how far each optical axis misses a point, and the cameras' median distance."""
+    gaps = {name: point - camera.center for name, camera in cameras.items()}
+    axes = {name: camera.cam_from_world[2, :3] for name, camera in cameras.items()}
+    misses = {n: float(np.linalg.norm(g - axes[n] * (axes[n] @ g))) for n, g in gaps.items()}
+    return misses, float(np.median([np.linalg.norm(gap) for gap in gaps.values()]))
 
 
 def canonical_from_rig(

@@ -78,7 +78,10 @@ def run(dataset: Dataset, item: str, config: CalibrateConfig, out: Path) -> Resu
         rig = _from_footage(index, config)
     check = None
     if rig.source != "footage":  # there the same footage would judge itself
-        rig = replace(rig, warnings=(*rig.warnings, *_odd_rig(rig.cameras)))
+        # a rig that is not in metres, or cameras that look elsewhere
+        oddities = "; ".join(judge(rig.cameras).warnings)
+        odd = (Note("cameras", oddities),) if oddities else ()
+        rig = replace(rig, warnings=(*rig.warnings, *odd))
         check = _check_footage(index, rig.cameras, config.check_frame_sets)
     return _write(rig, check, out)
 
@@ -132,14 +135,16 @@ def _write(rig: CalibratedRig, check: FootageCheck | None, out: Path) -> Result:
     return Result(metrics, rig.dropped, (*rig.warnings, *_notes(moved)), rig.expected)
 
 
-def _odd_rig(cameras: Mapping[str, Camera]) -> tuple[Note, ...]:
-    """Warn of a rig that is not in metres, or of cameras that look elsewhere."""
-    oddities = "; ".join(judge(cameras).warnings)
-    return (Note("cameras", oddities),) if oddities else ()
-
-
 def _rounded(value: float | None, digits: int) -> float | None:
     return None if value is None else round(value, digits)
+
+
+def _rows(found: Mapping[str, CameraTiming] | Mapping[str, HeadError]) -> dict[str, dict]:
+    """Return each camera's figures by name, to four digits."""
+    return {
+        name: {key: round(value, 4) for key, value in asdict(figures).items()}
+        for name, figures in found.items()
+    }
 
 
 def _notes(reasons: Mapping[str, str]) -> tuple[Note, ...]:
@@ -218,14 +223,8 @@ def _from_board(index: Index, config: CalibrateConfig) -> CalibratedRig:
             "corners": len(squared),
             "corners_rejected": solution.corners_found - len(squared),
             "board_frames": len(solution.boards),
-            "uncertainty": {
-                name: {"px": round(error.px, 4), "mm": round(error.mm, 4)}
-                for name, error in uncertainty.items()
-            },
-            "timing": {
-                name: {key: round(value, 4) for key, value in asdict(found).items()}
-                for name, found in solution.timing.items()
-            },
+            "uncertainty": _rows(uncertainty),
+            "timing": _rows(solution.timing),
         },
         gains=whites.gains(sorted(solution.cameras)),
         solution=solution,
@@ -326,10 +325,7 @@ def _from_footage(index: Index, config: CalibrateConfig) -> CalibratedRig:
             "known_focals": sorted(set(focals) & set(solved.cameras)),
             "eye_frame_sets": solved.eyes.frame_sets,
             "eye_spread": round(solved.eyes.spread, 5),
-            "uncertainty": {
-                name: {"px": round(error.px, 4), "mm": round(error.mm, 4)}
-                for name, error in stated.items()
-            },
+            "uncertainty": _rows(stated),
         },
         dropped=_notes(solved.dropped),
         warnings=(*_notes(_with_errors(solved.weak, stated)), Note("scale", scale)),
