@@ -40,7 +40,7 @@ from express50.shards.codecs import (
 from express50.shards.reader import ShardReader
 from express50.shards.writer import PackedSample, ShardWriter, write_manifest
 
-DISTINCT, CAMERAS, RANDOM, PASSES = 40, 20, 2000, 3
+DISTINCT, CAMERAS, PASSES = 40, 20, 3
 SHARD = 256 * 10**6
 Members = dict[str, bytes]
 Passes = dict[str, Callable[[], Iterator[Members]]]

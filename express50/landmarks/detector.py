@@ -148,13 +148,11 @@ def detect_many(
     return [_detection(place) for place in _with_close_ups(net, pyramids, faces)]
 
 
-def detect_at(
-    net: LandmarkNet, image: np.ndarray, window: np.ndarray, refinements: int = 2
-) -> Detection:
+def detect_at(net: LandmarkNet, image: np.ndarray, window: np.ndarray) -> Detection:
     """Detect as `detect` does, but where a window (2, 3) says that the face is (`window_about`)."""
     pyramid = make_pyramid(image)
     coarse = _run(net, [Look(pyramid, window)])
-    found = _refined(net, [pyramid], coarse, refinements)
+    found = _refined(net, [pyramid], coarse, 2)
     return _detection(_with_close_ups(net, [pyramid], found)[0])
 
 

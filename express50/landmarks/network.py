@@ -92,8 +92,9 @@ class Residual(nn.Module):
 class ShapeHead(nn.Module):
     """Corrects all points of a face together; estimates error scales and visibility."""
 
-    def __init__(self, features: int, width: int = 192) -> None:
+    def __init__(self, features: int) -> None:
         super().__init__()
+        width = 192
         self.look = nn.Linear(features, 64)
         self.first, self.second = nn.Linear(3 * POINTS + 64, width), nn.Linear(width, 4 * POINTS)
         self.spread = nn.Parameter(torch.zeros(POINTS))
@@ -116,8 +117,9 @@ class ShapeHead(nn.Module):
 class OutlinePart(nn.Module):
     """Finds the outline from the trunk's maps; see `Output`."""
 
-    def __init__(self, maps: int, features: int, width: int = 160) -> None:
+    def __init__(self, maps: int, features: int) -> None:
         super().__init__()
+        width = 160
         self.heat = nn.Conv2d(maps, OUTLINE, 3, 1, 1)
         self.look = nn.Linear(features, 64)
         self.first = nn.Linear(3 * OUTLINE + 2 * POINTS + 64, width)
