@@ -36,8 +36,8 @@ SPREAD = 0.2  # share by which hair may be brighter or darker than visible hair 
 LOW = 1.2  # deviations at which noise and subject are equally likely; alpha is 0 below
 HIGH = 6.0  # deviations that prove foreground; weaker pixels must be connected to such ones
 FIRM = 0.5  # share of the nearby subject's difference over which a pixel looks opaque
-# Deviations by which a subject differs where its pixels can be told from noise one by one, and how
-# often noisier pictures are blurred (docs/LOG.md, "Underexposed footage").
+# Deviations by which a subject differs where single pixels stand out from noise, and how often
+# noisier pictures are blurred (docs/LOG.md, "Underexposed footage").
 PLAIN, SOFTENINGS = 4.8, 2
 CORE = 0.018  # radius of the disc that must fit inside a part of the subject for it to be solid
 OPEN = 1.5  # deviations: an area that differs by less shows the plate

@@ -4,7 +4,7 @@ Each vertex searches for the surface along its normal. A thin plate is fitted to
 are found, and interpolates them where none are; weak springs hold the rest in place. Samples of
 the plate's posterior give the uncertainty. Vertices move along normals only: tracking sees the
 skin's texture, so it knows better where along the skin they belong. The surface's colours and
-confidence tell skin from hair and cloth.
+confidence distinguish skin from hair and cloth.
 """
 
 from __future__ import annotations

@@ -82,7 +82,7 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
     expected = doubt.expected
     if shape_spread(track.shape) > LARGEST_SPREAD:  # the error model knows people only
         expected = None
-        why = "the tracked head has a shape that nobody has, so no error is stated; see 'track'"
+        why = "the tracked head has an impossible shape, so no error is stated; see 'track'"
         warnings.append(Note("head shape", why))
     return Result(metrics, (), warnings, expected)
 
