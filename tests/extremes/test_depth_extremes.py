@@ -37,11 +37,11 @@ COARSE = 6.0  # millimetres per voxel
 FLAT = from_dense(np.zeros(3), 1.0, np.zeros((2, 2, 2), np.float32))
 
 
-def views_of(cameras, change=lambda rgb: rgb):
+def views_of(cameras):
     made = []
     for camera in cameras:
         rgb, alpha, _ = render(camera)
-        made.append(make_view(camera, change(rgb), alpha, 1024))
+        made.append(make_view(camera, rgb, alpha, 1024))
     return made
 
 

@@ -29,9 +29,9 @@ def labels_of(camera, alpha, depth=None, head=SCENE.head) -> np.ndarray:
     return label_view(head, camera, rgb, np.float32(alpha), depth, False, CONFIG.image_side).labels
 
 
-def turned_away(distance: float = 1.0):
+def turned_away():
     """A camera before the face that looks the other way."""
-    eye = np.array([0.0, 0.0, distance])
+    eye = np.array([0.0, 0.0, 1.0])
     K = np.array([[100.0, 0, 32], [0, 100, 32], [0, 0, 1]])
     pose = look_at(eye, 2 * eye, np.array([0.0, 1, 0]))
     return pinhole_camera("away", K, 64, 64, pose)

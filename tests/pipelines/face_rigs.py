@@ -26,14 +26,14 @@ def face() -> np.ndarray:
     return points
 
 
-def face_cameras(count: int = 6, span_deg: float = 90.0, focal: float = 1100.0) -> dict:
+def face_cameras(count: int = 6, span_deg: float = 90.0) -> dict:
     """Cameras on an arc before the face at two heights, with one radial term."""
     rig = {}
     for i in range(count):
         angle = np.radians(span_deg) * (i / max(count - 1, 1) - 0.5)
         eye = 1.1 * np.array([np.sin(angle), 0.2 * (-1) ** i, np.cos(angle)])
         pose = look_at(eye, np.zeros(3), np.array([0.0, 1.0, 0.0]))
-        f = focal * (1 + 0.02 * np.sin(3 * i))
+        f = 1100.0 * (1 + 0.02 * np.sin(3 * i))
         params = (f, SIZE[0] / 2, SIZE[1] / 2, -0.05)
         rig[f"cam{i:02d}"] = Camera(f"cam{i:02d}", *SIZE, "SIMPLE_RADIAL", params, pose)
     return rig
@@ -43,12 +43,10 @@ def see(
     rig: dict[str, Camera],
     sets: int = 2,
     features: int = 130,
-    noise_px: float = 0.3,
     landmark_px: float = 2.0,
     blind: tuple[str, ...] = (),
-    wrong: float = 0.1,
 ) -> dict[int, FrameSetPoints]:
-    """Landmarks and features in recorded pixels; a share `wrong` of each camera's looks is mixed.
+    """Landmarks and features in recorded pixels; a tenth of each camera's looks is mixed.
 
     Features are seen within 75 degrees of the surface's normal, faces by all but `blind` cameras.
     """
@@ -73,9 +71,9 @@ def see(
             towards = camera.center - spots
             towards /= np.linalg.norm(towards, axis=1, keepdims=True)
             shown = np.flatnonzero(np.sum(towards * normals, axis=1) > np.cos(np.radians(75)))
-            pixels = project(camera, spots[shown])[0] + rng.normal(size=(len(shown), 2)) * noise_px
+            pixels = project(camera, spots[shown])[0] + rng.normal(size=(len(shown), 2)) * 0.3
             own = looks[shown] + rng.normal(size=(len(shown), 128)) * 0.02
-            mixed = np.flatnonzero(rng.random(len(shown)) < wrong)
+            mixed = np.flatnonzero(rng.random(len(shown)) < 0.1)
             own[mixed] = own[np.roll(mixed, 1)]
             own /= np.linalg.norm(own, axis=1, keepdims=True)
             found[name] = (pixels, own.astype(np.float32))
@@ -83,9 +81,9 @@ def see(
     return seen
 
 
-def perturbed(rig: dict[str, Camera], degrees: float, metres: float, seed: int = 0) -> dict:
-    """Every camera turned and moved so far, each its own way."""
-    rng = np.random.default_rng(seed)
+def perturbed(rig: dict[str, Camera], degrees: float, metres: float) -> dict:
+    """Every camera turned and moved so far, each in its own direction."""
+    rng = np.random.default_rng(0)
     out = {}
     for name, camera in rig.items():
         turn, shift = rng.normal(size=(2, 3))

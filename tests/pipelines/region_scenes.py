@@ -43,14 +43,11 @@ def tracked(jaw: float = 0.0, offset: tuple[float, float, float] = (0, 0, 0)) ->
     return make_head(vertices + offset, np.eye(3), head_labels(model))
 
 
-def camera_at(
-    azimuth_deg: float, size: int = 160, distance: float = 1.0, rise: float = 0.05,
-    offset: tuple[float, float, float] = (0, 0, 0),
-) -> Camera:  # fmt: skip
+def camera_at(azimuth_deg: float, size: int = 160, distance: float = 1.0) -> Camera:
     """Place a camera around the head that sees 45 cm of it."""
     angle = np.radians(azimuth_deg)
-    target = np.array([0.0, -0.04, 0.0]) + offset
-    eye = target + distance * np.array([np.sin(angle), rise, np.cos(angle)])
+    target = np.array([0.0, -0.04, 0.0])
+    eye = target + distance * np.array([np.sin(angle), 0.05, np.cos(angle)])
     K = np.array([[distance * size / 0.45, 0, size / 2], [0, distance * size / 0.45, size / 2],
                   [0, 0, 1.0]])  # fmt: skip
     return pinhole_camera("cam", K, size, size, look_at(eye, target, np.array([0.0, 1, 0])))

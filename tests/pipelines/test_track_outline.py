@@ -10,9 +10,9 @@ from pipelines.track.outline import OutlineTerm, matte_distance, outline_vertice
 from tests.pipelines.test_track import make_camera
 
 
-def disc_alpha(size: int = 300, radius: float = 80.0) -> np.ndarray:
-    grid = np.arange(size) + 0.5 - size / 2
-    return np.where(np.hypot(grid[:, None], grid) < radius, 255, 0).astype(np.uint8)
+def disc_alpha() -> np.ndarray:
+    grid = np.arange(300) + 0.5 - 150
+    return np.where(np.hypot(grid[:, None], grid) < 80.0, 255, 0).astype(np.uint8)
 
 
 def test_signed_distance_of_a_disc() -> None:

@@ -91,15 +91,13 @@ def ball(radius: float = RADIUS, rings: int = 40, centre: np.ndarray = ORIGIN):
     return vertices + centre, faces
 
 
-def places_on(
-    faces: np.ndarray, vertices: np.ndarray, count: int = 400, seed: int = 0
-) -> MeshPlaces:
-    """Samples on faces that look along +z."""
-    rng = np.random.default_rng(seed)
+def places_on(faces: np.ndarray, vertices: np.ndarray) -> MeshPlaces:
+    """Draw 400 samples on faces that look along +z."""
+    rng = np.random.default_rng(0)
     way = np.cross(*(vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2)))
     front = np.flatnonzero(way[:, 2] > 0.6 * np.linalg.norm(way, axis=1).clip(1e-12))
-    chosen = rng.choice(front, count)
-    return MeshPlaces(faces[chosen], rng.dirichlet(np.ones(3), count))
+    chosen = rng.choice(front, 400)
+    return MeshPlaces(faces[chosen], rng.dirichlet(np.ones(3), 400))
 
 
 def seen_weights(

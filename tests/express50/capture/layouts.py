@@ -118,7 +118,7 @@ AVA_FRAMES = [("EXP_neutral_peak", n) for n in (100, 103, 106)] + [
 ]
 
 
-def write_ava(root: Path, missing=(), unpublished=(), encode=avif) -> Path:
+def write_ava(root: Path, missing=(), unpublished=()) -> Path:
     """A capture of four cameras; K is for 2668 x 4096, pictures are a sixteenth; millimetres."""
     path = root / "20220818--1122--ABC123"
     names = [f"cam{n}" for n in (400981, 401031, 401045, 401163)]
@@ -142,7 +142,7 @@ def write_ava(root: Path, missing=(), unpublished=(), encode=avif) -> Path:
         with zipfile.ZipFile(path / f"decoder/image/{name}.zip", "w") as archive:
             for _, frame in AVA_FRAMES:
                 if (number, frame) not in missing and frame not in unpublished:
-                    data = encode(picture(number, frame, shape))
+                    data = avif(picture(number, frame, shape))
                     archive.writestr(f"{name}/{frame:06d}.avif", data)
     return path
 

@@ -60,7 +60,7 @@ def flame_dict() -> dict[str, np.ndarray]:
     }
 
 
-def write_flame(folder: Path, torch_embedding: bool = True) -> Path:
+def write_flame(folder: Path) -> Path:
     """Write model, embedding, masks and template OBJ; returns the model's path."""
     content: dict[str, object] = dict(flame_dict())
     with foreign_classes() as (ch, csc):
@@ -78,7 +78,7 @@ def write_flame(folder: Path, torch_embedding: bool = True) -> Path:
         )
         content |= {"shapedirs": shaped, "J_regressor": sparse}
         (folder / "flame.pkl").write_bytes(pickle.dumps(content, protocol=2))
-    write_embedding(folder / "landmark_embedding.npy", torch_embedding)
+    write_embedding(folder / "landmark_embedding.npy", with_torch=True)
     masks = {name: np.arange(5) + 5 * i for i, name in enumerate(MASKS)}
     (folder / "FLAME_masks.pkl").write_bytes(pickle.dumps(masks, protocol=2))
     write_template(folder / "head_template_mesh.obj")

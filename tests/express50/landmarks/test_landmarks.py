@@ -262,10 +262,10 @@ def test_heads_play_the_script_and_wink() -> None:
     assert np.abs(drawn).max() <= 1.2 + 1e-6
 
 
-def on_canvas(rgba: np.ndarray, seed: int, at: tuple[int, int], size: int = 400) -> np.ndarray:
+def on_canvas(rgba: np.ndarray, seed: int, at: tuple[int, int]) -> np.ndarray:
     """A view over noise, somewhere in a larger frame."""
     rng = np.random.default_rng(seed)
-    frame = np.kron(rng.integers(0, 255, (20, 20, 3)), np.ones((size // 20, size // 20, 1)))
+    frame = np.kron(rng.integers(0, 255, (20, 20, 3)), np.ones((20, 20, 1)))
     alpha = rgba[..., 3:] / 255.0
     x, y = at
     patch = frame[y : y + 208, x : x + 208]

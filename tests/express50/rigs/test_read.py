@@ -32,14 +32,13 @@ def make_rig(count=4, dist=(-0.11, 0.07, 0.001, -0.002), size=(640, 480)):
     return rig
 
 
-def assert_same(found, expected, tolerance=1e-6):
+def assert_same(found, expected):
     assert sorted(found) == sorted(expected)
     for name, camera in expected.items():
         other = found[name]
         assert (other.width, other.height) == (camera.width, camera.height)
-        np.testing.assert_allclose(
-            project(other, HEAD)[0], project(camera, HEAD)[0], atol=tolerance, rtol=0
-        )
+        pixels, wanted = project(other, HEAD)[0], project(camera, HEAD)[0]
+        np.testing.assert_allclose(pixels, wanted, atol=1e-6, rtol=0)
 
 
 def write_colmap(folder, rig):
