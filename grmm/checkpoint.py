@@ -27,6 +27,7 @@ from grmm.model import GRMM, PinholeView
 from grmm.networks import Networks
 
 FORMAT = "grmm.checkpoint/1"
+BUILT_IN = "procedural"  # the head model of this name; others are named after their files
 PARAMETERS = ("shape", "expression", "neck", "jaw", "eyes", "R", "t")  # of a frame
 ANY = object()
 # Settings of older checkpoints and the value that this version computes with; no result depends
@@ -86,7 +87,17 @@ class Checkpoint:
     loop: dict[str, Any]
 
     def views(self, source: Source) -> HeadViews:
-        """Prepare the samples of a source as the training data were."""
+        """Prepare the samples of a source as the training data were.
+
+        Raises:
+            FormatError: one is of the built-in head, the other is not. Models of other files are
+                told apart by their numbers of coefficients (`grmm.data.check_tracked`).
+        """
+        if (source.head == BUILT_IN) != (self.head.name == BUILT_IN):
+            raise FormatError(
+                f"the shards were tracked with head model {source.head!r}, the checkpoint has"
+                f" {self.head.name!r}; expected one model for both"
+            )
         return HeadViews(source, self.head, self.config.data)
 
 

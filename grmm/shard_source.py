@@ -128,9 +128,6 @@ class MixedSource:
         """
         self.head = sources[0].head
         owners: dict[str, ShardSource] = {}
-        roots = [source.reader.root.resolve() for source in sources]
-        if len(set(roots)) < len(roots):
-            raise FormatError(f"{sources[-1].reader.root}: named twice; name each folder once")
         for source in sources:
             if source.head != self.head:
                 raise FormatError(

@@ -33,6 +33,14 @@ def test_checkpoint_is_read_with_weights_only_and_damage_is_named(tmp_path):
         load_checkpoint(path)
 
 
+def test_shards_of_another_head_model_are_refused(path, source, monkeypatch):
+    loaded = load_checkpoint(path)
+    loaded.views(source)
+    monkeypatch.setattr(source, "head", "procedural")
+    with pytest.raises(FormatError, match="tracked with head model 'procedural', the checkpoint"):
+        loaded.views(source)
+
+
 class Command:
     """Pickles to a call of ``os.system``."""
 
