@@ -46,6 +46,7 @@ LEAST_VIEWS, ERRING = 4, 16  # views that see an odd colour; one view in so many
 LEAST_SKIN = 200  # pixels of skin in a view that is asked
 LEAST_CELLS = 20  # of a connected part
 FRONT_M, BRIDGE_M, REACH_M = 0.015, 0.005, 0.045  # depth of a rim, half a bridge, rim from its eye
+WIDER_OVAL = 1.1  # ellipses through a rim, outside which cells are not its own
 BEARINGS, AROUND = 24, 0.6  # about an eye, and the share of them that shows a rim
 EYE_M = 0.015  # radius of an eye with its lashes and shadow, which are not glasses
 WIDER_M = 0.0012  # by which cells are wider than glasses: odd pixels are dilated by one
@@ -88,8 +89,9 @@ def find_glasses(head: TrackedHead, pictures: Sequence[Picture]) -> np.ndarray:
     lenses = []
     for k, eye in enumerate(eyes):
         rim = frame[beside & (near[k] < np.minimum(near[1 - k], REACH_M))]
-        if _is_around(rim, eye):
-            lenses.append(_lens(rim, grid[:, :, 0, :2]))
+        rim = rim[np.linalg.norm(rim[:, :2] - eye[:2], axis=1) > EYE_M]
+        if _is_around(rim[:, :2], eye):
+            lenses.append(_lens(rim, eye, grid[:, :, 0, :2]))
     return np.concatenate([frame, *lenses]) @ head.R.T + head.center if lenses else nothing
 
 
@@ -121,21 +123,37 @@ def _unlike_skin(head: TrackedHead, pictures: Sequence[Picture], grid: np.ndarra
     return found
 
 
+def _bearings(places: np.ndarray, eye: np.ndarray) -> np.ndarray:
+    """Return the bearings (N,) of places (N, 2) about an eye, in axes of the head, in steps."""
+    x, y = (places - eye[:2]).T
+    return ((np.arctan2(y, x) / (2 * np.pi) % 1) * BEARINGS).astype(int)
+
+
 def _is_around(rim: np.ndarray, eye: np.ndarray) -> bool:
-    """Check that a rim (N, 3) runs around an eye (3,), in axes of the head; brows do not."""
-    off = rim[:, :2] - eye[:2]
-    x, y = off[np.linalg.norm(off, axis=1) > EYE_M].T
-    bearing = ((np.arctan2(y, x) / (2 * np.pi) % 1) * BEARINGS).astype(int)
-    return len(np.unique(bearing)) >= AROUND * BEARINGS
+    """Check that a rim (N, 2) runs around an eye (3,), in axes of the head; brows do not."""
+    return len(np.unique(_bearings(rim, eye))) >= AROUND * BEARINGS
 
 
-def _lens(rim: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Fill a rim (N, 3) with places (n, 3); `grid` (nx, ny, 2) has the columns along the gaze."""
+def _lens(rim: np.ndarray, eye: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Fill a rim (N, 3) with places (n, 3); `grid` (nx, ny, 2) has the columns along the gaze.
+
+    An ellipse closes the rim where it touches the nose and is not found, and tells it from brows
+    and bars behind it.
+    """
     rim = rim[rim[:, 2] > np.quantile(rim[:, 2], 0.9) - FRONT_M]  # without the bar to the ear
-    outline = cv2.convexHull(((rim[:, :2] - grid[0, 0]) / CELL_M).round().astype(np.int32))
-    filled = cv2.fillConvexPoly(np.zeros(grid.shape[1::-1], np.uint8), outline, 1).T > 0
+    cells = ((rim[:, :2] - grid[0, 0]) / CELL_M).round().astype(np.int32)
+    filled, oval, wider = np.zeros((3, *grid.shape[1::-1]), np.uint8)
+    cv2.fillConvexPoly(filled, cv2.convexHull(cells), 1)
+    found = np.isin(_bearings(grid.reshape(-1, 2), eye), _bearings(rim[:, :2], eye))
+    found = found.reshape(grid.shape[:2]).T
+    border = (filled > cv2.erode(filled, np.ones((3, 3), np.uint8))) & found
+    middle, axes, angle = cv2.fitEllipseDirect(np.argwhere(border)[:, ::-1])
+    cv2.ellipse(oval, (middle, axes, angle), 1, cv2.FILLED)
+    cv2.ellipse(wider, (middle, np.multiply(axes, WIDER_OVAL), angle), 1, cv2.FILLED)
+    filled[:] = 0
+    cv2.fillConvexPoly(filled, cv2.convexHull(cells[wider[cells[:, 1], cells[:, 0]] > 0]), 1)
+    places = grid[np.where(found, filled, filled | oval).T > 0]
     plane = np.linalg.lstsq(np.c_[rim[:, :2], np.ones(len(rim))], rim[:, 2], rcond=None)[0]
-    places = grid[filled]
     return np.c_[places, np.c_[places, np.ones(len(places))] @ plane]
 
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 from express50.contract.config import check_ranges
 
-VERSION = 24
+VERSION = 25
 UV_WEIGHTS = Path(__file__).with_name("face_uv_weights.npz")
 
 

@@ -84,6 +84,14 @@ def test_glasses_are_found_with_their_lenses_and_labelled() -> None:
     assert not label_mask(bare, "apparel").any()
 
 
+def test_a_rim_with_a_gap_is_closed() -> None:
+    found = find_glasses(scenes()[0].head, pictures(rims(0.8)))
+    for eye in eyes():
+        x, y = (found[:, :2] - eye[:2]).T
+        gap = np.abs(np.arctan2(y, x) + 0.2 * np.pi) < 0.05 * np.pi  # its middle
+        assert np.hypot(x, y)[gap & (np.hypot(x, y) < 1.5 * RADIUS)].max() > RADIUS
+
+
 def brows() -> np.ndarray:
     """Points (N, 3) on the skin along dark brows, and around dark eyes."""
     head = scenes()[0].head
