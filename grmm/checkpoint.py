@@ -19,7 +19,7 @@ from express50.files.arrays import read_weights
 from express50.files.atomic import write_with
 from express50.files.text import reason
 from express50.geometry.shapes import PIXEL_LIMIT, check_shape
-from express50.head.load import load_head
+from express50.head.load import BUILTIN_NAME, load_head
 from express50.head.model import HeadModel
 from grmm.config import Config, ModelConfig, as_tables, from_tables
 from grmm.data import NO_OFFSETS, HeadViews, Source, Tracked, check_tracked, stacked
@@ -27,7 +27,6 @@ from grmm.model import GRMM, PinholeView
 from grmm.networks import Networks
 
 FORMAT = "grmm.checkpoint/1"
-BUILT_IN = "procedural"  # the head model of this name; others are named after their files
 PARAMETERS = ("shape", "expression", "neck", "jaw", "eyes", "R", "t")  # of a frame
 ANY = object()
 # Settings of older checkpoints and the value that this version computes with; no result depends
@@ -93,7 +92,7 @@ class Checkpoint:
             FormatError: one is of the built-in head, the other is not. Models of other files are
                 told apart by their numbers of coefficients (`grmm.data.check_tracked`).
         """
-        if (source.head == BUILT_IN) != (self.head.name == BUILT_IN):
+        if (source.head == BUILTIN_NAME) != (self.head.name == BUILTIN_NAME):
             raise FormatError(
                 f"the shards were tracked with head model {source.head!r}, the checkpoint has"
                 f" {self.head.name!r}; expected one model for both"

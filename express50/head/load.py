@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from express50.head.model import HeadModel
 
 BUILTIN = Path(__file__).with_name("builtin.npz")
+BUILTIN_NAME = "procedural"  # as commands and tracks name it; other head models are named by path
 # Arrays with the names and shapes of HeadModel's fields.
 FIELDS = (
     "template", "shape_dirs", "expression_dirs", "pose_dirs", "joint_regressor", "skinning",
@@ -51,7 +52,7 @@ def load_topology(spec: str | Path) -> HeadTopology:
     Raises:
         HeadModelError: as `load_head`.
     """
-    path = BUILTIN if str(spec) == "procedural" else Path(spec).expanduser()
+    path = BUILTIN if str(spec) == BUILTIN_NAME else Path(spec).expanduser()
     if path.suffix == ".npz" and path.is_file() and is_stored(path):
         arrays = read_arrays(path, HeadModelError, "a stored head model", FIELDS)
         faces = arrays["faces"].astype(np.int64)
@@ -72,7 +73,7 @@ def load_head(spec: str | Path) -> HeadModel:
     Raises:
         HeadModelError: the name is unknown, or a file is missing or damaged.
     """
-    if str(spec) == "procedural":
+    if str(spec) == BUILTIN_NAME:
         return load_builtin()
     path = Path(spec).expanduser()
     if not path.exists():
@@ -96,7 +97,7 @@ def load_head(spec: str | Path) -> HeadModel:
 @cache
 def load_builtin() -> HeadModel:
     """Load the built-in head (float32, CPU). Callers share it and must not modify it."""
-    return load_stored(BUILTIN, "procedural")
+    return load_stored(BUILTIN, BUILTIN_NAME)
 
 
 def load_stored(path: Path, name: str) -> HeadModel:

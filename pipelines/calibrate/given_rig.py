@@ -179,9 +179,11 @@ def _find_exchanged(
 
 
 def _judge_size(cameras: dict[str, Camera], tracks: PointTracks) -> tuple[dict[str, Camera], str]:
-    """Compare the distance between the eyes with people's; return mended cameras and a warning.
+    """Compare the distance between the eyes with that of people.
 
-    Cameras are mended where other focal lengths alone explain it.
+    Returns:
+        The cameras, with other focal lengths if these alone explain the distance, and a warning,
+        empty if the distance is usual.
     """
     error, eyes_mm = _fit_faces(cameras, tracks)
     nowhere = not 1e-3 < eyes_mm < np.inf  # cameras of one place do not triangulate

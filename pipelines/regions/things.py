@@ -90,6 +90,8 @@ def find_glasses(head: TrackedHead, pictures: Sequence[Picture]) -> np.ndarray:
     for k, eye in enumerate(eyes):
         rim = frame[beside & (near[k] < np.minimum(near[1 - k], REACH_M))]
         rim = rim[np.linalg.norm(rim[:, :2] - eye[:2], axis=1) > EYE_M]
+        if len(rim):  # without the bar to the ear
+            rim = rim[rim[:, 2] > np.quantile(rim[:, 2], 0.9) - FRONT_M]
         if _is_around(rim[:, :2], eye):
             lenses.append(_lens(rim, eye, grid[:, :, 0, :2]))
     return np.concatenate([frame, *lenses]) @ head.R.T + head.center if lenses else nothing
@@ -140,7 +142,6 @@ def _lens(rim: np.ndarray, eye: np.ndarray, grid: np.ndarray) -> np.ndarray:
     An ellipse closes the rim where it touches the nose and is not found, and tells it from brows
     and bars behind it.
     """
-    rim = rim[rim[:, 2] > np.quantile(rim[:, 2], 0.9) - FRONT_M]  # without the bar to the ear
     cells = ((rim[:, :2] - grid[0, 0]) / CELL_M).round().astype(np.int32)
     filled, oval, wider = np.zeros((3, *grid.shape[1::-1]), np.uint8)
     cv2.fillConvexPoly(filled, cv2.convexHull(cells), 1)

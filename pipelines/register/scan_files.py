@@ -65,7 +65,7 @@ def run_scans(args: argparse.Namespace) -> int:
     taken: set[str] = set()
     try:
         for path in files:
-            # A refused name may be another scan's; with its ending it is no folder's.
+            # A refused scan is listed by its file name, which is never the name of a folder.
             refused = not ID.fullmatch(path.stem) or path.stem in taken
             name = path.name if refused else path.stem
             taken.add(name)
