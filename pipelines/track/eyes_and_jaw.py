@@ -148,9 +148,17 @@ def with_irises_and_jaw(
     sigma, terms = target.sigma.copy(), list(target.terms)
     if eyes is not None:
         terms.append(_iris_term(model, target, mesh, rotation, eyes))
-    for row, view in enumerate(target.observation.views):
-        if view.visible_contour and np.isfinite(sigma[row]).any():
-            terms.append(_jaw_term(model, view, mesh, sigma[row]))
+    for own, view in zip(sigma, target.observation.views, strict=True):
+        if not view.visible_contour or not np.isfinite(own).any():
+            continue
+        line = contour_points(model, mesh, view.camera)
+        size = float(np.ptp(view.points, axis=0).max())
+        spread = np.hypot(view.sigma[:JAW], RIM_SHARE * size)
+        taken = np.flatnonzero(np.isfinite(own[:JAW]) & line.moved & line.usable)
+        seen = Sighting(view.camera, np.arange(len(taken)), view.points[taken], spread[taken])
+        terms.append(PixelTerm(MeshPlaces.of_vertices(line.places.vertices[taken, 0]), (seen,)))
+        # Landmarks on the rim, and those that the head hides, lose their fixed places.
+        own[:JAW][line.moved | ~line.usable] = np.inf
     return replace(target, sigma=sigma, terms=tuple(terms))
 
 
@@ -168,23 +176,6 @@ def _iris_term(
             spread = np.array([np.hypot(sigma, common)])
             sightings.append(Sighting(view.camera, np.array([side]), pixel[None], spread))
     return PixelTerm(MeshPlaces.of_vertices(np.array(eyes.vertices)), tuple(sightings))
-
-
-def _jaw_term(
-    model: HeadModel, view: LandmarkView, mesh: np.ndarray, sigma: np.ndarray
-) -> PixelTerm:
-    """Make the term of the jaw's points on the rim.
-
-    `sigma` (68,) is changed here: it loses these points, and those that the head hides, as fixed
-    landmarks.
-    """
-    line = contour_points(model, mesh, view.camera)
-    size = float(np.ptp(view.points, axis=0).max())
-    spread = np.hypot(view.sigma[:JAW], RIM_SHARE * size)
-    taken = np.flatnonzero(np.isfinite(sigma[:JAW]) & line.moved & line.usable)
-    sigma[:JAW][line.moved | ~line.usable] = np.inf
-    seen = Sighting(view.camera, np.arange(len(taken)), view.points[taken], spread[taken])
-    return PixelTerm(MeshPlaces.of_vertices(line.places.vertices[taken, 0]), (seen,))
 
 
 def shut_terms(model: HeadModel, observation: Observation) -> tuple[ShutTerm, ...]:
