@@ -102,21 +102,6 @@ class PatchViews:
         return float(np.median(sizes)) if sizes else 1e-3
 
 
-def patch_views(
-    model: HeadModel, pictures: FrameSetCrops, mesh: np.ndarray, sets: list[MeshPlaces]
-) -> list[PatchViews]:
-    """Weigh how a frame set's crops see sets of samples on a mesh (V, 3)."""
-    faces = model.faces.numpy()
-    images = [(root @ GREY, camera) for root, camera in pictures.images()]
-    visibility, found = Visibility(mesh, faces), []
-    for samples in sets:
-        places, normals = samples.at(mesh), sample_normals(samples, mesh)
-        weights = view_weights(visibility, pictures, places, normals)
-        weights = np.where(weights > MIN_COSINE, weights**2, 0.0)
-        found.append(PatchViews(images, weights, places, normals, mesh, faces))
-    return found
-
-
 def search(views: PatchViews, reach: float) -> PatchSearch:
     """Search for the surface within `reach` metres of the places, along the normals."""
     pixel = views.pixel
@@ -269,15 +254,17 @@ def patch_terms(
     `reach` is in metres to either side, `weight` is the trust in the result. Vertices that are
     `covered` (V,) are left out.
     """
-    sets = [samples for samples, _ in skin]
-    if covered is not None:
-        sets = [samples.some(~covered[samples.vertices].any(1)) for samples in sets]
-    terms = []
-    for samples, (_, trust), views in zip(
-        sets, skin, patch_views(model, pictures, mesh, sets), strict=True
-    ):
-        found = search(views, reach)
-        term = surface_term(found, samples, views.places, views.normals, trust * weight)
+    faces = model.faces.numpy()
+    images = [(root @ GREY, camera) for root, camera in pictures.images()]
+    visibility, terms = Visibility(mesh, faces), []
+    for samples, trust in skin:
+        if covered is not None:
+            samples = samples.some(~covered[samples.vertices].any(1))
+        places, normals = samples.at(mesh), sample_normals(samples, mesh)
+        weights = view_weights(visibility, pictures, places, normals)
+        weights = np.where(weights > MIN_COSINE, weights**2, 0.0)
+        found = search(PatchViews(images, weights, places, normals, mesh, faces), reach)
+        term = surface_term(found, samples, places, normals, trust * weight)
         if term is not None:
             terms.append(term)
     return terms
