@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 
+import numpy as np
 import torch
 
 from express50.errors import HeadModelError
@@ -303,3 +304,8 @@ def vertex_normals(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
     safe = torch.where(scale > 0, normals / scale.clamp_min(torch.finfo(scale.dtype).tiny), 0.0)
     length = torch.where(scale > 0, safe.square().sum(-1, keepdim=True), 1.0).sqrt()
     return safe / length
+
+
+def normals_of(points: np.ndarray, faces: np.ndarray | torch.Tensor) -> np.ndarray:
+    """Return the `vertex_normals` (V, 3) of a single mesh of points (V, 3) and faces (F, 3)."""
+    return vertex_normals(torch.from_numpy(points)[None], torch.as_tensor(faces))[0].numpy()

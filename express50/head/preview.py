@@ -12,7 +12,7 @@ from express50.errors import HeadModelError
 from express50.geometry.conventions import cell_centres
 from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
 from express50.geometry.transforms import unit
-from express50.head.model import HeadModel, pose, vertex_normals
+from express50.head.model import HeadModel, normals_of, pose
 
 Array = np.ndarray
 
@@ -78,7 +78,7 @@ def render_preview(
     seen = np.isfinite(distance)
     corner = faces[hits["primitive_ids"].numpy()[seen]]
     weights = barycentrics(hits, seen)[:, :, None]
-    normals = vertex_normals(torch.from_numpy(points)[None], model.faces.cpu())[0].numpy()
+    normals = normals_of(points, model.faces.cpu())
     n = (normals[corner] * weights).sum(1)
     n /= np.linalg.norm(n, axis=1, keepdims=True) + 1e-9
     colors = np.tile(np.array(_SKIN), (len(points), 1))

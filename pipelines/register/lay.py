@@ -21,7 +21,7 @@ from express50.files.images import srgb_to_linear
 from express50.geometry.meshes import cotangent_laplacian
 from express50.geometry.raycast import join_rays, mesh_scene
 from express50.geometry.transforms import unit
-from express50.head.model import HeadModel, vertex_normals
+from express50.head.model import HeadModel, normals_of
 from pipelines.register.untangle import untangled
 from pipelines.track.basis import in_regions, movable_vertices
 
@@ -203,8 +203,7 @@ def too_fine(model: HeadModel, mesh: np.ndarray, places: np.ndarray) -> np.ndarr
 
 def mesh_normals(vertices: np.ndarray, faces: torch.Tensor) -> np.ndarray:
     """Return unit normals (V, 3) of a mesh (V, 3)."""
-    centred = torch.from_numpy(vertices - vertices.mean(0))
-    return vertex_normals(centred[None], faces)[0].numpy()
+    return normals_of(vertices - vertices.mean(0), faces)
 
 
 def smoothed(

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 
 from express50.errors import StageError
 from express50.files.images import linear_to_srgb, write_image
@@ -20,7 +19,7 @@ from express50.geometry.cameras import Camera
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.raycast import visible_faces
 from express50.geometry.sampling import sh_polynomials
-from express50.head.model import HeadModel, vertex_normals
+from express50.head.model import HeadModel, normals_of
 from pipelines.track.state import Target
 from pipelines.track.surface import (
     FrameSetCrops,
@@ -327,7 +326,7 @@ class _Scene:
 
 
 def _scene(model: HeadModel, pictures: FrameSetCrops, mesh: np.ndarray) -> _Scene:
-    normals = vertex_normals(torch.from_numpy(mesh)[None], model.faces)[0].numpy()
+    normals = normals_of(mesh, model.faces)
     images = pictures.images()
     return _Scene(mesh, normals, pictures, images, Visibility(mesh, model.faces.numpy()))
 

@@ -24,12 +24,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from express50.geometry.cameras import Camera, project_with_slope
 from express50.geometry.raycast import join_rays, mesh_scene
 from express50.geometry.transforms import unit
-from express50.head.model import HeadModel, vertex_normals
+from express50.head.model import HeadModel, normals_of
 from express50.landmarks.irises import EYES
 from express50.landmarks.network import INNER_LIPS
 from pipelines.track.observe import LandmarkView, Observation, agree
@@ -107,7 +106,7 @@ def _seeing(
     model: HeadModel, target: Target, mesh: np.ndarray, side: int, vertex: int
 ) -> list[tuple[LandmarkView, np.ndarray, float]]:
     """Return the views that one eye looks at, with its iris' pixel (2,) and sigma."""
-    normal = vertex_normals(torch.from_numpy(mesh)[None], model.faces)[0, vertex].numpy()
+    normal = normals_of(mesh, model.faces)[vertex]
     found = []
     for view, sigma in zip(target.observation.views, target.sigma, strict=True):
         if view.irises is None or not np.isfinite(sigma).any():
@@ -296,7 +295,7 @@ def contour_points(model: HeadModel, vertices: np.ndarray, camera: Camera) -> Ja
     faces = model.faces.numpy()
     corners = faces[model.landmark_faces[:JAW].numpy()].copy()
     bary = model.landmark_bary[:JAW].numpy().astype(np.float64)
-    normals = vertex_normals(torch.from_numpy(vertices)[None], model.faces)[0].numpy()
+    normals = normals_of(vertices, model.faces)
     facing = (normals * unit(camera.center - vertices)).sum(1)
     own = (vertices[corners] * bary[..., None]).sum(1)
     moved = np.zeros(JAW, dtype=bool)

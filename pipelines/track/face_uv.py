@@ -23,7 +23,7 @@ from express50.geometry.conventions import cell_to_corner, corner_to_cell
 from express50.geometry.raycast import visible_faces
 from express50.geometry.sampling import bilinear
 from express50.geometry.transforms import unit
-from express50.head.model import HeadModel, landmarks, vertex_normals
+from express50.head.model import HeadModel, landmarks, normals_of
 from express50.landmarks.network import CROP, MIRROR, LandmarkNet, load_network
 from pipelines.track.appearance import robust_mean
 from pipelines.track.basis import movable_vertices
@@ -126,7 +126,7 @@ def slide_term(
     anchors = anchors.some(good)
     # The map rounds off where landmarks lie, but shows well how far they have moved.
     goals = anchors.at(mesh) + found[good] - home[good]
-    normals = vertex_normals(torch.from_numpy(mesh)[None], model.faces)[0].numpy()
+    normals = normals_of(mesh, model.faces)
     sigma = np.hypot(error[good] * step[good], FLOOR_M) * REDUNDANCY**0.5
     return SlideTerm(anchors, good + FIRST, goals, unit(anchors.at(normals)), sigma)
 

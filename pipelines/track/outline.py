@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import open3d as o3d
-import torch
 
 from express50.files.images import edge_distance
 from express50.geometry.cameras import (
@@ -23,7 +22,7 @@ from express50.geometry.cameras import (
 )
 from express50.geometry.raycast import mesh_scene
 from express50.geometry.sampling import bilinear_slope
-from express50.head.model import HeadModel, vertex_normals
+from express50.head.model import HeadModel, normals_of
 from pipelines.regions.colour import like_skin
 from pipelines.track.basis import in_regions
 from pipelines.track.surface import FEATURES, SignedDistance, Visibility, look_up, near_things
@@ -201,7 +200,7 @@ def bare_share(
     """
     scalp, face = in_regions(model, ("scalp",)), in_regions(model, ("face",))
     face &= ~in_regions(model, FEATURES)
-    normals = vertex_normals(torch.from_numpy(mesh)[None], model.faces)[0].numpy()
+    normals = normals_of(mesh, model.faces)
     visibility = Visibility(mesh, model.faces.numpy())
     values = np.full((len(images), *mesh.shape), np.nan)
     for value, (image, camera) in zip(values, images, strict=True):

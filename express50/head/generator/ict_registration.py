@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sparse
-import torch
 from scipy.interpolate import PchipInterpolator, RBFInterpolator
 from scipy.sparse.csgraph import dijkstra
 from scipy.sparse.linalg import LinearOperator, cg, splu
@@ -23,7 +22,7 @@ from express50.head.generator.eyes import LID_SEGMENTS
 from express50.head.generator.mesh import WholeMesh
 from express50.head.generator.regions import embed_landmarks
 from express50.head.ict import LANDMARKS, RANGES, IctArrays
-from express50.head.model import vertex_normals
+from express50.head.model import normals_of
 
 Array = np.ndarray
 
@@ -92,11 +91,6 @@ def ict_skin(arrays: IctArrays) -> IctSkin:
     graph = sparse.coo_matrix((np.ones(len(edges)), edges.T), shape=(len(points),) * 2)
     ends = np.unique(edges[uses == 1])
     return IctSkin(points, faces, normals_of(points, faces), (graph + graph.T).tocsr(), ends)
-
-
-def normals_of(points: Array, faces: Array) -> Array:
-    """Return unit vertex normals (N, 3) of a mesh."""
-    return vertex_normals(torch.from_numpy(points)[None], torch.from_numpy(faces))[0].numpy()
 
 
 def rim_targets(mesh: WholeMesh, skin: IctSkin) -> RimTargets:

@@ -20,7 +20,7 @@ from express50.geometry.conventions import cell_to_corner
 from express50.geometry.raycast import join_rays, mesh_scene
 from express50.geometry.sampling import bilinear
 from express50.geometry.transforms import make_transform, unit
-from express50.head.model import HeadModel, pose, vertex_normals
+from express50.head.model import HeadModel, normals_of, pose
 from express50.landmarks.training.random_heads import (
     Canvas,
     deform,
@@ -261,7 +261,7 @@ def draw_meshes(model: HeadModel, uv_map: FaceUvMap, rng: Rng) -> tuple[np.ndarr
     for low, high, share in ((10.0, 60.0, 0.003), (60.0, 200.0, 0.001)):
         field = np.stack([waves(true, rng, 6, low, high) for _ in range(3)], axis=1)
         off += early * rng.uniform(0.0, share) * field
-    normals = vertex_normals(torch.from_numpy(true)[None], model.faces)[0].numpy()
+    normals = normals_of(true, model.faces)
     # Along the normals the views agree better on where the skin is than along it.
     off -= rng.uniform(0.2, 1.0) * (off * normals).sum(1, keepdims=True) * normals
     face = np.unique(uv_map.samples.vertices[uv_map.skin])
@@ -284,8 +284,8 @@ class _PaintedScene:
     ) -> None:
         self.uv_map, self.person, self.faces = uv_map, person, model.faces.numpy()
         self.scene = mesh_scene(vertices, self.faces)
-        normals = vertex_normals(torch.from_numpy(vertices)[None], model.faces)[0]
-        self.normals, self.lamps = normals.numpy().astype(np.float32), lamps
+        self.normals = normals_of(vertices, model.faces).astype(np.float32)
+        self.lamps = lamps
         self.reach = lamps.reach(self.scene, vertices, self.normals, rng)
 
     def seen(self, camera: Camera, places: np.ndarray) -> np.ndarray:
