@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import functools
 import inspect
 import json
 import math
@@ -219,6 +220,7 @@ def made_with(path: Path, stage: Stage, known: Mapping[str, Any]) -> str | None:
     return next((k for k, c in known.items() if values(config_toml(stage.name, c)) == found), None)
 
 
+@functools.cache
 def field_documents(config: type) -> dict[str, str]:
     """Return the documentation strings below the fields of a config dataclass, by field."""
     try:

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 from express50.cli.status import read_status
+from express50.contract.config import field_documents
 from express50.contract.stage import ExpectedError, Note
 from express50.errors import CaptureError, ConfigError, DiskFullError, StageError
 from express50.runner import replaced
@@ -464,6 +465,7 @@ def test_two_runs_of_one_item_on_one_scheduler_both_make_it(tmp_path):
 
     datasets = [make_dataset(tmp_path / name, ["a", "b"]) for name in ("one", "two")]
     config, options = toy.ToyConfig(seconds=0.1), {"dashboard_address": None, "protocol": "tcp://"}
+    field_documents(toy.ToyConfig)  # CPython 3.11 may fail if two threads parse source at once
     with LocalCluster(n_workers=2, threads_per_worker=1, **options) as cluster:
         go = functools.partial(
             run_stage, toy.STAGE, config=config, scheduler=cluster.scheduler_address, progress=False
