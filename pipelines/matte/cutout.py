@@ -34,7 +34,6 @@ from pipelines.matte.visual_hull import (
     MatteView,
     evidence_of,
     make_space,
-    projection_of,
     subject_place,
 )
 
@@ -46,7 +45,7 @@ LEAST_DEPTH = 0.05  # metres in front of the camera
 HOLE_M2 = 1.5e-3  # larger gaps show the background
 CUTS = 6  # GrabCut's iterations
 FEWEST = 4  # cameras that can correct each other
-MANY = 7  # of fewer cameras, the hull is so much larger than the person that it holds much wall
+MANY = 7  # the hull of fewer cameras is so much larger than the person that it holds much wall
 SLACK_PX = (3.0, 1.5)  # distance from an outline within which it proves nothing, per round
 COLOURS, RARE = 32, 1e-5  # colour cells along each axis of Lab; share of a cell that is never seen
 UNSEEN = 2 / COLOURS**3  # the person does not have colours of a smaller share
@@ -207,7 +206,8 @@ def parts_of_a_person() -> dict[int, tuple[np.ndarray, ...]]:
     chin, bottom = float(face[8, 1]), float(vertices[:, 1].min())
     skull = vertices[vertices[:, 1] > chin]
     middle = (skull.min(0) + skull.max(0)) / 2
-    throat, back = (_middle_depth(vertices, y) for y in (chin - 0.02, bottom + 0.01))
+    slices = (vertices[np.abs(vertices[:, 1] - y) < 0.01, 2] for y in (chin - 0.02, bottom + 0.01))
+    throat, back = (float(depths.min() + depths.max()) / 2 for depths in slices)
     neck = _slab((0.03, 0.04), (chin, bottom - 0.05), (throat, back), 0.03)
     torso = _slab((0.07, 0.2, 0.24), (bottom, bottom - 0.08, bottom - 0.7), (back,) * 3, 0.1)
     hair = _slab((0.16, 0.18), (middle[1], bottom - 0.1), (back,) * 2, 0.12)
@@ -220,12 +220,6 @@ def parts_of_a_person() -> dict[int, tuple[np.ndarray, ...]]:
         cv2.GC_PR_FGD: (likely, vertices, torso),
         cv2.GC_FGD: (sure, neck, face.mean(0) + 0.95 * (face - face.mean(0))),
     }
-
-
-def _middle_depth(vertices: np.ndarray, height: float) -> float:
-    """Return the middle of the depths that a head has at a height."""
-    near = vertices[np.abs(vertices[:, 1] - height) < 0.01, 2]
-    return float(near.min() + near.max()) / 2
 
 
 def _slab(
@@ -287,13 +281,9 @@ def _corrected(
 ) -> list[np.ndarray]:
     """Cut all views again, within what the other views leave possible; `slack` is in pixels."""
     mattes = [
-        MatteView(
-            view.name, projection_of(view.camera, ball),
-            (view.camera.center - ball.center) / ball.radius, view.rgb, mask.astype(np.float32),
-            view.valid,
-        )
+        MatteView.of(view.camera, ball, view.rgb, mask.astype(np.float32), view.valid)
         for view, mask in zip(views, masks, strict=True)
-    ]  # fmt: skip
+    ]
     space = make_space(mattes, CELLS, slack)
     place = subject_place(space)
     seen = [evidence_of(matte, space, place) for matte in mattes]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.files.images import LIGHT_OF_LEVEL, edge_distance, shrink
+from express50.files.images import LIGHT_OF_LEVEL, box_about, edge_distance, shrink
 from pipelines.matte.plates import (
     PlateModel,
     blurred,
@@ -82,7 +82,7 @@ def key_alpha(
     if not region.any():
         return alpha
     # The remaining steps work around the subject only.
-    window = _box_around(region, _margin(length))
+    window = box_about(region, _margin(length))
     part = PlateModel(model.plate[window], model.sigma[window], model.whiten)
     frame, image, dark = frame[window], image[window], dark[window]
     difference, region = difference[window], region[window]
@@ -92,7 +92,9 @@ def key_alpha(
     if support.core.any():
         own = subject_colour(image, support.core, length)
         firm = firm_pixels(image, difference, own, support.core, part)
-        support = find_support(firm, region, clear & told_apart(own, part), length)
+        # What looks like a plate of the subject's colours may as well be a shirt of the wall's.
+        clear &= _length(whitened(own - part.plate, part)) > HIGH
+        support = find_support(firm, region, clear, length)
     alpha[whole][window] = _opacity(frame, difference, dark, support, part, length)
     alpha[~valid] = 0.0
     return alpha
@@ -114,21 +116,17 @@ def subject_window(
         found = subject_region(np.where(known, difference, 0.0), known.size)
         if found.any():
             region, factor = found, factor / side
-    return _box_around(region, _margin(max(valid.shape)) + math.ceil(2 * factor), factor)
+    x, y, width, height = (factor * side for side in cv2.boundingRect(region.astype(np.uint8)))
+    margin = _margin(max(valid.shape)) + math.ceil(2 * factor)
+    rows, columns = (
+        slice(max(0, math.floor(low) - margin), math.ceil(high) + margin)
+        for low, high in ((y, y + height), (x, x + width))
+    )
+    return rows, columns
 
 
 def _margin(length: int) -> int:
     return 2 * _pixels(CORE, length) + 2  # beyond every disc, and three deviations of the blurs
-
-
-def _box_around(mask: np.ndarray, margin: int, factor: float = 1.0) -> tuple[slice, slice]:
-    """Return rows and columns about a mask (h, w) of a picture that is `factor` times as large."""
-    x, y, width, height = (factor * side for side in cv2.boundingRect(mask.astype(np.uint8)))
-    ends = ((y, y + height), (x, x + width))
-    rows, columns = (
-        slice(max(0, math.floor(low) - margin), math.ceil(high) + margin) for low, high in ends
-    )
-    return rows, columns
 
 
 def _opacity(
@@ -307,7 +305,9 @@ def find_support(
     solid = (firm & region).astype(np.uint8)
     radius, edge = _pixels(CORE, length), _pixels(FILL, length)
     # The image's border cuts the subject off; the subject continues behind it.
-    pad = [4 * radius + edge + 2 if space < 3 * edge else 0 for space in _space_around(solid)]
+    rows, columns = box_about(solid)
+    spaces = rows.start, len(solid) - rows.stop, columns.start, solid.shape[1] - columns.stop
+    pad = [4 * radius + edge + 2 if space < 3 * edge else 0 for space in spaces]
     solid = cv2.copyMakeBorder(solid, *pad, cv2.BORDER_REPLICATE)
     thick = opened(solid, _pixels(0.006, length), erode)
     closed = thick | eroded_about(~eroded_about(~thick, 2 * edge), 2 * edge)
@@ -325,20 +325,6 @@ def find_support(
     core = eroded(core, 2 if length >= 256 else 1)
     core = core[pad[0] : core.shape[0] - pad[1], pad[2] : core.shape[1] - pad[3]]
     return Support(core, dilated(region, 1) & ~core)
-
-
-def _space_around(mask: np.ndarray) -> tuple[int, int, int, int]:
-    """Return how many rows and columns are empty above, below, left and right of a mask (H, W)."""
-    x, y, width, height = cv2.boundingRect(mask)
-    return y, mask.shape[0] - y - height, x, mask.shape[1] - x - width
-
-
-def told_apart(own: np.ndarray, model: PlateModel) -> np.ndarray:
-    """Return the pixels (H, W) bool whose plate is not of the subject's colours (H, W, 3) nearby.
-
-    Elsewhere a wide area that looks like the plate may as well be a shirt of the wall's colour.
-    """
-    return _length(whitened(own - model.plate, model)) > HIGH
 
 
 def firm_pixels(

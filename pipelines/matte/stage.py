@@ -31,7 +31,7 @@ from pipelines.matte.plates import (
     match_plate,
     white_share,
 )
-from pipelines.matte.visual_hull import INSIDE, Ball, MatteView, ball_of, projection_of
+from pipelines.matte.visual_hull import INSIDE, Ball, MatteView, ball_of
 
 COLUMNS = 6  # of the picture
 TILE = 240
@@ -44,7 +44,7 @@ WINDOW = 5  # pixels, odd: side of the window in which alpha's spread is measure
 NEARBY = 0.04  # share of the longer side: width of the neighbourhood that describes an outline
 
 MatteFunction = Callable[[np.ndarray, Any, np.ndarray], np.ndarray]
-"""Of a frame (H, W, 3) uint8, its plate or None, and valid pixels: opacity (H, W) float32."""
+"""Solve opacity (H, W) float32 from a frame (H, W, 3) uint8, a plate or None, and valid pixels."""
 
 
 @dataclass(frozen=True)
@@ -221,14 +221,8 @@ def make_view(
     """Reduce a recorded camera with its undistorted image (H, W, 3) and alpha (H, W), uint8."""
     rgb = shrink(image, side)
     small = resized(camera, rgb.shape[1], rgb.shape[0])
-    return MatteView(
-        name=camera.id,
-        projection=projection_of(pinhole(small), ball),
-        center=(camera.center - ball.center) / ball.radius,
-        rgb=rgb,
-        alpha=shrink(alpha, side).astype(np.float32) / 255,
-        valid=undistorted_mask(small),
-    )
+    share = shrink(alpha, side).astype(np.float32) / 255
+    return MatteView.of(pinhole(small), ball, rgb, share, undistorted_mask(small))
 
 
 def corrected(

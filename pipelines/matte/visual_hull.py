@@ -56,6 +56,18 @@ class MatteView:
     alpha: np.ndarray
     valid: np.ndarray
 
+    @classmethod
+    def of(
+        cls, camera: Camera, ball: Ball, rgb: np.ndarray, alpha: np.ndarray, valid: np.ndarray
+    ) -> MatteView:
+        """Place a pinhole camera's picture in the ball's coordinates."""
+        R, t = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
+        # Over the radius, so that depths are in its units too and float32 suffices.
+        offset = (R @ ball.center + t) / ball.radius
+        projection = np.column_stack([camera.K @ R, camera.K @ offset]).astype(np.float32)
+        center = (camera.center - ball.center) / ball.radius
+        return cls(camera.id, projection, center, rgb, alpha, valid)
+
 
 @dataclass(frozen=True)
 class Space:
@@ -89,14 +101,6 @@ def ball_of(cameras: Mapping[str, Camera]) -> Ball | None:
         extents.append(depth * min(camera.width / camera.K[0, 0], camera.height / camera.K[1, 1]))
     radius = float(np.median(extents)) / 2
     return Ball(center, radius) if radius > 0 else None
-
-
-def projection_of(camera: Camera, ball: Ball) -> np.ndarray:
-    """Return the projection (3, 4) float32 of ball coordinates into a pinhole camera's image."""
-    R, t = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
-    # Over the radius, so that depths are in its units too and float32 suffices.
-    offset = (R @ ball.center + t) / ball.radius
-    return np.column_stack([camera.K @ R, camera.K @ offset]).astype(np.float32)
 
 
 def label_pixels(view: MatteView, margin: float) -> np.ndarray:
