@@ -8,13 +8,14 @@ import multiprocessing
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 
-from express50.capture.frames import read_frame, read_recorded_plate
+from express50.capture.frames import FrameReader, read_recorded_plate
 from express50.capture.index import read_index
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
@@ -117,7 +118,8 @@ def true_pictures(
     if camera.id not in index.plates:
         sys.exit(f"{dataset.root}: {subject}/{camera.id} has no plate; name another --dataset")
     valid = cv2.erode(undistorted_mask(camera).astype(np.uint8), np.ones((3, 3))) > 0
-    image = read_frame(dataset, subject, camera.id, frame, undistort=False)
+    with closing(FrameReader(index, camera.id)) as reader:
+        image = reader.read(frame)
     return {
         "frame": undistort_image(image, camera),
         "plate": undistort_image(read_recorded_plate(index, camera.id), camera),

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.capture.frames import read_cameras_of, read_frame
+from express50.capture.frames import FootageReader, read_cameras_of
 from express50.capture.raw import read_capture
 from express50.contract.layout import Dataset
 from express50.files.containers import read_picture
@@ -145,11 +145,12 @@ def median_colours(
     """Return the median root of light (N, 3) of places on a mesh; NaN where few cameras see it."""
     visibility = Visibility(vertices, model.faces.numpy())
     seen = np.full((len(cameras), len(places), 3), np.nan)
-    for row, (name, camera) in enumerate(cameras.items()):
-        clear = visibility.weights(camera, places, normals) > MIN_COSINE
-        if clear.any():
-            image = np.sqrt(LIGHT_OF_LEVEL[read_frame(dataset, subject, name, frame)])
-            seen[row, clear] = look_up(camera, image, places[clear])
+    with FootageReader(dataset, subject) as footage:
+        for row, (name, camera) in enumerate(cameras.items()):
+            clear = visibility.weights(camera, places, normals) > MIN_COSINE
+            if clear.any():
+                image = np.sqrt(LIGHT_OF_LEVEL[footage.read(name, frame)])
+                seen[row, clear] = look_up(camera, image, places[clear])
     enough = np.isfinite(seen[..., 0]).sum(0) >= LEAST_VIEWS
     colours = np.full(places.shape, np.nan)
     colours[enough] = np.nanmedian(seen[:, enough], axis=0)

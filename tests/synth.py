@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import struct
+from contextlib import closing
 from fractions import Fraction
 from pathlib import Path
 
 import av
 import numpy as np
 
+from express50.capture.frames import FootageReader, FrameReader
+from express50.capture.index import read_index
+from express50.contract.layout import Dataset
 from express50.files.calibration import write_cameras
 from express50.files.images import write_image
 from express50.geometry.cameras import Camera, rays
@@ -16,6 +20,17 @@ from express50.geometry.transforms import look_at
 
 RADIUS_M = 0.1
 EXPRESSIONS = ("neutral", "smile")
+
+
+def read_frame(
+    dataset: Dataset, subject: str, camera_id: str, frame: int, undistort: bool = True
+) -> np.ndarray:
+    """Read one frame (H, W, 3) of the footage: the picture made of it, or as it was recorded."""
+    if undistort:
+        with FootageReader(dataset, subject) as footage:
+            return footage.read(camera_id, frame)
+    with closing(FrameReader(read_index(dataset, subject), camera_id)) as reader:
+        return reader.read(frame)
 
 
 def make_rig(cameras: int = 3, size: int = 64) -> dict[str, Camera]:

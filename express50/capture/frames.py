@@ -39,26 +39,21 @@ def dhash(image: np.ndarray) -> str:
     its right neighbour. Source: N. Krawetz, "Kind of like that", 2013.
     """
     grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
-    if len(grey) % 8 == 0 and grey.shape[1] >= 9:
+    height, width = grey.shape
+    if height % 8 == 0 and width >= 9:
         # OpenCV takes 23 ms at 4K, and its means are up to 0.005 off before it rounds them. These
         # take 1 ms and say which bits such an error cannot change.
-        means = _cell_means(grey)
+        bands = [cv2.reduce(b, 0, cv2.REDUCE_SUM, dtype=cv2.CV_32S)[0] for b in np.split(grey, 8)]
+        up_to = np.pad(np.cumsum(bands, axis=1, dtype=np.int64), ((0, 0), (1, 0)))
+        ends = np.linspace(0, width, 10)
+        sums = np.diff([np.interp(ends, np.arange(width + 1), row) for row in up_to])
+        means = sums / (height / 8 * width / 9)
         least, most = np.rint(means - 0.01), np.rint(means + 0.01)
         sure = most[:, :-1] < least[:, 1:]
         if (sure == (least[:, :-1] < most[:, 1:])).all():
             return np.packbits(sure).tobytes().hex()
     cells = cv2.resize(grey, (9, 8), interpolation=cv2.INTER_AREA)
     return np.packbits(cells[:, :-1] < cells[:, 1:]).tobytes().hex()
-
-
-def _cell_means(grey: np.ndarray) -> np.ndarray:
-    """Average a grey image (8 h, W) uint8 to (8, 9) float64."""
-    height, width = grey.shape
-    rows = [cv2.reduce(band, 0, cv2.REDUCE_SUM, dtype=cv2.CV_32S)[0] for band in np.split(grey, 8)]
-    up_to = np.pad(np.cumsum(rows, axis=1, dtype=np.int64), ((0, 0), (1, 0)))
-    ends = np.linspace(0, width, 10)
-    sums = np.diff([np.interp(ends, np.arange(width + 1), row) for row in up_to])
-    return sums / (height / 8 * width / 9)
 
 
 class FrameReader:
@@ -137,31 +132,29 @@ def corrected(image: np.ndarray, source: CameraSource | RawCamera) -> np.ndarray
 
 
 class FootageReader:
-    """Reads frames of all cameras of a subject; videos stay open, so reading forward is quick."""
+    """Reads pictures of all cameras of a subject; videos stay open, so reading forward is quick."""
 
-    def __init__(self, dataset: Dataset, subject: str, undistort: bool = True) -> None:
-        """Read index and cameras, but open no video; ``undistort`` makes frames into pictures.
+    def __init__(self, dataset: Dataset, subject: str) -> None:
+        """Read index and cameras, but open no video.
 
         Raises:
-            StageError: ingest, or calibrate if undistorting, has not run.
+            StageError: ingest or calibrate has not run.
         """
         self._index = read_index(dataset, subject)
-        self._cameras = read_recorded_cameras(dataset, subject) if undistort else None
+        self._cameras = read_recorded_cameras(dataset, subject)
         self._sizes = picture_sizes(dataset, subject)
         self._readers: dict[str, FrameReader] = {}
 
     def read(self, camera_id: str, frame: int) -> np.ndarray:
-        """Read a full-resolution frame (H, W, 3) uint8 sRGB by decode index.
+        """Make the picture (H, W, 3) uint8 sRGB of a frame, given by its decode index.
 
         Raises:
             CaptureError: there is no such camera or frame, or the footage changed.
-            StageError: frames are to be undistorted, but the camera is not calibrated.
+            StageError: the camera is not calibrated.
         """
         if camera_id not in self._readers:
             self._readers[camera_id] = FrameReader(self._index, camera_id)
         image = self._readers[camera_id].read(frame)
-        if self._cameras is None:
-            return image
         subject = self._index.subject
         check_known(subject, "calibrated camera", [camera_id], self._cameras, StageError)
         camera = self._cameras[camera_id]
@@ -173,14 +166,6 @@ class FootageReader:
     def __exit__(self, *unused: object) -> None:
         for reader in self._readers.values():
             reader.close()
-
-
-def read_frame(
-    dataset: Dataset, subject: str, camera_id: str, frame: int, undistort: bool = True
-) -> np.ndarray:
-    """Read one frame (H, W, 3) uint8 sRGB by decode index, as ``FootageReader`` does."""
-    with FootageReader(dataset, subject, undistort) as footage:
-        return footage.read(camera_id, frame)
 
 
 def read_recorded_plate(index: Index, camera_id: str) -> np.ndarray:

@@ -116,7 +116,7 @@ def read_capture(root: Path) -> RawCapture:
             if not path.exists():
                 dropped[path.name] = f"{path}: {not_fetched(path)}"
             continue
-        if not ID.fullmatch(path.name) and _holds_footage(path):
+        if not ID.fullmatch(path.name) and ((path / "frames").is_dir() or _videos(path)):
             raise CaptureError(
                 f"{path}: camera id {path.name!r}, expected at most 120 letters, digits, '_' and"
                 f" '-'; call it {identifier(path.name)[:120]!r} here, in plates/, board/ and"
@@ -241,10 +241,6 @@ def _videos(folder: Path) -> list[Path]:
         for path in folder.iterdir()
         if path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".")
     )
-
-
-def _holds_footage(folder: Path) -> bool:
-    return (folder / "frames").is_dir() or bool(_videos(folder))
 
 
 def _read_camera(folder: Path) -> RawCamera:

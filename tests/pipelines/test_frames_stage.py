@@ -12,7 +12,6 @@ import skimage.data
 
 from express50.capture import frames as frames_module
 from express50.capture.frames import (
-    read_frame,
     read_peak_frame,
     read_plate_image,
     read_recorded_plate,
@@ -35,7 +34,7 @@ from express50.geometry.sampling import undistort_image
 from pipelines.frames import STAGE
 from tests.pipelines.test_matte_stage import make_dataset
 from tests.stages import run_here
-from tests.synth import make_capture, make_rig
+from tests.synth import make_capture, make_rig, read_frame
 
 
 def run(dataset, **settings):

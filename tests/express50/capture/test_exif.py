@@ -8,13 +8,14 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from express50.capture.frames import read_frame, read_proxy
+from express50.capture.frames import read_proxy
 from express50.capture.index import read_index
 from express50.contract.layout import Dataset
 from express50.errors import FormatError
 from express50.files.images import read_exif, upright
 from pipelines.calibrate.footage import known_focals
 from tests.stages import ingest_captures
+from tests.synth import read_frame
 
 WIDTH, HEIGHT, FILM_MM = 64, 48, 28
 # What a camera stores of the upright picture under each orientation, as EXIF defines them: where

@@ -12,7 +12,6 @@ from express50.capture.frames import (
     FrameReader,
     dhash,
     read_cameras_of,
-    read_frame,
     read_proxy,
     read_recorded_plate,
 )
@@ -27,7 +26,7 @@ from express50.files.video import VideoReader
 from express50.geometry.sampling import undistort_image
 from express50.runner.runner import run_stage
 from pipelines import ingest
-from tests.synth import make_capture, make_rig, render_ball
+from tests.synth import make_capture, make_rig, read_frame, render_ball
 
 
 def ingest_capture(root, capture):
@@ -72,7 +71,8 @@ def test_each_video_is_opened_once_and_closed_at_the_end(tmp_path, monkeypatch):
     monkeypatch.setattr(VideoReader, "close", lambda self: (closed.append(1), stop(self))[1])
     make_capture(tmp_path / "S001", cameras=4, video=True)
     dataset = ingest_capture(tmp_path / "data", tmp_path / "S001")
-    with FootageReader(dataset, "S001", undistort=False) as footage:
+    write_calibration(dataset, make_rig(4))
+    with FootageReader(dataset, "S001") as footage:
         for frame in range(3):
             for name in read_index(dataset, "S001").cameras:
                 footage.read(name, frame)

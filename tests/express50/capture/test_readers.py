@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from express50.capture.colour_correction import correct_srgb
-from express50.capture.frames import FrameReader, read_frame, read_proxy, read_recorded_plate
+from express50.capture.frames import FrameReader, read_proxy, read_recorded_plate
 from express50.capture.index import Cue, calibration_file, read_index
 from express50.capture.readers.read import detect, read_any, read_people, subject_of
 from express50.capture.readers.selection import common_timeline
@@ -20,7 +20,7 @@ from express50.runner.runner import run_stage
 from pipelines import calibrate, ingest
 from tests.express50.capture import layouts
 from tests.express50.capture.layouts import picture, rig
-from tests.synth import noise_video_images, turn_video, write_video
+from tests.synth import noise_video_images, read_frame, turn_video, write_video
 
 HEAD = np.array([[0.02, 1.22, 0.05], [-0.05, 1.15, -0.03], [0.0, 1.2, 0.0]])
 

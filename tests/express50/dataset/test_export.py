@@ -13,7 +13,7 @@ import pytest
 import trimesh
 
 from express50.__main__ import main
-from express50.capture.frames import read_cameras_of, read_frame
+from express50.capture.frames import read_cameras_of
 from express50.contract.layout import Dataset
 from express50.dataset.export_avatar import centred
 from express50.files.calibration import read_cameras, write_cameras
@@ -24,6 +24,7 @@ from tests.express50.dataset.tracked import track_arrays, world_vertices, write_
 from tests.express50.head.flame_files import write_flame
 from tests.express50.head.flame_reader import flame_vertices
 from tests.pipelines.bump_dataset import make_dataset
+from tests.synth import read_frame
 
 CAMERAS = 3
 
