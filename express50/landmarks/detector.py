@@ -166,8 +166,8 @@ def _searches(width: int, height: int, smallest: float) -> Iterator[list[np.ndar
     """Yield windows to look in: the whole frame, then turned and smaller ones, then smaller yet.
 
     Frames of any size have the same number of rounds. If smaller windows than usual are allowed,
-    turned ones of the second size come last, because a photograph may lie on its side; of a rig's
-    footage this is known.
+    turned ones of the second size come last, because a photograph may lie on its side; for a
+    rig's footage this is known.
     """
     longer = float(max(width, height))
     turned = [np.pi / 2, np.pi, 1.5 * np.pi]
@@ -234,7 +234,7 @@ def _agreed(place: _Place, looks: list[_Place]) -> _Place:
     )
     differ = np.median(spread) / (DIFFER_SHARE * max(face_box(mean)[1], 1e-6))
     good_mean = together.score >= KEEP_SHARE * place.score
-    # If they agree, their mean is the better place, even if a profile scores less from so near.
+    # If they agree, their mean is the better place, even if a profile scores less in close-ups.
     kept = together if differ < 1.0 or good_mean else place
     score = together.score if good_mean else place.score
     return replace(kept, score=float(score / (1.0 + differ**4)))
@@ -357,7 +357,7 @@ def sample_window(pyramid: list[np.ndarray], window: np.ndarray, size: int = CRO
 
 
 def _run(net: LandmarkNet, looks: Sequence[Look]) -> list[_Place]:
-    """Run the network on looks, `BATCH` at a time."""
+    """Run the network on looks, `BATCH` at a time; places are in pixels of the looks' images."""
     places = []
     for start in range(0, len(looks), BATCH):
         part = looks[start : start + BATCH]
@@ -369,30 +369,17 @@ def _run(net: LandmarkNet, looks: Sequence[Look]) -> list[_Place]:
         visible = torch.sigmoid(output.seen).double().numpy()
         scores = torch.sigmoid(output.logit).double().numpy()
         found, edges = output.points.double().numpy(), output.outline.double().numpy()
-        places += [
-            _placed(look.window, *row)
-            for look, *row in zip(part, found, edges, scales, visible, scores, strict=True)
-        ]
+        rows = zip(part, found, edges, scales, visible, scores, strict=True)
+        for look, points, outline, sigma, seen, score in rows:
+            points, outline = (transform_points(look.window, one) for one in (points, outline))
+            determinant = np.linalg.det(look.window[:, :2])
+            sigma = sigma * np.sqrt(abs(determinant))
+            if determinant < 0:
+                points, sigma, seen = points[MIRROR], sigma[MIRROR], seen[MIRROR]
+                outline = outline[::-1]
+            vague = np.median(sigma) / (VAGUE_SHARE * max(face_box(points)[1], 1e-6))
+            places.append(_Place(points, outline, sigma, seen, float(score / (1.0 + vague**2))))
     return places
-
-
-def _placed(
-    window: np.ndarray,
-    found: np.ndarray,
-    edge: np.ndarray,
-    sigma: np.ndarray,
-    seen: np.ndarray,
-    score: float,
-) -> _Place:
-    """Return the face that a crop showed, in pixels of its image."""
-    points, outline = (transform_points(window, part) for part in (found, edge))
-    determinant = np.linalg.det(window[:, :2])
-    sigma = sigma * np.sqrt(abs(determinant))
-    if determinant < 0:
-        points, sigma, seen = points[MIRROR], sigma[MIRROR], seen[MIRROR]
-        outline = outline[::-1]
-    vague = np.median(sigma) / (VAGUE_SHARE * max(face_box(points)[1], 1e-6))
-    return _Place(points, outline, sigma, seen, float(score / (1.0 + vague**2)))
 
 
 def follow(net: LandmarkNet, image: np.ndarray, window: np.ndarray) -> Detection:

@@ -150,29 +150,6 @@ def train(
     return descend(net, steps, rate, folder / f"training-{name}.pt", loss_at)
 
 
-@dataclass(frozen=True)
-class LandmarkBatch:
-    """Stacked crops: images (B, 3, H, W) in [0, 1], points (B, 68 + 17, 2), rest (B[, 68])."""
-
-    images: torch.Tensor
-    points: torch.Tensor
-    visible: torch.Tensor
-    score: torch.Tensor
-    weight: torch.Tensor
-
-
-def crop_batch(crops: list[TrainingCrop]) -> LandmarkBatch:
-    """Stack crops for the network."""
-    images = torch.from_numpy(np.stack([crop.image for crop in crops])).permute(0, 3, 1, 2)
-    return LandmarkBatch(
-        images.contiguous(memory_format=torch.channels_last).float() / 255.0,
-        torch.from_numpy(np.stack([crop.points for crop in crops])),
-        torch.from_numpy(np.stack([crop.visible for crop in crops])),
-        torch.tensor([crop.score for crop in crops]),
-        torch.tensor([crop.weight for crop in crops]),
-    )
-
-
 def point_loss(
     output: Output, points: torch.Tensor, first: int = 0
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -194,16 +171,20 @@ def place_loss(
 
 def crop_loss(net: LandmarkNet, crops: list[TrainingCrop]) -> torch.Tensor:
     """Return the loss of a batch: that of points and outline, and entropies of both logits."""
-    batch = crop_batch(crops)
+    images = torch.from_numpy(np.stack([crop.image for crop in crops])).permute(0, 3, 1, 2)
     with torch.autocast("cpu", torch.bfloat16):
-        output: Output = net(batch.images)
-    marks, outline = batch.points.tensor_split((POINTS,), dim=1)
-    seen = functional.binary_cross_entropy_with_logits(output.seen, batch.visible, reduction="none")
-    share = batch.weight / batch.weight.sum().clamp_min(1.0)
-    points = (point_loss(output, marks)[0] + 0.5 * seen).mean(1) * share
+        output: Output = net(images.contiguous(memory_format=torch.channels_last).float() / 255.0)
+    points = torch.from_numpy(np.stack([crop.points for crop in crops]))
+    marks, outline = points.tensor_split((POINTS,), dim=1)
+    visible = torch.from_numpy(np.stack([crop.visible for crop in crops]))
+    seen = functional.binary_cross_entropy_with_logits(output.seen, visible, reduction="none")
+    weight = torch.tensor([crop.weight for crop in crops])
+    share = weight / weight.sum().clamp_min(1.0)
+    loss = (point_loss(output, marks)[0] + 0.5 * seen).mean(1) * share
     edge = output.outline, output.outline_log_scale, output.outline_heat
-    points = points + 0.5 * place_loss(*edge, outline)[0].mean(1) * share
-    return points.sum() + functional.binary_cross_entropy_with_logits(output.logit, batch.score)
+    loss = loss + 0.5 * place_loss(*edge, outline)[0].mean(1) * share
+    score = torch.tensor([crop.score for crop in crops])
+    return loss.sum() + functional.binary_cross_entropy_with_logits(output.logit, score)
 
 
 if __name__ == "__main__":
