@@ -65,9 +65,9 @@ def _reduced(camera: Camera, image: np.ndarray, frame: int) -> np.ndarray:
 def read_footage(index: Index, cameras: Mapping[str, Camera], count: int) -> Images:
     """Yield reduced images of ingested footage at up to `count` instants.
 
-    The instants are the middles of cues, or spread over all frames where there are no cues. A key
-    frame of the first camera earlier in the cue is taken instead: of 4K footage with one key frame
-    per second, reading it takes a tenth of the time.
+    The instants are the middles of cues, or spread over all frames where there are no cues. If the
+    first camera has a key frame earlier in the cue, that is taken instead: in 4K footage with one
+    key frame per second, it is read in a tenth of the time.
     """
     cues = [cue for cue in index.cues if cue.end_frame < index.frames]
     spread = evenly(range(index.frames), count)
@@ -85,7 +85,7 @@ def read_footage(index: Index, cameras: Mapping[str, Camera], count: int) -> Ima
 def read_raw_footage(root: Path, cameras: Mapping[str, Camera], count: int) -> Images:
     """Yield reduced images of a raw capture at up to `count` instants, as `read_footage` does.
 
-    Of a video without cues only the first frame is read, as its length is unknown.
+    Only the first frame of a video without cues is read, because its length is unknown.
 
     Raises:
         CaptureError: the capture is unusable, or a camera has no such frame.
@@ -138,21 +138,20 @@ def find_points(read: Callable[[], Images], small: bool = False) -> dict[int, Fr
         for frame, name, image in read():
             if frame in lacking and faces[frame][name].score < FACE_SCORE:
                 faces[frame][name] = detect(net, image, smallest=SMALL)
-    landmarks = {frame: _landmarks(_with_face(seen)) for frame, seen in faces.items()}
+    # Deviations are enlarged, because the landmarks of a view err together.
+    landmarks = {
+        frame: [
+            (name, face.points, LANDMARK_INFLATION * np.maximum(face.sigma, FEATURE_SIGMA_PX))
+            for name, face in _with_face(seen).items()
+        ]
+        for frame, seen in faces.items()
+    }
     return {f: FrameSetPoints(landmarks[f], without_fixed(features[f])) for f in sorted(features)}
 
 
 def _with_face(faces: Mapping[str, Detection]) -> dict[str, Detection]:
     """Return the cameras that show a face."""
     return {name: face for name, face in faces.items() if face.score >= FACE_SCORE}
-
-
-def _landmarks(faces: Mapping[str, Detection]) -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """Return each camera's landmarks and their deviations, which grow as they err together."""
-    sigma = {
-        n: LANDMARK_INFLATION * np.maximum(f.sigma, FEATURE_SIGMA_PX) for n, f in faces.items()
-    }
-    return [(name, face.points, sigma[name]) for name, face in faces.items()]
 
 
 def find_features(image: np.ndarray) -> Features:

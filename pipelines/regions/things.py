@@ -39,10 +39,10 @@ from pipelines.regions.geometry import FACE, WIDTH_M, TrackedHead, nearest, rend
 
 EYES, SKIN = LABELS.index("eyes"), LABELS.index("skin")
 CELL_M = 0.002
-# Of the searched box: half its size beside the eyes and above them, and its ends along the gaze.
+# Ends of the searched box about the middle of the eyes: to the sides, upwards, along the gaze.
 BOX_M = ((-0.08, 0.08), (-0.045, 0.04), (-0.03, 0.045))
 CLEAR_M, FAR_M = 0.003, 0.03  # from the mesh, between which glasses are looked for
-LEAST_VIEWS, ERRING = 4, 16  # views that see an odd colour; one view in so many may see skin
+LEAST_VIEWS, ERRING = 4, 16  # views that see an odd colour; one in ERRING may see skin
 LEAST_SKIN = 200  # pixels of skin in a view that is asked
 LEAST_CELLS = 20  # of a connected part
 FRONT_M, BRIDGE_M, REACH_M = 0.015, 0.005, 0.045  # depth of a rim, half a bridge, rim from its eye
@@ -52,7 +52,7 @@ EYE_M = 0.015  # radius of an eye with its lashes and shadow, which are not glas
 WIDER_M = 0.0012  # by which cells are wider than glasses: odd pixels are dilated by one
 
 SIDE, AROUND_M = 384, 0.1  # most pixels of the crops that are compared, and their margin
-NEAR_M = 0.008  # the face is within so much of the tracked mesh
+NEAR_M = 0.008  # largest distance of the face from the tracked mesh
 HEIGHTS_M = np.arange(0.012, 0.1, 0.006)  # before it, about which things are looked for
 STEPS_M = (-0.0022, -0.0007, 0.0008, 0.0023)  # compared about each of them
 APART = (0.5, 0.97)  # cosines between views that are compared: others look alike, or unlike
@@ -62,7 +62,7 @@ PATCH_PX, NOISE = 9, 0.006  # side of what is compared and averaged; noise of ro
 # Agreement by which a thing must be better than the face to be one, and to leave the face unsure.
 THING_MARGIN, BARE_MARGIN = 0.1, -0.05
 EDGE_M = 0.005  # from the border between face and thing, within which the nearest edge is taken
-LEAST_THING, WITNESSES = 0.005, 2  # share of the face in so many views; less is chance
+LEAST_THING, WITNESSES = 0.005, 2  # share of the face, and views that show it; less is chance
 
 Picture = tuple[Camera, np.ndarray, np.ndarray]
 """A pinhole camera, its frame (H, W, 3) uint8 and its matte (H, W) in [0, 1]."""
@@ -92,7 +92,8 @@ def find_glasses(head: TrackedHead, pictures: Sequence[Picture]) -> np.ndarray:
         rim = rim[np.linalg.norm(rim[:, :2] - eye[:2], axis=1) > EYE_M]
         if len(rim):  # without the bar to the ear
             rim = rim[rim[:, 2] > np.quantile(rim[:, 2], 0.9) - FRONT_M]
-        if _is_around(rim[:, :2], eye):
+        # Unlike brows, a rim runs around its eye.
+        if len(np.unique(_bearings(rim[:, :2], eye))) >= AROUND * BEARINGS:
             lenses.append(_lens(rim, eye, grid[:, :, 0, :2]))
     return np.concatenate([frame, *lenses]) @ head.R.T + head.center if lenses else nothing
 
@@ -129,11 +130,6 @@ def _bearings(places: np.ndarray, eye: np.ndarray) -> np.ndarray:
     """Return the bearings (N,) of places (N, 2) about an eye, in axes of the head, in steps."""
     x, y = (places - eye[:2]).T
     return ((np.arctan2(y, x) / (2 * np.pi) % 1) * BEARINGS).astype(int)
-
-
-def _is_around(rim: np.ndarray, eye: np.ndarray) -> bool:
-    """Check that a rim (N, 2) runs around an eye (3,), in axes of the head; brows do not."""
-    return len(np.unique(_bearings(rim, eye))) >= AROUND * BEARINGS
 
 
 def _lens(rim: np.ndarray, eye: np.ndarray, grid: np.ndarray) -> np.ndarray:
@@ -279,7 +275,7 @@ def face_views(head: TrackedHead, pictures: Sequence[Picture]) -> list[FaceView]
 
 
 def _not_before_bare_face(things: np.ndarray, views: Sequence[FaceView]) -> np.ndarray:
-    """Keep the places (n, 3) before the face that no view sees the face through."""
+    """Leave out the places (n, 3) through which some view sees the face."""
     for view in views:
         pixels, inside = inside_frame(view.camera, things)
         column, row = pixels[inside].astype(np.int64).T
@@ -420,7 +416,7 @@ def _sampled(
 
 
 def _carve(head: TrackedHead, sweep: _Sweep, views: Sequence[FaceView]) -> None:
-    """Take the room before the face that others see away from a sweep."""
+    """Remove from a sweep the room in front of the face that other views see."""
     for view in views:
         line = _line(view.camera, head.center, sweep.places, sweep.ways)
         ends = np.where(view.bare, view.depth - np.float32(NEAR_M), 0)

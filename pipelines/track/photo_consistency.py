@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import open3d as o3d
 from scipy.spatial import cKDTree
 
 from express50.geometry.cameras import Camera, project_pinhole, project_with_slope
@@ -52,8 +51,8 @@ MIN_COSINE = 0.4
 # Hair and cloth may cover neck and ears: fewer samples per sample of the face, and less trust.
 COVERED_SHARE, COVERED_TRUST = 0.25, 0.3
 
-# A beard or a fringe covers a place if more than this share of so many nearest samples is unlike
-# skin; brows and nostrils are narrower.
+# A beard or a fringe covers a place if more than this share of its nearest samples is unlike skin;
+# brows and nostrils are narrower.
 HAIR_NEIGHBOURS, HAIR_SHARE = 40, 0.65
 
 SkinSamples = list[tuple[MeshPlaces, float]]
@@ -136,9 +135,7 @@ def agreement(views: PatchViews, heights: np.ndarray) -> np.ndarray:
     weights, places, normals = views.weights, views.places, views.normals
     if len(weights) > VIEWS:
         weights = np.where(weights >= np.sort(weights, axis=0)[-VIEWS], weights, 0.0)
-    spacing, centre = SPACING_PX * views.pixel, views.mesh.mean(0)
-    scene = mesh_scene(views.mesh - centre, views.faces)
-    shapes = _shapes(scene, centre, places, normals, spacing)
+    shapes = _shapes(views)
     count, size = len(places), PATCH * PATCH
     total = np.zeros((count, len(heights), size), np.float32)
     mass, square = np.zeros(count), np.zeros(count)
@@ -188,17 +185,13 @@ def _patches(
     return values
 
 
-def _shapes(
-    scene: o3d.t.geometry.RaycastingScene,
-    origin: np.ndarray,
-    places: np.ndarray,
-    normals: np.ndarray,
-    spacing: float,
-) -> np.ndarray:
-    """Lay a square grid (S, 3, PATCH^2) on the mesh about each sample.
+def _shapes(views: PatchViews) -> np.ndarray:
+    """Lay a square grid (S, 3, PATCH^2) on the mesh about each place.
 
-    A nose is too round for flat patches. The scene's origin lies at `origin` (3,) in the world.
+    A nose is too round for flat patches.
     """
+    normals, spacing, centre = views.normals, SPACING_PX * views.pixel, views.mesh.mean(0)
+    scene = mesh_scene(views.mesh - centre, views.faces)
     # The tangents must not depend on the camera.
     axis = np.where(np.abs(normals[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
     across = unit(np.cross(axis, normals))
@@ -207,7 +200,7 @@ def _shapes(
     v, u = np.meshgrid(grid, grid, indexing="ij")
     flat = u.reshape(1, -1, 1) * across[:, None] + v.reshape(1, -1, 1) * along[:, None]
     lift = 2.0 * spacing * PATCH
-    start = places[:, None] - origin + flat + lift * normals[:, None]
+    start = views.places[:, None] - centre + flat + lift * normals[:, None]
     hit = scene.cast_rays(join_rays(start, -normals[:, None]))["t_hit"].numpy()
     rise = np.where(np.isfinite(hit), lift - hit, 0.0)
     # A hit further away is another part of the face, which does not continue the patch.

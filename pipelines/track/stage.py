@@ -27,7 +27,7 @@ from express50.head.model import landmarks
 from pipelines.track.appearance import write_texture
 from pipelines.track.basis import Basis, freeze_shape, make_basis, split_shape, with_modes
 from pipelines.track.config import TrackConfig
-from pipelines.track.eyes_and_jaw import EyeOffsets, shut_terms
+from pipelines.track.eyes_and_jaw import shut_terms
 from pipelines.track.fit import consistent_sigma, fit, vertex_sigma
 from pipelines.track.observe import Observation
 from pipelines.track.read_inputs import observe_peaks, open_follower, open_landmarks, read_clip
@@ -129,9 +129,15 @@ def track_clips(
     follow = open_follower(config.landmarks)
     read = partial(read_clip, dataset, item, source, follow, peaks, config.photo_side)
     shape, index = split_shape(basis.model, state.shape)[0], read_index(dataset, item)
+    # A run reuses the windows of an interrupted one that has the same identity, so this changes
+    # with everything clips are tracked from. The peaks' fit counts because machines round
+    # differently.
+    fitted = (shape.tobytes(), state.bias.tobytes(), eyes and vars(eyes))
+    digests = {k: path_digest(v) if isinstance(v, Path) else v for k, v in inputs.items()}
+    identity = repr((value_digest(digests), asdict(config), fitted))
     return write_clips(
-        out, tracker, config.head, shape, index.cues, index.fps, read,
-        dataset.windows_dir(item), clips_identity(inputs, config, shape, state, eyes),
+        out, tracker, config.head, shape, index.cues, index.fps, read, dataset.windows_dir(item),
+        identity,
     )  # fmt: skip
 
 
@@ -159,23 +165,6 @@ def single_view_warnings(peaks: Sequence[Observation], cameras: Mapping[str, Cam
         for peak in peaks
         if len(peak.views) == 1 < len(cameras)
     ]
-
-
-def clips_identity(
-    inputs: Mapping[str, Path | str],
-    config: TrackConfig,
-    shape: np.ndarray,
-    state: State,
-    eyes: EyeOffsets | None,
-) -> str:
-    """Return a text that changes with everything clips are tracked from.
-
-    A run reuses the windows of an interrupted one that has the same text. The peaks' fit is part
-    of it, because machines round differently.
-    """
-    fitted = (shape.tobytes(), state.bias.tobytes(), eyes and vars(eyes))
-    digests = {k: path_digest(v) if isinstance(v, Path) else v for k, v in inputs.items()}
-    return repr((value_digest(digests), asdict(config), fitted))
 
 
 def stated_bounds(
