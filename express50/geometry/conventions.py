@@ -32,7 +32,7 @@ def mirror_pixels(pixels: np.ndarray, width: int) -> np.ndarray:
 
 
 def mirror_opencv_pixels(pixels: np.ndarray, width: int) -> np.ndarray:
-    """Return OpenCV's pixels (N, 2) of such an image."""
+    """Return OpenCV's pixels (N, 2) of an image flipped left to right, `width` pixels wide."""
     return corner_to_opencv_pixels(mirror_pixels(opencv_pixels_to_corner(pixels), width))
 
 

@@ -300,7 +300,7 @@ def verified_pairs(
     """Return the matches (M, 2) by frame that one fundamental matrix of two cameras explains.
 
     `candidates` are matches by descriptors. The result is empty where the matrix explains fewer
-    than 12 plus an eighth of them: of false ones it explains about 8 plus a twentieth.
+    than 12 plus an eighth of them: it explains about 8 plus a twentieth of false ones.
     """
     if candidates is None:
         candidates = {frame: match_descriptors(a[1], b[1]) for frame, (a, b) in features.items()}

@@ -203,7 +203,7 @@ def in_tiles(
 ) -> np.ndarray:
     """Call ``compute(rows, columns)`` for tiles of an image, and join the results (H, W) float32.
 
-    Of an overlap, each tile's outer quarter is not used, because the tile does not see what
+    The outer quarter of each tile's overlap is not used, because the tile does not see what
     surrounds it. In the half between, one tile fades into the other; where they agree, the result
     is exactly theirs. The longest side of a tile and the overlap are multiples of 64 pixels, so
     that networks that halve the picture several times sample all tiles alike.

@@ -39,7 +39,7 @@ ROUNDS = 10
 OUTLIER = 2.5
 NOISE_FLOOR = 0.002
 VIEW_OUTLIER = 4.0  # standard deviations at which a view's colour is outvoted
-LIGHT_FRAME_SETS = 8  # light of so many frame sets is as good as that of all
+LIGHT_FRAME_SETS = 8  # more frame sets do not improve the light
 SCHEMA = "express50.appearance/1"
 TEXTURE_FRAME_SETS = 3
 # Two frame sets never align exactly, and their mean is blurred: the first one's views count this
@@ -216,8 +216,8 @@ def write_texture(
     """Estimate light and gains, bake albedo.png and write it with appearance.npz into `out`.
 
     Nothing is written if no picture shows any of the head. Meshes (E, V, 3) are of the E targets;
-    light and gains are estimated at so many `samples` of the skin; the texture has `side` texels
-    per side.
+    light and gains are estimated at about `samples` places on the skin; the texture has `side`
+    texels per side.
     """
     skin = spread_samples(model, samples)
     some = range(0, len(pictures), -(-len(pictures) // LIGHT_FRAME_SETS))

@@ -55,12 +55,12 @@ class Basis:
 
     @property
     def shape_size(self) -> int:
-        """Number of shape coefficients."""
+        """Return the number of shape coefficients."""
         return self.model.shape_dirs.shape[2]
 
     @property
     def expression_size(self) -> int:
-        """Number of expression coefficients."""
+        """Return the number of expression coefficients."""
         return self.model.expression_dirs.shape[2]
 
 

@@ -49,8 +49,8 @@ LEAST_CAMERAS = 2
 # squared confidences over the cameras sum to at most this share of the usual.
 CHANCE = 0.3
 GAP = 0.1  # share of the gap between the lids that is left
-# Lips are shut if they are seen apart by less than so many standard deviations. However many views
-# there are, the deviation is half of the best one's or more: all views of a mouth err together.
+# Lips are shut if they are seen apart by less than this number of standard deviations. These are at
+# least this share of the best view's, because all views of a mouth err together.
 LIPS_SHUT, COMMON_SHARE = 3.0, 0.5
 
 JAW = 17

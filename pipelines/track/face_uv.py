@@ -39,7 +39,7 @@ from pipelines.track.surface import (
 )
 from pipelines.track.terms import MeshPlaces, SlideTerm, landmark_anchors
 
-REDUNDANCY = 2.0  # neighbouring landmarks err together: so many count as one
+REDUNDANCY = 2.0  # landmarks that count as one, because neighbours err together
 FLOOR_M = 0.0004
 VIEW_NOISE = 0.05  # standard deviation of root light between views of one place
 LEAST_SEEN, LEAST_VIEWS = 0.1, 2

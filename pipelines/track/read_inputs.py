@@ -167,7 +167,7 @@ def _find_face(
 
 
 def agreed(cue: str, frame: int, views: list[LandmarkView]) -> Observation | None:
-    """Return what the views agree on; None if that is no face."""
+    """Return what the views agree on; None if that is not a face."""
     observation = agree(cue, frame, views)[0] if views else None
     if observation is None or observation.inliers.sum(1).max() < MIN_LANDMARKS:
         return None

@@ -65,7 +65,7 @@ class ClipTracker:
     """Settings and helpers for tracking windows of one person, whose basis is of `freeze_shape`.
 
     Every `stride`-th frame is tracked. `eyes`, `skin` and `uv_map` are those of the peaks' rounds;
-    the surface is searched for in so many `rounds` per frame; then come the `sweeps` of smoothing.
+    the surface is searched for in `rounds` rounds per frame, and motion is smoothed in `sweeps`.
     """
 
     person: Basis

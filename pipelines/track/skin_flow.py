@@ -19,14 +19,14 @@ from pipelines.track.surface import FrameSetCrops, sample_normals
 from pipelines.track.terms import SlideTerm
 
 FINE = 2  # texels of 0.65 mm on the cheeks
-LOCAL = 6.0  # texels: light and shade are evened out over so many
+LOCAL = 6.0  # texels over which light and shade are evened out
 NOISE = 0.01  # of root light: contrast must stand out from it
 EVERY = 4  # texels between places that are followed
 BACK = 0.6  # texels by which the flow there and back may miss
 TEXTURED = 0.02  # least contrast, in every direction, of what is followed
 SIGMA = 0.5  # texels
-REDUNDANCY = 30.0  # neighbouring places err together: so many count as one
-RIM = 9  # texels: flow is not trusted so near to what is not seen
+REDUNDANCY = 30.0  # places that count as one, because neighbours err together
+RIM = 9  # texels: closer than this to what is not seen, flow is not trusted
 
 
 @dataclass(frozen=True)

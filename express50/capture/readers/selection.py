@@ -81,7 +81,7 @@ def unique_ids(root: Path, names: Iterable[str], stem: Callable[[str], str]) -> 
 
 
 def folder_id(path: Path) -> str:
-    """Return the folder's name as an id, of a file the name of its folder."""
+    """Return the name of a folder, or of the folder that holds a file, as an id."""
     return identifier((path if path.is_dir() else path.parent).resolve().name)
 
 

@@ -71,7 +71,7 @@ def read_participant(path: Path, selection: Selection) -> RawCapture:
     for serial in filter(selection.has_camera, sorted(calibration)):
         names = {s: f"sequences/{s}/images/cam_{serial}.mp4" for s in wanted}
         videos[serial] = {(s, 0): name for s, name in names.items() if (path / name).is_file()}
-        try:  # of a part that was not fetched, the timeline says what is missing
+        try:  # if only a part was not fetched, the timeline says what is missing
             check_links(*(path / name for name in names.values() if not videos[serial]))
         except CaptureError as error:
             dropped[serial] = str(error)
@@ -167,7 +167,7 @@ def actor_of(path: Path) -> str:
 
 
 def read_actor(path: Path, selection: Selection) -> RawCapture:
-    """Read an actor's clips; of a clip with and without sound the one with sound is taken.
+    """Read an actor's clips; a clip with sound is preferred to the same clip without.
 
     Raises:
         CaptureError: no clip can be used.

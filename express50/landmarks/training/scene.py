@@ -22,7 +22,7 @@ FRAME_SIDE_M = 0.38
 HIDING_M = 0.005  # what lies this far or less in front of a landmark does not hide it
 OPEN_RAYS, OPEN_M = 4, 0.08  # rays per vertex that measure the ambient light, and their length
 GLASSES_SHARE, NATURAL_SHARE = 0.25, 0.75
-LASHES_SHARE = 0.3  # of the heads that have lashes keep them: opaque ones are denser than real ones
+LASHES_SHARE = 0.3  # of the heads with lashes that keep them: opaque lashes look too dense
 RING = 24  # corners of a lens
 Rng = np.random.Generator
 
