@@ -105,12 +105,12 @@ def write_obj(
     faces: np.ndarray,
     uv: np.ndarray,
     uv_faces: np.ndarray,
-    texture: str | None = None,
+    texture: str | None,
 ) -> None:
     """Write an OBJ file of vertices (V, 3) and faces (F, 3) with texture coordinates.
 
-    The coordinates are ``uv`` (T, 2) and ``uv_faces`` (F, 3). ``texture`` is the file name of a
-    picture beside the OBJ; an .mtl file with the OBJ's name then refers to it.
+    The coordinates are ``uv`` (T, 2) and ``uv_faces`` (F, 3). ``texture`` may be the file
+    name of a picture beside the OBJ; an .mtl file with the OBJ's name then refers to it.
     """
     lines = []
     if texture is not None:

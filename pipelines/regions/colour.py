@@ -110,7 +110,7 @@ def label_by_colour(
     alpha: np.ndarray,
     geometry: HeadGeometry,
     bare: bool,
-    skin_colours: np.ndarray | None = None,
+    skin_colours: np.ndarray | None,
 ) -> np.ndarray:
     """Label pixels (H, W) uint8 by geometry, and hair, skin, ears, neck and torso by colour too.
 

@@ -77,7 +77,7 @@ def fit(
 
 
 def vertex_sigma(
-    basis: Basis, targets: list[Target], state: State, free: tuple[str, ...] = ()
+    basis: Basis, targets: list[Target], state: State, free: tuple[str, ...]
 ) -> np.ndarray:
     """Return standard deviations (E, V), metres, of all vertices under the fit's covariance.
 

@@ -78,7 +78,7 @@ class ClipTracker:
 
 
 def make_windows(
-    frames: Sequence[int], size: int = WINDOW, sweeps: int = SWEEPS
+    frames: Sequence[int], sweeps: int, size: int = WINDOW
 ) -> list[tuple[Sequence[int], Sequence[int]]]:
     """Cut frames into overlapping windows to fit, each with the frames that it alone keeps."""
     overlap = 2 * sweeps + 2
@@ -281,7 +281,7 @@ def write_clips(
     for cue in cues:
         frames = list(range(cue.start_frame, cue.end_frame + 1, tracker.stride))
         found: dict[int, Pose] = {}
-        windows = make_windows(frames, sweeps=tracker.sweeps)
+        windows = make_windows(frames, tracker.sweeps)
         for number, (fitted, kept) in enumerate(windows):
             file = folder / f"{cue.expression_id}_{number:04d}.npz"
             done = _read_window(file)

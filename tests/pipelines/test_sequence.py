@@ -101,7 +101,7 @@ def test_a_frozen_shape_is_the_same_head() -> None:
 
 @pytest.mark.parametrize(("count", "window", "sweeps"), [(1, 48, 2), (13, 4, 0), (50, 7, 3)])
 def test_every_frame_is_kept_by_one_window(count: int, window: int, sweeps: int) -> None:
-    windows = make_windows(range(100, 100 + count), window, sweeps)
+    windows = make_windows(range(100, 100 + count), sweeps, window)
     assert [frame for _, kept in windows for frame in kept] == list(range(100, 100 + count))
     assert all(set(kept) <= set(fitted) for fitted, kept in windows)
     for (before, _), (after, _) in zip(windows, windows[1:], strict=False):

@@ -101,7 +101,7 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def start_network(start: Path | None, parts: Sequence[str] = PARTS) -> LandmarkNet:
+def start_network(start: Path | None, parts: Sequence[str]) -> LandmarkNet:
     """Return a network with the given weights, ready to train some of its parts."""
     net = LandmarkNet(whole=True)
     if start is not None:
