@@ -192,7 +192,7 @@ def read_capture_toml(root: Path) -> dict:
     path = root / "capture.toml"
     check_links(path)
     table = read_toml(path, CaptureError) if path.is_file() else {}
-    return {key: plain(value) for key, value in table.items()}
+    return {key: dates_as_text(value) for key, value in table.items()}
 
 
 def check_identity(path: Path, subject: object, fps: object) -> None:
@@ -226,12 +226,12 @@ def check_focals(path: Path, given: Any) -> None:
             )
 
 
-def plain(value: object) -> object:
+def dates_as_text(value: object) -> object:
     """Convert dates in TOML content to text, so that it can go into JSON."""
     if isinstance(value, dict):
-        return {key: plain(one) for key, one in value.items()}
+        return {key: dates_as_text(one) for key, one in value.items()}
     if isinstance(value, list):
-        return [plain(one) for one in value]
+        return [dates_as_text(one) for one in value]
     return value if isinstance(value, str | int | float) else str(value)
 
 
@@ -295,7 +295,7 @@ def _read_board(root: Path, cameras: dict[str, RawCamera]) -> dict | None:
     config = read_toml(path, CaptureError)
     files = {name: image_names(folder / name) for name in cameras}
     return {
-        "config": plain(config),
+        "config": dates_as_text(config),
         "cameras": {k: [f"board/{k}/{name}" for name in v] for k, v in files.items() if v},
     }
 
