@@ -345,8 +345,12 @@ def missed(
     it, and whose colour is the surface's. Spots that the matte does not enclose must lie deeper in
     the hull than its corners stand out.
     """
-    lacking = evidence.solid & (view.alpha < INSIDE) & view.valid
-    depth = _inner_distance(evidence.solid)
+    solid = evidence.solid
+    lacking = solid & (view.alpha < INSIDE) & view.valid
+    # The image's borders are not edges of the solid.
+    depth = np.full(solid.shape, float(max(solid.shape)), np.float32)
+    if not solid.all():
+        depth = cv2.distanceTransform(solid.astype(np.uint8), cv2.DIST_L2, 5)
     deep = depth > MARGIN * max(lacking.shape)
     todo = lacking & (subject[view.name] | (depth > _corner_height(view, others) * depth.max()))
     alike = shows_surface(view, evidence, todo, others, subject)
@@ -360,14 +364,7 @@ def missed(
         filled = np.zeros_like(filled)
     left = float((lacking & deep & ~filled).sum()) / max(int(deep.sum()), 1)
     grown = cv2.dilate(filled.astype(np.uint8), np.ones((3, 3))) > 0
-    return grown & (evidence.solid | (view.alpha >= INSIDE)), left
-
-
-def _inner_distance(mask: np.ndarray) -> np.ndarray:
-    """Return the distance (h, w) of a mask's pixels to its edge; image borders are not edges."""
-    if mask.all():
-        return np.full(mask.shape, float(max(mask.shape)), np.float32)
-    return cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
+    return grown & (solid | (view.alpha >= INSIDE)), left
 
 
 def _corner_height(view: MatteView, others: Sequence[MatteView]) -> float:

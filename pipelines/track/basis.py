@@ -95,15 +95,15 @@ class Points:
     def __call__(self, parameters: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
         """Evaluate world positions (M, 3) for parameters (D,) about the rotation (3, 3)."""
         linear, pose = parameters[:-POSE_SIZE], parameters[-POSE_SIZE:]
-        rest, joints = self._rest(linear)[None], self._joints(linear)[None]
-        posed = skin(rest, joints, _joint_rotations(pose)[None], self.skinning, self.pose_dirs)[0]
+        rest, joints = self._at_rest(linear)
+        turns = _joint_rotations(pose)
+        posed = skin(rest[None], joints[None], turns[None], self.skinning, self.pose_dirs)[0]
         return posed @ (axis_angle_to_matrix(pose[12:15]) @ rotation).T + pose[15:]
 
-    def _rest(self, linear: torch.Tensor) -> torch.Tensor:
-        return self.template + self.directions @ linear
-
-    def _joints(self, linear: torch.Tensor) -> torch.Tensor:
-        return self.basis.joints + self.basis.joint_directions @ linear
+    def _at_rest(self, linear: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return vertices (M, 3) and joints (J, 3) for shape and expression, before posing."""
+        joints = self.basis.joints + self.basis.joint_directions @ linear
+        return self.template + self.directions @ linear, joints
 
     def evaluate(self, parameters: np.ndarray, rotation: np.ndarray) -> np.ndarray:
         """Evaluate positions (M, 3)."""
@@ -119,7 +119,7 @@ class Points:
         """
         values, about = torch.from_numpy(parameters), torch.from_numpy(rotation)
         linear, pose = values[:-POSE_SIZE], values[-POSE_SIZE:]
-        rest, joints = self._rest(linear), self._joints(linear)
+        rest, joints = self._at_rest(linear)
 
         turns = _joint_rotations(pose)
         turn, shift = joint_transforms(joints[None], turns[None])
