@@ -30,7 +30,7 @@ POSE, LENS = 6, 8  # unknowns of a camera: of its pose, and of the lens with the
 
 @dataclass(frozen=True)
 class BoardRig:
-    """Cameras in the rig's space (their `cam_from_world`), and rig_from_board (4, 4) a frame."""
+    """Cameras in the rig's space (their `cam_from_world`), and rig_from_board (4, 4) by frame."""
 
     cameras: dict[str, Camera]
     boards: dict[int, np.ndarray]
