@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from express50.geometry.conventions import cell_centres, cell_to_corner
+from express50.geometry.conventions import cell_centres, cell_to_corner, corner_to_cell
 from express50.geometry.sampling import smoothstep
 from express50.head.model import HeadModel, landmarks
 from express50.twin.body import Body, model_materials
@@ -47,8 +47,8 @@ def sample_skin(texture: SkinTexture, points: np.ndarray) -> np.ndarray:
     """Sample the texture (N, 4) bilinearly at places (N, 3) on the mean head."""
     height, width = texture.pixels.shape[:2]
     az, el = unit_to_spherical(points - texture.centre.astype(np.float32))
-    x = (az * np.float32(0.5 / np.pi) + np.float32(0.5)) * width - np.float32(0.5)
-    y = (el * np.float32(1.0 / np.pi) + np.float32(0.5)) * height - np.float32(0.5)
+    x = corner_to_cell((az * np.float32(0.5 / np.pi) + np.float32(0.5)) * width)
+    y = corner_to_cell((el * np.float32(1.0 / np.pi) + np.float32(0.5)) * height)
     y = np.clip(y, 0, np.float32(height - 1.01))
     return sample_panorama(texture.pixels, x, y)
 

@@ -24,6 +24,7 @@ from express50.files.atomic import write_json
 from express50.files.calibration import read_cameras, write_cameras
 from express50.files.images import write_image
 from express50.geometry.cameras import Camera, pinhole, unproject
+from express50.geometry.conventions import cell_to_corner
 from express50.rigs.world_frame import check_meeting, judge, meeting_point
 from pipelines.calibrate.board import BoardCorners, board_from_table, board_points, read_corners
 from pipelines.calibrate.board_rig import BoardSolution, solve_rig
@@ -411,7 +412,7 @@ def _draw_field(axes: Axes, solution: BoardSolution) -> None:
     full = np.flatnonzero(count >= 5)
     sums = [np.bincount(cell, solution.errors[:, i], minlength=cells**2) for i in range(2)]
     mean = np.stack(sums, axis=1)[full] / count[full, None]
-    at = (np.column_stack([full % cells, full // cells]) + 0.5) / cells
+    at = cell_to_corner(np.column_stack([full % cells, full // cells])) / cells
     longest = float(np.linalg.norm(mean, axis=1).max(initial=1e-9))
     axes.quiver(at[:, 0], at[:, 1], mean[:, 0], mean[:, 1], angles="xy", scale=longest * 12)
     axes.set_xlim(0, 1)

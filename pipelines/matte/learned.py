@@ -16,6 +16,7 @@ import numpy as np
 from scipy.sparse.linalg import LinearOperator, cg
 
 from express50.files.images import resize_area
+from express50.geometry.conventions import cell_centres
 from pipelines.networks import Network, Role
 
 BGMV2 = Role(setting="matte.weights", inputs=("src", "bgr"), outputs=("pha",))
@@ -233,8 +234,8 @@ def _join(whole: np.ndarray, piece: np.ndarray, start: int, end: int) -> None:
     """Write a piece into the columns from ``start``; it fades in over those before ``end``."""
     shared = end - start
     if shared > 0:
-        place = np.arange(shared) + 0.5
-        share = np.clip((place - shared / 4) / (shared / 2), 0, 1).astype(np.float32)
+        share = np.clip((cell_centres(shared) - shared / 4) / (shared / 2), 0, 1)
+        share = share.astype(np.float32)
         old = whole[:, start:end]
         new = piece[:, :shared]
         old[:] = np.where(share < 1, old + share * (new - old), new)

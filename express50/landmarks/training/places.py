@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import open3d as o3d
 
-from express50.geometry.conventions import corner_to_cell
+from express50.geometry.conventions import cell_to_corner, corner_to_cell
 from express50.geometry.raycast import barycentrics, mesh_scene
 from express50.geometry.transforms import similarity_fit
 from express50.head.load import load_head
@@ -119,7 +119,7 @@ class FaceFront:
             (mask > 127).view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
         )
         edge = max(found, key=len)[:, 0].astype(np.float64)
-        return (edge + 0.5 - shift) / scale + low
+        return (cell_to_corner(edge) - shift) / scale + low
 
 
 @lru_cache(maxsize=4)
