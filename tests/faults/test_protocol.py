@@ -34,6 +34,7 @@ SILENT = (
 )
 
 
+@pytest.mark.no_cover  # it would take twice as long, and the model is not the product
 @pytest.mark.parametrize("swaps", [True, False])
 def test_every_state_is_right(swaps):
     count, wrong, way = explore(Rules(swaps=swaps))
@@ -53,6 +54,7 @@ HARM = {
 }
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_every_mistake_is_found(mistake):
     _, wrong, way = explore(Rules(mistake, swaps="former" not in mistake))
