@@ -10,6 +10,7 @@ from typing import Any
 from express50.console import OK, add_command, answer, count, say, say_json
 from express50.contract.layout import existing_dataset
 from express50.errors import ConfigError, StageError
+from express50.head import BUILTIN_NAME
 
 FORMATS = ("gaussian-avatars", "obj", "ply", "glb")
 
@@ -61,8 +62,9 @@ def add_commands(subparsers: Any) -> None:
     )  # fmt: skip
     add = parser.add_argument
     add("out", type=Path, metavar="OUT", help="picture to write (.png or .jpg)")
-    words = "procedural, or the path of a FLAME, ICT-FaceKit or .npz model (default: procedural)"
-    add("--model", default="procedural", help=words)
+    words = f"{BUILTIN_NAME}, or the path of a FLAME, ICT-FaceKit or .npz model"
+    words += " (default: %(default)s)"
+    add("--model", default=BUILTIN_NAME, help=words)
     words = "directions to look from, degrees to the subject's left (default: 0,40,90)"
     add("--yaws", default="0,40,90", metavar="DEG,...", help=words)
     words = "side of a picture, pixels (default: 256)"

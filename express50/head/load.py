@@ -16,12 +16,12 @@ import numpy as np
 
 from express50.errors import HeadModelError
 from express50.files.arrays import read_arrays
+from express50.head import BUILTIN_NAME
 
 if TYPE_CHECKING:
     from express50.head.model import HeadModel
 
 BUILTIN = Path(__file__).with_name("builtin.npz")
-BUILTIN_NAME = "procedural"  # as commands and tracks name it; other head models are named by path
 # Arrays with the names and shapes of HeadModel's fields.
 FIELDS = (
     "template", "shape_dirs", "expression_dirs", "pose_dirs", "joint_regressor", "skinning",
@@ -29,8 +29,8 @@ FIELDS = (
     "expression_names",
 )  # fmt: skip
 _KINDS = (
-    '"procedural", a FLAME .pkl, an ICT-FaceKit checkout, an .npz of its arrays, or a stored head'
-    " model"
+    f'"{BUILTIN_NAME}", a FLAME .pkl, an ICT-FaceKit checkout, an .npz of its arrays, or a stored'
+    " head model"
 )
 
 

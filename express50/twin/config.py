@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from express50.contract.config import check_ranges
 from express50.errors import ConfigError
+from express50.head import BUILTIN_NAME
 
 KINDS = ("glasses", "hand", "beard", "moustache", "fringe", "microphone", "mask")
 """What a subject can wear or hold."""
@@ -15,7 +16,7 @@ KINDS = ("glasses", "hand", "beard", "moustache", "fringe", "microphone", "mask"
 class TwinConfig:
     """Settings of ``express50 twin record``; the same settings give the same bytes."""
 
-    head: str = "procedural"
+    head: str = BUILTIN_NAME
     "head model: procedural, or the path of a file; its expressions must have names"
     subjects: int = 4
     "number of subjects"

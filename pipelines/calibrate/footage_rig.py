@@ -306,10 +306,10 @@ def _weak(tracks: PointTracks) -> dict[str, str]:
 def mean_landmarks() -> np.ndarray:
     """Return the landmarks (68, 3) of the built-in mean head, metres, head space."""
     # Imported here: only rigs that come without any calibration need a head.
-    from express50.head.load import load_head
+    from express50.head.load import load_builtin
     from express50.head.model import landmarks
 
-    head = load_head("procedural")
+    head = load_builtin()
     return landmarks(head, head.template[None])[0].double().numpy()
 
 

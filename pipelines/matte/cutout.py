@@ -198,10 +198,10 @@ def _at_scale(view: CutView, factor: float) -> CutView:
 @cache
 def parts_of_a_person() -> dict[int, tuple[np.ndarray, ...]]:
     """Return convex parts (N, 3) of a person, head space, metres, by GrabCut label."""
-    from express50.head.load import load_head
+    from express50.head.load import load_builtin
     from pipelines.calibrate.footage_rig import mean_landmarks
 
-    vertices = load_head("procedural").template.double().numpy()
+    vertices = load_builtin().template.double().numpy()
     face = mean_landmarks()
     chin, bottom = float(face[8, 1]), float(vertices[:, 1].min())
     skull = vertices[vertices[:, 1] > chin]

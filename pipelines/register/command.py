@@ -7,6 +7,7 @@ from typing import Any
 
 from express50.contract.stage import Command
 from express50.errors import ConfigError
+from express50.head import BUILTIN_NAME
 
 
 def add_options(parser: Any) -> None:
@@ -17,8 +18,8 @@ def add_options(parser: Any) -> None:
         " landmark files beside them; DATASET is then the folder to write to; may be repeated",
     )  # fmt: skip
     parser.add_argument(
-        "--head", default="procedural", metavar="MODEL",
-        help="with --scan: head model to fit, as in track.head (default: procedural)",
+        "--head", default=BUILTIN_NAME, metavar="MODEL",
+        help="with --scan: head model to fit, as in track.head (default: %(default)s)",
     )  # fmt: skip
     parser.set_defaults(handler=run)
 
@@ -29,7 +30,7 @@ def run(args: Any) -> int:
         from pipelines.register.scan_files import run_scans
 
         return run_scans(args)
-    if args.head != "procedural":
+    if args.head != BUILTIN_NAME:
         raise ConfigError(
             f"--head {args.head} is for scans; a dataset's head model is track.head, so run"
             f" 'express50 track' with --set track.head={args.head}"

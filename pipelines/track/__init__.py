@@ -7,6 +7,7 @@ from pathlib import Path
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
 from express50.errors import ConfigError
+from express50.head import BUILTIN_NAME
 from pipelines.track.config import PRESETS, UV_WEIGHTS, VERSION, TrackConfig
 
 __all__ = ["STAGE"]
@@ -37,7 +38,7 @@ def _setting_files(config: TrackConfig) -> dict[str, Path]:
     from express50.landmarks import source_files
 
     found = source_files(config.landmarks)
-    if config.head != "procedural":
+    if config.head != BUILTIN_NAME:
         found["head"] = Path(config.head).expanduser()
     for name, setting in (("head", "head"), ("landmarks", "landmarks"), ("fan", "landmarks")):
         if name in found and not found[name].exists():
@@ -53,7 +54,7 @@ def try_files(config: TrackConfig) -> None:
     from express50.landmarks import EMBEDDED
 
     _setting_files(config)
-    if config.head != "procedural":
+    if config.head != BUILTIN_NAME:
         from express50.head.load import load_head
 
         load_head(config.head)

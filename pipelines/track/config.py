@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from express50.contract.config import check_ranges
+from express50.head import BUILTIN_NAME
 
 VERSION = 25
 UV_WEIGHTS = Path(__file__).with_name("face_uv_weights.npz")
@@ -16,7 +17,7 @@ UV_WEIGHTS = Path(__file__).with_name("face_uv_weights.npz")
 class TrackConfig:
     """Settings that trade time for accuracy or select the frames to track."""
 
-    head: str = "procedural"
+    head: str = BUILTIN_NAME
     """Head model: procedural, the path of a FLAME pickle, or of ICT-FaceKit."""
     landmarks: str = "embedded"
     """Source of landmarks: embedded, fan:PATH of FAN's TorchScript weights, or the path of a file

@@ -17,7 +17,7 @@ import open3d as o3d
 from express50.geometry.conventions import cell_to_corner, corner_to_cell
 from express50.geometry.raycast import barycentrics, mesh_scene
 from express50.geometry.transforms import similarity_fit
-from express50.head.load import load_head
+from express50.head.load import load_builtin
 from express50.head.model import HeadModel, landmarks
 
 INSIDE = (
@@ -63,7 +63,7 @@ class FaceFront:
 
     def __init__(self, model: HeadModel) -> None:
         """Find the part; other head models take its limits from the built-in one."""
-        builtin = load_head("procedural")
+        builtin = load_builtin()
         region = {name: mask.numpy() for name, mask in builtin.regions.items()}
         front = region["face"] & ~region["nose"] & ~region["lips"]
         rest = model.template.double().numpy()

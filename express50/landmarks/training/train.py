@@ -24,6 +24,7 @@ import torch
 from torch.nn import functional
 
 from express50.contract.config import field_documents
+from express50.head import BUILTIN_NAME
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.landmarks import WEIGHTS
@@ -92,7 +93,7 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error("--parts needs --start, the weights of the other parts")
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    models = [load_head(spec) for spec in ("procedural", options.ict) if spec]
+    models = [load_head(spec) for spec in (BUILTIN_NAME, options.ict) if spec]
     plan = TrainingPlan(**{name: getattr(options, name) for name in words})
     net = train(models, plan, options.views, options.start, options.parts)
     for name in set(options.parts) & set(CLOSE_UPS):

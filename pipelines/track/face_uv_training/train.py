@@ -21,6 +21,7 @@ import torch
 from express50.errors import FormatError
 from express50.geometry.conventions import corner_to_cell
 from express50.geometry.sampling import bilinear
+from express50.head import BUILTIN_NAME
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.landmarks.network import WEIGHTS as START
@@ -92,7 +93,7 @@ def main(arguments: list[str] | None = None) -> int:
     except FormatError as error:
         parser.error(f"--start {error}")
     cv2.setNumThreads(1)
-    models = [load_head(spec) for spec in ("procedural", options.ict) if spec]
+    models = [load_head(spec) for spec in (BUILTIN_NAME, options.ict) if spec]
     plan = UvTrainingPlan(steps=options.steps, files=options.files, seed=options.seed)
     save_network(train(models, plan, options.cases, options.start), options.out)
     net = load_network(options.out)
