@@ -346,6 +346,8 @@ def run_agree(args: argparse.Namespace) -> int:
         return answer(args, data, "no expression was marked by two people yet")
     groups = {"all": overall} | pairs | expressions
     lines = table(("of", *_FIGURES), [{"of": name} | row for name, row in groups.items()])
+    if any(row["alpha"] is None for row in groups.values()):
+        lines.append("alpha is n/a (-) for one clip alone, and where all marks are at one time")
     interval = overall["alpha_interval"] or "n/a (too few clips)"
     return answer(args, data, *lines, f"Krippendorff's alpha of all, 95 % interval: {interval}")
 

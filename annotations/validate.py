@@ -251,7 +251,10 @@ def clip_times(clip: MarkedClip) -> np.ndarray:
 
 
 def interval_alpha(units: Sequence[np.ndarray]) -> float | None:
-    """Compute Krippendorff's alpha with the interval metric; None where all values are the same.
+    """Compute Krippendorff's alpha with the interval metric.
+
+    None where it is undefined: all values are the same, or there is one unit alone, whose spread
+    is also the expected one.
 
     The mean squared difference of all pairs of values is twice their variance, which gives a closed
     form without the coincidence matrix (K. Krippendorff, Content Analysis, 2004, chapter 11).
@@ -261,7 +264,7 @@ def interval_alpha(units: Sequence[np.ndarray]) -> float | None:
     """
     values = np.concatenate(units)
     expected = 2.0 * values.var(ddof=1)
-    if expected < _NO_SPREAD:
+    if len(units) < 2 or expected < _NO_SPREAD:
         return None
     observed = sum(len(unit) * 2.0 * unit.var(ddof=1) for unit in units) / len(values)
     return float(1.0 - observed / expected)

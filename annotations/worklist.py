@@ -7,7 +7,15 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from statistics import median
 
-from annotations.labels import Label, current_labels, is_person, labels_of, origin, read_labels
+from annotations.labels import (
+    Label,
+    current_labels,
+    is_person,
+    labels_of,
+    origin,
+    read_labels,
+    voices,
+)
 from annotations.suggestions import read_suggestions, reference_subject
 from express50.capture.demographics import age_counts, gender_counts, shown_counts
 from express50.capture.index import read_index
@@ -120,17 +128,22 @@ def progress(dataset: Dataset, subject: str) -> dict[str, object]:
 
 
 def effort(dataset: Dataset) -> dict[str, dict[str, object]]:
-    """Sum each person's effort over all subjects; marks and flags that were undone count too."""
+    """Count each person's labels in force; their time and keys include what was undone."""
     spent: dict[str, list[Label]] = defaultdict(list)
+    force: dict[str, list[Label]] = defaultdict(list)
     for subject in dataset.subjects():
-        for label in read_labels(dataset, subject):
+        events = read_labels(dataset, subject)
+        for label in events:
             if is_person(label.annotator) and label.action in ("mark", "flag"):
                 spent[label.annotator].append(label)
+        for own in voices(events).values():
+            for who, label in own.items():
+                force[who].append(label)
     figures: dict[str, dict[str, object]] = {}
     for who, labels in sorted(spent.items()):
-        followed = [x.frame == x.suggested for x in labels if x.suggested is not None]
+        followed = [x.frame == x.suggested for x in force[who] if x.suggested is not None]
         figures[who] = {
-            "labels": len(labels),
+            "labels": len(force[who]),
             "seconds_median": _median(x.seconds for x in labels),
             "seconds_total": round(sum(x.seconds or 0.0 for x in labels), 1),
             "keys_median": _median(x.keys for x in labels),

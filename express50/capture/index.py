@@ -241,7 +241,7 @@ def check_peak(index: Index, expression: str, peak: Peak) -> None:
     """Check that a label's frame matches the index.
 
     Raises:
-        CaptureError: time stamp or hash differ, so the label was made on other footage.
+        CaptureError: time stamp or hash differ, so footage or label have changed.
     """
     source = index.cameras.get(peak.camera)
     there = source is not None and 0 <= peak.frame < source.frames
@@ -249,8 +249,9 @@ def check_peak(index: Index, expression: str, peak: Peak) -> None:
     if found != (peak.pts, peak.dhash):
         raise CaptureError(
             f"{index.subject}/{expression}: frame {peak.frame} of {peak.camera} has time and hash "
-            f"{found}, but the label has {(peak.pts, peak.dhash)}; the footage changed since it "
-            "was labelled: run 'express50 align' again"
+            f"{found}, but the label has {(peak.pts, peak.dhash)}; the footage or the "
+            "label has changed: run 'express50 align' again; if that does not help, see 'express50 "
+            "annotate validate'"
         )
 
 

@@ -57,6 +57,8 @@ def test_status_counts_people_rules_and_flags(annotate):
     row = status["subjects"][0]
     assert (row["by_person"], row["flagged"], row["expressions"]) == (1, 1, len(EXPRESSIONS))
     assert status["annotators"]["ann"]["labels"] == 2
+    annotate("undo", "S001", "smile", "--annotator", "ann")
+    assert annotate("status")["annotators"]["ann"]["labels"] == 1
 
 
 def test_agree_measures_and_review_settles_without_losing_labels(annotate):
@@ -95,6 +97,7 @@ def test_alpha_is_krippendorffs_on_time_within_the_clip():
     ]
     assert agreement(far)["alpha"] < 0  # frame numbers alone would say nearly 1
     assert agreement([])["alpha"] is None
+    assert agreement(far[:1])["alpha"] is None  # its spread is also the expected one
 
 
 @pytest.mark.parametrize("ending", ["csv", "json"])
@@ -293,7 +296,7 @@ def test_reference_is_the_first_unless_chosen(annotate):
         ("status", [["S001", "3", "1", "0", "0", "0", "-"], ["ann", "1", "-", "0.0", "-", "1.0"]]),
         ("labels", [["S001", "smile", "frame", "14", "ann"]]),
         ("coverage", [["S001", "1", "0", "0", "0", "2"], ["S002", "0", "0", "0", "0", "3"]]),
-        ("agree", [["all", "1", "0.0", "0.0", "1.0", "4.0", "0.0", "0.0"]]),
+        ("agree", [["all", "1", "0.0", "0.0", "1.0", "4.0", "0.0", "-"]]),
         ("suggest", [["S001", "smile", "14", "0.2", "peak"]]),
         ("next", [["S001", "neutral", "0.10"], ["S002", "smile", "1.00"]]),
     ],
