@@ -34,6 +34,13 @@ REMEDIES = {
     errno.EDQUOT: "free some space, your quota is used up",
 }
 
+# Words of a figure's name as readers write them; units go to its end.
+UNITS = {"db": "dB", "mm": "mm", "m": "m", "px": "px", "gib": "GiB"}
+SPELLINGS = {
+    "psnr": "PSNR", "ssim": "SSIM", "rmse": "RMSE", "lpips": "LPIPS", "fid": "FID", "iou": "IoU",
+    "heldout": "held-out",
+}  # fmt: skip
+
 
 class _HelpFormatter(argparse.RawDescriptionHelpFormatter):
     """Keeps the lines of descriptions, wraps long ones, and aligns lists of sub-commands."""
@@ -258,6 +265,17 @@ def count(number: float, noun: str) -> str:
     """Return a number with its noun: ``1 file``, ``2 files``, ``0 files``, ``1.5 files``."""
     words = f"{number:,}" if isinstance(number, int) else f"{number:.6g}"
     return f"{words} {noun}" + ("" if number == 1 else "s")
+
+
+def figure_label(name: str) -> str:
+    """Return a figure's name for readers; "train.psnr_db" is "train: PSNR, dB"."""
+    parts = []
+    for part in name.split("."):
+        words = part.split("_")
+        units = [UNITS[word] for word in words if word in UNITS]
+        text = " ".join(SPELLINGS.get(word, word) for word in words if word not in UNITS)
+        parts.append(", ".join([text, *units]))
+    return ": ".join(parts)
 
 
 def format_table(header: list[str], rows: list[list[str]]) -> Iterator[str]:

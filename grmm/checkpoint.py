@@ -5,6 +5,7 @@ Writes are atomic. Reads use ``weights_only``, so nothing in a checkpoint is exe
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,11 +16,12 @@ import torch
 from torch import Tensor
 
 from express50.errors import ConfigError, FormatError, HeadModelError
-from express50.files.arrays import read_weights
+from express50.files.arrays import DAMAGE, read_weights
 from express50.files.atomic import write_with
 from express50.files.text import reason
 from express50.geometry.shapes import PIXEL_LIMIT, check_shape
-from express50.head.load import BUILTIN_NAME, load_head
+from express50.head import BUILTIN_NAME
+from express50.head.load import load_head
 from express50.head.model import HeadModel
 from grmm.config import Config, ModelConfig, as_tables, from_tables
 from grmm.data import NO_OFFSETS, HeadViews, Source, Tracked, check_tracked, stacked
@@ -185,7 +187,7 @@ def read_content(path: Path) -> dict[str, Any]:
     """Read the tables of a checkpoint as they were saved.
 
     Raises:
-        FormatError: no such file, or not a checkpoint of this format.
+        FormatError: no such file, not a checkpoint of this format, or bytes in it have changed.
     """
     remedy = "name the checkpoint.pt of 'grmm train' or 'grmm fit'; if it is damaged, copy it again"
     remedy += " or make it again with --overwrite"
@@ -193,6 +195,16 @@ def read_content(path: Path) -> dict[str, Any]:
     found = content.get("format") if isinstance(content, dict) else None
     if found != FORMAT:
         raise FormatError(f"{path}: format is {found!r}, expected {FORMAT!r}")
+    try:  # torch writes a CRC-32 per tensor, but does not compare it
+        with zipfile.ZipFile(path) as archive:
+            changed = archive.testzip()
+    except DAMAGE as error:
+        changed = reason(error)
+    if changed:
+        raise FormatError(
+            f"{path}: its bytes changed after it was written (CRC-32, {changed}); copy it again"
+            " or make it again with --overwrite"
+        )
     return content
 
 

@@ -16,8 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from express50.console import log
 from express50.contract.segmentation_labels import TORSO
-from express50.errors import FormatError
+from express50.errors import FormatError, TrainError, few
+from express50.geometry.sampling import evenly
 from express50.geometry.transforms import make_transform
 from express50.head.model import HeadModel, pose
 from grmm.config import DataConfig
@@ -26,6 +28,7 @@ from grmm.model import HeadState, PinholeView, Rendering
 
 NO_OFFSETS = np.zeros((0, 3), np.float32)
 CACHE_BYTES = 512 << 20  # of decoded samples: a few hundred of 512 px
+LOOKED_AT = 64  # mattes before training: decoding those of a large dataset takes minutes
 DEFAULTS = DataConfig()  # black behind the head
 Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
@@ -306,6 +309,24 @@ class HeadViews:
                 )
         check_tracked(where, sample.place.tracked, self.head)
         return sample
+
+    def check_mattes(self, indices: Sequence[int]) -> None:
+        """Look at the mattes of some views, evenly spread, and log which are empty.
+
+        Raises:
+            TrainError: all of them are empty.
+        """
+        looked = evenly(indices, LOOKED_AT)
+        empty = [self._where(i) for i in looked if not bool(self.item(i).mask.any())]
+        if not empty:
+            return
+        words = (
+            f"the mattes of {len(empty)} of {len(looked)} views are empty ({few(empty)});"
+            " check them with 'express50 report' and pack again, or give other views"
+        )
+        if len(empty) == len(looked):
+            raise TrainError(words)
+        log(words)
 
     def _where(self, index: int) -> str:
         key = self.keys[index]

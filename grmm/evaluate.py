@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from express50.console import count
+from express50.console import figure_label, format_table
 from express50.contract.segmentation_labels import label_mask
 from express50.errors import FormatError, TrainError, few
 from express50.files.atomic import write_bytes, write_json
@@ -285,10 +285,16 @@ def write_evaluation(
 
 
 def summary_lines(summary: dict) -> list[str]:
-    """Format a summary for a terminal: one line per kind, then the metrics that are n/a."""
-    names = ("psnr_db", "psnr_head_db", "ssim", "rmse", "lpips")
-    lines = []
-    for kind, numbers in (summary["by_kind"] or {"all": summary}).items():
-        values = "  ".join(f"{name} {numbers[name]}" for name in names if is_number(numbers[name]))
-        lines.append(f"{kind} ({count(numbers['images'], 'image')}): {values}")
-    return lines + [f"{k}: {summary[k]}" for k in ("lpips", "fid") if "n/a" in str(summary[k])]
+    """Format a summary for a terminal: a row per kind, then the metrics that are n/a."""
+    names = ["images", "psnr_db", "psnr_head_db", "ssim", "rmse", "lpips"]
+    kinds = summary["by_kind"] or {"all": summary}
+    names = [name for name in names if any(is_number(row[name]) for row in kinds.values())]
+    rows = [
+        [kind, *(str(row[name]) if is_number(row[name]) else "n/a" for name in names)]
+        for kind, row in kinds.items()
+    ]
+    missing = [name for name in ("lpips", "fid") if "n/a" in str(summary[name])]
+    return [
+        *format_table(["views", *map(figure_label, names)], rows),
+        *(f"{figure_label(name)}: {summary[name]}" for name in missing),
+    ]

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from express50.console import log
+from express50.console import figure_label, log
 from express50.errors import TrainError
 from express50.files.atomic import check_space, write_json
 from express50.geometry.sampling import evenly
@@ -144,11 +144,7 @@ def start(loaded: Checkpoint, views: HeadViews, given: list[int]) -> FitState:
             f"got views of {len(subjects)} subjects ({', '.join(subjects) or 'none'}), "
             "expected one; check --subject, --expression and --cameras"
         )
-    if not any(bool(views.item(i).mask.any()) for i in given):
-        raise TrainError(
-            f"{subjects[0]}: the mattes of the given views are empty; check them with 'express50"
-            " report' and pack again, or give other views"
-        )
+    views.check_mattes(given)
     model = loaded.model
     codes = model.z_exp.detach()
     known = dict(zip(model.expressions, codes, strict=True))
@@ -319,7 +315,8 @@ def _scores(state: FitState, held_out: Sequence[int]) -> Scores:
         name: mean(evaluate(state.views, evenly(indices, LOOKED_AT), state.render), "psnr_db")
         for name, indices in chosen.items()
     }
-    log("fit: " + "  ".join(f"{k} {v}" for k, v in scores.items() if v is not None))
+    shown = [f"{figure_label(k)}: {v}" for k, v in scores.items() if v is not None]
+    log(f"fit: {'; '.join(shown)}")
     return scores
 
 

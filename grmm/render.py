@@ -39,6 +39,8 @@ Sheet = tuple[list[list[np.ndarray]], list[str], list[str]]
 COLUMNS = "footage, refined, drawn, depth, error times four"  # of comparison sheets
 STEPS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 TURNS = {"neck, yaw": ("neck.1", 0.35), "eyes, yaw": ("eyes", 0.4)}  # radians of a step of 1
+CONTROL_ROWS = 9  # most rows of `control_sheet`
+SHEET_LIMIT = 65_000  # pixels; a JPEG has at most 65,500 per side
 JAW_OPEN = 0.35  # radians
 DEVIATIONS = 1.5  # standard deviations a step of 1 moves a code
 

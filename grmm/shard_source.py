@@ -16,6 +16,7 @@ from express50.files.digests import text_digest
 from express50.shards.reader import ShardReader
 from grmm.data import Place, Sample, SampleKey, Tracked
 
+FOCALS = 0.05, 1e4  # least and largest focal length, sides of the picture: 168 to 0.006 degrees
 INSET_PX = 2  # of the footage's border, which undistortion cannot fill
 SIZES: dict[str, tuple[int, ...] | None] = {  # of what is tracked; None: any vector
     "shape": None, "expression": None, "neck": (3,), "jaw": (3,), "eyes": (6,), "R": (3, 3),
@@ -80,14 +81,22 @@ class ShardSource:
         return self._place(index, self.reader.meta(index))
 
     def _place(self, index: int, meta: dict) -> Place:
-        where = f"{self.reader.root}: {self.reader.entries[index].key}"
+        entry = self.reader.entries[index]
+        where = f"{self.reader.root / entry.shard}: {entry.key}"
         if meta.get("head") != self.head:
             raise FormatError(
                 f"{where}: tracked with head model {meta.get('head')!r}, the first sample with "
                 f"{self.head!r}; train on one of them: pack them into different folders"
             )
-        rows, columns, _ = seen_window(meta, where)
+        rows, columns, size = seen_window(meta, where)
         K = _matrix(meta, "K", (3, 3), where)
+        low, high = (factor * max(size) for factor in FOCALS)
+        fits = ((low < K.diagonal()[:2]) & (K.diagonal()[:2] < high)).all()
+        if not fits or (abs(K) > high).any() or K[1, 0] or (K[2] != (0, 0, 1)).any():
+            raise FormatError(
+                f"{where}: K is {K.tolist()}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with"
+                f" fx and fy of {low:g} to {high:g} px; correct the cameras and pack again"
+            )
         K[:2, 2] -= columns.start, rows.start
         return Place(
             K=K,

@@ -91,6 +91,7 @@ def train(
     config = with_map_size(config, views)
     state = prepare(views, config, rank, world)
     state.own_terms = own_terms
+    views.check_mattes(state.training)
     checkpoint = out / "checkpoint.pt"
     if resume:
         restore(state, checkpoint, config, device)

@@ -11,7 +11,7 @@ import jinja2
 import matplotlib as mpl
 from markupsafe import Markup
 
-from express50.console import format_seconds
+from express50.console import figure_label, format_seconds
 from express50.contract.layout import Dataset
 from express50.contract.stage import stages, typical_error
 from express50.errors import CaptureError, FormatError
@@ -35,12 +35,6 @@ PANELS = 4
 BARS, BINS = 200, 40  # most bars of a panel
 VIDEO_LIMIT = 8_000_000  # bytes
 INK = "#2457a6"
-# Words of a figure's name as readers write them; units go to its end.
-UNITS = {"db": "dB", "mm": "mm", "m": "m", "px": "px", "gib": "GiB"}
-SPELLINGS = {
-    "psnr": "PSNR", "ssim": "SSIM", "rmse": "RMSE", "lpips": "LPIPS", "fid": "FID", "iou": "IoU",
-    "heldout": "held-out",
-}  # fmt: skip
 
 
 def render_page(dataset: Dataset, title: str | None = None) -> str:
@@ -103,7 +97,7 @@ def _stage_view(dataset: Dataset, stage: str, receipts: list[Receipt]) -> dict:
         "noted": _reasons(metrics, "warnings"),
         "error": typical_error(metrics.values()) or "n/a",
         "seconds": number(round(sum(r.seconds for r in receipts), 1)),
-        "columns": [_label(column) for column in columns],
+        "columns": [figure_label(column) for column in columns],
         "rows": [
             {"item": item, "cells": [number(row.get(c)) for c in columns]} for item, row in shown
         ],
@@ -137,7 +131,7 @@ def _cards(dataset: Dataset, views: list[dict], summary: dict) -> list[dict[str,
         cards["minutes in total"] = f"{sum(seconds.values()) / 60:.1f}"
     for key in ("train.psnr_heldout_view_db", "fit.psnr_db", "peak_memory_gib"):
         if summary.get(key) is not None:
-            cards[_label(key)] = summary[key]
+            cards[figure_label(key)] = summary[key]
     return [{"label": label, "value": number(value)} for label, value in cards.items()]
 
 
@@ -171,7 +165,7 @@ def _rows(table: dict, prefix: str = "") -> list[dict[str, str]]:
     """Flatten a nested table of figures into rows of label and value; lists are left out."""
     rows: list[dict[str, str]] = []
     for key, value in table.items():
-        label = f"{prefix}{_label(key)}"
+        label = f"{prefix}{figure_label(key)}"
         if isinstance(value, dict):
             rows += _rows(value, f"{label}: ")
         elif not isinstance(value, list):
@@ -213,17 +207,6 @@ def _words(name: str) -> str:
     return name.replace("_", " ")
 
 
-def _label(name: str) -> str:
-    """Return a figure's name for readers; "train.psnr_db" is "train: PSNR, dB"."""
-    parts = []
-    for part in name.split("."):
-        words = part.split("_")
-        units = [UNITS[word] for word in words if word in UNITS]
-        text = " ".join(SPELLINGS.get(word, word) for word in words if word not in UNITS)
-        parts.append(", ".join([text, *units]))
-    return ": ".join(parts)
-
-
 def number(value: object) -> str:
     """Format a figure for readers; n/a if it was not measured."""
     if value is None:
@@ -260,7 +243,7 @@ def _metric_bars(figures: dict[str, dict[str, float]], columns: list[str]) -> Ma
         else:  # bars narrower than a pixel, and megabytes of them
             axes.hist(values, bins=BINS, color=INK)
             axes.set_ylabel("items", fontsize=7)
-        axes.set_title(_label(column), fontsize=9)
+        axes.set_title(figure_label(column), fontsize=9)
         axes.spines[["top", "right"]].set_visible(False)
     figure.tight_layout()
     return _svg(figure)

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from express50.console import OK, answer, log, say
+from express50.console import OK, answer, figure_label, log, say
 from express50.contract.config import config_toml, known_assignments
 from express50.errors import ConfigError, check_known
 from express50.files.atomic import write_bytes, write_json
@@ -49,7 +49,7 @@ def train(args: argparse.Namespace) -> int:
         return OK
     names = ("psnr_heldout_view_db", "psnr_train_db", "ssim", "iterations", "gaussians")
     values = {name: metrics.get(name) for name in names}
-    lines = [f"{name}: {'n/a' if value is None else value}" for name, value in values.items()]
+    lines = [f"{figure_label(k)}: {'n/a' if v is None else v}" for k, v in values.items()]
     return answer(args, metrics, *lines, f"wrote {args.out / 'checkpoint.pt'}")
 
 
@@ -125,7 +125,8 @@ def fit(args: argparse.Namespace) -> int:
     rest = sorted({*select(views.keys, args.subject, args.expression, "*")} - {*given})
     metrics = fit(loaded, views, given, rest, args.out)
     reached = f"{metrics['seconds']} s, {metrics['iterations']} iterations"
-    line = f"psnr_db: {metrics['psnr_db']} ({metrics['psnr_is_of']}), after {reached}"
+    psnr = f"{figure_label('psnr_db')}: {metrics['psnr_db']}"
+    line = f"{psnr} ({metrics['psnr_is_of']}), after {reached}"
     return answer(args, metrics, line, f"wrote {args.out}")
 
 
@@ -142,9 +143,15 @@ def render(args: argparse.Namespace) -> int:
     clips = render.read_clips(args.drive, args.drive_cue) if args.drive else None
     view = render.camera_of(loaded, args.camera, args.size)
     view = render.orbit(view, args.yaw, model.head_centre, args.pitch)
-    args.out.mkdir(parents=True, exist_ok=True)
-    write_image(args.out / "picture.png", render.picture(loaded, head, view))
-    say(f"wrote {args.out / 'picture.png'}")
+    subjects, expressions = model.subjects[:8], model.expressions[: args.columns]
+    columns = max(args.samples, len(expressions))
+    rows = max(len(subjects), render.CONTROL_ROWS if args.controls else 0)
+    if max(columns * view.width, rows * view.height) > render.SHEET_LIMIT:
+        raise ConfigError(
+            f"a sheet of {columns} x {rows} pictures of {view.width} x {view.height} px is larger"
+            f" than {render.SHEET_LIMIT} px; lower --size, --samples or --columns"
+        )
+    # Whatever may fail comes before the first file; videos are drawn as they are written.
     videos: dict[str, Any] = {}
     rates: dict[str, float] = {}
     if args.turntable:
@@ -153,10 +160,8 @@ def render(args: argparse.Namespace) -> int:
         end = _frame_head(loaded, args.to, args.expression)
         videos["interpolation"] = render.interpolation(loaded, head, end, view, args.frames)
     if clips is not None:
+        render.check_clips(loaded, clips)
         videos["driven"], rates["driven"] = render.driven(loaded, head, clips, view), clips.rate
-    for name, frames in videos.items():
-        render.write_video(args.out / f"{name}.mp4", frames, rates.get(name, RIG_RATE))
-        say(f"wrote {args.out / name}.mp4")
     sheets: dict[str, Any] = {}
     if args.views:
         sheets["views"] = render.novel_views(loaded, head, view)
@@ -170,8 +175,14 @@ def render(args: argparse.Namespace) -> int:
         sheets["samples"] = render.sample_sheet(
             loaded, head, view, args.samples, args.seed, args.spread
         )
-    expressions = model.expressions[: args.columns]
-    sheets["grid"] = render.expression_grid(loaded, model.subjects[:8], expressions, view)
+    sheets["grid"] = render.expression_grid(loaded, subjects, expressions, view)
+    picture = render.picture(loaded, head, view)
+    args.out.mkdir(parents=True, exist_ok=True)
+    write_image(args.out / "picture.png", picture)
+    say(f"wrote {args.out / 'picture.png'}")
+    for name, frames in videos.items():
+        render.write_video(args.out / f"{name}.mp4", frames, rates.get(name, RIG_RATE))
+        say(f"wrote {args.out / name}.mp4")
     for name, sheet in sheets.items():
         render.write_sheet(args.out / f"{name}.jpg", *sheet)
         say(f"wrote {args.out / name}.jpg")

@@ -33,6 +33,16 @@ def test_checkpoint_is_read_with_weights_only_and_damage_is_named(tmp_path):
         load_checkpoint(path)
 
 
+def test_a_flipped_bit_in_the_weights_is_named(path):
+    load_checkpoint(path)
+    whole, name = path.read_bytes(), "colour.bias"
+    weights = load_checkpoint(path).model.state_dict()[name].numpy().tobytes()
+    place = whole.index(weights) + len(weights) // 2
+    path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+    with pytest.raises(FormatError, match=r"checkpoint.pt: its bytes changed .* copy it again"):
+        load_checkpoint(path)
+
+
 def test_shards_of_another_head_model_are_refused(path, source, monkeypatch):
     loaded = load_checkpoint(path)
     loaded.views(source)

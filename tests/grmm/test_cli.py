@@ -1,5 +1,6 @@
 import csv
 import json
+import re
 import subprocess
 import sys
 
@@ -68,7 +69,7 @@ def test_train_sees_the_training_split_only(checkpoint):
 def test_training_again_goes_on_and_refuses_what_differs(shards, tmp_path, capsys):
     train = ["train", str(shards), str(tmp_path), *TINY]
     assert main(train) == 0
-    assert "psnr_heldout_view_db: n/a\n" in capsys.readouterr().out
+    assert "PSNR held-out view, dB: n/a\n" in capsys.readouterr().out
 
     assert main(train) == 0
     assert "has all of its 3 iterations; to train on, raise" in capsys.readouterr().err
@@ -131,14 +132,16 @@ def test_who_is_no_stranger_or_is_left_out_is_said(checkpoint, shards, tmp_path,
     assert main(evaluate) == 0
     said = capsys.readouterr()
     assert "left out S002, whom training did not see" in said.err
-    assert "(1 image): psnr_db" in said.out
+    header, row, *_ = said.out.splitlines()
+    assert header.split()[:4] == ["views", "images", "PSNR,", "dB"] and row.split()[2] == "1"
 
 
 def test_a_summary_names_a_metric_that_is_missing_once():
     row = dict.fromkeys(NUMBERS, 1.0) | dict.fromkeys(IDS, "")
     lines = summary_lines(summarise([row]))
-    assert lines[0].startswith("all (1 image): psnr_db 1.0")
-    assert sum("lpips" in line for line in lines) == 1
+    assert lines[0] == "views  images  PSNR, dB  PSNR head, dB  SSIM  RMSE"
+    assert lines[1].split() == ["all", "1", *["1.0"] * 4] and len(lines) == 4
+    assert [line.split(": n/a: ")[0] for line in lines[2:]] == ["LPIPS", "FID"]
 
 
 def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
@@ -180,6 +183,9 @@ def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
         (["render", "{out}/absent.pt", "{out}"], 1, "absent.pt: no such file"),
         (["render", "{shards}", "{out}"], 1, "is a folder, expected a file"),
         (["render", "{checkpoint}", "{out}", "--subject=S9"], 2, "no subject 'S9'"),
+        (["render", "{checkpoint}", "{out}", "--samples=3000"], 2,
+         "3000 x 2 pictures of 32 x 32 px is larger than 65000 px; lower --size, --samples"),
+        (["render", "{checkpoint}", "{out}", "--to=S000/e9"], 2, "e9"),
         (["export", "{checkpoint}", "{out}/head.obj"], 2, "expected one of .html, .ply, .spz"),
         (["export", "{checkpoint}", "{out}/head.html", "--format=splats"], 2,
          "--format splats writes .glb"),
@@ -194,6 +200,7 @@ def test_errors_are_one_line_and_set_the_exit_code(
     assert main([a.format(**names) if "{" in a else a for a in arguments]) == code
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert message in error and error.startswith("grmm: ")
+    assert list(tmp_path.iterdir()) == [], "nothing is left half made"
 
 
 @pytest.mark.parametrize(
@@ -278,6 +285,23 @@ def test_samples_without_a_head_model_are_refused(tmp_path):
     writer.close()
     with pytest.raises(FormatError, match="meta names no head model"):
         ShardSource(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "K",
+    [np.zeros((3, 3)), np.eye(3), -np.eye(3), np.diag([40.0, 1e30, 1.0]), np.diag([40.0, 40, 2])],
+    ids=["zero", "unit", "negative", "huge", "scaled"],
+)
+def test_impossible_camera_matrices_are_named(tmp_path, K):
+    sample = packed(EllipsoidSource(size=32), 0)
+    meta = json.loads(sample.members["meta.json"]) | {"K": K.tolist()}
+    members = dict(sample.members) | {"meta.json": json.dumps(meta).encode()}
+    writer = ShardWriter(tmp_path, 1 << 24)
+    writer.add_group("train", [PackedSample("S000", "e0", "cam00", members)])
+    writer.close()
+    words = rf"train-000000.tar: S000_e0_cam00: K is {re.escape(str(K.tolist()))}, expected"
+    with pytest.raises(FormatError, match=words):
+        ShardSource(tmp_path).place(0)
 
 
 def test_mixed_head_models_are_refused(tmp_path):

@@ -2,6 +2,7 @@ import io
 import json
 import math
 import os
+import re
 import signal
 import time
 from dataclasses import replace
@@ -147,6 +148,23 @@ def test_training_on_a_full_disk_stops_at_once(tmp_path, source, monkeypatch, ca
     with pytest.raises(DiskFullError):
         train(source, ellipsoid_head(), tmp_path, tiny_config(train={"iterations": 25}))
     assert "iteration 20" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("empty", [1, 12])
+def test_empty_mattes_are_named_before_training(tmp_path, source, monkeypatch, capsys, empty):
+    def read(index):
+        sample = EllipsoidSource.read(source, index)
+        return replace(sample, alpha=sample.alpha * (index >= empty))
+
+    monkeypatch.setattr(source, "read", read)
+    words = f"the mattes of {empty} of 12 views are empty (S000/e0/cam00"
+    if empty == 12:
+        with pytest.raises(TrainError, match=re.escape(words)):
+            train(source, ellipsoid_head(), tmp_path, tiny_config())
+        assert list(tmp_path.iterdir()) == []
+    else:
+        train(source, ellipsoid_head(), tmp_path, tiny_config(train={"iterations": 1}))
+        assert words in capsys.readouterr().err
 
 
 def test_files_of_metrics_are_checked_before_training(tmp_path, source):
