@@ -65,8 +65,8 @@ class Workload:
     width: int  # number of items processed in parallel
     cores: bool  # True if core seconds count instead of clock seconds
     fixed: Mapping[str, str] = field(default_factory=dict)  # settings of stages that have begun
-    # per stage, the setting that its outputs were made with and the finished share
-    done: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+    # what is made already, by the run or by a trial: per stage, the setting and the share of items
+    done: Sequence[Mapping[str, tuple[str, float]]] = ()
     kinds: Sequence[ResultKind] = RESULTS  # results of the chain
 
 
@@ -109,6 +109,23 @@ def item_seconds(load: Workload, stage: Stage, label: str) -> tuple[int, float]:
     return count, (cost.core_seconds if load.cores else cost.seconds) * grown
 
 
+def taken_over(load: Workload, trial: Trial) -> dict[str, tuple[str, float]]:
+    """Return, by stage, a trial's setting and the share of the items that a run takes from it.
+
+    Where it had fewer expressions than the script, an item of all of them is another one, and so
+    is everything after it.
+    """
+    found, whole = {}, trial.footage.expressions >= trial.scripted
+    for stage in load.stages:
+        if stage.name in trial.failed or not (whole or "expressions" not in stage.growth.time):
+            break
+        if stage.name in trial.costs:
+            label = trial.settings[stage.name]
+            items = item_seconds(load, stage, label)[0]
+            found[stage.name] = label, min(1.0, trial.costs[stage.name].items / items)
+    return found
+
+
 def sizes_of(measured: PilotFigures, stage: Stage) -> list[MeasuredSize]:
     """Return what an item of a stage cost on the footage of both sizes that the pilot tried."""
     base, *others = measured.trials
@@ -142,7 +159,7 @@ def size_factor(load: Workload, stage: Stage, settings: Mapping[str, str]) -> fl
 def stage_seconds(load: Workload, stage: Stage, label: str, left: float = 1.0) -> float:
     """Return the seconds of a stage at a setting, for the share of its items that is left."""
     count, seconds = item_seconds(load, stage, label)
-    count = math.ceil(count * left)
+    count = math.ceil(count * left - 1e-9)
     if count == 0 or load.cores:
         return count * seconds
     first = load.measured.trials[0].costs.get(stage.name)
@@ -203,31 +220,35 @@ def expected_errors(load: Workload, lost: Mapping[str, float]) -> dict[str, Expe
 
 
 class _State(NamedTuple):
-    """Settings of the first stages, seconds by stage, squares by result, whether all is made."""
+    """Settings of the first stages, seconds by stage, squares by result.
+
+    ``kept`` numbers those of `Workload.done` that were made with the same settings up to here.
+    """
 
     settings: dict[str, str]
     each: dict[str, float]
     lost: dict[str, float]
-    kept: bool
+    kept: frozenset[int]
 
 
 def front(load: Workload) -> list[Point]:
     """Return the choices that no other beats in time and error, the quickest first."""
     scale = scales(load)
     reducing = [stage.name for stage in load.stages if stage.growth.reduces]
-    states = [_State({}, {}, dict.fromkeys(scale, 0.0), True)]
+    states = [_State({}, {}, dict.fromkeys(scale, 0.0), frozenset(range(len(load.done))))]
     for stage in load.stages:
-        there, share = load.done.get(stage.name, ("", 0.0))
+        there = [made.get(stage.name, ("", 0.0)) for made in load.done]
         losses, grown = load.measured.losses.get(stage.name, {}), []
         for label in labels_of(load, stage.name):
-            parts = [stage_seconds(load, stage, label, part) for part in (1.0, 1.0 - share)]
+            left = {share: stage_seconds(load, stage, label, 1.0 - share) for _, share in there}
+            left[0.0] = stage_seconds(load, stage, label)
             more = losses.get(label, {})
             for state in states:
-                factor = size_factor(load, stage, state.settings)
-                whole, rest = (factor * part for part in parts)
-                kept = state.kept and label == there
+                kept = frozenset(n for n in state.kept if there[n][0] == label)
+                seconds = left[max((there[n][1] for n in kept), default=0.0)]
                 lost = {r: value + more.get(r, 0.0) ** 2 for r, value in state.lost.items()}
-                each = {**state.each, stage.name: rest if kept else whole}
+                seconds *= size_factor(load, stage, state.settings)
+                each = {**state.each, stage.name: seconds}
                 grown.append(_State({**state.settings, stage.name: label}, each, lost, kept))
         states = _best(grown, scale, reducing)
     points = []
@@ -273,7 +294,7 @@ def _best(
     kept: list[_State] = []
     for state in states:
         beaten = any(
-            (other.kept or not state.kept)
+            other.kept >= state.kept
             and all(other.lost[r] <= state.lost[r] for r in scale)
             and all(other.settings.get(n) == state.settings.get(n) for n in reducing)
             for other in kept

@@ -102,7 +102,7 @@ class Trial:
     costs: dict[str, Cost]  # cost of each stage
     errors: dict[str, list[float]]  # ``[value, low, high]`` that stages state for each result
     failed: dict[str, str]  # per stage that made nothing, the reason
-    folder: str  # folder of its outputs
+    folder: str  # folder of its outputs, below the pilot's
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ from express50.contract.stage import Stage, typical_error
 from express50.dial.budget import Clock
 from express50.dial.figures import Cost, PilotFigures, Trial, footage_of, trial_of
 from express50.dial.results import RESULTS, ResultKind, differences, whole_peaks
-from express50.errors import ConfigError, DiskFullError, Express50Error, FormatError
+from express50.errors import ConfigError, DiskFullError, Express50Error, FormatError, StageError
 from express50.files.atomic import link_file, write_json
 from express50.files.digests import files_of, value_digest
 from express50.files.text import read_json_table
@@ -34,7 +34,6 @@ from express50.runner.replaced import keeping
 from express50.runner.runner import run_stage
 
 PEAKS = 3  # expressions of a trial
-SPARE_SHARE = 0.5  # of the time that the cheapest settings would leave over, for trials
 STEEPER = 3.0  # a setting that was not tried may cost this many times the one below it
 MEASURES = 3  # version of how results are compared
 Ladder = Mapping[str, Any]  # configurations of a stage by the name of the setting, cheapest first
@@ -90,7 +89,7 @@ class Pilot:
         dataset = Dataset(root)
         if source is not None:
             shutil.rmtree(root, ignore_errors=True)
-            shutil.copytree(source.folder, root, copy_function=_link)
+            shutil.copytree(chain.dataset.pilot_dir / source.folder, root, copy_function=_link)
             record.unlink()
         elif not root.is_dir():  # otherwise items of a trial that was stopped are kept
             self._begin(dataset)
@@ -108,6 +107,8 @@ class Pilot:
             if why:
                 failed[stage.name] = why.replace(self.subject, "the subject")
             _cut_peaks(dataset, self.subject, peaks)
+        if not dataset.subjects():
+            raise StageError(": ".join(next(iter(failed.items()))))
         count = len(_rows(dataset.peaks_file(self.subject)))
         whole = footage_of(dataset)
         footage = replace(whole, expressions=float(max(1, count)))
@@ -118,7 +119,7 @@ class Pilot:
             costs=costs,
             errors=stated_errors(chain, dataset),
             failed=failed,
-            folder=str(root),
+            folder=name,
         )
         if not self.clock.closed():
             write_json(record, asdict(done))
@@ -178,11 +179,20 @@ def cost_of(dataset: Dataset, stage: str, receipts: Sequence[Receipt], extra: fl
 def keep_for_run(dataset: Dataset, settings: Mapping[str, str]) -> None:
     """Move what trials made at chosen settings to the store of replaced outputs.
 
-    The run takes an output from there where it would make the same.
+    The run takes an output from there where it would make the same. Trials that share the settings
+    of more stages come first: what a stage makes depends on the stages before it as well.
     """
     moved: set[tuple[str, str]] = set()
-    for record in sorted(dataset.pilot_dir.glob("*/trial.json")):
-        trial, folder = trial_of(json.loads(record.read_text("utf-8"))), Dataset(record.parent)
+
+    def alike(trial: Trial) -> int:
+        differ = (k for k, name in enumerate(settings) if trial.settings[name] != settings[name])
+        return next(differ, len(settings))
+
+    trials = [
+        (trial_of(json.loads(record.read_text("utf-8"))), Dataset(record.parent))
+        for record in sorted(dataset.pilot_dir.glob("*/trial.json"))
+    ]
+    for trial, folder in sorted(trials, key=lambda pair: -alike(pair[0])):
         for subject in folder.subjects():
             with suppress(FileNotFoundError):  # the peaks before they were cut
                 whole_peaks(folder, subject).rename(folder.peaks_file(subject))
@@ -260,8 +270,8 @@ def _base(pilot: Pilot, settings: dict[str, str], choices: Sequence[str]) -> Tri
         )
 
 
-def measure(pilot: Pilot, allowance: float) -> PilotFigures:
-    """Run trials, the cheapest first, as far as the allowance of time goes.
+def measure(pilot: Pilot, allowed: Callable[[PilotFigures], float]) -> PilotFigures:
+    """Run trials, the cheapest first, for as many seconds as ``allowed`` gives to the first one.
 
     The first one, at the cheapest settings, always runs to its end or to that of the budget. Where
     a stage makes nothing whatever its settings, it stays the only one.
@@ -274,11 +284,12 @@ def measure(pilot: Pilot, allowance: float) -> PilotFigures:
     chain.tell(f"measuring on {where}, every stage at its cheapest setting")
     base = _base(pilot, cheapest, choices)
     cheapest = base.settings
-    allowance = max(allowance, SPARE_SHARE * spare_seconds(pilot, base))
     began, trials = pilot.clock.now(), [base]
     untried: dict[str, list[str]] = {}
     if pilot.clock.closed() or broken_stage(chain, base):
         return PilotFigures(key=chain.key(), trials=trials, losses={})
+    untold: dict[str, dict] = {name: {} for name in choices}
+    allowance = allowed(PilotFigures(key=chain.key(), trials=trials, losses=untold))
     ladders = {name: list(chain.ladders[name]) for name in choices}
     higher = {n: ladder[ladder.index(cheapest[n]) + 1 :] for n, ladder in ladders.items()}
     steps = [(name, label) for name, labels in higher.items() for label in labels]
@@ -303,20 +314,6 @@ def measure(pilot: Pilot, allowance: float) -> PilotFigures:
             grown[name] = STEEPER * max(1.0, ratio)
     losses = {name: _losses(pilot, trials, cheapest, name) for name in choices}
     return PilotFigures(key=chain.key(), trials=trials, losses=losses, untried=untried)
-
-
-def spare_seconds(pilot: Pilot, base: Trial) -> float:
-    """Guess the seconds of the budget that a run at the cheapest settings would leave over.
-
-    On a small dataset a tenth of the budget may pay for no trial at all; then nothing better than
-    the cheapest settings would be known, and most of the time would stay unused.
-    """
-    size = len(pilot.chain.dataset.captures()) * base.scripted / base.footage.expressions
-    width = pilot.chain.pool.width()
-    each = (
-        _charged(pilot, cost) / (1 if pilot.clock.cores else width) for cost in base.costs.values()
-    )
-    return pilot.clock.left() - sum(each) * size
 
 
 def _charged(pilot: Pilot, cost: Cost) -> float:
@@ -351,8 +348,9 @@ def _losses(
     good = {label: t for label, t in tried.items() if t is not None and name not in t.failed}
     if not good:
         return {}
-    best = Dataset(Path(list(good.values())[-1].folder))
-    others = {label: Dataset(Path(trial.folder)) for label, trial in good.items()}
+    root = pilot.chain.dataset.pilot_dir
+    others = {label: Dataset(root / trial.folder) for label, trial in good.items()}
+    best = list(others.values())[-1]
     return {
         label: differences(other, best, pilot.subject, pilot.chain.kinds) if other != best else {}
         for label, other in others.items()

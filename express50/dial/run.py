@@ -12,11 +12,12 @@ import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from express50.console import count, format_seconds
 from express50.contract.config import made_with
-from express50.contract.layout import exclusion_reason
+from express50.contract.layout import Dataset, exclusion_reason
 from express50.contract.stage import Stage
 from express50.dial.budget import Budget, Clock, Goal, budget_text
 from express50.dial.choice import (
@@ -29,9 +30,10 @@ from express50.dial.choice import (
     front,
     goal_result,
     item_seconds,
-    labels_of,
+    point_of,
     size_factor,
     stage_seconds,
+    taken_over,
 )
 from express50.dial.figures import PilotFigures, dial_dir, footage_of, read_measured
 from express50.dial.pilot import (
@@ -49,10 +51,11 @@ from express50.files.text import read_json_table
 from express50.runner.ledger import Ledger
 from express50.runner.runner import Summary, run_stage
 
-PILOT_SHARE = 0.1  # of the budget, for trials that are not what the run makes anyway
+SPARE_SHARE = 0.5  # of the time that the cheapest settings would leave over, for trials
 SAFETY = 0.95  # of the time left is planned with: what items take varies
 BELIEVED = 0.1  # of the expected time must have passed before its speed changes choices
 GRACE = 0.1  # of the budget by which a run may end late rather than stop with nothing made
+BUSY = 1.5  # times its processor time on all workers: waiting took much of a trial
 PILOTS = 3  # subjects whose footage is tried if the first one's is bad
 
 
@@ -76,9 +79,12 @@ class RunState:
     finished: bool = False  # whether nothing was left
 
 
-def measured_figures(
-    chain: Chain, clock: Clock, allowance: float, chosen: bool = False
-) -> PilotFigures:
+def run_file(dataset: Dataset) -> Path:
+    """Return the path of the state of a dataset's budgeted run."""
+    return dial_dir(dataset) / "run.json"
+
+
+def measured_figures(chain: Chain, clock: Clock, chosen: bool = False) -> PilotFigures:
     """Read what was measured of a chain's dataset, or measure it.
 
     Settings that there was no time to try are tried by the next run, unless its settings are
@@ -92,33 +98,41 @@ def measured_figures(
     found = read_measured(path, chain.key())
     if found is not None and (chosen or not found.untried):
         return found
-    found = _measure_one(chain, clock, allowance)
-    if not clock.closed():  # folders of trials go; no figure names a person
-        trials = [replace(trial, folder="") for trial in found.trials]
-        write_json(path, asdict(replace(found, trials=trials)))
+    found = _measure_one(chain, clock)
+    if not clock.closed():
+        write_json(path, asdict(found))
     return found
 
 
-def _measure_one(chain: Chain, clock: Clock, allowance: float) -> PilotFigures:
+def _measure_one(chain: Chain, clock: Clock) -> PilotFigures:
     """Measure the first subject whose footage every stage can work on; raises what callers do."""
     root = chain.dataset.root
-    subjects = [s for s in chain.dataset.captures() if not exclusion_reason(chain.dataset, s)]
+    captures = chain.dataset.captures()
+    subjects = [s for s in captures if not exclusion_reason(chain.dataset, s)]
+    if captures and not subjects:
+        take_in = f"express50 annotate include {root} {min(captures)}"
+        raise StageError(f"{root}: every subject is excluded; to take one in again: '{take_in}'")
     if not subjects:
         raise StageError(f"{root}: has no captures yet; run 'express50 run {root} CAPTURE'")
+
+    def allowed(base: PilotFigures) -> float:
+        need = front(workload(chain, base, clock.cores, {}))[0].seconds
+        return SPARE_SHARE * (clock.left() - need)
+
     for subject in subjects[:PILOTS]:
         try:
-            found = measure(Pilot(chain, subject, clock), allowance)
-        except StageError as error:
-            if clock.budget is None or not clock.closed():
-                raise
-            raise ConfigError(
-                f"--budget {clock.budget.text}: the time ended before the footage of {subject} was"
-                " ingested; give more time"
-            ) from error
-        broken = broken_stage(chain, found.trials[0])
-        if not broken or clock.closed():  # a stage without time has no output
-            return found
-        reason = f"{broken}: {found.trials[0].failed[broken]}"
+            found = measure(Pilot(chain, subject, clock), allowed)
+            broken = broken_stage(chain, found.trials[0])
+            if not broken or clock.closed():  # a stage without time has no output
+                return found
+            reason = f"{broken}: {found.trials[0].failed[broken]}"
+        except StageError as error:  # nothing is ingested
+            reason = str(error)
+            if clock.budget is not None and clock.closed():
+                raise ConfigError(
+                    f"--budget {clock.budget.text}: the time ended before the footage of {subject}"
+                    " was ingested; give more time"
+                ) from error
         chain.tell(f"{subject} cannot be measured: {reason}")
     raise StageError(
         f"{root}: no subject could be measured: {reason}; correct that, or run without --budget to"
@@ -138,15 +152,17 @@ def workload(
         stages=chain.stages, ladders=chain.ladders, measured=measured, footage=footage,
         width=chain.pool.width(), cores=cores, fixed=begun, kinds=chain.kinds,
     )  # fmt: skip
-    dataset, done = chain.dataset, {}
+    dataset, made_here = chain.dataset, {}
     if dataset.ledger.is_file():
         with Ledger(dataset.ledger, read_only=True) as ledger:
             for stage in chain.stages:
                 path, ladder = dataset.config_file(stage.name), load.ladders[stage.name]
                 if (label := made_with(path, stage, ladder)) is not None:
                     made = sum(r.status == "done" for r in ledger.read(stage.name).values())
-                    done[stage.name] = label, min(1.0, made / item_seconds(load, stage, label)[0])
-    return replace(load, done=done)
+                    share = min(1.0, made / item_seconds(load, stage, label)[0])
+                    made_here[stage.name] = label, share
+    there = [t for t in measured.trials if t.folder and (dataset.pilot_dir / t.folder).is_dir()]
+    return replace(load, done=[made_here, *(taken_over(load, trial) for trial in there)])
 
 
 @dataclass
@@ -172,8 +188,9 @@ class _Run:
     def keep(self, **changes: Any) -> None:
         """Change the state, and store it with what is spent."""
         self.state = replace(self.state, **changes)
-        path = dial_dir(self.chain.dataset) / "run.json"
-        write_json(path, asdict(replace(self.state, spent=self.clock.now())))
+        write_json(
+            run_file(self.chain.dataset), asdict(replace(self.state, spent=self.clock.now()))
+        )
 
     def asked(self) -> str:
         """Write the budget and the goal with the result that it is for."""
@@ -222,15 +239,18 @@ def run_within(
     except KeyboardInterrupt:
         run.keep()  # the stopped item took time as well
         raise
+    except ConfigError:
+        if not run.state.settings:  # nothing is begun, and measuring does not count again
+            run_file(chain.dataset).unlink(missing_ok=True)
+        raise
 
 
 def _measure_and_run(
     run: _Run, goal: Goal | None, again: bool, ended: Callable[[Stage, Summary], None]
 ) -> tuple[list[Summary], RunState]:
     """Measure, choose settings unless they are chosen already, and run the stages."""
-    chain, clock, state, budget = run.chain, run.clock, run.state, run.clock.budget
-    allowance = PILOT_SHARE * budget.seconds if budget else math.inf
-    run.measured = measured_figures(chain, clock, allowance, chosen=bool(state.settings))
+    chain, clock, state = run.chain, run.clock, run.state
+    run.measured = measured_figures(chain, clock, chosen=bool(state.settings))
     load = run.workload()
     run.wanted = None if goal is None else (goal_result(load, goal), goal.value)
     if not state.settings:
@@ -272,7 +292,7 @@ def _resumed(chain: Chain, budget: Budget | None, goal: Goal | None) -> RunState
     fresh = RunState(
         key=chain.key(), budget=budget.text if budget else "", goal=goal.text if goal else ""
     )
-    path = dial_dir(chain.dataset) / "run.json"
+    path = run_file(chain.dataset)
     if not path.is_file():
         return fresh
     try:
@@ -287,19 +307,26 @@ def _first_choice(run: _Run, load: Workload, goal: Goal | None) -> Point:
     clock, wanted, points = run.clock, run.wanted, front(load)
     left = clock.left()
     if clock.closed() or points[0].seconds > left:
-        least = clock.now() + points[0].seconds
+        spent, least = clock.now(), points[0].seconds
         words = "core time" if load.cores else f"with {count(load.width, 'worker')}"
         asked = f"--budget {clock.budget.text if clock.budget else ''}"
         if clock.closed():
             raise ConfigError(
                 f"{asked}: it ended before every stage was measured at its cheapest setting; the"
-                f" cheapest settings need more than {format_seconds(least)} {words}; give several"
-                " times as much; what was measured is kept"
+                f" cheapest settings need more than {format_seconds(spent + least)} {words}; give"
+                " several times as much; what was measured is kept"
             )
+        more = 1.1 * least
+        give = f"give --budget {budget_text(more, load.cores)} or more"
+        if clock.budget is not None and more <= clock.budget.seconds:
+            give = "the same command again will do"
+        core = point_of(replace(load, cores=True), points[0].settings).seconds
+        if not load.cores and least > BUSY * core / load.width:
+            give += f"; only {format_seconds(core)} of it is processor time: where other programs"
+            give += f" slowed the measuring, give --budget {budget_text(1.1 * core, True)} instead"
         raise ConfigError(
-            f"{asked}: the cheapest settings need about {format_seconds(least)} {words},"
-            f" {format_seconds(clock.now())} of it already spent on measuring, which is kept; give"
-            f" --budget {budget_text(1.1 * least, load.cores)} or more"
+            f"{asked}: the cheapest settings need about {format_seconds(least)} {words} after"
+            f" {format_seconds(spent)} of measuring, which is kept and not counted again; {give}"
         )
     point = choose(points, left * SAFETY, wanted)
     if goal is not None and wanted is not None and point.errors[wanted[0]].value > goal.value:
@@ -340,18 +367,14 @@ def _choose_rest(run: _Run, stage: Stage) -> None:
 def _run_one(run: _Run, stage: Stage) -> Summary | None:
     """Run a stage until the budget ends; None if it has nothing to work on."""
     chain, clock, label = run.chain, run.clock, run.state.settings[stage.name]
-    load = workload(chain, run.measured, clock.cores, {})
+    load = run.workload()
     items, item = item_seconds(load, stage, label)
     factor = size_factor(load, stage, run.state.settings)
-    rest = sum(
-        min(stage_seconds(load, other, one) for one in labels_of(load, other.name))
-        * size_factor(load, other, run.state.settings)
-        for other in chain.stages[chain.names.index(stage.name) + 1 :]
-    )
     slow, early = run.slowness(), 0.0
     if clock.budget:
-        own = factor * stage_seconds(load, stage, label) * slow
-        early = reserved(own, rest * slow, clock.left(), clock.budget.seconds)
+        each = front(load)[0].each  # the quickest that may follow
+        rest = sum(each[name] for name in chain.names[chain.names.index(stage.name) + 1 :])
+        early = reserved(each[stage.name] * slow, rest * slow, clock.left(), clock.budget.seconds)
     clock.expect(factor * item * slow, early)
     before = clock.now()
     if not stage.items(chain.dataset):  # an earlier stage made nothing

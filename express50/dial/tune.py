@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -28,8 +27,8 @@ def tune(chain: Chain) -> tuple[dict[str, Any], list[str]]:
     Raises:
         StageError: no footage can be measured.
     """
-    measured = measured_figures(chain, Clock(None), math.inf)
-    load = replace(workload(chain, measured, False, {}), done={})
+    measured = measured_figures(chain, Clock(None))
+    load = replace(workload(chain, measured, False, {}), done=())
     points = front(load)
     presets = {preset: point_of(load, preset_settings(load, preset)) for preset in PRESETS}
     table = {

@@ -10,9 +10,18 @@ import pytest
 from annotations.suggestions import reference_subject
 from express50.contract.layout import Dataset, existing_dataset
 from express50.dial.budget import Clock, parse_budget, parse_goal
+from express50.dial.choice import point_of
 from express50.dial.figures import Cost, Footage, Trial, dial_dir
-from express50.dial.pilot import Pilot, spare_seconds, trial_seconds
-from express50.dial.run import RunState, closing_lines, reserved, run_within
+from express50.dial.pilot import Pilot, keep_for_run, trial_seconds
+from express50.dial.run import (
+    RunState,
+    closing_lines,
+    measured_figures,
+    reserved,
+    run_file,
+    run_within,
+    workload,
+)
 from express50.dial.tune import tune
 from express50.errors import ConfigError, StageError
 from express50.files.atomic import write_json
@@ -106,6 +115,36 @@ def test_a_tight_budget_takes_the_best_that_fits(tmp_path, captures, monkeypatch
     assert state.finished and state.spent <= parse_budget(budget).seconds * 1.1
 
 
+@pytest.mark.parametrize("expressions", [3, 4])
+def test_what_trials_made_costs_the_run_nothing(tmp_path, expressions):
+    """With 4 expressions, `solve` of a trial's 3 is another item, and so is `map` after it."""
+    chain = chain_of(tmp_path / "d", captures_of(tmp_path / "c", 1, expressions))
+    measured = measured_figures(chain, Clock(None))
+    load = workload(chain, measured, False, {})
+    whole = [t for t in measured.trials if t.footage.expressions == 3]
+    assert len(whole) == 5
+    for trial in whole:
+        each = point_of(load, trial.settings).each
+        assert each["ingest"] == each["align"] == 0
+        assert (each["solve"] == each["map"] == 0) == (expressions == 3)
+    shutil.rmtree(chain.dataset.pilot_dir)  # as `tune` does
+    assert point_of(workload(chain, measured, False, {}), whole[0].settings).seconds > 0
+
+
+@pytest.mark.parametrize("steps", [("standard", "draft"), ("reference", "draft")])
+def test_a_run_takes_what_the_trial_with_its_settings_made(tmp_path, steps):
+    chain = chain_of(tmp_path / "d", captures_of(tmp_path / "c", 1, 3))
+    measured_figures(chain, Clock(None))
+    chosen = dict(zip(("ingest", "align", "solve", "map"), ("standard",) * 2 + steps, strict=True))
+    keep_for_run(chain.dataset, chosen)
+    restored = {}
+    for stage in chain.stages:
+        config = chain.ladders[stage.name][chosen[stage.name]]
+        summary = run_stage(stage, chain.dataset, config, pool=chain.pool, progress=False)
+        restored[stage.name] = sum(o.restored for o in summary.outcomes)
+    assert restored == {"ingest": 1, "align": 1, "solve": 1, "map": 3}
+
+
 def test_trials_of_a_core_hour_budget_are_guessed_in_core_hours(tmp_path, captures):
     chain = chain_of(tmp_path / "d", captures)  # three subjects of four expressions
     cost = Cost(seconds=50.0, core_seconds=2.0, bytes=1.0, memory=1.0, items=3)
@@ -117,8 +156,6 @@ def test_trials_of_a_core_hour_budget_are_guessed_in_core_hours(tmp_path, captur
     cores, clock = (Pilot(chain, "S0", Clock(parse_budget(text))) for text in ("1ch", "1h"))
     assert trial_seconds(cores, base, "solve", 3.0) == 3 * 2 * 3 + 3 * 2
     assert trial_seconds(clock, base, "solve", 3.0) == 3 * 50 * 3 + 3 * 50
-    assert spare_seconds(cores, base) == pytest.approx(3600 - 2 * 3 * 2 * 3 * 4 / 3)
-    assert spare_seconds(clock, base) == pytest.approx(3600 - 2 * 3 * 50 * 3 * 4 / 3, abs=5)
 
 
 def test_a_budget_below_the_cheapest_settings_says_what_the_least_is(tmp_path, captures):
@@ -127,8 +164,16 @@ def test_a_budget_below_the_cheapest_settings_says_what_the_least_is(tmp_path, c
     assert not (tmp_path / "d" / "map").exists()
     with pytest.raises(ConfigError, match="nothing but trials has been made yet"):
         existing_dataset(tmp_path / "d")
+    assert not run_file(Dataset(tmp_path / "d")).exists()  # measuring does not count again
     _, state = go(tmp_path / "d", captures, "5m")  # with what the pilot made
     assert state.finished and state.stated["value"][0] == pytest.approx(error_of(state.settings))
+
+
+def test_a_refused_budget_says_how_much_of_it_was_waiting(tmp_path, captures, monkeypatch):
+    monkeypatch.setenv(PAUSE, "0.02")
+    table, _ = tune(chain_of(tmp_path / "d", captures))  # toys sleep
+    with pytest.raises(ConfigError, match=r"processor time: .* --budget 0\.\d+ch instead"):
+        go(tmp_path / "d", captures, f"{0.9 * table['front'][0]['seconds']:.2f}s")
 
 
 @pytest.mark.parametrize("budget", ["0.001s", "0.2s"])  # ends in ingest; on a slow machine, later
@@ -149,8 +194,7 @@ def test_a_goal_is_reached_in_the_least_time_or_refused(tmp_path, captures):
 
 
 def test_a_goal_that_untried_settings_may_reach_asks_for_more_time(tmp_path, captures, monkeypatch):
-    monkeypatch.setattr("express50.dial.run.PILOT_SHARE", 0.0)
-    monkeypatch.setattr("express50.dial.pilot.SPARE_SHARE", 0.0)
+    monkeypatch.setattr("express50.dial.run.SPARE_SHARE", 0.0)
     with pytest.raises(ConfigError, match=r"no time to try .*solve standard and reference.*larger"):
         go(tmp_path / "d", captures, "5m", "0.6mm")
 
@@ -198,8 +242,7 @@ def test_captures_that_come_after_a_finished_run_get_the_budget_anew(
 
 
 def test_a_larger_budget_tries_what_a_small_one_had_no_time_for(tmp_path, captures, monkeypatch):
-    monkeypatch.setattr("express50.dial.run.PILOT_SHARE", 0.0)
-    monkeypatch.setattr("express50.dial.pilot.SPARE_SHARE", 0.0)
+    monkeypatch.setattr("express50.dial.run.SPARE_SHARE", 0.0)
     _, cheap = go(tmp_path / "d", captures, "5m")
     assert cheap.settings["map"] == "draft"
     monkeypatch.undo()
@@ -289,6 +332,25 @@ def test_a_stage_that_fails_at_every_setting_is_named_and_nothing_else_is_tried(
         go(tmp_path / "d", captures, "5m", said=said)
     assert sum("cannot be measured" in line for line in said) == 3
     assert not any(line.startswith("measuring map") for line in said)
+
+
+def test_a_subject_that_cannot_be_ingested_is_not_measured_but_the_next_is(tmp_path):
+    captures, said = captures_of(tmp_path / "c", 2, 1), []
+    chain = chain_of(tmp_path / "d", captures, said)
+    for video in (captures[0] / "cameras").rglob("*.*"):
+        video.write_bytes(b"damaged")
+    summaries, state = run_within(chain, parse_budget("5m"), None, lambda stage, summary: None)
+    assert any(line.startswith("S0 cannot be measured: ingest: ") for line in said)
+    assert state.finished and summaries[0].count("failed") == 1 and summaries[-1].ok
+
+
+def test_excluded_subjects_are_not_called_missing_captures(tmp_path):
+    chain = chain_of(tmp_path / "d", captures_of(tmp_path / "c", 1, 1))
+    labels = chain.dataset.labels_file("S0")
+    labels.parent.mkdir()
+    labels.write_text('{"action": "exclude", "reason": "blinks"}\n')
+    with pytest.raises(StageError, match="every subject is excluded; .*include .* S0"):
+        measured_figures(chain, Clock(None))
 
 
 def test_core_hours_count_processor_time_alone(tmp_path, captures):
