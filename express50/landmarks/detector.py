@@ -34,7 +34,7 @@ from express50.landmarks.network import (
 
 # A point whose error scale is this share of the face box has half the confidence.
 HALF_CONFIDENCE_SHARE = 0.025
-VAGUE_SHARE = 0.06  # of the face box: median error scale that halves the score; no face is vague
+VAGUE_SHARE = 0.06  # of the face box: median error scale that halves the score; faces have less
 FOUND_SCORE = 0.5  # the search continues until a face has this score
 # The network finds faces of 0.5 to 1.4 times the trained size, up to a quarter of the window from
 # its middle. So windows shrink by SHRINK, and lie STEP of their side apart.
@@ -42,7 +42,7 @@ SHRINK, STEP = 0.55, 0.5
 SMALLEST = 0.25
 SMALL = 0.08  # where that finds too little: people fill a rig's pictures, but not all others
 BATCH = 32  # windows at a time
-KEEP_SHARE = 0.8  # of a place's score that a nearer look must have to replace it
+KEEP_SHARE = 0.8  # a nearer look replaces a place if it has this share of its score
 # Sizes of the crops of the last look, relative to the trained one, and whether they are mirrored.
 # On faces, even in profile, their median points differ by less than DIFFER_SHARE of the face box;
 # on walls, coins and backs of heads they differ by more, so there the score falls.

@@ -34,7 +34,7 @@ from express50.landmarks import WEIGHTS
 
 CROP = 128
 POINTS, OUTLINE = 68, 17
-STRETCH = 1.15  # of the heat maps about the crop's middle: points may lie a little outside the crop
+STRETCH = 1.15  # of the heat maps beyond the crop: points may lie a little outside it
 CROP_MARGIN = 1.55  # side of a crop over the longer side of its landmarks' box
 # Partner of each iBUG-68 point in the mirror image, then of the 68 + 17 with the outline.
 MIRROR = np.array(

@@ -54,7 +54,7 @@ same."""
 CENTRE, BEND = 0.005, 0.02
 """Standard deviations of principal points, as a share of the diagonal, and of how far lenses bend
 the image's corner, as a share of half of it: footage alone says little about either."""
-LOOSE = 0.02  # of the diagonal: a camera that may be off by more at the head is not placed
+LOOSE = 0.02  # share of the diagonal: a camera that may be off by more at the head is not placed
 OUTLIER = 4.0  # sigmas; features with larger errors are mismatches and not reported
 EYES = (slice(36, 42), slice(42, 48))
 NOMINAL = 2.5  # focal length, in longer sides, at which distances are first estimated

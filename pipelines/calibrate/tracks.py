@@ -28,7 +28,7 @@ FEATURE_SIGMA_PX = 0.7
 NEIGHBOURS, WIDEST_DEG = 6, 45.0
 """Features are compared between each camera and this many neighbours, if their axes differ by less
 than the angle: beyond it features no longer look alike."""
-ON_PLANE = 0.005  # of the width: distance from a homography within which a match lies on its plane
+ON_PLANE = 0.005  # share of the width: matches this close to a homography lie on its plane
 LEAST_MIRRORED = 100  # matches; faces that are their own mirror image give up to 46
 LEAST_POINTS = 20  # that a camera must share with two others to be judged by them
 

@@ -26,7 +26,7 @@ SALIENT = Role(
 MULTIPLE = 4  # BackgroundMattingV2 refines patches of 4 x 4 pixels
 LEAST_SIDE = 64  # smaller inputs leave its encoder no pixels
 OVERLAP = 256  # pixels; half of it is context that a tile sees but does not write
-SIDE = 1024  # of the salient networks, if the file does not say
+SIDE = 1024  # of a salient network's input, if the file does not say
 MEAN = np.array([0.485, 0.456, 0.406], np.float32)  # ImageNet's
 DEVIATION = np.array([0.229, 0.224, 0.225], np.float32)
 # Weight of the enlarged alpha against smoothness along colours; small, because it has no detail.

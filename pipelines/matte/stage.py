@@ -33,7 +33,7 @@ from pipelines.matte.plates import (
 )
 from pipelines.matte.visual_hull import INSIDE, Ball, MatteView, ball_of
 
-COLUMNS = 6  # of the picture
+COLUMNS = 6  # of the contact sheet
 TILE = 240
 RED, GREEN = (235, 50, 40), (50, 220, 80)
 EMPTY = 0.003  # share of the image below which a matte counts as empty

@@ -17,7 +17,7 @@ LANDMARK_FLOOR_PX = 1.0  # least error assumed of a landmark, for a face 128 px 
 # Landmarks 0..16 slide along the jaw; in a single view the jaw's width depends on them alone.
 JAW_LINE_WEIGHT, SINGLE_VIEW_JAW_WEIGHT = 0.25, 0.7
 INLIER_SIGMA = 3.5
-MIN_SHARE = 0.4  # of its known landmarks that must agree for a view to stay
+MIN_SHARE = 0.4  # share of a view's known landmarks that must agree for it to stay
 # Largest standard deviation, as a share of the face, so that vague landmarks can disagree too.
 SIGMA_SHARE_LIMIT = 0.04
 LEAST_POINTS = 12  # landmarks on which cameras agree, to place a head by

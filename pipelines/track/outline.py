@@ -37,7 +37,7 @@ EDGE_SIGMA_M = 0.0015
 # gap (metres) at which the pull on vertices inside the matte has faded.
 COVER_SIGMA_M, HAIR_GAP_M, BALD_GAP_M = 0.008, 0.004, 0.03
 BALD_SHARE = 0.6
-LEAST_SEEN = 0.06  # of the scalp: temples alone are bare on most people
+LEAST_SEEN = 0.06  # share of the scalp: temples alone are bare on most people
 COVERED = ("neck", "scalp", "forehead", "left_ear", "right_ear")
 BARE = ("face", "nose", "lips")
 

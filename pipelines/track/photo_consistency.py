@@ -42,10 +42,10 @@ MEAN_KERNEL = np.full(PATCH * PATCH, 1.0 / (PATCH * PATCH), np.float32)
 GREY = np.full(3, 1.0 / 3.0, np.float32)
 # Noise that a patch's contrast must exceed: root of light, 0..1.
 NOISE = 0.006
-LEAST_SCORE, LEAST_SHARP = 0.3, 0.02  # of a height that counts as found
+LEAST_SCORE, LEAST_SHARP = 0.3, 0.02  # least values of a height that counts as found
 NEIGHBOURS, NEIGHBOUR_LIMIT_PX = 24, 1.2  # largest distance from the neighbours' median height
 OUTLIER_PX = 2.5
-SIGMA_PX = 0.8  # of a height with a score of 1
+SIGMA_PX = 0.8  # standard deviation of a height with a score of 1
 # Cosine to the camera below which a patch is foreshortened too much to be compared.
 MIN_COSINE = 0.4
 # Hair and cloth may cover neck and ears: fewer samples per sample of the face, and less trust.

@@ -39,7 +39,7 @@ Read = Callable[[str], np.ndarray]
 DETECTOR_PASSES = 3  # crops after the coarse pass; 1 measures the same on the twin
 FOLLOWED_VIEWS = 10  # the most frontal ones, in which a clip's face is followed; more add nothing
 LEAST_FACING = 0.1  # cosine between the face's direction and that to a camera in which to look
-RECENTRE_SHARE = 0.12  # of a crop: a face further from its middle is looked at again, centred
+RECENTRE_SHARE = 0.12  # share of a crop: a face further from its middle is looked at again
 # A followed face is lost unless more than this share of its views has at least this score.
 FOLLOWED_SHARE, FOLLOWED_SCORE = 0.5, 0.5
 

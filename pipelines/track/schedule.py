@@ -29,10 +29,10 @@ from pipelines.track.state import State, Target, all_vertices, rotations
 from pipelines.track.surface import FrameSetCrops, mask_things, near_things
 from pipelines.track.terms import NormalTerm, SlideTerm, Term, landmark_anchors
 
-LANDMARK_STEPS = 14  # of the first fit, to landmarks alone; 6 measure the same on the twin
-ROUND_STEPS = 4  # of the fit in each round
+LANDMARK_STEPS = 14  # in the first fit, to landmarks alone; 6 steps measure the same on the twin
+ROUND_STEPS = 4  # in the fit of each round
 EYE_ROUNDS = 2  # least number of rounds, as irises and visible jaw lines are found in each
-PATCH_REACH_M = 0.008  # of the first search, to either side of the mesh
+PATCH_REACH_M = 0.008  # to either side of the mesh, in the first search
 NARROWING, NARROWINGS = 0.6, 3  # factor on the reach from round to round, and in how many rounds
 HAIR_FACTOR = 30.0  # on the standard deviation of a landmark in hair
 NEAR_THING_M, NEAR_THING_FACTOR = 0.02, 6.0  # the same for a landmark this close to a thing

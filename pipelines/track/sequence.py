@@ -45,7 +45,7 @@ from pipelines.track.surface import CutCrops
 from pipelines.track.terms import MeshPlaces, PointTerm, landmark_anchors
 
 WINDOW = 48  # frames tracked in one piece, and kept if the run is stopped
-SWEEP_STEPS = 2  # of a quadratic
+SWEEP_STEPS = 2  # of a frame's fit in a sweep, whose evidence is a quadratic
 SWEEPS = 2  # 1 leaves a third more jitter, 4 changes little
 SMOOTH_M = 0.001  # standard deviation of a point about the middle of the neighbouring frames'
 # Vertices beside the landmarks that neighbours are compared by, and the effective number of all.
