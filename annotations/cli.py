@@ -117,7 +117,7 @@ def _add_labelling_actions(add: Callable[..., Callable]) -> None:
     argument = add("next", run_next, words, "subjects", "annotator")
     argument("--order", choices=ORDERS, default=ORDERS[0], help=order)
     words = "list at most this many (default: %(default)s)"
-    argument("--count", type=int, default=10, metavar="N", help=words)
+    argument("--count", type=natural, default=10, metavar="N", help=words)
     argument = add("mark", run_mark, "mark the peak frame of an expression", "clip", "annotator")
     argument("frame", type=int, metavar="FRAME", help="0-based decode index")
     words = "camera in which you judged it (default: the suggestion's)"
@@ -138,7 +138,7 @@ def _add_reviewing_actions(add: Callable[..., Callable]) -> None:
     words = "list disagreements, or settle one"
     argument = add("review", run_review, words, "subjects", "annotator")
     words = "marks at most this many frames apart agree (default: %(default)s)"
-    argument("--beyond", type=int, default=2, metavar="FRAMES", help=words)
+    argument("--beyond", type=natural, default=2, metavar="FRAMES", help=words)
     argument("--all", action="store_true", help="also list settled disagreements")
     words = "VERDICT is a frame, the annotator who is right, or the reason for a flag: "
     words += f"{', '.join(FLAG_REASONS)}, or flag:REASON"
@@ -152,7 +152,7 @@ def _add_reviewing_actions(add: Callable[..., Callable]) -> None:
     argument("--camera", metavar="ID", help="show this camera (default: the label's)")
     words = "frames to show before and after each label (default: 4 with --subject or --expression,"
     words += " else 0)"
-    argument("--around", type=int, metavar="N", help=words)
+    argument("--around", type=natural, metavar="N", help=words)
     words = "outline suggestions with less confidence than this (default: %(default)s)"
     argument("--sure", type=float, default=0.5, metavar="P", help=words)
 
@@ -170,6 +170,13 @@ def dataset_folder(text: str) -> Dataset:
         what = "not a dataset (no captures.json)" if dataset.root.is_dir() else "no such dataset"
         raise argparse.ArgumentTypeError(f"{text}: {what}; run 'express50 ingest {text} CAPTURE'")
     return dataset
+
+
+def natural(text: str) -> int:
+    """Parse a whole number that is not negative."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r}, expected a whole number, 0 or more")
+    return int(text)
 
 
 def person(text: str) -> str:
@@ -261,7 +268,7 @@ def run_suggest(args: argparse.Namespace) -> int:
 def run_next(args: argparse.Namespace) -> int:
     """Print the first tasks of the worklist."""
     tasks = worklist(args.dataset, args.annotator, args.subject, order=args.order)
-    head = [asdict(task) for task in tasks[: max(0, args.count)]]
+    head = [asdict(task) for task in tasks[: args.count]]
     rows = [row | {"doubt": f"{row['doubt']:.2f}"} for row in head]
     lines = table(("subject", "expression", "doubt"), rows)
     return answer(args, {"left": len(tasks), "tasks": head}, *lines, f"{len(tasks)} left")
@@ -356,6 +363,7 @@ def run_review(args: argparse.Namespace) -> int:
     """Print the disagreements, or settle one."""
     if args.settle:
         subject, expression, verdict = args.settle
+        chosen_subjects(args.dataset, [subject])
         index = read_index(args.dataset, subject)
         label = settlement(args.dataset, index, expression, verdict, args.annotator)
         append_label(args.dataset, label)
@@ -413,7 +421,7 @@ def run_sheet(args: argparse.Namespace) -> int:
     around = args.around if args.around is not None else AROUND if chosen else 0
     faces = FaceFinder(args.dataset)
     faces.load()
-    page = render_sheet(args.dataset, sheet, faces=faces, around=max(0, around)).encode()
+    page = render_sheet(args.dataset, sheet, faces=faces, around=around).encode()
     args.file.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(args.file, page)
     counts = sheet.counts()
@@ -433,7 +441,9 @@ def run_reference(args: argparse.Namespace) -> int:
 def run_rule(args: argparse.Namespace) -> int:
     """Append the rule's marks; people's labels override them."""
     chosen = chosen_subjects(args.dataset, args.subject) or included_subjects(args.dataset)
-    indexes = (read_index(args.dataset, subject) for subject in chosen)
+    indexes = [read_index(args.dataset, subject) for subject in chosen]
+    known = dict.fromkeys(cue.expression_id for index in indexes for cue in index.cues)
+    check_known(str(args.dataset.root), "expression", args.expression or (), known)
     marks = [m for i in indexes for m in last_frame_marks(args.dataset, i, args.expression)]
     for mark in marks:
         append_label(args.dataset, mark)

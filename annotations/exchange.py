@@ -156,7 +156,11 @@ def _typed(name: str, value: object) -> Any:
         return text == "True"
     if kind in (str, str | None):
         return text
-    number = int(text) if kind == int | None else float(text)
+    try:
+        number = int(text) if kind == int | None else float(text)
+    except ValueError:
+        wanted = "whole number" if kind == int | None else "number"
+        raise ValueError(f"{name} is {text[:40]!r}, expected a {wanted}") from None
     if not abs(number) < LARGEST:  # refuses NaN too
         raise ValueError(f"{name} is {text[:40]}, expected a number under 2^63")
     return number

@@ -233,6 +233,21 @@ def test_invalid_input_prints_one_line_naming_it(annotate, dataset, capsys, word
     assert dataset.labels_file("S001").read_bytes() == before
 
 
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["next", "--count", "-3"], "'-3', expected a whole number, 0 or more"),
+        (["review", "--beyond", "-1"], "'-1', expected a whole number, 0 or more"),
+        (["review", "--settle", "S009", "smile", "14"], "no subject 'S009'"),
+        (["rule", "--expression", "smlie"], "no expression 'smlie'"),
+    ],
+)
+def test_wrong_usage_is_refused(dataset, capsys, words, named):
+    action, *rest = words
+    assert main(["annotate", action, str(dataset.root), *rest]) == 2
+    assert named in capsys.readouterr().err
+
+
 def test_a_disagreement_is_settled_by_a_reason_in_words(annotate):
     mark(annotate, "ann", "smile", 14)
     annotate("review", "--settle", "S001", "smile", "flag:eyes shut", "--annotator", "eve")
@@ -250,6 +265,7 @@ def test_a_disagreement_is_settled_by_a_reason_in_words(annotate):
         ({"dhash": "f" * 16}, "f" * 16),
         ({"pts": 3}, "pts 140"),
         ({"expression": ""}, "missing ['expression']"),
+        ({"frame": "1e9"}, "frame is '1e9', expected a whole number"),
     ],
 )
 def test_import_refuses_invalid_events(annotate, dataset, tmp_path, capsys, change, named):
