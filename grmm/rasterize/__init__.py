@@ -151,6 +151,7 @@ def _check_values(tensors: dict[str, Tensor]) -> list[list[float]]:
             bad = ~(tensors[name].detach().abs() < LIMIT)
             raise NotFiniteTensorError(
                 f"{name} has {int(bad.sum())} values that are not finite or over {LIMIT:g}, the"
-                f" first at {tuple(bad.nonzero()[0].tolist())}; expected finite numbers"
+                f" first at {tuple(bad.nonzero()[0].tolist())}; expected finite numbers, as of a"
+                " trained model with moderate controls"
             )
     return [values[-9:-6], values[-6:-3], values[-3:]]
