@@ -198,7 +198,7 @@ def config_texts(config: Any) -> dict[str, str]:
 
 def config_toml(name: str, config: Any) -> str:
     """Return the TOML table of a config, each field below a comment with its documentation."""
-    documents = field_documents(type(config))
+    documents = field_documents(config.__class__)
     lines = [f"[{name}]"]
     for key, text in config_texts(config).items():
         lines += [f"# {line}" for line in textwrap.wrap(documents.get(key, ""), 98)]
