@@ -280,7 +280,7 @@ def measure(pilot: Pilot, allowed: Callable[[PilotFigures], float]) -> PilotFigu
     choices = tradable(chain)
     cheapest = {n: next(iter(chain.ladders[n])) if n in choices else standard_of(chain.ladders[n])
                 for n in names}  # fmt: skip
-    where = f"{PEAKS} expressions of one subject"
+    where = f"up to {PEAKS} expressions of one subject"
     chain.tell(f"measuring on {where}, every stage at its cheapest setting")
     base = _base(pilot, cheapest, choices)
     cheapest = base.settings
