@@ -136,9 +136,8 @@ def effort(dataset: Dataset) -> dict[str, dict[str, object]]:
         for label in events:
             if is_person(label.annotator) and label.action in ("mark", "flag"):
                 spent[label.annotator].append(label)
-        for own in voices(events).values():
-            for who, label in own.items():
-                force[who].append(label)
+        for who, label in (pair for own in voices(events).values() for pair in own.items()):
+            force[who].append(label)
     figures: dict[str, dict[str, object]] = {}
     for who, labels in sorted(spent.items()):
         followed = [x.frame == x.suggested for x in force[who] if x.suggested is not None]

@@ -147,7 +147,8 @@ def _line_of(error: Exception) -> str:
 
 def system_error_line(error: OSError) -> str:
     """Return one line of what the system refused, where, and what to do."""
-    place = f" {error.filename}:" if error.filename is not None else ""
+    name = error.filename2 or error.filename  # of a rename, the target: the source is temporary
+    place = f" {name}:" if name is not None else ""
     words = error.strerror or " ".join(str(error).split()) or "no reason given"
     return f"{type(error).__name__}:{place} {words}; {REMEDIES.get(error.errno or 0, REMEDY)}"
 

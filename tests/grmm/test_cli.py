@@ -205,6 +205,12 @@ def test_errors_are_one_line_and_set_the_exit_code(
     assert list(tmp_path.iterdir()) == [], "nothing is left half made"
 
 
+def test_a_file_that_cannot_be_written_is_named_as_it_was_given(checkpoint, tmp_path, capsys):
+    (tmp_path / "head.ply").mkdir()
+    assert main(["export", str(checkpoint), str(tmp_path / "head.ply")]) == 1
+    assert f"IsADirectoryError: {tmp_path / 'head.ply'}: " in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "arguments",
     [["render", "--columns=0"], ["render", "--frames=0"], ["render", "--samples=-1"],
