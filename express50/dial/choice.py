@@ -117,7 +117,7 @@ def taken_over(load: Workload, trial: Trial) -> dict[str, tuple[str, float]]:
     """
     found, whole = {}, trial.footage.expressions >= trial.scripted
     for stage in load.stages:
-        if stage.name in trial.failed or not (whole or "expressions" not in stage.growth.time):
+        if stage.name in trial.failed or (not whole and "expressions" in stage.growth.time):
             break
         if stage.name in trial.costs:
             label = trial.settings[stage.name]
