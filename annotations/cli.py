@@ -465,7 +465,13 @@ def run_exclusion(args: argparse.Namespace) -> int:
     )  # fmt: skip
     append_label(args.dataset, event)
     because = f": {event.reason}" if event.reason else ""
-    return answer(args, asdict(event), f"{args.subject}: {args.action}d{because}")
+    lines = [f"{args.subject}: {args.action}d{because}"]
+    try:
+        if included_subjects(args.dataset):
+            reference_subject(args.dataset)
+    except AnnotationError as error:  # the reference person is excluded
+        lines.append(str(error))
+    return answer(args, asdict(event), *lines)
 
 
 def run_export(args: argparse.Namespace) -> int:

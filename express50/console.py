@@ -116,7 +116,7 @@ def run_handler(
         return USAGE if isinstance(error, ConfigError) else FAILED
     except KeyboardInterrupt:
         sys.stderr.write(
-            f"{program}: interrupted; finished work is kept, run the same command to continue\n"
+            f"{program}: interrupted; finished work is kept; run the same command again\n"
         )
         return INTERRUPTED
 

@@ -156,6 +156,14 @@ def test_exclude_and_include_a_subject(annotate, dataset):
     assert included_subjects(dataset) == ["S001", "S002"]
 
 
+def test_excluding_the_chosen_reference_asks_for_another(annotate, dataset, capsys):
+    annotate("reference", "S001")
+    for subject, asks in (("S002", False), ("S001", True)):
+        assert main(["annotate", "exclude", str(dataset.root), subject, "glasses"]) == 0
+        assert ("choose one of" in capsys.readouterr().out) is asks
+        annotate("include", subject)
+
+
 def test_validate_finds_a_frame_that_is_not_the_one_labelled(annotate, dataset):
     mark(annotate, "ann", "smile", 14)
     assert annotate("validate")["ok"] is True
