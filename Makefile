@@ -30,10 +30,9 @@ $(READY): pyproject.toml constraints.txt setup.py scripts/system_libs.sh $(wildc
 demo: $(READY) ## the whole chain on a synthetic capture (or CAPTURES="dir ..."): build/demo/report/index.html
 	$(BIN)/python -m benchmarks.demo build/demo $(if $(CAPTURES),--captures $(CAPTURES)) --workers $(WORKERS)
 
-# One process more than WORKERS: tests of the runner and of budgets wait for other processes most of the time.
 test: check ## lint, types and every test; ends with the share of lines that they run
 	@mkdir -p build
-	$(BIN)/python -m pytest --cov --cov-report= -n $$(($(WORKERS) + 1)) --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest --cov --cov-report= -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 	@echo "coverage: $$($(BIN)/coverage report --format=total) % of the product's lines"
 
 check: $(READY) ## lint and types

@@ -7,7 +7,7 @@ from express50.console import USAGE
 from express50.contract.layout import Dataset
 from express50.dataset.report import render_page
 from express50.dial.tune import tune
-from tests.express50.dial.toy_chain import captures_of, chain_of
+from tests.express50.dial.toy_chain import PAUSE, captures_of, chain_of
 
 
 @pytest.mark.parametrize(
@@ -36,7 +36,8 @@ def test_tune_has_no_option_that_needs_chosen_settings(capsys):
         assert main(["tune", "DATA", *option]) == USAGE
 
 
-def test_the_report_shows_the_front(tmp_path):
+def test_the_report_shows_the_front(tmp_path, monkeypatch):
+    monkeypatch.setenv(PAUSE, "0.02")  # seconds that a busy machine does not drown
     captures = captures_of(tmp_path / "captures", subjects=1, expressions=2)
     tune(chain_of(tmp_path / "data", captures))
     page = render_page(Dataset(tmp_path / "data"))
