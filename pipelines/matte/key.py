@@ -92,7 +92,7 @@ def key_alpha(
     if support.core.any():
         own = subject_colour(image, support.core, length)
         firm = firm_pixels(image, difference, own, support.core, part)
-        # What looks like a plate of the subject's colours may as well be a shirt of the wall's.
+        # Where the plate has the subject's colours, what looks like it may be a shirt.
         clear &= _length(whitened(own - part.plate, part)) > HIGH
         support = find_support(firm, region, clear, length)
     alpha[whole][window] = _opacity(frame, difference, dark, support, part, length)
