@@ -239,9 +239,10 @@ def run_within(
     except KeyboardInterrupt:
         run.keep()  # the stopped item took time as well
         raise
-    except ConfigError:
-        if not run.state.settings:  # nothing is begun, and measuring does not count again
-            run_file(chain.dataset).unlink(missing_ok=True)
+    except ConfigError:  # measuring does not count again, and an earlier run keeps its choices
+        path = run_file(chain.dataset)
+        if path.is_file() and not read_json_table(path, FormatError).get("settings"):
+            path.unlink()
         raise
 
 

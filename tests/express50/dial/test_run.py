@@ -158,14 +158,21 @@ def test_trials_of_a_core_hour_budget_are_guessed_in_core_hours(tmp_path, captur
 
 
 def test_a_budget_below_the_cheapest_settings_says_what_the_least_is(tmp_path, captures):
-    with pytest.raises(ConfigError, match=r"--budget 0\.2s: .*; give"):
+    with pytest.raises(
+        ConfigError, match=r"(the cheapest (settings )?need|the time ended) .*; give"
+    ):
         go(tmp_path / "d", captures, "0.2s")
     assert not (tmp_path / "d" / "map").exists()
     with pytest.raises(ConfigError, match="nothing but trials has been made yet"):
         existing_dataset(tmp_path / "d")
-    assert not run_file(Dataset(tmp_path / "d")).exists()  # measuring does not count again
+    kept = run_file(Dataset(tmp_path / "d"))
+    assert not kept.exists()  # measuring does not count again
     _, state = go(tmp_path / "d", captures, "5m")  # with what the pilot made
     assert state.finished and state.stated["value"][0] == pytest.approx(error_of(state.settings))
+    before = kept.read_bytes()
+    with pytest.raises(ConfigError, match=r"--budget 0\.001s: "):
+        go(tmp_path / "d", captures, "0.001s")
+    assert kept.read_bytes() == before  # a refused budget costs no earlier run its choices
 
 
 def test_a_refused_budget_says_how_much_of_it_was_waiting(tmp_path, captures, monkeypatch):
