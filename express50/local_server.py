@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from socket import SHUT_RDWR, socket
+from socket import SHUT_RDWR, SOCK_STREAM, getaddrinfo, socket
 from threading import BoundedSemaphore, Timer
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
@@ -69,13 +69,27 @@ class RequestGuard:
         return after if mine and slash else None
 
 
+def check_host(host: str) -> None:
+    """Check that a server can listen on this address; ConfigError if it is not this machine's."""
+    try:
+        family, kind, _, _, address = getaddrinfo(host, 0, type=SOCK_STREAM)[0]
+        with socket(family, kind) as probe:
+            probe.bind(address)
+    except OSError as error:
+        raise ConfigError(
+            f"{host}: {error.strerror or error}; expected an address of this machine, such as"
+            " 127.0.0.1, or 0.0.0.0 for all of its addresses"
+        ) from error
+
+
 class PageServer(ThreadingHTTPServer):
     """Serves a few pages; ``serve_forever`` answers until Ctrl-C."""
 
     daemon_threads = True
 
     def __init__(self, get: Get, post: Post | None, host: str, port: int) -> None:
-        """Bind the port without serving yet; ConfigError if it is taken or invalid."""
+        """Bind the port without serving yet; ConfigError if address or port cannot be used."""
+        check_host(host)
         if not 0 <= port <= 65535:
             raise ConfigError(f"port {port}: expected 0 to 65535 (0: any free port)")
         self.guard, self.get, self.post = RequestGuard(host), get, post

@@ -92,7 +92,13 @@ def unseen_views(
 
 def given_views(views: HeadViews, subject: str, protocol: FitProtocol) -> list[int]:
     """Choose the views to fit from; a ConfigError says that the shards have none."""
-    given = select(views.keys, subject, protocol.expression, ",".join(protocol.cameras) or "*")
+    cameras = ",".join(protocol.cameras) or "*"
+    try:
+        given = select(views.keys, subject, protocol.expression, cameras)
+    except ConfigError as error:
+        raise ConfigError(
+            f"{error}; --fit-cameras and --fit-expression choose the views to fit {subject} from"
+        ) from error
     if protocol.cameras:
         return given
     first = min(views.keys[i].camera for i in given)

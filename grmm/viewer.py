@@ -26,7 +26,7 @@ from websockets.http11 import Request, Response
 
 from express50.console import stdout_to_stderr
 from express50.geometry.transforms import invert_transform, make_transform, quat_to_matrix
-from express50.local_server import RequestGuard
+from express50.local_server import RequestGuard, check_host
 from grmm.checkpoint import Checkpoint
 from grmm.edit import POSES, HeadCodes, between, controlled, principal_directions, trained_head
 from grmm.head_crop import draw_window, without_neck_end
@@ -152,6 +152,7 @@ class Viewer:
 
     def __init__(self, loaded: Checkpoint, host: str, port: int, moving: int, still: int) -> None:
         """Start to listen; heights in pixels while things move and once they rest."""
+        check_host(host)  # the library would wait without a word
         self.loaded, self.heights = loaded, {True: moving, False: still}
         self.preview = Preview(loaded)
         self._stop, self._wake = threading.Event(), threading.Event()

@@ -124,3 +124,9 @@ def test_a_bug_in_a_page_is_one_line(capsys):
 def test_a_port_out_of_range_is_one_error():
     with pytest.raises(ConfigError, match="port 70000: expected 0 to 65535"):
         PageServer(page, None, "127.0.0.1", 70000)
+
+
+@pytest.mark.parametrize("host", ["192.0.2.1", "no-such-host.invalid"])
+def test_an_address_of_another_machine_is_one_error(host):
+    with pytest.raises(ConfigError, match=f"{host}: .*; expected an address of this machine"):
+        PageServer(page, None, host, 0)

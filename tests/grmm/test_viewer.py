@@ -11,6 +11,7 @@ import torch
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from express50.errors import ConfigError
 from grmm.checkpoint import load_checkpoint
 from grmm.edit import controlled, trained_head
 from grmm.render import frontal, orbit, picture
@@ -146,3 +147,8 @@ def test_other_sites_and_other_users_do_not_get_in(loaded):
                 urllib.request.urlopen(viewer.address + path, timeout=5)
         with urllib.request.urlopen(viewer.address, timeout=5) as page:
             assert b"Viser" in page.read()
+
+
+def test_an_address_of_another_machine_is_one_error(loaded):
+    with pytest.raises(ConfigError, match="expected an address of this machine"):
+        Viewer(loaded, "192.0.2.1", 0, 64, 128)
