@@ -13,6 +13,7 @@ import numpy as np
 from express50.console import log
 from express50.errors import ConfigError, FormatError
 from express50.files.digests import text_digest
+from express50.geometry.transforms import is_rigid, make_transform
 from express50.shards.reader import ShardReader
 from grmm.data import Place, Sample, SampleKey, Tracked
 
@@ -98,10 +99,19 @@ class ShardSource:
                 f" fx and fy of {low:g} to {high:g} px; correct the cameras and pack again"
             )
         K[:2, 2] -= columns.start, rows.start
+        cam_from_world = _matrix(meta, "cam_from_world", (4, 4), where)
+        tracked = self._tracked(meta, self.keys[index].subject, where)
+        head_pose = make_transform(tracked.R, tracked.t)
+        for name, pose in (("cam_from_world", cam_from_world), ("the track's R", head_pose)):
+            if not is_rigid(pose):
+                raise FormatError(
+                    f"{where}: {name} is not a rotation and a translation (determinant"
+                    f" {np.linalg.det(pose[:3, :3]):.4g}, expected 1); correct it and pack again"
+                )
         return Place(
             K=K,
-            cam_from_world=_matrix(meta, "cam_from_world", (4, 4), where),
-            tracked=self._tracked(meta, self.keys[index].subject, where),
+            cam_from_world=cam_from_world,
+            tracked=tracked,
             size=(rows.stop - rows.start, columns.stop - columns.start),
         )
 

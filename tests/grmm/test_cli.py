@@ -3,6 +3,7 @@ import json
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import av
 import numpy as np
@@ -283,16 +284,21 @@ def test_help_needs_no_torch():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_samples_without_a_head_model_are_refused(tmp_path):
-    sample = packed(EllipsoidSource(size=16), 0)
-    meta = json.loads(sample.members["meta.json"])
-    del meta["head"]
+def shards_whose_meta_has(folder: Path, **changes) -> Path:
+    """Write one sample whose meta differs; a change to None removes the key."""
+    sample = packed(EllipsoidSource(size=32), 0)
+    meta = json.loads(sample.members["meta.json"]) | changes
+    meta = {name: value for name, value in meta.items() if value is not None}
     members = dict(sample.members) | {"meta.json": json.dumps(meta).encode()}
-    writer = ShardWriter(tmp_path, 1 << 24)
+    writer = ShardWriter(folder, 1 << 24)
     writer.add_group("train", [PackedSample("S000", "e0", "cam00", members)])
     writer.close()
+    return folder
+
+
+def test_samples_without_a_head_model_are_refused(tmp_path):
     with pytest.raises(FormatError, match="meta names no head model"):
-        ShardSource(tmp_path)
+        ShardSource(shards_whose_meta_has(tmp_path, head=None))
 
 
 @pytest.mark.parametrize(
@@ -301,15 +307,21 @@ def test_samples_without_a_head_model_are_refused(tmp_path):
     ids=["zero", "unit", "negative", "huge", "scaled"],
 )
 def test_impossible_camera_matrices_are_named(tmp_path, K):
-    sample = packed(EllipsoidSource(size=32), 0)
-    meta = json.loads(sample.members["meta.json"]) | {"K": K.tolist()}
-    members = dict(sample.members) | {"meta.json": json.dumps(meta).encode()}
-    writer = ShardWriter(tmp_path, 1 << 24)
-    writer.add_group("train", [PackedSample("S000", "e0", "cam00", members)])
-    writer.close()
+    shards = shards_whose_meta_has(tmp_path, K=K.tolist())
     words = rf"train-000000.tar: S000_e0_cam00: K is {re.escape(str(K.tolist()))}, expected"
     with pytest.raises(FormatError, match=words):
-        ShardSource(tmp_path).place(0)
+        ShardSource(shards).place(0)
+
+
+@pytest.mark.parametrize(
+    "T",
+    [np.zeros((4, 4)), np.diag([1.0, 1, -1, 1]), np.diag([1000.0, 1000, 1000, 1])],
+    ids=["zero", "mirrored", "in millimetres"],
+)
+def test_poses_that_are_not_rigid_are_named(tmp_path, T):
+    words = "train-000000.tar: S000_e0_cam00: cam_from_world is not a rotation and a translation"
+    with pytest.raises(FormatError, match=words):
+        ShardSource(shards_whose_meta_has(tmp_path, cam_from_world=T.tolist())).place(0)
 
 
 def test_mixed_head_models_are_refused(tmp_path):
