@@ -38,8 +38,7 @@ from express50.twin.truth import Truth, align_worlds
 from pipelines.depth.maps import picture_of, surface_maps
 from pipelines.depth.prior import close_mesh
 from pipelines.depth.surface import HeadSurface
-from pipelines.matte.config import MatteConfig
-from pipelines.matte.stage import rim_figures, rim_of, wall_noise
+from pipelines.matte.stage import SHOWN, rim_figures, rim_of, wall_noise
 from pipelines.register.lay import LaidMesh, mesh_normals
 from pipelines.register.stage import error_figures as laid_figures
 from pipelines.register.stage import lone_sigma
@@ -152,7 +151,7 @@ def _matte(peak: _Peak) -> Iterator[Sample]:
     for name in facts["coverage"]:
         alpha, frame = peak.alpha(name), peak.frame_of(name)
         plated, noise = name not in facts["without_plate"], wall_noise(alpha, frame)
-        rgb = shrink(frame, MatteConfig().side)
+        rgb = shrink(frame, SHOWN)
         parts.append(rim_figures(alpha, rgb, noise, plated, len(facts["coverage"])))
         true = peak.truth.render_alpha(peak.subject, peak.frame, peak.true_camera(name))
         errors.append(np.abs(alpha / 255 - true)[rim_of(alpha)])

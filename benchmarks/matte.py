@@ -1,7 +1,7 @@
 """Measure mattes against known alpha, beside plain keys and textbook matting.
 
 ``python -m benchmarks.matte`` draws scenes (`benchmarks.matte_scenes`: dark, blond and frizzy
-strands, each before a plain and a cluttered plate) and keys them (``standard``; presets key alike);
+strands, each before a plain and a cluttered plate) and keys them;
 with ``--twin`` it keys the peaks of the demo's twin too, undistorted with the true cameras so that
 only keying is measured.
 

@@ -52,7 +52,6 @@ from benchmarks.common import (
 )
 from benchmarks.matte import errors
 from benchmarks.matte_disturbances import DISTURBANCES, Shot, other_plates, walls
-from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.errors import NoFaceError
 from express50.files.images import contact_sheet, write_image
@@ -60,7 +59,6 @@ from express50.geometry.cameras import pinhole
 from express50.geometry.sampling import evenly
 from express50.twin.config import TwinConfig
 from express50.twin.truth import Truth
-from pipelines.matte import STAGE
 from pipelines.matte.config import MatteConfig
 from pipelines.matte.consensus import agree
 from pipelines.matte.cutout import CutView, cut_out, make_cut_view, soft_alpha
@@ -69,7 +67,6 @@ from pipelines.matte.plates import LEAST_SHARE, match_plate
 from pipelines.matte.stage import corrected, make_view
 from pipelines.matte.visual_hull import ball_of
 
-PRESETS = ("draft", "standard")
 RIG = TwinConfig(
     subjects=1, first_subject=61, cameras=24, width=384, height=384, footage="jpg",
     expressions=("neutral", "jaw_open"), frames_per_expression=4, board_frames=0,
@@ -93,16 +90,14 @@ def main() -> int:
     parser.add_argument("--subject", type=int, default=RIG.first_subject, help="of the twin")
     parser.add_argument("--recording", type=Path, default=Path("build/bench-views"))
     parser.add_argument("--peaks", type=int, default=2, help="moments, at most")
-    parser.add_argument("--set", dest="assignments", action="append", default=[])
-    parser.add_argument("--pictures", type=Path, help="folder for pictures of the standard preset")
+    parser.add_argument("--pictures", type=Path, help="folder for pictures")
     parser.add_argument("--plates-only", action="store_true", help="leave out no_plate")
     args = parser.parse_args()
     check_twin_options(parser, args)
     cv2.setNumThreads(1)
     twin = replace(RIG, first_subject=args.subject)
     dataset, truth = named_or_recorded(args, twin, args.recording)
-    configs = {name: resolve_config(STAGE, name, None, args.assignments) for name in PRESETS}
-    rows: dict[tuple[int, str, str], list[Figures]] = {}
+    rows: dict[tuple[int, str], list[Figures]] = {}
     bare: dict[tuple[int, str], list[Figures]] = {}
     plates: dict[str, list[Figures]] = {}
     for subject, frame in moments(dataset, truth, args.peaks):
@@ -112,15 +107,14 @@ def main() -> int:
             keyed = [undone.get(id(shot)) or key(shot) for shot in disturb(clean)]
             undone |= {id(k.shot): k for k in keyed if scene == "undisturbed"}
             for step in (1, 3):
-                for preset, config in configs.items():
-                    row = measure(keyed[::step], config, sheet_of(args, preset, scene, step, frame))
-                    rows.setdefault((len(keyed[::step]), preset, scene), []).append(row)
-                    words = subject, frame, scene, preset, len(keyed[::step]), rounded(row)
-                    print(*words, file=sys.stderr)
+                row = measure(keyed[::step], sheet_of(args, scene, step, frame))
+                rows.setdefault((len(keyed[::step]), scene), []).append(row)
+                words = subject, frame, scene, len(keyed[::step]), rounded(row)
+                print(*words, file=sys.stderr)
         if not args.plates_only:
             for scene, shots in {"recorded": clean, **walls(clean)}.items():
                 for step in (1, 3):
-                    sheet = sheet_of(args, "standard", f"no-plate-{scene}", step, frame)
+                    sheet = sheet_of(args, f"no-plate-{scene}", step, frame)
                     bare.setdefault((len(shots[::step]), scene), []).append(
                         without_plates(shots[::step], sheet)
                     )
@@ -158,19 +152,19 @@ def shots_of(dataset: Dataset, truth: Truth, subject: str, frame: int) -> list[S
 
 
 def key(shot: Shot) -> Keyed:
-    """Return the shot with its camera's own alpha, by the standard preset."""
+    """Return the shot with its camera's own alpha."""
     alpha = key_alpha(shot.frame, shot.plate, shot.valid, MatteConfig().shadow)
     return Keyed(shot, np.rint(255 * alpha).astype(np.uint8))
 
 
-def measure(keyed: list[Keyed], config: MatteConfig, sheet: Path | None) -> Figures:
+def measure(keyed: list[Keyed], sheet: Path | None) -> Figures:
     """Return errors of one moment before and after the cameras agree, and the seconds it takes."""
     started = time.process_time()
     ball = ball_of({k.shot.camera.id: k.shot.camera for k in keyed})
     if ball is None:
         sys.exit("the rig looks at no one place; name another --dataset")
-    views = [make_view(k.shot.camera, ball, k.shot.frame, k.alpha, config.side) for k in keyed]
-    found = agree(views, config.cells)
+    views = [make_view(k.shot.camera, ball, k.shot.frame, k.alpha) for k in keyed]
+    found = agree(views)
     after = [
         corrected(k.alpha, found.removed.get(k.shot.camera.id), found.filled.get(k.shot.camera.id))
         for k in keyed
@@ -257,23 +251,20 @@ def bare_summary(rows: dict[tuple[int, str], list[Figures]]) -> dict[str, Any]:
     return table
 
 
-def sheet_of(
-    args: argparse.Namespace, preset: str, scene: str, step: int, frame: int
-) -> Path | None:
+def sheet_of(args: argparse.Namespace, scene: str, step: int, frame: int) -> Path | None:
     """Return where the picture of a measurement goes, if anywhere."""
-    if args.pictures is None or preset != "standard" or step == 1:
+    if args.pictures is None or step == 1:
         return None
     return args.pictures / f"{scene}-{frame}.png"
 
 
-def summary(rows: dict[tuple[int, str, str], list[Figures]]) -> dict[str, object]:
-    """Return means over the peaks by number of cameras, preset and scene, with their ratios."""
+def summary(rows: dict[tuple[int, str], list[Figures]]) -> dict[str, object]:
+    """Return means over the peaks by number of cameras and scene, with their ratios."""
     table: dict[str, Any] = {}
-    for (count, preset, scene), mine in rows.items():
+    for (count, scene), mine in rows.items():
         row = means(mine)
         row["sad_ratio_to_key"] = row["sad"] / row["sad_key"]
-        scenes = table.setdefault(f"cameras_{count}", {}).setdefault(preset, {})
-        scenes[scene] = rounded(row)
+        table.setdefault(f"cameras_{count}", {})[scene] = rounded(row)
     return table
 
 

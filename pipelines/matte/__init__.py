@@ -7,7 +7,7 @@ from pathlib import Path
 from express50.capture.index import peak_items
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
-from pipelines.matte.config import NETWORKS, PRESETS, WITHOUT_PLATE, MatteConfig
+from pipelines.matte.config import NETWORKS, WITHOUT_PLATE, MatteConfig
 
 
 def inputs(dataset: Dataset, item: str, config: MatteConfig) -> dict[str, Path | str]:
@@ -52,9 +52,8 @@ def needs_gpu(config: MatteConfig) -> bool:
 
 STAGE = Stage(
     name="matte",
-    version=20,
+    version=21,
     config=MatteConfig,
-    presets=PRESETS,
     items=peak_items,
     inputs=inputs,
     run=run,

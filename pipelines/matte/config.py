@@ -1,4 +1,4 @@
-"""Define the settings of the matte stage and its presets."""
+"""Define the settings of the matte stage."""
 
 from __future__ import annotations
 
@@ -31,16 +31,10 @@ class MatteConfig:
     """Broad darkening of the plate by up to this share is a shadow; 0 turns this off."""
     agree: bool = True
     """Let the cameras correct each other; false keeps every camera's own matte."""
-    side: int = 192
-    """Longest side, pixels, of the images that are compared between cameras."""
-    cells: int = 96
-    """Cells along each side of the cube in which the cameras are compared."""
 
     def __post_init__(self) -> None:
         """Refuse values that matte nothing or everything."""
-        check_ranges(
-            "matte", self, shadow=(0, 0.99), tile=(512, math.inf), side=(16, 2048), cells=(16, 256)
-        )
+        check_ranges("matte", self, shadow=(0, 0.99), tile=(512, math.inf))
         if (self.method in NETWORKS) != bool(self.weights):
             raise ConfigError(
                 f"matte.method {self.method!r} with matte.weights {self.weights!r}: key and grabcut"
@@ -48,6 +42,3 @@ class MatteConfig:
             )
         if self.tile % 64:
             raise ConfigError(f"matte.tile is {self.tile}, expected a multiple of 64")
-
-
-PRESETS: dict[str, dict[str, object]] = {"draft": {"side": 128, "cells": 64}}

@@ -26,6 +26,9 @@ from pipelines.matte.visual_hull import (
     subject_place,
 )
 
+# Longest side of the pictures, and cells along each side of space: 192 and 96 take three times as
+# long and are no better (docs/LOG.md, "Mattes").
+SIDE, CELLS = 128, 64
 FEWEST = 4  # views; of three, two with the same error would overrule a correct one
 EMPTY, FULL = 0.003, 0.98  # shares of the image
 # A matte is wrong as a whole if over STRAY of it lies off the others' subject and it lacks over
@@ -72,7 +75,7 @@ class Agreement:
     unchanged: str = ""
 
 
-def agree(views: Sequence[MatteView], cells: int) -> Agreement:
+def agree(views: Sequence[MatteView], cells: int = CELLS) -> Agreement:
     """Compare the views of one frame set, on `cells` cells along each side of space."""
     doubted = {view.name: why for view in views if (why := _why_useless(view))}
     # Most of the others must be right; otherwise the wrong ones cannot be identified.

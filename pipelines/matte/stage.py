@@ -20,7 +20,7 @@ from express50.files.images import box_about, shrink, tile_sheet, write_image
 from express50.geometry.cameras import Camera, pinhole, resized
 from express50.geometry.sampling import undistorted_mask
 from pipelines.matte.config import NETWORKS, WITHOUT_PLATE, MatteConfig
-from pipelines.matte.consensus import Agreement, agree
+from pipelines.matte.consensus import SIDE, Agreement, agree
 from pipelines.matte.cutout import CutView, cut_out, make_cut_view, soft_alpha
 from pipelines.matte.key import dilated, key_alpha
 from pipelines.matte.plates import (
@@ -35,6 +35,7 @@ from pipelines.matte.visual_hull import INSIDE, Ball, MatteView, ball_of
 
 COLUMNS = 6  # of the contact sheet
 TILE = 240
+SHOWN = 192  # longest side of the pictures in the contact sheet, pixels
 RED, GREEN = (235, 50, 40), (50, 220, 80)
 EMPTY = 0.003  # share of the image below which a matte counts as empty
 # Share of the image's top or of a side that the subject may cover before it counts as cut off.
@@ -49,7 +50,7 @@ MatteFunction = Callable[[np.ndarray, Any, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class CameraMatte:
-    """The matte of one camera alone: alpha (H, W) uint8, and the frame reduced to `matte.side`.
+    """The matte of one camera alone: alpha (H, W) uint8, and the frame reduced to `SHOWN`.
 
     `noise` is the `wall_noise` of the full frame.
     """
@@ -73,28 +74,24 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
     if not mattes:
         raise StageError(f"{item}: {dropped[0].why if dropped else 'no camera is calibrated'}")
     alphas = {name: matte.alpha for name, matte in mattes.items()}
-    # If the cameras share no place, views are for the contact sheet only.
-    place = ball or Ball(np.zeros(3), 1.0)
-    views = [
-        make_view(cameras[name], place, matte.rgb, matte.alpha, config.side)
-        for name, matte in mattes.items()
-    ]
-    compares = config.agree and ball is not None
-    if compares:
-        found = agree(views, config.cells)
+    views = []
+    if not config.agree:
+        found = Agreement(unchanged="matte.agree is off")
+    elif ball is None:
+        found = Agreement(unchanged="the cameras do not look at one place")
     else:
-        off = "the cameras do not look at one place" if config.agree else "matte.agree is off"
-        found = Agreement(unchanged=off)
+        views = [make_view(cameras[n], ball, m.rgb, m.alpha) for n, m in mattes.items()]
+        found = agree(views)
     final = {
         name: corrected(alpha, found.removed.get(name), found.filled.get(name))
         for name, alpha in alphas.items()
     }
     for name, alpha in final.items():
         write_image(out / f"{name}.png", alpha)
-    _write_picture(out, views, found)
+    _write_picture(out, mattes, found)
     figures = {
         "method": config.method,
-        "views": len(views) if compares else 0,
+        "views": len(views),
         "without_plate": [name for name, matte in mattes.items() if not matte.plated],
         "coverage": {name: round(float(a.mean()) / 255, 6) for name, a in final.items()},
         "border_contact": {name: border_contact(alpha) for name, alpha in final.items()},
@@ -136,7 +133,7 @@ def camera_mattes(
             if plate is not None or config.method in NETWORKS:
                 alpha = eight_bit(matte_one(frame, plate, valid), valid)
                 noise = wall_noise(alpha, frame)
-                found[name] = CameraMatte(alpha, shrink(frame, config.side), noise)
+                found[name] = CameraMatte(alpha, shrink(frame, SHOWN), noise)
         except (CaptureError, StageError) as error:
             dropped.append(Note(name, str(error)))
             continue
@@ -152,7 +149,7 @@ def camera_mattes(
         frame, valid = read(name), valid_pixels(cameras[name])
         alpha = eight_bit(soft_alpha(frame, valid, cuts[name]), valid)
         noise = wall_noise(alpha, frame)
-        found[name] = CameraMatte(alpha, shrink(frame, config.side), noise, plated=False)
+        found[name] = CameraMatte(alpha, shrink(frame, SHOWN), noise, plated=False)
     return {name: found[name] for name in cameras if name in found}, dropped, warnings
 
 
@@ -216,7 +213,7 @@ def _matte_function(config: MatteConfig) -> MatteFunction:
 
 
 def make_view(
-    camera: Camera, ball: Ball, image: np.ndarray, alpha: np.ndarray, side: int
+    camera: Camera, ball: Ball, image: np.ndarray, alpha: np.ndarray, side: int = SIDE
 ) -> MatteView:
     """Reduce a recorded camera with its undistorted image (H, W, 3) and alpha (H, W), uint8."""
     rgb = shrink(image, side)
@@ -350,16 +347,17 @@ def matte_warnings(alphas: dict[str, np.ndarray]) -> list[Note]:
     return notes
 
 
-def _write_picture(out: Path, views: list[MatteView], found: Agreement) -> None:
+def _write_picture(out: Path, mattes: Mapping[str, CameraMatte], found: Agreement) -> None:
     """Draw every camera's subject: removed pixels are red, filled pixels are green."""
     odd = {note.what for note in found.warnings}
     tiles = {}
-    for view in views:
-        tile = np.where(view.alpha[..., None] > INSIDE, view.rgb, view.rgb // 3)
+    for name, matte in mattes.items():
+        opaque = shrink(matte.alpha, SHOWN) > 255 * INSIDE
+        tile = np.where(opaque[..., None], matte.rgb, matte.rgb // 3)
         for masks, colour in ((found.removed, RED), (found.filled, GREEN)):
-            if view.name in masks:
-                mask = masks[view.name]
+            if name in masks:
+                mask = cv2.resize(masks[name].astype(np.uint8), tile.shape[1::-1]) > 0
                 tile[mask] = (0.3 * tile[mask] + 0.7 * np.array(colour)).astype(np.uint8)
-        tiles[view.name + ("?" if view.name in odd else "")] = tile
+        tiles[name + ("?" if name in odd else "")] = tile
     (out / "qc").mkdir()
     write_image(out / "qc" / "agreement.jpg", tile_sheet(tiles, COLUMNS, TILE), quality=88)

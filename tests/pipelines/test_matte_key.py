@@ -268,10 +268,7 @@ def test_a_window_around_the_subject_harms_nothing(monkeypatch) -> None:
     assert mae(key(wide), wide) < 1.02 * whole
 
 
-@pytest.mark.parametrize(
-    "change",
-    [{"shadow": 1.0}, {"side": 4}, {"cells": 1000}],
-)
+@pytest.mark.parametrize("change", [{"shadow": 1.0}, {"tile": 64}, {"tile": 1000}])
 def test_wrong_settings_are_refused(change) -> None:
     with pytest.raises(ConfigError, match="matte"):
         MatteConfig(**change)

@@ -25,7 +25,7 @@ from pipelines import calibrate, frames
 from pipelines.matte import STAGE
 from pipelines.matte.stage import rim_figures, wall_noise
 from tests.pipelines.bump_dataset import make_dataset as bump_dataset
-from tests.pipelines.matte_rig import SIZE, disc
+from tests.pipelines.matte_rig import disc
 from tests.pipelines.matte_scenes import make_scene
 from tests.pipelines.stand_ins import Bad, Difference, onnx_bright, torchscript
 from tests.stages import ingest_captures, run_here
@@ -189,7 +189,7 @@ def shaded(tmp_path_factory) -> Dataset:
 
 
 def test_what_one_camera_alone_shows_is_removed(shaded) -> None:
-    assert run(shaded, side=SIZE, cells=64).ok
+    assert run(shaded).ok
     figures = metrics_of(shaded)
     assert figures["views"] == 8 and figures["dropped"] == []
     assert set(figures["removed"]) == {"cam02"}
