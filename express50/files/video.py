@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
@@ -204,17 +204,25 @@ def video_tags(path: Path) -> VideoTags:
     container, stream = _open(path)
     with container:
         for frame in _decode(path, container, stream):
-            return VideoTags(
-                round(frame.rotation / 90) % 4,
-                HDR_CURVES.get(int(frame.color_trc), ""),
-                bool(frame.interlaced_frame),
-                float(stream.codec_context.sample_aspect_ratio or 1),
-            )
+            return _tags(frame, stream)
     raise CaptureError(f"{path}: video holds no frame; record or copy it again")
 
 
-def iterate_video(path: Path) -> Iterator[tuple[int, np.ndarray]]:
+def _tags(frame: av.VideoFrame, stream: av.VideoStream) -> VideoTags:
+    return VideoTags(
+        round(frame.rotation / 90) % 4,
+        HDR_CURVES.get(int(frame.color_trc), ""),
+        bool(frame.interlaced_frame),
+        float(stream.codec_context.sample_aspect_ratio or 1),
+    )
+
+
+def iterate_video(
+    path: Path, tell: Callable[[VideoTags], None] | None = None
+) -> Iterator[tuple[int, np.ndarray]]:
     """Decode a whole video in display order.
+
+    `tell` is called with what `video_tags` returns, before the first frame.
 
     Yields:
         Time stamp (in the stream's own unit) and (H, W, 3) uint8 sRGB image.
@@ -227,6 +235,8 @@ def iterate_video(path: Path) -> Iterator[tuple[int, np.ndarray]]:
     with container:
         count = 0
         for frame in _decode(path, container, stream):
+            if tell and not count:
+                tell(_tags(frame, stream))
             count += 1
             yield int(frame.pts), _pixels(path, frame)
     if count == 0:

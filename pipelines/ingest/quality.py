@@ -18,6 +18,7 @@ import numpy as np
 import scipy
 
 from express50.files.images import linear_to_srgb, shrink, srgb_to_linear
+from express50.files.video import VideoTags
 
 SIDE = 96  # longer side, pixels, of the images in which movement is measured
 FEWEST_CAMERAS, FEWEST_FRAMES = 3, 24
@@ -49,11 +50,13 @@ class CameraMeasurements:
         moves: (F,) movement since the frame before, grey levels.
         cells: (F, 16, 16, 3) linear light.
         widths: frame and width of its sharpest edges, pixels, of some frames.
+        tags: what its first video says of its pictures; None if it has none.
     """
 
     moves: np.ndarray
     cells: np.ndarray
     widths: tuple[tuple[int, float], ...]
+    tags: VideoTags | None = None
 
 
 def check_quality(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import tarfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,7 @@ from express50.files.atomic import dump_json
 from express50.files.containers import WITHIN, inside, read_picture
 from express50.files.digests import file_sha256, text_digest
 from express50.files.images import ORIENTATION, encode_jpeg, has_alpha, read_exif, shrink, upright
-from express50.files.video import VideoTags, iterate_video, video_fps, video_tags
+from express50.files.video import VideoTags, iterate_video, video_fps
 from express50.geometry.sampling import edge_width
 from pipelines.ingest.quality import CameraMeasurements, light_cells, movement, small_grey
 
@@ -44,10 +44,11 @@ def scan_camera(
     moves: list[float] = []
     cells: list[np.ndarray] = []
     widths: list[tuple[int, float]] = []
+    tags: list[VideoTags] = []
     before: np.ndarray | None = None
     size: tuple[int, ...] | None = None
     with ProxyWriter(folder / f"{camera.id}.tar") as proxies:
-        for clip, stamp, image in iterate_camera(camera):
+        for clip, stamp, image in iterate_camera(camera, tags.append):
             size = size or image.shape[:2]
             if image.shape[:2] != size:
                 raise CaptureError(
@@ -84,7 +85,8 @@ def scan_camera(
         correction=camera.correction,
         orientation=camera.orientation,
     )
-    return source, CameraMeasurements(np.array(moves), np.stack(cells), tuple(widths))
+    measured = CameraMeasurements(np.array(moves), np.stack(cells), tuple(widths), *tags[:1])
+    return source, measured
 
 
 def trimmed(
@@ -109,20 +111,26 @@ def trimmed(
         dhash=tuple(source.dhash[i] for i in chosen),
         names=names,
         clips=counts,
-    ), CameraMeasurements(
-        measured.moves[keep],
-        measured.cells[keep],
-        tuple((number[frame], width) for frame, width in measured.widths if frame in number),
+    ), replace(
+        measured,
+        moves=measured.moves[keep],
+        cells=measured.cells[keep],
+        widths=tuple((number[frame], width) for frame, width in measured.widths if frame in number),
     )
 
 
-def iterate_camera(camera: RawCamera) -> Iterator[tuple[int, int, np.ndarray]]:
-    """Yield clip, time stamp and recorded image (H, W, 3) uint8 sRGB of every frame."""
+def iterate_camera(
+    camera: RawCamera, tell: Callable[[VideoTags], None]
+) -> Iterator[tuple[int, int, np.ndarray]]:
+    """Yield clip, time stamp and recorded image (H, W, 3) uint8 sRGB of every frame.
+
+    `tell` is called with the tags of every video.
+    """
     if camera.kind == "video":
-        yield from ((0, stamp, image) for stamp, image in iterate_video(camera.path))
+        yield from ((0, stamp, image) for stamp, image in iterate_video(camera.path, tell))
     elif camera.kind == "videos":
         for clip, name in enumerate(camera.names):
-            for stamp, image in iterate_video(inside(camera.path, name)):
+            for stamp, image in iterate_video(inside(camera.path, name), tell):
                 yield clip, stamp, upright(image, camera.orientation)
     else:
         ends = np.cumsum(camera.counts or (len(camera.names),))
@@ -148,7 +156,11 @@ def _steps(pts: tuple[int, ...], clips: tuple[int, ...]) -> np.ndarray:
     return steps[within]
 
 
-def odd_footage(raw: RawCapture, cameras: Mapping[str, CameraSource]) -> dict[str, str]:
+def odd_footage(
+    raw: RawCapture,
+    cameras: Mapping[str, CameraSource],
+    measured: Mapping[str, CameraMeasurements],
+) -> dict[str, str]:
     """Return warnings about rate, time stamps, channels and orientation, by camera."""
     found = {}
     for name, source in cameras.items():
@@ -160,9 +172,8 @@ def odd_footage(raw: RawCapture, cameras: Mapping[str, CameraSource]) -> dict[st
                 if has_alpha(path):
                     why = "has an alpha channel, which is left out: a later stage makes mattes"
                     oddities.append(why)
-        else:
+        elif tags := measured[name].tags:
             path = inside(camera.path, camera.names[0]) if camera.names else camera.path
-            tags = video_tags(path)
             orientation = ORIENTATION[tags.turn]
             oddities += [w for w in (_rate(raw, path), _uneven(source)) if w] + _odd_pictures(tags)
         if orientation != 1 and camera.orientation == 1:

@@ -155,7 +155,7 @@ def run(
     clips = next(iter(cameras.values())).clips or (index.frames,)
     kept = {name: measured[name] for name in cameras}
     figures, warnings = check_quality(kept, digests, clips, sync_frames, blur_ratio)
-    for name, why in odd_footage(raw, cameras).items():
+    for name, why in odd_footage(raw, cameras, measured).items():
         warnings[name] = "; ".join([why, *filter(None, [warnings.get(name)])])
     write_json(out / "checks.json", figures)
     lost = {f"camera {k}": why for k, why in sorted(dropped.items())}
