@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -26,10 +27,11 @@ from express50.files.video import iterate_video
 from express50.geometry.cameras import Camera, resized
 from express50.geometry.conventions import opencv_pixels_to_corner
 from express50.geometry.sampling import evenly
-from express50.landmarks.detector import SMALL, Detection, detect
-from express50.landmarks.network import load_network
 from pipelines.calibrate.config import LONG_SIDE
 from pipelines.calibrate.tracks import FEATURE_SIGMA_PX, Features, FrameSetPoints
+
+if TYPE_CHECKING:
+    from express50.landmarks.detector import Detection
 
 FEATURES = 4000  # kept per image, strongest first
 FACE_SCORE = 0.4  # profiles have no more; their landmarks come with a large sigma
@@ -127,6 +129,10 @@ def find_points(read: Callable[[], Images], small: bool = False) -> dict[int, Fr
     With `small`, images are read again and smaller windows searched if most frame sets lack a
     second face.
     """
+    # Imported here: given cameras that are not checked need no network.
+    from express50.landmarks.detector import SMALL, detect
+    from express50.landmarks.network import load_network
+
     net = load_network()
     faces: dict[int, dict[str, Detection]] = {}
     features: dict[int, dict[str, Features]] = {}

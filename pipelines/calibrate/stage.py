@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from express50.capture.index import Index, calibration_file, read_index
@@ -354,17 +355,21 @@ def draw_rig(path: Path, cameras: Mapping[str, Camera], boards: np.ndarray) -> N
     titles = ("from above (front of the rig below)", "from the front")
     for column, (title, plane) in enumerate(zip(titles, ([0, 2], [0, 1]), strict=True), 1):
         axes = figure.add_subplot(1, 2, column)
+        frusta, sights = [], []
         for name, camera in sorted(cameras.items()):
             size = np.array([camera.width, camera.height])
             corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size
             outline = unproject(pinhole(camera), corners, np.full(4, 0.12 * reach))[:, plane]
             start = camera.center[plane]
-            for i in range(4):
-                side = np.stack([start, outline[i], outline[(i + 1) % 4]])
-                axes.plot(*side.T, color="tab:blue", lw=0.8)
+            frusta += [
+                [start, side, after]
+                for side, after in zip(outline, np.roll(outline, -1, 0), strict=True)
+            ]
             end = start if met is None else start + reach * camera.cam_from_world[2, plane]
-            axes.plot([start[0], end[0]], [start[1], end[1]], color="0.8", lw=0.5, zorder=0)
+            sights.append([start, end])
             axes.annotate(name, start, fontsize=6, textcoords="offset points", xytext=(3, 3))
+        axes.add_collection(LineCollection(frusta, color="tab:blue", lw=0.8))
+        axes.add_collection(LineCollection(sights, color="0.8", lw=0.5, zorder=0))
         if len(boards):
             axes.plot(*boards[:, plane].T, ".", color="tab:orange", ms=3, label="board")
             axes.legend(loc="upper right", fontsize=7)

@@ -224,7 +224,7 @@ def test_small_faces_are_searched_for_only_if_a_second_one_is_missing(monkeypatc
         score = scores[camera] if smallest == 0.25 else 0.7
         return Detection(np.ones((68, 2)), np.ones(68), np.ones(68), score)
 
-    monkeypatch.setattr("pipelines.calibrate.footage.detect", find)
+    monkeypatch.setattr("express50.landmarks.detector.detect", find)
     blank = [(0, f"cam{k}", np.full((32, 32, 3), k, np.uint8)) for k in range(3)]
     found = find_points(lambda: blank, small=True)[0].landmarks
     assert [name for name, _, _ in found] == [f"cam{k}" for k in range(3)][: 3 if again else 2]
