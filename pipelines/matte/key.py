@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.files.images import LIGHT_OF_LEVEL, box_about, edge_distance, shrink
+from express50.files.images import LIGHT_OF_LEVEL, box_about, shrink
 from pipelines.matte.plates import (
     PlateModel,
     blurred,
@@ -181,7 +181,9 @@ def eroded(mask: np.ndarray, radius: float) -> np.ndarray:
         side = np.arange(-radius, radius + 1)
         disc = (side[:, None] ** 2 + side**2 <= radius**2).astype(np.uint8)
         return cv2.erode(mask.astype(np.uint8), disc) > 0
-    return edge_distance(mask) > radius
+    # Squared distances are integers; their roots may be a bit off (`edge_distance`).
+    rough = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return rough > math.sqrt(math.floor(radius * radius) + 0.5)
 
 
 def eroded_about(mask: np.ndarray, radius: int) -> np.ndarray:
