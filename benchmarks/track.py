@@ -51,7 +51,7 @@ from pipelines.track import run as track_subject
 from pipelines.track import stage as track_stage
 
 EXPRESSIONS = ("neutral", "smile", "jaw_open", "pucker", "brow_raise", "wink_left")
-PRESETS = ("draft", "standard", "reference")
+PRESETS = ("draft", "standard")
 LANDMARK_ONLY: dict[str, object] = {
     "outline_rounds": 0, "patch_rounds": 0, "uv_rounds": 0,
 }  # fmt: skip
@@ -86,7 +86,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = make_parser("track", __doc__)
     add_twin_options(parser)
     parser.add_argument("--captures", type=Path, help="its captures, with the held-out cameras")
-    parser.add_argument("--presets", default="draft,standard,reference", type=preset_names)
+    parser.add_argument("--presets", default="draft,standard", type=preset_names)
     parser.add_argument("--subjects", type=int, default=2)
     parser.add_argument("--cameras", type=int, default=18, help=f"of these {HELD_OUT} are held out")
     parser.add_argument("--side", type=int, default=512, help="pixels of the recorded footage")

@@ -68,5 +68,4 @@ PRESETS: dict[str, dict[str, object]] = {
         "cameras": 6, "search": 0.5, "outline_rounds": 2, "patch_rounds": 4, "uv_rounds": 4,
         "samples": 2000, "offset_modes": 80, "texture_side": 256, "clip_rounds": 0,
     },
-    "reference": {"photo_side": 1024, "texture_side": 1024, "clip_rounds": 3},
 }  # fmt: skip
