@@ -54,13 +54,6 @@ def test_an_odd_4k_frame_is_seen_small_and_refined_in_tiles(tmp_path) -> None:
     assert np.abs(alpha - disc).sum() < 0.004 * disc.sum()
 
 
-def test_black_and_white_frames(tmp_path) -> None:
-    network = load_network(torchscript(Difference(), tmp_path / "net.pt"), BGMV2)
-    black, white = (np.full((70, 70, 3), v, np.uint8) for v in (0, 255))
-    assert background_alpha(network, black, black, 512).max() == 0
-    assert background_alpha(network, white, black, 512)[1:-1, 1:-1].min() == 1
-
-
 def test_warnings_of_empty_and_cut_off_mattes() -> None:
     alpha = np.zeros((40, 60), np.uint8)
     alpha[10:, 20:40] = 255  # at the bottom every subject is cut off

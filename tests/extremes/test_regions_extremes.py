@@ -121,34 +121,19 @@ def test_figures_of_nothing_are_numbers_and_named() -> None:
     assert "30%" in str(view_warning(figures | changes[-1]))
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "message"),
-    [
-        ("vertices", np.nan, "vertices .*not finite.*; run 'express50 track' again"),
-        ("vertices", np.inf, "vertices .*not finite"),
-        ("R", np.nan, "R .*not finite"),
-        ("vertices", "short", "not a track .*shape"),
-        ("head", "missing", "not a track"),
-        ("expressions", "other", "it is not tracked"),
-    ],
-)
-def test_damaged_tracks_are_one_clear_line(tmp_path, key, value, message) -> None:
+def test_damaged_tracks_are_one_clear_line(tmp_path) -> None:
     dataset = make_dataset(tmp_path, cameras=2, size=32)
     path = dataset.track_file("S001")
     with np.load(path) as table:
         arrays = dict(table)
-    if value == "short":
-        arrays[key] = arrays[key][:, :-1]
-    elif value == "missing":
-        del arrays[key]
-    elif value == "other":
-        arrays[key] = np.array(["shout", "wink"])
-    else:
-        arrays[key][-1, 0] = value
-    np.savez(path, **arrays)
-    with pytest.raises((FormatError, StageError), match=message) as caught:
-        STAGE.run(dataset, "S001/smile", CONFIG, tmp_path)
-    assert "\n" not in str(caught.value)
+    for changes, message in (
+        ({"R": np.nan * arrays["R"]}, "R .*not finite.*; run 'express50 track' again"),
+        ({"expressions": np.array(["shout", "wink"])}, "it is not tracked"),
+    ):
+        np.savez(path, **arrays | changes)
+        with pytest.raises((FormatError, StageError), match=message) as caught:
+            STAGE.run(dataset, "S001/smile", CONFIG, tmp_path)
+        assert "\n" not in str(caught.value)
 
 
 def test_mattes_and_depth_maps_of_another_size_are_named(tmp_path) -> None:

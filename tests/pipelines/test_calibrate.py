@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from express50.errors import CalibrationError
-from express50.files.calibration import read_cameras, write_cameras
+from express50.files.calibration import write_cameras
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
 from express50.rigs.camera_builder import in_metres
 from express50.rigs.world_frame import canonical_from_rig, meeting_point, move_cameras
@@ -293,19 +293,6 @@ def test_given_cameras_in_millimetres_are_warned_of(tmp_path) -> None:
         "warnings"
     ]
     assert row["what"] == "cameras" and "in metres?" in row["why"]
-
-
-def test_a_malformed_calibration_file_is_refused(tmp_path) -> None:
-    rig = make_rig(2)
-    path = tmp_path / "calibration.json"
-    write_cameras(path, rig)
-    text = path.read_text()
-    path.write_text(text.replace("OPENCV", "OPENKV", 1))
-    with pytest.raises(CalibrationError, match="OPENKV"):
-        read_cameras(path)
-    path.write_text(text.replace("1.0\n   ]", "1.0,\n    2.0\n   ]", 1))
-    with pytest.raises(CalibrationError, match="world_to_camera"):
-        read_cameras(path)
 
 
 @pytest.mark.parametrize(

@@ -97,12 +97,6 @@ def test_skin_without_texture_gives_no_measurement() -> None:
     assert nothing(*search(cameras, noisy))
 
 
-@pytest.mark.parametrize("value", [0.0, 1.0])
-def test_all_black_and_all_white_pictures_give_no_measurement(value: float) -> None:
-    cameras = rig()
-    assert nothing(*search(cameras, [np.full((256, 256), value, np.float32)] * 4))
-
-
 def test_one_view_or_the_same_view_twice_gives_no_measurement(pictures) -> None:
     cameras, images = pictures
     assert nothing(*search(cameras[:1], images[:1]))

@@ -1,10 +1,4 @@
-"""A session without a screen: order, cost, undo, and what survives a kill."""
-
-import os
-import signal
-import subprocess
-import sys
-from pathlib import Path
+"""A session without a screen: order, cost and undo."""
 
 import pytest
 
@@ -15,8 +9,6 @@ from annotations.worklist import LabelTask
 from express50.capture.index import read_index
 from express50.errors import AnnotationError
 from tests.annotations.footage import suggest
-
-REPOSITORY = Path(__file__).resolve().parents[3]
 
 
 class Clock:
@@ -158,28 +150,3 @@ def test_missing_inputs_become_notes_and_problems(dataset):
     assert "suggestions" in " ".join(
         load_scene(dataset, LabelTask("S001", "smile", 1), "ann").notes
     )
-
-
-_KILLED = """
-import sys
-sys.path[:0] = sys.argv[2:]
-from express50.contract.layout import Dataset
-from annotations.ui.session import Session
-from tests.annotations.ui.test_session import mark
-session = Session(Dataset(sys.argv[1]), "ann", order="subject")
-while session.done < len(session.tasks):
-    print(mark(session).expression, session.tasks[session.position - 1].subject, flush=True)
-sys.stdin.read()
-"""
-
-
-def test_killed_session_loses_no_acknowledged_mark(suggested):
-    command = [sys.executable, "-c", _KILLED, str(suggested.root), str(REPOSITORY)]
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stdin=subprocess.PIPE, text=True, cwd=REPOSITORY,
-        env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
-    ) as child:  # fmt: skip
-        acknowledged = [child.stdout.readline().split()[0] for _ in range(4)]
-        child.send_signal(signal.SIGKILL)
-    found = [*read_labels(suggested, "S001"), *read_labels(suggested, "S002")]
-    assert [label.expression for label in found][:4] == acknowledged
