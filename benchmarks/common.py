@@ -63,11 +63,11 @@ def recorded(config: TwinConfig, folder: Path, preset: str = "draft") -> tuple[D
 
 
 def named_or_recorded(
-    options: argparse.Namespace, config: TwinConfig, folder: Path, preset: str = "draft"
+    options: argparse.Namespace, config: TwinConfig, folder: Path
 ) -> tuple[Dataset, Truth]:
     """Return what the options of `add_twin_options` name, or else a recording (`recorded`)."""
     if options.dataset is None:
-        return recorded(config, folder, preset)
+        return recorded(config, folder)
     return Dataset(options.dataset), Truth(options.truth)
 
 

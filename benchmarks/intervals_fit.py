@@ -170,13 +170,13 @@ def _item_ratios(ratios: dict[str, list[float]], unit: Unit) -> tuple[float, flo
     return low, value, high
 
 
-def ause(errors: np.ndarray, doubt: np.ndarray, steps: int = 50) -> float:
+def ause(errors: np.ndarray, doubt: np.ndarray) -> float:
     """Return the sparsification error of a doubt (N,) about errors (N,).
 
     It is the area between the mean errors that are left as the most doubted elements are taken
     away, and those left as the worst are, over the mean error (Ilg et al. 2018).
     """
-    kept = np.maximum((np.linspace(1, 1 / steps, steps) * len(errors)).astype(int), 1)
+    kept = np.maximum((np.linspace(1, 1 / 50, 50) * len(errors)).astype(int), 1)
 
     def left(key: np.ndarray) -> np.ndarray:
         total = np.cumsum(errors[np.argsort(key, kind="stable")])

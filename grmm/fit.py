@@ -184,9 +184,14 @@ def invert_codes(state: FitState, until: float = math.inf) -> int:
 
 def tune_decoders(state: FitState, until: float = math.inf) -> int:
     """Fine-tune the decoders with the locality loss (stage 2); returns the iterations done."""
-    settings = state.config.fit
-    optimizer = _decoder_optimizer(state)
-    rng = np.random.default_rng(state.config.train.seed)
+    settings, train = state.config.fit, state.config.train
+    # Adam moves the decoders; codes and refinement stay fixed.
+    rates = {"decoders": settings.stage2_lr, "texels": settings.stage2_lr * train.texel_lr_scale}
+    parameters = state.model.parameter_groups()
+    for parameter in (*parameters["decoders"], *parameters["texels"]):
+        parameter.requires_grad_(True)
+    groups = [{"params": parameters[name], "lr": rate} for name, rate in rates.items()]
+    optimizer, rng = torch.optim.Adam(groups, fused=True), np.random.default_rng(train.seed)
     done = 0
     for number, _, item in _items(state, settings.stage2_iterations, until):
         optimizer.zero_grad()
@@ -217,16 +222,6 @@ def _items(state: FitState, iterations: int, until: float) -> Iterator[tuple[int
             return
         item = state.views.item(shuffle.next(), crop=True)
         yield number, max(number / iterations, min(used, 1.0)), item
-
-
-def _decoder_optimizer(state: FitState) -> torch.optim.Optimizer:
-    """Build Adam over the decoders; codes and refinement stay fixed."""
-    parameters, lr = state.model.parameter_groups(), state.config.fit.stage2_lr
-    rates = {"decoders": lr, "texels": lr * state.config.train.texel_lr_scale}
-    for parameter in (*parameters["decoders"], *parameters["texels"]):
-        parameter.requires_grad_(True)
-    groups = [{"params": parameters[name], "lr": rate} for name, rate in rates.items()]
-    return torch.optim.Adam(groups, fused=True)
 
 
 def start_texture(state: FitState) -> None:

@@ -356,7 +356,13 @@ def _run_items(
     with showing(stage.name, total, progress) as show:
 
         def settle(receipt: Receipt) -> None:
-            _record(dataset, ledger, receipt, receipt.item in work.still_valid)
+            if receipt.status != "failed":
+                record_published(dataset, ledger, receipt)
+            elif receipt.item in work.still_valid:
+                ledger.note_attempt(receipt)
+            else:  # the former output is set aside, unread
+                _retire(dataset, ledger, receipt.stage, receipt.item)
+                ledger.write(receipt)
             outcomes[receipt.item] = _outcome(receipt, again=work.again.get(receipt.item, ""))
             show(receipt)
             log.settle(receipt.item)
@@ -396,17 +402,6 @@ def _refuse_alike(stage: Stage, ended: list[Receipt], former: Mapping[str, Recei
             f" they worked before: {ended[0].reason}; fix the setting, or run the same command"
             " again to continue with the others"
         )
-
-
-def _record(dataset: Dataset, ledger: Ledger, receipt: Receipt, still_valid: bool) -> None:
-    """Store a receipt; a failed item's former output is set aside, unread, unless it stands."""
-    if receipt.status != "failed":
-        record_published(dataset, ledger, receipt)
-    elif still_valid:
-        ledger.note_attempt(receipt)
-    else:
-        _retire(dataset, ledger, receipt.stage, receipt.item)
-        ledger.write(receipt)
 
 
 def _retire(dataset: Dataset, ledger: Ledger, stage: str, item: str) -> None:

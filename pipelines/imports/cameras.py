@@ -58,7 +58,12 @@ def aligning_transform(
         _, turned, shifted = _fit([change(pose) for pose in their_poses], our_poses)
         if turned.max() <= TURN_DEG and shifted.max() <= SHARE * max(size, _size(our_poses)):
             raise CalibrationError(f"{where}: {advice}")
-    _check_unit(their_poses, our_poses, where)
+    scale = _size(their_poses) / max(size, 1e-9)
+    if len(shared) > 1 and size >= 1e-6 and abs(scale - 1) > 2 * SHARE:
+        raise CalibrationError(
+            f"{where}: its rig is {scale:.4g} times as large as the dataset's: its unit is not the"
+            " metre, or it is another rig; export it in metres"
+        )
     worst = int((turn / TURN_DEG + shift / (SHARE * max(size, 1e-9))).argmax())
     raise CalibrationError(
         f"{where}: camera {shared[worst]} is {turn[worst]:.1f} degrees and"
@@ -93,17 +98,6 @@ def _size(poses: list[np.ndarray]) -> float:
     centres = np.stack([invert_transform(pose)[:3, 3] for pose in poses])
     spread = float(np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()))
     return spread if len(poses) > 1 else 1.0
-
-
-def _check_unit(theirs: list[np.ndarray], ours: list[np.ndarray], where: str) -> None:
-    if len(ours) < 2 or _size(ours) < 1e-6:
-        return
-    scale = _size(theirs) / _size(ours)
-    if abs(scale - 1) > 2 * SHARE:
-        raise CalibrationError(
-            f"{where}: its rig is {scale:.4g} times as large as the dataset's: its unit is not the"
-            " metre, or it is another rig; export it in metres"
-        )
 
 
 def _fit(
