@@ -39,7 +39,7 @@ def dataset(tmp_path):
 
 def run(dataset):
     assert toy.run_toy(dataset).ok
-    return toy.run_stage_of(LATER, dataset)
+    return toy.run_toy(dataset, stage=LATER)
 
 
 def look(dataset, **options):
@@ -92,7 +92,7 @@ def test_harm_is_found_fixed_and_made_again_to_the_same_bytes(dataset, kind, har
     assert found == {} and "toy: 1 of 2 items to do" in result.notes[0]
     assert [o.status for o in toy.run_toy(dataset).outcomes] == ["done", "skipped"]
     assert toy.tree(dataset.stage_dir("toy")) == before
-    assert toy.run_stage_of(LATER, dataset).count("skipped") == 2
+    assert toy.run_toy(dataset, stage=LATER).count("skipped") == 2
     assert look(dataset)[1].sound and not list(dataset.stale_dir.glob("toy/*"))
 
 
@@ -134,14 +134,14 @@ def test_upstream_made_anew_with_other_bytes_blames_what_was_made_of_the_old(dat
     assert set(found) == {("outdated", "after S001"), ("outdated", "after S002")}
     assert "changed since it was made: toy" in found["outdated", "after S001"].what
     assert look(dataset, fix=True)[1].sound
-    assert toy.run_stage_of(LATER, dataset).count("done") == 2
+    assert toy.run_toy(dataset, stage=LATER).count("done") == 2
     assert look(dataset)[0] == {}
 
 
 def test_downstream_that_read_a_file_replaced_by_hand_is_found(dataset):
     good = toy.tree(dataset.stage_dir("after"))
     flip(output(dataset))
-    assert toy.run_stage_of(LATER, dataset).count("done") == 1  # it reads the wrong bytes
+    assert toy.run_toy(dataset, stage=LATER).count("done") == 1  # it reads the wrong bytes
     found, _ = look(dataset)
     # The second cannot be judged before the first is fixed, and is then.
     assert list(found) == [("changed", "toy S001")]

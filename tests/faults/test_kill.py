@@ -1,7 +1,11 @@
-"""SIGKILL at any moment: every output is absent or whole, and a rerun gives the same bytes."""
+"""SIGKILL at any moment: every output is absent or whole, and a rerun gives the same bytes.
+
+A killed run leaves no SLURM job behind that waits for it.
+"""
 
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,9 +14,14 @@ from pathlib import Path
 
 import pytest
 
+from express50.__main__ import main
 from express50.contract.layout import Dataset
 from pipelines import ingest
+from tests import slurm_stand_in
+from tests.express50.dataset.tracked import track_arrays, write_track
+from tests.express50.head.flame_files import write_flame
 from tests.faults import toy
+from tests.pipelines.bump_dataset import make_dataset
 from tests.synth import make_capture
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -139,3 +148,54 @@ def test_a_glance_at_a_lock_keeps_no_stage_from_starting(tmp_path, monkeypatch):
     monkeypatch.setattr(publish.time, "sleep", lambda _: glance.close())
     with publish.stage_lock(dataset, "toy"):
         assert publish.is_running(dataset, "toy")
+
+
+def export_killed(arguments: list[str], out: Path, files: int) -> bool:
+    """Run an export and kill it once that many files are there; False if it ended before."""
+    process = start(["express50", *arguments])
+    while sum(path.is_file() for path in (out / ".S001.part").rglob("*")) < files:
+        if process.poll() is not None:
+            return False
+        time.sleep(0.0005)
+    process.kill()
+    return process.wait() == -signal.SIGKILL
+
+
+def test_a_killed_export_is_absent_and_made_whole_by_the_next_run(tmp_path):
+    dataset = make_dataset(tmp_path, cameras=8, size=48)
+    write_track(dataset.track_file("S001"), track_arrays(write_flame(tmp_path)))
+    out, again = tmp_path / "out", tmp_path / "again"
+    arguments = ["export", str(dataset.root), str(out), "--format=gaussian-avatars"]
+    for _ in range(5):  # on a busy machine the export may be through before anyone looks
+        if export_killed(arguments, out, 5):
+            break
+        shutil.rmtree(out)
+    assert not (out / "S001").exists() and (out / ".S001.part").exists()
+    assert main(arguments) == 0
+    assert main([*arguments[:2], str(again), arguments[3]]) == 0
+    assert [path.name for path in out.iterdir()] == ["S001"]
+    assert toy.tree(out) == toy.tree(again)
+
+
+def test_killed_driver_leaves_no_slurm_job_and_a_rerun_completes(tmp_path):
+    pytest.importorskip("dask_jobqueue")
+    home = tmp_path / "cluster"
+    commands = slurm_stand_in.install(home)
+    dataset = toy.make_dataset(tmp_path / "data", [f"item{n}" for n in range(24)])
+    arguments = ["tests.faults.toy", str(dataset.root), "slurm"]
+    path = {"PATH": f"{commands}{os.pathsep}{os.environ['PATH']}"}
+    process = start(arguments, **path)
+    give_up = time.monotonic() + 60
+    while len(list(dataset.root.glob("toy/*"))) < 3 and time.monotonic() < give_up:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    try:
+        assert 3 <= len(list(dataset.root.glob("toy/*"))) < 24
+        assert slurm_stand_in.all_end(home)
+        assert start(arguments, **path).wait(timeout=90) == 0
+        assert len(list(dataset.root.glob("toy/*"))) == 24
+        assert slurm_stand_in.all_end(home)
+    finally:
+        for pid in slurm_stand_in.alive(home):
+            slurm_stand_in.end_of_time(pid)

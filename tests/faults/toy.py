@@ -13,8 +13,8 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result, Stage
 from express50.errors import StageError
@@ -114,11 +114,6 @@ def after_toy() -> Stage:
     )
 
 
-def run_stage_of(stage: Stage, dataset: Dataset):
-    config = resolve_config(stage, "standard", None, [])
-    return run_stage(stage, dataset, config, workers=0, progress=False)
-
-
 def make_dataset(root: Path, names: list[str]) -> Dataset:
     (root / "in").mkdir(parents=True)
     for name in names:
@@ -132,10 +127,15 @@ def run_toy_in_jobs(dataset: Dataset):
         return run_stage(STAGE, dataset, ToyConfig(seconds=0.05), pool=pool, progress=False)
 
 
-def run_toy(dataset: Dataset, workers: int = 0, **values: object):
-    assignments = [f"toy.{key}={value!r}" for key, value in values.items()]
-    config = resolve_config(STAGE, "standard", None, assignments)
-    return run_stage(STAGE, dataset, config, workers=workers, progress=False)
+def run_toy(
+    dataset: Dataset,
+    workers: int = 0,
+    stage: Stage = STAGE,
+    items: list[str] | None = None,
+    **values: Any,
+):
+    """Run the toy, or another stage with its settings."""
+    return run_stage(stage, dataset, ToyConfig(**values), items, workers=workers, progress=False)
 
 
 def tree(root: Path) -> dict[str, bytes]:

@@ -19,7 +19,6 @@ from express50.runner import clusters, executor, preflight
 from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger
 from express50.runner.preflight import problems
-from express50.runner.runner import run_stage
 from express50.runner.slurm import SlurmJob
 from tests.faults import toy
 from tests.faults.toy import make_dataset, run_toy, tree
@@ -90,8 +89,7 @@ def test_a_file_in_place_of_a_dataset(tmp_path, capsys):
 
 def test_space_is_compared_with_what_items_took(dataset, monkeypatch):
     """Two of four items are made, of 192 kB each."""
-    config = toy.ToyConfig()
-    run_stage(toy.STAGE, dataset, config, items=["a", "b"], workers=0, progress=False)
+    run_toy(dataset, items=["a", "b"])
     usage = SimpleNamespace(total=1e12, free=100e6 + 400e3)
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage)
     assert found(dataset) == []
@@ -101,7 +99,7 @@ def test_space_is_compared_with_what_items_took(dataset, monkeypatch):
     with pytest.raises(NotReadyError, match="2 items of 192"):
         run_toy(dataset)
     assert not dataset.item_dir("toy", "c").exists()
-    run_stage(toy.STAGE, dataset, config, items=["a", "b", "c"], workers=0, progress=False)
+    run_toy(dataset, items=["a", "b", "c"])
     usage.free = 99e6
     (line,) = found(dataset)
     assert "the disk is nearly full: 99.0 MB are left, expected 100.0 MB" in line
@@ -109,8 +107,8 @@ def test_space_is_compared_with_what_items_took(dataset, monkeypatch):
 
 def test_what_was_replaced_counts_as_space(dataset, monkeypatch):
     config = toy.ToyConfig(word="b")
-    for one in (toy.ToyConfig(), config):
-        run_stage(toy.STAGE, dataset, one, items=["a", "b"], workers=0, progress=False)
+    for word in ("a", "b"):
+        run_toy(dataset, items=["a", "b"], word=word)
     usage = SimpleNamespace(total=1e12, free=100e6 + 1e3)
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage)
     assert found(dataset, [(toy.STAGE, config)]) == []

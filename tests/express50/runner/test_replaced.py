@@ -149,7 +149,7 @@ def test_a_full_disk_takes_the_store_before_it_stops_a_run(tmp_path):
         return toy.run(dataset, item, config, out)
 
     stage = dataclasses.replace(toy.STAGE, run=full_once)
-    summary = run_stage(stage, dataset, toy.ToyConfig(word="c"), workers=0, progress=False)
+    summary = run_toy(dataset, stage=stage, word="c")
     assert summary.ok and tries == ["a", "z_full", "z_full"]
 
 

@@ -75,35 +75,26 @@ def test_footage_that_may_not_be_read_is_not_a_defect(tmp_path):
     assert not dataset.log_file("toy", "denied1").exists()
 
 
-def test_second_run_skips_and_a_changed_input_or_config_redoes(tmp_path):
+def test_a_changed_input_setting_or_version_makes_an_item_again_and_is_said(tmp_path):
     dataset = make_dataset(tmp_path / "data", ["a", "b"])
-    assert set(statuses(run_toy(dataset)).values()) == {"done"}
-    assert set(statuses(run_toy(dataset)).values()) == {"skipped"}
-    (dataset.root / "in" / "a.txt").write_text("other")
-    assert statuses(run_toy(dataset)) == {"a": "done", "b": "skipped"}
-    assert set(statuses(run_toy(dataset, word="b")).values()) == {"done"}
     newer = dataclasses.replace(toy.STAGE, version=2)
-    summary = run_stage(newer, dataset, toy.ToyConfig(word="b"), workers=0, progress=False)
-    assert set(statuses(summary).values()) == {"done"}
 
-
-def test_what_is_made_again_is_said_with_its_reason(tmp_path):
-    dataset = make_dataset(tmp_path / "data", ["a", "b"])
-
-    def again(stage=toy.STAGE, **values):
-        summary = run_stage(stage, dataset, toy.ToyConfig(**values), workers=0, progress=False)
+    def again(**values):
+        """Return each item's reason; an item without one was skipped."""
+        summary = run_toy(dataset, **values)
         reasons = {o.item: o.again for o in summary.outcomes}
+        assert statuses(summary) == {k: "done" if why else "skipped" for k, why in reasons.items()}
         assert all(why in "\n".join(summary.lines()) for why in reasons.values())
         return [reasons["a"], reasons["b"]]
 
+    assert set(statuses(run_toy(dataset)).values()) == {"done"}
     assert again() == ["", ""]
     (dataset.root / "in" / "a.txt").write_text("other")
     assert again() == ["inputs changed: text", ""]
     assert again(word="c") == ['settings changed: word was "a", is "c"'] * 2
-    newer = dataclasses.replace(toy.STAGE, version=2)
-    assert again(newer, word="c") == ["stage version changed: it was 1, is 2"] * 2
+    assert again(stage=newer, word="c") == ["stage version changed: it was 1, is 2"] * 2
     shutil.rmtree(dataset.item_dir("toy", "b"))
-    assert again(newer, word="c") == ["", "output missing"]
+    assert again(stage=newer, word="c") == ["", "output missing"]
 
 
 class OneItem:
@@ -128,7 +119,7 @@ def test_a_closed_monitor_leaves_items_that_the_next_run_makes(tmp_path, workers
     left = [o.item for o in summary.outcomes if o.status == "left"]
     assert 3 <= len(left) <= 5 and not summary.ok and f"{len(left)} left" in next(summary.lines())
     assert len(monitor.seen) + len(left) == 6 and all(r.core_seconds > 0 for r in monitor.seen)
-    rest = run_stage(toy.STAGE, dataset, config, workers=0, progress=False)
+    rest = run_toy(dataset, seconds=0.1)
     assert rest.ok and rest.count("done") == len(left)
 
 
@@ -187,7 +178,7 @@ def test_a_run_that_is_stopped_costs_nothing_that_was_made(tmp_path):
 
     mistyped = dataclasses.replace(toy.STAGE, run=stopped)
     with pytest.raises(KeyboardInterrupt):
-        run_stage(mistyped, dataset, toy.ToyConfig(word="b"), workers=0, progress=False)
+        run_toy(dataset, stage=mistyped, word="b")
     with Ledger(dataset.ledger) as ledger:
         (status,) = read_status(ledger, ["toy"])
     assert (status.state, status.done, status.missing) == ("stopped", 1, 3)
@@ -241,7 +232,7 @@ def test_outputs_stand_where_footage_is_out_of_reach(tmp_path):
         raise CaptureError(f"{item}: no such capture")
 
     gone = dataclasses.replace(toy.STAGE, inputs=unmounted)
-    summary = run_stage(gone, dataset, toy.ToyConfig(), workers=0, progress=False)
+    summary = run_toy(dataset, stage=gone)
     assert statuses(summary) == {"a": "failed", "b": "failed"}
     assert statuses(run_toy(dataset)) == {"a": "skipped", "b": "skipped"}
 
@@ -254,12 +245,11 @@ def test_outputs_stand_where_a_file_of_the_footage_is_out_of_reach(tmp_path):
         return toy.inputs(dataset, item, config) | ({"given": given} if item == "a" else {})
 
     stage = dataclasses.replace(toy.STAGE, inputs=naming)
-    run = functools.partial(run_stage, stage, dataset, toy.ToyConfig(), workers=0, progress=False)
-    assert run().ok
+    assert run_toy(dataset, stage=stage).ok
     given.rename(tmp_path / "away")
-    assert statuses(run()) == {"a": "failed", "b": "skipped"}
+    assert statuses(run_toy(dataset, stage=stage)) == {"a": "failed", "b": "skipped"}
     (tmp_path / "away").rename(given)
-    assert statuses(run()) == {"a": "skipped", "b": "skipped"}
+    assert statuses(run_toy(dataset, stage=stage)) == {"a": "skipped", "b": "skipped"}
 
 
 def test_a_defect_in_naming_inputs_is_one_items(tmp_path):
@@ -269,7 +259,7 @@ def test_a_defect_in_naming_inputs_is_one_items(tmp_path):
         return toy.inputs(dataset, item, config) | ({} if item == "b" else {"x": {}["absent"]})
 
     broken = dataclasses.replace(toy.STAGE, inputs=naming)
-    summary = run_stage(broken, dataset, toy.ToyConfig(), workers=0, progress=False)
+    summary = run_toy(dataset, stage=broken)
     assert statuses(summary) == {"a": "failed", "b": "done"}
     assert "KeyError: 'absent' (unexpected; traceback in" in summary.outcomes[0].reason
 
@@ -309,7 +299,7 @@ def test_a_setting_that_fits_no_item_leaves_what_is_made(tmp_path):
 
     broken = dataclasses.replace(toy.STAGE, inputs=without)
     with pytest.raises(StageError, match="no item can be made: StageError: toy.weights /nope.pth"):
-        run_stage(broken, dataset, toy.ToyConfig(word="b"), workers=0, progress=False)
+        run_toy(dataset, stage=broken, word="b")
     assert statuses(run_toy(dataset)) == {"a": "skipped", "b": "skipped"}
 
 
@@ -341,7 +331,7 @@ def test_outputs_of_vanished_items_are_set_aside_only_by_a_full_run(tmp_path):
     dataset = make_dataset(tmp_path / "data", ["a", "b"])
     run_toy(dataset)
     (dataset.root / "in" / "b.txt").unlink()
-    run_stage(toy.STAGE, dataset, toy.ToyConfig(), items=["a"], workers=0, progress=False)
+    run_toy(dataset, items=["a"])
     assert dataset.item_dir("toy", "b").exists()
     run_toy(dataset)
     assert not dataset.item_dir("toy", "b").exists()
@@ -404,7 +394,7 @@ def test_receipt_and_metrics_hold_the_expected_error(tmp_path):
         run=lambda *task: dataclasses.replace(toy.STAGE.run(*task), expected_error=stated),
     )
     dataset = make_dataset(tmp_path / "data", ["a"])
-    run_stage(stage, dataset, toy.ToyConfig(), workers=0, progress=False)
+    run_toy(dataset, stage=stage)
     metrics = json.loads((dataset.item_dir("toy", "a") / "metrics.json").read_text())
     assert receipts(dataset)["a"].metrics == metrics
     assert metrics["expected_error"] == {"value": 0.4, "low": 0.3, "high": 0.6, "unit": "mm"}

@@ -175,22 +175,22 @@ def test_items_of_a_job_at_its_time_limit_are_tried_again(cluster, tmp_path, mon
     assert "died 2 times" in reason and "its job reached 10" in reason
     assert len(slurm_stand_in.pids(cluster)) >= 2
     (calm.root / "in" / "poison1.txt").unlink()
-    run_stage(toy.STAGE, calm, toy.ToyConfig(seconds=0.4), workers=0, progress=False)
+    toy.run_toy(calm, seconds=0.4)
     assert toy.tree(hurt.stage_dir("toy")) == toy.tree(calm.stage_dir("toy"))
     assert slurm_stand_in.all_end(cluster)
 
 
-def test_jobs_that_end_at_once_are_one_error(cluster, tmp_path):
-    (cluster / "stillborn").touch()
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("stillborn", r"3 SLURM jobs in a row ended before .*100\d.out"),
+        ("refuse", "sbatch refused: .*Invalid partition name"),
+    ],
+)
+def test_jobs_that_end_at_once_or_are_refused_are_one_error(cluster, tmp_path, fault, words):
+    (cluster / fault).touch()
     dataset = toy.make_dataset(tmp_path / "data", ["a", "b"])
-    with pytest.raises(StageError, match=r"3 SLURM jobs in a row ended before .*100\d.out"):
-        run_toy(dataset, small())
-
-
-def test_refusal_of_sbatch_is_one_error(cluster, tmp_path):
-    (cluster / "refuse").touch()
-    dataset = toy.make_dataset(tmp_path / "data", ["a", "b"])
-    with pytest.raises(StageError, match="sbatch refused: .*Invalid partition name"):
+    with pytest.raises(StageError, match=words):
         run_toy(dataset, small())
 
 
