@@ -23,6 +23,7 @@ from express50.contract.layout import Dataset
 from express50.files.images import decode_image
 from express50.runner import worker
 from express50.shards.reader import ShardReader
+from tests.faults.toy import tree
 
 pytestmark = pytest.mark.slow
 
@@ -98,12 +99,7 @@ def test_each_peak_frame_is_decoded_once(dataset, reads):
 
 def stage_bytes(root: Path) -> dict[str, bytes]:
     """Read every published file; the ledger and labels hold times of day and are left out."""
-    return {
-        str(p.relative_to(root)): p.read_bytes()
-        for stage in STAGES
-        for p in sorted((root / stage).rglob("*"))
-        if p.is_file()
-    }
+    return {f"{s}/{name}": data for s in STAGES for name, data in tree(root / s).items()}
 
 
 def test_footage_alone_gives_figures_close_to_the_truth(dataset, twin, tmp_path):

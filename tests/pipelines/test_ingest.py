@@ -15,18 +15,16 @@ from express50.contract.stage import Note
 from express50.errors import CaptureError, ConfigError, StageError
 from express50.files.images import read_image
 from express50.files.video import iterate_video
-from express50.runner.runner import run_stage
 from pipelines import ingest
 from pipelines.calibrate.footage import has_one_lens
 from pipelines.ingest.scan import time_gaps
 from pipelines.ingest.stage import usual_count
+from tests.stages import run_here
 from tests.synth import make_capture, noise_video_images, turn_video, write_frames, write_video
 
 
 def run(dataset, **values):
-    assignments = [f"ingest.{k}={v}" for k, v in values.items()]
-    config = resolve_config(ingest.STAGE, "standard", None, assignments)
-    return run_stage(ingest.STAGE, dataset, config, workers=0, progress=False)
+    return run_here(ingest.STAGE, dataset, **values)
 
 
 def metrics(dataset, subject="S001"):
@@ -231,8 +229,6 @@ def test_cues_outside_the_footage_are_dropped_and_reported(dataset):
 
 
 def test_frames_of_different_size_drop_the_camera(dataset):
-    from tests.synth import write_frames
-
     folder = camera_folder(dataset, "cam01")
     (folder / "video.mp4").unlink()
     images = [np.zeros((64, 64, 3), np.uint8)] * 7 + [np.zeros((32, 64, 3), np.uint8)]

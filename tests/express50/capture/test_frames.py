@@ -16,25 +16,14 @@ from express50.capture.frames import (
     read_recorded_plate,
 )
 from express50.capture.index import check_peak, read_index, read_peak_rows, read_peaks
-from express50.contract.config import resolve_config
-from express50.contract.layout import Dataset
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.calibration import write_cameras
 from express50.files.containers import to_srgb
 from express50.files.images import write_image
 from express50.files.video import VideoReader
 from express50.geometry.sampling import undistort_image
-from express50.runner.runner import run_stage
-from pipelines import ingest
+from tests.stages import ingest_captures
 from tests.synth import make_capture, make_rig, read_frame, render_ball
-
-
-def ingest_capture(root, capture):
-    dataset = Dataset(root)
-    ingest.register(dataset, [capture])
-    config = resolve_config(ingest.STAGE)
-    assert run_stage(ingest.STAGE, dataset, config, workers=0, progress=False).ok
-    return dataset
 
 
 def write_calibration(dataset, rig):
@@ -54,7 +43,7 @@ def test_frames_and_plates_are_the_recorded_pixels(ingested):
 
 def test_video_frames_are_exact_in_any_order(tmp_path):
     make_capture(tmp_path / "S001", frames=30, video=True, size=64)
-    dataset = ingest_capture(tmp_path / "data", tmp_path / "S001")
+    dataset = ingest_captures(tmp_path / "data", tmp_path / "S001", preset="standard")
     reader = FrameReader(read_index(dataset, "S001"), "cam00")
     sequential = [reader.read(n) for n in range(30)]
     for frame in (29, 0, 17, 16, 3):
@@ -70,7 +59,7 @@ def test_each_video_is_opened_once_and_closed_at_the_end(tmp_path, monkeypatch):
     monkeypatch.setattr(VideoReader, "__init__", lambda *a: (opened.append(1), start(*a))[1])
     monkeypatch.setattr(VideoReader, "close", lambda self: (closed.append(1), stop(self))[1])
     make_capture(tmp_path / "S001", cameras=4, video=True)
-    dataset = ingest_capture(tmp_path / "data", tmp_path / "S001")
+    dataset = ingest_captures(tmp_path / "data", tmp_path / "S001", preset="standard")
     write_calibration(dataset, make_rig(4))
     with FootageReader(dataset, "S001") as footage:
         for frame in range(3):
@@ -82,7 +71,7 @@ def test_each_video_is_opened_once_and_closed_at_the_end(tmp_path, monkeypatch):
 
 def test_changed_footage_is_noticed(tmp_path):
     make_capture(tmp_path / "S001", cameras=1)
-    dataset = ingest_capture(tmp_path / "data", tmp_path / "S001")
+    dataset = ingest_captures(tmp_path / "data", tmp_path / "S001", preset="standard")
     noise = np.random.default_rng(0).integers(0, 255, (8, 8, 3), dtype=np.uint8)
     other = np.kron(noise, np.ones((8, 8, 1), np.uint8))
     write_image(tmp_path / "S001/cameras/cam00/frames/000002.png", other)
@@ -195,7 +184,7 @@ def test_light_that_is_not_finite_or_on_another_scale_is_refused(value, message)
 
 def test_a_plate_of_another_size_is_one_clear_error(tmp_path):
     make_capture(tmp_path / "raw")
-    dataset = ingest_capture(tmp_path / "data", tmp_path / "raw")
+    dataset = ingest_captures(tmp_path / "data", tmp_path / "raw", preset="standard")
     write_image(tmp_path / "raw" / "plates" / "cam01.png", np.zeros((20, 30, 3), np.uint8))
     with pytest.raises(CaptureError, match="30x20.*64x64"):
         read_recorded_plate(read_index(dataset, "S001"), "cam01")

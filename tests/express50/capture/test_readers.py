@@ -10,28 +10,23 @@ from express50.capture.frames import FrameReader, read_proxy, read_recorded_plat
 from express50.capture.index import Cue, calibration_file, read_index
 from express50.capture.readers.read import detect, read_any, read_people, subject_of
 from express50.capture.readers.selection import common_timeline
-from express50.contract.config import resolve_config
-from express50.contract.layout import Dataset
 from express50.errors import CalibrationError, CaptureError
 from express50.files.calibration import read_cameras, write_cameras
 from express50.files.images import encode_png
 from express50.geometry.cameras import project
-from express50.runner.runner import run_stage
-from pipelines import calibrate, ingest
+from pipelines import calibrate
 from tests.express50.capture import layouts
 from tests.express50.capture.layouts import picture, rig
+from tests.stages import ingest_captures, run_here
 from tests.synth import noise_video_images, read_frame, turn_video, write_video
 
 HEAD = np.array([[0.02, 1.22, 0.05], [-0.05, 1.15, -0.03], [0.0, 1.2, 0.0]])
 
 
 def ingested(tmp_path, *captures):
-    dataset = Dataset(tmp_path / "data")
-    subjects = ingest.register(dataset, list(captures))
-    config = resolve_config(ingest.STAGE, "draft")
-    summary = run_stage(ingest.STAGE, dataset, config, workers=0, progress=False)
-    assert summary.ok, [o.reason for o in summary.outcomes]
-    return dataset, subjects[0]
+    """Return a dataset of captures, and the first one's subject."""
+    dataset = ingest_captures(tmp_path / "data", *captures)
+    return dataset, subject_of(captures[0])
 
 
 def metrics(dataset, subject):
@@ -74,8 +69,7 @@ def test_renderme_full_release(tmp_path):
     assert not {"age", "gender", "weight"} & set(index.meta)
     assert str(tmp_path) not in dataset.index_file(subject).read_text()
     assert_rig(dataset, subject, rig([f"cam{n:02d}" for n in range(4)]))
-    config = resolve_config(calibrate.STAGE, "draft", None, ["calibrate.check_frame_sets=0"])
-    assert run_stage(calibrate.STAGE, dataset, config, workers=0, progress=False).ok
+    assert run_here(calibrate.STAGE, dataset, preset="draft", check_frame_sets=0).ok
 
 
 def test_renderme_key_frames_and_what_is_left_out(tmp_path):

@@ -23,6 +23,7 @@ from express50.rigs.transforms_json import read_transforms
 from tests.express50.dataset.tracked import track_arrays, world_vertices, write_track
 from tests.express50.head.flame_files import write_flame
 from tests.express50.head.flame_reader import flame_vertices
+from tests.faults.toy import tree
 from tests.pipelines.bump_dataset import make_dataset
 from tests.synth import read_frame
 
@@ -61,14 +62,6 @@ def avatars(dataset, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("avatars")
     assert export(dataset, out, "gaussian-avatars") == 0
     return out
-
-
-def files_of(folder: Path) -> dict[str, bytes]:
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
 
 
 @pytest.mark.parametrize("subject", ["S001", "S002"])
@@ -182,16 +175,16 @@ def test_heads_that_are_not_flame_say_so_and_bring_meshes(dataset, avatars) -> N
 
 
 def test_exporting_twice_gives_the_same_bytes_and_leaves_nothing_aside(dataset, avatars) -> None:
-    before = files_of(avatars)
+    before = tree(avatars)
     assert export(dataset, avatars, "gaussian-avatars") == 0
-    assert files_of(avatars) == before
+    assert tree(avatars) == before
     assert sorted(path.name for path in avatars.iterdir()) == ["S001", "S002"]
 
 
 @pytest.mark.parametrize("kind", ["gaussian-avatars", "glb"])
 def test_an_interrupted_export_leaves_the_former_one(dataset, tmp_path, monkeypatch, kind) -> None:
     assert export(dataset, tmp_path, kind, "--subject=S001") == 0
-    before, writes = files_of(tmp_path), []
+    before, writes = tree(tmp_path), []
 
     def stop(path: Path, data: bytes) -> int:
         writes.append(path)
@@ -203,13 +196,13 @@ def test_an_interrupted_export_leaves_the_former_one(dataset, tmp_path, monkeypa
         patch.setattr(Path, "write_bytes", stop)
         assert export(dataset, tmp_path, kind, "--subject=S001") == 130
     assert len(writes) == 2
-    assert files_of(tmp_path) == before
+    assert tree(tmp_path) == before
     # A kill gives no time to clean up: what it left is taken away by the next run.
     (tmp_path / ".S001.part").mkdir()
     (tmp_path / ".S001.part" / "half").write_text("x")
     (tmp_path / "S001").rename(tmp_path / ".S001.part.former")
     assert export(dataset, tmp_path, kind, "--subject=S001") == 0
-    assert files_of(tmp_path) == before
+    assert tree(tmp_path) == before
 
 
 def test_a_folder_that_is_not_an_export_is_kept(dataset, tmp_path, capsys) -> None:

@@ -109,10 +109,20 @@ def write_qualisys(folder):
     return folder / "Calib.qca.txt", pixels
 
 
-def local(pose):
-    """Return x, y and r^2 of the points on the plane z = 1."""
+def on_plane(pose):
+    """Return x and y of the points on the plane z = 1."""
     x, y, z = pose[:3, :3] @ HEAD.T + pose[:3, 3:]
-    return x / z, y / z, (x / z) ** 2 + (y / z) ** 2
+    return x / z, y / z
+
+
+def brown(pose, radial, tangential):
+    """Return x and y of the points on the plane z = 1, bent by Brown's lens."""
+    (x, y), (k1, k2, k3), (p1, p2) = on_plane(pose), radial, tangential
+    r2 = x * x + y * y
+    factor = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    u = x * factor + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y
+    v = y * factor + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
+    return u, v
 
 
 def write_metashape(folder):
@@ -128,10 +138,7 @@ def write_metashape(folder):
             f'<camera id="{n}" sensor_id="0" component_id="0" label="{name}.jpg">'
             f"<transform>{spaced(to_chunk)}</transform></camera>\n"
         )
-        x, y, r2 = local(pose)
-        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-        u = x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y
-        v = y * radial + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
+        u, v = brown(pose, (k1, k2, k3), (p1, p2))
         across, down = SIZE[0] / 2 + cx + u * f + u * b1, SIZE[1] / 2 + cy + v * f
         pixels[name] = np.stack([across, down], 1)
     width, height = SIZE
@@ -168,10 +175,7 @@ def write_realitycapture(folder):
             f"<xcr:DistortionCoeficients>{k1} {k2} {k3} 0 {t1} {t2}</xcr:DistortionCoeficients>\n"
             "</rdf:Description></rdf:RDF></x:xmpmeta>\n"
         )
-        x, y, r2 = local(pose)
-        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-        u = x * radial + t1 * (r2 + 2 * x * x) + 2 * t2 * x * y
-        v = y * radial + t2 * (r2 + 2 * y * y) + 2 * t1 * x * y
+        u, v = brown(pose, (k1, k2, k3), (t1, t2))
         shares = np.stack([u * film / 36 + U, v * film / 36 + V], 1)
         pixels[name] = shares * side + np.array(SIZE) / 2
     return folder, pixels
@@ -189,7 +193,7 @@ def write_vggt(folder):
     )
     pixels = {}
     for name, pose in RIG.items():
-        x, y, _ = local(pose)
+        x, y = on_plane(pose)
         ends = np.stack([700 * x + width / 2, 695 * y + height / 2], 1)
         pixels[name] = ends * np.array(SIZE) / (width, height)
     return folder / "predictions.npz", pixels

@@ -19,14 +19,7 @@ from express50.files.video import VideoFootage, iterate_video
 from express50.twin.config import TwinConfig
 from express50.twin.record import print_progress, record
 from express50.twin.studio import film_board, film_subject
-
-
-def digests(root):
-    return {
-        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(root.rglob("*"))
-        if path.is_file()
-    }
+from tests.faults.toy import tree
 
 
 def test_capture_follows_the_raw_layout(recording, small_config):
@@ -65,15 +58,15 @@ def test_same_seed_gives_the_same_bytes_however_cameras_are_shared_out(tiny_conf
         for group in groups:
             film_subject(tiny_config, "S001", group, root / "capture", root / "truth", int)
             film_board(tiny_config, group, root / "board", int)
-    assert len(digests(tmp_path / "a")) == 2 * (4 + 1 + 1) + 5
-    assert digests(tmp_path / "a") == digests(tmp_path / "b")
+    assert len(tree(tmp_path / "a")) == 2 * (4 + 1 + 1) + 5
+    assert tree(tmp_path / "a") == tree(tmp_path / "b")
 
 
 @pytest.mark.slow
 def test_processes_do_not_change_the_bytes(tiny_config, tmp_path):
     record(tiny_config, tmp_path / "a", workers=1)
     record(tiny_config, tmp_path / "b", workers=2)
-    assert digests(tmp_path / "a") == digests(tmp_path / "b")
+    assert tree(tmp_path / "a") == tree(tmp_path / "b")
 
 
 def test_video_repeats_its_bytes_and_another_seed_does_not(tiny_config, tmp_path):
@@ -90,11 +83,11 @@ def test_video_repeats_its_bytes_and_another_seed_does_not(tiny_config, tmp_path
 def test_recording_again_keeps_what_is_there_and_adds_the_rest(tiny_config, tmp_path):
     config = dataclasses.replace(tiny_config, cameras=1, board_frames=0, plates=False)
     assert record(config, tmp_path, workers=1) == ["S001"]
-    before = digests(tmp_path / "captures" / "S001")
+    before = tree(tmp_path / "captures" / "S001")
     assert record(config, tmp_path, workers=1) == []
     more = dataclasses.replace(config, subjects=2)
     assert record(more, tmp_path, workers=1) == ["S002"]
-    assert digests(tmp_path / "captures" / "S001") == before
+    assert tree(tmp_path / "captures" / "S001") == before
     with pytest.raises(CaptureError, match="seed differ"):
         record(dataclasses.replace(config, seed=9), tmp_path, workers=1)
 
