@@ -1,4 +1,4 @@
-"""What stands before the face is found where views agree on it; nothing behind it counts."""
+"""Things before the face, and glasses, are found where views agree; nothing behind them counts."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ import pytest
 
 from express50.files.images import linear_to_srgb
 from express50.geometry.cameras import project, unproject
+from express50.head.load import load_head
 from express50.head.model import HeadModel
 from pipelines.regions.geometry import head_labels, make_head
 from pipelines.regions.things import face_views
 from pipelines.track.outline import matte_distance, outline_terms, sample_distance
 from pipelines.track.photo_consistency import patch_terms, skin_samples
-from pipelines.track.schedule import find_things, matted_pictures
+from pipelines.track.schedule import find_things, find_worn_glasses, matted_pictures
 from pipelines.track.surface import FrameSetCrops, HeadCrop, mask_things, near_things
+from tests.pipelines.test_regions_glasses import eyes, painted, rims, scenes
 from tests.pipelines.textured_scenes import ORIGIN, RADIUS, ball_head, paint, picture, rig
 
 SMALL = 0.018
@@ -112,3 +114,29 @@ def test_an_edge_of_the_matte_that_is_a_things_does_not_pull() -> None:
     with_thing, without_thing = pulls(things[:0]), pulls(things)
     assert with_thing.min() < -8 and without_thing.min() > -6
     assert len(without_thing) > 0.75 * len(with_thing)
+
+
+def worn(places: np.ndarray, mattes: bool = True) -> FrameSetCrops:
+    drawn = [painted(scene, places) for scene in scenes()]
+    alphas = [np.rint(255 * one.alpha).astype(np.uint8) if mattes else None for one in drawn]
+    return FrameSetCrops(
+        (), tuple(HeadCrop(d.camera, d.rgb, a) for d, a in zip(drawn, alphas, strict=True))
+    )
+
+
+def test_glasses_are_taken_out_of_the_crops() -> None:
+    model, mesh, pictures = (
+        load_head("procedural"),
+        scenes()[0].head.vertices,
+        worn(rims()),
+    )
+    found = find_worn_glasses(model, pictures, mesh, np.eye(3))
+    assert len(found) > 500 and (found[:, 2] > eyes()[:, 2].min() - 0.04).all()
+    front = pictures.crops[3]
+    left = mask_things(pictures, found).crops[3].alpha
+    assert left is not None and front.alpha is not None
+    gone = (front.alpha > 0) & (left == 0)
+    assert 0.01 < gone.mean() < 0.05
+    assert len(find_worn_glasses(model, worn(rims()[:0]), mesh, np.eye(3))) == 0
+    assert len(find_worn_glasses(model, worn(rims(), mattes=False), mesh, np.eye(3))) == 0
+    assert len(find_worn_glasses(model, FrameSetCrops((), ()), mesh, np.eye(3))) == 0
