@@ -6,6 +6,7 @@ import gc
 import json
 import os
 import pickle
+import shutil
 import tarfile
 from pathlib import Path
 
@@ -177,15 +178,8 @@ def test_reader_survives_pickling_and_forking(shards):
     assert reader.members(0) == first
 
 
-def copy(shards: Path, target: Path) -> Path:
-    target.mkdir()
-    for path in shards.iterdir():
-        (target / path.name).write_bytes(path.read_bytes())
-    return target
-
-
 def test_a_flipped_byte_is_found_and_named(shards, tmp_path, capsys):
-    root = copy(shards, tmp_path / "bad")
+    root = shutil.copytree(shards, tmp_path / "bad")
     reader = ShardReader(root)
     entry = reader.entries[4]
     offset = entry.members["depth.png"][0] + 11
@@ -202,7 +196,7 @@ def test_a_flipped_byte_is_found_and_named(shards, tmp_path, capsys):
 
 
 def test_a_header_that_names_another_member_is_found(shards, tmp_path):
-    root = copy(shards, tmp_path / "bad")
+    root = shutil.copytree(shards, tmp_path / "bad")
     entry = ShardReader(root).entries[0]
     start = entry.members["alpha.png"][0] - 512
     data = bytearray((root / entry.shard).read_bytes())
@@ -213,7 +207,7 @@ def test_a_header_that_names_another_member_is_found(shards, tmp_path):
 
 @pytest.mark.parametrize("cut", ["truncate", "remove"])
 def test_a_short_or_missing_shard_is_named(shards, tmp_path, cut):
-    root = copy(shards, tmp_path / "bad")
+    root = shutil.copytree(shards, tmp_path / "bad")
     path = sorted(root.glob("train*.tar"))[0]
     path.unlink() if cut == "remove" else path.write_bytes(path.read_bytes()[:-512])
     with pytest.raises(FormatError, match=path.name):
@@ -235,7 +229,7 @@ def test_a_short_or_missing_shard_is_named(shards, tmp_path, cut):
     ],
 )
 def test_a_forged_index_is_refused(shards, tmp_path, change, message):
-    root = copy(shards, tmp_path / "bad")
+    root = shutil.copytree(shards, tmp_path / "bad")
     table = json.loads((root / "index.json").read_text())
     change(table)
     (root / "index.json").write_text(json.dumps(table))
@@ -244,7 +238,7 @@ def test_a_forged_index_is_refused(shards, tmp_path, change, message):
 
 
 def test_manifest_cannot_point_outside(shards, tmp_path):
-    root = copy(shards, tmp_path / "bad")
+    root = shutil.copytree(shards, tmp_path / "bad")
     table = json.loads((root / "manifest.json").read_text())
     table["files"]["../secret"] = {"bytes": 1, "sha256": "0"}
     (root / "manifest.json").write_text(json.dumps(table))
