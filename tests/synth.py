@@ -125,10 +125,11 @@ def write_video(
     options: dict[str, str] | None = None,
     container_options: dict[str, str] | None = None,
     ticks: list[int] | None = None,
+    rate: int = 24,
 ) -> None:
     """H.264 with B-frames, as cameras write it; ``ticks`` are time stamps in 96ths of a second."""
     with av.open(str(path), "w", options=container_options or {}) as container:
-        stream = container.add_stream(codec, rate=24)
+        stream = container.add_stream(codec, rate=rate)
         stream.height, stream.width = images[0].shape[:2]
         stream.pix_fmt = "yuv420p"
         stream.codec_context.gop_size = gop

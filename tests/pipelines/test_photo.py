@@ -6,7 +6,6 @@ import json
 import shutil
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 import OpenImageIO as oiio
@@ -29,7 +28,7 @@ from pipelines.photo.capture import (
     upright_frames,
 )
 from pipelines.track.config import TrackConfig
-from tests.synth import turn_video
+from tests.synth import turn_video, write_video
 
 data = pytest.importorskip("skimage.data")
 
@@ -206,16 +205,6 @@ def test_a_photograph_on_its_side_is_tracked_as_an_upright_one(
 def test_subject_ids_are_made_of_file_names() -> None:
     assert subject_id(Path("my face.jpg")) == "my_face"
     assert subject_id(Path("???.jpg")) == "photo"
-
-
-def write_video(path: Path, images: list[np.ndarray], rate: int = 25) -> None:
-    with av.open(str(path), "w") as file:
-        stream = file.add_stream("libx264", rate=rate)
-        stream.height, stream.width = images[0].shape[:2]
-        stream.pix_fmt, stream.options = "yuv420p", {"crf": "12"}
-        for image in images:
-            file.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
-        file.mux(stream.encode())
 
 
 def test_a_telephones_video_is_stored_upright(tmp_path: Path, astronaut: np.ndarray) -> None:
