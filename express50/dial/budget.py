@@ -14,6 +14,7 @@ from express50.errors import ConfigError
 from express50.runner.ledger import Receipt
 
 SECONDS = {"s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ch": 3600.0}
+SAFETY = 0.95  # of the time left is planned with: what items take varies
 PART = re.compile(r"(\d+(?:\.\d+)?)(s|min|m|ch|h|d)")
 
 
@@ -86,6 +87,7 @@ class Clock:
     keep: Callable[[], None] = lambda: None
     item: float = 0.0  # expected seconds of one item of the running stage, which must still fit
     early: float = 0.0  # seconds of the budget reserved for later stages
+    until: float = math.inf  # spent seconds after which no item begins, if before the budget's end
     core: float = 0.0
     began: float = field(default_factory=time.monotonic)
     _kept: float = 0.0
@@ -104,18 +106,25 @@ class Clock:
         """Return what may still be spent."""
         return float("inf") if self.budget is None else self.budget.seconds - self.now()
 
-    def expect(self, item: float, early: float = 0.0) -> None:
-        """Set the expected seconds of the next stage's items, and the reserve for later stages."""
-        self.item, self.early, self._closed = item, early, False
+    def plannable(self) -> float:
+        """Return the seconds that plans may use."""
+        return SAFETY * self.left()
+
+    def expect(self, item: float, early: float = 0.0, until: float = math.inf) -> None:
+        """Set the expected seconds of the next items, the reserve for later stages, and a limit."""
+        self.item, self.early, self.until, self._closed = item, early, until, False
 
     def settled(self, receipt: Receipt) -> None:
         """Count an item; one with 0 attempts was not made but restored."""
         self.core += receipt.core_seconds if receipt.attempts else 0.0
+        if receipt.attempts and self.until < math.inf:  # a trial: what its items take is a guess
+            self.item = max(self.item, receipt.core_seconds if self.cores else receipt.seconds)
         if time.monotonic() - self._kept > 2.0:
             self._kept = time.monotonic()
             self.keep()
 
     def closed(self) -> bool:
-        """Return whether a further item would probably end after the budget."""
-        self._closed = self._closed or self.left() - self.early < self.item
+        """Return whether a further item would probably end after the budget, or the limit."""
+        left = min(self.left() - self.early, self.until - self.now())
+        self._closed = self._closed or left < self.item
         return self._closed

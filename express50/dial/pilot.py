@@ -1,13 +1,15 @@
 """Measure on a few items what the settings of every stage cost, and what they do to the results.
 
 A trial is a small dataset below ``.staging/pilot``: one subject, cut to a few peaks once these are
-known. The first trial runs every stage at its cheapest setting. Each other trial starts as a linked
-copy of it with one stage set higher; the runner then makes only what that changes.
+known if it has many. The first trial runs every stage at its cheapest setting. Each other trial
+starts as a linked copy of it with one stage set higher; the runner then makes only what that
+changes.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +17,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import mean, median
-from typing import Any
+from typing import Any, Protocol
 
 from express50.capture.index import read_index
 from express50.contract.layout import Dataset
@@ -34,7 +36,9 @@ from express50.runner.replaced import keeping
 from express50.runner.runner import run_stage
 
 PEAKS = 3  # expressions of a trial
-STEEPER = 3.0  # a setting that was not tried may cost this many times the one below it
+WHOLE = 6  # a subject with no more is tried whole: then a run takes over all that a trial made
+STEEPER = 2.0  # a setting that was not tried is taken to cost so many times the one below it
+STEEPEST = 3.0  # and no more than this; measured were 1.5 to 2.7
 MEASURES = 3  # version of how results are compared
 Ladder = Mapping[str, Any]  # configurations of a stage by the name of the setting, cheapest first
 
@@ -77,15 +81,37 @@ class Pilot:
     chain: Chain
     subject: str
     clock: Clock
+    cut: bool = False  # whether the time ended in the last trial, so that it measured nothing
 
-    def trial(self, settings: Mapping[str, str], peaks: int, source: Trial | None) -> Trial:
-        """Run one trial, or read it if it ran before."""
-        chain = self.chain
-        name = value_digest([chain.key(), dict(settings), peaks, self.subject])[:12]
-        root = chain.dataset.pilot_dir / name
-        record = root / "trial.json"
+    def record(self, settings: Mapping[str, str], peaks: int) -> Path:
+        """Return the path of what a trial measured, in the trial's folder."""
+        name = value_digest([self.chain.key(), dict(settings), peaks, self.subject])[:12]
+        return self.chain.dataset.pilot_dir / name / "trial.json"
+
+    def trial(
+        self,
+        settings: Mapping[str, str],
+        peaks: int,
+        source: Trial | None,
+        words: str = "",
+        limit: float = math.inf,
+    ) -> Trial:
+        """Run one trial, or read it if it ran before.
+
+        Args:
+            settings: name of the setting of each stage.
+            peaks: number of expressions.
+            source: trial to start from, or None.
+            words: what to tell people before it runs.
+            limit: seconds after which none of its items begins.
+        """
+        chain, record = self.chain, self.record(settings, peaks)
+        self.cut = False
         if record.is_file():
             return trial_of(json.loads(record.read_text(encoding="utf-8")))
+        if words:
+            chain.tell(words)
+        root, until = record.parent, self.clock.now() + limit
         dataset = Dataset(root)
         if source is not None:
             shutil.rmtree(root, ignore_errors=True)
@@ -96,6 +122,8 @@ class Pilot:
         costs, failed = dict(source.costs) if source else {}, {}
         for stage in chain.stages:
             config = chain.ladders[stage.name][settings[stage.name]]
+            before = source.costs.get(stage.name) if source else None
+            self.clock.expect(0.0 if before is None else _item_seconds(self, before), until=until)
             try:
                 cost, why = self._run(stage, dataset, config, anew=source is not None)
             except (ConfigError, DiskFullError):
@@ -107,8 +135,11 @@ class Pilot:
             if why:
                 failed[stage.name] = why.replace(self.subject, "the subject")
             _cut_peaks(dataset, self.subject, peaks)
+            broken = stage.name in failed and stage.name in chain.measurable()
+            if self.cut or broken:  # what follows would be of older outputs, or of none
+                break
         if not dataset.subjects():
-            raise StageError(": ".join(next(iter(failed.items()))))
+            raise StageError(": ".join(next(iter(failed.items()), ("", "the time is over"))))
         count = len(_rows(dataset.peaks_file(self.subject)))
         whole = footage_of(dataset)
         footage = replace(whole, expressions=float(max(1, count)))
@@ -119,9 +150,9 @@ class Pilot:
             costs=costs,
             errors=stated_errors(chain, dataset),
             failed=failed,
-            folder=name,
+            folder=root.name,
         )
-        if not self.clock.closed():
+        if not self.cut:
             write_json(record, asdict(done))
         return done
 
@@ -149,6 +180,7 @@ class Pilot:
         summary = run_stage(
             stage, dataset, config, pool=pool, progress=not anew, monitor=self.clock
         )
+        self.cut = summary.count("left") > 0
         counted = ("done",) if anew else ("done", "skipped")
         made = {o.item for o in summary.outcomes if o.status in counted}
         failures = [o.reason for o in summary.outcomes if o.status == "failed"]
@@ -177,12 +209,12 @@ def cost_of(dataset: Dataset, stage: str, receipts: Sequence[Receipt], extra: fl
 
 
 def keep_for_run(dataset: Dataset, settings: Mapping[str, str]) -> None:
-    """Move what trials made at chosen settings to the store of replaced outputs.
+    """Put copies of what trials made at chosen settings into the store of replaced outputs.
 
     The run takes an output from there where it would make the same. Trials that share the settings
     of more stages come first: what a stage makes depends on the stages before it as well.
     """
-    moved: set[tuple[str, str]] = set()
+    kept: set[tuple[str, str]] = set()
 
     def alike(trial: Trial) -> int:
         differ = (k for k, name in enumerate(settings) if trial.settings[name] != settings[name])
@@ -193,17 +225,25 @@ def keep_for_run(dataset: Dataset, settings: Mapping[str, str]) -> None:
         for record in sorted(dataset.pilot_dir.glob("*/trial.json"))
     ]
     for trial, folder in sorted(trials, key=lambda pair: -alike(pair[0])):
-        for subject in folder.subjects():
-            with suppress(FileNotFoundError):  # the peaks before they were cut
-                whole_peaks(folder, subject).rename(folder.peaks_file(subject))
         for name in (n for n, label in settings.items() if trial.settings.get(n) == label):
             with Ledger(folder.ledger, read_only=True) as ledger:
                 receipts, made = ledger.read(name), ledger.made(name)
-            for item in (i for i in made if (name, i) not in moved):
+            for item in (i for i in made if (name, i) not in kept):
                 keep = keeping(dataset, replace(receipts[item], made=made[item]))
                 if keep is not None and folder.item_dir(name, item).is_dir():
-                    keep(folder.item_dir(name, item))
-                    moved.add((name, item))
+                    keep(_copied(folder, name, item))
+                    kept.add((name, item))
+
+
+def _copied(trial: Dataset, stage: str, item: str) -> Path:
+    """Copy an output of a trial by links, with the peaks as they were before they were cut."""
+    copy = trial.root.parent / "copy"
+    shutil.rmtree(copy, ignore_errors=True)
+    shutil.copytree(trial.item_dir(stage, item), copy, copy_function=_link)
+    with suppress(FileNotFoundError):
+        whole = whole_peaks(trial, item).name
+        (copy / whole).replace(copy / trial.peaks_file(item).name)
+    return copy
 
 
 def _link(source: str, target: str) -> None:
@@ -217,7 +257,7 @@ def _rows(path: Path) -> dict[str, Any]:
 
 
 def _cut_peaks(dataset: Dataset, subject: str, count: int) -> None:
-    """Leave a few peaks, spread over the script, the first of it among them."""
+    """Leave a few peaks, spread over the script, the first of it among them; all if few."""
     path, whole = dataset.peaks_file(subject), whole_peaks(dataset, subject)
     if not path.is_file():
         return
@@ -226,7 +266,7 @@ def _cut_peaks(dataset: Dataset, subject: str, count: int) -> None:
     rows = _rows(whole)
     order = [cue.expression_id for cue in read_index(dataset, subject).cues]
     names = sorted(rows, key=lambda name: order.index(name) if name in order else len(order))
-    kept = evenly(names, count)
+    kept = names if 1 < count < len(names) <= WHOLE else evenly(names, count)
     if set(kept) != _rows(path).keys():
         write_json(path, {name: rows[name] for name in rows if name in kept})
 
@@ -258,20 +298,33 @@ def broken_stage(chain: Chain, trial: Trial) -> str:
 
 def _base(pilot: Pilot, settings: dict[str, str], choices: Sequence[str]) -> Trial:
     """Run the first trial; a stage that makes nothing at its cheapest setting is set higher."""
+    where = "on a few expressions of one subject"
+    words = f"measuring {where}, every stage at its cheapest setting"
     while True:
-        base = pilot.trial(settings, PEAKS, None)
+        base = pilot.trial(settings, PEAKS, None, words)
         broken = broken_stage(pilot.chain, base)
         ladder = list(pilot.chain.ladders.get(broken, ()))
-        if broken not in choices or settings[broken] == ladder[-1] or pilot.clock.closed():
+        if broken not in choices or settings[broken] == ladder[-1] or pilot.cut:
             return base
         settings |= {broken: ladder[ladder.index(settings[broken]) + 1]}
-        pilot.chain.tell(
-            f"{broken} made nothing at its cheapest setting; trying {settings[broken]}"
-        )
+        words = f"{broken} made nothing at its cheapest setting; trying {settings[broken]}"
 
 
-def measure(pilot: Pilot, allowed: Callable[[PilotFigures], float]) -> PilotFigures:
-    """Run trials, the cheapest first, for as many seconds as ``allowed`` gives to the first one.
+class Allowance(Protocol):
+    """Says how long trials may take, from what was measured so far."""
+
+    def spare(self, figures: PilotFigures, guess: Trial | None = None) -> float:
+        """Return the seconds that a run with the best choice so far would leave.
+
+        With a guess of a trial, the run has its setting as well.
+        """
+
+    def doubtful(self, figures: PilotFigures) -> float:
+        """Return by how many seconds of the run a trial of one expression may correct the plan."""
+
+
+def measure(pilot: Pilot, allowance: Allowance) -> PilotFigures:
+    """Run trials, the cheapest first, as long as they and a run with what they try fit the time.
 
     The first one, at the cheapest settings, always runs to its end or to that of the budget. Where
     a stage makes nothing whatever its settings, it stays the only one.
@@ -280,45 +333,72 @@ def measure(pilot: Pilot, allowed: Callable[[PilotFigures], float]) -> PilotFigu
     choices = tradable(chain)
     cheapest = {n: next(iter(chain.ladders[n])) if n in choices else standard_of(chain.ladders[n])
                 for n in names}  # fmt: skip
-    where = f"up to {PEAKS} expressions of one subject"
-    chain.tell(f"measuring on {where}, every stage at its cheapest setting")
     base = _base(pilot, cheapest, choices)
-    cheapest = base.settings
-    began, trials = pilot.clock.now(), [base]
-    untried: dict[str, list[str]] = {}
-    if pilot.clock.closed() or broken_stage(chain, base):
-        return PilotFigures(key=chain.key(), trials=trials, losses={})
-    untold: dict[str, dict] = {name: {} for name in choices}
-    allowance = allowed(PilotFigures(key=chain.key(), trials=trials, losses=untold))
-    ladders = {name: list(chain.ladders[name]) for name in choices}
-    higher = {n: ladder[ladder.index(cheapest[n]) + 1 :] for n, ladder in ladders.items()}
-    steps = [(name, label) for name, labels in higher.items() for label in labels]
-    steps.sort(key=lambda step: trial_seconds(pilot, base, step[0]))
-    grown: dict[str, float] = {}
-    if base.footage.expressions > 1 and trial_seconds(pilot, base, names[0]) < allowance:
-        trials.append(pilot.trial(cheapest, 1, base))
-    for name, label in steps:
-        factor = grown.get(name, STEEPER)
-        expected = trial_seconds(pilot, base, name, factor)
-        if pilot.clock.now() - began + expected > allowance:
-            untried.setdefault(name, []).append(label)
-            continue
-        chain.tell(f"measuring {name} {label}")
-        trial = pilot.trial(cheapest | {name: label}, PEAKS, base)
-        if pilot.clock.closed():
-            untried.setdefault(name, []).append(label)
-            break
-        trials.append(trial)
-        if name in trial.costs and name in base.costs:
-            ratio = trial.costs[name].core_seconds / max(base.costs[name].core_seconds, 1e-9)
-            grown[name] = STEEPER * max(1.0, ratio)
-    losses = {name: _losses(pilot, trials, cheapest, name) for name in choices}
-    return PilotFigures(key=chain.key(), trials=trials, losses=losses, untried=untried)
+    found = PilotFigures(key=chain.key(), trials=[base], losses={})
+    if pilot.cut or broken_stage(chain, base):
+        return found
+    found = replace(
+        found, losses={name: _losses(pilot, [base], base.settings, name) for name in choices}
+    )
+    limit = min(allowance.spare(found), allowance.doubtful(found))
+    if base.footage.expressions > 1 and (
+        pilot.record(base.settings, 1).is_file() or one_peak_seconds(pilot, base) <= limit
+    ):
+        single = pilot.trial(base.settings, 1, base, "measuring one expression alone", limit)
+        if not pilot.cut:
+            found = replace(found, trials=[base, single])
+    grown: dict[str, float] = {}  # how many times as long as at first a stage took, at most
+    for name, label in _steps(pilot, base, choices):
+        settings, factor = {**base.settings, name: label}, grown.get(name, 1.0)
+        pilot.clock.expect(0.0)
+        known, limit = pilot.record(settings, PEAKS).is_file(), allowance.spare(found)
+        if known or _fits(pilot, base, (name, label), factor, found, allowance):
+            trial = pilot.trial(settings, PEAKS, base, f"measuring {name} {label}", limit)
+            if not pilot.cut:
+                trials = [*found.trials, trial]
+                losses = found.losses | {name: _losses(pilot, trials, base.settings, name)}
+                found = replace(found, trials=trials, losses=losses)
+                if name in trial.costs and name in base.costs:
+                    before = max(base.costs[name].core_seconds, 1e-9)
+                    grown[name] = max(1.0, trial.costs[name].core_seconds / before)
+                continue
+        untried = [*found.untried.get(name, []), label]
+        found = replace(found, untried=found.untried | {name: untried})
+    pilot.clock.expect(0.0)
+    pilot.cut = False  # the first trial is whole
+    return found
 
 
-def _charged(pilot: Pilot, cost: Cost) -> float:
-    """Return what a stage's items take of the budget, one after the other."""
-    return cost.items * (cost.core_seconds if pilot.clock.cores else cost.seconds)
+def _fits(
+    pilot: Pilot,
+    base: Trial,
+    step: tuple[str, str],
+    factor: float,
+    found: PilotFigures,
+    allowance: Allowance,
+) -> bool:
+    """Return whether there is time for a trial of a step, and for a run with it.
+
+    Even at its worst, the trial must leave time for the best choice so far.
+    """
+    likely, worst = (guessed(pilot, base, *step, factor * f) for f in (STEEPER, STEEPEST))
+    return trial_seconds(pilot, worst, step[0]) <= allowance.spare(found) and (
+        trial_seconds(pilot, likely, step[0]) <= allowance.spare(found, likely)
+    )
+
+
+def _steps(pilot: Pilot, base: Trial, choices: Sequence[str]) -> list[tuple[str, str]]:
+    """List settings above the cheapest ones: first one step up, as a second one gains less.
+
+    Those whose trials are quicker come first.
+    """
+    steps = []
+    for name in choices:
+        ladder = list(pilot.chain.ladders[name])
+        higher = ladder[ladder.index(base.settings[name]) + 1 :]
+        seconds = trial_seconds(pilot, base, name)
+        steps += [(rank, seconds, (name, label)) for rank, label in enumerate(higher)]
+    return [step for _, _, step in sorted(steps)]
 
 
 def standard_of(ladder: Ladder) -> str:
@@ -326,14 +406,52 @@ def standard_of(ladder: Ladder) -> str:
     return "standard" if "standard" in ladder else next(iter(ladder))
 
 
-def trial_seconds(pilot: Pilot, base: Trial, name: str, factor: float = 1.0) -> float:
-    """Guess the seconds of a trial that changes a stage: it, and all that follows."""
+def _item_seconds(pilot: Pilot, cost: Cost) -> float:
+    return cost.core_seconds if pilot.clock.cores else cost.seconds
+
+
+def _charged(pilot: Pilot, cost: Cost) -> float:
+    """Return what a stage's items take of the budget."""
+    width = 1 if pilot.clock.cores else min(pilot.chain.pool.width(), cost.items)
+    return cost.items * _item_seconds(pilot, cost) / width
+
+
+def guessed(pilot: Pilot, base: Trial, name: str, label: str, factor: float) -> Trial:
+    """Guess what a trial would measure that sets a stage higher, as if that took `factor` times.
+
+    Later stages take as long as before, but longer where the setting makes their pictures larger.
+    """
+    stages = pilot.chain.stages[pilot.chain.names.index(name) :]
+    reduces, footage, costs = stages[0].growth.reduces, base.footage, dict(base.costs)
+    if reduces:
+        side = getattr(pilot.chain.ladders[name][label], reduces)
+        footage = replace(footage, side=float(side))
+    for stage in (one for one in stages if one.name in costs):
+        more = footage.time(stage.growth) / base.footage.time(stage.growth)
+        more, cost = factor if stage.name == name else more, costs[stage.name]
+        costs[stage.name] = replace(
+            cost, seconds=cost.seconds * more, core_seconds=cost.core_seconds * more
+        )
+    return replace(base, settings={**base.settings, name: label}, costs=costs)
+
+
+def trial_seconds(pilot: Pilot, guess: Trial, name: str) -> float:
+    """Return the seconds of a trial that changes a stage: it, and all that follows."""
     names = pilot.chain.names
-    later = [n for n in names[names.index(name) :] if n in base.costs]
-    reduces = pilot.chain.stages[names.index(name)].growth.reduces  # then all later ones cost more
-    return sum(
-        _charged(pilot, base.costs[n]) * (factor if reduces or n == name else 1.0) for n in later
-    )
+    later = [n for n in names[names.index(name) :] if n in guess.costs]
+    return sum(_charged(pilot, guess.costs[n]) for n in later)
+
+
+def one_peak_seconds(pilot: Pilot, base: Trial) -> float:
+    """Guess the seconds of a trial of one expression: what others have no part in is there."""
+    seconds, changed = 0.0, False
+    for stage in pilot.chain.stages:
+        changed |= "expressions" in stage.growth.time
+        if changed and stage.name in base.costs:
+            cost = base.costs[stage.name]
+            each = "expressions" in stage.growth.items
+            seconds += _charged(pilot, cost) / (cost.items if each else 1)
+    return seconds
 
 
 def _losses(

@@ -10,16 +10,15 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from express50.console import count, format_seconds
-from express50.contract.config import made_with
-from express50.contract.layout import Dataset, exclusion_reason
+from express50.console import format_seconds
+from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
-from express50.dial.budget import Budget, Clock, Goal, budget_text
+from express50.dial.budget import Budget, Clock, Goal, budget_text, parse_budget
 from express50.dial.choice import (
     Point,
     Workload,
@@ -33,30 +32,22 @@ from express50.dial.choice import (
     point_of,
     size_factor,
     stage_seconds,
-    taken_over,
 )
-from express50.dial.figures import PilotFigures, dial_dir, footage_of, read_measured
+from express50.dial.figures import PilotFigures, dial_dir
+from express50.dial.measuring import BUSY, core_seconds, measured_figures, time_words, workload
 from express50.dial.pilot import (
     Chain,
-    Pilot,
-    broken_stage,
     keep_for_run,
-    measure,
     stated_errors,
 )
 from express50.dial.results import RESULTS
-from express50.errors import ConfigError, FormatError, StageError
+from express50.errors import ConfigError, FormatError
 from express50.files.atomic import write_json
 from express50.files.text import read_json_table
-from express50.runner.ledger import Ledger
-from express50.runner.runner import Summary, run_stage
+from express50.runner.runner import Outcome, Summary, run_stage
 
-SPARE_SHARE = 0.5  # of the time that the cheapest settings would leave over, for trials
-SAFETY = 0.95  # of the time left is planned with: what items take varies
 BELIEVED = 0.1  # of the expected time must have passed before its speed changes choices
 GRACE = 0.1  # of the budget by which a run may end late rather than stop with nothing made
-BUSY = 1.5  # times its processor time on all workers: waiting took much of a trial
-PILOTS = 3  # subjects whose footage is tried if the first one's is bad
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,92 +68,12 @@ class RunState:
     # ``[value, low, high]`` of each result, as the stages state in the end
     stated: dict[str, list[float]] = field(default_factory=dict)
     finished: bool = False  # whether nothing was left
+    rest: float = 0.0  # expected seconds of what was left
 
 
 def run_file(dataset: Dataset) -> Path:
     """Return the path of the state of a dataset's budgeted run."""
     return dial_dir(dataset) / "run.json"
-
-
-def measured_figures(chain: Chain, clock: Clock, chosen: bool = False) -> PilotFigures:
-    """Read what was measured of a chain's dataset, or measure it.
-
-    Settings that there was no time to try are tried by the next run, unless its settings are
-    ``chosen`` already. Trials that are still there are not run again.
-
-    Raises:
-        ConfigError: the budget ended before any footage was ingested.
-        StageError: no footage can be measured.
-    """
-    path = dial_dir(chain.dataset) / "measured.json"
-    found = read_measured(path, chain.key())
-    if found is not None and (chosen or not found.untried):
-        return found
-    found = _measure_one(chain, clock)
-    if not clock.closed():
-        write_json(path, asdict(found))
-    return found
-
-
-def _measure_one(chain: Chain, clock: Clock) -> PilotFigures:
-    """Measure the first subject whose footage every stage can work on; raises what callers do."""
-    root = chain.dataset.root
-    captures = chain.dataset.captures()
-    subjects = [s for s in captures if not exclusion_reason(chain.dataset, s)]
-    if captures and not subjects:
-        take_in = f"express50 annotate include {root} {min(captures)}"
-        raise StageError(f"{root}: every subject is excluded; to take one in again: '{take_in}'")
-    if not subjects:
-        raise StageError(f"{root}: has no captures yet; run 'express50 run {root} CAPTURE'")
-
-    def allowed(base: PilotFigures) -> float:
-        need = front(workload(chain, base, clock.cores, {}))[0].seconds
-        return SPARE_SHARE * (clock.left() - need)
-
-    for subject in subjects[:PILOTS]:
-        try:
-            found = measure(Pilot(chain, subject, clock), allowed)
-            broken = broken_stage(chain, found.trials[0])
-            if not broken or clock.closed():  # a stage without time has no output
-                return found
-            reason = f"{broken}: {found.trials[0].failed[broken]}"
-        except StageError as error:  # nothing is ingested
-            reason = str(error)
-            if clock.budget is not None and clock.closed():
-                raise ConfigError(
-                    f"--budget {clock.budget.text}: the time ended before the footage of {subject}"
-                    " was ingested; give more time"
-                ) from error
-        chain.tell(f"{subject} cannot be measured: {reason}")
-    raise StageError(
-        f"{root}: no subject could be measured: {reason}; correct that, or run without --budget to"
-        " see what each stage says"
-    )
-
-
-def workload(
-    chain: Chain, measured: PilotFigures, cores: bool, begun: Mapping[str, str]
-) -> Workload:
-    """Describe what is left to make."""
-    seen, captures = measured.trials[0], len(chain.dataset.captures())
-    footage = replace(seen.footage, subjects=float(captures), expressions=seen.scripted)
-    if 0 < len(chain.dataset.subjects()) >= captures:
-        footage = footage_of(chain.dataset)
-    load = Workload(
-        stages=chain.stages, ladders=chain.ladders, measured=measured, footage=footage,
-        width=chain.pool.width(), cores=cores, fixed=begun, kinds=chain.kinds,
-    )  # fmt: skip
-    dataset, made_here = chain.dataset, {}
-    if dataset.ledger.is_file():
-        with Ledger(dataset.ledger, read_only=True) as ledger:
-            for stage in chain.stages:
-                path, ladder = dataset.config_file(stage.name), load.ladders[stage.name]
-                if (label := made_with(path, stage, ladder)) is not None:
-                    made = sum(r.status == "done" for r in ledger.read(stage.name).values())
-                    share = min(1.0, made / item_seconds(load, stage, label)[0])
-                    made_here[stage.name] = label, share
-    there = [t for t in measured.trials if t.folder and (dataset.pilot_dir / t.folder).is_dir()]
-    return replace(load, done=[made_here, *(taken_over(load, trial) for trial in there)])
 
 
 @dataclass
@@ -207,7 +118,7 @@ class _Run:
         believed = max(1.0, BELIEVED * (self.state.seconds - self.state.spent))
         if self.expected < believed:
             return 1.0
-        return min(4.0, max(0.5, self.real / self.expected))
+        return min(4.0, max(0.25, self.real / self.expected))
 
 
 def run_within(
@@ -251,7 +162,7 @@ def _measure_and_run(
 ) -> tuple[list[Summary], RunState]:
     """Measure, choose settings unless they are chosen already, and run the stages."""
     chain, clock, state = run.chain, run.clock, run.state
-    run.measured = measured_figures(chain, clock, chosen=bool(state.settings))
+    run.measured = measured_figures(chain, clock, goal, chosen=bool(state.settings))
     load = run.workload()
     run.wanted = None if goal is None else (goal_result(load, goal), goal.value)
     if not state.settings:
@@ -270,20 +181,19 @@ def _measure_and_run(
     for line in lines:
         chain.tell(line)
     run.keep()
-    summaries = []
+    summaries: list[Summary] = []
     for stage in chain.stages:
-        if stage.name not in run.state.begun:
-            _choose_rest(run, stage)
-        summary = _run_one(run, stage)
+        summary = _run_one(run, stage, summaries)
         if summary is None:
             break
         summaries.append(summary)
         ended(stage, summary)
-    whole = len(summaries) == len(chain.stages) and not any(s.count("left") for s in summaries)
+    whole = len(summaries) == len(chain.stages) and not _any_left(summaries)
     stated = stated_errors(chain, chain.dataset) if summaries else {}
+    rest = 0.0 if whole else point_of(run.workload(), run.state.settings).seconds
     run.state = replace(run.state, spent=clock.now())
-    run.keep(finished=whole, stated=stated)
-    if whole:
+    run.keep(finished=whole, stated=stated, rest=rest)
+    if whole and not run.measured.untried:  # else a larger budget goes on with them
         shutil.rmtree(chain.dataset.pilot_dir, ignore_errors=True)
     return summaries, run.state
 
@@ -307,21 +217,15 @@ def _resumed(chain: Chain, budget: Budget | None, goal: Goal | None) -> RunState
 def _first_choice(run: _Run, load: Workload, goal: Goal | None) -> Point:
     clock, wanted, points = run.clock, run.wanted, front(load)
     left = clock.left()
-    if clock.closed() or points[0].seconds > left:
+    if points[0].seconds > max(0.0, left):
         spent, least = clock.now(), points[0].seconds
-        words = "core time" if load.cores else f"with {count(load.width, 'worker')}"
+        words = time_words(load.cores, load.width)
         asked = f"--budget {clock.budget.text if clock.budget else ''}"
-        if clock.closed():
-            raise ConfigError(
-                f"{asked}: it ended before every stage was measured at its cheapest setting; the"
-                f" cheapest settings need more than {format_seconds(spent + least)} {words}; give"
-                " several times as much; what was measured is kept"
-            )
         more = 1.1 * least
         give = f"give --budget {budget_text(more, load.cores)} or more"
         if clock.budget is not None and more <= clock.budget.seconds:
             give = "the same command again will do"
-        core = point_of(replace(load, cores=True), points[0].settings).seconds
+        core = core_seconds(load, points[0].settings)
         if not load.cores and least > BUSY * core / load.width:
             give += f"; only {format_seconds(core)} of it is processor time: where other programs"
             give += f" slowed the measuring, give --budget {budget_text(1.1 * core, True)} instead"
@@ -329,7 +233,7 @@ def _first_choice(run: _Run, load: Workload, goal: Goal | None) -> Point:
             f"{asked}: the cheapest settings need about {format_seconds(least)} {words} after"
             f" {format_seconds(spent)} of measuring, which is kept and not counted again; {give}"
         )
-    point = choose(points, left * SAFETY, wanted)
+    point = choose(points, clock.plannable(), wanted)
     if goal is not None and wanted is not None and point.errors[wanted[0]].value > goal.value:
         name = wanted[0]
         reaching = [p for p in points if p.errors[name].value <= goal.value]
@@ -349,9 +253,10 @@ def _first_choice(run: _Run, load: Workload, goal: Goal | None) -> Point:
 def _choose_rest(run: _Run, stage: Stage) -> None:
     """Begin a stage; choose its and later settings again if the time left requires it."""
     state, points = run.state, front(run.workload())
-    left = run.clock.left() / run.slowness()
+    slow = run.slowness()
+    left = run.clock.left() / slow
     now = next((p for p in points if p.settings == state.settings), None)
-    better = choose(points, left * SAFETY, run.wanted)
+    better = choose(points, run.clock.plannable() / slow, run.wanted)
     late = now is None or now.seconds > left
     begun = [*state.begun, stage.name]
     changed = [n for n, label in better.settings.items() if label != state.settings[n]]
@@ -365,23 +270,58 @@ def _choose_rest(run: _Run, stage: Stage) -> None:
     run.keep(settings=better.settings, begun=begun, changes=[*state.changes, line])
 
 
-def _run_one(run: _Run, stage: Stage) -> Summary | None:
+def _any_left(summaries: Sequence[Summary]) -> bool:
+    return any(summary.count("left") for summary in summaries)
+
+
+def ready_items(items: Sequence[str], before: Sequence[Summary]) -> tuple[list[str], list[str]]:
+    """Return a stage's items that can be made, and those that wait for an earlier stage.
+
+    Those of a subject wait if an earlier stage had no time for a part of it. All wait if the stage
+    before made nothing.
+    """
+    left = {o.item.split("/")[0] for s in before for o in s.outcomes if o.status == "left"}
+    nothing = all(outcome.status == "left" for outcome in before[-1].outcomes)
+    waiting = [item for item in items if nothing or item.split("/")[0] in left]
+    return [item for item in items if item not in waiting], waiting
+
+
+def _run_one(run: _Run, stage: Stage, before: Sequence[Summary]) -> Summary | None:
     """Run a stage until the budget ends; None if it has nothing to work on."""
+    items = list(stage.items(run.chain.dataset))
+    waiting: list[str] = []
+    if not items:  # an earlier stage made nothing
+        return None
+    if _any_left(before):
+        items, waiting = ready_items(items, before)
+    summary = Summary(stage.name, (), 0.0)
+    if items:
+        if stage.name not in run.state.begun:
+            _choose_rest(run, stage)
+        summary = _run_ready(run, stage, items if waiting else None)
+    left = tuple(Outcome(item, "left") for item in waiting)
+    return replace(summary, outcomes=(*summary.outcomes, *left))
+
+
+def _run_ready(run: _Run, stage: Stage, chosen: list[str] | None) -> Summary:
+    """Run chosen items of a stage, or all."""
     chain, clock, label = run.chain, run.clock, run.state.settings[stage.name]
     load = run.workload()
     items, item = item_seconds(load, stage, label)
     factor = size_factor(load, stage, run.state.settings)
     slow, early = run.slowness(), 0.0
+    nothing_to_make = point_of(load, run.state.settings).each[stage.name] == 0
     if clock.budget:
         each = front(load)[0].each  # the quickest that may follow
         rest = sum(each[name] for name in chain.names[chain.names.index(stage.name) + 1 :])
         early = reserved(each[stage.name] * slow, rest * slow, clock.left(), clock.budget.seconds)
-    clock.expect(factor * item * slow, early)
+    item *= factor * slow
+    if nothing_to_make and clock.budget:  # what a trial made is only moved, after the end as well
+        item, early = -GRACE * clock.budget.seconds, 0.0
+    clock.expect(item, early)
     before = clock.now()
-    if not stage.items(chain.dataset):  # an earlier stage made nothing
-        return None
     config = chain.ladders[stage.name][label]
-    summary = run_stage(stage, chain.dataset, config, pool=chain.pool, monitor=clock)
+    summary = run_stage(stage, chain.dataset, config, chosen, pool=chain.pool, monitor=clock)
     made = sum(o.status == "done" and not o.restored for o in summary.outcomes)
     if made:
         run.real += clock.now() - before
@@ -412,6 +352,12 @@ def closing_lines(state: RunState, summaries: Sequence[Summary]) -> Iterator[str
     for name in (n for n in promised if n not in state.stated and state.finished):
         yield f"{name}: no error is stated, {promised[name]['value']:.2g} {units[name]} promised"
     left = [f"{s.count('left')} of {s.stage}" for s in summaries if s.count("left")]
-    if not state.finished:
-        what = ", ".join(left) or "later stages"
-        yield f"the time is over; left: {what}; a larger --budget continues from here"
+    if left:
+        cores = bool(state.budget) and parse_budget(state.budget).cores
+        more = budget_text(1.1 * state.rest, cores)
+        if more == state.budget:  # which would be the same run, whose time is over
+            more = budget_text(1.3 * state.rest, cores)
+        yield f"the time is over; left: {', '.join(left)}; all that is finished is kept"
+        yield f"to make the rest, run again with --budget {more} or more; it counts from then on"
+    elif not state.finished:
+        yield f"stopped after {summaries[-1].stage}: it leaves the next stage nothing to work on"

@@ -14,8 +14,8 @@ from express50.contract.config import PRESETS
 from express50.dial.budget import Clock
 from express50.dial.choice import Point, Workload, error_text, front, labels_of, point_of
 from express50.dial.figures import dial_dir
+from express50.dial.measuring import measured_figures, workload
 from express50.dial.pilot import Chain, standard_of
-from express50.dial.run import measured_figures, workload
 from express50.files.atomic import write_bytes, write_json
 
 

@@ -14,6 +14,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
+
 from express50.capture.index import peak_items, read_index
 from express50.contract.config import distinct_settings, resolve_config
 from express50.contract.layout import Dataset
@@ -29,6 +31,7 @@ PAUSE = "EXPRESS50_TOY_PAUSE"  # seconds of a step
 FAILS = "EXPRESS50_TOY_FAILS"  # "stage steps": raises at these steps
 STOPS = "EXPRESS50_TOY_STOPS"  # "stage item": is interrupted there, once
 REST = 0.5
+pause = time.sleep
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +74,19 @@ def _work(stage: str, item: str, steps: int, times: int) -> None:
     if os.environ.get(STOPS) == f"{stage} {item}":
         del os.environ[STOPS]
         raise KeyboardInterrupt
-    time.sleep(float(os.environ.get(PAUSE, "0.004")) * steps * times)
+    pause(float(os.environ.get(PAUSE, "0.004")) * steps * times)
+
+
+def count_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a step take one second of processor time, and nothing else any, without waiting."""
+    spent = [0.0]
+
+    def pass_by(seconds: float) -> None:
+        spent[0] += seconds
+
+    monkeypatch.setenv(PAUSE, "1")
+    monkeypatch.setattr("tests.express50.dial.toy_chain.pause", pass_by)
+    monkeypatch.setattr("express50.runner.worker.core_seconds", lambda: spent[0])
 
 
 def added(size: float, steps: int) -> float:

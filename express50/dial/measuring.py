@@ -1,0 +1,228 @@
+"""Measure a dataset within a budget, or read what was measured before; say what is left to make."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+
+from express50.console import count, format_seconds
+from express50.contract.config import made_with
+from express50.contract.layout import exclusion_reason
+from express50.dial.budget import Clock, Goal
+from express50.dial.choice import (
+    Workload,
+    choose,
+    front,
+    goal_result,
+    item_seconds,
+    point_of,
+    taken_over,
+)
+from express50.dial.figures import PilotFigures, Trial, dial_dir, footage_of, read_measured
+from express50.dial.pilot import PEAKS, Chain, Pilot, broken_stage, measure
+from express50.errors import ConfigError, StageError
+from express50.files.atomic import write_json
+from express50.runner.ledger import Ledger
+
+PILOTS = 3  # subjects whose footage is tried if the first one's is bad
+BUSY = 1.5  # times its processor time on all workers: waiting took much of a trial
+
+
+def measured_figures(
+    chain: Chain, clock: Clock, goal: Goal | None = None, chosen: bool = False
+) -> PilotFigures:
+    """Read what was measured of a chain's dataset, or measure it.
+
+    Settings that there was no time to try are tried by the next run, unless its settings are
+    ``chosen`` already. Trials that are still there are not run again.
+
+    Raises:
+        ConfigError: the budget ended before any footage was ingested, or no stage states an error
+            in the goal's unit.
+        StageError: no footage can be measured.
+    """
+    path = dial_dir(chain.dataset) / "measured.json"
+    found = read_measured(path, chain.key())
+    if found is not None and not chosen and _slowed(chain, clock, found):
+        found = _timed_again(chain, clock, found)
+    if found is not None and (chosen or not found.untried):
+        return found
+    found = _measure_one(chain, clock, _Allowance(chain, clock, goal))
+    write_json(path, asdict(found))
+    return found
+
+
+@dataclass(frozen=True)
+class _Allowance:
+    """Says how long trials may take; an `Allowance` of the pilot."""
+
+    chain: Chain
+    clock: Clock
+    goal: Goal | None
+
+    def spare(self, figures: PilotFigures, guess: Trial | None = None) -> float:
+        load, left = workload(self.chain, figures, self.clock.cores, {}), self.clock.plannable()
+        points = front(load)
+        wanted = None if self.goal is None else (goal_result(load, self.goal), self.goal.value)
+        best = choose(points, left, wanted)
+        seconds = best.seconds
+        if guess is not None:
+            changed = {n for n, s in guess.settings.items() if s != figures.trials[0].settings[n]}
+            settings = best.settings | {name: guess.settings[name] for name in changed}
+            more = replace(figures, trials=[*figures.trials, guess])
+            seconds = point_of(workload(self.chain, more, self.clock.cores, {}), settings).seconds
+        if wanted and best.errors[wanted[0]].value <= wanted[1]:
+            # More trials can only find a quicker choice, and none is quicker than the cheapest.
+            left = min(left, seconds + best.seconds - points[0].seconds)
+        return left - seconds
+
+    def doubtful(self, figures: PilotFigures) -> float:
+        if self.clock.budget is None and self.goal is None:
+            return math.inf  # `tune` measures everything, also for `plan`
+        load = workload(self.chain, figures, self.clock.cores, {})
+        first, seconds = figures.trials[0], 0.0
+        for stage in load.stages:
+            if stage.name in first.costs:
+                items, each = item_seconds(load, stage, first.settings[stage.name])
+                cost = first.costs[stage.name]
+                tried = cost.core_seconds if load.cores else cost.seconds
+                seconds += items * max(0.0, each - tried) / (1 if load.cores else load.width)
+        return seconds
+
+
+def _slowed(chain: Chain, clock: Clock, found: PilotFigures) -> bool:
+    """Return whether a budget would be refused for clock figures that were mostly waiting.
+
+    Other programs may have slowed the trials of an earlier command, and may have ended since. Where
+    the budget is not refused, the run sees by itself that it is ahead of time.
+    """
+    if clock.cores or clock.budget is None:
+        return False
+    load = workload(chain, found, False, {})
+    least = front(load)[0]
+    waited = least.seconds > BUSY * core_seconds(load, least.settings) / load.width
+    return waited and least.seconds > clock.left()
+
+
+def core_seconds(load: Workload, settings: Mapping[str, str]) -> float:
+    """Predict the processor seconds of given settings."""
+    return point_of(replace(load, cores=True), settings).seconds
+
+
+def _timed_again(chain: Chain, clock: Clock, found: PilotFigures) -> PilotFigures:
+    """Run the first trial again; take other trials to have waited as much per processor second."""
+    first = found.trials[0]
+    pilots = [Pilot(chain, subject, clock) for subject in _subjects(chain)]
+    pilots = [p for p in pilots if p.record(first.settings, PEAKS).parent.name == first.folder]
+    if not pilots:
+        return found
+    shutil.rmtree(chain.dataset.pilot_dir / first.folder, ignore_errors=True)
+    words = "measuring again, as other programs may have slowed the machine when it was measured"
+    try:
+        base = pilots[0].trial(first.settings, PEAKS, None, words)
+    except StageError:  # not even the footage was read in the time
+        return found
+    if pilots[0].cut or broken_stage(chain, base):
+        return found
+    trials = [base, *(_slowed_as(base, trial) for trial in found.trials[1:])]
+    for trial in trials:
+        record = chain.dataset.pilot_dir / trial.folder / "trial.json"
+        if record.is_file():
+            write_json(record, asdict(trial))
+    found = replace(found, trials=trials)
+    write_json(dial_dir(chain.dataset) / "measured.json", asdict(found))
+    return found
+
+
+def _slowed_as(base: Trial, trial: Trial) -> Trial:
+    """Return a trial whose items waited as long per processor second as those of another one."""
+    costs = dict(trial.costs)
+    for name, now in base.costs.items():
+        if name in costs and now.core_seconds > 0:
+            seconds = costs[name].core_seconds * now.seconds / now.core_seconds
+            costs[name] = replace(costs[name], seconds=seconds, extra=now.extra)
+    return replace(trial, costs=costs)
+
+
+def _subjects(chain: Chain) -> list[str]:
+    """List the first subjects that are not excluded; StageError if there are none."""
+    root, captures = chain.dataset.root, chain.dataset.captures()
+    subjects = [s for s in captures if not exclusion_reason(chain.dataset, s)]
+    if captures and not subjects:
+        take_in = f"express50 annotate include {root} {min(captures)}"
+        raise StageError(f"{root}: every subject is excluded; to take one in again: '{take_in}'")
+    if not subjects:
+        raise StageError(f"{root}: has no captures yet; run 'express50 run {root} CAPTURE'")
+    return subjects[:PILOTS]
+
+
+def _measure_one(chain: Chain, clock: Clock, allowance: _Allowance) -> PilotFigures:
+    """Measure the first subject whose footage every stage can work on; raises what callers do."""
+    subjects = _subjects(chain)
+    for subject in subjects:
+        try:
+            pilot = Pilot(chain, subject, clock)
+            found = measure(pilot, allowance)
+            broken = broken_stage(chain, found.trials[0])
+            if pilot.cut:
+                raise ConfigError(_too_small(chain, clock, found))
+            if not broken:
+                return found
+            reason = f"{broken}: {found.trials[0].failed[broken]}"
+        except StageError as error:  # nothing is ingested
+            reason = str(error)
+            if clock.budget is not None and clock.closed():
+                raise ConfigError(
+                    f"--budget {clock.budget.text}: the time ended before the footage of {subject}"
+                    " was ingested; give more time"
+                ) from error
+        if subject != subjects[-1]:
+            chain.tell(f"{subject} cannot be measured, trying the next subject: {reason}")
+    raise StageError(
+        f"{chain.dataset.root}: no subject could be measured: {reason}; correct that, or run"
+        " without --budget to see what each stage says"
+    )
+
+
+def _too_small(chain: Chain, clock: Clock, found: PilotFigures) -> str:
+    """Say that the budget ended in the first trial."""
+    least = clock.now() + front(workload(chain, found, clock.cores, {}))[0].seconds
+    return (
+        f"--budget {clock.budget.text if clock.budget else ''}: it ended before every stage was"
+        " measured at its cheapest setting; the cheapest settings need more than"
+        f" {format_seconds(least)} {time_words(clock.cores, chain.pool.width())}; give several"
+        " times as much; what was measured is kept"
+    )
+
+
+def time_words(cores: bool, width: int) -> str:
+    """Say what kind of time a budget counts."""
+    return "core time" if cores else f"with {count(width, 'worker')}"
+
+
+def workload(
+    chain: Chain, measured: PilotFigures, cores: bool, begun: Mapping[str, str]
+) -> Workload:
+    """Describe what is left to make."""
+    seen, captures = measured.trials[0], len(chain.dataset.captures())
+    footage = replace(seen.footage, subjects=float(captures), expressions=seen.scripted)
+    if 0 < len(chain.dataset.subjects()) >= captures:
+        footage = footage_of(chain.dataset)
+    load = Workload(
+        stages=chain.stages, ladders=chain.ladders, measured=measured, footage=footage,
+        width=chain.pool.width(), cores=cores, fixed=begun, kinds=chain.kinds,
+    )  # fmt: skip
+    dataset, made_here = chain.dataset, {}
+    if dataset.ledger.is_file():
+        with Ledger(dataset.ledger, read_only=True) as ledger:
+            for stage in chain.stages:
+                path, ladder = dataset.config_file(stage.name), load.ladders[stage.name]
+                if (label := made_with(path, stage, ladder)) is not None:
+                    done = [r for r in ledger.read(stage.name).values() if r.status == "done"]
+                    made = sum(dataset.item_dir(stage.name, r.item).is_dir() for r in done)
+                    share = min(1.0, made / item_seconds(load, stage, label)[0])
+                    made_here[stage.name] = label, share
+    there = [t for t in measured.trials if t.folder and (dataset.pilot_dir / t.folder).is_dir()]
+    return replace(load, done=[made_here, *(taken_over(load, trial) for trial in there)])
