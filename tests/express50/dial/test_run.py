@@ -106,11 +106,11 @@ def test_the_front_is_the_one_that_trying_everything_gives(tmp_path, captures, m
 
 
 def test_a_tight_budget_takes_the_best_that_fits(tmp_path, captures, monkeypatch):
-    monkeypatch.setenv(PAUSE, "0.02")
+    count_pauses(monkeypatch)
     table, _ = tune(chain_of(tmp_path / "d", captures))
     middle = table["front"][len(table["front"]) // 2]
-    budget = f"{middle['seconds'] * 1.2 + 0.5:.1f}s"
-    _, state = go(tmp_path / "d", captures, budget)
+    state = spend(tmp_path / "d", captures, 1.2 * middle["core_seconds"])
+    assert state.finished
     assert state.promised["value"]["value"] <= middle["errors"]["value"]["value"]
     assert state.promised["value"]["value"] > table["front"][-1]["errors"]["value"]["value"]
 
@@ -260,11 +260,11 @@ def test_a_larger_budget_tries_what_a_small_one_had_no_time_for(tmp_path, captur
 
 
 def test_a_slower_machine_than_measured_gets_cheaper_settings(tmp_path, captures, monkeypatch):
-    monkeypatch.setenv(PAUSE, "0.01")
+    count_pauses(monkeypatch)
     tune(chain_of(tmp_path / "d", captures))
-    monkeypatch.setenv(PAUSE, "0.05")
+    monkeypatch.setenv(PAUSE, "5")
     said = []
-    _, state = go(tmp_path / "d", captures, "8s", said=said)
+    state = spend(tmp_path / "d", captures, 800, said)
     assert state.settings["map"] != "reference" and any("behind time" in line for line in said)
     assert state.changes
 
