@@ -52,7 +52,7 @@ def needs_gpu(config: MatteConfig) -> bool:
 
 STAGE = Stage(
     name="matte",
-    version=21,
+    version=22,
     config=MatteConfig,
     items=peak_items,
     inputs=inputs,

@@ -124,7 +124,7 @@ def camera_mattes(
     read = partial(read_peak_frame, dataset, subject, expression)
     matte_one = _matte_function(config)
     found: dict[str, CameraMatte] = {}
-    seen: list[CutView] = []
+    seen: dict[str, CutView] = {}
     dropped: list[Note] = []
     warnings: list[Note] = []
     for name, camera in cameras.items():
@@ -139,10 +139,14 @@ def camera_mattes(
             dropped.append(Note(name, str(error)))
             continue
         warnings += [Note(name, why)] if why else []
-        seen.append(make_cut_view(pinhole(camera), frame, valid, alpha))
-    unplated = [view.name for view in seen if view.known is None]
+        if alpha is None:
+            seen[name] = make_cut_view(pinhole(camera), frame, valid)
+    unplated = list(seen)
+    for name in found if unplated else ():  # read again, as most captures have all plates
+        frame, valid = read(name), valid_pixels(cameras[name])
+        seen[name] = make_cut_view(pinhole(cameras[name]), frame, valid, found[name].alpha)
     try:
-        cuts = cut_out(seen, ball) if unplated else {}
+        cuts = cut_out([seen[name] for name in cameras if name in seen], ball) if unplated else {}
     except NoFaceError as error:
         dropped += [Note(name, str(error)) for name in unplated]
         return found, sorted(dropped, key=lambda note: note.what), warnings
