@@ -9,7 +9,7 @@ from typing import Any
 
 from rich.filesize import decimal
 
-from express50.console import FAILED, OK, add_command, answer, count, stdout_to_stderr
+from express50.console import FAILED, OK, add_command, answer, count, log, stdout_to_stderr
 from express50.contract.layout import Dataset, existing_dataset
 from express50.contract.stage import hook, stages
 
@@ -29,10 +29,11 @@ def add_commands(subparsers: Any) -> None:
     check.add_argument("--deep", action="store_true", help="read every byte of every output")
     words = "set wrong outputs aside, so that the next run makes them again; delete leftovers"
     check.add_argument("--fix", action="store_true", help=words)
-    words = "delete outputs that were replaced or set aside"
+    words = "delete outputs that were replaced or set aside, and trials of budgets"
     add_command(
         subparsers, "prune", run_prune, words,
-        description="Delete outputs that were replaced, or set aside because they were wrong. The "
+        description="Delete outputs that were replaced, or set aside because they were wrong, and "
+        "what `run --budget` made to measure settings. The "
         "present outputs stay. As long as the disk has 2 GB left, stages keep the last two "
         "replaced outputs of each item, so that going back to old settings or inputs takes no "
         "work.",
@@ -95,11 +96,17 @@ def run_check(args: argparse.Namespace) -> int:
 
 
 def run_prune(args: argparse.Namespace) -> int:
-    """Delete replaced and stale outputs, and say what that freed."""
+    """Delete replaced and stale outputs and trials, and say what that freed."""
+    from express50.runner.publish import is_running
     from express50.runner.replaced import empty
 
     dataset = existing_dataset(args.dataset)
-    freed = (empty(folder) for folder in (dataset.replaced_dir, dataset.stale_dir))
+    folders = [dataset.replaced_dir, dataset.stale_dir, dataset.pilot_dir]
+    locks = dataset.pilot_dir.glob("*/.staging/.*.lock")
+    if any(is_running(Dataset(lock.parents[1]), lock.stem[1:]) for lock in locks):
+        log("a trial is running, so trials are kept")
+        folders.remove(dataset.pilot_dir)
+    freed = map(empty, folders)
     files, size = map(sum, zip(*freed, strict=True))
     line = f"{args.dataset}: freed {decimal(size)} in {count(files, 'file')}"
     return answer(args, {"files": files, "bytes": size}, line)

@@ -27,7 +27,7 @@ from pipelines.matte.visual_hull import (
 )
 
 # Longest side of the pictures, and cells along each side of space: 192 and 96 take three times as
-# long and are no better (docs/LOG.md, "Mattes").
+# long and gain next to nothing (docs/LOG.md, "Mattes").
 SIDE, CELLS = 128, 64
 FEWEST = 4  # views; of three, two with the same error would overrule a correct one
 EMPTY, FULL = 0.003, 0.98  # shares of the image

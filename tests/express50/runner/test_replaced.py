@@ -10,9 +10,11 @@ from unittest.mock import Mock
 import pytest
 
 from express50.__main__ import main
+from express50.contract.layout import Dataset
 from express50.dataset.audit import audit
 from express50.runner import replaced
 from express50.runner.ledger import Ledger
+from express50.runner.publish import stage_lock
 from express50.runner.runner import run_stage
 from tests.faults import toy
 from tests.faults.toy import make_dataset, run_toy, tree
@@ -174,3 +176,16 @@ def test_prune_empties_the_store_and_says_what_it_freed(dataset, capsys):
     dataset.stale_dir.symlink_to(dataset.stage_dir("toy"))  # what is not deleted is not freed
     assert main(["prune", str(dataset.root)]) == 0
     assert "freed 0 bytes in 0 files" in capsys.readouterr().out
+
+
+def test_prune_deletes_trials_unless_one_is_running(dataset, capsys):
+    trial = Dataset(dataset.pilot_dir / "0123")
+    with stage_lock(trial, "toy"):
+        (trial.root / "trial.json").write_text("{}")
+        assert main(["prune", str(dataset.root)]) == 0
+        shown = capsys.readouterr()
+        assert "freed 0 bytes" in shown.out and "a trial is running" in shown.err
+        assert (trial.root / "trial.json").is_file()
+    assert main(["prune", str(dataset.root)]) == 0
+    assert "freed 2 bytes in 2 files" in capsys.readouterr().out
+    assert not dataset.pilot_dir.exists()
