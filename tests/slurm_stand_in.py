@@ -11,6 +11,8 @@ from pathlib import Path
 
 import psutil
 
+from express50.runner.slurm import ALONE_SECONDS
+
 SBATCH = """#!{python}
 import os, pathlib, re, shutil, subprocess, sys
 home = pathlib.Path({home!r})
@@ -41,13 +43,19 @@ for path in sorted(pathlib.Path({home!r}).glob("*.pid")):
         print(path.stem)
 """
 
+# SLURM kills what is left KillWait seconds after SIGTERM, 30 by default. Python may lose the
+# signal, as an exception within a callback of the garbage collector is only printed.
 SCANCEL = """#!{python}
-import os, pathlib, signal, sys
+import os, pathlib, signal, subprocess, sys
 for number in sys.argv[1:]:
+    group = (pathlib.Path({home!r}) / (number + ".pid")).read_text()
     try:
-        os.killpg(int((pathlib.Path({home!r}) / (number + ".pid")).read_text()), signal.SIGTERM)
+        os.killpg(int(group), signal.SIGTERM)
     except ProcessLookupError:
-        pass
+        continue
+    quiet = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+    subprocess.Popen(["sh", "-c", "sleep 10; kill -KILL -- -" + group], start_new_session=True,
+                     **quiet)
 """
 
 
@@ -86,8 +94,8 @@ def alive(home: Path) -> list[int]:
     return [pid for pid in pids(home) if pid in groups]
 
 
-def all_end(home: Path, patience: float = 30.0) -> bool:
-    """Whether every job ends within so many seconds."""
+def all_end(home: Path, patience: float = ALONE_SECONDS + 30.0) -> bool:
+    """Whether every job ends within so many seconds; a worker may wait for its lost scheduler."""
     give_up = time.monotonic() + patience
     while alive(home) and time.monotonic() < give_up:
         time.sleep(0.1)
