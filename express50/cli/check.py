@@ -33,10 +33,9 @@ def add_commands(subparsers: Any) -> None:
     add_command(
         subparsers, "prune", run_prune, words,
         description="Delete outputs that were replaced, or set aside because they were wrong, and "
-        "what `run --budget` made to measure settings. The "
-        "present outputs stay. As long as the disk has 2 GB left, stages keep the last two "
-        "replaced outputs of each item, so that going back to old settings or inputs takes no "
-        "work.",
+        "what `run --budget` made to measure settings. The present outputs stay. As long as the "
+        "disk has 2 GB left, stages keep the last two replaced outputs of each item, so that going "
+        "back to old settings or inputs takes no work.",
     )  # fmt: skip
     subject = subparsers.add_parser("subject", help="withdraw a person from a dataset")
     actions = subject.add_subparsers(dest="action", metavar="ACTION", required=True)
@@ -102,8 +101,8 @@ def run_prune(args: argparse.Namespace) -> int:
 
     dataset = existing_dataset(args.dataset)
     folders = [dataset.replaced_dir, dataset.stale_dir, dataset.pilot_dir]
-    locks = dataset.pilot_dir.glob("*/.staging/.*.lock")
-    if any(is_running(Dataset(lock.parents[1]), lock.stem[1:]) for lock in locks):
+    trials = map(Dataset, dataset.pilot_dir.glob("*"))
+    if any(is_running(trial, name) for trial in trials for name in stages()):
         log("a trial is running, so trials are kept")
         folders.remove(dataset.pilot_dir)
     freed = map(empty, folders)

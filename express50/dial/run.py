@@ -358,6 +358,9 @@ def closing_lines(state: RunState, summaries: Sequence[Summary]) -> Iterator[str
         if more == state.budget:  # which would be the same run, whose time is over
             more = budget_text(1.3 * state.rest, cores)
         yield f"the time is over; left: {', '.join(left)}; all that is finished is kept"
-        yield f"to make the rest, run again with --budget {more} or more; it counts from then on"
+        yield (
+            f"to make the rest, run again with --budget {more} or more; what was spent so far does"
+            " not count"
+        )
     elif not state.finished:
         yield f"stopped after {summaries[-1].stage}: it leaves the next stage nothing to work on"

@@ -180,7 +180,7 @@ def test_prune_empties_the_store_and_says_what_it_freed(dataset, capsys):
 
 def test_prune_deletes_trials_unless_one_is_running(dataset, capsys):
     trial = Dataset(dataset.pilot_dir / "0123")
-    with stage_lock(trial, "toy"):
+    with stage_lock(trial, "matte"):
         (trial.root / "trial.json").write_text("{}")
         assert main(["prune", str(dataset.root)]) == 0
         shown = capsys.readouterr()
