@@ -7,7 +7,7 @@ identity, expression and pose; `appearance` per view; `draw` rasterises and refi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor, nn
@@ -18,6 +18,7 @@ from grmm.anchors import interpolate, make_anchors, tangent_frames, uv_gradients
 from grmm.config import SCALE_RANGE_MM, ModelConfig
 from grmm.networks import DISPLACEMENT_M, Networks, normalise_depth
 from grmm.rasterize import rasterize
+from grmm.recorded import Recorded
 
 THICKNESS = 0.3  # of a Gaussian before training, along the normal over the tangents (G2)
 
@@ -193,7 +194,8 @@ class GRMM(Networks):
         self, z_id: Tensor, z_exp: Tensor, state: HeadState, maps: Maps | None = None
     ) -> Gaussians:
         """Decode everything that does not depend on the view; ``maps`` if they are known."""
-        maps = self.decode(z_id, z_exp, state) if maps is None else maps
+        if maps is None:
+            return _whole_geometry(z_id, z_exp, *vars(state).values(), module=self)
         z_id, z_exp = self._inputs(z_id, z_exp, state)
         displacement = torch.zeros_like(state.vertices)
         if self.mesh is not None:
@@ -229,8 +231,7 @@ class GRMM(Networks):
     def appearance(self, z_id: Tensor, state: HeadState, view: PinholeView) -> Tensor:
         """Decode colours in [0, 1] and features, (N, 3 + features), as one view sees them."""
         z_id, _ = self._inputs(z_id, self.z_exp[0], state)
-        maps = self._sample(self.colour(z_id, view.direction().to(z_id.dtype)))
-        return torch.cat([torch.sigmoid(maps[:, :3]), maps[:, 3:]], 1)
+        return _appearance(z_id, view.direction().to(z_id.dtype), module=self)
 
     def draw(
         self,
@@ -284,8 +285,8 @@ class GRMM(Networks):
         """
         base = interpolate(vertices, self.corners, self.barycentrics)
         shift = DISPLACEMENT_M * offsets[:, :3]
-        unit = offsets.new_tensor([1.0, 0.0, 0.0, 0.0])
-        quats = nn.functional.normalize(offsets[:, 3:7] + unit, dim=1, eps=1e-8)
+        turned = torch.cat([offsets[:, 3:4] + 1.0, offsets[:, 4:7]], 1)
+        quats = nn.functional.normalize(turned, dim=1, eps=1e-8)
         if self.config.frame == "head":
             return base + shift, quats
         # No gradient passes through the frames: it is ill-conditioned on slivers.
@@ -293,6 +294,20 @@ class GRMM(Networks):
             frames, _ = tangent_frames(vertices, self.corners, self.gradients)
             turn = matrix_to_quat(frames)
         return base + (frames * shift[:, None, :]).sum(2), quat_multiply(turn, quats)
+
+
+@Recorded
+def _whole_geometry(model: GRMM, z_id: Tensor, z_exp: Tensor, *parts: Tensor) -> Gaussians:
+    """Decode `GRMM.geometry` with its maps; ``parts`` are those of a `HeadState`."""
+    names = (field.name for field in fields(HeadState))
+    state = HeadState(**dict(zip(names, parts, strict=True)))
+    return model.geometry(z_id, z_exp, state, model.decode(z_id, z_exp, state))
+
+
+@Recorded
+def _appearance(model: GRMM, z_id: Tensor, direction: Tensor) -> Tensor:
+    maps = model._sample(model.colour(z_id, direction))
+    return torch.cat([torch.sigmoid(maps[:, :3]), maps[:, 3:]], 1)
 
 
 def initial_scales(spacing_mm: Tensor, config: ModelConfig) -> Tensor:

@@ -7,6 +7,7 @@ on a machine with nvcc but no GPU its import starts a long build.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import torch
@@ -25,6 +26,7 @@ from grmm.rasterize.projection import (
     pair_offsets,
     project,
 )
+from grmm.recorded import Recorded
 
 TILE = 16
 CHUNK = 32  # channels of one pass; more would not fit the shared memory of the backward kernel
@@ -37,7 +39,9 @@ def rasterize_gsplat(
     """Render; see ``grmm.rasterize``. The tensors must be float32 on a CUDA device."""
     gsplat = _require_gsplat(scene.means)
     width, height, K = camera.width, camera.height, camera.K
-    splats = project(scene, camera, options.antialiased)
+    place = camera.K, camera.cam_from_world, camera.width, camera.height
+    shapes = scene.means, scene.quats, scene.scales, scene.opacities
+    splats = PROJECTIONS[options.antialiased](*shapes, *place)
     tiles = _tiles(gsplat, splats, width, height)
     channels = [plane_channels(splats, K), splats.normals[:, : 3 * options.normals], scene.colors]
     passes = []
@@ -66,6 +70,27 @@ def rasterize_gsplat(
         median_depth=median,
         normals=normals if options.normals else None,
     )
+
+
+def _project(
+    antialiased: bool,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    K: Tensor,
+    cam_from_world: Tensor,
+    width: Any,
+    height: Any,
+) -> Projection:
+    """Call `project` with its arguments one by one."""
+    camera = Pinhole(K=K, cam_from_world=cam_from_world, width=width, height=height)
+    colors = means[:, :0]  # which no projection reads
+    scene = Splats(means=means, quats=quats, scales=scales, opacities=opacities, colors=colors)
+    return project(scene, camera, antialiased)
+
+
+PROJECTIONS = {flag: Recorded(partial(_project, flag)) for flag in (False, True)}
 
 
 def plane_channels(splats: Projection, K: Tensor) -> Tensor:

@@ -114,7 +114,10 @@ class Projection:
 
 
 def project(scene: Splats, camera: Pinhole, antialiased: bool = False) -> Projection:
-    """Project Gaussians into a camera; differentiable in their geometry and in the camera."""
+    """Project Gaussians into a camera; differentiable in their geometry and in the camera.
+
+    Nothing is copied to a GPU or read from it, so that CUDA graphs can hold it.
+    """
     dtype, width, height = scene.means.dtype, camera.width, camera.height
     means, quats, scales, opacities, _ = (tensor.double() for tensor in vars(scene).values())
     K, cam_from_world = camera.K.double(), camera.cam_from_world.double()
@@ -122,7 +125,8 @@ def project(scene: Splats, camera: Pinhole, antialiased: bool = False) -> Projec
     points = means @ R.T + t
     front = points[:, 2] > NEAR_M
     # Culled points get a harmless place, so that gradients contain no division by zero.
-    points = torch.where(front[:, None], points, points.new_tensor([0.0, 0.0, 1.0]))
+    harmless = torch.eye(3, dtype=points.dtype, device=points.device)[2]
+    points = torch.where(front[:, None], points, harmless)
     jacobian = _jacobian(points, K, width, height)
     rows = _product(jacobian, _product(R, quat_to_matrix(quats)) * scales[:, None, :])
     variances = rows.square().sum(2)  # of u, v and the ray length
@@ -210,8 +214,8 @@ def _extents(
     """Return half sizes (N, 2) of the boxes where alpha >= 1/255, and if they are in the image."""
     level = 2.0 * torch.log((opacities / ALPHA_MIN).clamp(min=1.0))
     extents = (level[:, None] * variances).sqrt()
-    size = means2d.new_tensor([width, height])
-    inside = ((means2d + extents >= 0) & (means2d - extents <= size)).all(1)
+    low, high = means2d - extents, means2d + extents
+    inside = (high >= 0).all(1) & (low[:, 0] <= width) & (low[:, 1] <= height)
     return extents, inside & (opacities >= ALPHA_MIN)
 
 

@@ -1,0 +1,103 @@
+"""Play a function's GPU kernels again as one CUDA graph.
+
+A head is drawn by some 300 small kernels, and launching them one by one takes a processor longer
+than running them takes a GPU. A recorded function costs one launch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from threading import Lock
+from typing import Any, Generic, TypeVar
+from weakref import WeakKeyDictionary
+
+import torch
+from torch import Tensor, nn
+
+Result = TypeVar("Result")
+KEPT = 4  # recordings of a function and module; each holds its own memory
+
+
+@dataclass(frozen=True, eq=False)
+class _Recording(Generic[Result]):
+    play: Callable[[], None]
+    inputs: list[Tensor]
+    outputs: Result
+
+
+class Recorded(Generic[Result]):
+    """A function of tensors, and of a module if one is given, recorded on its second call.
+
+    The function must not read from the GPU or copy to it, and returns a tensor or a dataclass of
+    tensors. Numbers may differ between calls: the function gets them as tensors. It is called as
+    usual on a CPU and where gradients are wanted.
+    """
+
+    def __init__(self, function: Callable[..., Result]) -> None:
+        """Wrap a function, whose documentation stays; nothing is recorded yet."""
+        self._function, self.__doc__ = function, function.__doc__
+        self._recordings: WeakKeyDictionary[object, dict[Any, _Recording[Result] | None]]
+        self._recordings = WeakKeyDictionary()
+        self._lock = Lock()
+
+    def __call__(self, *values: Tensor | float, module: nn.Module | None = None) -> Result:
+        """Call the function; the caller may keep and change what it returns."""
+        function = self._function if module is None else partial(self._function, module)
+        if not _can_record(values):
+            return function(*values)
+        with self._lock:
+            known = self._recordings.setdefault(self if module is None else module, {})
+            # Training changes weights in place. Weights that were moved lie elsewhere.
+            weights = [] if module is None else [*module.parameters(), *module.buffers()]
+            shapes = [(v.shape, v.dtype) if isinstance(v, Tensor) else None for v in values]
+            key = (*shapes, *(weight.data_ptr() for weight in weights))
+            if key not in known:  # recording does not pay for a single call
+                for old in list(known)[: len(known) - KEPT + 1]:
+                    del known[old]
+                known[key] = None
+                return function(*values)
+            recording = known[key]
+            if recording is None:
+                recording = known[key] = _record(function, values)
+            for mine, value in zip(recording.inputs, values, strict=True):
+                if isinstance(value, Tensor):
+                    mine.copy_(value)
+                else:
+                    mine.fill_(value)
+            recording.play()
+            return _copied(recording.outputs)
+
+
+def _can_record(values: Sequence[Tensor | float]) -> bool:
+    """Say whether the tensors are on a GPU and no gradient is wanted."""
+    return not torch.is_grad_enabled() and all(v.is_cuda for v in values if isinstance(v, Tensor))
+
+
+def _record(
+    function: Callable[..., Result], values: Sequence[Tensor | float]
+) -> _Recording[Result]:
+    """Record a function's kernels for inputs of these shapes."""
+    device = next(v.device for v in values if isinstance(v, Tensor))
+    inputs = [
+        v.clone()
+        if isinstance(v, Tensor)
+        else torch.full((), v, dtype=torch.float64, device=device)
+        for v in values
+    ]
+    aside = torch.cuda.Stream()
+    aside.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(aside):  # libraries take their memory now, not within the graph
+        function(*inputs)
+    torch.cuda.current_stream().wait_stream(aside)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+        outputs = function(*inputs)
+    return _Recording(play=graph.replay, inputs=inputs, outputs=outputs)
+
+
+def _copied(result: Any) -> Any:
+    if isinstance(result, Tensor):
+        return result.clone()
+    return replace(result, **{name: value.clone() for name, value in vars(result).items()})
