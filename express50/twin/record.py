@@ -6,14 +6,16 @@ Worker processes film the subjects; each is then published complete or not at al
 from __future__ import annotations
 
 import argparse
+import fcntl
 import json
 import multiprocessing
 import os
 import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -80,11 +82,28 @@ def record_command(args: argparse.Namespace) -> int:
         plates=not args.no_plates,
         hair=not args.no_hair,
     )
-    recorded = record(config, args.out, max(1, args.workers), print_progress())
+    with _alone(args.out):
+        recorded = record(config, args.out, max(1, args.workers), print_progress())
     captures, kept = args.out / "captures", args.subjects - len(recorded)
     rest = f"; {kept} recorded before" if kept else ""
     line = f"{count(len(recorded), 'subject')} recorded in {captures}{rest}"
     return answer(args, {"captures": str(captures), "recorded": recorded}, line)
+
+
+@contextmanager
+def _alone(out: Path) -> Iterator[None]:
+    """Make and lock a folder; the system releases the lock however the process ends."""
+    out.mkdir(parents=True, exist_ok=True)
+    folder = os.open(out, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            words = f"{out}: another process records into this folder; wait until it ends"
+            raise CaptureError(words) from None
+        yield
+    finally:
+        os.close(folder)
 
 
 def record(

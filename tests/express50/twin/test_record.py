@@ -1,6 +1,7 @@
 import csv
 import dataclasses
 import errno
+import fcntl
 import hashlib
 import json
 import os
@@ -133,6 +134,15 @@ def test_command_line_records_also_where_files_have_one_name(tmp_path, capsys, m
     assert set(read_capture(root).calibration) == {"cam00"}
     with (root / "cues.csv").open() as file:
         assert [row["end_frame"] for row in csv.DictReader(file)] == ["3"]
+
+
+def test_two_recordings_into_one_folder_are_refused(tmp_path, capsys):
+    folder = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(folder, fcntl.LOCK_EX)
+    assert main(["twin", "record", str(tmp_path), "--subjects=1"]) == 1
+    assert "another process records into this folder" in capsys.readouterr().err
+    os.close(folder)
+    assert not list(tmp_path.iterdir())
 
 
 def test_wrong_settings_are_refused(tmp_path):
