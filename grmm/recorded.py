@@ -51,10 +51,12 @@ class Recorded(Generic[Result]):
             known = self._recordings.setdefault(self if module is None else module, {})
             # Training changes weights in place. Weights that were moved lie elsewhere.
             weights = [] if module is None else [*module.parameters(), *module.buffers()]
-            shapes = [(v.shape, v.dtype) if isinstance(v, Tensor) else None for v in values]
+            shapes = [
+                (v.shape, v.dtype, v.device) if isinstance(v, Tensor) else None for v in values
+            ]
             key = (*shapes, *(weight.data_ptr() for weight in weights))
             if key not in known:  # recording does not pay for a single call
-                for old in list(known)[: len(known) - KEPT + 1]:
+                for old in list(known)[: max(0, len(known) - KEPT + 1)]:
                     del known[old]
                 known[key] = None
                 return function(*values)

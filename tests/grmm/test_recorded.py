@@ -87,6 +87,22 @@ def test_the_oldest_recordings_are_dropped(recordings):
     assert recordings == [(1,), (2,), (3,), (4,), (5,), (1,)]
 
 
+@torch.no_grad()
+def test_four_recordings_are_kept(recordings):
+    function = Recorded(lambda x: Sums(total=x.sum(), scaled=x))
+    for rows in (1, 1, 2, 2, 3, 3, 4, 4, 1, 1):
+        function(torch.ones(rows))
+    assert recordings == [(1,), (2,), (3,), (4,)]
+
+
+@torch.no_grad()
+def test_another_device_is_recorded_anew(recordings):
+    function = Recorded(lambda x: Sums(total=x.sum(), scaled=x))
+    for device in ("cpu", "cpu", "meta", "meta"):
+        found = function(torch.ones(2, device=device))
+    assert recordings == [(2,), (2,)] and found.scaled.device.type == "meta"
+
+
 def test_nothing_is_recorded_where_gradients_are_wanted(recordings):
     layer, function = torch.nn.Linear(3, 2), Recorded(sums)
     for _ in range(3):
