@@ -47,22 +47,22 @@ tradeoff: $(READY) ## sweep the speed-accuracy knobs into docs/TRADEOFFS.md
 	$(BIN)/python -m benchmarks.tradeoff
 
 ingest: $(READY) ## index CAPTURES="dir ..." into DATASET
-	$(BIN)/express50 ingest $(DATASET) $(CAPTURES) $(STAGE_FLAGS)
+	$(BIN)/express50 ingest "$(DATASET)" $(CAPTURES) $(STAGE_FLAGS)
 
 calibrate align frames matte track depth register regions pack: $(READY) ## one stage over DATASET
-	$(BIN)/express50 $@ $(DATASET) $(STAGE_FLAGS)
+	$(BIN)/express50 $@ "$(DATASET)" $(STAGE_FLAGS)
 
 run: $(READY) ## every stage within BUDGET=2h, with settings chosen for CAPTURES="dir ..." in DATASET
-	$(BIN)/express50 run $(DATASET) $(CAPTURES) --budget $(BUDGET) --workers $(WORKERS) $(foreach kv,$(SET),--set $(kv)) $(if $(SLURM),--slurm $(SLURM))
+	$(BIN)/express50 run "$(DATASET)" $(CAPTURES) --budget $(BUDGET) --workers $(WORKERS) $(foreach kv,$(SET),--set $(kv)) $(if $(SLURM),--slurm $(SLURM))
 
 tune: $(READY) ## measure what time buys on DATASET: error against time of the whole chain
-	$(BIN)/express50 tune $(DATASET) $(CAPTURES) --workers $(WORKERS)
+	$(BIN)/express50 tune "$(DATASET)" $(CAPTURES) --workers $(WORKERS)
 
 train: $(READY) ## train GRMM on DATASET's shards, or go on with it, sized for the machine and an hour
-	$(BIN)/grmm train $(DATASET)/pack/shards $(DATASET)/grmm $(TRAIN)
+	$(BIN)/grmm train "$(DATASET)/pack/shards" "$(DATASET)/grmm" $(TRAIN)
 
 report: $(READY) ## gather DATASET's QC into one HTML page
-	$(BIN)/express50 report $(DATASET)
+	$(BIN)/express50 report "$(DATASET)"
 
 clean: ## remove what was built, keep .venv
 	rm -rf build .mypy_cache .ruff_cache .pytest_cache

@@ -379,10 +379,10 @@ def choice_lines(load: Workload, point: Point, asked: str, spent: float) -> Iter
     yield f"done in {format_seconds(spent + point.seconds)}, measuring included"
     rows = []
     for stage in load.stages:
-        label = point.settings[stage.name]
-        rows.append(
-            [stage.name, label, format_seconds(point.each[stage.name]), _why(load, stage, point)]
-        )
+        label, seconds = point.settings[stage.name], point.each[stage.name]
+        made = not seconds and cost_at(load, stage.name, label) is not None  # by a trial
+        time = "made already" if made else format_seconds(seconds)
+        rows.append([stage.name, label, time, _why(load, stage, point)])
     yield from format_table(["stage", "setting", "time", "why"], rows)
 
 

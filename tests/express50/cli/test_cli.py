@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import json
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -296,3 +297,11 @@ def test_a_librarys_warning_is_one_line_without_its_place():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stderr == "grmm: warning: slow\n"
+
+
+@pytest.mark.parametrize("target", ["ingest", "depth", "run", "tune", "train", "report"])
+def test_make_takes_a_dataset_whose_name_has_spaces(target):
+    command = ["make", "-n", "READY=", target, "DATASET=my data", "CAPTURES=caps/S001"]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    words = shlex.split(done.stdout.splitlines()[-1])
+    assert words[2].split("/")[0] == "my data"

@@ -319,8 +319,10 @@ def test_a_disk_without_hard_links_will_do(tmp_path, captures, monkeypatch):
 
 def test_one_item_is_enough(tmp_path):
     captures = captures_of(tmp_path / "captures", subjects=1, expressions=1)
-    _, state = go(tmp_path / "d", captures, "5m")
+    said = []
+    _, state = go(tmp_path / "d", captures, "5m", said=said)
     assert state.finished and state.settings["map"] == "reference"
+    assert any(re.match("solve +reference +made already +standard: ", line) for line in said)
 
 
 def test_a_setting_that_fails_in_the_pilot_is_not_chosen(tmp_path, captures, monkeypatch):
