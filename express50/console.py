@@ -34,6 +34,10 @@ REMEDIES = {
     errno.EDQUOT: "free some space, your quota is used up",
 }
 
+# torch's error on a CPU is a RuntimeError that only its words tell apart.
+OUT_OF_MEMORY = re.compile("out of memory|can't allocate memory", re.IGNORECASE)
+AMOUNT = re.compile(r"llocate ([\d.]+ \w+)")
+
 # Words of a figure's name as readers write them; units go to its end.
 UNITS = {"db": "dB", "mm": "mm", "m": "m", "px": "px", "gib": "GiB"}
 SPELLINGS = {
@@ -138,6 +142,13 @@ def _line_of(error: Exception) -> str:
         return f"{name}: {words}"
     if isinstance(error, OSError):  # not a bug: permissions, a missing folder, a full disk
         return system_error_line(error)
+    if isinstance(error, MemoryError) or OUT_OF_MEMORY.search(words):
+        wanted = AMOUNT.search(words)
+        amount = f" for {wanted[1]}" if wanted else ""
+        return (
+            f"{name}: not enough memory{amount}; end other programs, or ask for less: a smaller "
+            "preset, size or number of workers"
+        )
     last = traceback.extract_tb(error.__traceback__)[-1]
     return (
         f"{name}: {Express50Error(words)} (unexpected, in {Path(last.filename).name} line "

@@ -307,21 +307,25 @@ def write_sheet(
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], rate: float = tracks.RIG_RATE) -> None:
-    """Write (H, W, 3) uint8 frames as H.264; an odd last row or column is cut.
+    """Write (H, W, 3) uint8 frames as H.264; an odd last row or column is repeated.
 
     ``rate`` is in frames per second.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(f".{path.name}.part.mp4")
-    with av.open(str(aside), "w") as container:
-        stream = container.add_stream("libx264", rate=Fraction(rate).limit_denominator(1001))
-        stream.pix_fmt = "yuv420p"
-        stream.options = {"crf": "16", "preset": "veryfast"}
-        for number, frame in enumerate(frames):
-            even = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
-            if number == 0:
-                stream.height, stream.width = even.shape[:2]
-            picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
-            container.mux(stream.encode(picture))
-        container.mux(stream.encode())
-    aside.replace(path)
+    try:
+        with av.open(str(aside), "w") as container:
+            stream = container.add_stream("libx264", rate=Fraction(rate).limit_denominator(1001))
+            stream.pix_fmt = "yuv420p"
+            stream.options = {"crf": "16", "preset": "veryfast"}
+            for number, frame in enumerate(frames):
+                odd = [(0, side % 2) for side in frame.shape[:2]]
+                even = np.pad(frame, [*odd, (0, 0)], mode="edge")
+                if number == 0:
+                    stream.height, stream.width = even.shape[:2]
+                picture = av.VideoFrame.from_ndarray(even, format="rgb24")
+                container.mux(stream.encode(picture))
+            container.mux(stream.encode())
+        aside.replace(path)
+    finally:
+        aside.unlink(missing_ok=True)

@@ -16,6 +16,7 @@ from express50.shards.writer import PackedSample, ShardWriter
 from grmm.cli import build_parser, main
 from grmm.cli.commands import train_config
 from grmm.evaluate import IDS, NUMBERS, summarise, summary_lines
+from grmm.render import write_video
 from grmm.shard_source import ShardSource, seen_window
 from tests.grmm.packed import TINY, packed, write_shards
 from tests.grmm.synthetic import EllipsoidSource
@@ -114,6 +115,22 @@ def test_render_writes_a_picture_per_frame_and_pair(checkpoint, tmp_path):
     picture, grid = (read_image(tmp_path / name) for name in ("picture.png", "grid.jpg"))
     assert picture.std() > 10, "a head, not one grey"
     assert grid.shape[0] >= 2 * picture.shape[0] and grid.shape[1] >= 2 * picture.shape[1]
+
+
+@pytest.mark.parametrize(("size", "drawn"), [((1, 1), (2, 2)), ((5, 8), (6, 8))])
+def test_a_video_has_even_sides(size, drawn, tmp_path):
+    write_video(tmp_path / "a.mp4", [np.full((*size, 3), 90, np.uint8)] * 2)
+    with av.open(str(tmp_path / "a.mp4")) as video:
+        pictures = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+    assert [picture.shape[:2] for picture in pictures] == [drawn] * 2
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
+
+
+def test_a_video_that_cannot_be_written_leaves_no_part_of_it(tmp_path):
+    (tmp_path / "a.mp4").mkdir()
+    with pytest.raises(IsADirectoryError):
+        write_video(tmp_path / "a.mp4", [np.zeros((8, 8, 3), np.uint8)] * 2)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
 
 
 def test_evaluate_counts_its_images_on_standard_output(checkpoint, shards, tmp_path, capsys):

@@ -111,6 +111,27 @@ def test_a_defect_is_one_line_unless_its_traceback_is_asked_for(capsys, monkeypa
     assert more[:1] == (["Traceback (most recent call last):"] if debug else [])
 
 
+@pytest.mark.parametrize(
+    ("error", "amount"),
+    [
+        (MemoryError(), ""),
+        (MemoryError("Unable to allocate 8.00 GiB for an array with shape (1,)"), " for 8.00 GiB"),
+        (RuntimeError("CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0"), " for 2.00 GiB"),
+        (RuntimeError("can't allocate memory: you tried to allocate 24 bytes."),
+         " for 24 bytes"),
+    ],
+    ids=["python", "numpy", "gpu", "cpu"],
+)  # fmt: skip
+def test_too_little_memory_is_no_defect(error, amount, capsys):
+    def handler(args):
+        raise error
+
+    assert run_handler("grmm", handler, argparse.Namespace()) == 1
+    said = capsys.readouterr().err
+    assert f": not enough memory{amount}; end other programs" in said and said.count("\n") == 1
+    assert "unexpected" not in said
+
+
 def test_names_from_outside_send_no_control_sequences(capsys):
     say("camera \x1b[31mred \u202eevil", "tab\tä \udcff")
     log("cleared \x1b[2J\r\x9b")
