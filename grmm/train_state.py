@@ -250,8 +250,8 @@ def restore(state: TrainState, path: Path, config: Config, device: torch.device)
     state.iteration, state.seconds = loaded.loop["iteration"], loaded.loop["seconds"]
     if finished(state, config):
         log(
-            f"{path}: already has all of its {state.iteration} iterations; to train on, raise "
-            "train.iterations or --budget"
+            f"{path}: its budget is used up, after {state.iteration} iterations in "
+            f"{state.seconds:.1f} s; to train on, raise train.iterations or --budget"
         )
     else:
         log(f"{path}: resuming at iteration {state.iteration}")

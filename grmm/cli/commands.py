@@ -47,7 +47,8 @@ def train(args: argparse.Namespace) -> int:
     metrics = train(source, load_head(source.head), args.out, config, resume=resume)
     if not metrics:  # only the first process of torchrun reports
         return OK
-    names = ("psnr_heldout_view_db", "psnr_train_db", "ssim", "iterations", "gaussians")
+    new = ("psnr_heldout_expression_db",) if config.data.holdout_expressions else ()
+    names = ("psnr_heldout_view_db", *new, "psnr_train_db", "ssim", "iterations", "gaussians")
     values = {name: metrics.get(name) for name in names}
     lines = [f"{figure_label(k)}: {'n/a' if v is None else v}" for k, v in values.items()]
     return answer(args, metrics, *lines, f"wrote {args.out / 'checkpoint.pt'}")

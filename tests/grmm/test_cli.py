@@ -74,7 +74,7 @@ def test_training_again_goes_on_and_refuses_what_differs(shards, tmp_path, capsy
     assert "PSNR held-out view, dB: n/a\n" in capsys.readouterr().out
 
     assert main(train) == 0
-    assert "has all of its 3 iterations; to train on, raise" in capsys.readouterr().err
+    assert "its budget is used up, after 3 iterations in " in capsys.readouterr().err
     assert main([*train, "--set=train.iterations=4"]) == 0
     assert "resuming at iteration 3" in capsys.readouterr().err
     steps = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
@@ -106,6 +106,12 @@ def test_fit_reports_held_out_views_and_writes_over_nothing(checkpoint, shards, 
     before = made.read_bytes()
     assert main(fit) == 2 and main([fit[0], str(made), *fit[2:], "--overwrite"]) == 2
     assert made.read_bytes() == before, "neither a former fit nor the checkpoint read is replaced"
+
+
+def test_the_figure_of_a_held_out_expression_is_printed(shards, tmp_path, capsys):
+    train = ["train", str(shards), str(tmp_path), *TINY, "--holdout-expressions=S000/e0"]
+    assert main(train) == 0
+    assert re.search(r"^PSNR held-out expression, dB: \d", capsys.readouterr().out, re.MULTILINE)
 
 
 def test_render_writes_a_picture_per_frame_and_pair(checkpoint, tmp_path):
