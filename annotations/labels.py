@@ -253,6 +253,11 @@ def current_labels(labels: Iterable[Label]) -> dict[str, Label]:
     return {label.expression: label for label in events}  # the last one wins
 
 
+def latest_labels(labels: Iterable[Label]) -> list[Label]:
+    """Return each annotator's latest label of each expression; those undone are left out."""
+    return [stack[-1] for stack in _stacks(labels).values() if stack]
+
+
 def labels_of(labels: Iterable[Label], annotator: str) -> dict[str, Label]:
     """Return one annotator's labels by expression; their adjudications of others are left out."""
     own = {

@@ -149,12 +149,17 @@ def accept_sure(
                 write(make_event(index, expression, "undo", AUTOMATIC))
             continue
         frame, camera, sure = suggested.frame, suggested.camera, suggested.confidence
-        old = known.get(expression)
-        if old is None or (old.frame, old.camera, old.confidence) != (frame, camera, sure):
-            mark = make_mark(index, expression, frame, camera, AUTOMATIC)
-            write(replace(mark, suggested=frame, confidence=sure))
+        mark = make_mark(index, expression, frame, camera, AUTOMATIC)
+        mark, old = replace(mark, suggested=frame, confidence=sure), known.get(expression)
+        if old is None or _shown(old) != _shown(mark):
+            write(mark)
     wanted = {cue.expression_id for cue in index.cues}
     return {e: label for e, label in current_labels(labels).items() if e in wanted}
+
+
+def _shown(mark: Label) -> tuple[object, ...]:
+    """Return what a mark says; other footage has other hashes at the same frame."""
+    return mark.frame, mark.camera, mark.confidence, mark.pts, mark.dhash
 
 
 def _automatic(labels: list[Label]) -> dict[str, Label]:

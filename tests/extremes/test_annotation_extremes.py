@@ -3,6 +3,7 @@
 import asyncio
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,9 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from textual.geometry import Size
 
+from annotations.align.stage import accept_sure
 from annotations.labels import append_label, make_mark, read_labels
 from annotations.sheet import make_sheet, render_sheet
-from annotations.suggestions import read_suggestions
+from annotations.suggestions import Suggested, read_suggestions
 from annotations.ui import task as moves
 from annotations.ui.app import AnnotateApp
 from annotations.ui.picture import frames_ahead
@@ -221,3 +223,37 @@ def test_huge_frame_numbers_survive_the_store(tmp_path):
     tile = next(t for row in sheet.rows for t in row.tiles if t.expression == "smile")
     assert tile.doubtful and "other footage" in tile.words
     assert json.loads(dataset.labels_file("S001").read_text())["frame"] == 2**62
+
+
+def test_a_new_label_mends_one_that_the_footage_no_longer_fits(tmp_path):
+    """Labels stay in the file when a capture is replaced; only those in use are compared."""
+    dataset = make_dataset(tmp_path, subjects=("S001",))
+    index = read_index(dataset, "S001")
+    cue = index.cues[0]
+    good = make_mark(index, cue.expression_id, cue.start_frame, "a", "ann")
+
+    def identities():
+        return sum(problem.kind == "identity" for problem in problems(dataset))
+
+    append_label(dataset, replace(good, dhash="f" * 16))
+    assert identities() == 1
+    append_label(dataset, good)
+    assert identities() == 0
+
+
+def test_automatic_labels_follow_the_footage_at_the_same_frame(tmp_path):
+    dataset = make_dataset(tmp_path, subjects=("S001",))
+    index = read_index(dataset, "S001")
+    cue = index.cues[0]
+    frame = cue.start_frame
+    suggested = Suggested(
+        frame=frame, camera="a", confidence=1.0, start=frame, activity=[1.0], candidates=[frame]
+    )
+    sure = {cue.expression_id: suggested}
+    accept_sure(dataset, index, sure, 0.0)
+    accept_sure(dataset, index, sure, 0.0)
+    assert len(read_labels(dataset, "S001")) == 1
+    source = index.cameras["a"]
+    other = replace(source, dhash=tuple("f" * 16 for _ in source.dhash))
+    accept_sure(dataset, replace(index, cameras={**index.cameras, "a": other}), sure, 0.0)
+    assert [label.dhash for label in read_labels(dataset, "S001")][1:] == ["f" * 16]
