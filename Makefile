@@ -3,6 +3,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 DATASET ?= build/dataset
+# Recipes quote DATASET, and a shell expands ~ only outside of quotes.
+override DATASET := $(patsubst ~/%,$(HOME)/%,$(DATASET))
 CAPTURES ?=
 PRESET ?= standard
 WORKERS ?= 2

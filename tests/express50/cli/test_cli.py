@@ -326,3 +326,11 @@ def test_make_takes_a_dataset_whose_name_has_spaces(target):
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
     words = shlex.split(done.stdout.splitlines()[-1])
     assert words[2].split("/")[0] == "my data"
+
+
+def test_make_takes_a_dataset_in_the_home_folder(monkeypatch):
+    """Not every shell expands ~ in an argument to make."""
+    monkeypatch.setenv("HOME", "/home/someone")
+    command = ["make", "-n", "READY=", "report", "DATASET=~/data"]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    assert shlex.split(done.stdout)[-1] == "/home/someone/data"
