@@ -320,17 +320,24 @@ def test_a_librarys_warning_is_one_line_without_its_place():
     assert done.stderr == "grmm: warning: slow\n"
 
 
+def made_by(*arguments: str) -> list[str]:
+    """Return the words of the last command that make would run."""
+    command = ["make", "--dry-run", "--no-print-directory", "READY=", *arguments]
+    # The suite itself is run by make, whose settings are not for this one.
+    outer = {name: text for name, text in os.environ.items() if not name.startswith("MAKE")}
+    done = subprocess.run(
+        command, cwd=REPOSITORY, env=outer, capture_output=True, text=True, check=True
+    )
+    return shlex.split(done.stdout.splitlines()[-1])
+
+
 @pytest.mark.parametrize("target", ["ingest", "depth", "run", "tune", "train", "report"])
 def test_make_takes_a_dataset_whose_name_has_spaces(target):
-    command = ["make", "-n", "READY=", target, "DATASET=my data", "CAPTURES=caps/S001"]
-    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
-    words = shlex.split(done.stdout.splitlines()[-1])
+    words = made_by(target, "DATASET=my data", "CAPTURES=caps/S001")
     assert words[2].split("/")[0] == "my data"
 
 
 def test_make_takes_a_dataset_in_the_home_folder(monkeypatch):
     """Not every shell expands ~ in an argument to make."""
     monkeypatch.setenv("HOME", "/home/someone")
-    command = ["make", "-n", "READY=", "report", "DATASET=~/data"]
-    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
-    assert shlex.split(done.stdout)[-1] == "/home/someone/data"
+    assert made_by("report", "DATASET=~/data")[-1] == "/home/someone/data"
