@@ -122,7 +122,7 @@ def test_a_defect_is_one_line_unless_its_traceback_is_asked_for(capsys, monkeypa
     ],
     ids=["python", "numpy", "gpu", "cpu"],
 )  # fmt: skip
-def test_too_little_memory_is_no_defect(error, amount, capsys):
+def test_too_little_memory_is_not_called_a_defect(error, amount, capsys):
     def handler(args):
         raise error
 
