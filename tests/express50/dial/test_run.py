@@ -108,11 +108,13 @@ def test_the_front_is_the_one_that_trying_everything_gives(tmp_path, captures, m
 def test_a_tight_budget_takes_the_best_that_fits(tmp_path, captures, monkeypatch):
     count_pauses(monkeypatch)
     table, _ = tune(chain_of(tmp_path / "d", captures))
-    middle = table["front"][len(table["front"]) // 2]
+    best = table["front"][-1]
+    # On a busy machine the front may have few points, so that the middle one is nearly the best.
+    middle = [p for p in table["front"] if p["core_seconds"] < 0.7 * best["core_seconds"]][-1]
     state = spend(tmp_path / "d", captures, 1.2 * middle["core_seconds"])
     assert state.finished
     assert state.promised["value"]["value"] <= middle["errors"]["value"]["value"]
-    assert state.promised["value"]["value"] > table["front"][-1]["errors"]["value"]["value"]
+    assert state.promised["value"]["value"] > best["errors"]["value"]["value"]
 
 
 @pytest.mark.parametrize("expressions", [4, 7])
