@@ -65,7 +65,7 @@ def problems(dataset: Dataset, subjects: list[str] | None = None) -> list[LabelP
         for number in unreadable_lines(dataset, subject):
             what = f"line {number} of {dataset.labels_file(subject)} cannot be read; label it again"
             found.append(LabelProblem(subject, "", "unreadable", what))
-        for label in latest_labels(labels):  # a new mark mends a wrong one
+        for label in latest_labels(labels):  # a newer label replaces a wrong one
             for kind, what in footage_problems(index, label):
                 words = f"{label.annotator}: {what}"
                 found.append(LabelProblem(subject, label.expression, kind, words))

@@ -1,7 +1,7 @@
 """Play a function's GPU kernels again as one CUDA graph.
 
-A head is drawn by some 300 small kernels, and launching them one by one takes a processor longer
-than running them takes a GPU. A recorded function costs one launch.
+A head is drawn by many small kernels, and a GPU runs most of them faster than a processor launches
+them. A recorded function needs one launch.
 """
 
 from __future__ import annotations
