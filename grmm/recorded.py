@@ -16,6 +16,8 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor, nn
 
+from express50.console import log
+
 Result = TypeVar("Result")
 KEPT = 4  # recordings of a function and module; each holds its own memory
 
@@ -27,12 +29,16 @@ class _Recording(Generic[Result]):
     outputs: Result
 
 
+PLAIN: _Recording[Any] = _Recording(play=lambda: None, inputs=[], outputs=None)
+"""Stands for a function that cannot be recorded."""
+
+
 class Recorded(Generic[Result]):
     """A function of tensors, and of a module if one is given, recorded on its second call.
 
     The function must not read from the GPU or copy to it, and returns a tensor or a dataclass of
     tensors. Numbers may differ between calls: the function gets them as tensors. It is called as
-    usual on a CPU and where gradients are wanted.
+    usual on a CPU, where gradients are wanted and where recording fails.
     """
 
     def __init__(self, function: Callable[..., Result]) -> None:
@@ -62,7 +68,9 @@ class Recorded(Generic[Result]):
                 return function(*values)
             recording = known[key]
             if recording is None:
-                recording = known[key] = _record(function, values)
+                recording = known[key] = _recording(function, values)
+            if recording is PLAIN:
+                return function(*values)
             for mine, value in zip(recording.inputs, values, strict=True):
                 if isinstance(value, Tensor):
                     mine.copy_(value)
@@ -77,6 +85,17 @@ def _can_record(values: Sequence[Tensor | float]) -> bool:
     return not torch.is_grad_enabled() and all(v.is_cuda for v in values if isinstance(v, Tensor))
 
 
+def _recording(
+    function: Callable[..., Result], values: Sequence[Tensor | float]
+) -> _Recording[Any]:
+    """Record a function, or return PLAIN where the GPU cannot: it costs speed alone."""
+    try:
+        return _record(function, values)
+    except RuntimeError as error:  # torch's, for too little memory and for unsupported operations
+        log(f"drawing is slower, because the GPU cannot record it: {str(error).splitlines()[0]}")
+        return PLAIN
+
+
 def _record(
     function: Callable[..., Result], values: Sequence[Tensor | float]
 ) -> _Recording[Result]:
@@ -88,7 +107,8 @@ def _record(
         else torch.full((), v, dtype=torch.float64, device=device)
         for v in values
     ]
-    with torch.cuda.device(device):
+    # A capture that fails leaves its own stream behind as the current one.
+    with torch.cuda.device(device), torch.cuda.stream(torch.cuda.current_stream(device)):
         aside = torch.cuda.Stream()
         aside.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(aside):  # libraries take their memory now, not within the graph

@@ -96,6 +96,21 @@ def test_four_recordings_are_kept(recordings):
 
 
 @torch.no_grad()
+def test_what_cannot_be_recorded_is_called_as_usual(recordings, monkeypatch, capsys):
+    tried = []
+
+    def fail(function, values):
+        tried.append(len(values))
+        raise torch.OutOfMemoryError("CUDA out of memory.\nTried to allocate 2.00 GiB")
+
+    monkeypatch.setattr(recorded, "_record", fail)
+    function = Recorded(lambda x: Sums(total=x.sum(), scaled=x))
+    for call in range(4):
+        assert float(function(torch.full((2,), call)).total) == 2 * call
+    assert tried == [1] and capsys.readouterr().err.count("\n") == 1
+
+
+@torch.no_grad()
 def test_another_device_is_recorded_anew(recordings):
     function = Recorded(lambda x: Sums(total=x.sum(), scaled=x))
     for device in ("cpu", "cpu", "meta", "meta"):
