@@ -28,6 +28,8 @@ from express50.geometry.shapes import PIXEL_LIMIT
 # An H.264 or H.265 picture may be displayed up to 16 pictures away from its position in the stream,
 # so the key frame nearest to a wanted picture may be displayed after it.
 REORDER = 16
+# Decoders that can leave out pictures that no other picture refers to, with FFmpeg's names.
+LEAVING_OUT = ("h264", "hevc")
 # Accepted containers. FFmpeg goes by content: a playlist named video.mp4 would make it read other
 # files.
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
@@ -138,11 +140,21 @@ def _full_chroma(frame: av.VideoFrame, red: float, blue: float) -> np.ndarray:
 
 
 def _decode(
-    path: Path, container: av.container.InputContainer, stream: av.VideoStream
+    path: Path,
+    container: av.container.InputContainer,
+    stream: av.VideoStream,
+    unneeded: Callable[[int], bool] | None = None,
 ) -> Iterator[av.VideoFrame]:
-    """Yield frames in display order from the current position; raise CaptureError on damage."""
+    """Yield frames in display order from the current position; raise CaptureError on damage.
+
+    Frames whose time stamps are `unneeded` may be left out, if no other frame refers to them.
+    """
+    context = stream.codec_context
     try:
         for packet in container.demux(stream):
+            if unneeded and context.name in LEAVING_OUT:
+                left = packet.pts is not None and unneeded(packet.pts)
+                context.skip_frame = "NONREF" if left else "DEFAULT"
             if packet.is_corrupt:
                 raise CaptureError(
                     f"{path}: damaged packet at byte {packet.pos}; the file is truncated or "
@@ -249,9 +261,10 @@ class VideoReader:
     def __init__(self, path: Path, pts: tuple[int, ...]) -> None:
         self.path = path
         self.pts = pts
+        self._wanted = 0  # time stamp; no frame before it is needed
         self._container, self._stream = _open(path)
-        self._frames: Iterator[av.VideoFrame] = _decode(path, self._container, self._stream)
-        self._next = 0  # decode index of the frame that _frames yields next
+        self._frames = self._decode()
+        self._next = 0  # decode index of the first frame that _frames can still yield
 
     def read(self, frame: int) -> np.ndarray:
         """Read the image (H, W, 3) uint8 sRGB at a decode index.
@@ -263,6 +276,7 @@ class VideoReader:
             raise CaptureError(
                 f"{self.path}: frame {frame} does not exist, expected 0 to {len(self.pts) - 1}"
             )
+        self._wanted = self.pts[frame]
         if not self._next <= frame < self._next + 2 * REORDER:
             self._seek(frame)
         image = self._decode_until(frame)
@@ -295,12 +309,15 @@ class VideoReader:
         """Go back to the first frame by reopening the file."""
         self._container.close()
         self._container, self._stream = _open(self.path)
-        self._frames = _decode(self.path, self._container, self._stream)
+        self._frames = self._decode()
         self._next = 0
 
     def close(self) -> None:
         """Close the file."""
         self._container.close()
+
+    def _decode(self) -> Iterator[av.VideoFrame]:
+        return _decode(self.path, self._container, self._stream, lambda pts: pts < self._wanted)
 
     def _seek(self, frame: int) -> None:
         """Go to a key frame before a frame: to the nearest, or with an allowance for reordering."""
@@ -309,7 +326,7 @@ class VideoReader:
                 break
             try:
                 self._container.seek(self.pts[target], stream=self._stream, backward=True)
-                frames = _decode(self.path, self._container, self._stream)
+                frames = self._decode()
                 first = next(frames, None)
             except DAMAGE:  # no index to seek with
                 break

@@ -20,8 +20,9 @@ FRAMES = 61
         {"gop": 60, "b_frames": 8},
         {"gop": 16, "b_frames": 4, "options": {"x264-params": "open-gop=1:bframes=4:b-pyramid=2"}},
         {"gop": 1, "b_frames": 0},
+        {"gop": 24, "codec": "libx265", "options": {"x265-params": "log-level=none:bframes=6"}},
     ],
-    ids=["closed", "long", "open", "intra"],
+    ids=["closed", "long", "open", "intra", "h265"],
 )
 def video(request, tmp_path_factory):
     path = tmp_path_factory.mktemp("video") / "video.mp4"
@@ -29,7 +30,9 @@ def video(request, tmp_path_factory):
     return path
 
 
-def test_random_reads_give_the_sequential_frames(video):
+@pytest.mark.parametrize("threads", ["1", "3"])
+def test_random_reads_give_the_sequential_frames(video, threads, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", threads)
     sequential = list(iterate_video(video))
     assert len(sequential) == FRAMES
     pts = tuple(stamp for stamp, _ in sequential)
@@ -55,7 +58,7 @@ def test_full_chroma_gives_ffmpegs_colours(monkeypatch, shape, matrix, space):
     assert (ours == ffmpegs).mean() > 0.9 or ours.size < 10
 
 
-def test_a_read_decodes_from_the_nearest_key_frame(tmp_path, monkeypatch):
+def test_a_read_decodes_what_it_needs_from_the_nearest_key_frame(tmp_path, monkeypatch):
     path, decoded = tmp_path / "video.mp4", []
     write_video(path, noise_video_images(FRAMES), gop=12, b_frames=2)
     pts = tuple(stamp for stamp, _ in iterate_video(path))
@@ -72,7 +75,10 @@ def test_a_read_decodes_from_the_nearest_key_frame(tmp_path, monkeypatch):
     with av.open(str(path)) as container:
         keys = [frame.pts for frame in container.decode(video=0) if frame.key_frame]
     nearest = max(key for key in keys if key <= pts[50])
-    assert decoded == [stamp for stamp in pts if nearest <= stamp <= pts[50]]
+    between = [stamp for stamp in pts if nearest <= stamp <= pts[50]]
+    assert decoded[0] == nearest
+    assert decoded[-1] == pts[50]
+    assert set(decoded) < set(between)  # those that others refer to
 
 
 def test_a_key_frame_before_a_frame_is_found_and_reads_go_on(video):
