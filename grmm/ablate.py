@@ -187,7 +187,7 @@ def changed(config: Config, variant: Variant, used: Sequence[Path]) -> Config:
         cameras = {key.camera for key in keys}
         frames = {"/".join(key.frame) for key in keys}
         data = tables["data"]
-        data["holdout_cameras"] = [c for c in data["holdout_cameras"] if c in cameras]
+        data["holdout_cameras"] = [p for p in data["holdout_cameras"] if fnmatch.filter(cameras, p)]
         data["holdout_expressions"] = [
             p for p in data["holdout_expressions"] if fnmatch.filter(frames, p)
         ]

@@ -133,7 +133,7 @@ class DataConfig:
     """Settings that choose what training reads from the shards."""
 
     holdout_cameras: tuple[str, ...] = ()
-    """Camera ids that training never sees; metrics.json reports on them."""
+    """Cameras that training never sees, as ids or shell patterns; metrics.json reports on them."""
     holdout_expressions: tuple[str, ...] = ()
     """SUBJECT/EXPRESSION frames that training never sees, as shell patterns (S002/smile, */wink*).
     Another subject must show the expression, or it has no code."""

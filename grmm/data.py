@@ -7,7 +7,7 @@ parameters once per (subject, expression) and kept.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Generic, Protocol, TypeVar
@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from express50.console import log
+from express50.console import count, log
 from express50.contract.segmentation_labels import TORSO
 from express50.errors import FormatError, TrainError, few
 from express50.geometry.sampling import evenly
@@ -24,7 +24,7 @@ from express50.geometry.transforms import make_transform
 from express50.head.model import HeadModel, pose
 from grmm.config import DataConfig
 from grmm.head_crop import behind_torso, crop_view, head_window
-from grmm.model import HeadState, PinholeView, Rendering
+from grmm.model import GRMM, HeadState, PinholeView, Rendering
 
 NO_OFFSETS = np.zeros((0, 3), np.float32)
 CACHE_BYTES = 512 << 20  # of decoded samples: a few hundred of 512 px
@@ -183,6 +183,20 @@ class HeadView:
     def comparable(self, image: Tensor) -> Tensor:
         """Return ``image`` (3, H, W) with the footage where the neck is hidden."""
         return torch.where(self.hidden, self.target, image)
+
+
+def with_codes(model: GRMM, keys: Sequence[SampleKey], chosen: Iterable[int]) -> list[int]:
+    """Choose the samples whose person and expression have a code; log which frames do not."""
+    known: dict[bool, list[int]] = {True: [], False: []}
+    for index in chosen:
+        key = keys[index]
+        known[key.subject in model.subjects and key.expression in model.expressions].append(index)
+    if lost := sorted({"/".join(keys[index].frame) for index in known[False]}):
+        log(
+            f"{count(len(lost), 'frame')} cannot be measured, because training saw nothing of the"
+            f" person or the expression: {few(lost)}"
+        )
+    return known[True]
 
 
 class Cache(Generic[Key, Value]):
@@ -363,15 +377,15 @@ class HeadViews:
 def check_tracked(where: str, tracked: Tracked, head: HeadModel) -> None:
     """Raise FormatError for parameters that the head model does not have."""
     shapes, expressions = head.shape_dirs.shape[2], len(head.expression_names)
-    for what, got, count in (
+    for what, got, limit in (
         ("shape coefficients", len(tracked.shape), shapes),
         ("expression coefficients", len(tracked.expression), expressions),
         ("offsets", len(tracked.offsets), len(head.template)),
     ):
         # Trailing coefficients may be missing; offsets are either complete or absent.
-        if got > count or (what == "offsets" and got not in (0, count)):
+        if got > limit or (what == "offsets" and got not in (0, limit)):
             raise FormatError(
-                f"{where}: {got} {what}, head model {head.name!r} has {count}; was "
+                f"{where}: {got} {what}, head model {head.name!r} has {limit}; was "
                 "the dataset tracked with another head model? If not, pack it again"
             )
 

@@ -191,10 +191,10 @@ def select(keys: Sequence[SampleKey], subjects: str, expressions: str, cameras: 
     for kind, text in (("subject", subjects), ("expression", expressions), ("camera", cameras)):
         known = sorted({getattr(key, kind) for key in keys})
         chosen: set[str] = set()
-        for pattern in filter(None, map(str.strip, text.split(","))):
+        for pattern in map(str.strip, text.strip(", ").split(",")):
             matching = fnmatch.filter(known, pattern)
             if not matching:
-                raise ConfigError(f"no {kind} is {pattern}; the shards have {', '.join(known)}")
+                raise ConfigError(f"no {kind} is {pattern!r}; the shards have {', '.join(known)}")
             chosen.update(matching)
         found = [i for i in found if getattr(keys[i], kind) in chosen]
     if not found:

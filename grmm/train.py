@@ -227,6 +227,7 @@ def report(
     state: TrainState, config: Config, out: Path, perceptual: PerceptualMetrics
 ) -> dict[str, object]:
     """Evaluate, draw previews and write metrics.json."""
+    log("measuring the model, component by component, and drawing previews")
     model, views, count = state.model, state.views, config.train.evaluate_images
     render = training_render(model, views)
     trained = {views.keys[i].frame for i in state.training}
@@ -253,7 +254,7 @@ def report(
         "fid": perceptual.fid(),
         "depth_median_mm": mean(holdout or training, "depth_mm"),
         "heldout_images": len(holdout),
-        "heldout_cameras": list(config.data.holdout_cameras),
+        "heldout_cameras": sorted({views.keys[i].camera for i in held}),
         "training_views": len(state.training),
         "subjects": list(model.subjects),
         "expressions": list(model.expressions),

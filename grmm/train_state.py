@@ -8,7 +8,7 @@ import json
 import math
 import os
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event, current_thread, main_thread
@@ -17,14 +17,14 @@ import torch
 from torch import Tensor
 
 from express50.console import log
-from express50.errors import ConfigError, TrainError, check_known
+from express50.errors import FEW, ConfigError, TrainError, few
 from express50.files.atomic import write_bytes
 from express50.files.text import read_text
 from express50.geometry.sampling import evenly
 from grmm import losses
 from grmm.checkpoint import Gallery, load_checkpoint, save_checkpoint
 from grmm.config import Config, as_tables
-from grmm.data import HeadView, HeadViews, SampleKey, Shuffle
+from grmm.data import HeadView, HeadViews, SampleKey, Shuffle, with_codes
 from grmm.model import GRMM, Rendering
 
 COVERED_TEXELS = 0.75  # of a map that head models' layouts use
@@ -61,15 +61,11 @@ def prepare(views: HeadViews, config: Config, rank: int = 0, world: int = 1) -> 
     subjects = sorted({keys[i].subject for i in training})
     expressions = sorted({keys[i].expression for i in training})
     model = GRMM(config.model, views.head, subjects, expressions).to(views.head.device)
-    # A held-out sample can only be judged where its codes were trained.
-    holdout = [
-        i for i in holdout if keys[i].subject in subjects and keys[i].expression in expressions
-    ]
     return TrainState(
         model=model,
         views=views,
         training=training,
-        holdout=holdout,
+        holdout=with_codes(model, keys, holdout),
         optimizer=make_optimizer(model, config),
         shuffle=Shuffle(training, config.train.seed, rank, world),
         perceptual=losses.load_vgg(config.loss.vgg16, views.head.device),
@@ -117,19 +113,11 @@ def split_samples(keys: Sequence[SampleKey], config: Config) -> tuple[list[int],
         ConfigError: a held-out name fits no sample.
         TrainError: nothing is left to train on.
     """
-    cameras = config.data.holdout_cameras
-    check_known("data.holdout_cameras", "camera", cameras, sorted({key.camera for key in keys}))
-    frames = {"/".join(key.frame) for key in keys}
-    held = {p: set(fnmatch.filter(frames, p)) for p in config.data.holdout_expressions}
-    for pattern, found in held.items():
-        if not found:
-            raise ConfigError(
-                f"data.holdout_expressions names {pattern}; expected SUBJECT/EXPRESSION such as "
-                f"{min(frames)}"
-            )
-    unseen = set().union(*held.values())
+    cameras, frames = {key.camera for key in keys}, {"/".join(key.frame) for key in keys}
+    held = _matching("holdout_cameras", config.data.holdout_cameras, cameras)
+    unseen = _matching("holdout_expressions", config.data.holdout_expressions, frames)
     holdout = [
-        i for i, key in enumerate(keys) if key.camera in cameras or "/".join(key.frame) in unseen
+        i for i, key in enumerate(keys) if key.camera in held or "/".join(key.frame) in unseen
     ]
     training = sorted(set(range(len(keys))) - set(holdout))
     if not training:
@@ -138,6 +126,16 @@ def split_samples(keys: Sequence[SampleKey], config: Config) -> tuple[list[int],
             "hold out fewer or pack more"
         )
     return training, holdout
+
+
+def _matching(setting: str, patterns: Iterable[str], known: Collection[str]) -> set[str]:
+    """Return the names that match any of the patterns; refuse a pattern that none matches."""
+    found = {pattern: fnmatch.filter(known, pattern) for pattern in patterns}
+    for pattern, names in found.items():
+        if not names:
+            expected = few(sorted(known), FEW)
+            raise ConfigError(f"data.{setting} names {pattern}; expected some of {expected}")
+    return set().union(*found.values())
 
 
 def make_optimizer(model: GRMM, config: Config) -> torch.optim.Optimizer:

@@ -106,10 +106,12 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "TIME", "stop after this time: 60s, 4m, 2h", type=parse_seconds, dest="seconds"
     ),
     "--holdout-cameras": value(
-        "ID,...", "cameras to hold out for testing: cam02,cam05", default=""
+        "ID,...", "cameras to hold out for testing, ids or patterns: cam02,cam05", default=""
     ),
     "--holdout-expressions": value(
-        "SUBJECT/EXPRESSION,...", "expressions to hold out for testing: S002/smile", default=""
+        "SUBJECT/EXPRESSION,...",
+        "expressions to hold out for testing, ids or patterns: S002/smile",
+        default="",
     ),
     "--paper-diff": flag("print the differences from the paper instead"),
     "--overwrite": flag("start over even if OUT has a checkpoint"),
@@ -121,7 +123,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--cameras": value("ID,...", "only these, ids or patterns: cam02,cam05", default="*"),
     "--images": value(
         "N",
-        "measure at most this many images, evenly spread (default: all)",
+        "measure at most this many images, evenly spread; of people who are fitted, at most this"
+        " many per person and kind (default: all)",
         type=at_least(0),
         default=0,
     ),

@@ -272,6 +272,7 @@ def _split(
     loaded: Checkpoint, views: HeadViews, args: argparse.Namespace
 ) -> tuple[list[int], dict[str, list[int]]]:
     """Split samples into those with trained codes and, per person, those to fit first."""
+    from grmm.data import with_codes
     from grmm.shard_source import select
 
     chosen = select(views.keys, args.subjects, args.expressions, args.cameras)
@@ -279,7 +280,7 @@ def _split(
     strangers = sorted({keys[i].subject for i in chosen} - {*model.subjects})
     unseen = {name: [i for i in chosen if keys[i].subject == name] for name in strangers}
     known = [i for i in chosen if keys[i].subject not in unseen]
-    known = [i for i in known if keys[i].expression in model.expressions]
+    known = with_codes(model, keys, known)
     if args.fit_cameras:
         return known, unseen
     if not known:

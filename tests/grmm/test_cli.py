@@ -32,7 +32,7 @@ def shards(tmp_path_factory):
 @pytest.fixture(scope="module")
 def checkpoint(shards, tmp_path_factory):
     out = tmp_path_factory.mktemp("run")
-    assert main(["train", str(shards), str(out), *TINY, "--holdout-cameras=cam01"]) == 0
+    assert main(["train", str(shards), str(out), *TINY, "--holdout-cameras=*1"]) == 0
     return out / "checkpoint.pt"
 
 
@@ -109,9 +109,21 @@ def test_fit_reports_held_out_views_and_writes_over_nothing(checkpoint, shards, 
 
 
 def test_the_figure_of_a_held_out_expression_is_printed(shards, tmp_path, capsys):
-    train = ["train", str(shards), str(tmp_path), *TINY, "--holdout-expressions=S000/e0"]
+    train = ["train", str(shards), str(tmp_path), *TINY, "--holdout-expressions"]
+    assert main([*train, "S000/e0"]) == 0
+    said = capsys.readouterr()
+    assert re.search(r"^PSNR held-out expression, dB: \d", said.out, re.MULTILINE)
+    assert "cannot be measured" not in said.err and "measuring the model" in said.err
+
+
+def test_held_out_expressions_without_a_code_are_named(shards, tmp_path, capsys):
+    train = ["train", str(shards), str(tmp_path), *TINY, "--holdout-expressions=*/e0"]
     assert main(train) == 0
-    assert re.search(r"^PSNR held-out expression, dB: \d", capsys.readouterr().out, re.MULTILINE)
+    line = "2 frames cannot be measured, because training saw nothing of the person or the"
+    assert f"{line} expression: S000/e0, S001/e0\n" in capsys.readouterr().err
+    checkpoint, out = str(tmp_path / "checkpoint.pt"), str(tmp_path / "e")
+    assert main(["evaluate", checkpoint, str(shards), out, "--subjects=S000"]) == 0
+    assert "1 frame cannot be measured" in capsys.readouterr().err
 
 
 def test_render_writes_a_picture_per_frame_and_pair(checkpoint, tmp_path):
@@ -185,12 +197,15 @@ def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
         (["train", "{out}", "{out}", "--budget=9s"], 1, "the index is missing"),
         (["train", "{out}", "{out}"], 1, "the index is missing"),
         (["train", "{out}/absent", "{out}"], 1, "absent: no such folder; name the folder that"),
-        (["train", "{shards}", "{out}", *TINY, "--holdout-cameras=x"], 2, "no camera 'x'"),
+        (["train", "{shards}", "{out}", *TINY, "--holdout-cameras=x"], 2,
+         "data.holdout_cameras names x; expected some of cam00, cam01, cam02"),
         (["fit", "{checkpoint}", "{shards}", "{out}", "--subject=S9"], 2, "no subject is"),
         (["fit", "{checkpoint}", "{shards}", "{out}", "--subject=S002", "--set=train.lr=1"], 2,
          "expected fit, metrics, loss"),
         (["fit", "{checkpoint}", "{shards}", "{out}", "--subject=S002", "--cameras=cam00,cam9"], 2,
-         "no camera is cam9; the shards have cam00, cam01, cam02"),
+         "no camera is 'cam9'; the shards have cam00, cam01, cam02"),
+        (["score", "{shards}", "{shards}", "{out}", "--cameras="], 2,
+         "no camera is ''; the shards have cam00"),
         (["train", "{checkpoint}", "{checkpoint}"], 2, "is a file, expected a folder"),
         (["train", "{shards}", "{out}", *TINY, "--set=loss.ssim=-1"], 2, "loss.ssim is -1"),
         (["train", "{shards}", "{out}", *TINY, "--set=train.lr=-1"], 2, "train.lr is -1"),
