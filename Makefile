@@ -5,6 +5,7 @@ READY := .venv/.ready
 DATASET ?= build/dataset
 # Recipes quote DATASET, and a shell expands ~ only outside of quotes.
 override DATASET := $(patsubst ~/%,$(HOME)/%,$(DATASET))
+# Folders with spaces in their names need quotes or backslashes: CAPTURES="'my dir' other".
 CAPTURES ?=
 PRESET ?= standard
 WORKERS ?= 2

@@ -13,8 +13,10 @@ import sys
 import textwrap
 import traceback
 import warnings
+from _thread import interrupt_main
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from threading import Timer
 from typing import IO, Any
 
 from express50.errors import ConfigError, Express50Error, nearest
@@ -27,12 +29,14 @@ REMEDIES = {
     errno.EEXIST: "give another path",
     errno.ENOTDIR: "give another path",
     errno.EISDIR: "give the path of a file",
-    errno.EACCES: "check its owner and permissions, or give another path",
-    errno.EPERM: "check its owner and permissions, or give another path",
-    errno.EROFS: "give a path that is writable",
+    errno.EACCES: "check its owner and permissions",
+    errno.EPERM: "check its owner and permissions",
+    errno.EROFS: "make its disk writable, or use another one",
     errno.ENOSPC: "free some space",
     errno.EDQUOT: "free some space, your quota is used up",
 }
+
+LATER = 0.05  # seconds, after which a callback of the garbage collection has ended
 
 # torch's error on a CPU is a RuntimeError that only its words tell apart.
 OUT_OF_MEMORY = re.compile("out of memory|can't allocate memory", re.IGNORECASE)
@@ -159,9 +163,16 @@ def _line_of(error: Exception) -> str:
 def system_error_line(error: OSError) -> str:
     """Return one line of what the system refused, where, and what to do."""
     name = error.filename2 or error.filename  # of a rename, the target: the source is temporary
+    if error.errno == errno.EROFS:
+        return not_writable(name, error)
     place = f" {name}:" if name is not None else ""
     words = error.strerror or " ".join(str(error).split()) or "no reason given"
     return f"{type(error).__name__}:{place} {words}; {REMEDIES.get(error.errno or 0, REMEDY)}"
+
+
+def not_writable(place: object, error: OSError) -> str:
+    """Return one line on a folder or file that cannot be written to: why, and what to do."""
+    return f"{place}: not writable ({error.strerror}); {REMEDIES.get(error.errno or 0, REMEDY)}"
 
 
 def add_command(
@@ -204,19 +215,31 @@ def ignoring_closed_pipe(stream: IO[str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _stop_on_sigterm() -> Iterator[None]:
-    """Handle SIGTERM, which batch systems send, like Ctrl-C."""
+    """Handle SIGTERM, which batch systems send, like Ctrl-C.
+
+    Python ignores exceptions in callbacks of its garbage collection: there, both are sent again.
+    """
 
     def stop(number: int, frame: object) -> None:
         raise KeyboardInterrupt
 
+    def report(ignored: Any) -> None:
+        if ignored.exc_type is KeyboardInterrupt:
+            Timer(LATER, interrupt_main, [signal.SIGTERM]).start()
+        else:
+            report_ignored(ignored)
+
+    report_ignored = sys.unraisablehook
     try:
         former = signal.signal(signal.SIGTERM, stop)
     except ValueError:  # not the main thread
         yield
         return
+    sys.unraisablehook = report
     try:
         yield
     finally:
+        sys.unraisablehook = report_ignored
         signal.signal(signal.SIGTERM, former)
 
 

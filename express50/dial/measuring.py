@@ -191,9 +191,9 @@ def _too_small(chain: Chain, clock: Clock, found: PilotFigures) -> str:
     least = clock.now() + front(workload(chain, found, clock.cores, {}))[0].seconds
     return (
         f"--budget {clock.budget.text if clock.budget else ''}: it ended before every stage was"
-        " measured at its cheapest setting; the cheapest settings need more than"
+        " measured at its cheapest setting; those that were measured, and their measuring, need"
         f" {format_seconds(least)} {time_words(clock.cores, chain.pool.width())}; give several"
-        " times as much; what was measured is kept"
+        " times as much. What was measured is kept, so that the same command gets further"
     )
 
 

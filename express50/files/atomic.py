@@ -50,6 +50,10 @@ def write_with(path: Path, write: Callable[[BinaryIO], object]) -> None:
                 file.flush()
                 os.fsync(file.fileno())
             aside.replace(path)
+        except OSError as error:
+            if error.filename == str(aside):  # a name that nobody has given
+                error.filename = str(path)
+            raise
         finally:
             aside.unlink(missing_ok=True)
         sync_directory(path.parent)

@@ -13,7 +13,7 @@ from typing import Any
 import psutil
 from rich.filesize import decimal
 
-from express50.console import count
+from express50.console import count, not_writable
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
 from express50.errors import Express50Error, FormatError, StageError
@@ -64,7 +64,7 @@ def _folder_problems(dataset: Dataset, stages: Iterable[Stage]) -> Iterator[str]
         except NotADirectoryError:
             yield f"{folder}: is a file, expected a writable folder"
         except OSError as error:
-            yield f"{folder}: not writable ({error.strerror}); check its owner and permissions"
+            yield not_writable(folder, error)
 
 
 def _worker_problems(work: Sequence[tuple[Stage, Any]], pool: Pool) -> Iterator[str]:

@@ -2,11 +2,15 @@
 
 import argparse
 import dataclasses
+import errno
+import gc
 import json
 import os
 import shlex
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -269,6 +273,21 @@ def test_what_the_system_refuses_is_one_line(run, data, capture):
     assert "/proc/none" in err and "Traceback" not in err
 
 
+def test_a_read_only_disk_is_named_as_before_a_run(run, data, capture, monkeypatch):
+    assert run("ingest", data, capture)[0] == 0
+    page = data / "report/index.html"
+    real = Path.open
+
+    def read_only(path, mode="r", **options):
+        if path.parent == page.parent and "w" in mode:
+            raise OSError(errno.EROFS, "Read-only file system", str(path))
+        return real(path, mode, **options)
+
+    monkeypatch.setattr(Path, "open", read_only)
+    line = f"express50: {page}: not writable (Read-only file system); make its disk writable, or"
+    assert run("report", data)[2] == f"{line} use another one\n"
+
+
 def test_a_reader_that_leaves_stops_nothing(data, capture):
     command = [sys.executable, "-m", "express50", "ingest", str(data), str(capture)]
     read, write = os.pipe()
@@ -298,6 +317,22 @@ def test_only_the_module_of_the_asked_command_is_imported(data):
     command = [sys.executable, "-c", code, str(data)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_within_a_garbage_collection_stops(number, capsys):
+    def stop(phase, info):
+        gc.callbacks.remove(stop)
+        signal.raise_signal(number)
+
+    def handler(args):
+        gc.callbacks.append(stop)
+        gc.collect()
+        time.sleep(5)
+        return 0
+
+    assert run_handler("express50", handler, argparse.Namespace()) == 130
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_interrupt_keeps_what_is_finished_and_says_so(run, data, capture, monkeypatch):
@@ -333,8 +368,9 @@ def made_by(*arguments: str) -> list[str]:
 
 @pytest.mark.parametrize("target", ["ingest", "depth", "run", "tune", "train", "report"])
 def test_make_takes_a_dataset_whose_name_has_spaces(target):
-    words = made_by(target, "DATASET=my data", "CAPTURES=caps/S001")
+    words = made_by(target, "DATASET=my data", r"CAPTURES='caps/S 1' caps/S\ 2")
     assert words[2].split("/")[0] == "my data"
+    assert words[3:5] == ["caps/S 1", "caps/S 2"] or target in ("depth", "train", "report")
 
 
 def test_make_takes_a_dataset_in_the_home_folder(monkeypatch):
