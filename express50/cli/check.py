@@ -61,6 +61,8 @@ def run_check(args: argparse.Namespace) -> int:
     from express50.dataset.audit import audit
 
     started = time.perf_counter()
+    if args.deep:
+        log(f"{args.dataset}: reading every file")
     if not (args.dataset / "ingest").exists():  # if it exists, a missing ledger is a finding
         existing_dataset(args.dataset)
     for path in args.checkpoint:

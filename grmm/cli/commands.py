@@ -6,13 +6,13 @@ Torch takes a second to import and --help must not wait for it, so handlers impo
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from express50.console import OK, answer, figure_label, log, say
+from express50.console import OK, answer, count, figure_label, log, say
 from express50.contract.config import config_toml, known_assignments
 from express50.errors import ConfigError, check_known
 from express50.files.atomic import write_bytes, write_json
@@ -164,24 +164,28 @@ def render(args: argparse.Namespace) -> int:
         render.check_clips(loaded, clips)
         videos["driven"], rates["driven"] = render.driven(loaded, head, clips, view), clips.rate
     sheets: dict[str, Any] = {}
+
+    def draw(name: str, function: Callable[..., Any], *values: Any) -> None:
+        log(f"drawing {name}.jpg, {view.width} x {view.height} px per picture")
+        sheets[name] = function(loaded, *values)
+
     if args.views:
-        sheets["views"] = render.novel_views(loaded, head, view)
+        draw("views", render.novel_views, head, view)
     if args.controls:
-        sheets["controls"] = render.control_sheet(loaded, head, view)
+        draw("controls", render.control_sheet, head, view)
     if args.expression_of:
         plain = _frame_head(loaded, args.subject or model.subjects[0])
         donor = _frame_head(loaded, args.expression_of)
-        sheets["transfer"] = render.residual_sheet(loaded, plain, donor, view)
+        draw("transfer", render.residual_sheet, plain, donor, view)
     if args.samples:
-        sheets["samples"] = render.sample_sheet(
-            loaded, head, view, args.samples, args.seed, args.spread
-        )
-    sheets["grid"] = render.expression_grid(loaded, subjects, expressions, view)
+        draw("samples", render.sample_sheet, head, view, args.samples, args.seed, args.spread)
+    draw("grid", render.expression_grid, subjects, expressions, view)
     picture = render.picture(loaded, head, view)
     args.out.mkdir(parents=True, exist_ok=True)
     write_image(args.out / "picture.png", picture)
     say(f"wrote {args.out / 'picture.png'}")
     for name, frames in videos.items():
+        log(f"drawing {name}.mp4, {view.width} x {view.height} px")
         render.write_video(args.out / f"{name}.mp4", frames, rates.get(name, RIG_RATE))
         say(f"wrote {args.out / name}.mp4")
     for name, sheet in sheets.items():
@@ -215,6 +219,7 @@ def export(args: argparse.Namespace) -> int:
         subject, _ = _frame(loaded, args.subject, None)
         views = loaded.views(ShardSource(args.shards, "*")) if args.shards else None
         clips = read_clips(args.drive, args.drive_cue) if args.drive else None
+        log("making the page: a smaller model learns to draw the head")
         say(f"wrote {args.out}: {export_player(args.out, loaded, head, subject, views, clips)}")
         return OK
     say(f"wrote {args.out}: {write_export(args.out, loaded, head, view, form)}")
@@ -260,6 +265,7 @@ def evaluate(args: argparse.Namespace) -> int:
     for subject, chosen in unseen.items():  # before anybody is fitted for nothing
         unseen_views(loaded, views, subject, protocol, chosen)
     render = training_render(loaded.model, views)
+    log(f"measuring {count(len(known), 'image')} of people with codes")
     rows = evaluate(views, known, render, judge, kind, keep)
     for subject, chosen in unseen.items():
         found, effort = evaluate_unseen(loaded, views, subject, protocol, judge, keep, chosen)
@@ -311,6 +317,7 @@ def score(args: argparse.Namespace) -> int:
     chosen = select(views.keys, args.subjects, args.expressions, args.cameras)
     chosen = evenly(chosen, args.images or len(chosen))
     judge = PerceptualMetrics(MetricsConfig(alexnet=args.alexnet, inception=args.inception))
+    log(f"measuring {count(len(chosen), 'image')}")
     rows = score(args.renders, source.window, views, chosen, judge, args.partial)
     _report(args, rows, judge)
     if len(rows) < len(chosen):

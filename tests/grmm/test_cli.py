@@ -126,10 +126,15 @@ def test_held_out_expressions_without_a_code_are_named(shards, tmp_path, capsys)
     assert "1 frame cannot be measured" in capsys.readouterr().err
 
 
-def test_render_writes_a_picture_per_frame_and_pair(checkpoint, tmp_path):
+def test_render_writes_a_picture_per_frame_and_pair(checkpoint, tmp_path, capsys):
     assert main(["render", str(checkpoint), str(tmp_path), "--turntable", "--frames=2"]) == 0
     with av.open(str(tmp_path / "turntable.mp4")) as video:
         assert sum(1 for _ in video.decode(video=0)) == 2
+    said = capsys.readouterr().err  # before what may take minutes
+    assert said == "".join(
+        f"drawing {name}, 32 x 32 px{more}\n"
+        for name, more in (("grid.jpg", " per picture"), ("turntable.mp4", ""))
+    )
     picture, grid = (read_image(tmp_path / name) for name in ("picture.png", "grid.jpg"))
     assert picture.std() > 10, "a head, not one grey"
     assert grid.shape[0] >= 2 * picture.shape[0] and grid.shape[1] >= 2 * picture.shape[1]
