@@ -37,7 +37,7 @@ from express50.files.images import srgb_to_linear
 from express50.geometry.sampling import evenly
 from express50.twin.config import TwinConfig
 from express50.twin.truth import Truth
-from pipelines.matte.config import MatteConfig
+from pipelines.matte import MatteConfig
 from pipelines.matte.key import dilated, eroded, key_alpha
 from pipelines.matte.plates import exposed, exposure_gain
 from pipelines.pack.crop import own_colours

@@ -59,7 +59,7 @@ from express50.geometry.cameras import pinhole
 from express50.geometry.sampling import evenly
 from express50.twin.config import TwinConfig
 from express50.twin.truth import Truth
-from pipelines.matte.config import MatteConfig
+from pipelines.matte import MatteConfig
 from pipelines.matte.consensus import agree
 from pipelines.matte.cutout import CutView, cut_out, make_cut_view, soft_alpha
 from pipelines.matte.key import key_alpha

@@ -207,7 +207,11 @@ def _refine(
     limit = max(NEAR * float(np.hypot(c.width, c.height)) for c in rig.cameras.values())
     loss_scale, timing = limit / 3, dict[str, CameraTiming]()
     for number in range(rounds):
-        keep = _held(np.linalg.norm(errors, axis=1) < limit, corners)
+        keep = np.linalg.norm(errors, axis=1) < limit
+        # Frames in which no image has six kept corners are left out: nothing holds the board there.
+        counts = np.zeros((len(corners.cameras), len(corners.frames)), int)
+        np.add.at(counts, (corners.camera[keep], corners.frame[keep]), 1)
+        keep &= (counts.max(0) >= 6)[corners.frame]
         rig, keep = _drop_cameras(rig, corners, keep, dropped)
         if number:
             timing = estimate_timing(rig, seen, keep, points, loss_scale, timing)
@@ -239,13 +243,6 @@ def _check_agreement(names: list[str], found: BoardCorners, kept: BoardCorners) 
             " cameras and record the board again, or rename its images so that those of one moment"
             " have the same name"
         )
-
-
-def _held(keep: np.ndarray, corners: BoardCorners) -> np.ndarray:
-    """Leave out frames in which no image has six kept corners: nothing holds the board's pose."""
-    counts = np.zeros((len(corners.cameras), len(corners.frames)), int)
-    np.add.at(counts, (corners.camera[keep], corners.frame[keep]), 1)
-    return keep & (counts.max(0) >= 6)[corners.frame]
 
 
 def _simplest_models(

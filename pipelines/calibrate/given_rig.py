@@ -162,7 +162,11 @@ def _find_exchanged(
     pairs: list[tuple[str, str]] = []
     while error > ODD_FACES:
         tried = {
-            (min(a, b), max(a, b)): _exchange(cameras, a, b)
+            (min(a, b), max(a, b)): {
+                **cameras,
+                a: replace(cameras[b], id=a),
+                b: replace(cameras[a], id=b),
+            }
             for a in showing
             for b in cameras
             if a != b
@@ -220,11 +224,6 @@ def _fit_faces(cameras: Mapping[str, Camera], tracks: PointTracks) -> tuple[floa
     eyes = np.stack([points.reshape(-1, 68, 3)[:, side].mean(1) for side in EYES])
     gap = float(np.median(np.linalg.norm(eyes[0] - eyes[1], axis=1)))
     return float(np.minimum(errors, WORST).mean()), 1e3 * gap
-
-
-def _exchange(cameras: Mapping[str, Camera], a: str, b: str) -> dict[str, Camera]:
-    """Return cameras of which two have each other's lens and pose."""
-    return {**cameras, a: replace(cameras[b], id=a), b: replace(cameras[a], id=b)}
 
 
 def _with_focal(camera: Camera, factor: float) -> Camera:

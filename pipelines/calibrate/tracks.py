@@ -259,8 +259,12 @@ def mirrored_cameras(
     for a, b in pairs:
         mine, there = mirror_features(features[a], widths[a]), features[b]
         found = verified_pairs({frame: (mine, there)}).get(frame, np.zeros((0, 2), int))
-        places = mine[0][found[:, 0]], there[0][found[:, 1]]
-        turned.update(dict.fromkeys((a, b), _off_plane(*places, ON_PLANE * widths[b])))
+        off_plane = 0
+        if len(found) >= LEAST_INLIERS:
+            p, q = mine[0][found[:, 0]], there[0][found[:, 1]]
+            H, mask = cv2.findHomography(p, q, cv2.USAC_MAGSAC, ON_PLANE * widths[b])
+            off_plane = len(p) if H is None else int((mask == 0).sum())
+        turned.update(dict.fromkeys((a, b), off_plane))
     suspects = {name for name in features if turned[name] > LEAST_MIRRORED}
     for a, b in (pair for pair in pairs if suspects & set(pair)):
         agreed = verified_pairs({frame: (features[a], features[b])}).values()
@@ -272,14 +276,6 @@ def mirrored_cameras(
         for name in sorted(suspects)
         if turned[name] > 2 * straight[name] + LEAST_MIRRORED
     }
-
-
-def _off_plane(p: np.ndarray, q: np.ndarray, near: float) -> int:
-    """Count the matches of pixels (M, 2) that are not `near` where one homography has them."""
-    if len(p) < LEAST_INLIERS:
-        return 0
-    H, mask = cv2.findHomography(p, q, cv2.USAC_MAGSAC, near)
-    return len(p) if H is None else int((mask == 0).sum())
 
 
 def mirror_features(features: Features, width: int) -> Features:

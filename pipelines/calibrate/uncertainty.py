@@ -73,8 +73,14 @@ def state_uncertainty(solution: BoardSolution, points: np.ndarray) -> dict[str, 
         squared = _squared_errors(by_camera, by_point, rigid_steps(head), covariance)
         return dict(zip(names, (excess * squared).tolist(), strict=True))
 
-    squared = expected(solution.corners)
-    halves = _halves(solution.corners)
+    corners = solution.corners
+    squared = expected(corners)
+    # Each half has every other board frame, and only the cameras that both halves hold.
+    side = np.searchsorted(np.unique(corners.frame), corners.frame) % 2
+    seen = np.zeros((2, len(corners.cameras)))
+    np.add.at(seen, (side, corners.camera), 1)
+    held = (seen.min(0) >= LEAST_CORNERS)[corners.camera]
+    halves = [corners.select(held & (side == k)) for k in (0, 1)]
     if len(np.unique(halves[0].camera)) > 1:
         one, other = (adjust_board_rig(rig, half, points, scale).cameras for half in halves)
         variance = [expected(half) for half in halves]
@@ -209,12 +215,3 @@ def footage_uncertainty(
     covariance = cameras_covariance(fit, tracks, priors, scale)
     squared = _squared_errors(*derived, motions, covariance)
     return dict(zip(tracks.names, np.sqrt(squared).tolist(), strict=True))
-
-
-def _halves(corners: BoardCorners) -> tuple[BoardCorners, BoardCorners]:
-    """Split the corners by every other board frame, without cameras that a half does not hold."""
-    side = np.searchsorted(np.unique(corners.frame), corners.frame) % 2
-    seen = np.zeros((2, len(corners.cameras)))
-    np.add.at(seen, (side, corners.camera), 1)
-    held = (seen.min(0) >= LEAST_CORNERS)[corners.camera]
-    return corners.select(held & (side == 0)), corners.select(held & (side == 1))

@@ -175,7 +175,15 @@ def odd_footage(
         elif tags := measured[name].tags:
             path = inside(camera.path, camera.names[0]) if camera.names else camera.path
             orientation = ORIENTATION[tags.turn]
-            oddities += [w for w in (_rate(raw, path), _uneven(source)) if w] + _odd_pictures(tags)
+            with suppress(CaptureError):  # a container without a rate
+                fps = video_fps(path)
+                if abs(fps - raw.fps) > FPS_SLACK * raw.fps:
+                    oddities.append(
+                        f"is a video at {fps:.4g} fps, the capture says {raw.fps:.4g}; correct fps"
+                        " there"
+                    )
+            oddities += [why] if (why := _uneven(source)) else []
+            oddities += _odd_pictures(tags)
         if orientation != 1 and camera.orientation == 1:
             oddities.append(
                 "asks players to turn or mirror it, but is used as stored; calibration, board and"
@@ -184,14 +192,6 @@ def odd_footage(
         if oddities:
             found[f"camera {name}"] = "; ".join(oddities)
     return found
-
-
-def _rate(raw: RawCapture, path: Path) -> str:
-    with suppress(CaptureError):  # a container without a rate
-        fps = video_fps(path)
-        if abs(fps - raw.fps) > FPS_SLACK * raw.fps:
-            return f"is a video at {fps:.4g} fps, the capture says {raw.fps:.4g}; correct fps there"
-    return ""
 
 
 def _odd_pictures(tags: VideoTags) -> list[str]:

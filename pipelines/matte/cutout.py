@@ -336,7 +336,10 @@ def _foreign(views: Sequence[MatteView], sure: Sequence[np.ndarray]) -> list[np.
     most of it is left out, because its cut may include some wall. As cameras differ, colours of
     the view's own `sure` pixels (h, w) count too.
     """
-    cells = [_colour_cells(view.rgb) for view in views]
+    cells = []  # of Lab colour
+    for view in views:
+        lab = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2LAB).astype(np.int64) // (256 // COLOURS)
+        cells.append((lab[..., 0] * COLOURS + lab[..., 1]) * COLOURS + lab[..., 2])
     person = np.array(
         [_shares(cell[view.alpha > 0]) for cell, view in zip(cells, views, strict=True)]
     )
@@ -347,12 +350,6 @@ def _foreign(views: Sequence[MatteView], sure: Sequence[np.ndarray]) -> list[np.
         known = np.maximum(known, _shares(cells[k][one]))
         found.append((known < UNSEEN)[cells[k]])
     return found
-
-
-def _colour_cells(rgb: np.ndarray) -> np.ndarray:
-    """Return the cell of Lab colour (h, w) of pixels (h, w, 3) uint8."""
-    lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB).astype(np.int64) // (256 // COLOURS)
-    return (lab[..., 0] * COLOURS + lab[..., 1]) * COLOURS + lab[..., 2]
 
 
 def _shares(cells: np.ndarray) -> np.ndarray:

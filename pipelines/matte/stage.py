@@ -19,7 +19,6 @@ from express50.errors import CaptureError, NoFaceError, StageError
 from express50.files.images import box_about, shrink, tile_sheet, write_image
 from express50.geometry.cameras import Camera, pinhole, resized
 from express50.geometry.sampling import undistorted_mask
-from pipelines.matte.config import NETWORKS, WITHOUT_PLATE, MatteConfig
 from pipelines.matte.consensus import SIDE, Agreement, agree
 from pipelines.matte.cutout import CutView, cut_out, make_cut_view, soft_alpha
 from pipelines.matte.key import dilated, key_alpha
@@ -62,8 +61,11 @@ class CameraMatte:
     plated: bool = True
 
 
-def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
-    """Write `<camera>.png` per camera, and a contact sheet.
+def run(
+    dataset: Dataset, item: str, out: Path, *, method: str, weights: str, tile: int,
+    shadow: float, agreeing: bool,
+) -> Result:  # fmt: skip
+    """Write `<camera>.png` per camera, and a contact sheet; `agreeing` cameras correct each other.
 
     Raises:
         StageError: no camera could be matted.
@@ -71,12 +73,13 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
     cv2.setNumThreads(1)  # the runner counts one core per item
     cameras = read_cameras_of(dataset, item.split("/")[0], undistorted=False)
     ball = ball_of(cameras)
-    mattes, dropped, odd_plates = camera_mattes(dataset, item, config, cameras, ball)
+    matte_one = _matte_function(method, weights, tile, shadow)
+    mattes, dropped, odd_plates = camera_mattes(dataset, item, method, matte_one, cameras, ball)
     if not mattes:
         raise StageError(f"{item}: {dropped[0].why if dropped else 'no camera is calibrated'}")
     alphas = {name: matte.alpha for name, matte in mattes.items()}
     views = []
-    if not config.agree:
+    if not agreeing:
         found = Agreement(unchanged="matte.agree is off")
     elif ball is None:
         found = Agreement(unchanged="the cameras do not look at one place")
@@ -91,7 +94,7 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
         write_image(out / f"{name}.png", alpha)
     _write_picture(out, mattes, found)
     figures = {
-        "method": config.method,
+        "method": method,
         "views": len(views),
         "without_plate": [name for name, matte in mattes.items() if not matte.plated],
         "coverage": {name: round(float(a.mean()) / 255, 6) for name, a in final.items()},
@@ -112,8 +115,8 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
 
 
 def camera_mattes(
-    dataset: Dataset, item: str, config: MatteConfig, cameras: Mapping[str, Camera],
-    ball: Ball | None,
+    dataset: Dataset, item: str, method: str, matte_one: MatteFunction,
+    cameras: Mapping[str, Camera], ball: Ball | None,
 ) -> tuple[dict[str, CameraMatte], list[Note], list[Note]]:  # fmt: skip
     """Matte each camera of a peak; those without a plate are cut out together.
 
@@ -122,7 +125,7 @@ def camera_mattes(
     """
     subject, expression = item.split("/")
     read = partial(read_peak_frame, dataset, subject, expression)
-    matte_one = _matte_function(config)
+
     found: dict[str, CameraMatte] = {}
     seen: dict[str, CutView] = {}
     dropped: list[Note] = []
@@ -130,8 +133,8 @@ def camera_mattes(
     for name, camera in cameras.items():
         try:
             frame, valid, alpha = read(name), valid_pixels(camera), None
-            plate, why = _plate(dataset, subject, name, frame, valid, config)
-            if plate is not None or config.method in NETWORKS:
+            plate, why = _plate(dataset, subject, name, frame, valid, method)
+            if plate is not None or method == "salient":
                 alpha = eight_bit(matte_one(frame, plate, valid), valid)
                 noise = wall_noise(alpha, frame)
                 found[name] = CameraMatte(alpha, shrink(frame, SHOWN), noise)
@@ -159,20 +162,19 @@ def camera_mattes(
 
 
 def _plate(
-    dataset: Dataset, subject: str, camera: str, frame: np.ndarray, valid: np.ndarray,
-    config: MatteConfig,
+    dataset: Dataset, subject: str, camera: str, frame: np.ndarray, valid: np.ndarray, method: str
 ) -> tuple[np.ndarray | None, str]:  # fmt: skip
     """Read a plate and match it to the frame; also returns a warning, empty if all is well."""
-    if config.method in WITHOUT_PLATE:
+    if method not in ("key", "bgmv2"):
         return None, ""
     plate = read_plate_image(dataset, subject, camera)
-    if plate is None and config.method == "bgmv2":
+    if plate is None and method == "bgmv2":
         raise StageError(
             f"no clean plate of {camera}; photograph the empty set as plates/{camera}.png and run"
             " 'express50 ingest' and 'express50 frames' again, or set matte.method to key, grabcut"
             " or salient"
         )
-    if plate is None or config.method == "bgmv2":
+    if plate is None or method == "bgmv2":
         return plate, ""
     matched = match_plate(plate, frame, valid)
     if matched.share >= LEAST_SHARE:
@@ -202,18 +204,18 @@ def eight_bit(alpha: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.rint(np.where(valid, alpha, np.float32(0)) * 255).astype(np.uint8)
 
 
-def _matte_function(config: MatteConfig) -> MatteFunction:
+def _matte_function(method: str, weights: str, tile: int, shadow: float) -> MatteFunction:
     """Return the function that mattes one frame; torch is imported for networks only."""
-    if config.method in ("key", "grabcut"):
-        return lambda frame, plate, valid: key_alpha(frame, plate, valid, config.shadow)
+    if method in ("key", "grabcut"):
+        return lambda frame, plate, valid: key_alpha(frame, plate, valid, shadow)
     from pipelines.matte.learned import BGMV2, SALIENT, background_alpha, salient_alpha
     from pipelines.networks import load_network as load_weights
 
-    network = load_weights(config.weights, SALIENT if config.method == "salient" else BGMV2)
-    if config.method == "salient":
+    network = load_weights(weights, SALIENT if method == "salient" else BGMV2)
+    if method == "salient":
         return lambda frame, plate, valid: salient_alpha(network, frame)
     return lambda frame, plate, valid: background_alpha(
-        network, frame, exposed(plate, exposure_gain(frame, plate)), config.tile
+        network, frame, exposed(plate, exposure_gain(frame, plate)), tile
     )
 
 

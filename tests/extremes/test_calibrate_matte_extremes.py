@@ -14,7 +14,7 @@ from express50.rigs.world_frame import canonical_from_rig, move_cameras
 from pipelines.calibrate.board import gather, refine_corners, square_sides
 from pipelines.calibrate.board_rig import solve_rig
 from pipelines.calibrate.stage import check_given
-from pipelines.matte.config import MatteConfig
+from pipelines.matte import MatteConfig
 from pipelines.matte.key import key_alpha
 from pipelines.matte.plates import exposure_gain
 from tests.pipelines.board_rigs import (

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.matte_scenes import exposed, make_scene, plain
-from pipelines.matte.config import MatteConfig
+from pipelines.matte import MatteConfig
 from pipelines.matte.key import key_alpha
 
 

@@ -19,7 +19,6 @@ from pipelines.calibrate.footage_rig import solve_footage
 from pipelines.calibrate.given_rig import check_footage
 from pipelines.calibrate.tracks import mirror_features
 from pipelines.calibrate.uncertainty import state_uncertainty
-from pipelines.matte.config import MatteConfig
 from pipelines.matte.stage import _plate
 from tests.pipelines import test_calibrate_moves, test_ingest_quality
 from tests.pipelines.board_rigs import (
@@ -130,7 +129,7 @@ def test_a_plate_of_another_room(capture, tmp_path) -> None:
         assert [n.what for n in outcome.warnings if n.why == why] == ["cam01"]
     frame, valid = read_image(plate), np.ones((64, 64), bool)
     write_image(plate, np.full((64, 64, 3), 255, np.uint8))
-    why = _plate(dataset, "S001", "cam01", frame, valid, MatteConfig())[1]
+    why = _plate(dataset, "S001", "cam01", frame, valid, "key")[1]
     assert why.startswith("100% of its plate's top and sides is white: the plate is overexposed")
 
 

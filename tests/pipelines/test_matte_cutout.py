@@ -22,7 +22,7 @@ from express50.twin.config import TwinConfig
 from express50.twin.truth import Truth
 from pipelines import calibrate, frames, ingest
 from pipelines.matte import STAGE as MATTE
-from pipelines.matte.config import MatteConfig
+from pipelines.matte import MatteConfig
 from pipelines.matte.cutout import cut_out, make_cut_view, parts_of_a_person, soft_alpha
 from pipelines.matte.stage import valid_pixels
 from pipelines.photo.capture import make_photo_capture, open_picture, single_camera

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from express50.errors import ConfigError, StageError
-from pipelines.matte.config import MatteConfig
+from pipelines.matte import MatteConfig
 from pipelines.matte.learned import (
     BGMV2,
     SALIENT,
