@@ -22,9 +22,8 @@ from grmm.model import GRMM
 from grmm.shard_source import ShardSource
 from pipelines.depth import STAGE as DEPTH
 from pipelines.depth import DepthConfig
-from pipelines.pack import ENCODE
+from pipelines.pack import ENCODE, EncodeConfig, PackConfig
 from pipelines.pack import STAGE as PACK
-from pipelines.pack.config import EncodeConfig, PackConfig
 from tests.express50.dataset.tracked import track_arrays, world_vertices, write_track
 from tests.grmm.synthetic import tiny_config
 from tests.pipelines.bump_dataset import make_dataset, published

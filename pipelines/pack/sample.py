@@ -40,7 +40,6 @@ from express50.files.text import read_json_table
 from express50.geometry.cameras import Camera
 from express50.shards.codecs import encode_pictures
 from express50.shards.writer import PackedSample, sample_key
-from pipelines.pack.config import EncodeConfig
 from pipelines.pack.crop import (
     crop_pinhole,
     cut_depth,
@@ -158,9 +157,12 @@ class LoadedSample:
 
 
 def load_sample(
-    dataset: Dataset, subject: PackedSubject, expression: str, camera: Camera, config: EncodeConfig
-) -> LoadedSample:
+    dataset: Dataset, subject: PackedSubject, expression: str, camera: Camera, remove_torso: bool,
+    min_confidence: float,
+) -> LoadedSample:  # fmt: skip
     """Load one view from the outputs of the earlier stages.
+
+    Depth counts as known where its confidence is at least `min_confidence`.
 
     Raises:
         StageError: it is not tracked, an image is missing, or their sizes differ.
@@ -182,13 +184,13 @@ def load_sample(
             f"frame, matte, depth and regions differ in size: {', '.join(map(str, sizes))}"
         )
     torso = "kept"
-    if head is not None and parts is not None and config.torso == "remove":
+    if head is not None and parts is not None and remove_torso:
         # Depth stays where labels tell whose it is: elsewhere a torso's would bend the head.
         alpha, torso = head, "removed"
         valid = valid & ((head > 127) | label_mask(parts, "torso"))
-    if config.min_confidence > 0:
+    if min_confidence > 0:
         sure = read_image(folder / f"{camera.id}_confidence.png")
-        valid = valid & (sure >= round(255 * config.min_confidence))
+        valid = valid & (sure >= round(255 * min_confidence))
     plate = read_plate_image(dataset, subject.name, camera.id)
     return LoadedSample(rgb, plate, matte, alpha, depth, valid, parts, torso)
 
@@ -220,12 +222,9 @@ def occluded(parts: np.ndarray) -> dict[str, float]:
 
 
 def encode_sample(
-    loaded: LoadedSample,
-    subject: PackedSubject,
-    expression: str,
-    camera: Camera,
-    config: EncodeConfig,
-) -> tuple[PackedSample, dict]:
+    loaded: LoadedSample, subject: PackedSubject, expression: str, camera: Camera, size: int,
+    profile: str,
+) -> tuple[PackedSample, dict]:  # fmt: skip
     """Cut one view to the square around its tracked head, and encode its files.
 
     Returns the files, and the content of meta.json.
@@ -236,24 +235,24 @@ def encode_sample(
     track = subject.track
     row = track.row(expression)
     crop = head_crop(camera, track.vertices[row].astype(np.float64), loaded.alpha)
-    depth, valid = cut_depth(loaded.depth, loaded.valid, crop, config.size)
+    depth, valid = cut_depth(loaded.depth, loaded.valid, crop, size)
     if (farthest := depth[valid].max(initial=0)) >= DEPTH_LIMIT_M:
         raise StageError(
             f"its depth reaches {farthest:.2f} m; shards hold less than {DEPTH_LIMIT_M:.2f} m"
         )
-    rgb = cut_own_colours(loaded.rgb, loaded.matte, loaded.plate, crop, config.size)
-    parts = None if loaded.parts is None else cut_labels(loaded.parts, crop, config.size)
+    rgb = cut_own_colours(loaded.rgb, loaded.matte, loaded.plate, crop, size)
+    parts = None if loaded.parts is None else cut_labels(loaded.parts, crop, size)
     sample_key(subject.name, expression, camera.id)  # raises if an id cannot be a file name
-    gain = subject.gains.get(camera.id, np.ones(3)) if config.even_colour else np.ones(3)
+    gain = subject.gains.get(camera.id, np.ones(3))
     members = encode_pictures(
         rgb if (gain == 1).all() else scale_light(rgb, 1.0 / gain),
-        cut_image(loaded.alpha, crop, config.size),
+        cut_image(loaded.alpha, crop, size),
         depth_to_uint16(depth, valid),
         parts,
-        config.profile,
+        profile,
     )
     meta = subject.meta | {
-        "K": crop_pinhole(camera, crop, config.size).K.tolist(),
+        "K": crop_pinhole(camera, crop, size).K.tolist(),
         "cam_from_world": camera.cam_from_world.tolist(),
         "camera": camera.id,
         "colour_gain": gain.tolist(),
@@ -261,7 +260,7 @@ def encode_sample(
         "depth_scale_m": DEPTH_UNIT_M,
         "expression": expression,
         "frame": subject.peaks[expression],
-        "height": config.size,
+        "height": size,
         "label": subject.labels[expression],
         "occluded": None if parts is None else occluded(parts),
         "parts": parts is not None,
@@ -273,7 +272,7 @@ def encode_sample(
             "registered": expression in subject.registered,
             "shape": track.shape.tolist(),
         },
-        "width": config.size,
+        "width": size,
     }
     if (recorded := subject.recorded[camera.id]) != meta["source_size"]:
         meta["recorded_size"] = recorded

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,6 @@ from express50.files.text import read_json_table
 from express50.shards.reader import ShardReader, sample_panels, write_offsets, write_registered
 from express50.shards.writer import ShardWriter, gather_shards, write_manifest
 from pipelines.pack.card import split_position, split_subjects, write_card
-from pipelines.pack.config import EncodeConfig, PackConfig
 from pipelines.pack.sample import encode_sample, load_sample, read_subject
 
 SHARD_BYTES = 256_000_000  # a shard is closed at this size; an expression is never split
@@ -28,7 +28,10 @@ QC_SAMPLES = 12
 ON_CARD = ("subject", "expression", "camera", "label", "licence", "consent", "head", "parts")
 
 
-def encode(dataset: Dataset, name: str, config: EncodeConfig, out: Path) -> Result:
+def encode(
+    dataset: Dataset, name: str, out: Path, *, size: int, profile: str, even_colour: bool,
+    remove_torso: bool, min_confidence: float,
+) -> Result:  # fmt: skip
     """Write one subject's shards, index and manifest.
 
     Raises:
@@ -37,6 +40,8 @@ def encode(dataset: Dataset, name: str, config: EncodeConfig, out: Path) -> Resu
     """
     cv2.setNumThreads(1)
     subject = read_subject(dataset, name)
+    if not even_colour:
+        subject = replace(subject, gains={})
     writer = ShardWriter(out, SHARD_BYTES)
     metas: list[dict] = []
     dropped: list[Note] = []
@@ -45,8 +50,10 @@ def encode(dataset: Dataset, name: str, config: EncodeConfig, out: Path) -> Resu
         group = []
         for camera_id, camera in sorted(subject.cameras.items()):
             try:
-                loaded = load_sample(dataset, subject, expression, camera, config)
-                sample, meta = encode_sample(loaded, subject, expression, camera, config)
+                loaded = load_sample(
+                    dataset, subject, expression, camera, remove_torso, min_confidence
+                )
+                sample, meta = encode_sample(loaded, subject, expression, camera, size, profile)
             except (CaptureError, FormatError, StageError) as error:
                 dropped.append(Note(f"{name}/{expression}/{camera_id}", str(error)))
                 continue
@@ -72,14 +79,14 @@ def encode(dataset: Dataset, name: str, config: EncodeConfig, out: Path) -> Resu
         "with_parts": sum(meta["parts"] for meta in metas),
         "torso_removed": sum(meta["torso"] == "removed" for meta in metas),
         "registered": sum(meta["track"]["registered"] for meta in metas),
-        "size": config.size,
-        "profile": config.profile,
+        "size": size,
+        "profile": profile,
     }
     warnings = warn_of_gaps(metas) + subject.notes
     if without_depth:
         why = f"{without_depth} of {count(len(metas), 'sample')} know no depth"
-        if config.min_confidence > 0:
-            why += f"; lower encode.min_confidence, which is {config.min_confidence:g}"
+        if min_confidence > 0:
+            why += f"; lower encode.min_confidence, which is {min_confidence:g}"
         warnings.append(Note("depth", why))
     return Result(metrics, dropped, warnings)
 
@@ -100,7 +107,7 @@ def warn_of_gaps(metas: list[dict]) -> list[Note]:
     return warnings
 
 
-def pack(dataset: Dataset, config: PackConfig, out: Path) -> Result:
+def pack(dataset: Dataset, out: Path, test_subjects: Sequence[str], test_fraction: float) -> Result:
     """Gather the encoded subjects' shards; write index, manifest, splits and card.
 
     Raises:
@@ -111,10 +118,10 @@ def pack(dataset: Dataset, config: PackConfig, out: Path) -> Result:
     if not accounts:
         why = "; ".join(f"{note.what}: {note.why}" for note in dropped[:3])
         raise StageError(f"shards: no subject can be packed ({why}); run the earlier stages")
-    splits = split_subjects(list(accounts), config.test_subjects, config.test_fraction)
+    splits = split_subjects(list(accounts), test_subjects, test_fraction)
     sources = [(dataset.item_dir("encode", n), split) for split in splits for n in splits[split]]
     digests = gather_shards(sources, out)
-    how = "named" if config.test_subjects else "hash of the subject's id"
+    how = "named" if test_subjects else "hash of the subject's id"
     write_json(out / "splits.json", splits | {"chosen_by": how})
     reader = ShardReader(out)
     totals = _totals(out, reader, accounts)
@@ -134,20 +141,18 @@ def pack(dataset: Dataset, config: PackConfig, out: Path) -> Result:
     again = "run 'express50 pack' without a subset"
     mixed = [key for key in ("size", "profile") if "," in totals[key]]
     warnings = [Note(key, f"subjects were encoded with {totals[key]}; {again}") for key in mixed]
-    return Result(
-        metrics, dropped, warnings + warn_of_temporary_test_subjects(splits["test"], config)
-    )
+    if not test_subjects:
+        warnings += warn_of_temporary_test_subjects(splits["test"], test_fraction)
+    return Result(metrics, dropped, warnings)
 
 
-def warn_of_temporary_test_subjects(test: Sequence[str], config: PackConfig) -> list[Note]:
+def warn_of_temporary_test_subjects(test: Sequence[str], fraction: float) -> list[Note]:
     """Warn of a test subject that was chosen only because no id's hash is below the fraction."""
-    if config.test_subjects:
-        return []
     why = (
         "moves to training as soon as a subject whose id has a lower hash is added; to keep it in"
         " the test split, name it in pack.test_subjects"
     )
-    return [Note(name, why) for name in test if split_position(name) >= config.test_fraction]
+    return [Note(name, why) for name in test if split_position(name) >= fraction]
 
 
 def _read_accounts(dataset: Dataset) -> tuple[dict[str, dict], list[Note]]:

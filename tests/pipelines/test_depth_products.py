@@ -17,8 +17,7 @@ from express50.geometry.transforms import make_transform
 from express50.head.load import load_head
 from pipelines.depth import STAGE, DepthConfig
 from pipelines.depth.maps import PhotoErrors, compared_view, photo_errors
-from pipelines.pack import ENCODE
-from pipelines.pack.config import EncodeConfig
+from pipelines.pack import ENCODE, EncodeConfig
 from tests.pipelines.bump_dataset import make_dataset, published
 from tests.pipelines.bump_head import mesh, render, ring
 from tests.stages import run_here

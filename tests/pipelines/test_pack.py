@@ -24,10 +24,9 @@ from express50.shards.reader import ShardReader
 from express50.shards.writer import verify
 from pipelines.depth import STAGE as DEPTH
 from pipelines.depth import DepthConfig
-from pipelines.pack import ENCODE
+from pipelines.pack import ENCODE, EncodeConfig, PackConfig
 from pipelines.pack import STAGE as PACK
 from pipelines.pack.card import people_lines, split_subjects
-from pipelines.pack.config import EncodeConfig, PackConfig
 from pipelines.pack.crop import Crop, crop_pinhole, cut_depth, cut_image, cut_labels, head_crop
 from pipelines.pack.sample import nameless, occluded, read_subject
 from pipelines.pack.stage import warn_of_gaps, warn_of_temporary_test_subjects
@@ -154,10 +153,10 @@ def test_split_is_disjoint_and_stable():
     grown = split_subjects([*names, "S999"], (), 0.2)
     assert set(split["test"]) <= set(grown["test"])
     lent = split_subjects(["A", "B"], (), 0.01)["test"]
-    warned = warn_of_temporary_test_subjects(lent, PackConfig(test_fraction=0.01))
+    warned = warn_of_temporary_test_subjects(lent, 0.01)
     assert [note.what for note in warned] == lent != []
-    assert warn_of_temporary_test_subjects(split["test"], PackConfig(test_fraction=0.2)) == []
-    assert warn_of_temporary_test_subjects(lent, PackConfig(test_subjects=tuple(lent))) == []
+    assert warn_of_temporary_test_subjects(split["test"], 0.2) == []
+
     assert split_subjects(["A"], (), 0.5) == {"train": ["A"], "test": []}
     assert split_subjects(["A", "B"], ("B",), 0.5) == {"train": ["A"], "test": ["B"]}
     with pytest.raises(StageError, match="A, B"):
