@@ -43,7 +43,7 @@ from express50.contract.layout import Dataset
 from express50.files.images import write_image
 from express50.files.text import markdown_table
 from express50.geometry.transforms import transform_points
-from express50.twin.config import TwinConfig
+from express50.twin import TwinConfig
 from express50.twin.truth import Truth
 from pipelines import ingest
 from pipelines.ingest import register

@@ -49,7 +49,7 @@ from express50.geometry.transforms import (
     matrix_to_axis_angle,
 )
 from express50.rigs.world_frame import meeting_point
-from express50.twin.config import TwinConfig
+from express50.twin import TwinConfig
 from express50.twin.rig import make_rig, make_sensor
 from express50.twin.truth import align_worlds
 from pipelines.calibrate import STAGE

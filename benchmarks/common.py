@@ -23,7 +23,7 @@ from express50.contract.stage import Stage
 from express50.geometry.cameras import Camera, pinhole
 from express50.geometry.sampling import undistort_image, undistorted_mask
 from express50.runner.runner import run_stage
-from express50.twin.config import TwinConfig
+from express50.twin import TwinConfig
 from express50.twin.record import print_progress, record
 from express50.twin.truth import Truth
 from pipelines import ingest

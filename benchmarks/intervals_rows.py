@@ -26,8 +26,7 @@ from express50.files.calibration import read_cameras, write_cameras
 from express50.files.images import read_image, write_image
 from express50.geometry.transforms import axis_angle_to_matrix
 from express50.runner.runner import run_stage
-from express50.twin import rig
-from express50.twin.config import TwinConfig
+from express50.twin import TwinConfig, rig
 from express50.twin.record import record
 from express50.twin.truth import Truth
 from pipelines import calibrate, depth, frames, ingest, matte, register, track

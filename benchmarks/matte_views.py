@@ -57,7 +57,7 @@ from express50.errors import NoFaceError
 from express50.files.images import contact_sheet, write_image
 from express50.geometry.cameras import pinhole
 from express50.geometry.sampling import evenly
-from express50.twin.config import TwinConfig
+from express50.twin import TwinConfig
 from express50.twin.truth import Truth
 from pipelines.matte import MatteConfig
 from pipelines.matte.consensus import agree

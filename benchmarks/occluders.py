@@ -41,7 +41,7 @@ from express50.dataset.tracks import read_track
 from express50.files.images import read_image
 from express50.geometry.raycast import visible_faces
 from express50.geometry.transforms import transform_points
-from express50.twin.config import TwinConfig
+from express50.twin import TwinConfig
 from express50.twin.truth import Truth, align_worlds
 from pipelines import depth, regions, track
 

@@ -41,7 +41,7 @@ from express50.contract.config import build_config
 from express50.contract.layout import Dataset
 from express50.files.calibration import read_cameras, write_cameras
 from express50.head.load import load_head
-from express50.twin.config import TwinConfig
+from express50.twin import TwinConfig
 from express50.twin.record import record
 from express50.twin.truth import Truth
 from pipelines import calibrate, frames, ingest, matte

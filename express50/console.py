@@ -14,7 +14,7 @@ import textwrap
 import traceback
 import warnings
 from _thread import interrupt_main
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Timer
 from typing import IO, Any
@@ -317,19 +317,17 @@ def format_table(header: list[str], rows: list[list[str]]) -> Iterator[str]:
     """Yield the lines of a table with aligned columns, numbers to the right."""
     columns = list(zip(header, *rows, strict=True))
     widths = [max(map(len, column)) for column in columns]
-    right = [_holds_numbers(column[1:]) for column in columns]
+    right = []  # columns whose cells are numbers, where they are not empty, ``n/a`` or ``-``
+    for column in columns:
+        filled = [cell for cell in column[1:] if cell not in ("", "n/a", "-")]
+        numbers = all(re.fullmatch(r"[+-]?[\d,]*\.?\d+", cell) for cell in filled)
+        right.append(bool(filled) and numbers)
     for row in [header, *rows]:
         cells = (
             cell.rjust(width) if number else cell.ljust(width)
             for cell, width, number in zip(row, widths, right, strict=True)
         )
         yield "  ".join(cells).rstrip()
-
-
-def _holds_numbers(cells: Sequence[str]) -> bool:
-    """Return whether all cells that are not empty, ``n/a`` or ``-`` are numbers."""
-    filled = [cell for cell in cells if cell not in ("", "n/a", "-")]
-    return bool(filled) and all(re.fullmatch(r"[+-]?[\d,]*\.?\d+", cell) for cell in filled)
 
 
 def format_seconds(seconds: float) -> str:

@@ -84,7 +84,7 @@ def run_chain(args: argparse.Namespace) -> int:
 
 def run_tune(args: argparse.Namespace) -> int:
     """Measure every setting of every stage on a few items, and write the Pareto front."""
-    from express50.dial.tune import tune
+    from express50.dial.measuring import tune
 
     with _chain(args) as chain:
         if chain is None:

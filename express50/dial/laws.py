@@ -62,22 +62,16 @@ def _weighed(samples: Sequence[MeasuredSize]) -> tuple[np.ndarray, np.ndarray, n
     """Return work (S,), mean seconds (S,) above 0, and the errors (S,) of these."""
     works = np.array([sample.work for sample in samples])
     means = np.maximum([np.mean(sample.seconds) for sample in samples], 1e-9)
-    errors = _errors(samples, means)
-    # A mean that came out low must not weigh more for it: errors are relative to the fitted law.
-    errors *= np.array([_law(works, means, errors, one) for one in works]) / means
-    return works, means, errors
-
-
-def _errors(samples: Sequence[MeasuredSize], means: np.ndarray) -> np.ndarray:
-    """Return standard errors of means; items of all sizes have one relative spread."""
     counts = np.array([len(sample.seconds) for sample in samples])
-    free = int((counts - 1).sum())
-    spread = ALONE
+    free, spread = int((counts - 1).sum()), ALONE  # items of all sizes have one relative spread
     if free > 2:
         squares = [float(np.var(s.seconds)) * len(s.seconds) for s in samples]
         # Student's variance instead of the normal one: the spread is measured on a few items.
         spread = float(np.sqrt((np.array(squares) / means**2).sum() / (free - 2)))
-    return np.maximum(spread / np.sqrt(counts), LEAST_SPREAD) * means
+    errors = np.maximum(spread / np.sqrt(counts), LEAST_SPREAD) * means
+    # A mean that came out low must not weigh more for it: errors are relative to the fitted law.
+    errors *= np.array([_law(works, means, errors, one) for one in works]) / means
+    return works, means, errors
 
 
 def _law(

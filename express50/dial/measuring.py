@@ -1,29 +1,35 @@
-"""Measure a dataset within a budget, or read what was measured before; say what is left to make."""
+"""Measure settings on a dataset, within a budget or all of them, and say what is left to make."""
 
 from __future__ import annotations
 
+import csv
+import io
 import math
 import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
-from express50.console import count, format_seconds
-from express50.contract.config import made_with
+from express50.console import count, format_seconds, format_table
+from express50.contract.config import PRESETS, made_with
 from express50.contract.layout import exclusion_reason
 from express50.dial.budget import Clock, Goal
 from express50.dial.choice import (
+    Point,
     Workload,
     choose,
+    error_text,
     front,
     goal_result,
     item_seconds,
+    labels_of,
     point_of,
     taken_over,
 )
 from express50.dial.figures import PilotFigures, Trial, dial_dir, footage_of, read_measured
-from express50.dial.pilot import PEAKS, Chain, Pilot, broken_stage, measure
+from express50.dial.pilot import PEAKS, Chain, Pilot, broken_stage, measure, standard_of
 from express50.errors import ConfigError, StageError
-from express50.files.atomic import write_json
+from express50.files.atomic import write_bytes, write_json
 from express50.runner.ledger import Ledger
 
 PILOTS = 3  # subjects whose footage is tried if the first one's is bad
@@ -167,7 +173,14 @@ def _measure_one(chain: Chain, clock: Clock, allowance: _Allowance) -> PilotFigu
             found = measure(pilot, allowance)
             broken = broken_stage(chain, found.trials[0])
             if pilot.cut:
-                raise ConfigError(_too_small(chain, clock, found))
+                least = clock.now() + front(workload(chain, found, clock.cores, {}))[0].seconds
+                raise ConfigError(
+                    f"--budget {clock.budget.text if clock.budget else ''}: it ended before every"
+                    " stage was measured at its cheapest setting; those that were measured, and"
+                    f" their measuring, need {format_seconds(least)}"
+                    f" {time_words(clock.cores, chain.pool.width())}; give several times as much."
+                    " What was measured is kept, so that the same command gets further"
+                )
             if not broken:
                 return found
             reason = f"{broken}: {found.trials[0].failed[broken]}"
@@ -183,17 +196,6 @@ def _measure_one(chain: Chain, clock: Clock, allowance: _Allowance) -> PilotFigu
     raise StageError(
         f"{chain.dataset.root}: no subject could be measured: {reason}; correct that, or run"
         " without --budget to see what each stage says"
-    )
-
-
-def _too_small(chain: Chain, clock: Clock, found: PilotFigures) -> str:
-    """Say that the budget ended in the first trial."""
-    least = clock.now() + front(workload(chain, found, clock.cores, {}))[0].seconds
-    return (
-        f"--budget {clock.budget.text if clock.budget else ''}: it ended before every stage was"
-        " measured at its cheapest setting; those that were measured, and their measuring, need"
-        f" {format_seconds(least)} {time_words(clock.cores, chain.pool.width())}; give several"
-        " times as much. What was measured is kept, so that the same command gets further"
     )
 
 
@@ -226,3 +228,78 @@ def workload(
                     made_here[stage.name] = label, share
     there = [t for t in measured.trials if t.folder and (dataset.pilot_dir / t.folder).is_dir()]
     return replace(load, done=[made_here, *(taken_over(load, trial) for trial in there)])
+
+
+def tune(chain: Chain) -> tuple[dict[str, Any], list[str]]:
+    """Measure every setting on a few items; write ``dial/front.json`` and ``dial/front.csv``.
+
+    Returns the table and lines for people.
+
+    Raises:
+        StageError: no footage can be measured.
+    """
+    measured = measured_figures(chain, Clock(None))
+    load = replace(workload(chain, measured, False, {}), done=())
+    points = front(load)
+    presets = {preset: point_of(load, preset_settings(load, preset)) for preset in PRESETS}
+    table = {
+        "schema": "express50.front/1",
+        "footage": asdict(load.footage),
+        "workers": load.width,
+        "front": [_row(load, point) for point in points],
+        "presets": {name: _row(load, point) for name, point in presets.items()},
+    }
+    folder = dial_dir(chain.dataset)
+    write_json(folder / "front.json", table)
+    write_bytes(folder / "front.csv", _csv(points, presets).encode())
+    shutil.rmtree(chain.dataset.pilot_dir, ignore_errors=True)
+    return table, [*_lines(load, points, presets), f"wrote {folder}/front.json and front.csv"]
+
+
+def _row(load: Workload, point: Point) -> dict[str, Any]:
+    return asdict(point) | {"core_seconds": core_seconds(load, point.settings)}
+
+
+def preset_settings(load: Workload, preset: str) -> dict[str, str]:
+    """Return the settings of a preset; standard's where a stage lacks it or it was not tried."""
+    found = {}
+    for stage in load.stages:
+        tried = labels_of(load, stage.name)
+        found[stage.name] = preset if preset in tried else standard_of(dict.fromkeys(tried))
+    return found
+
+
+def _csv(points: list[Point], presets: Mapping[str, Point]) -> str:
+    """Write a row per point: time, errors with intervals, settings."""
+    out = io.StringIO()
+    head = ["point", "seconds"]
+    for name, error in points[-1].errors.items():
+        head += [f"{name}_{error.unit}{end}" for end in ("", "_low", "_high")]
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow([*head, *points[-1].settings])
+    for name, point in [*((str(k), p) for k, p in enumerate(points)), *presets.items()]:
+        figures = [f for e in point.errors.values() for f in (e.value, e.low, e.high)]
+        row = [name, f"{point.seconds:.1f}", *(f"{f:.5g}" for f in figures)]
+        writer.writerow([*row, *point.settings.values()])
+    return out.getvalue()
+
+
+def _lines(load: Workload, points: list[Point], presets: Mapping[str, Point]) -> list[str]:
+    """Write the front for people: settings are those that change from one point to the next."""
+    usual = preset_settings(load, "standard")
+    rows = []
+    for point in points:
+        same = [name for name, one in presets.items() if one.settings == point.settings]
+        changed = ", ".join(
+            f"{n} {label}" for n, label in point.settings.items() if label != usual[n]
+        )
+        errors = [error_text(name, error).partition(" ")[2] for name, error in point.errors.items()]
+        rows.append(
+            [format_seconds(point.seconds), *errors, "/".join(same) or changed or "standard"]
+        )
+    head = ["time", *points[-1].errors, "settings that differ from standard"]
+    beaten = [
+        name for name, one in presets.items() if one.settings not in [p.settings for p in points]
+    ]
+    words = f"not on the front, as another choice is quicker and no worse: {', '.join(beaten)}"
+    return [*format_table(head, rows), *([words] if beaten else [])]

@@ -71,8 +71,16 @@ def restore(
     if not entry.is_dir():
         return None
     try:
-        receipt = _whole_receipt(entry)
-        if (receipt.stage, receipt.item, receipt.fingerprint) == (stage, item, fingerprint):
+        row = read_json_table(entry / RECEIPT, FormatError)
+        made = row.pop("made")
+        marks = {name: FileMark(**mark) for name, mark in made.pop("files").items()}
+        receipt = Receipt(**row, made=Made(files=marks, **made))
+        found = {path.relative_to(entry).as_posix(): path for path in files_of(entry)}
+        whole = {name: mark.sha256 for name, mark in marks.items()} == {
+            name: file_sha256(path) for name, path in found.items()
+        }
+        asked = stage, item, fingerprint
+        if whole and (receipt.stage, receipt.item, receipt.fingerprint) == asked:
             with publishing(folder, dataset, stage, item, keeping(dataset, former)) as out:
                 entry.rename(out)  # over the empty folder, in one step
                 (out / RECEIPT).unlink()
@@ -81,19 +89,6 @@ def restore(
         pass  # it is made instead, which also says what is wrong with the disk
     shutil.rmtree(entry, ignore_errors=True)
     return None
-
-
-def _whole_receipt(entry: Path) -> Receipt:
-    """Read an entry's receipt and compare all of its files with it; FormatError if they differ."""
-    row = read_json_table(entry / RECEIPT, FormatError)
-    made = row.pop("made")
-    marks = {name: FileMark(**mark) for name, mark in made.pop("files").items()}
-    found = {path.relative_to(entry).as_posix(): path for path in files_of(entry)}
-    if {name: mark.sha256 for name, mark in marks.items()} != {
-        name: file_sha256(path) for name, path in found.items()
-    }:
-        raise FormatError(f"{entry}: not as published")
-    return Receipt(**row, made=Made(files=marks, **made))
 
 
 def make_room(dataset: Dataset) -> bool:

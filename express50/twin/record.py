@@ -26,7 +26,7 @@ from express50.contract.config import field_documents
 from express50.errors import CaptureError
 from express50.files.atomic import dump_json, link_file, write_json
 from express50.runner.worker import cap_threads
-from express50.twin.config import TwinConfig
+from express50.twin import TwinConfig
 
 _EXAMPLE = """express50 twin record build/twin --subjects 4 --cameras 8 --width 320 --height 320 \\
       --expressions neutral,smile,jaw_open --frames-per-expression 8 --seed 0

@@ -15,10 +15,10 @@ from express50.files.images import encode_png
 from express50.files.video import ImageFootage, VideoFootage
 from express50.geometry.cameras import Camera
 from express50.head.load import load_head
+from express50.twin import TwinConfig
 from express50.twin.alive import LivingSkin, living_skin
 from express50.twin.board import board_poses, render_board, studio_bands
 from express50.twin.body import Body, build_body, pose_body, with_hand
-from express50.twin.config import TwinConfig
 from express50.twin.render import RowBand, Sampling, hull_of, render_band, window_of
 from express50.twin.rig import Sensor, expose, make_rig, make_sensor
 from express50.twin.shade import LitScene, build_scene, find_eyes, make_lighting, shade

@@ -18,7 +18,7 @@ from express50.files.images import read_alpha, write_image
 from express50.geometry.cameras import pinhole
 from express50.head.load import load_head
 from express50.shards.reader import ShardReader
-from express50.twin.config import TwinConfig
+from express50.twin import TwinConfig
 from express50.twin.truth import Truth
 from pipelines import calibrate, frames, ingest
 from pipelines.matte import STAGE as MATTE

@@ -6,7 +6,7 @@ from express50.__main__ import main
 from express50.console import USAGE
 from express50.contract.layout import Dataset
 from express50.dataset.report import render_page
-from express50.dial.tune import tune
+from express50.dial.measuring import tune
 from tests.express50.dial.toy_chain import PAUSE, captures_of, chain_of
 
 

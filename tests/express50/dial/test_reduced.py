@@ -14,10 +14,10 @@ from express50.capture.index import peak_items, read_index
 from express50.contract.layout import Dataset
 from express50.contract.stage import ExpectedError, Growth, Result, Stage
 from express50.dial.budget import parse_budget
+from express50.dial.measuring import tune
 from express50.dial.pilot import Chain
 from express50.dial.results import ResultKind
 from express50.dial.run import run_within
-from express50.dial.tune import tune
 from express50.files.atomic import write_json
 from express50.files.calibration import write_cameras
 from express50.runner.executor import Pool

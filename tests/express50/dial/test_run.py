@@ -13,7 +13,7 @@ from express50.contract.layout import Dataset, existing_dataset
 from express50.dial.budget import Clock, parse_budget, parse_goal
 from express50.dial.choice import point_of
 from express50.dial.figures import Cost, Footage, Trial, dial_dir
-from express50.dial.measuring import measured_figures, workload
+from express50.dial.measuring import measured_figures, tune, workload
 from express50.dial.pilot import Pilot, guessed, keep_for_run, trial_seconds
 from express50.dial.run import (
     RunState,
@@ -22,7 +22,6 @@ from express50.dial.run import (
     run_file,
     run_within,
 )
-from express50.dial.tune import tune
 from express50.errors import ConfigError, StageError
 from express50.files.atomic import write_json
 from express50.runner.runner import run_stage

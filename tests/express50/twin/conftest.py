@@ -3,7 +3,7 @@ import dataclasses
 import pytest
 import torch
 
-from express50.twin.config import TwinConfig
+from express50.twin import TwinConfig
 from express50.twin.record import record
 
 SMALL = TwinConfig(

@@ -17,7 +17,7 @@ from express50.console import USAGE
 from express50.errors import CaptureError, ConfigError
 from express50.files.images import read_image
 from express50.files.video import VideoFootage, iterate_video
-from express50.twin.config import TwinConfig
+from express50.twin import TwinConfig
 from express50.twin.record import print_progress, record
 from express50.twin.studio import film_board, film_subject
 from tests.faults.toy import tree

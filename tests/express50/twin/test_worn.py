@@ -5,8 +5,8 @@ import pytest
 
 from express50.errors import ConfigError
 from express50.geometry.raycast import mesh_scene
+from express50.twin import KINDS, TwinConfig
 from express50.twin.body import pose_body
-from express50.twin.config import KINDS, TwinConfig
 from express50.twin.record import record
 from express50.twin.rig import make_rig
 from express50.twin.shade import build_scene, find_eyes, make_lighting, shade
