@@ -77,7 +77,11 @@ class Recorded(Generic[Result]):
                 else:
                     mine.fill_(value)
             recording.play()
-            return _copied(recording.outputs)
+            outputs: Any = recording.outputs
+            if isinstance(outputs, Tensor):
+                return outputs.clone()
+            copies = {name: value.clone() for name, value in vars(outputs).items()}
+            return replace(outputs, **copies)
 
 
 def _can_record(values: Sequence[Tensor | float]) -> bool:
@@ -118,9 +122,3 @@ def _record(
         with torch.cuda.graph(graph, capture_error_mode="thread_local"):
             outputs = function(*inputs)
     return _Recording(play=graph.replay, inputs=inputs, outputs=outputs)
-
-
-def _copied(result: Any) -> Any:
-    if isinstance(result, Tensor):
-        return result.clone()
-    return replace(result, **{name: value.clone() for name, value in vars(result).items()})

@@ -152,7 +152,17 @@ def read_track(path: Path) -> Track:
             numbers[name] = _doubt(arrays, name, numbers["vertices"].shape[:2])
         if len(set(names.tolist())) != len(names):
             raise ValueError("an expression appears twice")
-        glasses, rows = _glasses(arrays, len(names))
+        glasses, rows = None, np.zeros(0, np.int64)
+        if "glasses" in arrays:
+            glasses, rows = arrays["glasses"], arrays["glasses_row"]
+            check_shape("glasses", glasses, (rows.size, 3))
+            check_finite("glasses", glasses)
+            known = np.arange(len(names))
+            if rows.ndim != 1 or rows.dtype.kind not in "iu" or not np.isin(rows, known).all():
+                raise ValueError(
+                    f"glasses_row must name one of {len(names)} expressions for each point"
+                )
+            glasses, rows = glasses.astype(np.float32), rows.astype(np.int64)
         return Track(
             head=str(arrays["head"]), expressions=tuple(names.tolist()), **numbers,
             glasses=glasses, glasses_row=rows,
@@ -206,18 +216,6 @@ def _doubt(arrays: dict[str, np.ndarray], name: str, shape: tuple[int, ...]) -> 
     check_shape(name, arrays[name], shape)
     check_finite(name, arrays[name])
     return arrays[name].astype(np.float32)
-
-
-def _glasses(arrays: dict[str, np.ndarray], count: int) -> tuple[np.ndarray | None, np.ndarray]:
-    """Return points on glasses in `count` expressions, and their rows; None without any."""
-    if "glasses" not in arrays:
-        return None, np.zeros(0, np.int64)
-    places, rows = arrays["glasses"], arrays["glasses_row"]
-    check_shape("glasses", places, (rows.size, 3))
-    check_finite("glasses", places)
-    if rows.ndim != 1 or rows.dtype.kind not in "iu" or not np.isin(rows, np.arange(count)).all():
-        raise ValueError(f"glasses_row must name one of {count} expressions for each point")
-    return places.astype(np.float32), rows.astype(np.int64)
 
 
 def registration_of(path: Path, track: Track, digest: str) -> Registration | None:

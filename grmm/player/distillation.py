@@ -181,9 +181,32 @@ def distil(person: Person) -> Avatar:
 
 @torch.no_grad()
 def all_gaussians(person: Person) -> Avatar:
-    """Distil a person with every Gaussian of the model."""
+    """Distil a person with every Gaussian of the model.
+
+    The mesh decoder's displacements are fitted by least squares and added to the shapes; the head's
+    own pose stays exact.
+    """
+    loaded, avatar = person.loaded, _exact_parts(person)
+    if loaded.model.mesh is None:
+        return avatar
     poses = sampled_poses(person, POSES, torch.Generator().manual_seed(0))
-    return _with_mesh_decoder(person, _exact_parts(person), poses)
+    rows, targets = [], []
+    for pose in [person.pose(person.head.tracked), *poses]:
+        head = person.at(pose)
+        gaussians = loaded.model.geometry(head.z_id, head.z_exp, head.state(loaded))
+        features, turn, _ = _skinning(avatar, pose)
+        rows.append(features)
+        targets.append(torch.linalg.solve(turn, gaussians.displacement.to(turn)))
+    first, start = rows[0], targets[0]
+    moved = torch.stack(rows[1:]) - first
+    wanted = torch.stack(targets[1:]) - start
+    deviation = moved.square().mean(0).sqrt().clamp_min(1e-6)
+    moved = moved / deviation
+    gram = moved.T @ moved + RIDGE * len(moved) * torch.eye(moved.shape[1]).to(moved)
+    solution = torch.linalg.solve(gram, moved.T @ wanted.flatten(1)) / deviation[:, None]
+    added = solution.view_as(avatar.shapes)
+    rest = avatar.rest + start - torch.einsum("f,fvc->vc", first, added)
+    return replace(avatar, rest=rest, shapes=avatar.shapes + added)
 
 
 @torch.no_grad()
@@ -350,33 +373,6 @@ def _direction_features(view: PinholeView) -> Tensor:
     x, y, z = view.direction()
     one = torch.ones_like(x)
     return torch.stack([one, x, y, z, x * y, y * z, z * x, x * x - z * z, y * y])
-
-
-def _with_mesh_decoder(person: Person, avatar: Avatar, poses: list[AvatarPose]) -> Avatar:
-    """Add the mesh decoder's displacements, fitted by least squares, to the shapes.
-
-    The head's own pose stays exact.
-    """
-    loaded = person.loaded
-    if loaded.model.mesh is None:
-        return avatar
-    rows, targets = [], []
-    for pose in [person.pose(person.head.tracked), *poses]:
-        head = person.at(pose)
-        gaussians = loaded.model.geometry(head.z_id, head.z_exp, head.state(loaded))
-        features, turn, _ = _skinning(avatar, pose)
-        rows.append(features)
-        targets.append(torch.linalg.solve(turn, gaussians.displacement.to(turn)))
-    first, start = rows[0], targets[0]
-    moved = torch.stack(rows[1:]) - first
-    wanted = torch.stack(targets[1:]) - start
-    deviation = moved.square().mean(0).sqrt().clamp_min(1e-6)
-    moved = moved / deviation
-    gram = moved.T @ moved + RIDGE * len(moved) * torch.eye(moved.shape[1]).to(moved)
-    solution = torch.linalg.solve(gram, moved.T @ wanted.flatten(1)) / deviation[:, None]
-    added = solution.view_as(avatar.shapes)
-    rest = avatar.rest + start - torch.einsum("f,fvc->vc", first, added)
-    return replace(avatar, rest=rest, shapes=avatar.shapes + added)
 
 
 def _skinning(avatar: Avatar, pose: AvatarPose) -> tuple[Tensor, Tensor, Tensor]:

@@ -377,8 +377,19 @@ def mirrored_by_faces(poses: FacePoses) -> dict[str, str]:
     While heads turn, the rotation from one camera to another stays the same only if both or neither
     are mirrored. Nothing is found if heads keep still, or if half of the cameras would be named.
     """
+    # By how many degrees (2,) a camera's rotation to others varies over frame sets, for its
+    # pictures as recorded and mirrored: medians over two or more cameras.
+    varying: dict[str, list[np.ndarray]] = {}
+    for name, other in permutations(sorted(poses), 2):
+        shared = sorted(set(poses[name]) & set(poses[other]))
+        if len(shared) < TURNS:
+            continue
+        own, theirs = (np.stack([poses[n][frame][0] for frame in shared]) for n in (name, other))
+        ways = [own @ np.linalg.inv(theirs), MIRROR_X @ own @ MIRROR_X @ np.linalg.inv(theirs)]
+        turns = [_turns(votes, mean_transform(votes, np.ones(len(votes)))) for votes in ways]
+        varying.setdefault(name, []).append(np.sqrt(np.mean(np.square(turns), axis=1)))
+    spreads = {name: np.median(rows, axis=0) for name, rows in varying.items() if len(rows) >= 2}
     found = {}
-    spreads = _face_spreads(poses)
     for name, (recorded, turned) in spreads.items():
         usual = np.median([spread[0] for other, spread in spreads.items() if other != name])
         if turned < TURNED * recorded and usual < TURNED * recorded:
@@ -388,23 +399,6 @@ def mirrored_by_faces(poses: FacePoses) -> dict[str, str]:
                 " mirroring off where they are recorded, or mirror the files"
             )
     return found if 2 * len(found) < len(spreads) else {}
-
-
-def _face_spreads(poses: FacePoses) -> dict[str, np.ndarray]:
-    """Return by how many degrees (2,) each camera's rotation to others varies over frame sets.
-
-    The values are for its pictures as recorded and mirrored, medians over two or more cameras.
-    """
-    found: dict[str, list[np.ndarray]] = {}
-    for name, other in permutations(sorted(poses), 2):
-        shared = sorted(set(poses[name]) & set(poses[other]))
-        if len(shared) < TURNS:
-            continue
-        own, theirs = (np.stack([poses[n][frame][0] for frame in shared]) for n in (name, other))
-        ways = [own @ np.linalg.inv(theirs), MIRROR_X @ own @ MIRROR_X @ np.linalg.inv(theirs)]
-        turns = [_turns(votes, mean_transform(votes, np.ones(len(votes)))) for votes in ways]
-        found.setdefault(name, []).append(np.sqrt(np.mean(np.square(turns), axis=1)))
-    return {name: np.median(rows, axis=0) for name, rows in found.items() if len(rows) >= 2}
 
 
 def _turns(transforms: np.ndarray, mean: np.ndarray) -> np.ndarray:

@@ -194,7 +194,13 @@ def _judge_size(cameras: dict[str, Camera], tracks: PointTracks) -> tuple[dict[s
     if nowhere or EYES_MM[0] < eyes_mm < EYES_MM[1]:
         return cameras, ""
     factor = eyes_mm / USUAL_EYES_MM
-    other = {name: _with_focal(camera, factor) for name, camera in cameras.items()}
+    other = {}  # the cameras with focal lengths that explain the distance
+    for name, camera in cameras.items():
+        params = [
+            p * factor if key in ("f", "fx", "fy") else p
+            for key, p in zip(MODELS[camera.model], camera.params, strict=True)
+        ]
+        other[name] = replace(camera, params=tuple(params))
     share = _fit_faces(other, tracks)[0] / max(error, 1e-9)
     focal = f"the focal lengths {_times(1 / factor)}" if share < 1 / EXPLAINED else ""
     lengths = f"the rig's lengths {_times(factor)}" if share > EXPLAINED else ""
@@ -224,13 +230,6 @@ def _fit_faces(cameras: Mapping[str, Camera], tracks: PointTracks) -> tuple[floa
     eyes = np.stack([points.reshape(-1, 68, 3)[:, side].mean(1) for side in EYES])
     gap = float(np.median(np.linalg.norm(eyes[0] - eyes[1], axis=1)))
     return float(np.minimum(errors, WORST).mean()), 1e3 * gap
-
-
-def _with_focal(camera: Camera, factor: float) -> Camera:
-    """Return a camera whose focal length is multiplied."""
-    named = zip(MODELS[camera.model], camera.params, strict=True)
-    params = tuple(p * factor if name in ("f", "fx", "fy") else p for name, p in named)
-    return replace(camera, params=params)
 
 
 def _free_moved_cameras(

@@ -66,15 +66,8 @@ def state_uncertainty(solution: BoardSolution, points: np.ndarray) -> dict[str, 
     scale = 2 * max(float(np.median(np.linalg.norm(solution.errors, axis=1))) / 1.1774, 1e-3)
     sigma = _noise(solution, scale)
 
-    def expected(corners: BoardCorners) -> dict[str, float]:
-        names, covariance, excess = _covariance(rig, corners, points, sigma)
-        derived = zip(*[derive(rig.cameras[name], head) for name in names], strict=True)
-        by_camera, by_point = (np.stack(part) for part in derived)
-        squared = _squared_errors(by_camera, by_point, rigid_steps(head), covariance)
-        return dict(zip(names, (excess * squared).tolist(), strict=True))
-
     corners = solution.corners
-    squared = expected(corners)
+    squared = _expected(rig, corners, points, sigma, head)
     # Each half has every other board frame, and only the cameras that both halves hold.
     side = np.searchsorted(np.unique(corners.frame), corners.frame) % 2
     seen = np.zeros((2, len(corners.cameras)))
@@ -83,7 +76,7 @@ def state_uncertainty(solution: BoardSolution, points: np.ndarray) -> dict[str, 
     halves = [corners.select(held & (side == k)) for k in (0, 1)]
     if len(np.unique(halves[0].camera)) > 1:
         one, other = (adjust_board_rig(rig, half, points, scale).cameras for half in halves)
-        variance = [expected(half) for half in halves]
+        variance = [_expected(rig, half, points, sigma, head) for half in halves]
         for name, off in camera_errors(one, other, head).items():
             squared[name] *= max(1.0, (1 + off**2 / sum(half[name] for half in variance)) / 2)
     depth = {name: solution.cameras[name].cam_from_world[2, 3] for name in names}
@@ -141,13 +134,13 @@ def _noise(solution: BoardSolution, scale: float) -> np.ndarray:
     return sigma
 
 
-def _covariance(
-    rig: BoardRig, corners: BoardCorners, points: np.ndarray, sigma: np.ndarray
-) -> tuple[list[str], np.ndarray, float]:
-    """Return the names of the cameras and the covariance (14 C, 14 C) of their unknowns.
+def _expected(
+    rig: BoardRig, corners: BoardCorners, points: np.ndarray, sigma: np.ndarray, head: np.ndarray
+) -> dict[str, float]:
+    """Return the expected squared error, pixels, of points (K, 3) of the head by camera.
 
-    `sigma` is the noise of corners by the number that their camera has in `corners`. The third
-    value is how many times larger variances are as corners of one image are off together.
+    `sigma` is the noise of corners by the number that their camera has in `corners`. Errors grow
+    as corners of one image are off together.
     """
     present, camera = np.unique(corners.camera, return_inverse=True)
     names = [corners.cameras[i] for i in present]
@@ -168,7 +161,11 @@ def _covariance(
         alone += _together(drawn, corners) / DRAWS
     unknowns = np.count_nonzero(normal.diagonal) + 6 * (len(frames) - 1)
     left = max(1 - unknowns / errors.size, 0.1)  # share that the unknowns did not absorb
-    return names, covariance / left, max(1.0, together / max(alone, 1e-9))
+    derived = zip(*[derive(rig.cameras[name], head) for name in names], strict=True)
+    by_head, by_point = (np.stack(part) for part in derived)
+    squared = _squared_errors(by_head, by_point, rigid_steps(head), covariance / left)
+    excess = max(1.0, together / max(alone, 1e-9))
+    return dict(zip(names, (excess * squared).tolist(), strict=True))
 
 
 def _together(errors: np.ndarray, corners: BoardCorners) -> float:

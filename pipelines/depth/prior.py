@@ -165,29 +165,17 @@ def close_mesh(vertices: np.ndarray, faces: np.ndarray) -> TrackedSolid:
     if not large:
         return TrackedSolid(scene, None, scene, low, high)
     border = mesh_scene(points[0], np.concatenate([caps[k] for k in large]))
-    for k in large:
-        lower, walls = _body_below(vertices, loops[k], sum(map(len, points)))
-        points.append(lower)
-        solid.append(walls)
+    for loop in (loops[k] for k in large):  # below, walls go down and outward and end in a cap
+        ring, first = vertices[loop], sum(map(len, points))
+        middle = ring.mean(0)
+        down, outward = unit(middle - vertices.mean(0)), unit(ring - middle)
+        lower = ring + BODY * (down + outward)
+        row = first + np.arange(len(loop))
+        wall = np.stack([loop, np.roll(loop, -1), np.roll(row, -1), row], axis=1)
+        points.append(np.concatenate([lower, lower.mean(0, keepdims=True)]))
+        solid += [wall[:, :3], wall[:, [0, 2, 3]], _fan(row, first + len(loop))]
     body = mesh_scene(np.concatenate(points), np.concatenate(solid))
     return TrackedSolid(scene, border, body, low, high)
-
-
-def _body_below(
-    vertices: np.ndarray, loop: np.ndarray, first: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Continue a mesh below a large hole: new vertices (L + 1, 3), from number `first`, and faces.
-
-    The walls go down and outward alike, and end in a cap.
-    """
-    ring = vertices[loop]
-    middle = ring.mean(0)
-    down, outward = unit(middle - vertices.mean(0)), unit(ring - middle)
-    lower = ring + BODY * (down + outward)
-    row = first + np.arange(len(loop))
-    wall = np.stack([loop, np.roll(loop, -1), np.roll(row, -1), row], axis=1)
-    walls = np.concatenate([wall[:, :3], wall[:, [0, 2, 3]], _fan(row, first + len(loop))])
-    return np.concatenate([lower, lower.mean(0, keepdims=True)]), walls
 
 
 def _fan(loop: np.ndarray, middle: int) -> np.ndarray:

@@ -344,7 +344,11 @@ def _sweep(head: TrackedHead, shots: Sequence[_Shot], own: int, face: np.ndarray
         for room, offset in zip(free, HEIGHTS_M, strict=True):
             room &= _sampled(shot.alpha, _pixels_at(line, offset), 1.0) > 0.5
     mine = _patches(shots[own].grey[window])
-    near = [(shots[k], lines[k]) for k in _neighbours(head, shots, own)]
+    sights = unit(np.array([shot.camera.center - head.center for shot in shots]))
+    cosine = sights @ sights[own]
+    ranked = np.argsort(np.abs(cosine - BEST_APART), kind="stable").tolist()
+    chosen = [k for k in ranked if APART[0] < cosine[k] < APART[1]][:NEIGHBOURS]
+    near = [(shots[k], lines[k]) for k in chosen]
     step = STEPS_M[1] - STEPS_M[0]
     about = np.arange(-NEAR_M, NEAR_M + step / 2, step)
     on_face = np.max([_agreement(mine, near, offset) for offset in about], axis=0)
@@ -353,14 +357,6 @@ def _sweep(head: TrackedHead, shots: Sequence[_Shot], own: int, face: np.ndarray
         if (free[k] & face[window]).any():
             before[k] = np.max([_agreement(mine, near, offset + more) for more in STEPS_M], axis=0)
     return _Sweep(camera, depth, window, face[window], places, ways, on_face, before, free)
-
-
-def _neighbours(head: TrackedHead, shots: Sequence[_Shot], own: int) -> list[int]:
-    """Choose the views that a view is compared with."""
-    ways = unit(np.array([shot.camera.center - head.center for shot in shots]))
-    cosine = ways @ ways[own]
-    ranked = np.argsort(np.abs(cosine - BEST_APART), kind="stable").tolist()
-    return [k for k in ranked if APART[0] < cosine[k] < APART[1]][:NEIGHBOURS]
 
 
 def _agreement(

@@ -226,10 +226,20 @@ def shut_lids(
             _is_shut(now, seen[:k] + seen[k + 1 :] if usual is None else usual)
             for k, now in enumerate(seen)
         ]
-    return [
-        _shut(observation, sides) if sides.any() else observation
-        for observation, sides in zip(observations, shut, strict=True)
-    ]
+    found = []
+    for observation, sides in zip(observations, shut, strict=True):
+        views = []
+        for view in observation.views if sides.any() else ():
+            points = view.points.copy()
+            for eye in np.flatnonzero(sides):
+                upper, lower = (list(lid) for lid in EYES[eye][2:])
+                points[upper] = points[lower] + GAP * (points[upper] - points[lower])
+            views.append(replace(view, points=points))
+        if views:
+            observation, _ = agree(observation.expression, observation.frame, views)
+            observation = replace(observation, shut=tuple(np.flatnonzero(sides).tolist()))
+        found.append(observation)
+    return found
 
 
 def _irises(observation: Observation, side: int) -> dict[str, tuple[float, float]]:
@@ -258,18 +268,6 @@ def _is_shut(
         return False
     # Any camera counts here: a head that turned shows its irises to others.
     return sum(sure**2 for sure, _ in now.values()) <= CHANCE * np.square(usual).sum()
-
-
-def _shut(observation: Observation, sides: np.ndarray) -> Observation:
-    views = []
-    for view in observation.views:
-        points = view.points.copy()
-        for side in np.flatnonzero(sides):
-            upper, lower = (list(lid) for lid in EYES[side][2:])
-            points[upper] = points[lower] + GAP * (points[upper] - points[lower])
-        views.append(replace(view, points=points))
-    found, _ = agree(observation.expression, observation.frame, views)
-    return replace(found, shut=tuple(np.flatnonzero(sides).tolist()))
 
 
 @dataclass(frozen=True)

@@ -175,7 +175,12 @@ def _sweep(
     """Fit every second frame once more, towards where its neighbours are."""
     person, stride = tracker.person, tracker.stride
     marks = landmark_anchors(person.model)
-    spread = MeshPlaces.of_vertices(_spread_vertices(person.model.template.numpy()))
+    places, chosen = person.model.template.numpy(), [0]
+    nearest = np.linalg.norm(places - places[0], axis=1)
+    while len(chosen) < SPREAD_VERTICES:  # all over the head, each the furthest from the others
+        chosen.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, np.linalg.norm(places - places[chosen[-1]], axis=1))
+    spread = MeshPlaces.of_vertices(np.array(chosen))
     redundancy = ((len(marks.vertices) + SPREAD_VERTICES) / EFFECTIVE_POINTS) ** 0.5
     frames = [target.observation.frame for target in targets]
     meshes = [_mesh(person, pose) for pose in poses]
@@ -213,16 +218,6 @@ def _expected(
         # Of independent errors, over what the mean of two has.
         return expected, float(np.hypot(np.hypot(1 - share, share), 1.0) / 1.5**0.5)
     return None, 0.0
-
-
-def _spread_vertices(places: np.ndarray) -> np.ndarray:
-    """Choose vertices all over a head (V, 3), each the furthest from those before it."""
-    chosen = [0]
-    nearest = np.linalg.norm(places - places[0], axis=1)
-    for _ in range(SPREAD_VERTICES - 1):
-        chosen.append(int(np.argmax(nearest)))
-        nearest = np.minimum(nearest, np.linalg.norm(places - places[chosen[-1]], axis=1))
-    return np.array(chosen)
 
 
 def write_npz(path: Path, arrays: dict[str, np.ndarray]) -> None:

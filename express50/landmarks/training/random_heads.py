@@ -146,7 +146,15 @@ def deform(vertices: np.ndarray, rng: Rng) -> np.ndarray:
 def paint(canvas: Canvas, rng: Rng) -> tuple[np.ndarray, np.ndarray | None]:
     """Draw colours (N, 3) in [0, 1], and the thickness (N,), metres, of hair or None."""
     rest, region, marks = canvas.rest, canvas.region, canvas.marks
-    skin = _skin_color(rng)
+    if rng.random() < 0.1:  # any colour, else from dark to pale
+        skin = rng.uniform(0.15, 0.95, 3)
+    else:
+        tones = np.array(
+            [[0.26, 0.17, 0.13], [0.62, 0.43, 0.32], [0.85, 0.66, 0.55], [0.95, 0.80, 0.73]]
+        )
+        place = rng.uniform(0.0, 3.0)
+        shade = [np.interp(place, range(4), channel) for channel in tones.T]
+        skin = np.clip(shade * rng.uniform(0.9, 1.1, 3), 0.05, 1.0)
     colors = np.tile(skin, (len(rest), 1))
     # Lashes and what is in no region, a small part behind the lids, become dark.
     nothing = ~np.any([mask for name, mask in region.items() if name != LASHES], axis=0)
@@ -162,18 +170,6 @@ def paint(canvas: Canvas, rng: Rng) -> tuple[np.ndarray, np.ndarray | None]:
     _tint_beard(colors, canvas, rng)
     _color_eyes_and_mouth(colors, canvas, rng)
     return np.clip(colors, 0.0, 1.0).astype(np.float32), hair
-
-
-def _skin_color(rng: Rng) -> np.ndarray:
-    """Draw a skin colour (3,) from dark to pale; in some draws any colour."""
-    if rng.random() < 0.1:
-        return rng.uniform(0.15, 0.95, 3)
-    tones = np.array(
-        [[0.26, 0.17, 0.13], [0.62, 0.43, 0.32], [0.85, 0.66, 0.55], [0.95, 0.80, 0.73]]
-    )
-    place = rng.uniform(0.0, 3.0)
-    skin = [np.interp(place, range(4), channel) for channel in tones.T]
-    return np.clip(skin * rng.uniform(0.9, 1.1, 3), 0.05, 1.0)
 
 
 def _mix(colors: np.ndarray, color: np.ndarray, amount: np.ndarray) -> np.ndarray:

@@ -141,7 +141,13 @@ class HeadScene:
         specular = np.zeros_like(diffuse)
         camera, wrap = unit(hits.towards.mean(0)), rng.uniform(0.0, 0.3)
         for _ in range(rng.integers(1, 4)):
-            direction = _lamp(camera, natural, rng)
+            if not natural:
+                direction = unit(rng.normal(size=3) + camera * rng.uniform(0.0, 2.0))
+            elif rng.random() < 0.3:
+                direction = unit(camera + 0.12 * rng.normal(size=3))  # a flash
+            else:
+                higher = np.array([0.0, rng.uniform(0.1, 1.2), 0.0])
+                direction = unit(higher + unit(rng.normal(size=3)))
             color = rng.uniform(0.2, 1.0) * rng.uniform(0.8 if natural else 0.6, 1.0, 3)
             cosine = np.clip((hits.normals @ direction + wrap) / (1 + wrap), 0, None)
             if rng.random() < 0.5:
@@ -226,15 +232,6 @@ def project(projection: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return the pixels (N, 2) of points (N, 3) under a projection (3, 4)."""
     pixels = transform_points(projection, points)
     return pixels[:, :2] / pixels[:, 2:]
-
-
-def _lamp(camera: np.ndarray, natural: bool, rng: Rng) -> np.ndarray:
-    """Draw a direction towards a lamp."""
-    if not natural:
-        return unit(rng.normal(size=3) + camera * rng.uniform(0.0, 2.0))
-    if rng.random() < 0.3:
-        return unit(camera + 0.12 * rng.normal(size=3))  # a flash
-    return unit(np.array([0.0, rng.uniform(0.1, 1.2), 0.0]) + unit(rng.normal(size=3)))
 
 
 def _roughen(normals: np.ndarray, canvas: Canvas, rng: Rng) -> np.ndarray:
