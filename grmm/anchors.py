@@ -44,7 +44,15 @@ def make_anchors(head: HeadModel, n_g: int, mouth: bool = True) -> Anchors:
     """
     corners = head.uv.double()[head.uv_faces].cpu()  # (F, 3, 2)
     grid = torch.stack([corners[..., 0] * n_g, (1 - corners[..., 1]) * n_g], -1)
-    face, column, row = _candidate_texels(grid, n_g)
+    # Candidates are the texels whose centres lie in a triangle's bounding box.
+    low = torch.ceil(corner_to_cell(grid.amin(1))).clamp(0, n_g).long()  # (F, 2) as (column, row)
+    high = torch.floor(corner_to_cell(grid.amax(1))).clamp(-1, n_g - 1).long()
+    size = (high - low + 1).clamp_min(0)
+    count = size[:, 0] * size[:, 1]
+    face = torch.repeat_interleave(torch.arange(len(grid)), count)
+    offset = torch.arange(len(face)) - (count.cumsum(0) - count)[face]
+    width = size[face, 0]
+    column, row = low[face, 0] + offset % width, low[face, 1] + offset // width
     centre = cell_to_corner(torch.stack([column, row], -1).double())
     weights = _barycentrics(grid[face], centre)
     inside = (weights >= 0).all(1)
@@ -68,18 +76,6 @@ def mouth_faces(head: HeadModel) -> Tensor:
     """Mark faces (F,) bool with a corner on teeth or tongue, or inside the mouth."""
     solid = (head.regions["teeth"] | head.regions["tongue"])[head.faces].any(1)
     return (solid | head.regions["mouth_interior"][head.faces].all(1)).cpu()
-
-
-def _candidate_texels(grid: Tensor, n_g: int) -> tuple[Tensor, Tensor, Tensor]:
-    """List face, column and row of every texel whose centre lies in a triangle's bounding box."""
-    low = torch.ceil(corner_to_cell(grid.amin(1))).clamp(0, n_g).long()  # (F, 2) as (column, row)
-    high = torch.floor(corner_to_cell(grid.amax(1))).clamp(-1, n_g - 1).long()
-    size = (high - low + 1).clamp_min(0)
-    count = size[:, 0] * size[:, 1]
-    face = torch.repeat_interleave(torch.arange(len(grid)), count)
-    offset = torch.arange(len(face)) - (count.cumsum(0) - count)[face]
-    width = size[face, 0]
-    return face, low[face, 0] + offset % width, low[face, 1] + offset // width
 
 
 def _barycentrics(corners: Tensor, points: Tensor) -> Tensor:

@@ -347,23 +347,9 @@ def spz_bytes(gaussians: GaussianCloud) -> bytes:
         raise ConfigError(f"the head reaches {far:.4g} m, SPZ holds under 128 m; check --control")
     logs = np.log(gaussians.scales.astype(np.float64).clip(min=1e-30))
     harmonics = (gaussians.colors.astype(np.float64) - 0.5) / SH_DC
-    parts = [
-        struct.pack("<IIIBBBB", SPZ_MAGIC, SPZ_VERSION, len(fixed), 0, FRACTION_BITS, 0, 0),
-        fixed.astype("<i4").view(np.uint8).reshape(-1, 4)[:, :3].tobytes(),
-        _bytes(255 * gaussians.opacities),
-        _bytes(255 * (SPZ_COLOUR * harmonics + 0.5)),
-        _bytes(16 * (logs + 10)),
-        _smallest_three(gaussians.quats[:, [1, 2, 3, 0]]).tobytes(),
-    ]
-    return gzip.compress(b"".join(parts), mtime=0)
-
-
-def _smallest_three(quats: np.ndarray) -> np.ndarray:
-    """Pack quaternions (N, 4), xyzw, into (N,) uint32.
-
-    Two bits name the largest entry, which is made positive and left out; the others follow in
-    order, a bit for the sign and nine for the size over sqrt(1/2).
-    """
+    # Of a quaternion, two bits name the largest entry, which is made positive and left out; the
+    # others follow in order, a bit for the sign and nine for the size over sqrt(1/2).
+    quats = gaussians.quats[:, [1, 2, 3, 0]]
     quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     largest, rows = np.abs(quats).argmax(1), np.arange(len(quats))
     quats = quats * np.where(quats[rows, largest] < 0, -1, 1)[:, None]
@@ -372,7 +358,15 @@ def _smallest_three(quats: np.ndarray) -> np.ndarray:
     for values in np.take_along_axis(quats, others, 1).T:
         size = np.floor(511 * np.abs(values) * np.sqrt(2) + 0.5).clip(max=511).astype(np.uint32)
         packed = packed << 10 | (values < 0).astype(np.uint32) << 9 | size
-    return packed.astype("<u4")
+    parts = [
+        struct.pack("<IIIBBBB", SPZ_MAGIC, SPZ_VERSION, len(fixed), 0, FRACTION_BITS, 0, 0),
+        fixed.astype("<i4").view(np.uint8).reshape(-1, 4)[:, :3].tobytes(),
+        _bytes(255 * gaussians.opacities),
+        _bytes(255 * (SPZ_COLOUR * harmonics + 0.5)),
+        _bytes(16 * (logs + 10)),
+        packed.astype("<u4").tobytes(),
+    ]
+    return gzip.compress(b"".join(parts), mtime=0)
 
 
 def _bytes(values: np.ndarray) -> bytes:

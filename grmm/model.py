@@ -201,9 +201,19 @@ class GRMM(Networks):
         if self.mesh is not None:
             parts = self.mesh(z_id, z_exp, state.neck, state.jaw, state.expression)
             displacement = sum(part.to(state.vertices.dtype) for part in parts)
-        means, quats = self._place(state.vertices + displacement, maps.offsets)
+        vertices, offsets = state.vertices + displacement, maps.offsets
+        shift = DISPLACEMENT_M * offsets[:, :3]
+        # q = normalise(dq + identity), so that zeros mean no rotation (G1).
+        turned = torch.cat([offsets[:, 3:4] + 1.0, offsets[:, 4:7]], 1)
+        quats = nn.functional.normalize(turned, dim=1, eps=1e-8)
+        if self.config.frame != "head":
+            # No gradient passes through the frames: it is ill-conditioned on slivers.
+            with torch.no_grad():
+                frames, _ = tangent_frames(vertices, self.corners, self.gradients)
+                turn = matrix_to_quat(frames)
+            shift, quats = (frames * shift[:, None, :]).sum(2), quat_multiply(turn, quats)
         return Gaussians(
-            means=means,
+            means=interpolate(vertices, self.corners, self.barycentrics) + shift,
             quats=quats,
             scales_mm=maps.scales_mm,
             opacities=maps.opacities,
@@ -277,23 +287,6 @@ class GRMM(Networks):
     def _sample(self, maps: Tensor) -> Tensor:
         """Sample (C, n_g, n_g) at the covered texels, (N, C)."""
         return maps.flatten(1).index_select(1, self.texels).T.to(self.head_centre.dtype)
-
-    def _place(self, vertices: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
-        """Place means (N, 3) and quaternions (N, 4) on the mesh by decoded offsets (N, 7).
-
-        q = normalise(dq + identity), so that zeros mean no rotation (G1).
-        """
-        base = interpolate(vertices, self.corners, self.barycentrics)
-        shift = DISPLACEMENT_M * offsets[:, :3]
-        turned = torch.cat([offsets[:, 3:4] + 1.0, offsets[:, 4:7]], 1)
-        quats = nn.functional.normalize(turned, dim=1, eps=1e-8)
-        if self.config.frame == "head":
-            return base + shift, quats
-        # No gradient passes through the frames: it is ill-conditioned on slivers.
-        with torch.no_grad():
-            frames, _ = tangent_frames(vertices, self.corners, self.gradients)
-            turn = matrix_to_quat(frames)
-        return base + (frames * shift[:, None, :]).sum(2), quat_multiply(turn, quats)
 
 
 @Recorded

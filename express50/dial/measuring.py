@@ -132,7 +132,14 @@ def _timed_again(chain: Chain, clock: Clock, found: PilotFigures) -> PilotFigure
         return found
     if pilots[0].cut or broken_stage(chain, base):
         return found
-    trials = [base, *(_slowed_as(base, trial) for trial in found.trials[1:])]
+    trials = [base]
+    for trial in found.trials[1:]:
+        costs = dict(trial.costs)
+        for name, now in base.costs.items():
+            if name in costs and now.core_seconds > 0:
+                seconds = costs[name].core_seconds * now.seconds / now.core_seconds
+                costs[name] = replace(costs[name], seconds=seconds, extra=now.extra)
+        trials.append(replace(trial, costs=costs))
     for trial in trials:
         record = chain.dataset.pilot_dir / trial.folder / "trial.json"
         if record.is_file():
@@ -140,16 +147,6 @@ def _timed_again(chain: Chain, clock: Clock, found: PilotFigures) -> PilotFigure
     found = replace(found, trials=trials)
     write_json(dial_dir(chain.dataset) / "measured.json", asdict(found))
     return found
-
-
-def _slowed_as(base: Trial, trial: Trial) -> Trial:
-    """Return a trial whose items waited as long per processor second as those of another one."""
-    costs = dict(trial.costs)
-    for name, now in base.costs.items():
-        if name in costs and now.core_seconds > 0:
-            seconds = costs[name].core_seconds * now.seconds / now.core_seconds
-            costs[name] = replace(costs[name], seconds=seconds, extra=now.extra)
-    return replace(trial, costs=costs)
 
 
 def _subjects(chain: Chain) -> list[str]:

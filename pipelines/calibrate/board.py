@@ -183,7 +183,14 @@ def refine_corners(
 
 def _saddle(image: np.ndarray, start: np.ndarray, radius: int) -> np.ndarray | None:
     """Walk to the saddle (2,) near a start; None if there is none or the walk diverges."""
-    inverse, inside = _quadratic_fit(radius)
+    # Fit a x^2 + b x y + c y^2 + d x + e y + f on a disc of M pixels: its inverse is (6, M).
+    x, y = np.meshgrid(np.arange(-radius, radius + 1), np.arange(-radius, radius + 1))
+    inside = (x**2 + y**2 <= (radius + 0.5) ** 2).ravel()
+    x, y = x.ravel()[inside].astype(float), y.ravel()[inside].astype(float)
+    # Weights fall towards the rim, so that pixels enter and leave the fit smoothly.
+    weight = np.exp(-(x**2 + y**2) / (2 * (radius / 1.6) ** 2))
+    terms = np.stack([x * x, x * y, y * y, x, y, np.ones_like(x)], axis=1)
+    inverse = np.linalg.pinv(terms * np.sqrt(weight)[:, None]) * np.sqrt(weight)
     side = 2 * radius + 1
     at = start.astype(np.float64)
     for _ in range(6):
@@ -199,20 +206,6 @@ def _saddle(image: np.ndarray, start: np.ndarray, radius: int) -> np.ndarray | N
         if np.abs(step).max() < 1e-3:
             return at
     return at if np.abs(step).max() < 0.05 else None
-
-
-def _quadratic_fit(radius: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least-squares inverse (6, M) for a x^2 + b x y + c y^2 + d x + e y + f on a disc.
-
-    The second value marks the M pixels of the square patch that lie in the disc.
-    """
-    x, y = np.meshgrid(np.arange(-radius, radius + 1), np.arange(-radius, radius + 1))
-    inside = (x**2 + y**2 <= (radius + 0.5) ** 2).ravel()
-    x, y = x.ravel()[inside].astype(float), y.ravel()[inside].astype(float)
-    # Weights fall towards the rim, so that pixels enter and leave the fit smoothly.
-    weight = np.exp(-(x**2 + y**2) / (2 * (radius / 1.6) ** 2))
-    terms = np.stack([x * x, x * y, y * y, x, y, np.ones_like(x)], axis=1)
-    return np.linalg.pinv(terms * np.sqrt(weight)[:, None]) * np.sqrt(weight), inside
 
 
 def square_sides(board_xy: np.ndarray, pixels: np.ndarray, square: float) -> np.ndarray:

@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
@@ -398,31 +397,27 @@ def draw_residuals(
     scatter.hexbin(errors[:, 0], errors[:, 1], gridsize=40, extent=(-limit, limit) * 2, mincnt=1)
     scatter.set_aspect("equal")
     scatter.set_title(f"errors of {len(errors)} corners [px]", fontsize=10)
-    _draw_field(field, solution)
-    names = sorted(solution.cameras)
-    colours = ["tab:red" if n in solution.weak else "tab:blue" for n in names]
-    bars.bar(range(len(names)), [per_camera_px[name] for name in names], color=colours)
-    bars.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
-    bars.set_title("rms per camera [px]; red: weakly tied in", fontsize=10)
-    _save(figure, path)
-
-
-def _draw_field(axes: Axes, solution: BoardSolution) -> None:
-    """Draw the mean error in each cell of the image, over all cameras, as arrows."""
+    # The mean error in each cell of the image, over all cameras, as arrows.
     kept, cameras, cells = solution.corners, solution.cameras, 12
     known = [(c.width, c.height) if (c := cameras.get(n)) else (1, 1) for n in kept.cameras]
     where = kept.pixels / np.array(known)[kept.camera]
     cell = np.clip((where * cells).astype(int), 0, cells - 1) @ np.array([1, cells])
     count = np.bincount(cell, minlength=cells**2)
     full = np.flatnonzero(count >= 5)
-    sums = [np.bincount(cell, solution.errors[:, i], minlength=cells**2) for i in range(2)]
+    sums = [np.bincount(cell, errors[:, i], minlength=cells**2) for i in range(2)]
     mean = np.stack(sums, axis=1)[full] / count[full, None]
     at = cell_to_corner(np.column_stack([full % cells, full // cells])) / cells
     longest = float(np.linalg.norm(mean, axis=1).max(initial=1e-9))
-    axes.quiver(at[:, 0], at[:, 1], mean[:, 0], mean[:, 1], angles="xy", scale=longest * 12)
-    axes.set_xlim(0, 1)
-    axes.set_ylim(1, 0)
-    axes.set_title(f"mean error over the image (longest {longest:.3f} px)", fontsize=10)
+    field.quiver(at[:, 0], at[:, 1], mean[:, 0], mean[:, 1], angles="xy", scale=longest * 12)
+    field.set_xlim(0, 1)
+    field.set_ylim(1, 0)
+    field.set_title(f"mean error over the image (longest {longest:.3f} px)", fontsize=10)
+    names = sorted(solution.cameras)
+    colours = ["tab:red" if n in solution.weak else "tab:blue" for n in names]
+    bars.bar(range(len(names)), [per_camera_px[name] for name in names], color=colours)
+    bars.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
+    bars.set_title("rms per camera [px]; red: weakly tied in", fontsize=10)
+    _save(figure, path)
 
 
 def _save(figure: Figure, path: Path) -> None:

@@ -12,7 +12,7 @@ Source: mrcal's projection uncertainty (Kogan, https://mrcal.secretsauce.net/unc
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -58,15 +58,15 @@ def state_uncertainty(solution: BoardSolution, points: np.ndarray) -> dict[str, 
     more than the covariance predicts, the variance is multiplied by the mean of 1 and the squared
     ratio.
     """
-    solution = _facing(solution)
-    names = sorted(solution.cameras)
-    if len(names) < 2:
+    cameras = {n: c for n, c in solution.cameras.items() if c.cam_from_world[2, 3] > HEAD_RADIUS_M}
+    if len(cameras) < 2:
         return {}
-    rig, head = BoardRig(solution.cameras, solution.boards), head_points()
-    scale = 2 * max(float(np.median(np.linalg.norm(solution.errors, axis=1))) / 1.1774, 1e-3)
-    sigma = _noise(solution, scale)
-
-    corners = solution.corners
+    facing = np.array([name in cameras for name in solution.corners.cameras])
+    keep = facing[solution.corners.camera]
+    corners, errors = solution.corners.select(keep), solution.errors[keep]
+    rig, head = BoardRig(cameras, solution.boards), head_points()
+    scale = 2 * max(float(np.median(np.linalg.norm(errors, axis=1))) / 1.1774, 1e-3)
+    sigma = _noise(corners, errors, scale)
     squared = _expected(rig, corners, points, sigma, head)
     # Each half has every other board frame, and only the cameras that both halves hold.
     side = np.searchsorted(np.unique(corners.frame), corners.frame) % 2
@@ -79,19 +79,8 @@ def state_uncertainty(solution: BoardSolution, points: np.ndarray) -> dict[str, 
         variance = [_expected(rig, half, points, sigma, head) for half in halves]
         for name, off in camera_errors(one, other, head).items():
             squared[name] *= max(1.0, (1 + off**2 / sum(half[name] for half in variance)) / 2)
-    depth = {name: solution.cameras[name].cam_from_world[2, 3] for name in names}
-    return {n: head_error_of(solution.cameras[n], squared[n], depth[n]) for n in names}
-
-
-def _facing(solution: BoardSolution) -> BoardSolution:
-    """Leave out the cameras that do not have the whole head's place before them."""
-    cameras = {n: c for n, c in solution.cameras.items() if c.cam_from_world[2, 3] > HEAD_RADIUS_M}
-    facing = np.array([name in cameras for name in solution.corners.cameras])
-    keep = facing[solution.corners.camera]
-    return replace(
-        solution, cameras=cameras, corners=solution.corners.select(keep),
-        errors=solution.errors[keep],
-    )  # fmt: skip
+    depth = {name: camera.cam_from_world[2, 3] for name, camera in cameras.items()}
+    return {n: head_error_of(cameras[n], squared[n], depth[n]) for n in sorted(cameras)}
 
 
 def head_error_of(camera: Camera, squared_px: float, distance_m: float) -> HeadError:
@@ -123,12 +112,12 @@ def camera_errors(
     return dict(zip(names, rms.tolist(), strict=True))
 
 
-def _noise(solution: BoardSolution, scale: float) -> np.ndarray:
+def _noise(corners: BoardCorners, errors: np.ndarray, scale: float) -> np.ndarray:
     """Measure the corners' noise (C,) per camera, pixels, as a fit with Cauchy's loss passes it."""
-    length = np.linalg.norm(solution.errors, axis=1)
-    weight, sigma = 1 / (1 + (length / scale) ** 2), np.full(len(solution.corners.cameras), 1e-6)
-    for i in np.unique(solution.corners.camera):
-        mine = solution.corners.camera == i
+    length = np.linalg.norm(errors, axis=1)
+    weight, sigma = 1 / (1 + (length / scale) ** 2), np.full(len(corners.cameras), 1e-6)
+    for i in np.unique(corners.camera):
+        mine = corners.camera == i
         pull = np.sqrt(np.mean((weight[mine] * length[mine]) ** 2) / 2)
         sigma[i] = max(pull / np.mean(weight[mine] ** 2), 1e-6)
     return sigma

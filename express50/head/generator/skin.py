@@ -54,7 +54,19 @@ def add_skin(half: HalfMesh) -> None:
     index = np.concatenate([fixed, *rims])
     filled = _add_fill(half, half.points[index], holes)
     index = np.concatenate([index, filled])
-    faces = index[_triangulate(half.labels[index], len(fixed), [len(rim) for rim in rims])]
+    # The hull's triangles, without mid plane, end of the neck and insides of loops.
+    label = half.labels[index]
+    directions, flat = sphere(*label.T), np.abs(np.sin(label[:, 0])) < 1e-9
+    directions[flat, 0] = 0.0
+    faces = ConvexHull(directions).simplices
+    drop = flat[faces].all(1) | (np.abs(label[:, 1] - BOTTOM_LATITUDE) < 1e-6)[faces].all(1)
+    start = len(fixed)
+    for rim in rims:
+        member = np.zeros(len(label), bool)
+        member[start : start + len(rim)] = True
+        drop |= member[faces].all(1)
+        start += len(rim)
+    faces = index[faces[~drop]]
     half.add_faces("skin", faces)
     half.tags["grid"] = index
     # Filled vertices and their labels move towards their neighbours' means, on the skin.
@@ -124,22 +136,6 @@ def _add_fill(half: HalfMesh, fixed: Array, holes: list[Array]) -> Array:
     index = half.add(cast(*rays(*label[chosen].T)), "fill")
     half.labels[index] = label[chosen]
     return index
-
-
-def _triangulate(label: Array, midline: int, rims: list[int]) -> Array:
-    """Return the hull's triangles without mid plane, end of the neck and insides of loops."""
-    directions = sphere(*label.T)
-    flat = np.abs(np.sin(label[:, 0])) < 1e-9
-    directions[flat, 0] = 0.0
-    faces = ConvexHull(directions).simplices
-    drop = flat[faces].all(1) | (np.abs(label[:, 1] - BOTTOM_LATITUDE) < 1e-6)[faces].all(1)
-    start = midline
-    for count in rims:
-        member = np.zeros(len(label), bool)
-        member[start : start + count] = True
-        drop |= member[faces].all(1)
-        start += count
-    return faces[~drop]
 
 
 def set_skin_uv(half: HalfMesh) -> None:

@@ -255,7 +255,13 @@ def degrade(image: np.ndarray, rng: Rng) -> np.ndarray:
     if rng.random() < 0.35:
         image = cv2.GaussianBlur(image, (0, 0), size / CROP * rng.uniform(0.4, 1.8))
     if rng.random() < 0.1:
-        image = cv2.filter2D(image, -1, _motion(size / CROP * rng.uniform(2, 8), rng))
+        length = size / CROP * rng.uniform(2, 8)  # of a straight motion, pixels
+        side = 2 * int(np.ceil(length / 2)) + 1
+        kernel, angle = np.zeros((side, side), np.float32), rng.uniform(0, np.pi)
+        step = 0.5 * length * np.array([np.cos(angle), np.sin(angle)])
+        ends = (_whole(np.round(side // 2 + sign * step)) for sign in (-1, 1))
+        cv2.line(kernel, *ends, 1.0, 1, cv2.LINE_AA)
+        image = cv2.filter2D(image, -1, kernel / kernel.sum())
     if rng.random() < 0.5:
         noise = rng.standard_normal(image.shape, np.float32) * np.float32(rng.uniform(1, 14))
         image = np.clip(image + noise, 0, 255).astype(np.uint8)
@@ -266,16 +272,6 @@ def degrade(image: np.ndarray, rng: Rng) -> np.ndarray:
     if size != full:
         image = cv2.resize(image, (full, full), interpolation=cv2.INTER_LINEAR)
     return image
-
-
-def _motion(length: float, rng: Rng) -> np.ndarray:
-    """Return the kernel of a straight motion over a length in pixels."""
-    side = 2 * int(np.ceil(length / 2)) + 1
-    kernel, angle = np.zeros((side, side), np.float32), rng.uniform(0, np.pi)
-    step = 0.5 * length * np.array([np.cos(angle), np.sin(angle)])
-    ends = (_whole(np.round(side // 2 + sign * step)) for sign in (-1, 1))
-    cv2.line(kernel, *ends, 1.0, 1, cv2.LINE_AA)
-    return kernel / kernel.sum()
 
 
 def make_backgrounds(count: int, rng: Rng) -> np.ndarray:
