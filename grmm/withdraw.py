@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from grmm.checkpoint import read_content, write_content
 
@@ -25,12 +24,7 @@ def redact(path: Path, subject: str) -> bool:
         return False
     if content["subjects"] == [subject]:
         path.unlink()
-    else:
-        write_content(path, _without(content, subject))
-    return True
-
-
-def _without(content: dict[str, Any], subject: str) -> dict[str, Any]:
+        return True
     rows = [row for row, name in enumerate(content["subjects"]) if name != subject]
     places = [n for n, frame in enumerate(content["frames"]) if frame["subject"] != subject]
     frames = [content["frames"][n] for n in places]
@@ -39,7 +33,7 @@ def _without(content: dict[str, Any], subject: str) -> dict[str, Any]:
     kept = [row for row, name in enumerate(content["expressions"]) if name not in lost]
     # Indexing with a list copies: a view would carry the removed row to the disk.
     codes = {"z_id": content["model"]["z_id"][rows], "z_exp": content["model"]["z_exp"][kept]}
-    return content | {
+    rest = {
         "subjects": [content["subjects"][row] for row in rows],
         "expressions": [content["expressions"][row] for row in kept],
         "model": content["model"] | codes,
@@ -49,3 +43,5 @@ def _without(content: dict[str, Any], subject: str) -> dict[str, Any]:
         "optimizer": {},
         "loop": {},
     }
+    write_content(path, content | rest)
+    return True

@@ -163,25 +163,22 @@ def read_study(out: Path) -> dict:
             f"{path}: format is {study.get('format')!r}, expected {FORMAT!r} with "
             f"{', '.join(kinds)}; make the study again"
         )
-    if not _has_whole_examples(study):
-        raise FormatError(
-            f"{path}: its methods, its seed or an example are not as 'grmm study make' writes them;"
-            " make the study again"
-        )
-    return study
-
-
-def _has_whole_examples(study: dict) -> bool:
     try:
         first, second = study["methods"]
-        return type(study["seed"]) is int and all(
+        whole = type(study["seed"]) is int and all(
             isinstance(example["reference"], str)
             and example["pictures"].keys() == {first, second}
             and example["A"] in (first, second)
             for example in study["examples"]
         )
     except (KeyError, TypeError, ValueError, AttributeError):
-        return False
+        whole = False
+    if not whole:
+        raise FormatError(
+            f"{path}: its methods, its seed or an example are not as 'grmm study make' writes them;"
+            " make the study again"
+        )
+    return study
 
 
 def check_answer(study: dict, value: object, where: str = "answer") -> dict:

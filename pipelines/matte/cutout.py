@@ -382,7 +382,14 @@ def _posterior(
     image: np.ndarray, valid: np.ndarray, depth: np.ndarray, band: np.ndarray, density: float
 ) -> np.ndarray:
     """Return the posterior mean opacity (N,) of a band's pixels (H, W), from person and wall."""
-    wall, wall_error = _wall(image, valid & (depth <= -OUTER_M), depth, density)
+    # The wall is interpolated behind the person. Its error is measured in a ring where it is seen,
+    # by filling that from outside.
+    seen, reach = valid & (depth <= -OUTER_M), WALL_M * density
+    ring = seen & (depth > -OUTER_M - RING_M)
+    further, ring_weight = (mask.astype(np.float32) for mask in (seen & ~ring, ring))
+    missed = np.where(ring[..., None], image - _filled(image, further, reach), 0) ** 2
+    wall_error = np.sqrt(np.maximum(_filled(missed, ring_weight, 4 * reach), NOISE**2))
+    wall = _filled(image, seen.astype(np.float32), reach)
     light, behind = to_light(image), to_light(wall)[band]
     rim = (valid & (depth > RIM_M[0]) & (depth < RIM_M[1])).astype(np.float32)
     mean, covariance = local_colours(light, rim, band, REACH_M * density, SPREAD)
@@ -417,21 +424,6 @@ def _log_density(off: np.ndarray, covariance: np.ndarray, variance: np.ndarray) 
     determinant = np.maximum(a * A + f * F + e * E, 1e-30)
     square = A * x * x + B * y * y + C * z * z + 2 * (D * y * z + E * x * z + F * x * y)
     return -0.5 * (square / determinant + np.log(determinant))
-
-
-def _wall(
-    image: np.ndarray, seen: np.ndarray, depth: np.ndarray, density: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the wall (H, W, 3), interpolated behind the person, and its error (H, W, 3).
-
-    The error is measured in a ring where the wall is `seen` (H, W), by filling that from outside.
-    """
-    ring = seen & (depth > -OUTER_M - RING_M)
-    further, ring_weight = (mask.astype(np.float32) for mask in (seen & ~ring, ring))
-    reach = WALL_M * density
-    off = np.where(ring[..., None], image - _filled(image, further, reach), 0) ** 2
-    error = np.sqrt(np.maximum(_filled(off, ring_weight, 4 * reach), NOISE**2))
-    return _filled(image, seen.astype(np.float32), reach), error
 
 
 def _filled(image: np.ndarray, weight: np.ndarray, reach: float) -> np.ndarray:

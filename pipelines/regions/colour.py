@@ -136,8 +136,13 @@ def label_by_colour(
         # Half of each, because the back of a neck may be darker than any face.
         own, others = (c / np.float32(max(c.sum(), 1.0)) for c in (counts[1], skin_colours))
         counts[1] = SHARED * (own + others)
-    priors = _priors(labels, geometry, beyond)
-    best = (_likelihoods(counts, cells) + priors).argmax(0)
+    # Log-likelihoods (3, H, W) of hair, skin and torso.
+    likely = np.full((3, *cells[0].shape), np.log(UNTAUGHT), np.float32)
+    for row, taught in zip(likely, counts, strict=True):
+        if taught.sum() >= LEAST:
+            shares = gaussian_filter(taught, SMOOTH) / taught.sum()
+            row[:] = np.log(np.maximum(shares, 0) + RARE)[cells]
+    best = (likely + _priors(labels, geometry, beyond)).argmax(0)
     around = (geometry.mesh > 0) | geometry.rim | bare
     kept = np.isin(geometry.near, (SKIN, NECK, EARS)) & around
     skin_label = np.where(kept, geometry.near, SKIN)
@@ -146,16 +151,6 @@ def label_by_colour(
 
 
 Cells = tuple[np.ndarray, ...]
-
-
-def _likelihoods(counts: list[np.ndarray], cells: Cells) -> np.ndarray:
-    """Return log-likelihoods (3, H, W) of hair, skin and torso from counts (CELLS) of each."""
-    found = np.full((3, *cells[0].shape), np.log(UNTAUGHT), np.float32)
-    for row, taught in zip(found, counts, strict=True):
-        if taught.sum() >= LEAST:
-            shares = gaussian_filter(taught, SMOOTH) / taught.sum()
-            row[:] = np.log(np.maximum(shares, 0) + RARE)[cells]
-    return found
 
 
 def _cells(rgb: np.ndarray) -> Cells:

@@ -92,23 +92,11 @@ def draw_column(
     matrix = np.array([[scale, 0, -scale * corner[0]], [0, scale, -scale * corner[1]]])
     flags = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     crop = cv2.warpAffine(frame, affine_to_opencv(matrix), (tile, tile), flags=flags)
-    shaded = _wireframe(crop, camera, matrix, model, mesh)
-    marks = landmarks(model, torch.from_numpy(mesh)[None])[0].numpy()
-    _dots(shaded, transform_points(matrix, project_pinhole(camera, marks)[0]), FITTED_COLOR)
-    for points in seen:
-        _dots(shaded, transform_points(matrix, points), SEEN_COLOR)
-    cv2.putText(shaded, camera.id, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1)
-    return np.concatenate([crop, shaded])
-
-
-def _wireframe(
-    crop: np.ndarray, camera: Camera, matrix: np.ndarray, model: HeadModel, mesh: np.ndarray
-) -> np.ndarray:
-    """Blend visible triangle edges and the mesh's outline into a crop."""
-    K = np.diag([matrix[0, 0], matrix[1, 1], 1.0]) @ camera.K
+    # Visible edges of triangles and the mesh's outline are blended into the crop.
+    K = np.diag([scale, scale, 1.0]) @ camera.K
     K[:2, 2] += matrix[:, 2]
-    tile = pinhole_camera(camera.id, K, crop.shape[1], crop.shape[0], camera.cam_from_world)
-    cast = mesh_scene(mesh, model.faces.numpy()).cast_rays(camera_rays(tile))
+    view = pinhole_camera(camera.id, K, crop.shape[1], crop.shape[0], camera.cam_from_world)
+    cast = mesh_scene(mesh, model.faces.numpy()).cast_rays(camera_rays(view))
     hit = np.isfinite(cast["t_hit"].numpy())
     bary = cast["primitive_uvs"].numpy()
     smallest = np.minimum(bary.min(2), 1 - bary.sum(2))
@@ -117,7 +105,13 @@ def _wireframe(
     image = crop.astype(np.float32)
     image[edge] = 0.7 * image[edge] + 0.3 * np.array([90, 200, 255], np.float32)
     image[rim] = np.array([255, 60, 60], np.float32)
-    return np.ascontiguousarray(image.astype(np.uint8))
+    shaded = np.ascontiguousarray(image.astype(np.uint8))
+    marks = landmarks(model, torch.from_numpy(mesh)[None])[0].numpy()
+    _dots(shaded, transform_points(matrix, project_pinhole(camera, marks)[0]), FITTED_COLOR)
+    for points in seen:
+        _dots(shaded, transform_points(matrix, points), SEEN_COLOR)
+    cv2.putText(shaded, camera.id, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1)
+    return np.concatenate([crop, shaded])
 
 
 def _dots(image: np.ndarray, points: np.ndarray, color: tuple[int, int, int]) -> None:

@@ -16,7 +16,7 @@ from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
 from express50.geometry.transforms import make_transform, transform_points, unit
 from express50.head.model import HeadModel
 from express50.landmarks.training.places import face_front
-from express50.landmarks.training.random_heads import LASHES, Canvas, RandomHead, paint, waves
+from express50.landmarks.training.random_heads import LASHES, RandomHead, paint, waves
 
 FRAME_SIDE_M = 0.38
 HIDING_M = 0.005  # what lies this far or less in front of a landmark does not hide it
@@ -116,7 +116,15 @@ class HeadScene:
         canvas = self.canvas.at(face, bary)
         albedo = paint(canvas, np.random.default_rng(self.head.look))[0]
         normals = unit((self.head.normals[face] * bary[..., None]).sum(1))
-        normals = _roughen(normals, canvas, np.random.default_rng(self.head.look + 1))
+        # Pores and, on old faces, wrinkles bend the normals.
+        rough, bend = np.random.default_rng(self.head.look + 1), np.zeros_like(normals)
+        skin = canvas.region["face"] | canvas.region["neck"]
+        for low, high, most, flat in ((400.0, 2500.0, 0.12, 1.0), (150.0, 700.0, 0.35, 0.25)):
+            amount = most * rough.beta(1.0, 2.5)
+            places = canvas.rest * np.array([flat, 1.0, flat])
+            field = np.stack([waves(places, rough, 8, low, high) for _ in range(3)], axis=1)
+            bend += amount * field * skin[:, None]
+        normals = unit(normals + 0.5 * bend)
         start, ahead = np.split(rays.numpy()[hit], 2, axis=1)
         points = start + ahead * distance[hit][:, None]
         openness = (self.openness[face] * bary).sum(1)
@@ -232,18 +240,6 @@ def project(projection: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return the pixels (N, 2) of points (N, 3) under a projection (3, 4)."""
     pixels = transform_points(projection, points)
     return pixels[:, :2] / pixels[:, 2:]
-
-
-def _roughen(normals: np.ndarray, canvas: Canvas, rng: Rng) -> np.ndarray:
-    """Return normals (N, 3) bent by pores and, on old faces, wrinkles."""
-    skin = canvas.region["face"] | canvas.region["neck"]
-    bend = np.zeros_like(normals)
-    for low, high, most, flat in ((400.0, 2500.0, 0.12, 1.0), (150.0, 700.0, 0.35, 0.25)):
-        amount = most * rng.beta(1.0, 2.5)
-        places = canvas.rest * np.array([flat, 1.0, flat])
-        field = np.stack([waves(places, rng, 8, low, high) for _ in range(3)], axis=1)
-        bend += amount * field * skin[:, None]
-    return unit(normals + 0.5 * bend)
 
 
 def _blend(rgba: np.ndarray, outline: np.ndarray, color: np.ndarray, strength: float) -> None:
