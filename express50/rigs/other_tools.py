@@ -178,25 +178,21 @@ def read_metashape(path: Path) -> dict[str, Camera]:
             f"{path}: {len(chunks)} chunks, {len(aligned)} aligned cameras in {len(parts)}"
             " components; expected one chunk, aligned in one component: export only that"
         )
-    motion = _world_from_chunk(path, chunks[0], parts.pop())
+    # The similarity to the world is the component's, else the chunk's.
+    part = parts.pop()
+    inner = [c for c in chunks[0].iter("component") if c.get("id") == part]
+    found = [e.find("transform") for e in [*inner, chunks[0]]]
+    element = next((e for e in found if e is not None), None)
+    motion = np.eye(4)
+    if element is not None:
+        where = f"{path}: the chunk's transform"
+        turn = _numbers(where, element, "rotation", 9).reshape(3, 3)
+        scale = _numbers(where, element, "scale", 1)
+        motion = make_transform(turn * scale, _numbers(where, element, "translation", 3))
     sensors = {sensor.get("id"): sensor for sensor in chunks[0].iter("sensor")}
     names = names_from_files([camera.get("label", "") for camera in aligned])
     named = zip(names, aligned, strict=True)
     return as_rig((_metashape_camera(path, name, c, sensors, motion) for name, c in named), path)
-
-
-def _world_from_chunk(path: Path, chunk: Element, part: str) -> np.ndarray:
-    """Read the similarity (4, 4) to the world; return the identity if the chunk has none."""
-    inner = [c for c in chunk.iter("component") if c.get("id") == part]
-    found = [e.find("transform") for e in [*inner, chunk]]
-    element = next((e for e in found if e is not None), None)
-    if element is None:
-        return np.eye(4)
-    where = f"{path}: the chunk's transform"
-    R = _numbers(where, element, "rotation", 9).reshape(3, 3)
-    return make_transform(
-        R * _numbers(where, element, "scale", 1), _numbers(where, element, "translation", 3)
-    )
 
 
 def _metashape_camera(

@@ -177,7 +177,14 @@ def load_sample(
     if (depth_path := depth_file(folder, camera.id)) is None:
         raise StageError("it has no depth")
     depth, valid = read_depth(depth_path)
-    parts, head = _read_regions(dataset, item, camera.id)
+    parts = head = None
+    regions = dataset.item_dir("regions", item)
+    paths = regions / f"{camera.id}.png", regions / f"{camera.id}_head.png"
+    if all(path.is_file() for path in paths):
+        # The head has no alpha of its own where the regions stage could not separate the torso.
+        facts = read_json_table(regions / "metrics.json", FormatError)
+        torso_unknown = "torso" in facts["missing"] and facts["method"] == "mesh"
+        parts, head = read_alpha(paths[0]), None if torso_unknown else read_alpha(paths[1])
     sizes = [image.shape[:2] for image in (rgb, matte, depth, parts, head) if image is not None]
     if set(sizes) != {(camera.height, camera.width)}:
         raise StageError(
@@ -193,25 +200,6 @@ def load_sample(
         valid = valid & (sure >= round(255 * min_confidence))
     plate = read_plate_image(dataset, subject.name, camera.id)
     return LoadedSample(rgb, plate, matte, alpha, depth, valid, parts, torso)
-
-
-def _read_regions(
-    dataset: Dataset, item: str, camera_id: str
-) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Read the labels (H, W) uint8 and the head's alpha (H, W) uint8; None if missing.
-
-    The head has no alpha of its own where the regions stage could not separate the torso.
-
-    Raises:
-        FormatError: one of them is not an 8-bit grey image.
-    """
-    folder = dataset.item_dir("regions", item)
-    paths = folder / f"{camera_id}.png", folder / f"{camera_id}_head.png"
-    if not all(path.is_file() for path in paths):
-        return None, None
-    facts = read_json_table(folder / "metrics.json", FormatError)
-    torso_unknown = "torso" in facts["missing"] and facts["method"] == "mesh"
-    return read_alpha(paths[0]), None if torso_unknown else read_alpha(paths[1])
 
 
 def occluded(parts: np.ndarray) -> dict[str, float]:
