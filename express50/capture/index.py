@@ -120,28 +120,27 @@ def _read_cached(path: Path, dataset: Dataset, subject: str, captures_version: H
 
 def index_to_json(index: Index) -> dict[str, Any]:
     """Convert an index to JSON, without paths of this machine."""
+    # Defaults are left out: most captures have one clip, no correction and upright images.
+    plain = {"clips": (), "correction": (), "orientation": 1}
+    cameras = {}
+    for name, camera in index.cameras.items():
+        row = dict(vars(camera))
+        # Strings keep the file small and quick to read: a subject may have 10^5 frames.
+        row["pts"] = " ".join(map(str, camera.pts))
+        row["dhash"] = " ".join(camera.dhash)
+        row["names"] = list(camera.names)
+        cameras[name] = {k: v for k, v in row.items() if k not in plain or v != plain[k]}
     return {
         "schema": SCHEMA,
         "subject": index.subject,
         "fps": index.fps,
-        "cameras": {name: _camera_to_json(camera) for name, camera in index.cameras.items()},
+        "cameras": cameras,
         "plates": index.plates,
         "board": index.board,
         "calibration": index.calibration,
         "cues": [[cue.expression_id, cue.start_frame, cue.end_frame] for cue in index.cues],
         "meta": index.meta,
     }
-
-
-def _camera_to_json(camera: CameraSource) -> dict[str, Any]:
-    row = dict(vars(camera))
-    # Strings keep the file small and quick to read: a subject may have 10^5 frames.
-    row["pts"] = " ".join(map(str, camera.pts))
-    row["dhash"] = " ".join(camera.dhash)
-    row["names"] = list(camera.names)
-    # Defaults are left out: most captures have one clip, no correction and upright images.
-    plain = {"clips": (), "correction": (), "orientation": 1}
-    return {k: v for k, v in row.items() if k not in plain or v != plain[k]}
 
 
 def index_from_json(content: Mapping[str, Any], capture: Path) -> Index:

@@ -51,8 +51,15 @@ def measured_figures(
     """
     path = dial_dir(chain.dataset) / "measured.json"
     found = read_measured(path, chain.key())
-    if found is not None and not chosen and _slowed(chain, clock, found):
-        found = _timed_again(chain, clock, found)
+    if found is not None and not chosen and not clock.cores and clock.budget is not None:
+        load = workload(chain, found, False, {})
+        least = front(load)[0]
+        waited = least.seconds > BUSY * core_seconds(load, least.settings) / load.width
+        # Clock figures that are mostly waiting must not refuse a budget: other programs may have
+        # slowed the trials of an earlier command, and may have ended since. Where the budget is not
+        # refused, the run sees by itself that it is ahead of time.
+        if waited and least.seconds > clock.left():
+            found = _timed_again(chain, clock, found)
     if found is not None and (chosen or not found.untried):
         return found
     found = _measure_one(chain, clock, _Allowance(chain, clock, goal))
@@ -96,20 +103,6 @@ class _Allowance:
                 tried = cost.core_seconds if load.cores else cost.seconds
                 seconds += items * max(0.0, each - tried) / (1 if load.cores else load.width)
         return seconds
-
-
-def _slowed(chain: Chain, clock: Clock, found: PilotFigures) -> bool:
-    """Return whether a budget would be refused for clock figures that were mostly waiting.
-
-    Other programs may have slowed the trials of an earlier command, and may have ended since. Where
-    the budget is not refused, the run sees by itself that it is ahead of time.
-    """
-    if clock.cores or clock.budget is None:
-        return False
-    load = workload(chain, found, False, {})
-    least = front(load)[0]
-    waited = least.seconds > BUSY * core_seconds(load, least.settings) / load.width
-    return waited and least.seconds > clock.left()
 
 
 def core_seconds(load: Workload, settings: Mapping[str, str]) -> float:
