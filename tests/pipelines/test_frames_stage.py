@@ -18,7 +18,7 @@ from express50.capture.frames import (
     write_frame,
 )
 from express50.capture.index import read_index, read_peaks
-from express50.contract.layout import PLATES
+from express50.contract.layout import PLATES, Dataset
 from express50.errors import CaptureError, ConfigError, FormatError
 from express50.files.calibration import write_cameras
 from express50.files.images import (
@@ -45,10 +45,10 @@ def metrics_of(dataset, item):
     return json.loads((dataset.item_dir("frames", item) / "metrics.json").read_text())
 
 
-@pytest.fixture
-def dataset(tmp_path, capture):
-    """S001 with a lens that bends."""
-    dataset = make_dataset(tmp_path, [capture])
+@pytest.fixture(scope="module")
+def bent(tmp_path_factory, capture):
+    """S001 with a lens that bends; only copied."""
+    dataset = make_dataset(tmp_path_factory.mktemp("bent"), [capture])
     rig = {
         name: replace(camera, params=(*camera.params[:4], -0.2, 0.05, 0.01, 0.0))
         for name, camera in make_rig().items()
@@ -56,6 +56,12 @@ def dataset(tmp_path, capture):
     write_cameras(dataset.cameras_file("S001"), rig)
     assert run(dataset).ok
     return dataset
+
+
+@pytest.fixture
+def dataset(tmp_path, bent):
+    """S001 with a lens that bends."""
+    return Dataset(shutil.copytree(bent.root, tmp_path / "dataset"))
 
 
 def test_a_lens_that_folds_leaves_black_and_says_so(dataset):

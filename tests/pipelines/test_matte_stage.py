@@ -48,7 +48,7 @@ def metrics_of(dataset: Dataset, item: str = "S001/smile") -> dict:
 def make_dataset(root: Path, captures: list[Path]) -> Dataset:
     """Captures ingested, with given cameras, and labelled."""
     dataset = ingest_captures(root / "dataset", *captures, preset="standard")
-    assert run_here(calibrate.STAGE, dataset).ok
+    assert run_here(calibrate.STAGE, dataset, check_frame_sets=0).ok  # a ball has no face to match
     for subject in dataset.subjects():
         cues = read_index(dataset, subject).cues
         write_peaks(dataset, subject, {cue.expression_id: cue.start_frame for cue in cues})
