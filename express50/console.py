@@ -73,6 +73,9 @@ class Parser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"-\.?\d\S*")
 
     def _get_value(self, action: argparse.Action, text: str) -> Any:
+        if action.type is Path and not text:  # Path("") is the folder that the shell is in
+            words = "got an empty path, expected a name; is a variable of your shell not set?"
+            raise argparse.ArgumentError(action, words)
         try:
             return super()._get_value(action, text)
         except argparse.ArgumentError:

@@ -10,7 +10,7 @@ from typing import Any
 from rich.filesize import decimal
 
 from express50.console import FAILED, OK, add_command, answer, count, log, stdout_to_stderr
-from express50.contract.layout import Dataset, existing_dataset
+from express50.contract.layout import Dataset, check_folder, existing_dataset
 from express50.contract.stage import hook, stages
 
 
@@ -118,6 +118,7 @@ def run_withdraw(args: argparse.Namespace) -> int:
     from express50.dataset.withdraw import plan, withdraw
 
     dataset = Dataset(args.dataset)
+    check_folder(dataset)
     for path in args.checkpoint:  # refuses other files before anything is removed
         hook("read_checkpoint")(path)
     if not args.yes:

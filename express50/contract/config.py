@@ -156,7 +156,7 @@ def parse_assignment(text: str) -> tuple[str, str, object]:
     table, dot, key = name.strip().partition(".")
     if not (equals and dot and table and key):
         raise ConfigError(
-            f"--set {text!r}: expected TABLE.KEY=VALUE, for example track.iterations=200 or"
+            f"--set {text!r}: expected TABLE.KEY=VALUE, for example depth.voxel_mm=2 or"
             " train.lr=1e-3"
         )
     try:

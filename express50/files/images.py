@@ -200,8 +200,9 @@ def write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:
         spec.attribute("DateTime", "1970:01:01 00:00:00")
     target = oiio.ImageOutput.create(str(path))
     if target is None or not target.open(str(path), spec):
-        why = target.geterror() if target else oiio.geterror()
-        raise FormatError(f"{path}: cannot be written ({why.strip()}); give another path")
+        why = (target or oiio).geterror()
+        why = why if target else "expected .png, .jpg, .tif or .exr as its ending"
+        raise FormatError(f"{path}: cannot be written ({why.strip()}); give another name")
     written = target.write_image(image.reshape(image.shape[0], image.shape[1], channels))
     if not target.close() or not written:
         raise FormatError(f"{path}: writing failed ({target.geterror().strip()})")

@@ -116,7 +116,7 @@ def guess_format(path: Path) -> str:
         CalibrationError: the path does not exist, is a .json that is not JSON, or fits no format.
     """
     if not path.exists():
-        raise CalibrationError(f"{path}: does not exist")
+        raise CalibrationError(f"{path}: no such file or folder; expected a calibration")
     found = next((name for name, known in FORMATS.items() if known.fits(path)), None)
     if found is None:
         if path.suffix == ".json":
