@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from express50.errors import StageError
+from express50.geometry.conventions import corner_to_cell
 from express50.geometry.raycast import join_rays, mesh_scene
 from express50.geometry.sampling import bilinear
 from express50.geometry.transforms import unit
@@ -319,8 +320,7 @@ def _correlate(
         seen = weight > 0
         if not seen.any():
             continue
-        pixels = _patch_pixels(view, line[seen], patch[seen])
-        z = bilinear(grey, pixels.reshape(-1, 2)).reshape(pixels.shape[:3])
+        z = _patch_values(view, grey, line[seen], patch[seen])
         z -= z.mean(-1, keepdims=True)
         power = np.einsum("ndp,ndp->nd", z, z)
         share = weight[seen, None] / np.sqrt(power + count * noise * noise)
@@ -330,15 +330,22 @@ def _correlate(
     return (np.einsum("ndp,ndp->nd", total, total) - own) / np.maximum(pairs, 1e-9)[:, None]
 
 
-def _patch_pixels(view: DepthView, line: np.ndarray, patch: np.ndarray) -> np.ndarray:
-    """Project patches to pixels (n, D, P, 2) float32: affine within one, 1 % of its depth wide."""
+def _patch_values(
+    view: DepthView, grey: np.ndarray, line: np.ndarray, patch: np.ndarray
+) -> np.ndarray:
+    """Interpolate a view (H, W) at patches: (n, D, P). They are small: affine within one."""
     M = (view.camera.K @ view.camera.cam_from_world[:3, :3]).astype(np.float32)
-    p = (line - view.camera.center).astype(np.float32) @ M.T  # (n, D, 3)
-    depth = np.maximum(p[..., 2], 1e-6)
-    along = patch @ M.T  # (n, P, 3)
-    pixels = np.empty((*line.shape[:2], patch.shape[1], 2), np.float32)
+    # Vertices come last, for long inner loops.
+    center = ((line - view.camera.center).astype(np.float32) @ M.T).T[:, :, None]  # (3, D, 1, n)
+    along = np.ascontiguousarray((patch @ M.T).T)[:, None]  # (3, 1, P, n)
+    center, depth = np.ascontiguousarray(center), np.maximum(center[2], 1e-6)
+    maps = []
     for axis in range(2):
-        center = p[..., axis] / depth
-        moved = along[:, None, :, axis] - center[..., None] * along[:, None, :, 2]
-        pixels[..., axis] = center[..., None] + moved / depth[..., None]
-    return pixels
+        middle = center[axis] / depth
+        place = middle * along[2]
+        np.subtract(along[axis], place, out=place)
+        place /= depth
+        place += middle
+        maps.append(corner_to_cell(place).reshape(-1, len(patch)))
+    found = cv2.remap(grey, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.ascontiguousarray(found.reshape(place.shape).transpose(2, 0, 1))
