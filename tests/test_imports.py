@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tomllib
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -43,18 +44,28 @@ def sources():
 
 
 MODULES = {module_name(path): path for path in sources()}
-TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in MODULES.items()}
+
+
+@cache
+def trees():
+    """Every module's syntax tree; parsed by the process that runs the tests, not by all."""
+    return {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in MODULES.items()}
+
+
+@cache
+def imports():
+    """By module, names of all imported ones, in functions and under TYPE_CHECKING too."""
+    return {name: set(imports_of(tree)) for name, tree in trees().items()}
 
 
 def imports_of(tree):
-    """Names of all imported modules, in functions and under TYPE_CHECKING too."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.level == 0:
             # "from package import module" names a module, "from module import name" does not.
             below = {f"{node.module}.{alias.name}" for alias in node.names}
-            yield from below if below <= set(MODULES) else {node.module}
+            yield from below if below <= MODULES.keys() else {node.module}
 
 
 def docstrings(tree):
@@ -81,9 +92,9 @@ def names_module(text):
 def test_packages_import_only_the_core():
     wrong = [
         f"{name} imports {other}"
-        for name, tree in TREES.items()
+        for name, others in imports().items()
         if MODULES[name] != STAGE_LIST
-        for other in imports_of(tree)
+        for other in sorted(others)
         if other.split(".")[0] in PACKAGES
         and other.split(".")[0] not in ("express50", name.split(".")[0])
     ]
@@ -93,13 +104,13 @@ def test_packages_import_only_the_core():
 def test_no_module_is_imported_by_its_name_in_a_string():
     calls = [
         name
-        for name, tree in TREES.items()
+        for name, tree in trees().items()
         for node in ast.walk(tree)
         if isinstance(node, ast.Call)
         and getattr(node.func, "attr", getattr(node.func, "id", "")) in IMPORTERS
     ]  # fmt: skip
     named = [
-        f"{name}: {text!r}" for name, tree in TREES.items() for text in strings_of(tree)
+        f"{name}: {text!r}" for name, tree in trees().items() for text in strings_of(tree)
         if names_module(text) and text != name.rpartition(".")[0]  # its own folder, for resources
     ]  # fmt: skip
     assert calls == [] and named == []
@@ -115,14 +126,14 @@ def test_entry_points_lead_to_objects():
 
 def test_no_product_code_imports_tests_or_benchmarks():
     wrong = [
-        name for name, tree in TREES.items()
-        if {"tests", "benchmarks"} & {other.split(".")[0] for other in imports_of(tree)}
+        name for name, others in imports().items()
+        if {"tests", "benchmarks"} & {other.split(".")[0] for other in others}
     ]  # fmt: skip
     assert wrong == []
 
 
 def test_there_is_no_import_cycle():
-    edges = {name: (set(imports_of(tree)) & set(MODULES)) - {name} for name, tree in TREES.items()}
+    edges = {name: (others & set(MODULES)) - {name} for name, others in imports().items()}
     done = set()
 
     def visit(name, trail):
@@ -138,7 +149,7 @@ def test_there_is_no_import_cycle():
 
 def test_class_names_are_unique():
     counts = Counter(
-        node.name for tree in TREES.values() for node in tree.body
+        node.name for tree in trees().values() for node in tree.body
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
     )  # fmt: skip
     shared = {name for name, count in counts.items() if count > 1}
