@@ -390,12 +390,15 @@ def _fits(
 def _steps(pilot: Pilot, base: Trial, choices: Sequence[str]) -> list[tuple[str, str]]:
     """List settings above the cheapest ones: first one step up, as a second one gains less.
 
-    Those whose trials are quicker come first.
+    Those whose trials are quicker come first. Larger pictures than were recorded change nothing.
     """
-    steps = []
+    steps, reduces = [], {stage.name: stage.growth.reduces for stage in pilot.chain.stages}
     for name in choices:
-        ladder = list(pilot.chain.ladders[name])
-        higher = ladder[ladder.index(base.settings[name]) + 1 :]
+        configs = pilot.chain.ladders[name]
+        higher = list(configs)[list(configs).index(base.settings[name]) + 1 :]
+        if key := reduces[name]:
+            seen = {one: replace(base.footage, side=getattr(configs[one], key)) for one in higher}
+            higher = [one for one in higher if seen[one].picture > base.footage.picture]
         seconds = trial_seconds(pilot, base, name)
         steps += [(rank, seconds, (name, label)) for rank, label in enumerate(higher)]
     return [step for _, _, step in sorted(steps)]

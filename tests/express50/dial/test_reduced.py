@@ -14,12 +14,15 @@ from express50.capture.index import peak_items, read_index
 from express50.contract.layout import Dataset
 from express50.contract.stage import ExpectedError, Growth, Result, Stage
 from express50.dial.budget import parse_budget
+from express50.dial.figures import dial_dir
 from express50.dial.measuring import tune
 from express50.dial.pilot import Chain
 from express50.dial.results import ResultKind
 from express50.dial.run import run_within
+from express50.errors import FormatError
 from express50.files.atomic import write_json
 from express50.files.calibration import write_cameras
+from express50.files.text import read_json_table
 from express50.runner.executor import Pool
 from pipelines import ingest
 from pipelines.frames import STAGE as FRAMES
@@ -119,3 +122,14 @@ def test_a_tight_budget_reduces_pictures_and_a_larger_one_makes_them_whole_again
 
     assert widths(f"{(0.5 * saved + reduced) / 3600:.7f}ch") == {24}
     assert widths("1ch") == {48}
+
+
+@pytest.mark.parametrize(("side", "trials"), [(24, 3), (96, 2)])
+def test_pictures_that_are_small_enough_are_not_tried_whole(tmp_path, side, trials):
+    chain = chain_of(tmp_path / "d", captures_of(tmp_path, subjects=1))
+    chain.ladders["frames"]["draft"] = FRAMES.config(image_side=side)
+    tune(chain)
+    assert (
+        len(read_json_table(dial_dir(chain.dataset) / "measured.json", FormatError)["trials"])
+        == trials
+    )
