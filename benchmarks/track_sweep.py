@@ -41,7 +41,7 @@ KNOBS: tuple[tuple[str, dict[str, object]], ...] = (
     ("samples 8000", {"samples": 8000}),
     ("no outlines", {"outline_rounds": 0}),
     ("patch_rounds 2", {"patch_rounds": 2}),
-    ("patch_rounds 8", {"patch_rounds": 8, "uv_rounds": 8}),
+    ("patch_rounds 6", {"patch_rounds": 6, "uv_rounds": 6}),
     ("no patches", {"patch_rounds": 0}),
     ("no UV landmarks", {"uv_rounds": 0}),
     ("no offsets", {"offset_modes": 0}),

@@ -41,9 +41,9 @@ class TrackConfig:
     """Places on the skin at which patches are compared."""
     outline_rounds: int = 3
     """Last rounds in which the mesh is fitted to the mattes' outlines; 0 for none."""
-    patch_rounds: int = 6
+    patch_rounds: int = 3
     """Rounds in which the surface is searched for along the normals; 0 for none."""
-    uv_rounds: int = 6
+    uv_rounds: int = 3
     """First rounds that find landmarks on the face UV map; later rounds keep the last reading. 0
     for none."""
     offset_modes: int = 150
@@ -65,7 +65,7 @@ class TrackConfig:
 
 PRESETS: dict[str, dict[str, object]] = {
     "draft": {
-        "cameras": 6, "search": 0.5, "outline_rounds": 2, "patch_rounds": 4, "uv_rounds": 4,
+        "cameras": 6, "search": 0.5, "outline_rounds": 2,
         "samples": 2000, "offset_modes": 80, "texture_side": 256, "clip_rounds": 0,
     },
 }  # fmt: skip
