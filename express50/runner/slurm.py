@@ -10,6 +10,7 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -135,8 +136,11 @@ def job_script(job: SlurmJob, address: str, name: str, threads: int, logs: Path)
 
     An item may use ``threads`` threads; the job's output goes to the folder ``logs``.
     """
+    interrupted = signal.getsignal(signal.SIGINT)
     from dask_jobqueue.slurm import SLURMJob
 
+    if signal.getsignal(signal.SIGINT) is not interrupted:
+        signal.signal(signal.SIGINT, interrupted)  # the import made Ctrl-C end with exit code 0
     processes = job.processes(threads)
     environment = thread_environment(threads)
     if "PYTHONPATH" in os.environ:

@@ -329,6 +329,8 @@ def test_a_signal_within_a_garbage_collection_stops(number, capsys):
         gc.callbacks.remove(stop)
         signal.raise_signal(number)
 
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # libraries change it
+
     def handler(args):
         gc.callbacks.append(stop)
         gc.collect()

@@ -46,6 +46,17 @@ def run_toy(dataset, job, **values):
         return run_stage(toy.STAGE, dataset, toy.ToyConfig(**values), pool=jobs, progress=False)
 
 
+def test_writing_a_script_leaves_ctrl_c_alone():
+    code = (
+        "import signal; from pathlib import Path\n"
+        "from express50.runner.slurm import SlurmJob, job_script\n"
+        "job = SlurmJob(time='1:00:00', memory='1G', cores=1)\n"
+        "job_script(job, 'tcp://host:1', 'name', 1, Path('logs'))\n"
+        "assert signal.getsignal(signal.SIGINT) is signal.default_int_handler\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_script_asks_for_what_was_said_and_is_bash(tmp_path, monkeypatch):
     folder = tmp_path / "a b"
     folder.mkdir()
