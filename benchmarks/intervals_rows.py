@@ -34,7 +34,7 @@ from pipelines.ingest import register as take_in
 
 EXPRESSIONS = ("neutral", "smile")
 SETTINGS: dict[str, dict[str, object]] = {  # sizes that fit a small machine, as in the demo
-    "track": {"patch_rounds": 4, "samples": 2500, "offset_modes": 80, "texture_side": 256},
+    "track": {"samples": 2500, "offset_modes": 80, "texture_side": 256},
     "depth": {"voxel_mm": 2.8},
 }
 FRONT = {1: [4], 2: [3, 4], 4: [2, 3, 4, 5]}  # of eight cameras
