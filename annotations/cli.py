@@ -85,7 +85,7 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
     words = "print or choose the reference person, to whose frames all others are matched"
     argument = add("reference", run_reference, words)
     argument("subject", nargs="?", metavar="SUBJECT", help="new reference (default: print it)")
-    words = "label clips by RenderMe-360's rule: the last frame is the peak (default: e0 to e11)"
+    words = "label clips (e0 to e11, or --expression) by RenderMe-360's last-frame rule"
     add("rule", run_rule, words, "subjects", "expressions")
     words = "exclude a subject from all stages, and record the reason"
     argument = add("exclude", run_exclusion, words, "subject", "annotator")

@@ -20,20 +20,20 @@ def add_commands(subparsers: Any) -> None:
     verify = add_command(actions, "verify", run_verify, words, dataset=False)
     listing = add_command(actions, "ls", run_ls, "list the samples", dataset=False)
     show = add_command(
-        actions, "show", run_show, "print a sample's meta and write it as a picture", dataset=False,
+        actions, "show", run_show, "print a sample's metadata, or draw the sample", dataset=False,
         example="express50 shards show data/pack/shards S001_smile_cam03 --out a.png",
     )  # fmt: skip
     split = add_command(
-        actions, "split", run_split, "write part of the samples as shards of their own",
+        actions, "split", run_split, "write some of the samples as new shards",
         dataset=False, json=False,
         example="express50 shards split data/pack/shards test_only --split test",
     )  # fmt: skip
-    words = "write the samples of several folders into one"
+    words = "write the samples of several folders into one folder"
     merge = add_command(actions, "merge", run_merge, words, dataset=False, json=False)
     for action in (verify, listing, show, split):
         action.add_argument("directory", type=Path, metavar="DIR", help="folder of shards")
     show.add_argument("key", nargs="?", metavar="KEY", help="sample to show (default: the first)")
-    words = "write colours, matte and depth to this picture"
+    words = "also draw colours, matte and depth into this picture"
     show.add_argument("--out", type=Path, metavar="FILE", help=words)
     merge.add_argument("directories", type=Path, nargs="+", metavar="DIR", help="folders of shards")
     for action, names in ((listing, ("subject",)), (split, ("subject", "expression", "camera"))):

@@ -86,7 +86,9 @@ def add_commands(subparsers: Any) -> None:
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--json", action="store_true", help="print the receipts as JSON")
     how.add_argument("--page", type=Path, metavar="FILE", help=page)
-    how.add_argument("--serve", type=int, metavar="PORT", help="serve this page to this machine")
+    how.add_argument(
+        "--serve", type=int, metavar="PORT", help="serve this page, on this machine only"
+    )
 
 
 def show_status(args: argparse.Namespace) -> int:

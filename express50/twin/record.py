@@ -28,8 +28,8 @@ from express50.files.atomic import dump_json, link_file, write_json
 from express50.runner.worker import cap_threads
 from express50.twin import TwinConfig
 
-_EXAMPLE = """express50 twin record build/twin --subjects 4 --cameras 8 --width 320 --height 320 \\
-      --expressions neutral,smile,jaw_open --frames-per-expression 8 --seed 0
+_EXAMPLE = """express50 twin record build/twin --subjects 4 --cameras 8 \\
+      --width 320 --height 320 --expressions neutral,smile,jaw_open
 writes build/twin/captures/S001... (for 'express50 ingest') and build/twin/truth/S001..."""
 _NUMBERS = [setting.name for setting in fields(TwinConfig) if setting.type in ("int", "float")]
 

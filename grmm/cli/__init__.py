@@ -21,7 +21,7 @@ from grmm.config import PRESETS, TABLES
 DESCRIPTION = "Train the Gaussian Residual Morphable Model on packed shards, and use it."
 EPILOG = """example:
   grmm train DATASET/pack/shards OUT --budget 10m
-exit codes: 0 all done; 1 failed; 2 wrong usage or configuration"""
+exit codes: 0 all done; 1 failed; 2 wrong usage or settings"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -123,8 +123,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--cameras": value("ID,...", "only these, ids or patterns: cam02,cam05", default="*"),
     "--images": value(
         "N",
-        "measure at most this many images, evenly spread; of people who are fitted, at most this"
-        " many per person and kind (default: all)",
+        "measure at most this many images, evenly spread; for fitted people, the limit is per"
+        " person and kind of view (default: all)",
         type=at_least(0),
         default=0,
     ),
@@ -137,7 +137,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "ID,...", "fit people that training did not see from these cameras", default=""
     ),
     "--fit-expression": value(
-        "ID", "fit them from this expression (default: %(default)s)", default="neutral"
+        "ID", "fit these people from this expression (default: %(default)s)", default="neutral"
     ),
     "--fit-budget": value("TIME", "time per fit: 60s, 5m", type=parse_seconds),
     "--background": value(
@@ -163,8 +163,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--expression-of": value(
         "SUBJECT/EXPRESSION", "show another person's expression, from training"
     ),
-    "--z-id-of": value("SUBJECT", "take the residual identity code alone from this person"),
-    "--z-exp-of": value("EXPRESSION", "take the residual code alone from this expression"),
+    "--z-id-of": value("SUBJECT", "take only the residual identity code from this person"),
+    "--z-exp-of": value("EXPRESSION", "take only the residual code from this expression"),
     "--control": value(
         "NAME=NUMBERS",
         "change a parameter: jaw=0.3,0,0 (radians), neck.1=0.2, eyes=0,0.3,0,"
@@ -177,7 +177,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "N", "longer side, pixels (default: as trained)", type=at_least(0, 8192), default=0
     ),
     "--yaw": value("DEG", "move the camera around the head, degrees", type=finite, default=0.0),
-    "--pitch": value("DEG", "move it up, degrees", type=finite, default=0.0),
+    "--pitch": value("DEG", "move the camera up, degrees", type=finite, default=0.0),
     "--turntable": flag("write turntable.mp4"),
     "--degrees": value(
         "DEG", "angle that the turntable covers (default: 360)", type=finite, default=360.0
@@ -185,7 +185,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--frames": value(
         "N", "number of frames of a video (default: %(default)s)", type=at_least(1), default=72
     ),
-    "--to": value("SUBJECT/EXPRESSION", "write interpolation.mp4, which ends there"),
+    "--to": value("SUBJECT/EXPRESSION", "write interpolation.mp4, which ends at this expression"),
     "--drive": value(
         "SEQUENCE.NPZ", "write driven.mp4: the head moves as in these tracked clips", type=Path
     ),
@@ -211,7 +211,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         default=512,
     ),
     "--host": value(
-        "ADDRESS", "address to listen on (default: this machine alone)", default="127.0.0.1"
+        "ADDRESS", "address to listen on (default: this machine only)", default="127.0.0.1"
     ),
     "--port": value(
         "N", "port to listen on (default: %(default)s)", type=at_least(1, 65535), default=8080

@@ -36,7 +36,7 @@ def add_commands(subparsers: Any) -> None:
     importing.add_argument("out", type=Path, metavar="OUT", help="calibration.json to write")
     words = "replace the cameras that OUT holds"
     importing.add_argument("--overwrite", action="store_true", help=words)
-    words = "say whether a rig's cameras fit together"
+    words = "check whether a rig's cameras fit together"
     checking = add_command(actions, "check", run_check, words, dataset=False)
     words = "calibration in any known format"
     checking.add_argument("source", type=Path, metavar="SOURCE", help=words)

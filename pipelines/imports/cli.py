@@ -57,7 +57,7 @@ KINDS = {
 PATTERN = (
     "path of the files, with {subject}, {expression}, {camera}, {frame} (decode index) or"
     " {clip_frame} (counted from the cue's start), such as"
-    " 'masks/{subject}/{camera}/{frame:06d}.png'"
+    " 'maps/{subject}/{camera}/{frame:06d}.png'"
 )
 
 TRACKS = (
