@@ -202,7 +202,7 @@ def run_ui(args: argparse.Namespace) -> int:
     dataset = args.dataset
     subjects = _matching(included_subjects(dataset), args.subjects, "included subject")
     if not subjects:
-        raise AnnotationError(f"{dataset.root}: no subject is ingested and not excluded")
+        raise AnnotationError(f"{dataset.root}: no subject is ingested, or all are excluded")
     names = dict.fromkeys(c.expression_id for s in subjects for c in read_index(dataset, s).cues)
     session = Session(
         dataset,

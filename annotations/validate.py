@@ -185,7 +185,7 @@ def settlement(
         label = make_flag(index, expression, verdict.removeprefix(FLAG), annotator)
     else:
         raise AnnotationError(
-            f"{where}: {verdict!r} is not a frame, an annotator of it ({', '.join(said)}) or a"
+            f"{where}: {verdict!r} is not a frame, one of its annotators ({', '.join(said)}) or a"
             f" usual reason ({', '.join(FLAG_REASONS)}); write any other reason as {FLAG}REASON"
         )
     return replace(label, action="settle")

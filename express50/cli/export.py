@@ -85,8 +85,8 @@ def run_export(args: argparse.Namespace) -> int:
 
     if args.frames == "clips" and args.format == "gaussian-avatars":
         raise ConfigError(
-            "--frames clips: gaussian-avatars needs a matte of every frame, and 'matte' makes those"
-            " of peaks alone; export the clips as obj, ply or glb"
+            "--frames clips: gaussian-avatars needs a matte of every frame, but 'matte' only makes"
+            " those of peaks; export the clips as obj, ply or glb"
         )
     held = args.test_expression
     options = AvatarOptions(

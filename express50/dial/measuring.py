@@ -147,8 +147,8 @@ def _subjects(chain: Chain) -> list[str]:
     root, captures = chain.dataset.root, chain.dataset.captures()
     subjects = [s for s in captures if not exclusion_reason(chain.dataset, s)]
     if captures and not subjects:
-        take_in = f"express50 annotate include {root} {min(captures)}"
-        raise StageError(f"{root}: every subject is excluded; to take one in again: '{take_in}'")
+        include = f"express50 annotate include {root} {min(captures)}"
+        raise StageError(f"{root}: every subject is excluded; to include one: '{include}'")
     if not subjects:
         raise StageError(f"{root}: has no captures yet; run 'express50 run {root} CAPTURE'")
     return subjects[:PILOTS]
@@ -166,10 +166,10 @@ def _measure_one(chain: Chain, clock: Clock, allowance: _Allowance) -> PilotFigu
                 least = clock.now() + front(workload(chain, found, clock.cores, {}))[0].seconds
                 raise ConfigError(
                     f"--budget {clock.budget.text if clock.budget else ''}: it ended before every"
-                    " stage was measured at its cheapest setting; those that were measured, and"
-                    f" their measuring, need {format_seconds(least)}"
+                    " stage was measured at its cheapest setting; measuring and running the"
+                    f" measured stages alone takes {format_seconds(least)}"
                     f" {time_words(clock.cores, chain.pool.width())}; give several times as much."
-                    " What was measured is kept, so that the same command gets further"
+                    " What was measured is kept, so the same command gets further each time"
                 )
             if not broken:
                 return found

@@ -79,7 +79,7 @@ def load_head(spec: str | Path) -> HeadModel:
     if not path.exists():
         raise HeadModelError(
             f"head model {str(spec)!r}: no such file or folder; expected {_KINDS}. Tracks and"
-            " shards keep the path of their model: it has to be there"
+            " shards name their model by its path, so keep the file there"
         )
     if path.suffix == ".npz" and is_stored(path):
         return load_stored(path, path.stem)

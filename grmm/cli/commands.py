@@ -138,7 +138,7 @@ def render(args: argparse.Namespace) -> int:
     from grmm import render
 
     _no_file(args.out)
-    _goes_with(args, "drive", "drive_cue")
+    _require(args, "drive", "drive_cue")
     loaded = _load(args.checkpoint)
     model, head = loaded.model, _edited_head(loaded, args)
     clips = render.read_clips(args.drive, args.drive_cue) if args.drive else None
@@ -205,10 +205,10 @@ def export(args: argparse.Namespace) -> int:
         raise ConfigError(f"{args.out}: unknown kind of file, expected one of {expected}")
     ending = ".glb" if form in ("splats", "arkit") else f".{form}"
     if args.out.suffix.lower() != ending:
-        raise ConfigError(f"{args.out}: --format {form} writes {ending}; name the file so")
+        raise ConfigError(f"{args.out}: --format {form} needs a name that ends in {ending}")
     if form != "html" and (unused := [n for n in ("drive", "shards") if getattr(args, n)]):
-        raise ConfigError(f"--{unused[0]} goes with a .html page, not with {args.out.name}")
-    _goes_with(args, "drive", "drive_cue")
+        raise ConfigError(f"--{unused[0]} is only for .html pages, not for {args.out.name}")
+    _require(args, "drive", "drive_cue")
     _no_file(args.out.parent)
     loaded = _load(args.checkpoint)
     head, view = _edited_head(loaded, args), camera_of(loaded, args.camera, args.size)
@@ -245,7 +245,7 @@ def evaluate(args: argparse.Namespace) -> int:
     from grmm.shard_source import ShardSource
 
     _no_file(args.out)
-    _goes_with(args, "fit_cameras", "fit_budget")
+    _require(args, "fit_cameras", "fit_budget")
     loaded = _load(args.checkpoint, _metric_settings(args), args.fit_budget)
     source = ShardSource(args.shards, "*")
     views = loaded.views(source)
@@ -395,12 +395,12 @@ def study_table(args: argparse.Namespace) -> int:
     return answer(args, summary, markdown(summary))
 
 
-def _goes_with(args: argparse.Namespace, needed: str, *options: str) -> None:
+def _require(args: argparse.Namespace, needed: str, *options: str) -> None:
     """Refuse options that mean nothing without another one."""
     for option in options:
         if getattr(args, option) is not None and not getattr(args, needed):
             first, second = (f"--{name.replace('_', '-')}" for name in (option, needed))
-            raise ConfigError(f"{first} goes with {second}; give {second} too")
+            raise ConfigError(f"{first} needs {second}; give both")
 
 
 def _no_file(out: Path) -> None:

@@ -120,7 +120,7 @@ def _read_raw(camera: RawCamera, wanted: list[int]) -> Iterator[tuple[int, np.nd
             if length > max(wanted):
                 return
     missing = min(frame for frame in wanted if frame >= length)
-    raise CaptureError(f"{camera.path}: has {length} frames, frame {missing} was expected")
+    raise CaptureError(f"{camera.path}: has {length} frames, expected a frame {missing}")
 
 
 def find_points(read: Callable[[], Images], small: bool = False) -> dict[int, FrameSetPoints]:

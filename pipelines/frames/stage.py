@@ -32,7 +32,7 @@ FOLDS = (
     " calibrate again, or check that the coefficients belong to this image size"
 )
 
-LEAST_SIDE = 100  # pixels; on smaller pictures no face can be told
+LEAST_SIDE = 100  # pixels; in smaller pictures no face can be recognised
 FIRST_PLATES = 6  # one in 60 degrees of a full ring; a face is seen from 180
 FACE_SCORE = 0.4  # plates of an empty set have 0.00, with a person 0.5 to 1 if the face shows
 FACE = (

@@ -278,7 +278,7 @@ def _write_depths(given: PeakPictures, out: Path) -> Result:
         depths[name] = depth * (read_alpha(matte) > 127) if matte.is_file() else depth
     known = {name: depth for name, depth in depths.items() if depth.any()}
     if not known:
-        raise StageError(f"{given.item}: its depth maps know nothing inside the mattes")
+        raise StageError(f"{given.item}: its depth maps have no known depth inside the mattes")
     notes, checks = list[Note](), dict[str, object]()
     if empty := [name for name in depths if name not in known]:
         notes.append(Note(few(empty), "depth is unknown everywhere inside the matte"))

@@ -174,8 +174,8 @@ def _place_head(views: Sequence[CutView]) -> HeadPlace:
     best = max((face.score for face in faces), default=0.0)
     raise NoFaceError(
         f"no face found (score {best:.2f}, expected {FACE_SCORE} or more), and without plates the"
-        " face shows where a person is; set matte.method to salient and matte.weights, or give"
-        " plates"
+        " person is found by the face; record plates, or set matte.method=salient and"
+        " matte.weights"
     )
 
 

@@ -210,7 +210,7 @@ def check_face(points: np.ndarray, template: np.ndarray, what: str) -> None:
     if not SIZES[0] < scale < SIZES[1]:
         raise StageError(
             f"{what} are {scale:.3g} times as far apart as those of a human face, expected"
-            f" {SIZES[0]:g} to {SIZES[1]:g}; give the scan alone, in metres, centimetres or"
+            f" {SIZES[0]:g} to {SIZES[1]:g}; give only the head, in metres, centimetres or"
             " millimetres"
         )
     off, mirrored = _misfit(ours, theirs), _misfit(ours * [-1, 1, 1], theirs)

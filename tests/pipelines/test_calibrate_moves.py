@@ -270,7 +270,7 @@ def test_frame_sets_follow_the_cues_and_a_short_camera_is_named(footage, tmp_pat
     assert {frame for frame, _, _ in read_raw_footage(tmp_path / "capture", rig, 3)} == {0}
     cues = "expression_id,start_frame,end_frame\nneutral,0,0\nsmile,2,4\n"
     (tmp_path / "capture" / "cues.csv").write_text(cues)
-    with pytest.raises(CaptureError, match="has 1 frames, frame 3 was expected"):
+    with pytest.raises(CaptureError, match="has 1 frames, expected a frame 3"):
         list(read_raw_footage(tmp_path / "capture", rig, 2))
 
 

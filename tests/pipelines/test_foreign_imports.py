@@ -507,7 +507,7 @@ def test_an_empty_map_is_named_and_the_others_are_fused(dataset, tmp_path, capsy
     said = capsys.readouterr().out
     assert "= 1 done + 1 failed" in said and "unexpected" not in said
     assert "warning S001/smile: cam02: depth is unknown everywhere inside the matte" in said
-    assert "S001/neutral: its depth maps know nothing inside the mattes" in said
+    assert "S001/neutral: its depth maps have no known depth inside the mattes" in said
 
 
 def face(cameras: dict, points: np.ndarray) -> Observation:
