@@ -23,7 +23,7 @@ from benchmarks.grmm import held_out, make_shards
 from express50.files.atomic import write_json
 from grmm.ablate import GROUPS, Ablation, ablate
 from grmm.config import resolve
-from grmm.identity_evaluation import FitProtocol
+from grmm.fit import FitProtocol
 
 ROWS = ("no_residuals", "no_mesh_decoder", "no_refinement", "no_locality")
 EXPRESSIONS = ("neutral", "smile", "jaw_open", "pucker", "brow_raise", "wink_left", "anger",

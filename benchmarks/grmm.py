@@ -36,7 +36,7 @@ from grmm.config import Config, resolve
 from grmm.data import HeadViews
 from grmm.edit import trained_head
 from grmm.evaluate import REGIONS, evaluate, mean, training_render
-from grmm.identity_evaluation import NOVEL_VIEW, FitProtocol, evaluate_unseen
+from grmm.fit import NOVEL_VIEW, FitProtocol, evaluate_unseen
 from grmm.metrics import PerceptualMetrics
 from grmm.render import draw_views, frontal, orbit, picture, resized
 from grmm.shard_source import open_shards

@@ -40,7 +40,7 @@ from express50.twin.truth import Truth
 from pipelines.matte import MatteConfig
 from pipelines.matte.key import dilated, eroded, key_alpha
 from pipelines.matte.plates import exposed, exposure_gain
-from pipelines.pack.crop import own_colours
+from pipelines.pack.sample import own_colours
 
 HARD = (4.0, 6.0, 10.0, 16.0, 24.0, 40.0)  # 8-bit steps
 LOW, HIGH = (2.0, 4.0, 8.0, 16.0, 32.0), (12.0, 25.0, 40.0, 60.0, 90.0)  # noise deviations

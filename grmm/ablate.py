@@ -36,7 +36,7 @@ from grmm.evaluate import (
     mean,
     training_render,
 )
-from grmm.identity_evaluation import (
+from grmm.fit import (
     NOVEL_EXPRESSION,
     NOVEL_VIEW,
     FitProtocol,

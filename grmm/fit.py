@@ -1,4 +1,4 @@
-"""Fit an unseen person by inverse rendering, in the paper's two stages.
+"""Fit an unseen person by inverse rendering, in the paper's two stages; measure on other views.
 
 Stage 1 inverts the codes with all networks fixed, starting from the mean code. Stage 2 fixes the
 codes and fine-tunes the decoders, held near the pretrained model by the locality loss, and the mesh
@@ -14,13 +14,14 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from express50.console import figure_label, log
-from express50.errors import TrainError
+from express50.errors import ConfigError, TrainError
 from express50.files.atomic import check_space, write_json
 from express50.geometry.sampling import evenly
 from grmm import losses
@@ -28,10 +29,11 @@ from grmm.checkpoint import Checkpoint, Gallery, collect_gallery, save_checkpoin
 from grmm.config import Config
 from grmm.data import NO_OFFSETS, HeadView, HeadViews, Shuffle
 from grmm.edit import HeadCodes, between, trained_head, transfer
-from grmm.evaluate import evaluate, mean
+from grmm.evaluate import HELD_IDENTITY, Row, evaluate, mean
 from grmm.metrics import PerceptualMetrics
 from grmm.model import GRMM, PinholeView, Rendering
 from grmm.render import comparison_sheet
+from grmm.shard_source import select
 from grmm.warm_start import LOGIT_LIMIT, project_texture, spread_change
 
 Scores = dict[str, float | None]
@@ -40,6 +42,8 @@ STAGE1_SHARE = 0.35  # of a time budget (G22)
 STAGE1_LR = 1e-2  # learning rate of the codes: they are few and start at a mean (G22)
 STAGE1_FINAL_LR = 0.1  # rate at the end of stage 1 over the rate at its start (G22)
 LOCALITY_T = 0.3  # weight of the fitted subject in the interpolation (paper, supplement)
+NOVEL_VIEW = f"{HELD_IDENTITY}, novel view"
+NOVEL_EXPRESSION = f"{HELD_IDENTITY}, other expression"
 
 
 @dataclass(kw_only=True)
@@ -354,3 +358,87 @@ def save_fit(state: FitState, out: Path) -> None:
         head_spec=state.loaded.head_spec,
         gallery=Gallery(frames=own.frames | frames, cameras=cameras),
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitProtocol:
+    """The views of an unseen person that a fit gets.
+
+    Attributes:
+        cameras: patterns of those to fit from; empty: the first by id.
+        expression: patterns of those to fit; others are rendered with the codes of training.
+        images: the most to measure per person and kind, 0 = all.
+    """
+
+    cameras: tuple[str, ...] = ()
+    expression: str = "neutral"
+    images: int = 0
+
+
+def evaluate_unseen(
+    loaded: Checkpoint,
+    views: HeadViews,
+    subject: str,
+    protocol: FitProtocol,
+    judge: PerceptualMetrics,
+    keep: Callable[[int, Tensor], None] | None = None,
+    among: Sequence[int] | None = None,
+) -> tuple[list[Row], dict[str, Any]]:
+    """Fit a person from the protocol's views; rows of its other views and expressions, effort.
+
+    ``among`` are the indices to measure, by default all of the person's.
+
+    Raises:
+        ConfigError: the shards hold no such views, or nothing is left to measure.
+    """
+    given, own = unseen_views(loaded, views, subject, protocol, among)
+    state = start(loaded, views, given)
+    _, effort = run_stages(state, lambda: {})
+    rows = []
+    for kind, fitted in ((NOVEL_VIEW, True), (NOVEL_EXPRESSION, False)):
+        chosen = [i for i in own if (views.keys[i].expression in state.z_exp) == fitted]
+        chosen = evenly(chosen, protocol.images or len(chosen))
+        rows += evaluate(views, chosen, state.render, judge, lambda key, kind=kind: kind, keep)
+    cameras = sorted({views.keys[i].camera for i in given})
+    return rows, {"subject": subject, "cameras": cameras} | effort
+
+
+def unseen_views(
+    loaded: Checkpoint,
+    views: HeadViews,
+    subject: str,
+    protocol: FitProtocol,
+    among: Sequence[int] | None = None,
+) -> tuple[list[int], list[int]]:
+    """Choose a person's views to fit from and to measure; see `evaluate_unseen`."""
+    given = given_views(views, subject, protocol)
+    cameras = {views.keys[i].camera for i in given}
+    known = {*(views.keys[i].expression for i in given), *loaded.model.expressions}
+    own = [
+        i
+        for i in (range(len(views.keys)) if among is None else among)
+        if views.keys[i].subject == subject
+        and views.keys[i].expression in known
+        and views.keys[i].camera not in cameras
+    ]
+    if not own:
+        raise ConfigError(
+            f"{subject}: no view is left to measure: cameras {', '.join(sorted(cameras))} are "
+            f"used for the fit, and only expressions {', '.join(sorted(known))} can be drawn"
+        )
+    return given, own
+
+
+def given_views(views: HeadViews, subject: str, protocol: FitProtocol) -> list[int]:
+    """Choose the views to fit from; a ConfigError says that the shards have none."""
+    cameras = ",".join(protocol.cameras) or "*"
+    try:
+        given = select(views.keys, subject, protocol.expression, cameras)
+    except ConfigError as error:
+        raise ConfigError(
+            f"{error}; --fit-cameras and --fit-expression choose the views to fit {subject} from"
+        ) from error
+    if protocol.cameras:
+        return given
+    first = min(views.keys[i].camera for i in given)
+    return [i for i in given if views.keys[i].camera == first]

@@ -73,3 +73,26 @@ def _age(meta: Mapping) -> float | None:
     age = meta.get("age")
     known = is_number(age) and AGE_BANDS[0][0] <= age < AGE_BANDS[-1][1] + 1
     return age if known else None
+
+
+def people_lines(people: Sequence[Mapping]) -> list[str]:
+    """Count gender and age of the subjects in tables, if enough captures state them."""
+    lines = []
+    if genders := shown_counts(gender_counts(people)):
+        lines += _count_table("gender", genders)
+    if mean := mean_age(people):
+        lines += [f"Age: {mean[0]:g} years in the mean of {mean[1]} people.", ""]
+    if ages := shown_counts(age_counts(people)):
+        lines += _count_table("age", ages)
+    few = f"Gender and age are not stated, or of fewer than {LEAST_PEOPLE} of {len(people)} people."
+    return lines[:-1] or [few]
+
+
+def _count_table(name: str, counts: Mapping[str, int]) -> list[str]:
+    """Draw a table with a bar of one block per person, forty at most."""
+    scale = min(1.0, 40 / max(counts.values()))
+    rows = [
+        f"| {' '.join(value.replace('|', '/').split())} | {count} | {'█' * round(count * scale)} |"
+        for value, count in counts.items()
+    ]
+    return [f"| {name} | subjects | |", "|---|---|---|", *rows, ""]

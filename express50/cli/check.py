@@ -98,8 +98,7 @@ def run_check(args: argparse.Namespace) -> int:
 
 def run_prune(args: argparse.Namespace) -> int:
     """Delete replaced and stale outputs and trials, and say what that freed."""
-    from express50.runner.publish import is_running
-    from express50.runner.replaced import empty
+    from express50.runner.publish import empty, is_running
 
     dataset = existing_dataset(args.dataset)
     folders = [dataset.replaced_dir, dataset.stale_dir, dataset.pilot_dir]

@@ -25,7 +25,7 @@ from express50.dial.figures import Footage, dial_dir, footage_of, read_measured
 from express50.errors import ConfigError, StageError
 from express50.files.digests import files_of, text_digest
 from express50.runner.ledger import Ledger
-from express50.runner.replaced import size_of
+from express50.runner.publish import size_of
 
 SIZES = ("subjects", "expressions", "cameras", "frames_per_expression")
 # Campaigns of the papers: EXPRESS-50, and RenderMe-360 as it was used beside it (280 of its people,
@@ -279,7 +279,7 @@ def estimate(
     Workers are processes of one core each. Only datasets of the first one's preset count.
     """
     # Imported here, because NumPy would slow every command.
-    from express50.dial.laws import MeasuredSize, forecast, typical_seconds
+    from express50.dial.figures import MeasuredSize, forecast, typical_seconds
 
     rows = []
     for stage in known:

@@ -33,8 +33,14 @@ from express50.files.digests import file_sha256, files_of, text_digest
 from express50.runner.imported import AGAIN, import_trouble
 from express50.runner.ledger import FileMark, Ledger, Receipt
 from express50.runner.outdated import BAD_INPUT, differing, published_digest, why_outdated
-from express50.runner.publish import clean_leftovers, hold_stages, is_running, leftovers, set_aside
-from express50.runner.replaced import size_of
+from express50.runner.publish import (
+    clean_leftovers,
+    hold_stages,
+    is_running,
+    leftovers,
+    set_aside,
+    size_of,
+)
 from express50.runner.worker import fingerprint, input_digests
 from express50.shards.reader import read_entries
 from express50.shards.writer import verify

@@ -32,7 +32,7 @@ from express50.files.text import read_json_table
 from express50.geometry.sampling import evenly
 from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger, Receipt
-from express50.runner.replaced import keeping
+from express50.runner.publish import keeping
 from express50.runner.runner import run_stage
 
 PEAKS = 3  # expressions of a trial

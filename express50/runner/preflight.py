@@ -20,7 +20,7 @@ from express50.errors import Express50Error, FormatError, StageError
 from express50.files.atomic import LEAST_FREE
 from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger
-from express50.runner.replaced import size_of
+from express50.runner.publish import size_of
 
 WORKER_SHARE = 0.9 * 0.95  # share of the memory that workers get, and at which dask stops one
 CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")  # of containers and jobs

@@ -28,12 +28,13 @@ from express50.runner.preflight import expected_shortage
 from express50.runner.progress import RunLog, showing
 from express50.runner.publish import (
     clean_leftovers,
+    keeping,
+    make_room,
     record_published,
     run_folder,
     set_aside,
     stage_lock,
 )
-from express50.runner.replaced import keeping, make_room
 from express50.runner.worker import Task, failed_receipt, failure_reason, fingerprint, input_digests
 
 WARNINGS = 12  # lines; more of them would hide the account

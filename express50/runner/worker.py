@@ -26,8 +26,7 @@ from express50.errors import CaptureError, DiskFullError, Express50Error, StageE
 from express50.files.atomic import dump_json, naming_full_disk, write_bytes
 from express50.files.digests import files_of, value_digest
 from express50.runner.ledger import FileMark, Made, Receipt, mark_file
-from express50.runner.publish import publishing
-from express50.runner.replaced import empty, keeping, restore
+from express50.runner.publish import empty, keeping, publishing, restore
 
 BATCH_SECONDS = 0.2  # after this time a batch begins no further item
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from grmm.checkpoint import Checkpoint
     from grmm.data import HeadViews
     from grmm.edit import HeadCodes
-    from grmm.identity_evaluation import FitProtocol
+    from grmm.fit import FitProtocol
     from grmm.metrics import PerceptualMetrics
 
 AUTO = "auto"  # in place of a preset
@@ -240,7 +240,7 @@ def evaluate(args: argparse.Namespace) -> int:
     """Measure a checkpoint on people it has codes for, and on people fitted first."""
     from express50.geometry.sampling import evenly
     from grmm.evaluate import SEEN, evaluate, kind_of, save_pictures, training_render
-    from grmm.identity_evaluation import evaluate_unseen, unseen_views
+    from grmm.fit import evaluate_unseen, unseen_views
     from grmm.metrics import PerceptualMetrics
     from grmm.shard_source import ShardSource
 
@@ -355,7 +355,7 @@ def ablate(args: argparse.Namespace) -> int:
 
 
 def _protocol(args: argparse.Namespace) -> FitProtocol:
-    from grmm.identity_evaluation import FitProtocol
+    from grmm.fit import FitProtocol
 
     return FitProtocol(
         cameras=_split_names(args.fit_cameras), expression=args.fit_expression, images=args.images

@@ -93,8 +93,8 @@ def items(dataset: Dataset) -> list[str]:
 
 def inputs(dataset: Dataset, item: str, config: PackConfig) -> dict[str, Path | str]:
     """Name the encoded and the excluded subjects."""
+    from express50.capture.demographics import people_lines
     from express50.capture.readers.read import read_people
-    from pipelines.pack.card import people_lines
 
     found: dict[str, Path | str] = {}
     for subject in dataset.subjects():

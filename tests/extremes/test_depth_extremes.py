@@ -29,7 +29,7 @@ from pipelines.depth.views import (
     project_fast,
     silhouette_distance,
 )
-from pipelines.pack.crop import Crop, cut_depth, cut_image
+from pipelines.pack.sample import Crop, cut_depth, cut_image
 from tests.pipelines.bump_head import render, ring
 from tests.pipelines.dense_grid import from_dense
 

@@ -458,7 +458,7 @@ def test_nobody_is_fitted_if_somebody_lacks_the_views(checkpoint, tmp_path, monk
     source = EllipsoidSource(subjects=4, size=32)
     source.keys = [key for key in source.keys if (key.subject, key.expression) != ("S003", "e0")]
     root = write_shards(tmp_path / "shards", source, ("S002", "S003"))
-    monkeypatch.setattr("grmm.identity_evaluation.run_stages", lambda *unused: pytest.fail("fits"))
+    monkeypatch.setattr("grmm.fit.run_stages", lambda *unused: pytest.fail("fits"))
     evaluate = ["evaluate", str(checkpoint), str(root), str(tmp_path / "out")]
     assert main([*evaluate, "--fit-cameras=cam00", "--fit-expression=e0"]) == 2
     assert "S003" in capsys.readouterr().err

@@ -14,6 +14,9 @@ from grmm.config import MetricsConfig
 from grmm.data import HeadViews
 from grmm.edit import trained_head
 from grmm.fit import (
+    NOVEL_VIEW,
+    FitProtocol,
+    evaluate_unseen,
     fit,
     invert_codes,
     locality_loss,
@@ -22,7 +25,6 @@ from grmm.fit import (
     start,
     tune_decoders,
 )
-from grmm.identity_evaluation import NOVEL_VIEW, FitProtocol, evaluate_unseen
 from grmm.metrics import PerceptualMetrics
 from grmm.render import expression_grid, frontal, interpolation, turntable
 from grmm.train import train

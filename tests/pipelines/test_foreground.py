@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from express50.files.images import linear_to_srgb, srgb_to_linear
-from pipelines.pack.crop import Crop, cut_own_colours, own_colours
+from pipelines.pack.sample import Crop, cut_own_colours, own_colours
 
 
 def mixed(subject: np.ndarray, plate: np.ndarray, alpha: np.ndarray) -> np.ndarray:

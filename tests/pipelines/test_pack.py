@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import minimum_filter
 
+from express50.capture.demographics import people_lines
 from express50.contract.layout import Dataset
 from express50.contract.segmentation_labels import LABELS
 from express50.dataset.depth_files import read_depth
@@ -26,10 +27,18 @@ from pipelines.depth import STAGE as DEPTH
 from pipelines.depth import DepthConfig
 from pipelines.pack import ENCODE, EncodeConfig, PackConfig
 from pipelines.pack import STAGE as PACK
-from pipelines.pack.card import people_lines, split_subjects
-from pipelines.pack.crop import Crop, crop_pinhole, cut_depth, cut_image, cut_labels, head_crop
-from pipelines.pack.sample import nameless, occluded, read_subject
-from pipelines.pack.stage import warn_of_gaps, warn_of_temporary_test_subjects
+from pipelines.pack.sample import (
+    Crop,
+    crop_pinhole,
+    cut_depth,
+    cut_image,
+    cut_labels,
+    head_crop,
+    nameless,
+    occluded,
+    read_subject,
+)
+from pipelines.pack.stage import split_subjects, warn_of_gaps, warn_of_temporary_test_subjects
 from tests.pipelines.bump_dataset import make_dataset, published
 
 SMALL = EncodeConfig(size=64)

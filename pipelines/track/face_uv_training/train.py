@@ -26,8 +26,7 @@ from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.landmarks.network import WEIGHTS as START
 from express50.landmarks.network import LandmarkNet, load_network, save_network, trainable_network
-from express50.landmarks.training.descent import descend
-from express50.landmarks.training.train import point_loss
+from express50.landmarks.training.train import descend, point_loss
 from express50.landmarks.training.views import made_once
 from pipelines.track.config import UV_WEIGHTS
 from pipelines.track.face_uv import (

@@ -28,8 +28,7 @@ from express50.errors import CaptureError, FormatError, StageError, UnknownNameE
 from express50.files.digests import text_digest
 from express50.runner import publish
 from express50.runner.ledger import Ledger, Made, Receipt, Run, mark_file
-from express50.runner.publish import stage_lock
-from express50.runner.replaced import keeping
+from express50.runner.publish import keeping, stage_lock
 from pipelines import ingest
 from tests.faults.toy import tree
 from tests.synth import make_capture

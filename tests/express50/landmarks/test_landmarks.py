@@ -33,10 +33,9 @@ from express50.landmarks.network import (
     load_network,
     save_network,
 )
-from express50.landmarks.training.descent import descend
 from express50.landmarks.training.random_heads import random_head, random_parameters
 from express50.landmarks.training.scene import HeadScene, TrainingView
-from express50.landmarks.training.train import crop_loss, main, start_network
+from express50.landmarks.training.train import crop_loss, descend, main, start_network
 from express50.landmarks.training.views import (
     FACE_YAW,
     draw_views,

@@ -12,7 +12,7 @@ import pytest
 from express50.__main__ import main
 from express50.contract.layout import Dataset
 from express50.dataset.audit import audit
-from express50.runner import replaced
+from express50.runner import publish
 from express50.runner.ledger import Ledger
 from express50.runner.publish import stage_lock
 from express50.runner.runner import run_stage
@@ -118,7 +118,7 @@ def test_a_kill_while_an_output_is_restored_costs_that_entry_alone(dataset, monk
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(replaced, "keeping", killed)
+        patch.setattr(publish, "keeping", killed)
         with pytest.raises(KeyboardInterrupt):
             run_toy(dataset)
     assert tree(dataset.stage_dir("toy")) == other

@@ -23,7 +23,7 @@ from express50.cli.status import read_status
 from express50.contract.config import field_documents
 from express50.contract.stage import ExpectedError, Note
 from express50.errors import CaptureError, ConfigError, DiskFullError, StageError
-from express50.runner import replaced
+from express50.runner import publish
 from express50.runner.clusters import RemoteWorkers
 from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger
@@ -152,7 +152,7 @@ def test_lost_output_is_made_again(tmp_path):
 @pytest.mark.parametrize("room", [True, False])
 def test_output_of_an_item_that_failed_on_newer_data_is_not_read(tmp_path, room, monkeypatch):
     if not room:
-        monkeypatch.setattr(replaced, "LEAST_ROOM", float("inf"))
+        monkeypatch.setattr(publish, "LEAST_ROOM", float("inf"))
     dataset = make_dataset(tmp_path / "data", ["bad1"])
     source = dataset.root / "in" / "bad1.txt"
     source.write_text("repaired")
