@@ -1,4 +1,4 @@
-"""Write triangle meshes as PLY, OBJ or GLB in their own units, read surfaces, make Laplacians."""
+"""Write triangle meshes as PLY, OBJ or GLB in their own units, read surfaces, follow edges."""
 
 from __future__ import annotations
 
@@ -173,3 +173,29 @@ def cotangent_laplacian(
     half = sparse.csr_matrix((np.concatenate(values), edges), shape=(count, count))
     weights = (half + half.T).maximum(0.0).minimum(20.0)
     return sparse.diags(np.asarray(weights.sum(1)).ravel()) - weights, mass
+
+
+def edges_of(faces: np.ndarray) -> np.ndarray:
+    """List the edges (3 F, 2) of faces (F, 3), in the sense of the face."""
+    return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+
+
+def open_edges(faces: np.ndarray) -> np.ndarray:
+    """List the edges (E, 2) that only one of the faces (F, 3) has, in its sense and sorted."""
+    edges = edges_of(faces)
+    _, first, count = np.unique(
+        np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    return edges[first[count == 1]]
+
+
+def edge_graph(faces: np.ndarray, count: int) -> sparse.csr_matrix:
+    """Return the symmetric matrix (count, count) that is 1 where an edge of faces (F, 3) is."""
+    edges = edges_of(faces)
+    half = sparse.csr_matrix((np.ones(len(edges)), edges.T), shape=(count, count))
+    return ((half + half.T) > 0).astype(np.float64)
+
+
+def mesh_parts(faces: np.ndarray, count: int) -> np.ndarray:
+    """Number the connected parts of faces (F, 3); returns that of each of `count` vertices."""
+    return sparse.csgraph.connected_components(edge_graph(faces, count), directed=False)[1]

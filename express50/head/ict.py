@@ -12,14 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from skimage.measure import points_in_poly
 
 from express50.errors import HeadModelError
 from express50.files.arrays import read_arrays
 from express50.files.text import read_text
-from express50.geometry.meshes import check_faces
+from express50.geometry.meshes import check_faces, mesh_parts, open_edges
 from express50.geometry.sampling import smoothstep
 from express50.head.model import PARENTS, HeadModel, check_head
 
@@ -343,9 +341,7 @@ def ict_regions(
     near_nose = (template[:, :2] > nose.min(0) - margin) & (template[:, :2] < nose.max(0) + margin)
     lips = marks[48:60, :2]
     lips = lips.mean(0) + 1.04 * (lips - lips.mean(0))
-    # The neck's lower end is open: its edges have one face only.
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    edges, uses = np.unique(edges, axis=0, return_counts=True)
+    end = np.isin(number, open_edges(faces))  # the neck's lower end is open
     regions = {
         "face": face,
         "neck": skin & ~face & ~ears & ~scalp,
@@ -361,7 +357,7 @@ def ict_regions(
         "tongue": _tongue(template, faces, uv_faces, part["gums_tongue"]),
         "eyelashes": part["eyelashes"],
         "mouth_interior": part["mouth_socket"] | part["gums_tongue"],
-        "boundary": skin & np.isin(number, edges[uses == 1]) & (y < np.quantile(y, 0.05)),
+        "boundary": skin & end & (y < np.quantile(y, 0.05)),
     }
     for side in ("left", "right"):
         ball = part[f"{side}_eyeball"]
@@ -384,9 +380,7 @@ def _tongue(
     """
     inside = gums[faces].all(1)
     corners = uv_faces[inside]
-    pairs = corners.ravel(), np.repeat(corners[:, 0], 3)
-    links = coo_matrix((np.ones(corners.size), pairs), shape=(uv_faces.max() + 1,) * 2)
-    islands = connected_components(links, directed=False)[1][corners[:, 0]]
+    islands = mesh_parts(corners, uv_faces.max() + 1)[corners[:, 0]]
     mask = np.zeros(template.shape[0], dtype=bool)
     for island in np.unique(islands):
         ids = np.unique(faces[inside][islands == island])

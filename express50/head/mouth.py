@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from express50.errors import HeadModelError
+from express50.geometry.meshes import open_edges
 from express50.head.model import JOINTS, HeadModel
 
 FLAME_VERTICES, TOOTH_VERTICES = 5023, 120
@@ -193,12 +194,8 @@ def mouth_loop(faces: np.ndarray, name: str) -> np.ndarray:
     Raises:
         HeadModelError: the faces (F, 3) have no such loop.
     """
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    count = int(faces.max()) + 1
-    keys, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
-    open_edges = edges[~np.isin(keys, back)]
     # The face on the other side of an edge runs along it in the opposite direction.
-    following = {int(b): int(a) for a, b in open_edges}
+    following = {int(b): int(a) for a, b in open_edges(faces)}
     loop = [CORNERS[0]]
     while len(loop) <= LOOP_SIZE and (after := following.get(loop[-1])) not in (None, loop[0]):
         loop.append(after)

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from express50.files.images import disc
 from express50.geometry.cameras import inside_frame, rays
 from express50.geometry.conventions import cell_to_corner
+from express50.geometry.meshes import open_edges
 from express50.geometry.raycast import camera_rays, join_rays, mesh_scene
 from express50.geometry.sampling import bilinear
 from express50.geometry.transforms import unit
@@ -184,11 +185,7 @@ def _fan(loop: np.ndarray, middle: int) -> np.ndarray:
 
 def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:
     """Find closed chains of vertices along edges that only one triangle of (F, 3) has."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    _, first, count = np.unique(
-        np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True
-    )
-    following = dict(map(tuple, edges[first[count == 1]].tolist()))
+    following = dict(map(tuple, open_edges(faces).tolist()))
     loops = []
     while following:
         start, vertex = following.popitem()

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from express50.errors import StageError
 from express50.geometry.conventions import corner_to_cell
+from express50.geometry.meshes import mesh_parts
 from express50.geometry.raycast import join_rays, mesh_scene
 from express50.geometry.sampling import bilinear
 from express50.geometry.transforms import unit
@@ -43,7 +44,6 @@ from pipelines.depth.surface import (
     extract_mesh,
     fair,
     graph_laplacian,
-    largest_part,
     rim_targets,
     smooth_displacement,
 )
@@ -197,7 +197,9 @@ def _finished(
             f"no surface is left on a grid of {grid.voxel * 1e3:.3g} mm voxels; expected a head"
             " larger than a few voxels: check the mattes, or lower depth.voxel_mm"
         )
-    mesh = mesh._replace(faces=largest_part(mesh.vertices, mesh.faces))
+    part = mesh_parts(mesh.faces, len(mesh.vertices))[mesh.faces[:, 0]]
+    # Smaller parts are not the head.
+    mesh = mesh._replace(faces=mesh.faces[part == np.bincount(part).argmax()])
     offsets = np.array([-1.0, 0.0, 1.0]) * grid.voxel
     weights = view_weights(clear, mesh, grid.voxel)
     agreement = patch_scores(clear, weights, grid, mesh, offsets, noise)[:, 1]

@@ -15,6 +15,7 @@ from skimage.measure import marching_cubes
 
 from express50.geometry.cameras import unproject
 from express50.geometry.conventions import cell_to_corner
+from express50.geometry.meshes import edge_graph
 from express50.geometry.transforms import unit
 from pipelines.depth.blocks import (
     BLOCK,
@@ -117,10 +118,7 @@ def grid_normals(grid: LevelSet, index: np.ndarray) -> np.ndarray:
 
 def graph_laplacian(faces: np.ndarray, count: int) -> sparse.csc_matrix:
     """Build the random-walk Laplacian (V, V): each vertex minus the mean of its neighbours."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    ones = np.ones(len(edges))
-    adjacent = sparse.coo_matrix((ones, (edges[:, 0], edges[:, 1])), (count, count)).tocsr()
-    adjacent = ((adjacent + adjacent.T) > 0).astype(np.float64)
+    adjacent = edge_graph(faces, count)
     degree = np.maximum(np.asarray(adjacent.sum(1)).ravel(), 1.0)
     return (sparse.identity(count) - sparse.diags(1.0 / degree) @ adjacent).tocsc()
 
@@ -263,13 +261,3 @@ def fair(grid: LevelSet, sigma: float) -> LevelSet:
         return np.where(np.abs(own) < 3 * grid.voxel, smoothest, own)
 
     return replaced(grid, held(grid), values)
-
-
-def largest_part(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Keep the faces (F', 3) of the largest connected part; other parts are not the head."""
-    graph = sparse.coo_matrix(
-        (np.ones(len(faces) * 2), (faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel())),
-        (len(vertices), len(vertices)),
-    )
-    part = sparse.csgraph.connected_components(graph, directed=False)[1][faces[:, 0]]
-    return faces[part == np.bincount(part).argmax()]

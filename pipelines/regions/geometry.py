@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import open3d as o3d
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from express50.contract.segmentation_labels import HEAD, LABELS, label_mask
 from express50.files.images import disc, edge_distance
 from express50.geometry.cameras import Camera, crop_camera, project, rays, unproject
 from express50.geometry.conventions import opencv_pixels_to_corner
+from express50.geometry.meshes import mesh_parts
 from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
 from express50.head.load import HeadTopology
 
@@ -77,9 +76,7 @@ def head_labels(model: HeadModel | HeadTopology) -> HeadLabels:
     missing = [*by_mesh, *(["torso"] if len(end) < 3 else [])]
     named = np.any(list(masks.values()), axis=0) if masks else ~none
     # Connected sheets without a vertex of any region are lash cards.
-    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
-    graph = coo_matrix((np.ones(len(edges), np.int8), edges.T), shape=(len(none), len(none)))
-    _, sheet = connected_components(graph, directed=False)
+    sheet = mesh_parts(faces, len(none))
     kept = np.isin(sheet, sheet[named])
     return HeadLabels(faces[kept[faces[:, 0]]], labels, end, tuple(missing))
 

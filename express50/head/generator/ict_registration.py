@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.sparse.linalg import LinearOperator, cg, splu
 from scipy.spatial import cKDTree
 
-from express50.geometry.meshes import cotangent_laplacian
+from express50.geometry.meshes import cotangent_laplacian, edge_graph, open_edges
 from express50.geometry.transforms import unit
 from express50.head.generator.eyes import LID_SEGMENTS
 from express50.head.generator.mesh import WholeMesh
@@ -85,12 +85,8 @@ def ict_skin(arrays: IctArrays) -> IctSkin:
     """Return the skin of ICT's mean face, without mouth and eye sockets and what is in them."""
     points = 10.0 * arrays.template
     faces = arrays.faces[(arrays.faces < RANGES["mouth_socket"][0]).all(1)]
-    edges, uses = np.unique(
-        np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True
-    )
-    graph = sparse.coo_matrix((np.ones(len(edges)), edges.T), shape=(len(points),) * 2)
-    ends = np.unique(edges[uses == 1])
-    return IctSkin(points, faces, normals_of(points, faces), (graph + graph.T).tocsr(), ends)
+    graph, ends = edge_graph(faces, len(points)), np.unique(open_edges(faces))
+    return IctSkin(points, faces, normals_of(points, faces), graph, ends)
 
 
 def rim_targets(mesh: WholeMesh, skin: IctSkin) -> RimTargets:

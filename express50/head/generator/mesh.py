@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from express50.geometry.meshes import edges_of
+
 Array = np.ndarray
 
 
@@ -156,8 +158,7 @@ def pack_uv(mesh: WholeMesh) -> tuple[Array, Array]:
 
 def neighbour_mean(values: Array, faces: Array) -> Array:
     """Return the means of values (V,...) over neighbours along the edges of faces (F,3)."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    edges = np.unique(np.sort(edges, 1), axis=0)
+    edges = np.unique(np.sort(edges_of(faces), 1), axis=0)
     total = np.zeros_like(values)
     np.add.at(total, edges[:, 0], values[edges[:, 1]])
     np.add.at(total, edges[:, 1], values[edges[:, 0]])

@@ -19,6 +19,7 @@ from scipy.interpolate import RBFInterpolator
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
+from express50.geometry.meshes import edge_graph
 from express50.geometry.raycast import mesh_scene
 from express50.head.generator.expressions import LID_SHARE
 from express50.head.generator.field import EYE_CENTER, EYE_RADIUS, eye_center
@@ -123,9 +124,7 @@ def _spread(moves: Array, faces: Array, own: Array, known: Array) -> Array:
     """Fill in the unknown moves of vertices `own` from those around, as heat spreads."""
     index = np.full(len(moves), -1)
     index[own] = np.arange(len(own))
-    pairs = index[faces][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    links = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(own),) * 2).tocsr()
-    links = ((links + links.T) > 0).astype(float)
+    links = edge_graph(index[faces], len(own))
     laplacian = sparse.diags(np.asarray(links.sum(1)).ravel()) - links
     free = np.flatnonzero(~known)
     flat = moves[own].reshape(len(own), -1)
