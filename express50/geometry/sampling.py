@@ -119,6 +119,12 @@ def bilinear_slope(image: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, n
     return top + (low - top) * fy, slope
 
 
+def local_moments(image: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and variance (H, W) of an image (H, W) in a window about each pixel."""
+    mean, square = (cv2.blur(values, (side, side)) for values in (image, image * image))
+    return mean, np.maximum(square - mean * mean, 0)
+
+
 def edge_width(image: np.ndarray) -> float | None:
     """Measure the width of the sharpest edges of an image (H, W, 3) uint8; None with too few.
 

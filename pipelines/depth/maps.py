@@ -21,7 +21,7 @@ from express50.files.images import box_about
 from express50.geometry.cameras import Camera, crop_camera, rays, resized, unproject
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.raycast import barycentrics, camera_rays, join_rays, mesh_scene
-from express50.geometry.sampling import bilinear, edge_width
+from express50.geometry.sampling import bilinear, edge_width, local_moments
 from pipelines.depth.prior import TrackedSolid
 from pipelines.depth.surface import HeadSurface
 from pipelines.depth.views import INSIDE, in_picture, project_fast, reduced
@@ -421,8 +421,8 @@ def grain(rgb: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """
     box = box_about(mask, WINDOW)
     grey = cv2.cvtColor(np.ascontiguousarray(rgb[box]), cv2.COLOR_RGB2GRAY).astype(np.float32)
-    mean, square = (cv2.blur(values, (WINDOW, WINDOW))[mask[box]] for values in (grey, grey * grey))
-    return (1 + np.sqrt(np.maximum(square - mean * mean, 0))) / (DARK + mean)
+    mean, variance = (values[mask[box]] for values in local_moments(grey, WINDOW))
+    return (1 + np.sqrt(variance)) / (DARK + mean)
 
 
 def smoothed_errors(photo: PhotoErrors, valid: np.ndarray, window: int) -> np.ndarray:

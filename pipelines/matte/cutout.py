@@ -27,7 +27,7 @@ from express50.files.images import edge_distance, shrink
 from express50.geometry.cameras import Camera, resized
 from express50.geometry.conventions import corner_to_cell
 from express50.geometry.transforms import transform_points
-from pipelines.matte.plates import blurred, local_colours, to_light
+from pipelines.matte.plates import local_colours, nearest_first, to_light
 from pipelines.matte.visual_hull import (
     Ball,
     Evidence,
@@ -428,9 +428,5 @@ def _log_density(off: np.ndarray, covariance: np.ndarray, variance: np.ndarray) 
 
 def _filled(image: np.ndarray, weight: np.ndarray, reach: float) -> np.ndarray:
     """Average an image (H, W, 3) by weights (H, W) over the nearest distance that has any."""
-    total, mass = np.zeros_like(image), np.full(weight.shape, 1e-12, np.float32)
-    for octave in range(6):
-        share = np.float32(1e-2**octave)
-        total += share * blurred(image * weight[..., None], reach * 2**octave)
-        mass += share * blurred(weight, reach * 2**octave)
-    return total / mass[..., None]
+    mass = nearest_first(weight, reach, 6, least=1e-12)
+    return nearest_first(image * weight[..., None], reach, 6) / mass[..., None]

@@ -22,6 +22,7 @@ from pipelines.matte.plates import (
     fit_plate,
     light_noise,
     local_colours,
+    nearest_first,
     shrunk,
     solve_opacity,
     to_light,
@@ -357,12 +358,9 @@ def subject_colour(image: np.ndarray, core: np.ndarray, length: int) -> np.ndarr
         cv2.resize(values, size, interpolation=cv2.INTER_AREA)
         for values in (image * weight[..., None], weight)
     )
-    total, weights = np.zeros_like(colours), np.full_like(weight, 1e-12)
-    for octave in range(4):
-        reach, share = REACH * length * 2**octave / factor, np.float32(1e-2**octave)
-        total += share * blurred(colours, reach)
-        weights += share * blurred(weight, reach)
-    own = total / weights[..., None]
+    reach = REACH * length / factor
+    weights = nearest_first(weight, reach, 4, least=1e-12)
+    own = nearest_first(colours, reach, 4) / weights[..., None]
     return cv2.resize(own, (width, height), interpolation=cv2.INTER_LINEAR)
 
 

@@ -332,9 +332,8 @@ def local_colours(
 
     def nearby(values: np.ndarray) -> np.ndarray:
         small = cv2.resize(values * weight, size, interpolation=cv2.INTER_AREA)
-        total = np.full_like(small, 1e-3 * 1e-2**OCTAVES * small.mean())  # counts if none is near
-        for octave in range(OCTAVES):
-            total += 1e-2**octave * blurred(small, reach / factor * 2**octave)
+        least = 1e-3 * 1e-2**OCTAVES * small.mean()  # counts if none is near
+        total = nearest_first(small, reach / factor, OCTAVES, least)
         return cv2.resize(total, (width, height), interpolation=cv2.INTER_LINEAR)[where]
 
     share = np.maximum(nearby(np.ones_like(weight)), 1e-20)
@@ -345,6 +344,14 @@ def local_colours(
     covariance = np.stack(squares, axis=1)[:, _MATRIX] - outer
     tint = (TINT * spread) ** 2 * (mean**2).mean(axis=1)
     return mean, covariance + spread**2 * outer + tint[:, None, None] * np.eye(3)
+
+
+def nearest_first(image: np.ndarray, reach: float, octaves: int, least: float = 0) -> np.ndarray:
+    """Sum blurs of an image (H, W[, C]): each reaches twice as far as the last and counts 1 %."""
+    total = np.full_like(image, least)
+    for octave in range(octaves):
+        total += np.float32(1e-2**octave) * blurred(image, reach * 2**octave)
+    return total
 
 
 def blurred(image: np.ndarray, sigma: float) -> np.ndarray:

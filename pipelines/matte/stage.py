@@ -18,7 +18,7 @@ from express50.error_model import error_bounds, error_models, expect
 from express50.errors import CaptureError, NoFaceError, StageError
 from express50.files.images import box_about, shrink, tile_sheet, write_image
 from express50.geometry.cameras import Camera, pinhole, resized
-from express50.geometry.sampling import undistorted_mask
+from express50.geometry.sampling import local_moments, undistorted_mask
 from pipelines.matte.consensus import SIDE, Agreement, agree
 from pipelines.matte.cutout import CutView, cut_out, make_cut_view, soft_alpha
 from pipelines.matte.key import dilated, key_alpha
@@ -294,7 +294,7 @@ def rim_figures(
     contrast = contrast[window][rim]
     return {
         "soft": 0.05 + 4 * open_part[rim],
-        "spread": 0.01 + deviation(share)[rim],
+        "spread": 0.01 + np.sqrt(local_moments(share, WINDOW)[1])[rim],
         # Length of the outline nearby, as a multiple of a straight one's.
         "ragged": 0.1 + ragged * _nearby_side(alpha),
         "faint": (0.5 + noise) / (2 + contrast),
@@ -335,12 +335,6 @@ def _nearby_side(values: np.ndarray) -> int:
 def _nearby(values: np.ndarray) -> np.ndarray:
     """Average values (H, W[, C]) over the neighbourhood."""
     return cv2.blur(values, (_nearby_side(values), _nearby_side(values)))
-
-
-def deviation(values: np.ndarray) -> np.ndarray:
-    """Return the standard deviation (H, W) of values (H, W) within a window."""
-    mean, square = (cv2.blur(v, (WINDOW, WINDOW)) for v in (values, values * values))
-    return np.sqrt(np.maximum(square - mean * mean, 0))
 
 
 def matte_warnings(alphas: dict[str, np.ndarray]) -> list[Note]:

@@ -33,6 +33,7 @@ from express50.geometry.cameras import (
 )
 from express50.geometry.conventions import cell_to_corner, corner_to_cell
 from express50.geometry.raycast import join_rays
+from express50.geometry.sampling import local_moments
 from express50.geometry.transforms import unit
 from pipelines.regions.colour import colour_logs, like_skin
 from pipelines.regions.geometry import FACE, WIDTH_M, TrackedHead, nearest, render_head
@@ -381,8 +382,8 @@ def _agreement(
 
 def _patches(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return a picture (H, W), and mean and deviation, with noise, about each pixel."""
-    mean, square = (cv2.blur(values, (PATCH_PX, PATCH_PX)) for values in (grey, grey * grey))
-    return grey, mean, np.sqrt(np.maximum(square - mean * mean, 0) + np.float32(NOISE**2))
+    mean, variance = local_moments(grey, PATCH_PX)
+    return grey, mean, np.sqrt(variance + np.float32(NOISE**2))
 
 
 def _line(camera: Camera, center: np.ndarray, places: np.ndarray, ways: np.ndarray) -> _Line:
