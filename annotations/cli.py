@@ -42,7 +42,7 @@ from annotations.validate import (
 )
 from annotations.worklist import ORDERS, coverage, effort, progress, worklist
 from express50.capture.index import Index, read_index
-from express50.console import FAILED, OK, add_command, answer, count, format_table
+from express50.console import FAILED, OK, add_command, answer, count, format_table, number
 from express50.contract.layout import Dataset, exclusion_reason, included_subjects
 from express50.errors import AnnotationError, UnknownNameError, check_known
 
@@ -117,13 +117,13 @@ def _add_labelling_actions(add: Callable[..., Callable]) -> None:
     argument = add("next", run_next, words, "subjects", "annotator")
     argument("--order", choices=ORDERS, default=ORDERS[0], help=order)
     words = "list at most this many (default: %(default)s)"
-    argument("--count", type=natural, default=10, metavar="N", help=words)
+    argument("--count", type=number(0), default=10, metavar="N", help=words)
     argument = add("mark", run_mark, "mark the peak frame of an expression", "clip", "annotator")
-    argument("frame", type=int, metavar="FRAME", help="0-based decode index")
+    argument("frame", type=number(0), metavar="FRAME", help="0-based decode index")
     words = "camera in which you judged it (default: the suggestion's)"
     argument("--camera", metavar="ID", help=words)
-    argument("--first", type=int, metavar="FRAME", help="first frame of the plateau")
-    argument("--last", type=int, metavar="FRAME", help="last frame of the plateau")
+    argument("--first", type=number(0), metavar="FRAME", help="first frame of the plateau")
+    argument("--last", type=number(0), metavar="FRAME", help="last frame of the plateau")
     argument = add("flag", run_flag, "record that an expression has no peak", "clip", "annotator")
     argument("reason", metavar="REASON", help=", ".join(FLAG_REASONS) + ", ...")
     add("undo", run_undo, "undo your last event on an expression", "clip", "annotator")
@@ -138,7 +138,7 @@ def _add_reviewing_actions(add: Callable[..., Callable]) -> None:
     words = "list disagreements, or settle one"
     argument = add("review", run_review, words, "subjects", "annotator")
     words = "marks at most this many frames apart agree (default: %(default)s)"
-    argument("--beyond", type=natural, default=2, metavar="FRAMES", help=words)
+    argument("--beyond", type=number(0), default=2, metavar="FRAMES", help=words)
     argument("--all", action="store_true", help="also list settled disagreements")
     words = "VERDICT is a frame, the annotator who is right, or the reason for a flag: "
     words += f"{', '.join(FLAG_REASONS)}, or flag:REASON"
@@ -152,9 +152,9 @@ def _add_reviewing_actions(add: Callable[..., Callable]) -> None:
     argument("--camera", metavar="ID", help="show this camera (default: the label's)")
     words = "frames to show before and after each label (default: 4 with --subject or --expression,"
     words += " else 0)"
-    argument("--around", type=natural, metavar="N", help=words)
+    argument("--around", type=number(0), metavar="N", help=words)
     words = "outline suggestions with less confidence than this (default: %(default)s)"
-    argument("--sure", type=float, default=0.5, metavar="P", help=words)
+    argument("--sure", type=number(0, 1, float), default=0.5, metavar="P", help=words)
 
 
 def table(names: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> list[str]:
@@ -172,16 +172,9 @@ def dataset_folder(text: str) -> Dataset:
     return dataset
 
 
-def natural(text: str) -> int:
-    """Parse a whole number that is not negative."""
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r}, expected a whole number, 0 or more")
-    return int(text)
-
-
 def person(text: str) -> str:
-    """Parse a person's name: neither the align stage's, nor a rule's, nor empty."""
-    if not text.strip() or not is_person(text):
+    """Parse a person's name: neither the align stage's nor a rule's."""
+    if not is_person(text):
         raise argparse.ArgumentTypeError(f"{text!r} is not a valid annotator name; give yours")
     return unicodedata.normalize("NFC", text.strip())  # one person, however the name was typed
 
@@ -457,8 +450,6 @@ def run_exclusion(args: argparse.Namespace) -> int:
     reason = args.reason.strip() if args.action == "exclude" else None
     if args.action == "include" and exclusion_reason(args.dataset, args.subject) is None:
         raise AnnotationError(f"{args.subject} is not excluded")
-    if reason == "":
-        raise AnnotationError(f"{args.subject}: give a reason for it, such as 'heavy makeup'")
     event = Label(
         subject=args.subject, expression="", action=args.action, annotator=args.annotator,
         time=time.time(), reason=reason,

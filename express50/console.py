@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import errno
 import json
+import math
 import os
 import re
 import signal
@@ -72,10 +73,15 @@ class Parser(argparse.ArgumentParser):
         super().__init__(*arguments, **options | {"formatter_class": _HelpFormatter})
         self._negative_number_matcher = re.compile(r"-\.?\d\S*")
 
-    def _get_value(self, action: argparse.Action, text: str) -> Any:
-        if action.type is Path and not text:  # Path("") is the folder that the shell is in
-            words = "got an empty path, expected a name; is a variable of your shell not set?"
+    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
+        """Refuse values that name nothing; most would read as if the option were not given."""
+        empty = [text for text in arg_strings if not text.strip(", ")]
+        if empty and action.nargs != argparse.PARSER:  # those belong to a sub-command
+            words = f"got {empty[0]!r}, expected a value; is a variable of your shell not set?"
             raise argparse.ArgumentError(action, words)
+        return super()._get_values(action, arg_strings)
+
+    def _get_value(self, action: argparse.Action, text: str) -> Any:
         try:
             return super()._get_value(action, text)
         except argparse.ArgumentError:
@@ -105,6 +111,31 @@ class Parser(argparse.ArgumentParser):
             near = nearest(left[0].partition("=")[0], self._option_string_actions)
             self.error(f"unknown argument {left[0]!r}{near}")
         return found, left
+
+
+def number(low: int, high: int = 1 << 20, kind: type = int) -> Callable[[str], Any]:
+    """Make an argument type of numbers from ``low`` to ``high``, by default whole ones."""
+
+    def parse(text: str) -> Any:
+        try:
+            found = kind(text)
+        except ValueError:
+            found = math.nan
+        if low <= found <= high:
+            return found
+        wanted = "a whole number" if kind is int else "a number"
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected {wanted}, {low} to {high}")
+
+    return parse
+
+
+def picture_size(text: str) -> tuple[int, int]:
+    """Parse ``WIDTHxHEIGHT``, pixels."""
+    sides = re.fullmatch(r"0*([1-9]\d{0,5})x0*([1-9]\d{0,5})", text.lower(), re.ASCII)
+    if sides is None:
+        words = f"got {text!r}, expected WIDTHxHEIGHT, such as 3840x2160"
+        raise argparse.ArgumentTypeError(words)
+    return int(sides[1]), int(sides[2])
 
 
 def run_handler(

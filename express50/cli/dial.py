@@ -9,7 +9,6 @@ from typing import Any
 
 from express50.cli.stages import (
     add_run_options,
-    check_workers,
     refuse_swapped,
     run_all,
     say_account,
@@ -109,7 +108,6 @@ def _chain(args: argparse.Namespace) -> Iterator[Any]:
         raise ConfigError(
             "--print-job: the settings are not chosen yet; give --preset instead of --budget"
         )
-    check_workers(args)
     cap_threads(args.threads)
     known, dataset = list(stages().values()), Dataset(args.dataset.resolve())
     refuse_swapped(dataset, args.captures, args.command)

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from express50.console import OK, add_command, answer, count, say, say_json
+from express50.console import OK, add_command, answer, count, number, say, say_json
 from express50.contract.layout import existing_dataset
 from express50.errors import ConfigError, StageError
 from express50.head import BUILTIN_NAME
@@ -68,7 +68,7 @@ def add_commands(subparsers: Any) -> None:
     words = "directions to look from, degrees to the subject's left (default: 0,40,90)"
     add("--yaws", default="0,40,90", metavar="DEG,...", help=words)
     words = "side of a picture, pixels (default: 256)"
-    add("--size", type=int, default=256, metavar="N", help=words)
+    add("--size", type=number(1), default=256, metavar="N", help=words)
 
 
 def run_export(args: argparse.Namespace) -> int:
@@ -157,8 +157,6 @@ def run_preview(args: argparse.Namespace) -> int:
         yaws = (math.nan,)
     if not all(map(math.isfinite, yaws)):
         raise ConfigError(f"--yaws {args.yaws!r}: expected numbers with commas, such as 0,40,90")
-    if args.size < 1:
-        raise ConfigError(f"--size {args.size}: expected at least 1")
     model = load_head(args.model)
     args.out.parent.mkdir(parents=True, exist_ok=True)
     write_image(args.out, contact_sheet(model, yaws, args.size))

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from express50.console import FAILED, OK, add_command, answer, count, say, say_json
+from express50.console import FAILED, OK, add_command, answer, count, number, say, say_json
 from express50.errors import FormatError
 
 
@@ -45,7 +45,7 @@ def add_commands(subparsers: Any) -> None:
     for action in (split, merge):
         action.add_argument("out", type=Path, metavar="OUT", help="folder to make, or an empty one")
         words = "size of a shard, MB (default: 256)"
-        action.add_argument("--shard-mb", type=int, default=256, metavar="MB", help=words)
+        action.add_argument("--shard-mb", type=number(1), default=256, metavar="MB", help=words)
 
 
 def run_split(args: argparse.Namespace) -> int:

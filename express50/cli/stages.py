@@ -8,7 +8,17 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from express50.console import FAILED, OK, USAGE, add_command, log, say, say_json, stdout_to_stderr
+from express50.console import (
+    FAILED,
+    OK,
+    USAGE,
+    add_command,
+    log,
+    number,
+    say,
+    say_json,
+    stdout_to_stderr,
+)
 from express50.contract.config import PRESETS, config_toml, resolve_config
 from express50.contract.layout import Dataset, check_folder
 from express50.contract.stage import Stage, stages, with_required
@@ -57,7 +67,7 @@ def add_run_options(parser: argparse.ArgumentParser, captures: bool, preset: boo
         add("--replace", action="store_true", help=words)
     add_config_options(parser, preset)
     words = "local worker processes (default: 2); 0: work in this process"
-    add("--workers", type=int, default=2, metavar="N", help=words)
+    add("--workers", type=number(0), default=2, metavar="N", help=words)
     add("--scheduler", metavar="ADDRESS", help="run on a dask scheduler, tcp://host:port")
     words = "run in SLURM jobs: partition=P,time=4:00:00,memory=16G,cores=4,jobs=8, or a TOML file"
     add("--slurm", metavar="JOBS", help=words)
@@ -66,7 +76,7 @@ def add_run_options(parser: argparse.ArgumentParser, captures: bool, preset: boo
         words = "with --slurm: print the script of a job, and run nothing"
         add("--print-job", action="store_true", help=words)
     words = "threads that an item may use (default: 1)"
-    add("--threads", type=int, default=1, metavar="N", help=words)
+    add("--threads", type=number(1), default=1, metavar="N", help=words)
     words = "exit code 1 also if part of an item, such as a camera, was dropped"
     add("--strict", action="store_true", help=words)
 
@@ -121,7 +131,6 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
     from express50.runner.runner import Summary, run_stage
     from express50.runner.worker import cap_threads
 
-    check_workers(args)
     # Set before a stage imports NumPy, whose BLAS reads the thread limit when it is loaded.
     cap_threads(args.threads)
     dataset = Dataset(args.dataset)
@@ -192,14 +201,6 @@ def say_account(stage: Stage, dataset: Dataset, summary: Any) -> None:
     if stage.account is not None:
         done = [o.item for o in summary.outcomes if o.status == "done"]
         say(*stage.account(dataset, done))
-
-
-def check_workers(args: argparse.Namespace) -> None:
-    """Raise ConfigError if there are too few workers or threads."""
-    if args.workers < 0:
-        raise ConfigError(f"--workers {args.workers}: expected 0 or more")
-    if args.threads < 1:
-        raise ConfigError(f"--threads {args.threads}: expected 1 or more")
 
 
 def slurm_jobs(args: argparse.Namespace) -> Mapping[str, Any] | None:

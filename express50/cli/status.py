@@ -23,6 +23,7 @@ from express50.console import (
     count,
     format_seconds,
     format_table,
+    number,
     say,
 )
 from express50.contract.layout import Dataset, existing_dataset
@@ -86,9 +87,8 @@ def add_commands(subparsers: Any) -> None:
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--json", action="store_true", help="print the receipts as JSON")
     how.add_argument("--page", type=Path, metavar="FILE", help=page)
-    how.add_argument(
-        "--serve", type=int, metavar="PORT", help="serve this page, on this machine only"
-    )
+    serve = "serve this page, on this machine only"
+    how.add_argument("--serve", type=number(1, 65535), metavar="PORT", help=serve)
 
 
 def show_status(args: argparse.Namespace) -> int:

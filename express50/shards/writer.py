@@ -325,8 +325,6 @@ def copy_samples(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> in
         raise FormatError(f"{out}: is a file; expected an empty or absent folder")
     if out.exists() and any(out.iterdir()):
         raise FormatError(f"{out}: is not empty; expected an empty or absent folder")
-    if shard_mb < 1:
-        raise FormatError(f"--shard-mb is {shard_mb}, expected at least 1")
     if not any(len(reader) for reader in readers):
         raise FormatError(f"{readers[0].root}: no sample matches; 'express50 shards ls' lists them")
     splits = _checked_splits(readers)

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from express50.capture.expressions import select
-from express50.console import add_command, answer, count
+from express50.console import add_command, answer, count, number
 from express50.contract.config import field_documents
 from express50.errors import CaptureError
 from express50.files.atomic import dump_json, link_file, write_json
@@ -62,7 +62,8 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument("--give-calibration", action="store_true", help=words["give_calibration"])
     parser.add_argument("--no-plates", action="store_true", help="record no plates")
     parser.add_argument("--no-hair", action="store_true", help="record bald subjects")
-    parser.add_argument("--workers", type=int, default=min(8, os.cpu_count() or 1), metavar="N",
+    parser.add_argument("--workers", type=number(1), metavar="N",
+                        default=min(8, os.cpu_count() or 1),
                         help="processes; their number does not change the result")  # fmt: skip
 
 
@@ -83,7 +84,7 @@ def record_command(args: argparse.Namespace) -> int:
         hair=not args.no_hair,
     )
     with _alone(args.out):
-        recorded = record(config, args.out, max(1, args.workers), print_progress())
+        recorded = record(config, args.out, args.workers, print_progress())
     captures, kept = args.out / "captures", args.subjects - len(recorded)
     rest = f"; {kept} recorded before" if kept else ""
     line = f"{count(len(recorded), 'subject')} recorded in {captures}{rest}"

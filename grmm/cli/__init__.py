@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from express50 import __version__
-from express50.console import Parser, add_command, run_handler
+from express50.console import Parser, add_command, number, run_handler
 from grmm.cli import commands
 from grmm.config import PRESETS, TABLES
 
@@ -48,26 +48,15 @@ def parse_seconds(text: str) -> float:
     return seconds
 
 
-def at_least(low: int, high: int = 1 << 20) -> Callable[[str], int]:
-    """Make an argument type of whole numbers from ``low`` to ``high``."""
-
-    def number(text: str) -> int:
-        if text.lstrip("-").isdecimal() and low <= int(text) <= high:
-            return int(text)
-        raise argparse.ArgumentTypeError(f"{text!r}, expected a whole number, {low} to {high}")
-
-    return number
-
-
 def finite(text: str) -> float:
     """Parse a number that is neither NaN nor infinite."""
     try:
-        number = float(text)
+        found = float(text)
     except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
+        found = math.nan
+    if not math.isfinite(found):
         raise argparse.ArgumentTypeError(f"{text!r}, expected a finite number")
-    return number
+    return found
 
 
 def value(metavar: str, words: str, **settings: Any) -> dict[str, Any]:
@@ -125,7 +114,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "N",
         "measure at most this many images, evenly spread; for fitted people, the limit is per"
         " person and kind of view (default: all)",
-        type=at_least(0),
+        type=number(0),
         default=0,
     ),
     "--heldout": flag("leave out samples that training saw"),
@@ -141,12 +130,13 @@ OPTIONS: dict[str, dict[str, Any]] = {
     ),
     "--fit-budget": value("TIME", "time per fit: 60s, 5m", type=parse_seconds),
     "--background": value(
-        "GREY", "grey behind the pictures, 0 to 1 (default: 0)", type=finite, default=0.0
+        "GREY",
+        "grey behind the pictures, 0 to 1 (default: 0)",
+        type=number(0, 1, float),
+        default=0.0,
     ),
     "--partial": flag("score only the pictures that exist"),
-    "--seeds": value(
-        "N", "train each row this many times (default: 1)", type=at_least(1), default=1
-    ),
+    "--seeds": value("N", "train each row this many times (default: 1)", type=number(1), default=1),
     "--test": value(
         "SHARDS",
         "shards whose people are fitted, not trained on; may be repeated",
@@ -174,7 +164,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     ),
     "--camera": value("ID", "camera of the checkpoint (default: a frontal one)"),
     "--size": value(
-        "N", "longer side, pixels (default: as trained)", type=at_least(0, 8192), default=0
+        "N", "longer side, pixels (default: as trained)", type=number(0, 8192), default=0
     ),
     "--yaw": value("DEG", "move the camera around the head, degrees", type=finite, default=0.0),
     "--pitch": value("DEG", "move the camera up, degrees", type=finite, default=0.0),
@@ -183,7 +173,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "DEG", "angle that the turntable covers (default: 360)", type=finite, default=360.0
     ),
     "--frames": value(
-        "N", "number of frames of a video (default: %(default)s)", type=at_least(1), default=72
+        "N", "number of frames of a video (default: %(default)s)", type=number(1), default=72
     ),
     "--to": value("SUBJECT/EXPRESSION", "write interpolation.mp4, which ends at this expression"),
     "--drive": value(
@@ -193,28 +183,28 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--views": flag("write views.jpg: novel views"),
     "--controls": flag("write controls.jpg: one control changed at a time"),
     "--samples": value(
-        "N", "write samples.jpg with this many new heads", type=at_least(0), default=0
+        "N", "write samples.jpg with this many new heads", type=number(0), default=0
     ),
     "--spread": value(
         "FACTOR", "spread of the samples (default: 1, as in training)", type=finite, default=1.0
     ),
-    "--seed": value("N", "random seed (default: 0)", type=at_least(0), default=0),
+    "--seed": value("N", "random seed (default: 0)", type=number(0), default=0),
     "--columns": value(
-        "N", "number of expressions in grid.jpg (default: %(default)s)", type=at_least(1), default=8
+        "N", "number of expressions in grid.jpg (default: %(default)s)", type=number(1), default=8
     ),
     "--format": {"choices": commands.FORMATS, "help": "format (default: by FILE's name)"},
     "--shards": value("SHARDS", "with .html: measure its loss on this footage", type=Path),
     "--still": value(
         "N",
         "height of still pictures, pixels (default: %(default)s)",
-        type=at_least(16),
+        type=number(16),
         default=512,
     ),
     "--host": value(
         "ADDRESS", "address to listen on (default: this machine only)", default="127.0.0.1"
     ),
     "--port": value(
-        "N", "port to listen on (default: %(default)s)", type=at_least(1, 65535), default=8080
+        "N", "port to listen on (default: %(default)s)", type=number(1, 65535), default=8080
     ),
     # Studies
     "--reference": value("FOLDER", "true pictures", type=Path, required=True),
@@ -229,10 +219,10 @@ OPTIONS: dict[str, dict[str, Any]] = {
         default=["Ours", "Theirs"],
     ),
     "--examples": value(
-        "N", "examples per participant (default: %(default)s)", type=at_least(1), default=15
+        "N", "examples per participant (default: %(default)s)", type=number(1), default=15
     ),
     "--participants": value(
-        "N", "number of participants (default: %(default)s)", type=at_least(1), default=20
+        "N", "number of participants (default: %(default)s)", type=number(1), default=20
     ),
 }
 ALIASES = {"--budget": ["--seconds"]}
@@ -328,7 +318,7 @@ COMMANDS = {
         example="grmm view run/checkpoint.pt",
         changes={
             "--size": {
-                "type": at_least(16),
+                "type": number(16),
                 "default": 320,
                 "help": "height while the picture moves, pixels (default: %(default)s)",
             }  # fmt: skip

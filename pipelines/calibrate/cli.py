@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from express50.console import FAILED, OK, add_command, say, say_json
+from express50.console import FAILED, OK, add_command, number, picture_size, say, say_json
 from express50.errors import CalibrationError, ConfigError
 from express50.files.calibration import camera_rows, read_cameras, write_cameras
 from express50.geometry.cameras import Camera
@@ -43,13 +43,13 @@ def add_commands(subparsers: Any) -> None:
     words = "also look for cameras that have moved since"
     checking.add_argument("--footage", type=Path, metavar="CAPTURE", help=words)
     words = "with --footage: number of frame sets to compare (default: 4)"
-    checking.add_argument("--frames", type=int, default=4, metavar="N", help=words)
+    checking.add_argument("--frames", type=number(1), default=4, metavar="N", help=words)
     for action in (importing, checking):
         add = action.add_argument
         words = f"format of SOURCE: {', '.join(FORMATS)} (default: recognised)"
         add("--format", choices=FORMATS, metavar="NAME", help=words)
         words = "size of the footage, pixels; K is scaled to it"
-        add("--size", metavar="WIDTHxHEIGHT", help=words)
+        add("--size", type=picture_size, metavar="WIDTHxHEIGHT", help=words)
         words = "metres per unit of SOURCE's world (default: 1)"
         add("--scale", type=float, default=1.0, metavar="METRES", help=words)
 
@@ -90,8 +90,6 @@ def run_check(args: argparse.Namespace) -> int:
         from pipelines.calibrate.footage import find_points, read_raw_footage
         from pipelines.calibrate.given_rig import check_footage
 
-        if args.frames < 1:
-            raise ConfigError(f"--frames is {args.frames}, expected 1 or more")
         seen = find_points(partial(read_raw_footage, args.footage, cameras, args.frames))
         shown = {name for points in seen.values() for name in points.features}
         footage = check_footage({n: c for n, c in cameras.items() if n in shown}, seen)
@@ -100,13 +98,7 @@ def run_check(args: argparse.Namespace) -> int:
 
 
 def _read(args: argparse.Namespace) -> dict[str, Camera]:
-    size = None
-    if args.size is not None:
-        parts = args.size.lower().split("x")
-        if len(parts) != 2 or not all(p.isdigit() and int(p) > 0 for p in parts):
-            raise ConfigError(f"--size is {args.size!r}, expected WIDTHxHEIGHT such as 3840x2160")
-        size = int(parts[0]), int(parts[1])
-    return read_rig(args.source, args.format, size, args.scale)
+    return read_rig(args.source, args.format, args.size, args.scale)
 
 
 def _report(

@@ -7,7 +7,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from express50.console import FAILED, OK, add_command, say, say_json, stdout_to_stderr
+from express50.console import FAILED, OK, add_command, number, say, say_json, stdout_to_stderr
 from express50.contract.layout import Dataset
 from express50.contract.stage import Command, stages
 from express50.errors import ConfigError
@@ -40,7 +40,7 @@ def add_commands(subparsers: Any) -> None:
         help="focal length to assume if EXIF has none, mm on 35 mm film (default: 50)",
     )  # fmt: skip
     parser.add_argument(
-        "--windows", type=int, default=8, metavar="N",
+        "--windows", type=number(1), default=8, metavar="N",
         help="frames of a video that fit the head's shape, evenly spread (default: 8)",
     )  # fmt: skip
     parser.add_argument(
@@ -59,8 +59,6 @@ def check_options(args: argparse.Namespace) -> None:
     for name, value in (("--focal-px", args.focal_px), ("--film-mm", args.film_mm)):
         if value is not None and not 0 < value < float("inf"):
             raise ConfigError(f"{name} {value}: expected a number above 0")
-    if args.windows < 1:
-        raise ConfigError(f"--windows {args.windows}: expected at least 1")
 
 
 def run_photo(args: argparse.Namespace) -> int:

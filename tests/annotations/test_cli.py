@@ -227,7 +227,6 @@ def test_undo_and_review_say_what_they_mean(annotate, dataset, capsys):
         (["undo", "S001", "neutral"], "neutral"),
         (["flag", "S001", "smile", "a\rb"], repr("a\rb")),
         (["mark", "S001", "smile", "14", "--annotator", "a\x1b[31m"], repr("a\x1b[31m")),
-        (["exclude", "S001", " "], "S001"),
         (["include", "S001"], "S001 is not excluded"),
     ],
 )
@@ -244,8 +243,10 @@ def test_invalid_input_prints_one_line_naming_it(annotate, dataset, capsys, word
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (["next", "--count", "-3"], "'-3', expected a whole number, 0 or more"),
-        (["review", "--beyond", "-1"], "'-1', expected a whole number, 0 or more"),
+        (["next", "--count", "-3"], "--count: got '-3', expected a whole number, 0 to"),
+        (["review", "--beyond", "-1"], "'-1', expected a whole number, 0 to"),
+        (["sheet", "x.html", "--sure", "9"], "--sure: got '9', expected a number, 0 to 1"),
+        (["sheet", "x.html", "--sure", "nan"], "got 'nan'"),
         (["review", "--settle", "S009", "smile", "14"], "no subject 'S009'"),
         (["rule", "--expression", "smlie"], "no expression 'smlie'"),
     ],

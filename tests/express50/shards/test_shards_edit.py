@@ -86,5 +86,3 @@ def test_odd_places_to_write_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     (tmp_path / "file").touch()
     with pytest.raises(FormatError, match="is a file"):
         copy_samples([ShardReader(whole)], tmp_path / "file", 1)
-    with pytest.raises(FormatError, match="shard-mb is -1"):
-        copy_samples([ShardReader(whole)], tmp_path / "out", -1)
