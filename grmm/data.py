@@ -7,7 +7,7 @@ parameters once per (subject, expression) and kept.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Generic, Protocol, TypeVar
@@ -24,7 +24,7 @@ from express50.geometry.transforms import make_transform
 from express50.head.model import HeadModel, pose
 from grmm.config import DataConfig
 from grmm.head_crop import behind_torso, crop_view, head_window
-from grmm.model import GRMM, HeadState, PinholeView, Rendering
+from grmm.model import HeadState, PinholeView, Rendering
 
 NO_OFFSETS = np.zeros((0, 3), np.float32)
 CACHE_BYTES = 512 << 20  # of decoded samples: a few hundred of 512 px
@@ -185,16 +185,21 @@ class HeadView:
         return torch.where(self.hidden, self.target, image)
 
 
-def with_codes(model: GRMM, keys: Sequence[SampleKey], chosen: Iterable[int]) -> list[int]:
+def with_codes(
+    keys: Sequence[SampleKey],
+    chosen: Iterable[int],
+    subjects: Collection[str],
+    expressions: Collection[str],
+) -> list[int]:
     """Choose the samples whose person and expression have a code; log which frames do not."""
     known: dict[bool, list[int]] = {True: [], False: []}
     for index in chosen:
         key = keys[index]
-        known[key.subject in model.subjects and key.expression in model.expressions].append(index)
+        known[key.subject in subjects and key.expression in expressions].append(index)
     if lost := sorted({"/".join(keys[index].frame) for index in known[False]}):
         log(
-            f"{count(len(lost), 'frame')} cannot be measured, because training saw nothing of the"
-            f" person or the expression: {few(lost)}"
+            f"{count(len(lost), 'frame')} cannot be measured, because nothing of the person or the"
+            f" expression was trained or fitted: {few(lost)}"
         )
     return known[True]
 

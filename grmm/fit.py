@@ -27,7 +27,7 @@ from express50.geometry.sampling import evenly
 from grmm import losses
 from grmm.checkpoint import Checkpoint, Gallery, collect_gallery, save_checkpoint
 from grmm.config import Config
-from grmm.data import NO_OFFSETS, HeadView, HeadViews, Shuffle
+from grmm.data import NO_OFFSETS, HeadView, HeadViews, Shuffle, with_codes
 from grmm.edit import HeadCodes, between, trained_head, transfer
 from grmm.evaluate import HELD_IDENTITY, Row, evaluate, mean
 from grmm.metrics import PerceptualMetrics
@@ -410,23 +410,21 @@ def unseen_views(
     protocol: FitProtocol,
     among: Sequence[int] | None = None,
 ) -> tuple[list[int], list[int]]:
-    """Choose a person's views to fit from and to measure; see `evaluate_unseen`."""
+    """Choose a person's views to fit from and to measure, and log what cannot be measured."""
     given = given_views(views, subject, protocol)
     cameras = {views.keys[i].camera for i in given}
     known = {*(views.keys[i].expression for i in given), *loaded.model.expressions}
     own = [
         i
         for i in (range(len(views.keys)) if among is None else among)
-        if views.keys[i].subject == subject
-        and views.keys[i].expression in known
-        and views.keys[i].camera not in cameras
+        if views.keys[i].subject == subject and views.keys[i].camera not in cameras
     ]
-    if not own:
+    if not any(views.keys[i].expression in known for i in own):
         raise ConfigError(
             f"{subject}: no view is left to measure: cameras {', '.join(sorted(cameras))} are "
             f"used for the fit, and only expressions {', '.join(sorted(known))} can be drawn"
         )
-    return given, own
+    return given, with_codes(views.keys, own, [subject], known)
 
 
 def given_views(views: HeadViews, subject: str, protocol: FitProtocol) -> list[int]:

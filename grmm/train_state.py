@@ -65,7 +65,7 @@ def prepare(views: HeadViews, config: Config, rank: int = 0, world: int = 1) -> 
         model=model,
         views=views,
         training=training,
-        holdout=with_codes(model, keys, holdout),
+        holdout=with_codes(keys, holdout, subjects, expressions),
         optimizer=make_optimizer(model, config),
         shuffle=Shuffle(training, config.train.seed, rank, world),
         perceptual=losses.load_vgg(config.loss.vgg16, views.head.device),

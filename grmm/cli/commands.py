@@ -263,7 +263,7 @@ def evaluate(args: argparse.Namespace) -> int:
         )
     protocol = _protocol(args)
     for subject, chosen in unseen.items():  # before anybody is fitted for nothing
-        unseen_views(loaded, views, subject, protocol, chosen)
+        _, unseen[subject] = unseen_views(loaded, views, subject, protocol, chosen)
     render = training_render(loaded.model, views)
     log(f"measuring {count(len(known), 'image')} of people with codes")
     rows = evaluate(views, known, render, judge, kind, keep)
@@ -286,7 +286,7 @@ def _split(
     strangers = sorted({keys[i].subject for i in chosen} - {*model.subjects})
     unseen = {name: [i for i in chosen if keys[i].subject == name] for name in strangers}
     known = [i for i in chosen if keys[i].subject not in unseen]
-    known = with_codes(model, keys, known)
+    known = with_codes(keys, known, model.subjects, model.expressions)
     if args.fit_cameras:
         return known, unseen
     if not known:

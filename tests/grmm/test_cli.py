@@ -119,11 +119,15 @@ def test_the_figure_of_a_held_out_expression_is_printed(shards, tmp_path, capsys
 def test_held_out_expressions_without_a_code_are_named(shards, tmp_path, capsys):
     train = ["train", str(shards), str(tmp_path), *TINY, "--holdout-expressions=*/e0"]
     assert main(train) == 0
-    line = "2 frames cannot be measured, because training saw nothing of the person or the"
-    assert f"{line} expression: S000/e0, S001/e0\n" in capsys.readouterr().err
+    line = "2 frames cannot be measured, because nothing of the person or the expression was"
+    assert f"{line} trained or fitted: S000/e0, S001/e0\n" in capsys.readouterr().err
     checkpoint, out = str(tmp_path / "checkpoint.pt"), str(tmp_path / "e")
     assert main(["evaluate", checkpoint, str(shards), out, "--subjects=S000"]) == 0
     assert "1 frame cannot be measured" in capsys.readouterr().err
+    fitted = ["--subjects=S002", "--fit-cameras=cam00", "--fit-expression=e1"]
+    assert main(["evaluate", checkpoint, str(shards), out, *fitted]) == 0
+    said = capsys.readouterr().err
+    assert said.count("cannot be measured") == 1 and "trained or fitted: S002/e0\n" in said
 
 
 def test_render_writes_a_picture_per_frame_and_pair(checkpoint, tmp_path, capsys):
@@ -209,7 +213,7 @@ def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
          "expected fit, metrics, loss"),
         (["fit", "{checkpoint}", "{shards}", "{out}", "--subject=S002", "--cameras=cam00,cam9"], 2,
          "no camera is 'cam9'; the shards have cam00, cam01, cam02"),
-        (["score", "{shards}", "{shards}", "{out}", "--cameras="], 2,
+        (["score", "{shards}", "{shards}", "{out}", "--cameras=cam00,,cam01"], 2,
          "no camera is ''; the shards have cam00"),
         (["train", "{checkpoint}", "{checkpoint}"], 2, "is a file, expected a folder"),
         (["train", "{shards}", "{out}", *TINY, "--set=loss.ssim=-1"], 2, "loss.ssim is -1"),
@@ -421,6 +425,8 @@ def test_a_head_is_driven_by_tracked_clips(checkpoint, tmp_path, capsys):
     [
         (["train", "a", "b", "--budget", "-4m"], "'-4m' is not a time; expected a number of"),
         (["trian"], "unknown 'trian' (did you mean 'train'?)"),
+        (["render", "a", "b", "--to", ""], "argument --to: got '', expected a value; is a"),
+        (["train", "a", "b", "--holdout-cameras=,"], "argument --holdout-cameras: got ','"),
     ],
 )
 def test_wrong_usage_is_said_with_what_was_given(arguments, message, capsys):
