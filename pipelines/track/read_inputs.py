@@ -178,15 +178,17 @@ def _followed(
     read: Read, cameras: Mapping[str, Camera], follow: Follow, expected: np.ndarray
 ) -> list[LandmarkView]:
     """Return the views with a face near expected landmarks (68, 3); none if it is lost."""
-    views = []
     chosen = _facing_cameras(cameras, expected)
-    for name in chosen:
-        camera = cameras[name]
-        seen = follow(read(name), project_pinhole(camera, expected)[0])
-        if seen.face.score >= MIN_SCORE:
-            views.append(_landmark_view(camera, seen))
+    found = [_near(read, cameras[name], follow, expected) for name in chosen]
+    views = [view for view in found if view is not None]
     sure = sum(view.score >= FOLLOWED_SCORE for view in views)
     return views if sure > FOLLOWED_SHARE * len(chosen) else []
+
+
+def _near(read: Read, camera: Camera, follow: Follow, expected: np.ndarray) -> LandmarkView | None:
+    """Look for a face near expected landmarks (68, 3) in one camera; None if it is not there."""
+    seen = follow(read(camera.id), project_pinhole(camera, expected)[0])
+    return _landmark_view(camera, seen) if seen.face.score >= MIN_SCORE else None
 
 
 def _facing_cameras(cameras: Mapping[str, Camera], marks: np.ndarray) -> list[str]:
@@ -276,9 +278,8 @@ def search_all_views(
         rest = {name: cameras[name] for name in cameras if name not in views}
         for name in _facing_cameras(rest, expected):
             with suppress(CaptureError):  # this camera's footage lacks the frame
-                face = follow(read(name), project_pinhole(cameras[name], expected)[0])
-                if face.face.score >= MIN_SCORE:
-                    views[name] = _landmark_view(cameras[name], face)
+                if (view := _near(read, cameras[name], follow, expected)) is not None:
+                    views[name] = view
     return [views[name] for name in cameras if name in views]
 
 
