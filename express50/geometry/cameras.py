@@ -342,6 +342,22 @@ def _triangulate_one(P: np.ndarray, xy: np.ndarray, w: np.ndarray, focal: np.nda
     return point
 
 
+def nearest_to_lines(
+    origins: Sequence[np.ndarray], directions: Sequence[np.ndarray], least: float
+) -> np.ndarray | None:
+    """Return the point (3,) nearest to lines by origins (N, 3) and unit directions (N, 3).
+
+    None for (nearly) parallel lines: `least` is the least eigenvalue of the sum of the matrices
+    (3, 3) that project onto the planes across the lines.
+    """
+    total, right = np.zeros((3, 3)), np.zeros(3)
+    for origin, direction in zip(origins, directions, strict=True):
+        across = np.eye(3) - np.outer(direction, direction)
+        total += across
+        right += across @ origin
+    return None if np.linalg.eigvalsh(total)[0] < least else np.linalg.solve(total, right)
+
+
 def project_pinhole(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return pixels (..., 2) and depth (...) of world points (..., 3) in an undistorted camera."""
     ray, depth, _ = _rays(camera, points)

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from express50.errors import CalibrationError, few
-from express50.geometry.cameras import Camera, transform_camera
+from express50.geometry.cameras import Camera, nearest_to_lines, transform_camera
 from express50.geometry.conventions import FLIP_YZ
 from express50.geometry.transforms import is_rigid, make_transform
 
@@ -41,16 +41,11 @@ UNKNOWN = "is world_to_camera inverted, or are its axes not OpenCV's (x right, y
 
 def meeting_point(cameras: Mapping[str, Camera]) -> np.ndarray | None:
     """Return the point (3,) nearest to all optical axes; None for (nearly) parallel axes."""
-    total, right = np.zeros((3, 3)), np.zeros(3)
-    middle = np.mean([c.center for c in cameras.values()], axis=0)
-    for camera in cameras.values():
-        axis = camera.cam_from_world[2, :3]
-        across = np.eye(3) - np.outer(axis, axis)
-        total += across
-        right += across @ (camera.center - middle)
-    if np.linalg.eigvalsh(total)[0] < PARALLEL * len(cameras):
-        return None
-    return middle + np.linalg.solve(total, right)
+    centers = np.array([camera.center for camera in cameras.values()])
+    axes = [camera.cam_from_world[2, :3] for camera in cameras.values()]
+    middle = centers.mean(0)
+    point = nearest_to_lines(centers - middle, axes, PARALLEL * len(cameras))
+    return None if point is None else middle + point
 
 
 def depths_behind(cameras: Mapping[str, Camera]) -> dict[str, float]:

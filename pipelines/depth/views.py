@@ -13,7 +13,7 @@ import numpy as np
 from express50.contract.stage import Note
 from express50.errors import StageError
 from express50.files.images import box_about, resize_area, shrink
-from express50.geometry.cameras import Camera, project, resized
+from express50.geometry.cameras import Camera, nearest_to_lines, project, resized
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.sampling import bilinear
 from express50.geometry.transforms import is_rigid
@@ -213,23 +213,20 @@ def _meeting_point(views: Sequence[DepthView]) -> np.ndarray:
     """Find the point (3,) nearest to the rays through the mattes' centres."""
     if len(views) < 2:
         raise StageError(f"a surface needs two cameras with a matte, got {len(views)}")
-    A, b, origins = np.zeros((3, 3)), np.zeros(3), []
+    centers, directions = [view.camera.center for view in views], []
     for view in views:
         y, x = np.nonzero(view.alpha > INSIDE)
         K, R = view.camera.K, view.camera.cam_from_world[:3, :3]
         middle = cell_to_corner(np.array([x.mean(), y.mean()]))
         ray = np.r_[(middle - K[:2, 2]) / K[[0, 1], [0, 1]], 1.0]
-        ray = R.T @ ray / np.linalg.norm(ray)
-        plane = np.eye(3) - np.outer(ray, ray)
-        A, b = A + plane, b + plane @ view.camera.center
-        origins.append(view.camera.center)
-    scale = np.linalg.norm(np.std(origins, axis=0))
-    if scale < 1e-6 or np.linalg.eigvalsh(A)[0] < 1e-4:
+        directions.append(R.T @ ray / np.linalg.norm(ray))
+    point = nearest_to_lines(centers, directions, 1e-4)
+    if point is None or np.linalg.norm(np.std(centers, axis=0)) < 1e-6:
         raise StageError(
             f"{len(views)} cameras look along one line; expected two directions at least a degree"
             " apart: check the calibration"
         )
-    return np.linalg.solve(A, b)
+    return point
 
 
 def without_contradiction(views: Sequence[DepthView]) -> tuple[list[DepthView], list[Note]]:

@@ -166,3 +166,12 @@ def test_a_bad_camera_is_named(tmp_path, change, message):
         calibration_file.read_cameras(path)
     assert "cam07" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_the_point_nearest_to_lines_is_where_they_meet():
+    point, directions = np.array([0.1, -0.2, 0.3]), np.eye(3)
+    origins = point - directions * [[2.0], [3.0], [-1.0]]
+    assert np.allclose(cameras.nearest_to_lines(origins, directions, 1e-6), point)
+    beside = cameras.nearest_to_lines([[0, 0, 0], [0, 0, 1]], [[1.0, 0, 0], [0, 1.0, 0]], 1e-6)
+    assert np.allclose(beside, [0, 0, 0.5])
+    assert cameras.nearest_to_lines(origins, np.tile(directions[0], (3, 1)), 1e-6) is None

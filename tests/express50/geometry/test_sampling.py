@@ -11,6 +11,7 @@ from express50.geometry.sampling import (
     bilinear_slope,
     edge_width,
     evenly,
+    local_moments,
     sh_polynomials,
 )
 
@@ -82,3 +83,12 @@ def test_an_even_choice_holds_both_ends_and_nothing_twice(count):
     assert len(chosen) == min(count, 10) and chosen[0] == 0
     assert count == 1 or (chosen[-1] == 9 and np.ptp(np.diff(chosen)) <= 1)
     assert evenly([], count) == []
+
+
+def test_local_moments_are_those_of_the_window() -> None:
+    image = np.random.default_rng(1).uniform(0, 9, (12, 15)).astype(np.float32)
+    mean, variance = local_moments(image, 5)
+    window = image[3:8, 4:9]
+    assert mean[5, 6] == pytest.approx(window.mean(), rel=1e-5)
+    assert variance[5, 6] == pytest.approx(window.var(), rel=1e-4)
+    assert (local_moments(np.full_like(image, 7), 5)[1] == 0).all()
