@@ -24,7 +24,7 @@ from express50.capture.index import read_peaks
 from express50.contract.layout import Dataset
 from express50.dataset.tracks import read_registration, read_track
 from express50.error_model import (
-    PEOPLE_DIFFER,
+    HEAD_SIZE_SPREAD,
     ErrorModel,
     error_bounds,
     single_camera_sigma,
@@ -41,7 +41,7 @@ from pipelines.depth.surface import HeadSurface
 from pipelines.matte.stage import SHOWN, rim_figures, rim_of, wall_noise
 from pipelines.register.lay import LaidMesh, mesh_normals
 from pipelines.register.stage import error_figures as laid_figures
-from pipelines.register.stage import lone_sigma
+from pipelines.register.stage import sigma_along_normals
 from pipelines.track.report import error_figures as track_figures
 
 SAMPLES = 6000  # elements of an item at most
@@ -174,7 +174,7 @@ def _depth(peak: _Peak) -> Iterator[Sample]:
     }
     pictures = [picture_of(peak.cameras[n], *read(), read) for n, read in reads.items()]
     parts, errors, shared, skin = [], [], [], []
-    lone = PEOPLE_DIFFER if len(pictures) == 1 else 0.0
+    lone = HEAD_SIZE_SPREAD if len(pictures) == 1 else 0.0
     for name, view, _ in surface_maps(surface, pictures, solid):
         place = peak.subject, peak.frame, peak.true_camera(name)
         true, there = (values[view.window] for values in peak.truth.render_depth(*place))
@@ -226,7 +226,7 @@ def _meshes_of(
         laid = LaidMesh(one.vertices.astype(np.float64), one.seen, one.residual, one.sigma)
         # What the track states is fitted first, and is then a figure of the registration.
         figures = laid_figures(laid, track, row) | {f"{TRACK}{k}": v for k, v in tracked.items()}
-        shared = lone_sigma(laid, views, load_head(track.head))
+        shared = sigma_along_normals(laid, views, load_head(track.head))
         found["register"] = _Mesh(laid.vertices, figures, shared)
     return found
 

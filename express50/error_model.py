@@ -24,7 +24,7 @@ from express50.geometry.cameras import Camera
 FILE = Path(__file__).with_name("error_models.json")
 NOMINAL = 0.9  # share of the true errors that bounds and intervals should contain
 TINY = 1e-6
-PEOPLE_DIFFER = 0.04  # standard deviation of heads' size, as a share
+HEAD_SIZE_SPREAD = 0.04  # standard deviation of heads' size, as a share
 # Percentiles of |x| for a standard normal x: 50th and 90th; 5th, 50th and 95th.
 HALF, NINE_IN_TEN = 0.674, 1.645
 SHARED = 0.063, HALF, 1.96
@@ -99,7 +99,7 @@ def single_camera_sigma(cameras: Sequence[Camera], places: np.ndarray) -> np.nda
     """
     if len(cameras) != 1:
         return np.zeros(len(places))
-    return 1e3 * PEOPLE_DIFFER * np.linalg.norm(places - cameras[0].center, axis=1)
+    return 1e3 * HEAD_SIZE_SPREAD * np.linalg.norm(places - cameras[0].center, axis=1)
 
 
 def scores_of(model: ErrorModel, figures: Mapping[str, np.ndarray | float]) -> np.ndarray:

@@ -28,7 +28,7 @@ from grmm.model import HeadState, PinholeView, Rendering
 
 NO_OFFSETS = np.zeros((0, 3), np.float32)
 CACHE_BYTES = 512 << 20  # of decoded samples: a few hundred of 512 px
-LOOKED_AT = 64  # mattes before training: decoding those of a large dataset takes minutes
+CHECKED_MATTES = 64  # mattes before training: decoding those of a large dataset takes minutes
 DEFAULTS = DataConfig()  # black behind the head
 Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
@@ -335,7 +335,7 @@ class HeadViews:
         Raises:
             TrainError: all of them are empty.
         """
-        looked = evenly(indices, LOOKED_AT)
+        looked = evenly(indices, CHECKED_MATTES)
         empty = [self._where(i) for i in looked if not bool(self.item(i).mask.any())]
         if not empty:
             return

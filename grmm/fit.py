@@ -37,7 +37,7 @@ from grmm.shard_source import select
 from grmm.warm_start import LOGIT_LIMIT, project_texture, spread_change
 
 Scores = dict[str, float | None]
-LOOKED_AT = 12  # pictures scored between the stages
+SCORED_PICTURES = 12  # pictures scored between the stages
 STAGE1_SHARE = 0.35  # of a time budget (G22)
 STAGE1_LR = 1e-2  # learning rate of the codes: they are few and start at a mean (G22)
 STAGE1_FINAL_LR = 0.1  # rate at the end of stage 1 over the rate at its start (G22)
@@ -311,7 +311,7 @@ def _finite(loss: Tensor, iteration: int, stage: int) -> Tensor:
 def _scores(state: FitState, held_out: Sequence[int]) -> Scores:
     chosen = {"psnr_given_db": state.given, "psnr_held_out_db": held_out}
     scores = {
-        name: mean(evaluate(state.views, evenly(indices, LOOKED_AT), state.render), "psnr_db")
+        name: mean(evaluate(state.views, evenly(indices, SCORED_PICTURES), state.render), "psnr_db")
         for name, indices in chosen.items()
     }
     shown = [f"{figure_label(k)}: {v}" for k, v in scores.items() if v is not None]

@@ -56,7 +56,7 @@ from grmm.warm_start import warm_start
 
 LOG_EVERY = 20  # iterations between lines of progress
 SAVING_SHARE = 0.05  # at most this share of the training time
-PATIENT = 10_000  # most iterations that a CPU does in a day
+DAY_STEPS = 10_000  # iterations that a CPU does in a day, at most
 GREY_DB = 10.0  # the score of a grey picture
 GLOO_SECONDS = 0.5  # for Gloo's threads to free tensors; 0.2 was enough in every run
 
@@ -112,7 +112,11 @@ def train(
         )
         if state.perceptual is None:
             log("the perceptual term is off: loss.vgg16 names no weights")
-        if device.type == "cpu" and not config.train.seconds and config.train.iterations > PATIENT:
+        if (
+            device.type == "cpu"
+            and not config.train.seconds
+            and config.train.iterations > DAY_STEPS
+        ):
             log("this takes days on a CPU; use '--preset auto --budget 1h' to train for an hour")
 
     # --- The loop ------------------------------------------------------------------------------

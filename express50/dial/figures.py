@@ -24,7 +24,7 @@ from express50.files.text import read_json_table, read_toml
 SHORT_SIDE = 0.75  # of a picture over its long side if its shape is not known
 DRAWS = 400
 LEAST_SPREAD = 0.05  # of a mean: machines vary as much from day to day
-ALONE = 0.15  # of an item's seconds: their spread where no size has two items
+ASSUMED_SPREAD = 0.15  # of an item's seconds, as a share, if no size has two items
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,7 +206,7 @@ def _weighed(samples: Sequence[MeasuredSize]) -> tuple[np.ndarray, np.ndarray, n
     works = np.array([sample.work for sample in samples])
     means = np.maximum([np.mean(sample.seconds) for sample in samples], 1e-9)
     counts = np.array([len(sample.seconds) for sample in samples])
-    free, spread = int((counts - 1).sum()), ALONE  # items of all sizes have one relative spread
+    free, spread = int((counts - 1).sum()), ASSUMED_SPREAD  # the same share at all sizes
     if free > 2:
         squares = [float(np.var(s.seconds)) * len(s.seconds) for s in samples]
         # Student's variance instead of the normal one: the spread is measured on a few items.

@@ -27,13 +27,13 @@ from express50.dial.choice import (
     taken_over,
 )
 from express50.dial.figures import PilotFigures, Trial, dial_dir, footage_of, read_measured
-from express50.dial.pilot import PEAKS, Chain, Pilot, broken_stage, measure, standard_of
+from express50.dial.pilot import TRIAL_EXPRESSIONS, Chain, Pilot, broken_stage, measure, standard_of
 from express50.errors import ConfigError, StageError
 from express50.files.atomic import write_bytes, write_json
 from express50.runner.ledger import Ledger
 
-PILOTS = 3  # subjects whose footage is tried if the first one's is bad
-BUSY = 1.5  # times its processor time on all workers: waiting took much of a trial
+PILOT_SUBJECTS = 3  # most subjects that are tried, while the footage of each proves bad
+BUSY_RATIO = 1.5  # clock time over processor time on all workers, above which much was waiting
 
 
 def measured_figures(
@@ -54,7 +54,7 @@ def measured_figures(
     if found is not None and not chosen and not clock.cores and clock.budget is not None:
         load = workload(chain, found, False, {})
         least = front(load)[0]
-        waited = least.seconds > BUSY * core_seconds(load, least.settings) / load.width
+        waited = least.seconds > BUSY_RATIO * core_seconds(load, least.settings) / load.width
         # Clock figures that are mostly waiting must not refuse a budget: other programs may have
         # slowed the trials of an earlier command, and may have ended since. Where the budget is not
         # refused, the run sees by itself that it is ahead of time.
@@ -114,13 +114,15 @@ def _timed_again(chain: Chain, clock: Clock, found: PilotFigures) -> PilotFigure
     """Run the first trial again; take other trials to have waited as much per processor second."""
     first = found.trials[0]
     pilots = [Pilot(chain, subject, clock) for subject in _subjects(chain)]
-    pilots = [p for p in pilots if p.record(first.settings, PEAKS).parent.name == first.folder]
+    pilots = [
+        p for p in pilots if p.record(first.settings, TRIAL_EXPRESSIONS).parent.name == first.folder
+    ]
     if not pilots:
         return found
     shutil.rmtree(chain.dataset.pilot_dir / first.folder, ignore_errors=True)
     words = "measuring again, as other programs may have slowed the machine when it was measured"
     try:
-        base = pilots[0].trial(first.settings, PEAKS, None, words)
+        base = pilots[0].trial(first.settings, TRIAL_EXPRESSIONS, None, words)
     except StageError:  # not even the footage was read in the time
         return found
     if pilots[0].cut or broken_stage(chain, base):
@@ -151,7 +153,7 @@ def _subjects(chain: Chain) -> list[str]:
         raise StageError(f"{root}: every subject is excluded; to include one: '{include}'")
     if not subjects:
         raise StageError(f"{root}: has no captures yet; run 'express50 run {root} CAPTURE'")
-    return subjects[:PILOTS]
+    return subjects[:PILOT_SUBJECTS]
 
 
 def _measure_one(chain: Chain, clock: Clock, allowance: _Allowance) -> PilotFigures:

@@ -35,11 +35,11 @@ from express50.runner.ledger import Ledger, Receipt
 from express50.runner.publish import keeping
 from express50.runner.runner import run_stage
 
-PEAKS = 3  # expressions of a trial
-WHOLE = 6  # a subject with no more is tried whole: then a run takes over all that a trial made
-STEEPER = 2.0  # a setting that was not tried is taken to cost so many times the one below it
-STEEPEST = 3.0  # and no more than this; measured were 1.5 to 2.7
-MEASURES = 3  # version of how results are compared
+TRIAL_EXPRESSIONS = 3  # expressions of a trial
+WHOLE_SUBJECT = 6  # expressions, up to which all are tried: a run then reuses all of a trial
+LIKELY_RATIO = 2.0  # assumed cost of an untried setting over that of the setting below it
+WORST_RATIO = 3.0  # the same at worst; 1.5 to 2.7 were measured
+COMPARISON_VERSION = 3  # version of how results are compared
 Ladder = Mapping[str, Any]  # configurations of a stage by the name of the setting, cheapest first
 
 
@@ -65,7 +65,7 @@ class Chain:
             stage.name: [stage.version, {k: vars(c) for k, c in self.ladders[stage.name].items()}]
             for stage in self.stages
         }
-        return value_digest([MEASURES, steps, os.cpu_count(), self.pool.threads])[:16]
+        return value_digest([COMPARISON_VERSION, steps, os.cpu_count(), self.pool.threads])[:16]
 
     def measurable(self) -> list[str]:
         """Return the names of the stages up to the last one that makes a measured result."""
@@ -266,7 +266,7 @@ def _cut_peaks(dataset: Dataset, subject: str, count: int) -> None:
     rows = _rows(whole)
     order = [cue.expression_id for cue in read_index(dataset, subject).cues]
     names = sorted(rows, key=lambda name: order.index(name) if name in order else len(order))
-    kept = names if 1 < count < len(names) <= WHOLE else evenly(names, count)
+    kept = names if 1 < count < len(names) <= WHOLE_SUBJECT else evenly(names, count)
     if set(kept) != _rows(path).keys():
         write_json(path, {name: rows[name] for name in rows if name in kept})
 
@@ -301,7 +301,7 @@ def _base(pilot: Pilot, settings: dict[str, str], choices: Sequence[str]) -> Tri
     where = "on a few expressions of one subject"
     words = f"measuring {where}, every stage at its cheapest setting"
     while True:
-        base = pilot.trial(settings, PEAKS, None, words)
+        base = pilot.trial(settings, TRIAL_EXPRESSIONS, None, words)
         broken = broken_stage(pilot.chain, base)
         ladder = list(pilot.chain.ladders.get(broken, ()))
         if broken not in choices or settings[broken] == ladder[-1] or pilot.cut:
@@ -351,9 +351,11 @@ def measure(pilot: Pilot, allowance: Allowance) -> PilotFigures:
     for name, label in _steps(pilot, base, choices):
         settings, factor = {**base.settings, name: label}, grown.get(name, 1.0)
         pilot.clock.expect(0.0)
-        known, limit = pilot.record(settings, PEAKS).is_file(), allowance.spare(found)
+        known, limit = pilot.record(settings, TRIAL_EXPRESSIONS).is_file(), allowance.spare(found)
         if known or _fits(pilot, base, (name, label), factor, found, allowance):
-            trial = pilot.trial(settings, PEAKS, base, f"measuring {name} {label}", limit)
+            trial = pilot.trial(
+                settings, TRIAL_EXPRESSIONS, base, f"measuring {name} {label}", limit
+            )
             if not pilot.cut:
                 trials = [*found.trials, trial]
                 losses = found.losses | {name: _losses(pilot, trials, base.settings, name)}
@@ -381,7 +383,7 @@ def _fits(
 
     Even at its worst, the trial must leave time for the best choice so far.
     """
-    likely, worst = (guessed(pilot, base, *step, factor * f) for f in (STEEPER, STEEPEST))
+    likely, worst = (guessed(pilot, base, *step, factor * f) for f in (LIKELY_RATIO, WORST_RATIO))
     return trial_seconds(pilot, worst, step[0]) <= allowance.spare(found) and (
         trial_seconds(pilot, likely, step[0]) <= allowance.spare(found, likely)
     )

@@ -34,7 +34,13 @@ from express50.dial.choice import (
     stage_seconds,
 )
 from express50.dial.figures import PilotFigures, dial_dir
-from express50.dial.measuring import BUSY, core_seconds, measured_figures, time_words, workload
+from express50.dial.measuring import (
+    BUSY_RATIO,
+    core_seconds,
+    measured_figures,
+    time_words,
+    workload,
+)
 from express50.dial.pilot import (
     Chain,
     keep_for_run,
@@ -46,7 +52,7 @@ from express50.files.atomic import write_json
 from express50.files.text import read_json_table
 from express50.runner.runner import Outcome, Summary, run_stage
 
-BELIEVED = 0.1  # of the expected time must have passed before its speed changes choices
+BELIEVED_SHARE = 0.1  # of the expected time must have passed before its speed changes choices
 GRACE = 0.1  # of the budget by which a run may end late rather than stop with nothing made
 
 
@@ -115,7 +121,7 @@ class _Run:
 
     def slowness(self) -> float:
         """Return how much longer stages took than expected; 1 while too little was seen."""
-        believed = max(1.0, BELIEVED * (self.state.seconds - self.state.spent))
+        believed = max(1.0, BELIEVED_SHARE * (self.state.seconds - self.state.spent))
         if self.expected < believed:
             return 1.0
         return min(4.0, max(0.25, self.real / self.expected))
@@ -226,7 +232,7 @@ def _first_choice(run: _Run, load: Workload, goal: Goal | None) -> Point:
         if clock.budget is not None and more <= clock.budget.seconds:
             give = "the same command again will do"
         core = core_seconds(load, points[0].settings)
-        if not load.cores and least > BUSY * core / load.width:
+        if not load.cores and least > BUSY_RATIO * core / load.width:
             give += f"; only {format_seconds(core)} of it is processor time: where other programs"
             give += f" slowed the measuring, give --budget {budget_text(1.1 * core, True)} instead"
         raise ConfigError(

@@ -31,7 +31,7 @@ from express50.geometry.shapes import PIXEL_LIMIT
 WITHIN = "!/"
 BYTES_LIMIT = 1 << 28  # per encoded image or array
 NAME_LIMIT = 255  # bytes per path component
-BLOWN = 4.0  # median light two stops above white: values of 0 to 255, say
+OVEREXPOSED = 4.0  # median light two stops above white: values of 0 to 255, say
 OPEN_FILES = 4  # containers a process keeps open
 # What h5py raises on bad files.
 DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, AttributeError)
@@ -49,7 +49,7 @@ def to_srgb(image: np.ndarray) -> np.ndarray:
     if image.dtype.kind == "f":
         if not np.isfinite(image).all():
             raise ValueError("image holds NaN or infinity")
-        if np.median(image) > BLOWN:
+        if np.median(image) > OVEREXPOSED:
             raise ValueError(
                 f"its median is {np.median(image):.3g}, expected linear light from 0 to 1"
             )

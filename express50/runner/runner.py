@@ -38,7 +38,7 @@ from express50.runner.publish import (
 from express50.runner.worker import Task, failed_receipt, failure_reason, fingerprint, input_digests
 
 WARNINGS = 12  # lines; more of them would hide the account
-ALIKE = 3  # if the first items, this many, fail for the same reason, a setting is wrong
+ALIKE_FAILURES = 3  # if so many first items fail for the same reason, a setting is wrong
 KEPT = "imported; the stage does not make it"
 
 
@@ -373,7 +373,7 @@ def _run_items(
         def settle_task(receipt: Receipt) -> None:
             settle(receipt)
             ended.append(receipt)
-            if len(ended) == ALIKE < len(work.tasks):
+            if len(ended) == ALIKE_FAILURES < len(work.tasks):
                 _refuse_alike(stage, ended, work.former)
                 # Nothing was known before of a stage that was never run.
                 items = [*outcomes, *(task.item for task in work.tasks)]

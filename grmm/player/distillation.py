@@ -36,7 +36,7 @@ SPREAD = {"jaw": 0.15, "neck": 0.12, "eyes": 0.2, "coefficients": 0.2}  # of sam
 BEYOND_DEGREES = 15.0  # the player may turn so far beyond the training cameras
 PICTURE_PX = 320  # of sampled views
 FAINT_PX = 0.1  # a Gaussian that colours fewer pixels in every sampled picture is left out
-MOST = 60_000  # most Gaussians kept: those that colour the most pixels
+MOST_GAUSSIANS = 60_000  # most Gaussians kept: those that colour the most pixels
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -175,7 +175,7 @@ def distil(person: Person) -> Avatar:
             drawn(grey, pose, view).colors[..., 0].sum().backward()
         assert colours.grad is not None
         most = torch.maximum(most, colours.grad[0, :, 0])
-    least = max(FAINT_PX, float(most.topk(min(MOST, len(most))).values[-1]))
+    least = max(FAINT_PX, float(most.topk(min(MOST_GAUSSIANS, len(most))).values[-1]))
     return avatar.kept(most >= least)
 
 

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import open3d as o3d
 
-from express50.error_model import PEOPLE_DIFFER, Bounds, error_bounds
+from express50.error_model import HEAD_SIZE_SPREAD, Bounds, error_bounds
 from express50.files.images import box_about
 from express50.geometry.cameras import Camera, crop_camera, rays, resized, unproject
 from express50.geometry.conventions import cell_to_corner
@@ -175,7 +175,7 @@ def surface_maps(
             "photo_wide": smoothed_errors(errors, valid, 3 * WINDOW),
             "grain": grain(rgb, valid),
         }
-        shared = 1e3 * PEOPLE_DIFFER * seen.depth[seen.valid] if len(pictures) == 1 else 0.0
+        shared = 1e3 * HEAD_SIZE_SPREAD * seen.depth[seen.valid] if len(pictures) == 1 else 0.0
         bounds = error_bounds("depth", figures, shared)
         yield camera.id, replace(seen, figures=figures, bounds=bounds), errors
 

@@ -40,14 +40,20 @@ ERROR_STEPS = 30.0  # 8-bit steps at the bright end of the error maps
 BLANK = 24  # grey of unknown pixels
 SHOWN = 4  # cameras in the contact sheet
 TILE = 240  # pixels of a picture in it
-EXPECTING = 8  # every n-th pixel counts for the expected error
+ERROR_STRIDE = 8  # every n-th pixel counts for the expected error
 AGREEMENT = 0.85  # share of the tracked mesh that must lie in the mattes for it to be used
 
 
 def run(
     dataset: Dataset, item: str, out: Path, *, side: int, fineness: tuple[float, float, float]
 ) -> Result:
-    """Write every camera's maps, the coloured surface and a contact sheet."""
+    """Write every camera's maps, the coloured surface and a contact sheet.
+
+    `side` is `depth.image_side`; `fineness` are `depth.voxel_mm`, `voxel_px` and `noise`.
+
+    Raises:
+        StageError: there are too few usable views, or one view without a tracked head.
+    """
     cv2.setNumThreads(1)  # the runner counts one core per item
     views, pictures, dropped = read_views(dataset, item, side)
     # One camera of which nothing was dropped is a photograph, or a video.
@@ -90,7 +96,7 @@ def write_views(
         rows[camera_id] = view_figures(seen, errors)
         photo.append(errors)
         if seen.bounds is not None:
-            typical.append(seen.bounds.typical[::EXPECTING].astype(np.float32))
+            typical.append(seen.bounds.typical[::ERROR_STRIDE].astype(np.float32))
         if number in chosen:
             columns.append(view_panels(pictures[number].small[1], seen, errors.errors))
     labels = ["frame", "depth", "normals", "confidence", f"photo error, 0 to {ERROR_STEPS:g}/255"]

@@ -105,12 +105,12 @@ def run(
     }
     named = {note.what for note in found.warnings}
     odd = [note for note in matte_warnings(final) if note.what not in named]
-    doubt = {
+    bounds = {
         name: error_bounds("matte", rim_figures(alpha, own.rgb, own.noise, own.plated, len(mattes)))
         for (name, alpha), own in zip(final.items(), mattes.values(), strict=True)
     }
-    figures["expected"] = {name: asdict(e) for name, d in doubt.items() if (e := d.expected)}
-    expected = expect(error_models()["matte"], np.concatenate([d.typical for d in doubt.values()]))
+    figures["expected"] = {name: asdict(e) for name, b in bounds.items() if (e := b.expected)}
+    expected = expect(error_models()["matte"], np.concatenate([b.typical for b in bounds.values()]))
     return Result(figures, dropped, [*odd_plates, *found.warnings, *odd], expected)
 
 

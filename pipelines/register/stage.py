@@ -72,14 +72,14 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
     sigma = np.where(fine, np.hypot(track.sigma[row], SURFACE_M), laid.sigma)
     laid = replace(laid, sigma=sigma)
     cameras = list(read_cameras_of(dataset, subject).values())
-    shared = lone_sigma(laid, cameras, model)
-    doubt = error_bounds("register", error_figures(laid, track, row), shared)
-    metrics = write_registration(out, path, track, row, laid, bound=1e-3 * doubt.bound)
+    shared = sigma_along_normals(laid, cameras, model)
+    bounds = error_bounds("register", error_figures(laid, track, row), shared)
+    metrics = write_registration(out, path, track, row, laid, bound=1e-3 * bounds.bound)
     warnings = []
     if metrics["seen_share"] < LEAST_SEEN:
         why = f"the surface was found at only {metrics['seen_share']:.0%} of the face's vertices"
         warnings.append(Note(expression, why))
-    expected = doubt.expected
+    expected = bounds.expected
     if shape_spread(track.shape) > LARGEST_SPREAD:  # the error model knows people only
         expected = None
         why = "the tracked head has an impossible shape, so no error is stated; see 'track'"
@@ -87,7 +87,7 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
     return Result(metrics, (), warnings, expected)
 
 
-def lone_sigma(laid: LaidMesh, cameras: Sequence[Camera], model: HeadModel) -> np.ndarray:
+def sigma_along_normals(laid: LaidMesh, cameras: Sequence[Camera], model: HeadModel) -> np.ndarray:
     """Return the part along the mesh's normals of `single_camera_sigma` (V,), metres."""
     along = single_camera_sigma(cameras, laid.vertices)
     ray = laid.vertices - cameras[0].center

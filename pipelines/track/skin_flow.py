@@ -19,10 +19,10 @@ from pipelines.track.surface import FrameSetCrops, sample_normals
 from pipelines.track.terms import SlideTerm
 
 FINE = 2  # texels of 0.65 mm on the cheeks
-LOCAL = 6.0  # texels over which light and shade are evened out
+LIGHT_TEXELS = 6.0  # texels over which light and shade are evened out
 NOISE = 0.01  # of root light: contrast must stand out from it
-EVERY = 4  # texels between places that are followed
-BACK = 0.6  # texels by which the flow there and back may miss
+SPACING_TEXELS = 4  # texels between places that are followed
+RETURN_TEXELS = 0.6  # texels by which the flow there and back may miss
 TEXTURED = 0.02  # least contrast, in every direction, of what is followed
 SIGMA = 0.5  # texels
 REDUNDANCY = 30.0  # places that count as one, because neighbours err together
@@ -46,8 +46,8 @@ def skin_map(
     grey, weight = colors.mean(2), seen.astype(np.float32)
 
     def local(values: np.ndarray) -> np.ndarray:
-        share = cv2.GaussianBlur(weight, (0, 0), LOCAL)
-        return cv2.GaussianBlur(values * weight, (0, 0), LOCAL) / np.maximum(share, 1e-3)
+        share = cv2.GaussianBlur(weight, (0, 0), LIGHT_TEXELS)
+        return cv2.GaussianBlur(values * weight, (0, 0), LIGHT_TEXELS) / np.maximum(share, 1e-3)
 
     away = (grey - local(grey)) * weight
     even = away / np.sqrt(local(away**2) + NOISE**2)
@@ -83,14 +83,14 @@ def flow_term(
     inner = cv2.erode(both.astype(np.uint8), np.ones((RIM, RIM), np.uint8)).astype(np.float32)
     first, second = (np.where(both, one.grey, 128).astype(np.uint8) for one in (still, moved))
     there, back = _flow(first, second), _flow(second, first)
-    chosen = (uv_map.texels % EVERY == EVERY // 2).all(1)
+    chosen = (uv_map.texels % SPACING_TEXELS == SPACING_TEXELS // 2).all(1)
     ids = np.flatnonzero(chosen & (inner[tuple(uv_map.texels.T)] > 0))
     row, column = uv_map.texels[ids].T
     at = cell_to_corner(uv_map.texels[ids, ::-1])
     goal = at + there[row, column]
     missed = np.linalg.norm(goal + bilinear(back, goal) - at, axis=1)
     contrast = cv2.cornerMinEigenVal(first.astype(np.float32) / 255.0, 9, 3)[row, column]
-    sure = (missed < BACK) & (contrast > TEXTURED**2)
+    sure = (missed < RETURN_TEXELS) & (contrast > TEXTURED**2)
     sure &= bilinear(inner, goal) > 0.99
     ids, at, goal = ids[sure], at[sure], goal[sure]
     if not len(ids):

@@ -91,8 +91,8 @@ def run(
     metrics = track_metrics(model, targets, meshes)
     sigma = vertex_sigma(basis, targets, state, free_modes(targets))
     bounds = stated_bounds(cameras, sigma, meshes, metrics)
-    doubt = {"sigma": sigma, "bound": 1e-3 * np.stack([one.bound for one in bounds])}
-    write_track(out / "track.npz", config.head, basis, targets, state, meshes, doubt, glasses)
+    uncertainty = {"sigma": sigma, "bound": 1e-3 * np.stack([one.bound for one in bounds])}
+    write_track(out / "track.npz", config.head, basis, targets, state, meshes, uncertainty, glasses)
     if config.texture_side:
         sides = (config.samples, config.texture_side)
         write_texture(out, model, targets, meshes, evidence.pictures, *sides)
@@ -235,12 +235,12 @@ def write_track(
     targets: list[Target],
     state: State,
     vertices: np.ndarray,
-    doubt: Mapping[str, np.ndarray] | None = None,
+    uncertainty: Mapping[str, np.ndarray] | None = None,
     glasses: Sequence[np.ndarray] = (),
 ) -> None:
     """Write track.npz (docs/FORMAT.md).
 
-    `doubt` are the vertices' deviations and bounds (E, V), `glasses` the places (n, 3) of every
+    `uncertainty` holds the vertices' deviations and bounds (E, V), `glasses` the places (n, 3) of every
     expression's glasses, if they were looked for.
     """
     shape, offsets = split_shape(basis.model, state.shape)
@@ -253,7 +253,7 @@ def write_track(
         "offsets": offsets.astype(np.float32),
     }
     arrays |= pose_arrays(state.poses, basis.expression_size)
-    further = {"vertices": vertices, **(doubt or {})}
+    further = {"vertices": vertices, **(uncertainty or {})}
     if len(glasses):
         further["glasses"] = np.concatenate(glasses)
         arrays["glasses_row"] = np.repeat(np.arange(len(glasses)), [len(one) for one in glasses])

@@ -202,7 +202,7 @@ def test_a_goal_is_reached_in_the_least_time_or_refused(tmp_path, captures):
 
 
 def test_a_goal_that_untried_settings_may_reach_asks_for_more_time(tmp_path, captures, monkeypatch):
-    monkeypatch.setattr("express50.dial.pilot.STEEPER", 1e9)
+    monkeypatch.setattr("express50.dial.pilot.LIKELY_RATIO", 1e9)
     with pytest.raises(ConfigError, match=r"no time to try .*solve standard and reference.*larger"):
         go(tmp_path / "d", captures, "5m", "0.6mm")
 
@@ -250,7 +250,7 @@ def test_captures_that_come_after_a_finished_run_get_the_budget_anew(
 
 
 def test_a_larger_budget_tries_what_a_small_one_had_no_time_for(tmp_path, captures, monkeypatch):
-    monkeypatch.setattr("express50.dial.pilot.STEEPER", 1e9)
+    monkeypatch.setattr("express50.dial.pilot.LIKELY_RATIO", 1e9)
     _, cheap = go(tmp_path / "d", captures, "5m")
     assert cheap.settings["map"] == "draft"
     monkeypatch.undo()
@@ -439,7 +439,7 @@ def test_what_later_stages_cannot_begin_is_left_and_not_failed(tmp_path, capture
     monkeypatch.setattr("express50.dial.run.GRACE", 0.0)
     count_pauses(monkeypatch)
     budget = 90
-    monkeypatch.setattr("express50.dial.pilot.STEEPER", 1e9)
+    monkeypatch.setattr("express50.dial.pilot.LIKELY_RATIO", 1e9)
     chain = chain_of(tmp_path / "d", captures)
     measured_figures(chain, Clock(parse_budget(f"{budget / 3600:.7f}ch")))
     monkeypatch.setenv(PAUSE, "20")
