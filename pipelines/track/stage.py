@@ -240,8 +240,8 @@ def write_track(
 ) -> None:
     """Write track.npz (docs/FORMAT.md).
 
-    `uncertainty` holds the vertices' deviations and bounds (E, V), `glasses` the places (n, 3) of every
-    expression's glasses, if they were looked for.
+    `uncertainty` holds the vertices' deviations and bounds (E, V), `glasses` the places (n, 3) on
+    every expression's glasses, if they were looked for.
     """
     shape, offsets = split_shape(basis.model, state.shape)
     arrays = {
