@@ -125,6 +125,15 @@ def local_moments(image: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]
     return mean, np.maximum(square - mean * mean, 0)
 
 
+def robust_moments(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return median and deviation (...) of values (N, ...); few outliers change neither much.
+
+    The deviation is the median distance from the median, scaled to that of normal errors.
+    """
+    middle = np.median(values, axis=0)
+    return middle, 1.4826 * np.median(np.abs(values - middle), axis=0)
+
+
 def edge_width(image: np.ndarray) -> float | None:
     """Measure the width of the sharpest edges of an image (H, W, 3) uint8; None with too few.
 

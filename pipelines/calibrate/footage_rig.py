@@ -19,6 +19,7 @@ import numpy as np
 from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera, pinhole, project, triangulate
 from express50.geometry.conventions import MIRROR_X
+from express50.geometry.sampling import robust_moments
 from express50.geometry.transforms import (
     invert_transform,
     make_transform,
@@ -200,9 +201,8 @@ def eye_scale(shapes: Sequence[np.ndarray], eye_distance_m: float, where: str) -
             f"{where}: the eyes cannot be located in space, so nothing gives the metre; add"
             " calibration.json or board images, then run 'express50 ingest' again"
         )
-    eyes = float(np.median(gaps))
-    spread = 1.4826 * float(np.median(np.abs(gaps - eyes))) / eyes
-    return EyeScale(eye_distance_m / eyes, len(gaps), spread)
+    eyes, spread = map(float, robust_moments(gaps))
+    return EyeScale(eye_distance_m / eyes, len(gaps), spread / eyes)
 
 
 def _adjust(

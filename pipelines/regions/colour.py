@@ -17,6 +17,7 @@ from scipy.ndimage import gaussian_filter
 
 from express50.contract.segmentation_labels import LABELS, label_mask
 from express50.files.images import LIGHT_OF_LEVEL
+from express50.geometry.sampling import robust_moments
 from pipelines.regions.geometry import HAIR, SCALP, TORSO, HeadGeometry
 
 SKIN, NECK, EARS = (np.uint8(LABELS.index(name)) for name in ("skin", "neck", "ears"))
@@ -79,8 +80,7 @@ def like_skin(values: np.ndarray, face: np.ndarray) -> np.ndarray:
         r, g, b = logs.T
         return np.stack([(r + g + b) / 3.0, r - g, g - b], axis=1)
 
-    usual = np.median(ratios(face), axis=0)
-    spread = 1.4826 * np.median(np.abs(ratios(face) - usual), axis=0)
+    usual, spread = robust_moments(ratios(face))
     return (np.abs(ratios(values) - usual) < WITHIN * np.maximum(spread, LEAST_SPREAD)).all(1)
 
 
@@ -211,9 +211,8 @@ def scalp_votes(rgb: np.ndarray, labels: np.ndarray, alpha: np.ndarray) -> tuple
     )
     if min(len(skin), len(scalp)) < LEAST:
         return 0, 0
-    middle = np.median(skin, axis=0)
-    spread = np.maximum(1.4826 * np.median(np.abs(skin - middle), axis=0), FLOOR)
-    away = np.sqrt((((scalp - middle) / spread) ** 2).sum(1))
+    middle, spread = robust_moments(skin)
+    away = np.sqrt((((scalp - middle) / np.maximum(spread, FLOOR)) ** 2).sum(1))
     return len(scalp), int((away < ALIKE).sum())
 
 

@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 from express50.files.images import srgb_to_linear
 from express50.geometry.meshes import cotangent_laplacian
 from express50.geometry.raycast import join_rays, mesh_scene
+from express50.geometry.sampling import robust_moments
 from express50.geometry.transforms import unit
 from express50.head.model import HeadModel, normals_of
 from pipelines.register.untangle import untangled
@@ -237,8 +238,7 @@ def skin_trust(
     # Standard deviations that colours are off those of bare skin.
     log = np.log(srgb_to_linear(colors / 255.0) + 0.01)
     axes = np.stack([log[:, 0] - log[:, 1], log[:, 2] - log[:, 1], log.mean(1)], axis=1)
-    middle = np.median(axes[reference], axis=0)
-    spread = 1.4826 * np.median(np.abs(axes[reference] - middle), axis=0)
+    middle, spread = robust_moments(axes[reference])
     odd = np.linalg.norm((axes - middle) / np.maximum(spread, SPREADS), axis=1)
     _, owner = cKDTree(mesh).query(vertices, distance_upper_bound=LIPS_M)
     odd[np.r_[in_regions(model, ("lips",)), False][owner]] = 0.0

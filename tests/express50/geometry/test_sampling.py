@@ -12,6 +12,7 @@ from express50.geometry.sampling import (
     edge_width,
     evenly,
     local_moments,
+    robust_moments,
     sh_polynomials,
 )
 
@@ -92,3 +93,11 @@ def test_local_moments_are_those_of_the_window() -> None:
     assert mean[5, 6] == pytest.approx(window.mean(), rel=1e-5)
     assert variance[5, 6] == pytest.approx(window.var(), rel=1e-4)
     assert (local_moments(np.full_like(image, 7), 5)[1] == 0).all()
+
+
+def test_robust_moments_are_those_of_most_values() -> None:
+    values = np.random.default_rng(2).normal([3, -1], [0.5, 2], (4001, 2))
+    values[::50] = 1e6
+    middle, spread = robust_moments(values)
+    assert middle == pytest.approx([3, -1], abs=0.15)
+    assert spread == pytest.approx([0.5, 2], rel=0.12)
