@@ -25,7 +25,7 @@ from benchmarks.common import make_parser
 from express50.geometry.raycast import mesh_scene
 from express50.geometry.transforms import axis_angle_to_matrix, rigid_fit
 from express50.head.load import load_builtin, load_head
-from express50.head.model import HeadModel, landmarks, pose
+from express50.head.model import HeadModel, landmarks, landmarks_of, pose
 from express50.head.preview import render_preview
 from pipelines.register.scan import fit_scan
 from pipelines.register.scan_input import GREY, Scan
@@ -151,7 +151,7 @@ def sheet(own: HeadModel, other: HeadModel, seed: int) -> np.ndarray:
     halves = []
     for model in (own, other):
         people = draw_people(model, SHEET_PEOPLE, seed)
-        mark = landmarks(model, model.template[None])[0].double().numpy()[27]
+        mark = landmarks_of(model).astype(np.float64)[27]
         people = people - mark + [0.0, 0.024, 0.1]
         tiles = [
             np.concatenate([render_preview(model, v, yaw=y, size=SHEET_PX) for y in SHEET_SIDES], 1)

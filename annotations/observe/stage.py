@@ -24,7 +24,7 @@ from express50.contract.stage import Note, Result
 from express50.errors import FormatError, StageError, rounded_down
 from express50.files.arrays import read_arrays
 from express50.files.images import contact_sheet, write_image
-from express50.geometry.transforms import similarity_fit, transform_points
+from express50.geometry.transforms import scale_of, similarity_fit, transform_points
 
 if TYPE_CHECKING:
     from express50.landmarks.network import LandmarkNet
@@ -240,7 +240,7 @@ def find_points(
     import torch
 
     from express50.landmarks.detector import detect, window_about
-    from express50.landmarks.network import CROP, MIRROR, face_box
+    from express50.landmarks.network import CROP, MIRROR, as_input, face_box
 
     middle = detect(net, images[len(images) // 2], smallest=smallest)
     centre, side = face_box(middle.points)
@@ -250,7 +250,7 @@ def find_points(
         crops = np.stack([_cut(image, window, CROP) for image in images[start : start + BATCH]])
         both = np.concatenate([crops, crops[:, :, ::-1]])
         with torch.inference_mode():
-            output = net(torch.from_numpy(both).permute(0, 3, 1, 2).float() / 255.0)
+            output = net(as_input(both))
         direct, mirrored = output.points.double().numpy().reshape(2, len(crops), -1, 2)
         mirrored = np.stack([CROP - mirrored[:, MIRROR, 0], mirrored[:, MIRROR, 1]], axis=-1)
         batch = slice(start, start + len(crops))
@@ -308,7 +308,7 @@ def _cut(image: np.ndarray, window: np.ndarray, size: int) -> np.ndarray:
     """Cut a square through an affine (2, 3) from its pixels to the image's, corner origin."""
     from express50.landmarks.detector import cut_crop
 
-    step = float(np.sqrt(abs(np.linalg.det(window[:, :2]))))
+    step = scale_of(window)
     height, width = image.shape[:2]
     if step > 1.5:  # blurred first, because fine detail would alias
         small = (max(1, round(width / step)), max(1, round(height / step)))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Container
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -235,12 +236,13 @@ def dates_as_text(value: object) -> object:
     return value if isinstance(value, str | int | float) else str(value)
 
 
+def is_shown(path: Path, suffixes: Container[str]) -> bool:
+    """Return whether a path's name has one of the suffixes, and is not that of a hidden file."""
+    return path.suffix.lower() in suffixes and not path.name.startswith(".")
+
+
 def _videos(folder: Path) -> list[Path]:
-    return sorted(
-        path
-        for path in folder.iterdir()
-        if path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".")
-    )
+    return sorted(path for path in folder.iterdir() if is_shown(path, VIDEO_SUFFIXES))
 
 
 def _read_camera(folder: Path) -> RawCamera:
@@ -274,11 +276,7 @@ def image_names(folder: Path) -> list[str]:
     """List the image files in a folder, sorted; none when the folder is missing."""
     if not folder.is_dir():
         return []
-    return sorted(
-        path.name
-        for path in folder.iterdir()
-        if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
-    )
+    return sorted(path.name for path in folder.iterdir() if is_shown(path, IMAGE_SUFFIXES))
 
 
 def _read_board(root: Path, cameras: dict[str, RawCamera]) -> dict | None:

@@ -63,6 +63,11 @@ class Camera:
         return np.array([[fx, 0.0, p["cx"]], [0.0, fy, p["cy"]], [0.0, 0.0, 1.0]])
 
     @property
+    def focal(self) -> float:
+        """Return the focal length, pixels: the geometric mean of those across and down."""
+        return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
+
+    @property
     def dist(self) -> np.ndarray:
         """Return the distortion (8,) in OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6."""
         p = self._named()
@@ -304,7 +309,7 @@ def triangulate(
     seen = np.isfinite(xy).all(-1)
     w = np.where(seen, 1.0 if weights is None else np.asarray(weights, dtype=np.float64), 0.0)
     P = np.stack([c.cam_from_world[:3] for c in cameras])  # (C, 3, 4)
-    focal = np.array([np.sqrt(c.K[0, 0] * c.K[1, 1]) for c in cameras])
+    focal = np.array([camera.focal for camera in cameras])
     points = np.full((pixels.shape[1], 3), np.nan)
     enough = (w > 0).sum(0) >= 2
     for n in np.flatnonzero(enough):

@@ -84,6 +84,11 @@ def transform_points(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
     return points @ matrix[:size, :size].T + matrix[:size, size]
 
 
+def scale_of(affine: np.ndarray) -> float:
+    """Return how much longer an affine map (2, 3) makes lines, in the mean of its directions."""
+    return float(np.sqrt(abs(np.linalg.det(affine[:, :2]))))
+
+
 def invert_transform(T: np.ndarray) -> np.ndarray:
     """Return the inverse (4, 4) of a rigid transform (4, 4)."""
     R, t = T[:3, :3], T[:3, 3]

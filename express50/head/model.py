@@ -8,6 +8,7 @@ Head space: metres, y up, the face looks along +z, the subject's left is +x.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
@@ -286,10 +287,22 @@ def joint_transforms(
     return turn, torch.stack(world_joints, dim=1) - (turn @ joints[..., None])[..., 0]
 
 
+def in_regions(model: HeadModel, names: Sequence[str]) -> np.ndarray:
+    """Mark the vertices (V,) in any of the named regions that a model has."""
+    masks = [model.regions[name].numpy() for name in names if name in model.regions]
+    return np.any([np.zeros(len(model.template), dtype=bool), *masks], axis=0)
+
+
 def landmarks(model: HeadModel, vertices: torch.Tensor) -> torch.Tensor:
     """Return the 68 landmarks (B, 68, 3) on posed vertices (B, V, 3), iBUG-68 order."""
     corners = vertices[:, model.faces[model.landmark_faces]]
     return (corners * model.landmark_bary[None, :, :, None]).sum(2)
+
+
+def landmarks_of(model: HeadModel, points: np.ndarray | None = None) -> np.ndarray:
+    """Return the `landmarks` (68, 3) of a single mesh (V, 3); by default of the head at rest."""
+    mesh = model.template if points is None else torch.from_numpy(points)
+    return landmarks(model, mesh[None])[0].numpy()
 
 
 def vertex_normals(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from express50.geometry.conventions import affine_to_opencv
-from express50.geometry.transforms import transform_points
+from express50.geometry.transforms import scale_of, transform_points
 from express50.landmarks.network import (
     CROP,
     LEFT_EYE,
@@ -29,6 +29,7 @@ from express50.landmarks.network import (
     MOUTH,
     CloseNet,
     LandmarkNet,
+    as_input,
     face_box,
 )
 
@@ -326,10 +327,10 @@ def _looked_closer(
     windows = [close_window(net, place.points, *look) for look in looks]
     crops = np.stack([sample_window(pyramid, window, net.crop) for window in windows])
     with torch.inference_mode():
-        answer = net(torch.from_numpy(crops).permute(0, 3, 1, 2).float() / 255.0)
+        answer = net(as_input(crops))
     found, scales = (part.double().numpy() for part in answer)
     for (ids, _), window, at, scale in zip(looks, windows, found, np.exp(scales), strict=True):
-        scale = scale * np.sqrt(abs(np.linalg.det(window[:, :2])))
+        scale = scale * scale_of(window)
         surer = scale < place.sigma[ids]
         points[ids[surer]] = transform_points(window, at)[surer]
         sigma[ids[surer]] = scale[surer]
@@ -348,7 +349,7 @@ def make_pyramid(image: np.ndarray) -> list[np.ndarray]:
 
 def sample_window(pyramid: list[np.ndarray], window: np.ndarray, size: int = CROP) -> np.ndarray:
     """Cut a crop (size, size, 3) uint8 out of the level whose resolution fits the window."""
-    step = np.sqrt(abs(np.linalg.det(window[:, :2])))
+    step = scale_of(window)
     level = int(np.clip(np.floor(np.log2(max(step, 1e-6)) + 0.5), 0, len(pyramid) - 1))
     height, width = pyramid[0].shape[:2]
     shape = pyramid[level].shape
@@ -362,9 +363,8 @@ def _run(net: LandmarkNet, looks: Sequence[Look]) -> list[_Place]:
     for start in range(0, len(looks), BATCH):
         part = looks[start : start + BATCH]
         crops = np.stack([sample_window(look.pyramid, look.window) for look in part])
-        # Permuted to (N, 3, H, W), the crops are in channels-last memory format already.
         with torch.inference_mode():
-            output = net(torch.from_numpy(crops).permute(0, 3, 1, 2).float() / 255.0)
+            output = net(as_input(crops))
         scales = output.log_scale.double().exp().numpy()
         visible = torch.sigmoid(output.seen).double().numpy()
         scores = torch.sigmoid(output.logit).double().numpy()

@@ -48,6 +48,14 @@ INNER_LIPS = ((61, 62, 63), (67, 66, 65))  # those that meet, the upper ones fir
 COUNTERS = "num_batches_tracked"  # suffix of batch normalisation's buffers that are not stored
 
 
+def as_input(crops: np.ndarray) -> torch.Tensor:
+    """Make a network's input (B, 3, H, W), 0 to 1, of crops (B, H, W, 3) uint8.
+
+    It is in channels-last memory format, as the crops are.
+    """
+    return torch.from_numpy(crops).permute(0, 3, 1, 2).float() / 255.0
+
+
 def face_box(points: np.ndarray) -> tuple[np.ndarray, float]:
     """Return centre (2,) and side of the square that is cropped around landmarks (68, 2)."""
     low, high = points.min(0), points.max(0)

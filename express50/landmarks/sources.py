@@ -22,7 +22,7 @@ from express50.files.arrays import DAMAGE, read_arrays
 from express50.files.text import read_json
 from express50.geometry.cameras import Camera, normalised
 from express50.geometry.conventions import cell_to_corner
-from express50.geometry.transforms import transform_points
+from express50.geometry.transforms import scale_of, transform_points
 from express50.landmarks import source_files
 from express50.landmarks.detector import SMALLEST, Detection, cut_crop, detect, place_crop
 from express50.landmarks.irises import Irises, find_irises
@@ -294,7 +294,7 @@ def find_with_fan(fan: torch.jit.ScriptModule, image: np.ndarray, face: Detectio
     cells, spread, height = (np.array(part) for part in zip(*found, strict=True))
     step = FAN_CROP / HEAT
     points = transform_points(window, cells * step)
-    scale = float(np.sqrt(abs(np.linalg.det(window[:, :2]))))
+    scale = scale_of(window)
     confidence = np.clip(height, 0.0, 1.0)
     sigma = np.maximum(spread, 0.5) * step * scale / np.maximum(confidence, 0.05)
     return replace(face, points=points, sigma=sigma, confidence=face.score * confidence)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from express50.geometry.sampling import smoothstep
-from express50.head.model import HeadModel, landmarks
+from express50.head.model import HeadModel, landmarks_of
 from express50.twin.surface import fractal, make_lattice, noise
 
 # Standard deviation of a matrix entry if the amount is 1: the person adds two fifths of a motion.
@@ -136,5 +136,5 @@ def living_skin(
     # Two people of three redden with effort, the others turn pale.
     temper = rng.uniform(0.6, 1.0) * (1 if rng.uniform() < 2 / 3 else -0.7)
     flush = amount * temper * np.tanh(np.abs(expression).sum() / EFFORT)
-    marks = landmarks(model, model.template[None])[0].double().numpy()
+    marks = landmarks_of(model).astype(np.float64)
     return LivingSkin(folds=folds, flush=float(flush), marks=marks, lattice=lattice)

@@ -13,7 +13,7 @@ import numpy as np
 
 from express50.geometry.conventions import cell_centres, cell_to_corner, corner_to_cell
 from express50.geometry.sampling import smoothstep
-from express50.head.model import HeadModel, landmarks
+from express50.head.model import HeadModel, landmarks_of
 from express50.twin.body import Body, model_materials
 from express50.twin.surface import (
     MISS,
@@ -69,7 +69,7 @@ def _paint_rows(body: Body, seed: int, width: int, rows: range) -> np.ndarray:
     """Paint the texels (N, 4) of some rows."""
     model, look = body.model, body.subject.look
     points, masks = _surface_at(body, width, rows)
-    marks = landmarks(model, model.template[None])[0].double().numpy()
+    marks = landmarks_of(model).astype(np.float64)
     rng = np.random.default_rng([seed, body.subject.number, 8])
     lattices = [make_lattice(rng) for _ in range(6)]
     albedo = np.broadcast_to(look.skin.astype(np.float32), points.shape).copy()

@@ -199,7 +199,7 @@ def triangulate_tracks(cameras: Mapping[str, Camera], tracks: PointTracks) -> np
         mine = tracks.camera == index
         xy[mine] = np.nan_to_num(normalised(camera, tracks.pixels[mine]))
     pose = np.stack([camera.cam_from_world for camera in rig])[tracks.camera]
-    focal = np.array([_focal(camera) for camera in rig])[tracks.camera] / tracks.sigma
+    focal = np.array([camera.focal for camera in rig])[tracks.camera] / tracks.sigma
     d = np.einsum("nji,nj->ni", pose[:, :3, :3], np.column_stack([xy, np.ones(len(xy))]))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     centre = -np.einsum("nji,nj->ni", pose[:, :3, :3], pose[:, :3, 3])
@@ -224,13 +224,9 @@ def move_pose(cam_from_world: np.ndarray, step: np.ndarray) -> np.ndarray:
     return make_transform(axis_angle_to_matrix(step[:3]), step[3:]) @ cam_from_world
 
 
-def _focal(camera: Camera) -> float:
-    return float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
-
-
 def _lens(camera: Camera) -> np.ndarray:
     """Return the unknowns (4,) of a camera's lens: those from the log focal length on."""
-    return np.array([np.log(_focal(camera)), *camera.K[:2, 2], camera.dist[0]])
+    return np.array([np.log(camera.focal), *camera.K[:2, 2], camera.dist[0]])
 
 
 def _has_bend(camera: Camera) -> bool:
@@ -259,7 +255,7 @@ def _information(
             diagonal = float(np.hypot(camera.width, camera.height))
             row[:3], row[3:6], row[6] = priors.turn_rad, priors.move_m, priors.focal
             row[7:9] = priors.centre * diagonal
-            row[9] = _has_bend(camera) * priors.bend / (diagonal / 2 / _focal(camera)) ** 2
+            row[9] = _has_bend(camera) * priors.bend / (diagonal / 2 / camera.focal) ** 2
     information = np.zeros_like(sigma)
     information[sigma > 0] = sigma[sigma > 0] ** -2.0
     return information, np.flatnonzero(sigma)

@@ -236,7 +236,6 @@ def _predictor(
     counts = np.array([len(view.points) for view in views])
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
     ideal = np.concatenate([view.ideal for view in views])
-    focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
     # One stack of points per alternative; a view with a single pose repeats it.
     stacks = [
         np.concatenate(
@@ -254,7 +253,7 @@ def _predictor(
             placed = transform_points(pose, stack)
             ahead = np.where(placed[:, 2:] > 0, placed[:, 2:], 1e-9)
             squared = np.sum((placed[:, :2] / ahead - ideal) ** 2, axis=1)
-            errors.append(np.sqrt(np.add.reduceat(squared, starts) / counts) * focal)
+            errors.append(np.sqrt(np.add.reduceat(squared, starts) / counts) * camera.focal)
         return np.minimum(*errors)
 
     return predict

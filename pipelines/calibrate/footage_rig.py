@@ -307,10 +307,9 @@ def mean_landmarks() -> np.ndarray:
     """Return the landmarks (68, 3) of the built-in mean head, metres, head space."""
     # Imported here: only rigs that come without any calibration need a head.
     from express50.head.load import load_builtin
-    from express50.head.model import landmarks
+    from express50.head.model import landmarks_of
 
-    head = load_builtin()
-    return landmarks(head, head.template[None])[0].double().numpy()
+    return landmarks_of(load_builtin()).astype(np.float64)
 
 
 def start_camera(name: str, size: tuple[int, int], focal: float) -> Camera:

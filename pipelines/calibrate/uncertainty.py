@@ -85,8 +85,8 @@ def state_uncertainty(solution: BoardSolution, points: np.ndarray) -> dict[str, 
 
 def head_error_of(camera: Camera, squared_px: float, distance_m: float) -> HeadError:
     """Return the error of a camera so far from the head, from its square in pixels."""
-    focal, px = np.sqrt(camera.K[0, 0] * camera.K[1, 1]), np.sqrt(squared_px)
-    return HeadError(float(px), float(1e3 * px * distance_m / focal))
+    px = float(np.sqrt(squared_px))
+    return HeadError(px, 1e3 * px * float(distance_m) / camera.focal)
 
 
 def head_points() -> np.ndarray:

@@ -160,8 +160,7 @@ def hull_distance(views: Sequence[DepthView], points: np.ndarray) -> np.ndarray:
         camera = view.camera
         pixels, depth = project_fast(camera, points)
         inside = in_picture(camera, pixels, depth)
-        focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
-        metres = -bilinear(view.silhouette_px, pixels[inside]) * depth[inside] / focal
+        metres = -bilinear(view.silhouette_px, pixels[inside]) * depth[inside] / camera.focal
         distance[inside] = np.maximum(distance[inside], metres)
         seen += inside
     return np.where(seen >= max(2, len(views) / 3), distance, UNSEEN).astype(np.float32)

@@ -34,7 +34,7 @@ from express50.geometry.cameras import Camera, pinhole_camera
 from express50.geometry.conventions import FLIP_YZ
 from express50.geometry.sampling import evenly
 from express50.head.load import load_head
-from express50.head.model import landmarks
+from express50.head.model import landmarks_of
 from express50.head.preview import render_preview
 from express50.landmarks.detector import Detection, detect
 from express50.landmarks.network import load_network
@@ -309,7 +309,7 @@ def weigh_focal(
 def _cost(basis: Basis, detections: list[Detection], size: tuple[int, int], focal: float) -> float:
     """Compute the cost of the landmark fit with a focal length; infinite where no fit starts."""
     camera = single_camera("photo", *size, focal)
-    template = landmarks(basis.model, basis.model.template[None])[0].numpy()
+    template = landmarks_of(basis.model)
     targets, poses = [], []
     for number, seen in enumerate(detections):
         view = LandmarkView(camera.id, camera, seen.points, seen.sigma, seen.score)

@@ -22,9 +22,9 @@ from express50.geometry.meshes import cotangent_laplacian
 from express50.geometry.raycast import join_rays, mesh_scene
 from express50.geometry.sampling import robust_moments
 from express50.geometry.transforms import unit
-from express50.head.model import HeadModel, normals_of
+from express50.head.model import HeadModel, in_regions, normals_of
 from pipelines.register.untangle import untangled
-from pipelines.track.basis import in_regions, movable_vertices
+from pipelines.track.basis import movable_vertices
 
 # Per round: search distance to either side, metres, and the finest wavelength that the mesh
 # follows, in multiples of the last round's. Broad differences come first.

@@ -19,7 +19,7 @@ from express50.geometry.cameras import Camera, pinhole_camera, rays
 from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
 from express50.geometry.transforms import look_at, rigid_fit
 from express50.head.load import load_head
-from express50.head.model import HeadModel, landmarks
+from express50.head.model import HeadModel, landmarks_of
 from express50.landmarks import EMBEDDED
 from express50.landmarks.sources import Source, open_source
 from pipelines.register.lay import (
@@ -77,7 +77,7 @@ def fit_scan(scan: Scan, head: str, given: np.ndarray | None = None) -> FittedSc
     """
     torch.set_num_threads(1)
     basis = make_basis(load_head(head))
-    template = landmarks(basis.model, basis.model.template[None])[0].numpy()
+    template = landmarks_of(basis.model)
     given = np.full((68, 3), np.nan) if given is None else given
     observation = find_landmarks(scan, template, given)
     check_face(observation.points, template, "the landmarks of the face that is seen")

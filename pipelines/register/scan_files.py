@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import open3d as o3d
-import torch
 
 from express50.console import FAILED, OK, say, say_json
 from express50.dataset.export import write_head_obj
@@ -20,7 +19,7 @@ from express50.files.digests import file_sha256, value_digest
 from express50.files.text import ID, read_json_table, read_text
 from express50.geometry.raycast import mesh_scene
 from express50.head.load import load_head
-from express50.head.model import landmarks
+from express50.head.model import landmarks_of
 from pipelines.register.scan import PITCHES, YAWS, FittedScan, fit_scan
 from pipelines.register.scan_input import (
     KINDS,
@@ -181,7 +180,7 @@ def figures_of_landmarks(fitted: FittedScan, given: np.ndarray) -> dict:
 
     Distances are to the landmarks of the fitted parameters, without those of the jaw line.
     """
-    marks = landmarks(fitted.basis.model, torch.from_numpy(fitted.start)[None])[0].numpy()
+    marks = landmarks_of(fitted.basis.model, fitted.start)
     known = np.isfinite(given[:, 0])
     away = 1e3 * np.linalg.norm(marks - given, axis=1)[17:][known[17:]]
     return {

@@ -18,8 +18,7 @@ from scipy.spatial import cKDTree
 
 from express50.geometry.meshes import cotangent_laplacian
 from express50.geometry.transforms import rigid_fit, unit
-from express50.head.model import HeadModel
-from pipelines.track.basis import in_regions
+from express50.head.model import HeadModel, in_regions
 
 RIMS = ("lips", "left_eye_region", "right_eye_region")
 FIXED = ("left_eyeball", "right_eyeball", "teeth", "gums", "tongue", "boundary")

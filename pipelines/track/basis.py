@@ -22,7 +22,7 @@ from scipy.sparse.linalg import eigsh
 
 from express50.geometry.meshes import cotangent_laplacian
 from express50.geometry.transforms_torch import axis_angle_to_matrix
-from express50.head.model import HeadModel, joint_transforms, skin, vertex_normals
+from express50.head.model import HeadModel, in_regions, joint_transforms, skin, vertex_normals
 
 POSE_SIZE = 18
 # Parts that move as one or are not skin: their shape is the model's.
@@ -190,12 +190,6 @@ def _joint_rotations(pose: torch.Tensor) -> torch.Tensor:
     """Convert a pose (18,) to rotations (5, 3, 3) of the joints; the root's is the identity."""
     angles = torch.cat([torch.zeros_like(pose[:3]), pose[:12]]).reshape(5, 3)
     return axis_angle_to_matrix(angles)
-
-
-def in_regions(model: HeadModel, names: tuple[str, ...]) -> np.ndarray:
-    """Mark the vertices (V,) in any of the named regions that a model has."""
-    masks = [model.regions[name].numpy() for name in names if name in model.regions]
-    return np.any([np.zeros(len(model.template), dtype=bool), *masks], axis=0)
 
 
 def movable_vertices(model: HeadModel) -> np.ndarray:

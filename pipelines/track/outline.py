@@ -22,9 +22,8 @@ from express50.geometry.cameras import (
 )
 from express50.geometry.raycast import mesh_scene
 from express50.geometry.sampling import bilinear_slope
-from express50.head.model import HeadModel, normals_of
+from express50.head.model import HeadModel, in_regions, normals_of
 from pipelines.regions.colour import like_skin
-from pipelines.track.basis import in_regions
 from pipelines.track.surface import FEATURES, SignedDistance, Visibility, look_up, near_things
 from pipelines.track.terms import MeshPlaces, Residuals, huber
 

@@ -18,9 +18,8 @@ from express50.geometry.cameras import Camera, project_pinhole, project_with_slo
 from express50.geometry.conventions import corner_to_cell
 from express50.geometry.raycast import join_rays, mesh_scene
 from express50.geometry.transforms import unit
-from express50.head.model import HeadModel
+from express50.head.model import HeadModel, in_regions
 from pipelines.regions.colour import like_skin
-from pipelines.track.basis import in_regions
 from pipelines.track.surface import (
     COVERED,
     FEATURES,

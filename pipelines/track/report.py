@@ -17,7 +17,7 @@ from express50.geometry.cameras import Camera, pinhole_camera, project_pinhole
 from express50.geometry.conventions import affine_to_opencv
 from express50.geometry.raycast import camera_rays, mesh_scene
 from express50.geometry.transforms import transform_points
-from express50.head.model import HeadModel, landmarks
+from express50.head.model import HeadModel, landmarks, landmarks_of
 from pipelines.track.observe import facing
 from pipelines.track.outline import OutlineTerm
 from pipelines.track.state import Target
@@ -106,7 +106,7 @@ def draw_column(
     image[edge] = 0.7 * image[edge] + 0.3 * np.array([90, 200, 255], np.float32)
     image[rim] = np.array([255, 60, 60], np.float32)
     shaded = np.ascontiguousarray(image.astype(np.uint8))
-    marks = landmarks(model, torch.from_numpy(mesh)[None])[0].numpy()
+    marks = landmarks_of(model, mesh)
     _dots(shaded, transform_points(matrix, project_pinhole(camera, marks)[0]), FITTED_COLOR)
     for points in seen:
         _dots(shaded, transform_points(matrix, points), SEEN_COLOR)

@@ -23,7 +23,7 @@ from express50.errors import StageError
 from express50.files.digests import path_digest, value_digest
 from express50.geometry.cameras import Camera
 from express50.head.load import load_head
-from express50.head.model import landmarks
+from express50.head.model import landmarks, landmarks_of
 from pipelines.track.appearance import write_texture
 from pipelines.track.basis import Basis, freeze_shape, make_basis, split_shape, with_modes
 from pipelines.track.config import TrackConfig
@@ -203,7 +203,7 @@ def fit_landmarks(
     Raises:
         RigScaleError: the rig's unit is not the metre.
     """
-    template = landmarks(basis.model, basis.model.template[None])[0].numpy()
+    template = landmarks_of(basis.model)
     targets, poses, lost = [], [], []
     for observation in peaks:
         try:

@@ -14,8 +14,7 @@ from express50.geometry.cameras import Camera, crop_camera, inside_frame, projec
 from express50.geometry.raycast import join_rays, mesh_scene
 from express50.geometry.sampling import bilinear_slope
 from express50.geometry.transforms import unit
-from express50.head.model import HeadModel
-from pipelines.track.basis import in_regions
+from express50.head.model import HeadModel, in_regions
 from pipelines.track.terms import MeshPlaces
 
 UNCOVERED_SKIN = (

@@ -14,7 +14,7 @@ import torch
 from express50.errors import CaptureError
 from express50.geometry.cameras import Camera, project_pinhole
 from express50.head.load import load_head
-from express50.head.model import landmarks, pose
+from express50.head.model import landmarks_of, pose
 from express50.head.preview import render_preview
 from express50.landmarks.detector import Detection, detect
 from express50.landmarks.irises import find_irises
@@ -46,7 +46,7 @@ def fit_one(basis: Basis, face: Detection, camera: Camera) -> tuple[np.ndarray, 
     """World landmarks (68, 3) of a single-view fit, and their error between brows and mouth, px."""
     view = LandmarkView(camera.id, camera, face.points, face.sigma, face.score)
     observation, _ = agree("photo", 0, [view])
-    template = landmarks(basis.model, basis.model.template[None])[0].numpy()
+    template = landmarks_of(basis.model)
     start = start_state(basis, [initial_pose(observation, template)])
     target = Target(observation, landmark_sigma(observation), False)
     state, cost = fit(basis, [target], start, 8)

@@ -12,7 +12,7 @@ import trimesh
 from express50.errors import FormatError, StageError
 from express50.geometry.transforms import axis_angle_to_matrix
 from express50.head.load import load_builtin
-from express50.head.model import landmarks, pose
+from express50.head.model import landmarks, landmarks_of, pose
 from pipelines.register.scan import find_landmarks
 from pipelines.register.scan_input import GREY, UNITS, Scan, check_face, read_scan
 
@@ -24,7 +24,7 @@ def head():
     """The mean head as a scan, its landmarks, and the middles of its triangles."""
     model = load_builtin()
     vertices, faces = model.template.double().numpy(), model.faces.numpy()
-    marks = landmarks(model, model.template[None])[0].double().numpy()
+    marks = landmarks_of(model).astype(np.float64)
     scan = Scan(vertices, faces, np.full((len(vertices), 3), GREY), "metres", False)
     return scan, marks, vertices[faces].mean(1)
 

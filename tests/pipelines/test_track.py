@@ -15,7 +15,7 @@ from express50.contract.config import build_config
 from express50.errors import CaptureError, ConfigError, StageError
 from express50.geometry.cameras import Camera, project, project_with_slope
 from express50.geometry.transforms import axis_angle_to_matrix, look_at
-from express50.head.model import landmarks, pose
+from express50.head.model import landmarks_of, pose
 from express50.landmarks.detector import Detection
 from express50.landmarks.irises import Irises
 from express50.landmarks.sources import Marked
@@ -90,9 +90,7 @@ def test_sparse_points_equal_the_whole_model() -> None:
     )  # fmt: skip
     world = whole[0].numpy() @ scene.rotation.T + scene.own[-3:]
     np.testing.assert_allclose(scene.vertices, world, atol=1e-12)
-    np.testing.assert_allclose(
-        scene.marks, landmarks(model, torch.from_numpy(world)[None])[0].numpy(), atol=1e-12
-    )
+    np.testing.assert_allclose(scene.marks, landmarks_of(model, world), atol=1e-12)
 
 
 def test_jacobian_matches_finite_differences() -> None:
@@ -181,7 +179,7 @@ def test_a_rig_in_another_unit_is_named(scale: float) -> None:
         moved[:3, 3] *= scale
         cameras.append(dataclasses.replace(camera, cam_from_world=moved))
     observation, _ = agree("smile", 0, make_views(scene.marks * scale, 0.0, cameras))
-    template = landmarks(scene.basis.model, scene.basis.model.template[None])[0].numpy()
+    template = landmarks_of(scene.basis.model)
     words = f"the rig seems {scale:g}x off.* divide the camera translations by {scale:g} and"
     with pytest.raises(StageError, match=words):
         initial_pose(observation, template)
@@ -190,7 +188,7 @@ def test_a_rig_in_another_unit_is_named(scale: float) -> None:
 def targets_of(scene: Scene, views: list[LandmarkView]) -> tuple[list[Target], list]:
     observation, _ = agree("smile", 0, views)
     model = scene.basis.model
-    start = initial_pose(observation, landmarks(model, model.template[None])[0].numpy())
+    start = initial_pose(observation, landmarks_of(model))
     return [Target(observation, landmark_sigma(observation), False)], [start]
 
 
@@ -200,7 +198,7 @@ def test_exact_landmarks_give_the_mesh_back() -> None:
     observation, _ = agree("smile", 0, make_views(scene.marks))
     views = tuple(dataclasses.replace(view, sigma=np.full(68, 0.02)) for view in observation.views)
     observation = dataclasses.replace(observation, views=views)
-    template = landmarks(scene.basis.model, scene.basis.model.template[None])[0].numpy()
+    template = landmarks_of(scene.basis.model)
     targets = [Target(observation, np.full((3, 68), 0.005), False)]
     start = start_state(scene.basis, [initial_pose(observation, template)])
     state, _ = fit(scene.basis, targets, start, 60)

@@ -10,7 +10,7 @@ import torch
 
 from express50.geometry.cameras import project, triangulate
 from express50.head.load import load_head
-from express50.head.model import HeadModel, landmarks, vertex_normals
+from express50.head.model import HeadModel, landmarks, landmarks_of, vertex_normals
 from express50.landmarks.irises import Irises
 from pipelines.track.basis import make_basis
 from pipelines.track.eyes_and_jaw import (
@@ -90,7 +90,7 @@ def gazing(head: HeadModel, yaws: list[float]) -> list[tuple[np.ndarray, np.ndar
 
 def observed(head: HeadModel, mesh: np.ndarray, shift: np.ndarray) -> Target:
     """Exact views of a mesh, its irises seen a little beside the model's."""
-    marks = landmarks(head, torch.from_numpy(mesh)[None])[0].numpy()
+    marks = landmarks_of(head, mesh)
     left, right = iris_vertices(head)
     views = []
     for camera in RIG:
@@ -112,7 +112,7 @@ def test_irises_turn_the_eyes_and_a_constant_offset_does_not(head: HeadModel) ->
     eyes = measure_eyes(head, targets, np.tile(rest, (len(made), 1, 1)), turns)
     assert eyes is not None
     np.testing.assert_allclose(eyes.offsets[:, 1], 0.0012, atol=5e-4)
-    template = landmarks(head, head.template[None])[0].numpy()
+    template = landmarks_of(head)
     errors, blind = [], []
     for target, (_, truth) in zip(targets, made, strict=True):
         start = start_state(basis, [initial_pose(target.observation, template)])

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from express50.geometry.cameras import project
 from express50.geometry.transforms import axis_angle_to_matrix
 from express50.head.load import load_head
-from express50.head.model import landmarks, pose
+from express50.head.model import landmarks, landmarks_of, pose
 from express50.landmarks.irises import EYES, Irises
 from express50.landmarks.network import INNER_LIPS
 from pipelines.track.basis import make_basis
@@ -164,7 +164,7 @@ def test_eyes_that_are_known_to_be_shut_shut_the_mesh():
     observation = shut_lids([observe(table, time, marks) for time, table in found.items()])[2]
     assert observation.shut == (LEFT,) and len(shut_terms(head, observation)) == 1
     basis = make_basis(head)
-    template = landmarks(head, head.template[None])[0].double().numpy()
+    template = landmarks_of(head).astype(np.float64)
     start = start_state(basis, [initial_pose(observation, template)])
     sigma = landmark_sigma(observation)
     fitted = {}

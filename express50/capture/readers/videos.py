@@ -17,7 +17,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from express50.capture.colour_correction import check_matrix
-from express50.capture.raw import VIDEO_SUFFIXES, RawCamera, RawCapture, read_calibration, read_cues
+from express50.capture.raw import (
+    VIDEO_SUFFIXES,
+    RawCamera,
+    RawCapture,
+    is_shown,
+    read_calibration,
+    read_cues,
+)
 from express50.capture.readers.selection import (
     Moment,
     Selection,
@@ -209,9 +216,8 @@ def read_actor(path: Path, selection: Selection) -> RawCapture:
 
 def fits_video(path: Path) -> bool:
     """Return whether a path is a video file."""
-    usual = path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".")
     # A link to nothing counts: reading it says what to do.
-    return usual and (path.is_file() or path.is_symlink())
+    return is_shown(path, VIDEO_SUFFIXES) and (path.is_file() or path.is_symlink())
 
 
 def video_id(path: Path) -> str:

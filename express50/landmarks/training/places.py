@@ -18,7 +18,7 @@ from express50.geometry.conventions import cell_to_corner, corner_to_cell
 from express50.geometry.raycast import barycentrics, mesh_scene
 from express50.geometry.transforms import similarity_fit
 from express50.head.load import load_builtin
-from express50.head.model import HeadModel, landmarks
+from express50.head.model import HeadModel, in_regions, landmarks_of
 
 INSIDE = (
     "teeth", "tongue", "mouth_interior", "left_eyeball", "right_eyeball", "left_iris", "right_iris",
@@ -30,9 +30,8 @@ Places = tuple[np.ndarray, np.ndarray]  # faces (N,), weights (N, 3)
 @lru_cache(maxsize=4)
 def _skin(model: HeadModel) -> tuple[o3d.t.geometry.RaycastingScene, np.ndarray]:
     """Return the skin of a head model at rest as a scene, and the ids of its faces."""
-    inside = np.any([model.regions[n].numpy() for n in INSIDE if n in model.regions], axis=0)
     faces = model.faces.numpy()
-    skin = np.flatnonzero(~inside[faces].any(1))
+    skin = np.flatnonzero(~in_regions(model, INSIDE)[faces].any(1))
     return mesh_scene(model.template.numpy(), faces[skin]), skin
 
 
@@ -67,9 +66,7 @@ class FaceFront:
         region = {name: mask.numpy() for name, mask in builtin.regions.items()}
         front = region["face"] & ~region["nose"] & ~region["lips"]
         rest = model.template.double().numpy()
-        marks, builtin_marks = (
-            landmarks(one, one.template[None])[0].double().numpy() for one in (model, builtin)
-        )
+        marks, builtin_marks = (landmarks_of(one).astype(np.float64) for one in (model, builtin))
         if model.name != builtin.name:
             s, R, t = similarity_fit(marks, builtin_marks)
             faces, weights = closest_places(builtin, s * rest @ R.T + t)

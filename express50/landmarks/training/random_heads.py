@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from express50.capture.expressions import Expression, load_script
-from express50.head.model import HeadModel, landmarks, pose, vertex_normals
+from express50.head.model import HeadModel, landmarks, landmarks_of, pose, vertex_normals
 from express50.landmarks.network import INNER_LIPS
 from express50.landmarks.training.places import Places, closest_places, place_points
 
@@ -56,7 +56,7 @@ class Canvas:
     def of(cls, model: HeadModel) -> Canvas:
         """Make a canvas of a head model's vertices."""
         region = {name: mask.numpy() for name, mask in model.regions.items()}
-        marks = landmarks(model, model.template[None])[0].numpy()
+        marks = landmarks_of(model)
         rest = model.template.numpy()
         eyes = {side: rest[region[f"{side}_eyeball"]].mean(0) for side in ("left", "right")}
         return cls(rest, region, marks, float(rest[:, 1].max()), eyes)

@@ -43,6 +43,7 @@ from express50.landmarks.network import (
     CloseNet,
     LandmarkNet,
     Output,
+    as_input,
     eye_net,
     heat_loss,
     mouth_net,
@@ -266,7 +267,7 @@ def train_part(part: Part, models: list[HeadModel], folder: Path, seed: int) -> 
         rng = np.random.default_rng([seed, 8, step])
         picks = rng.integers(len(views), size=part.batch)
         crops, points = zip(*(close_crop(part, net, views[k], rng) for k in picks), strict=True)
-        images = torch.from_numpy(np.stack(crops)).permute(0, 3, 1, 2).float() / 255.0
+        images = as_input(np.stack(crops))
         found, log_scale = net(images)
         return laplace_loss(found, log_scale, torch.from_numpy(np.stack(points)))[0].mean()
 

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from express50.geometry.conventions import affine_to_opencv
-from express50.geometry.transforms import transform_points
+from express50.geometry.transforms import scale_of, transform_points
 from express50.head.model import HeadModel
 from express50.landmarks.network import (
     CROP,
@@ -151,7 +151,7 @@ def _random_placement(points: np.ndarray, rng: Rng) -> np.ndarray:
 
 def composite(rgba: np.ndarray, matrix: np.ndarray, background: np.ndarray) -> np.ndarray:
     """Warp a view, black where empty, into the crop over a background; return it as uint8."""
-    scale = float(np.sqrt(abs(np.linalg.det(matrix[:, :2]))))
+    scale = scale_of(matrix)
     if scale < 0.8:
         rgba = cv2.GaussianBlur(rgba, (0, 0), 0.45 / scale)
     size = background.shape[:2]

@@ -25,7 +25,13 @@ from express50.head import BUILTIN_NAME
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.landmarks.network import WEIGHTS as START
-from express50.landmarks.network import LandmarkNet, load_network, save_network, trainable_network
+from express50.landmarks.network import (
+    LandmarkNet,
+    as_input,
+    load_network,
+    save_network,
+    trainable_network,
+)
 from express50.landmarks.training.train import descend, point_loss
 from express50.landmarks.training.views import made_once
 from pipelines.track.config import UV_WEIGHTS
@@ -150,9 +156,8 @@ def make_batch(cases: list[Case], rng: np.random.Generator | None = None) -> UvB
     images = np.stack([window(one) for one in maps])
     points = np.stack([to_window(at[FIRST:]) for at, _ in found])
     known = np.stack([mask[FIRST:] for _, mask in found])
-    stacked = torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255.0
     return UvBatch(
-        stacked.contiguous(memory_format=torch.channels_last),
+        as_input(images).contiguous(memory_format=torch.channels_last),
         torch.from_numpy(points).float(),
         torch.from_numpy(known).float(),
     )

@@ -8,13 +8,13 @@ from scipy.spatial import cKDTree
 
 from express50.head.generator.head import procedural_mesh, stored_people, write_builtin
 from express50.head.load import BUILTIN
-from express50.head.model import REGIONS, landmarks
+from express50.head.model import REGIONS, landmarks_of
 from tests.express50.head.test_mouth import covered
 
 
 @pytest.fixture(scope="module")
 def points(head):
-    return landmarks(head, head.template[None])[0].numpy()
+    return landmarks_of(head)
 
 
 def edges_of(faces):

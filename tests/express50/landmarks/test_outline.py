@@ -7,13 +7,13 @@ import pytest
 
 from express50.geometry.transforms import axis_angle_to_matrix
 from express50.head.load import load_head
-from express50.head.model import landmarks
+from express50.head.model import landmarks_of
 from express50.landmarks.training.places import face_front
 
 FOCAL, DISTANCE, SIZE = 900.0, 0.8, 512
 HEAD = load_head("procedural")
 REST = HEAD.template.double().numpy()
-MARKS = landmarks(HEAD, HEAD.template[None])[0].double().numpy()
+MARKS = landmarks_of(HEAD).astype(np.float64)
 
 
 def seen(yaw: float, pitch: float = 0.0) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ import pytest
 
 from express50.capture.expressions import select
 from express50.head.load import load_head
-from express50.head.model import landmarks
+from express50.head.model import landmarks_of
 from express50.twin.alive import living_skin, own_offsets
 from express50.twin.body import build_body, head_vertices
 from express50.twin.subjects import make_subject, perform
@@ -50,7 +50,7 @@ def test_no_coefficients_of_the_model_give_a_personal_motion(model) -> None:
 
 
 def test_muscles_fold_the_skin_beside_them_and_effort_colours_it(model) -> None:
-    marks = landmarks(model, model.template[None])[0].double().numpy()
+    marks = landmarks_of(model).astype(np.float64)
     grid = np.linspace(-0.004, 0.004, 9)
     forehead = marks[19] + np.array([[0.015, 0.022 + dy, 0.0] for dy in grid])
     cheek = np.repeat(0.5 * (marks[46] + marks[54])[None], 9, 0)
