@@ -46,7 +46,7 @@ from express50.geometry.transforms import transform_points
 from express50.twin import TwinConfig
 from express50.twin.truth import Truth
 from pipelines import ingest
-from pipelines.ingest import register
+from pipelines.ingest import add_captures
 
 THRESHOLDS = (0.0, 0.3, 0.5, 0.7, 0.9, 0.95)
 OFF_APEX = (0.45, 0.85)  # strengths at which canonical frames off the apex are taken
@@ -266,7 +266,7 @@ def record_4k(scratch: Path, dataset: Dataset) -> Dataset:
     cues = f"neutral,0,{frames - 1}\nsmile,{frames},{2 * frames - 1}\n"
     (capture / "cues.csv").write_text("expression_id,start_frame,end_frame\n" + cues)
     big = Dataset(scratch / "big_dataset")
-    register(big, [capture])
+    add_captures(big, [capture])
     run_or_stop(ingest.STAGE, big, "standard")
     return big
 

@@ -57,7 +57,7 @@ def recorded(config: TwinConfig, folder: Path, preset: str = "draft") -> tuple[D
     """Return a twin recording, made where it is not there, and ingested with a preset."""
     record(config, folder, report=print_progress())
     dataset = Dataset(folder / "data")
-    ingest.register(dataset, sorted((folder / "captures").iterdir()))
+    ingest.add_captures(dataset, sorted((folder / "captures").iterdir()))
     run_or_stop(ingest.STAGE, dataset, preset)
     return dataset, Truth(folder / "truth")
 

@@ -34,7 +34,7 @@ DISTANCE_M, FILL = 1.0, 0.7  # camera to head; the head's height over the pictur
 
 
 def scene(device: torch.device, n_g: int, size: int) -> tuple[GRMM, HeadState, PinholeView]:
-    """Return a model of random weights, the template's head and a camera before it."""
+    """Return a model of random weights, the template's head and a camera in front."""
     torch.manual_seed(0)
     head = load_head("procedural").to(device)
     settings = resolve("paper").model

@@ -30,7 +30,7 @@ from express50.twin import TwinConfig, rig
 from express50.twin.record import record
 from express50.twin.truth import Truth
 from pipelines import calibrate, depth, frames, ingest, matte, register, track
-from pipelines.ingest import register as take_in
+from pipelines.ingest import add_captures
 
 EXPRESSIONS = ("neutral", "smile")
 SETTINGS: dict[str, dict[str, object]] = {  # sizes that fit a small machine, as in the demo
@@ -115,7 +115,7 @@ def make_row(condition: Condition, number: int, root: Path) -> tuple[Dataset, Tr
 
 def run_chain(dataset: Dataset, capture: Path, peaks: dict[str, int], preset: str = "") -> None:
     """Run the stages from ingest to registration; a stage that fails ends the row there."""
-    take_in(dataset, [capture])
+    add_captures(dataset, [capture])
     for stage in (ingest, calibrate, frames, matte, track, depth, register):
         name, presets = stage.STAGE.name, stage.STAGE.presets
         chosen = presets.get(preset, {}) if preset else SETTINGS.get(name, {})
@@ -197,7 +197,7 @@ def make_peaks(noise: float, numbers: Sequence[int], root: Path) -> None:
     )  # fmt: skip
     record(config, folder / "twin", workers=1)
     dataset = Dataset(folder / "dataset")
-    take_in(dataset, sorted((folder / "twin" / "captures").iterdir()))
+    add_captures(dataset, sorted((folder / "twin" / "captures").iterdir()))
     for stage in (ingest.STAGE, observe.STAGE):
         run_or_stop(stage, dataset, "standard")
     run_or_stop(align.STAGE, dataset, "standard", match=False)

@@ -2,7 +2,7 @@
 
 The twin records one person bare and with each of the things, and the stages up to ``regions`` are
 run with their defaults; `off` runs ``track``, ``depth`` and ``regions`` without what they do about
-things before the face, on the same mattes.
+things in front of the face, on the same mattes.
 
 ``iou`` is that of the label of what hides the face (apparel, hand, hair) against the truth, over
 the pixels at which the face of the bare head mesh would be seen. A lens is apparel; where hair

@@ -45,7 +45,7 @@ from express50.twin import TwinConfig
 from express50.twin.record import record
 from express50.twin.truth import Truth
 from pipelines import calibrate, frames, ingest, matte
-from pipelines.ingest import register
+from pipelines.ingest import add_captures
 from pipelines.track import STAGE
 from pipelines.track import run as track_subject
 from pipelines.track import stage as track_stage
@@ -129,7 +129,7 @@ def prepare(config: TwinConfig, folder: Path) -> Reference:
     for capture in sorted((folder / "captures").iterdir()):
         hold_out(capture, seen / capture.name)
     dataset, truth = Dataset(folder / "dataset"), Truth(folder / "truth")
-    register(dataset, sorted(seen.iterdir()))
+    add_captures(dataset, sorted(seen.iterdir()))
     for stage in (ingest.STAGE, calibrate.STAGE):
         run_or_stop(stage, dataset)
     for subject in dataset.subjects():

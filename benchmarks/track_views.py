@@ -4,7 +4,7 @@ A pixel of a held-out camera whose first surface is the tracked face is a point 
 is the median, over the tracking cameras that see the point on the tracked mesh (not hidden by the
 mesh, not at a slant), of the root of linear light at the point's projection, of the same moment. If
 the mesh is off, cameras look at different skin, and the picture blurs. It is compared in sRGB with
-the held-out camera's frame where it shows the true face's skin first (no hair before it). The same
+the held-out camera's frame where it shows the true face's skin first (no hair in front). The same
 for every preset.
 """
 

@@ -166,18 +166,18 @@ class HeadView:
     torso: Tensor
     background: float
 
-    def before_torso(self, rendering: Rendering) -> Rendering:
+    def hide_behind_torso(self, rendering: Rendering) -> Rendering:
         """Return a rendering that is background where the torso is in front of what was drawn."""
         images = (rendering.rgb, rendering.image)
-        rgb, image = (self.without_hidden(each, rendering.depth) for each in images)
+        rgb, image = (self.hide_image_behind_torso(each, rendering.depth) for each in images)
         return replace(rendering, rgb=rgb, image=image)
 
-    def without_hidden(self, image: Tensor, depth: Tensor) -> Tensor:
-        """Return ``image`` (3, H, W) with the background where the torso is before its depth."""
-        return self.beyond_torso(image, depth, self.background)
+    def hide_image_behind_torso(self, image: Tensor, depth: Tensor) -> Tensor:
+        """Return ``image`` (3, H, W) with the background where it lies behind the torso."""
+        return self.fill_behind_torso(image, depth, self.background)
 
-    def beyond_torso(self, values: Tensor, depth: Tensor, fill: float) -> Tensor:
-        """Return values (..., H, W) with ``fill`` where the torso is before ``depth`` (H, W)."""
+    def fill_behind_torso(self, values: Tensor, depth: Tensor, fill: float) -> Tensor:
+        """Return values (..., H, W) with ``fill`` where ``depth`` (H, W) lies behind the torso."""
         return torch.where((self.torso > 0) & (depth > self.torso), fill, values)
 
     def comparable(self, image: Tensor) -> Tensor:

@@ -89,7 +89,7 @@ def evaluate(
     rows = []
     for index in indices:
         item = views.item(index)
-        out = item.before_torso(render(item))
+        out = item.hide_behind_torso(render(item))
         both = item.depth_valid & (out.alpha > 0.5)
         error = (out.depth - item.depth)[both].abs()
         row = compare(out.image, item, judge, kind(item.key))

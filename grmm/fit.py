@@ -264,7 +264,7 @@ def reconstruction(state: FitState, *pairs: tuple[Tensor, Tensor]) -> Tensor:
 
 
 def _footage_loss(state: FitState, rendering: Rendering, item: HeadView) -> Tensor:
-    rendering = item.before_torso(rendering)
+    rendering = item.hide_behind_torso(rendering)
     images = (rendering.rgb, rendering.image)
     return reconstruction(state, *((item.comparable(image), item.target) for image in images))
 

@@ -62,9 +62,9 @@ def comparison_sheet(path: Path, views: HeadViews, indices: Sequence[int], rende
     rows, labels = [], []
     for index in indices:
         item = views.item(index)
-        out = item.before_torso(render(item))
+        out = item.hide_behind_torso(render(item))
         pictures = [to_uint8(image) for image in (item.target, out.image, out.rgb)]
-        pictures.append(depth_picture(out.depth, item.beyond_torso(out.alpha, out.depth, 0.0)))
+        pictures.append(depth_picture(out.depth, item.fill_behind_torso(out.alpha, out.depth, 0.0)))
         pictures.append(to_uint8(4 * (out.image - item.target).abs()))
         rows.append(pictures)
         labels.append(f"{item.key.subject} {item.key.expression} {item.key.camera}")

@@ -128,7 +128,7 @@ def train(
             state.iteration += 1
             state.seconds = time.perf_counter() - started
             if world > 1:
-                agree(state, interrupt, device)
+                synchronise(state, interrupt, device)
             last = finished(state, config) or interrupt.is_set()
             pause = max(config.train.save_seconds, cost / SAVING_SHARE)
             due = config.train.save_seconds > 0 and state.seconds - saved >= pause
@@ -203,7 +203,7 @@ def objective(
 ) -> dict[str, Tensor]:
     """Compute the weighted terms of the objective by name (paper: Training and Losses)."""
     weights, model = config.loss, state.model
-    rendering = item.before_torso(rendering)
+    rendering = item.hide_behind_torso(rendering)
     images = {"rgb": item.comparable(rendering.rgb)}
     if model.refinement is not None:
         images["image"] = item.comparable(rendering.image)
@@ -286,7 +286,7 @@ def join_processes() -> tuple[int, int, torch.device]:
     return int(os.environ.get("RANK", "0")), world, device
 
 
-def agree(state: TrainState, interrupt: Event, device: torch.device) -> None:
+def synchronise(state: TrainState, interrupt: Event, device: torch.device) -> None:
     """Give all processes the same clock and request to stop; otherwise they would deadlock."""
     common = torch.tensor([state.seconds, float(interrupt.is_set())], device=device)
     distributed.all_reduce(common, distributed.ReduceOp.MAX)

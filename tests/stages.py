@@ -27,7 +27,7 @@ def run_here(
 def ingest_captures(root: Path, *captures: Path, preset: str = "draft") -> Dataset:
     """Make a dataset of raw captures."""
     dataset = Dataset(root)
-    ingest.register(dataset, captures)
+    ingest.add_captures(dataset, captures)
     summary = run_here(ingest.STAGE, dataset, preset=preset)
     assert summary.ok, summary.lines()
     return dataset

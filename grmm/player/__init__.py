@@ -160,9 +160,9 @@ def _loss(person: Person, avatar: Avatar, subject: str, views: HeadViews) -> dic
         item = views.item(index)
         pose = person.pose(views.place(index).tracked, keys[index].expression)
         page = drawn(avatar, pose, item.view, views.background)
-        picture = item.without_hidden(page.colors.permute(2, 0, 1), page.depth)
+        picture = item.hide_image_behind_torso(page.colors.permute(2, 0, 1), page.depth)
         ours.append(psnr_db(picture, item.target, ~item.hidden))
-        picture = item.before_torso(full_rendering(person, pose, item.view)).image
+        picture = item.hide_behind_torso(full_rendering(person, pose, item.view)).image
         full.append(psnr_db(picture, item.target, ~item.hidden))
     if not chosen:
         return {"footage": f"--shards has no picture of {subject}"}

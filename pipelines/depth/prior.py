@@ -63,7 +63,7 @@ class TrackedSolid:
         return [silhouette_distance(view.bare.astype(np.float32)) for view in self.face_views]
 
     def carved(self, points: np.ndarray, hull: np.ndarray) -> np.ndarray:
-        """Return the hull's distances (N,) less the space before the face that views see empty."""
+        """Return the hull's distances (N,), without space in front of the face that is empty."""
         for view, bare in zip(self.face_views, self.bare_px, strict=True):
             pixels, depth = project_fast(view.camera, points)
             inside = in_picture(view.camera, pixels, depth)

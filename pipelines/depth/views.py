@@ -132,7 +132,7 @@ def project_fast(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.nda
 def in_picture(
     camera: Camera, pixels: np.ndarray, depth: np.ndarray, inset: float = 0.0
 ) -> np.ndarray:
-    """Mark the points (N,) before a camera whose pixels (N, 2) lie within its picture.
+    """Mark the points (N,) in front of a camera whose pixels (N, 2) lie within its picture.
 
     `inset` pixels along the border do not count. One column after the other takes a tenth of the
     time of `all(1)`.
@@ -152,7 +152,7 @@ def hull_distance(views: Sequence[DepthView], points: np.ndarray) -> np.ndarray:
     """Measure signed distances (N,) of points (N, 3) to the visual hull, metres, negative inside.
 
     It is the maximum over the views (Laurentini 1994). Points that fewer than two views, or less
-    than a third of them, see are outside; otherwise phantoms would float before the head.
+    than a third of them, see are outside; otherwise phantoms would float in front of the head.
     """
     distance = np.full(len(points), -UNSEEN, np.float32)
     seen = np.zeros(len(points), np.int16)

@@ -44,9 +44,9 @@ PRESETS: dict[str, dict[str, object]] = {
 }
 
 
-def register(dataset: Dataset, captures: Sequence[Path], replace: bool = False) -> list[str]:
+def add_captures(dataset: Dataset, captures: Sequence[Path], replace: bool = False) -> list[str]:
     """Add captures to the dataset's table, see `pipelines.ingest.stage`."""
-    from pipelines.ingest.stage import register as work
+    from pipelines.ingest.stage import add_captures as work
 
     return work(dataset, list(captures), replace)
 
@@ -101,7 +101,7 @@ STAGE = Stage(
     run=run,
     help="index raw captures: hash frames, write proxies, check sync, light and focus",
     purpose="Footage indexed frame by frame, with proxies for scrubbing.",
-    prepare=register,
+    prepare=add_captures,
     account=account,
     # Proxies have one size, whatever that of the footage.
     growth=Growth(("subjects",), ("frames", "views", "pixels"), ("frames", "views")),

@@ -45,7 +45,7 @@ METRES = ("m", "metre", "metres", "meter", "meters")
 FILE_ENDINGS = ("head", "confidence", "normals")  # later stages write <camera>_<ending>.png
 
 
-def register(dataset: Dataset, captures: list[Path], replace: bool = False) -> list[str]:
+def add_captures(dataset: Dataset, captures: list[Path], replace: bool = False) -> list[str]:
     """Add raw captures to the dataset's table; returns their subjects in the given order.
 
     A subject's other capture that still exists is only replaced if ``replace`` is true.

@@ -87,7 +87,7 @@ def run_photo(args: argparse.Namespace) -> int:
             picture, folder, subject, configs[-1],
             focal_px=args.focal_px, film_mm=args.film_mm, windows=args.windows,
         )  # fmt: skip
-        ingest.register(dataset, [folder])
+        ingest.add_captures(dataset, [folder])
         with Pool(0) as pool:
             summaries = []
             for stage, config in zip(loaded, configs, strict=True):

@@ -185,8 +185,8 @@ class HeadGeometry:
         near: (H, W) uint8 label at the nearest pixel of the mesh; 0 if no pixel shows it.
         rim: (H, W) bool, just beyond the mesh.
         height: (H, W) float32 metres above the neck's end; inf if the model does not mark it.
-        off: (H, W) float32 metres from the mesh to what stands before its face; 0 where nothing
-            stands CLEAR_M before it.
+        off: (H, W) float32 metres from the mesh to what is in front of its face; 0 where nothing
+            is CLEAR_M in front of it.
     """
 
     mesh: np.ndarray

@@ -41,7 +41,7 @@ from pipelines.regions.geometry import (
     make_head,
     render_head,
 )
-from pipelines.regions.things import Picture, find_glasses, shown_before
+from pipelines.regions.things import Picture, find_glasses, shown_in_front
 
 STUDIED_SIDE = 512  # pixels of the pictures that are studied for a person's colours and glasses
 STUDIED_CAMERAS = 4  # in which skin colours and bare scalps are looked for
@@ -220,7 +220,7 @@ def label_view(
     if glasses is not None and len(glasses):
         # Hair covers the temples of glasses, so nothing on scalp and ears is labelled.
         bearing = (geometry.mesh == SCALP) | (geometry.mesh == EARS)
-        worn = shown_before(glasses, camera, geometry.depth) & ~bearing
+        worn = shown_in_front(glasses, camera, geometry.depth) & ~bearing
         labels = np.where(worn, np.uint8(LABELS.index("apparel")), labels)
     if depth is not None:
         distance = np.linalg.norm(head.center - camera.center)

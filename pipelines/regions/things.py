@@ -1,14 +1,14 @@
 """Find things in front of the tracked face: glasses by colour, hands by how well views agree.
 
 **Glasses.** Frames are too thin for depth maps. But every view sees a place on a frame in a colour
-unlike skin, whereas a place before a bare face has skin behind it in some view. So colours carve
-the space before the eyes as silhouettes carve a hull. What is left is glasses if it runs around an
-eye; lenses, which show the colours behind them, fill the ring.
+unlike skin, whereas a place in front of a bare face has skin behind it in some view. So colours
+carve the space in front of the eyes as silhouettes carve a hull. What is left is glasses if it runs
+around an eye; lenses, which show the colours behind them, fill the ring.
 
 **Hands** have the colour of skin, and their outlines lie within the head's. But views that see the
-face agree on it, and views that see a hand agree before it. So along every ray to the face a view
-is compared with its neighbours, on the tracked mesh and wherever the mattes leave room before it.
-A ray that ends on the face leaves no room for things before it: agreement carves too.
+face agree on it, and views that see a hand agree in front of it. So along every ray to the face, a
+view is compared with its neighbours, on the tracked mesh and wherever the mattes leave room in
+front of it. A ray that ends on the face leaves no room for things in front: agreement carves too.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ WIDER_M = 0.0012  # by which cells are wider than glasses: odd pixels are dilate
 
 SIDE, AROUND_M = 384, 0.1  # most pixels of the crops that are compared, and their margin
 NEAR_M = 0.008  # largest distance of the face from the tracked mesh
-HEIGHTS_M = np.arange(0.012, 0.1, 0.006)  # before it, about which things are looked for
+HEIGHTS_M = np.arange(0.012, 0.1, 0.006)  # in front of the mesh, about which things are looked for
 STEPS_M = (-0.0022, -0.0007, 0.0008, 0.0023)  # compared about each of them
 APART = (0.5, 0.97)  # cosines between views that are compared: others look alike, or unlike
 NEIGHBOURS = 4  # views that a view is compared with, and the cosine that they are nearest to
@@ -155,8 +155,8 @@ def _lens(rim: np.ndarray, eye: np.ndarray, grid: np.ndarray) -> np.ndarray:
     return np.c_[places, np.c_[places, np.ones(len(places))] @ plane]
 
 
-def shown_before(places: np.ndarray, camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """Return pixels (H, W) bool that show places (n, 3) of glasses before a head.
+def shown_in_front(places: np.ndarray, camera: Camera, depth: np.ndarray) -> np.ndarray:
+    """Return pixels (H, W) bool that show places (n, 3) of glasses in front of a head.
 
     The depth (H, W) is the head's, camera z in metres, 0 beside it.
     """
@@ -176,13 +176,13 @@ def shown_before(places: np.ndarray, camera: Camera, depth: np.ndarray) -> np.nd
 
 @dataclass(frozen=True)
 class FaceView:
-    """What one view shows where it would see the tracked face, were there nothing before it.
+    """What one view shows where it would see the tracked face if nothing were in front of it.
 
     Attributes:
         camera: pinhole.
         depth: (H, W) of the head, camera z in metres, 0 beside it.
         bare: (H, W) bool, surely the face.
-        covered: (H, W) bool, surely something before it.
+        covered: (H, W) bool, surely something in front of the face.
         things: (n, 3) places, world, on what covers it.
     """
 
@@ -210,13 +210,13 @@ class _Shot:
 
 @dataclass(frozen=True)
 class _Sweep:
-    """How well a view agrees with others on the face and before it, in a window (h, w).
+    """How well a view agrees with others on the face and in front of it, in a window (h, w).
 
     Attributes:
         face: (h, w) bool.
         places: (h, w, 3) on the head, about its centre, and unit `ways` (h, w, 3) towards them.
         on_face: (h, w) best agreement within NEAR_M of the head.
-        before: (HEIGHTS_M, h, w) that before it.
+        before: (HEIGHTS_M, h, w) best agreement in front of the head.
         free: (HEIGHTS_M, h, w) bool, where there may be a thing.
     """
 
@@ -249,7 +249,7 @@ class _Sweep:
 
 
 def face_views(head: TrackedHead, pictures: Sequence[Picture]) -> list[FaceView]:
-    """Tell the face from what stands before it in every view of it; empty if nothing does.
+    """Separate the face from things in front of it in every view of it; empty if there are none.
 
     The views' cameras are those of crops of the pictures.
     """
@@ -363,7 +363,7 @@ def _sweep(head: TrackedHead, shots: Sequence[_Shot], own: int, face: np.ndarray
 def _agreement(
     mine: tuple[np.ndarray, ...], near: Sequence[tuple[_Shot, _Line]], offset: float
 ) -> np.ndarray:
-    """Correlate `_patches` of a view with those of its neighbours `offset` metres before the head.
+    """Correlate `_patches` of a view with those of neighbours `offset` metres in front of the head.
 
     Returns:
         The best correlation (h, w), averaged over a patch; -1 where no neighbour sees the place.

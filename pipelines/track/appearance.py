@@ -193,7 +193,7 @@ def robust_mean(
 ) -> np.ndarray:
     """Find root albedo (S, 3) on which most views agree: values (C, S, 3) = shade (C, S, 3) * mean.
 
-    Hair, highlights and what stands before the skin in one view (trust (C, S)) count for little.
+    Hair, highlights and things that hide the skin in one view (trust (C, S)) count for little.
     """
     weights = trust
     for _ in range(3):
@@ -303,7 +303,7 @@ def write_appearance(
 def texel_samples(model: HeadModel, side: int) -> tuple[MeshPlaces, np.ndarray]:
     """Find the places on the mesh of the texture's texels, and their rows and columns (S, 2)."""
     uv, uv_faces = model.uv.double().numpy(), model.uv_faces.numpy()
-    # The map a metre before a camera whose focal length is its side: a metre is the map's width.
+    # The map is a metre in front of a camera whose focal length is its side, so it is a metre wide.
     flat = np.column_stack([uv[:, 0], 1.0 - uv[:, 1], np.ones(len(uv))])
     camera = Camera("map", side, side, "PINHOLE", (side, side, 0.0, 0.0), np.eye(4))
     face_id = visible_faces(flat, uv_faces, camera)[0]

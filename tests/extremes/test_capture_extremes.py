@@ -148,7 +148,7 @@ def test_cameras_of_links_are_read_where_the_content_is_there(tmp_path):
     (cameras / "cam02").rename(tmp_path / "cam02")
     (cameras / "cam02").symlink_to("gone")
     dataset = Dataset(tmp_path / "data")
-    ingest.register(dataset, [tmp_path / "S001"])
+    ingest.add_captures(dataset, [tmp_path / "S001"])
     result = run_here(ingest.STAGE, dataset)
     assert result.ok and list(read_index(dataset, "S001").cameras) == ["cam00"]
     metrics = read_json(dataset.item_dir("ingest", "S001") / "metrics.json", CaptureError)

@@ -104,7 +104,7 @@ def test_killed_ingest_reruns_to_the_same_bytes(tmp_path):
     make_capture(tmp_path / "S001", cameras=4, frames=24, size=96, video=True)
     calm, hurt = Dataset(tmp_path / "calm"), Dataset(tmp_path / "hurt")
     for dataset in (calm, hurt):
-        ingest.register(dataset, [tmp_path / "S001"])
+        ingest.add_captures(dataset, [tmp_path / "S001"])
     seconds = timed(["express50.__main__", "ingest", str(calm.root)])
     expected = toy.tree(calm.stage_dir("ingest"))
 

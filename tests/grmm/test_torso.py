@@ -75,13 +75,13 @@ def test_nothing_is_drawn_behind_the_torso_and_all_before_it():
     item = HeadViews(Behind(size=64), ellipsoid_head(), hiding).item(0)
     picture, depth = torch.full((3, 64, 64), 0.5), torch.full((64, 64), 0.6)
     drawn = Rendering(image=picture, rgb=picture, depth=depth, alpha=depth, gaussians=None)
-    shown = item.before_torso(drawn)
+    shown = item.hide_behind_torso(drawn)
     assert not item.depth_valid[52:].any()
     for image in (shown.image, shown.rgb):
         assert (image[:, 52:, 32:] == 0.25).all()
         assert (image[:, 52:, :32] == 0.5).all() and (image[:, :50] == 0.5).all()
     plain = HeadViews(Behind(size=64), ellipsoid_head()).item(0)
-    assert torch.equal(plain.before_torso(drawn).image, picture)
+    assert torch.equal(plain.hide_behind_torso(drawn).image, picture)
 
 
 def necked_head():

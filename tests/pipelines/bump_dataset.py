@@ -33,7 +33,7 @@ def make_dataset(
     for subject in subjects:
         capture = root / "raw" / subject
         _write_capture(capture, subject, rig, shots)
-        ingest.register(dataset, [capture])
+        ingest.add_captures(dataset, [capture])
     run_here(ingest.STAGE, dataset)
     for subject in subjects:
         write_given(dataset, subject, rig, shots)

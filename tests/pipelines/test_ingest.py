@@ -35,7 +35,7 @@ def metrics(dataset, subject="S001"):
 def dataset(tmp_path):
     make_capture(tmp_path / "S001", cameras=3, frames=8, video=True)
     dataset = Dataset(tmp_path / "data")
-    ingest.register(dataset, [tmp_path / "S001"])
+    ingest.add_captures(dataset, [tmp_path / "S001"])
     return dataset
 
 
@@ -129,7 +129,7 @@ def test_capture_without_a_usable_camera_fails(dataset):
 
 def test_wrong_calibration_fails_its_item_only(dataset, tmp_path):
     make_capture(tmp_path / "S002", subject="S002", cameras=2, frames=4)
-    ingest.register(dataset, [tmp_path / "S002"])
+    ingest.add_captures(dataset, [tmp_path / "S002"])
     path = dataset.captures()["S001"] / "calibration.json"
     table = json.loads(path.read_text())
     table["cam00"]["params"] = table["cam00"]["params"][:5]
@@ -249,9 +249,9 @@ def test_capture_that_changed_is_ingested_again(dataset):
 def test_register_checks_before_it_writes(dataset, tmp_path):
     make_capture(tmp_path / "other", subject="S001", cameras=1)
     with pytest.raises(CaptureError, match=r"has the same subject \(S001\) as"):
-        ingest.register(dataset, [dataset.captures()["S001"], tmp_path / "other"])
+        ingest.add_captures(dataset, [dataset.captures()["S001"], tmp_path / "other"])
     with pytest.raises(CaptureError, match="no such folder"):
-        ingest.register(dataset, [tmp_path / "absent"])
+        ingest.add_captures(dataset, [tmp_path / "absent"])
 
 
 def test_another_capture_of_a_known_subject_is_refused_unless_it_replaces_the_first(
@@ -261,17 +261,17 @@ def test_another_capture_of_a_known_subject_is_refused_unless_it_replaces_the_fi
     make_capture(other, subject="S001", cameras=1)
     before = dataset.captures_file.read_bytes()
     with pytest.raises(CaptureError) as error:
-        ingest.register(dataset, [other])
+        ingest.add_captures(dataset, [other])
     assert all(str(path) in str(error.value) for path in (known, other, "--replace"))
     assert dataset.captures_file.read_bytes() == before
     (tmp_path / "link").symlink_to(known)
-    assert ingest.register(dataset, [tmp_path / "link"]) == ["S001"]  # the same folder
+    assert ingest.add_captures(dataset, [tmp_path / "link"]) == ["S001"]  # the same folder
 
     command = ["ingest", str(dataset.root), str(other), "--workers=0"]
     assert main(command) == 1 and main([*command, "--replace"]) == 0
     assert dataset.captures()["S001"] == other
     other.rename(known.with_name("moved"))  # no choice is left, so none is asked for
-    assert ingest.register(dataset, [known.with_name("moved")]) == ["S001"]
+    assert ingest.add_captures(dataset, [known.with_name("moved")]) == ["S001"]
     assert f"S001: {other} is gone" in capsys.readouterr().err
 
 
@@ -302,7 +302,7 @@ def test_lost_frames_count_as_time_gaps():
 
 def test_real_size_captures(shared, tmp_path):
     dataset = Dataset(tmp_path / "data")
-    ingest.register(dataset, [shared("captures/H900")])
+    ingest.add_captures(dataset, [shared("captures/H900")])
     assert run(dataset).ok
     assert metrics(dataset, "H900")["frames"] == 8 * 48
     assert metrics(dataset, "H900")["dropped"] == []
@@ -323,7 +323,7 @@ def test_footage_unlike_what_is_said_of_it_is_a_warning(tmp_path):
         "expression_id,start_frame,end_frame\nneutral,0,11\nsmile,8,23\n"
     )
     dataset = Dataset(tmp_path / "data")
-    ingest.register(dataset, [root])
+    ingest.add_captures(dataset, [root])
     assert run(dataset).ok
     said = {row["what"]: row["why"] for row in metrics(dataset)["warnings"]}
     assert "is a video at 24 fps, the capture says 12" in said["camera cam00"]
@@ -342,7 +342,7 @@ def test_videos_whose_pictures_are_not_what_they_seem_are_warned_of(tmp_path):
     write_video(hdr, images, options={"x264-params": "transfer=arib-std-b67"})
     write_video(interlaced, images, options={"x264-params": "interlaced=1:sar=16/15"})
     dataset = Dataset(tmp_path / "data")
-    ingest.register(dataset, [root])
+    ingest.add_captures(dataset, [root])
     assert run(dataset).ok
     said = {row["what"]: row["why"] for row in metrics(dataset)["warnings"]}
     assert "is HDR (HLG)" in said["camera cam00"]
@@ -373,11 +373,11 @@ def test_a_focal_length_that_is_none_fails_at_once(dataset, focal):
 def test_subjects_named_like_a_device_are_refused(tmp_path, subject):
     make_capture(tmp_path / "a", subject=subject, cameras=1)
     with pytest.raises(CaptureError, match="a name that Windows reserves for a device"):
-        ingest.register(Dataset(tmp_path / "data"), [tmp_path / "a"])
+        ingest.add_captures(Dataset(tmp_path / "data"), [tmp_path / "a"])
 
 
 def test_subjects_that_differ_by_case_alone_are_refused(dataset, tmp_path):
     make_capture(tmp_path / "small", subject="s001", cameras=1)
     with pytest.raises(CaptureError, match="s001 differs from S001 only in letter case"):
-        ingest.register(dataset, [tmp_path / "small"])
-    ingest.register(dataset, [tmp_path / "S001"])
+        ingest.add_captures(dataset, [tmp_path / "small"])
+    ingest.add_captures(dataset, [tmp_path / "S001"])

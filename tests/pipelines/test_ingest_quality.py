@@ -149,7 +149,7 @@ def test_ingest_warns_of_all_faults_and_writes_their_figures(footage, tmp_path):
         write_frames(capture / "cameras" / name / "frames", images)
     (capture / "capture.toml").write_text('subject = "S001"\nfps = 24\n')
     dataset = Dataset(tmp_path / "data")
-    ingest.register(dataset, [capture])
+    ingest.add_captures(dataset, [capture])
     summary = run_here(ingest.STAGE, dataset, preset="reference")
     assert summary.ok
     assert any("warning S001: camera cam02" in line for line in summary.lines())

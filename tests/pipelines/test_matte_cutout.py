@@ -138,7 +138,7 @@ def test_a_frame_without_a_face_fails_alone(tmp_path: Path) -> None:
     dataset = Dataset(tmp_path / "out")
     folder = dataset.root / "photos" / "eva"
     make_photo_capture(open_picture(tmp_path / "eva.mp4"), folder, "eva", config, windows=2)
-    ingest.register(dataset, [folder])
+    ingest.add_captures(dataset, [folder])
     for stage in (ingest.STAGE, calibrate.STAGE):
         assert run_here(stage, dataset).ok
     write_peaks(dataset, "eva", {"clip_00": 1, "clip_01": 6})

@@ -14,7 +14,7 @@ from express50.geometry.cameras import project
 from express50.geometry.conventions import corner_to_cell
 from pipelines.regions.geometry import render_head
 from pipelines.regions.stage import label_view
-from pipelines.regions.things import CELL_M, Picture, find_glasses, shown_before
+from pipelines.regions.things import CELL_M, Picture, find_glasses, shown_in_front
 from tests.pipelines.region_scenes import RegionScene, make_scene
 
 RADIUS, TUBE_M, LIFT_M, DARK = 0.022, 0.0018, 0.014, (25, 25, 30)
@@ -71,7 +71,7 @@ def test_glasses_are_found_with_their_lenses_and_labelled() -> None:
     for x, y in corner_to_cell(middle).round().astype(int):
         radius = round((RADIUS + TUBE_M) * scene.camera.K[0, 0] / (1 - LIFT_M))
         cv2.circle(true, (int(x), int(y)), radius, 1, -1)
-    shown = shown_before(found, scene.camera, depth)
+    shown = shown_in_front(found, scene.camera, depth)
     assert (shown & (true > 0)).sum() > 0.8 * (shown | (true > 0)).sum()
     worn = painted(scene, rims())
     labels = label_view(

@@ -213,7 +213,7 @@ def draw_case(model: HeadModel, uv_map: FaceUvMap, person: PaintedHead, rng: Rng
 
 
 def covered(colors: np.ndarray, rng: Rng) -> np.ndarray:
-    """Draw strands of hair and other things before the face, in some of the maps."""
+    """Draw strands of hair and other things in front of the face, in some of the maps."""
     if rng.random() < 0.5:
         return colors
     out = np.ascontiguousarray(colors, dtype=np.float32)

@@ -71,7 +71,7 @@ def test_a_trial_of_a_budgeted_run_is_shown(tmp_path, capsys):
     """It works in a dataset of its own, so that the table alone shows nothing for minutes."""
     make_capture(tmp_path / "S001", cameras=1)
     dataset = Dataset(tmp_path / "data")
-    ingest.register(dataset, [tmp_path / "S001"])
+    ingest.add_captures(dataset, [tmp_path / "S001"])
     trial = dataset.pilot_dir / "abc"
     trial.mkdir(parents=True)
     now = time.time()

@@ -210,7 +210,7 @@ def test_withdrawn_subject_is_not_taken_in_again(dataset):
     capture = dataset.captures()["S001"]
     withdraw(dataset, "S001")
     with pytest.raises(CaptureError, match="subject S001 was withdrawn"):
-        ingest.register(dataset, [capture])
+        ingest.add_captures(dataset, [capture])
 
 
 def test_what_others_outputs_and_tables_say_of_the_person_goes_too(dataset):

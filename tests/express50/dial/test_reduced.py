@@ -98,7 +98,7 @@ def _apart(a: Dataset, b: Dataset, subject: str, names: list[str]) -> list[float
 
 def chain_of(root: Path, captures: list[Path]) -> Chain:
     dataset, work = Dataset(root.resolve()), (ingest.STAGE, ALIGN, CALIBRATE, FRAMES, LOOK)
-    ingest.register(dataset, captures)
+    ingest.add_captures(dataset, captures)
     ladders = {stage.name: {"standard": stage.config()} for stage in work}
     ladders["frames"] = {n: FRAMES.config(image_side=side) for n, side in SIDES.items()}
     kinds = (ResultKind("look", "mm", (_file,), _apart),)

@@ -165,7 +165,7 @@ def captures_of(root: Path, subjects: int = 3, expressions: int = 4) -> list[Pat
 
 def chain_of(root: Path, captures: list[Path], said: list[str] | None = None) -> Chain:
     dataset = Dataset(root.resolve())
-    ingest.register(dataset, captures)
+    ingest.add_captures(dataset, captures)
     ladders = {
         stage.name: distinct_settings(stage, lambda s, p: resolve_config(s, p)) for stage in STAGES
     }
