@@ -30,7 +30,7 @@ class Tile:
     """One expression of one subject.
 
     Attributes:
-        subject, expression: whose, and of what.
+        subject, expression: ids of the person shown and of the expression.
         state: who chose the frame (``person``, ``rule``, ``auto``: a suggestion accepted by the
             align stage, ``suggestion``: one not yet accepted), or ``flagged`` or ``missing``.
         reference: whether this is the reference's canonical frame.

@@ -126,7 +126,7 @@ def subject_of(capture: Path) -> str:
 def run_stages(
     dataset: Path, captures: list[Path], unseen: str, workers: int, settings: str = "demo.toml"
 ) -> list[Step]:
-    """Run every stage over the dataset; a failed item is reported, and the chain goes on."""
+    """Run every stage over the dataset; a failed item is reported, and the chain continues."""
     common = ["--workers", str(workers), "--config", str(Path(__file__).with_name(settings))]
     steps = []
     for stage in STAGES:

@@ -68,7 +68,7 @@ def inputs(dataset: Dataset, item: str, config: object) -> dict[str, Path | str]
 
 
 def outputs(text: bytes) -> dict[str, bytes]:
-    """Return the files of an item, but for its metrics."""
+    """Return the files of an item, except its metrics."""
     pieces = (hashlib.sha256(text + b"%d" % number).digest() * 4000 for number in range(PIECES))
     return {f"{number}.bin": piece for number, piece in enumerate(pieces)}
 

@@ -1,11 +1,11 @@
 """Inject faults into runs (kills, full disks, damaged files) at random, and measure what is lost.
 
 ``python -m benchmarks.faults --hours 1`` runs one case after the other until the time is over. A
-case makes a dataset, runs a stage of slow items on it, hurts it, and runs it again until it is
-complete; then every byte is compared with what it must be, and `express50.dataset.audit` must find
-no fault. In a longer storm every third case kills a real stage, or a training, on a small
+case makes a dataset, runs a stage of slow items on it, injects faults, and runs it again until it
+is complete; then every byte is compared with the expected one, and `express50.dataset.audit` must
+find no fault. In a longer run every third case kills a real stage, or a training, on a small
 recording, which takes some minutes to make. Each case has a number, which is the seed of all that
-is random in it: ``--seed N`` runs one again. With ``--folder`` a stopped storm goes on.
+is random in it: ``--seed N`` runs one again. With ``--folder`` a stopped run continues.
 `seconds_lost_per_kill` is work that was begun and not published; starting again, up to the first
 item, is in `restart_seconds_median`. The last line printed is one JSON object.
 """
@@ -71,7 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = make_parser("faults", __doc__)
     parser.add_argument("--hours", type=float, default=1 / 60, help="how long (a minute)")
     parser.add_argument("--seed", type=int, help="run this case alone")
-    parser.add_argument("--folder", type=Path, help="keep cases here, and go on with them")
+    parser.add_argument("--folder", type=Path, help="keep cases here, and continue with them")
     options = parser.parse_args(arguments)
     with contextlib.ExitStack() as stack:
         folder = options.folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -105,7 +105,7 @@ def kind_of(number: int) -> str:
 
 
 def run_case(folder: Path, number: int) -> dict:
-    """Run one case; what is wrong with it is printed with its seed."""
+    """Run one case; print its faults with its seed."""
     kind = kind_of(number)
     scratch, error = folder / f"case{number}", ""
     shutil.rmtree(scratch, ignore_errors=True)
@@ -182,7 +182,7 @@ def kill_driver_of_workers(case: Case) -> None:
 
 
 def kill_worker(case: Case) -> None:
-    """Kill workers; the driver goes on with others."""
+    """Kill workers; the driver continues with others."""
     dataset = make_dataset(case)
     driver = start(case, dataset, "--workers", "2")
     for _ in range(KILLS):

@@ -3,8 +3,8 @@
 Eight people, the last never trained on; twelve expressions; twelve cameras of 256 px, two held out;
 three frames of training people held out. Footage goes through every stage, so that the shards have
 the faults of tracked, matted and fused data. The model and the baseline (texel colours averaged on
-the tracked mesh, drawn as Gaussians, nothing trained) are measured in one run, which goes on where
-a stopped one ended. The unseen person is tracked and fitted from one picture of the frontal camera
+the tracked mesh, drawn as Gaussians, nothing trained) are measured in one run, which continues a
+stopped one. The unseen person is tracked and fitted from one picture of the frontal camera
 and from two; figures that end in ``tracked_from_all_db`` take a track of all cameras. Frame rates
 are by the clock, of one process with ``--threads`` threads. `benchmarks.ablate` has the components.
 The last line is one JSON object.

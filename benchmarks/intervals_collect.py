@@ -55,11 +55,11 @@ class Sample:
     """Elements of one item.
 
     Attributes:
-        stage, item: of which it is.
+        stage, item: the names of its stage and item.
         figures: by name (N,).
         errors: (N,) true ones.
-        shared: (N,) deviations that all have in common, as `error_bounds` takes them.
-        skin: (N,) where the truth shows the head's own surface, of depth alone.
+        shared: (N,) deviations that all elements share, as `error_bounds` takes them.
+        skin: (N,) where the truth shows the head's own surface; for depth only.
     """
 
     stage: str

@@ -26,10 +26,10 @@ ROW_RIDGE = 0.03
 
 
 def fit_model(rows: Sequence[tuple[str, Sample]], unit: Unit) -> ErrorModel:
-    """Fit weights by least squares of logarithms, then the table; every item counts alike.
+    """Fit weights by least squares of logarithms, then the table; all items have equal weight.
 
-    Figures of elements are weighed by what they say within items, figures of whole items by what is
-    left between items: otherwise a few items would decide what a pixel's figure means. The items'
+    Figures of elements are fitted within items, and figures of whole items to the differences that
+    remain between items: otherwise a few items would decide what a pixel's figure means. The items'
     intervals come from items of conditions that their model did not see. `rows` name the condition
     of each sample.
     """

@@ -1,7 +1,7 @@
 """Record a digital twin under a condition and run the chain up to registration on it.
 
-A condition is a row of ``CONDITIONS``: how many cameras, how many pixels, how far away, and what is
-wrong with the footage. Peaks are the truth's, as alignment has rows of its own.
+A condition is a row of ``CONDITIONS``: how many cameras, how many pixels, how far away, and which
+fault the footage has. Peaks are the true ones, because alignment has its own rows.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ CONDITIONS = (
 
 
 def make_row(condition: Condition, number: int, root: Path) -> tuple[Dataset, Truth]:
-    """Record subject ``number`` and run the stages; what is there already is kept."""
+    """Record subject ``number`` and run the stages; existing results are kept."""
     subject = f"S{number:03d}"
     config = TwinConfig(
         subjects=1, first_subject=number, cameras=max(8, condition.views), width=condition.side,

@@ -50,7 +50,7 @@ Figures = dict[str, float | None]
 
 @dataclass(frozen=True)
 class Case:
-    """One expression: the tracked mesh (V, 3) in the true world, and what is true of it."""
+    """One expression: the tracked mesh (V, 3) in the true world, and its ground truth."""
 
     model: HeadModel
     mesh: np.ndarray

@@ -232,7 +232,7 @@ def centred(camera: Camera, factor: int = 1) -> Camera:
 
 
 def _whole(length: float, factor: int) -> int:
-    """Return the least multiple of 2 * factor pixels that covers a length, but for rounding."""
+    """Return the least multiple of 2 * factor pixels that covers a length, up to rounding."""
     return 2 * factor * math.ceil((length - 1e-6) / (2 * factor))
 
 

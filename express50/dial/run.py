@@ -339,7 +339,7 @@ def reserved(own: float, rest: float, left: float, budget: float) -> float:
     """Return the seconds that a stage must leave to those after it.
 
     Where its own seconds and the rest are over the time left by a tenth of the budget at most, the
-    run goes on and ends late rather than with nothing made.
+    run continues and ends late, rather than with nothing made.
     """
     short = own + rest - left
     return rest - short if 0 < short <= GRACE * budget else rest
