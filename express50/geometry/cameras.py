@@ -6,7 +6,7 @@ corner. Camera models and the order of their parameters are COLMAP's.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -348,7 +348,7 @@ def _triangulate_one(P: np.ndarray, xy: np.ndarray, w: np.ndarray, focal: np.nda
 
 
 def nearest_to_lines(
-    origins: Sequence[np.ndarray], directions: Sequence[np.ndarray], least: float
+    origins: Iterable[np.ndarray], directions: Iterable[np.ndarray], least: float
 ) -> np.ndarray | None:
     """Return the point (3,) nearest to lines by origins (N, 3) and unit directions (N, 3).
 
