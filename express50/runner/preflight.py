@@ -16,7 +16,7 @@ from rich.filesize import decimal
 from express50.console import count, not_writable
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
-from express50.errors import Express50Error, FormatError, StageError
+from express50.errors import Express50Error, FormatError, StageError, few
 from express50.files.atomic import LEAST_FREE
 from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger
@@ -54,17 +54,22 @@ def problems(
 
 
 def _folder_problems(dataset: Dataset, stages: Iterable[Stage]) -> Iterator[str]:
-    """Yield a line per folder that the stages write to and that is not writable."""
+    """Yield a line per reason for which folders that the stages write to are not writable."""
     inside = [dataset.stage_dir(stage.name) for stage in stages]
     inside += [dataset.staging_dir, dataset.config_file("").parent]
-    for folder in [_existing(dataset.root), *(one for one in inside if one.exists())]:
+    root, refused = _existing(dataset.root), dict[str, tuple[OSError, list[str]]]()
+    for folder in [root, *(one for one in inside if one.exists())]:
         try:
             with tempfile.TemporaryFile(dir=folder):
                 pass
         except NotADirectoryError:
             yield f"{folder}: is a file, expected a writable folder"
         except OSError as error:
-            yield not_writable(folder, error)
+            refused.setdefault(str(error.strerror), (error, []))[1].append(str(folder))
+            if folder == root:
+                break  # on a read-only disk, those inside are refused too
+    for error, folders in refused.values():
+        yield not_writable(few(folders), error)
 
 
 def _worker_problems(work: Sequence[tuple[Stage, Any]], pool: Pool) -> Iterator[str]:

@@ -238,7 +238,7 @@ def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
          "values that are not finite or over 1e+30"),
         (["export", "{checkpoint}", "{out}/head.obj"], 2, "expected one of .html, .ply, .spz"),
         (["export", "{checkpoint}", "{out}/head.html", "--format=splats"], 2,
-         "--format splats writes .glb"),
+         "--format splats needs a name that ends in .glb"),
         (["export", "{checkpoint}", "{out}/head.ply", "--control=jaw=3"], 2,
          "got 1 number, expected 3 with commas between, or jaw.0 to jaw.2 with one"),
     ],

@@ -63,22 +63,28 @@ def test_all_problems_are_said_at_once_and_nothing_is_started(dataset, monkeypat
     assert tree(dataset.root) == before
 
 
-@pytest.mark.parametrize("folder", ["", "toy", ".staging", "config"])
-def test_folders_are_tried(dataset, folder, monkeypatch):
+@pytest.mark.parametrize(
+    ("refused", "named"),
+    [
+        (["toy"], "{0}/toy"),
+        ([".staging", "config"], "{0}/.staging, {0}/config"),
+        (["", "toy", ".staging", "config"], "{0}"),
+    ],
+    ids=["stage", "two", "disk"],
+)
+def test_folders_are_tried_and_named_in_one_line(dataset, refused, named, monkeypatch):
     run_toy(dataset)
-    refused = (dataset.root / folder).resolve()
+    root = dataset.root.resolve()
     real = preflight.tempfile.TemporaryFile
 
     def read_only(dir):  # noqa: A002  (tests may run as root, to whom everything is permitted)
-        if dir == refused:
+        if dir in [root / folder for folder in refused]:
             raise PermissionError(13, "Permission denied")
         return real(dir=dir)
 
     monkeypatch.setattr(preflight.tempfile, "TemporaryFile", read_only)
-    dataset = type(dataset)(dataset.root.resolve())
-    assert found(dataset) == [
-        f"{refused}: not writable (Permission denied); check its owner and permissions"
-    ]
+    line = f"{named.format(root)}: not writable (Permission denied); check its owner and"
+    assert found(type(dataset)(root)) == [f"{line} permissions"]
 
 
 def test_a_file_in_place_of_a_dataset(tmp_path, capsys):
