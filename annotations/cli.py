@@ -43,8 +43,8 @@ from annotations.validate import (
 from annotations.worklist import ORDERS, coverage, effort, progress, worklist
 from express50.capture.index import Index, read_index
 from express50.console import FAILED, OK, add_command, answer, count, format_table, number
-from express50.contract.layout import Dataset, exclusion_reason, included_subjects
-from express50.errors import AnnotationError, UnknownNameError, check_known
+from express50.contract.layout import Dataset, check_folder, exclusion_reason, included_subjects
+from express50.errors import AnnotationError, ConfigError, UnknownNameError, check_known
 
 _FIGURES = ("clips", "within_1", "within_2", "within_4", "median_frames", "slip_rate", "alpha")
 AROUND = 4  # frames on either side when one subject or expression is shown
@@ -166,9 +166,10 @@ def table(names: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> list[str]:
 def dataset_folder(text: str) -> Dataset:
     """Parse the folder of an existing dataset."""
     dataset = Dataset(Path(text))
+    check_folder(dataset)
     if not dataset.captures_file.is_file():
-        what = "not a dataset (no captures.json)" if dataset.root.is_dir() else "no such dataset"
-        raise argparse.ArgumentTypeError(f"{text}: {what}; run 'express50 ingest {text} CAPTURE'")
+        what = "not a dataset (no captures.json)"
+        raise ConfigError(f"{text}: {what}; run 'express50 ingest {text} CAPTURE'")
     return dataset
 
 

@@ -22,7 +22,7 @@ from express50.contract.segmentation_labels import label_mask
 from express50.errors import FormatError, TrainError, few
 from express50.files.atomic import write_bytes, write_json
 from express50.files.images import read_image, write_image
-from express50.files.text import is_number
+from express50.files.text import is_number, no_folder
 from express50.shards.writer import sample_key
 from grmm.checkpoint import Checkpoint
 from grmm.config import MetricsConfig
@@ -184,6 +184,8 @@ def score(
     Raises:
         FormatError: pictures are missing, unreadable or of the wrong size; lists them.
     """
+    if not folder.is_dir():
+        raise FormatError(f"{folder}: {no_folder(folder)}; expected a folder of pictures")
     paths: dict[int, Path] = {}
     missing = []
     for index in indices:

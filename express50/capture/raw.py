@@ -22,6 +22,7 @@ from express50.files.text import (
     check_links,
     identifier,
     is_number,
+    no_folder,
     not_fetched,
     read_text,
     read_toml,
@@ -110,7 +111,9 @@ def read_capture(root: Path) -> RawCapture:
     meta = read_meta(root)
     folder = root / "cameras"
     if not folder.is_dir():
-        raise CaptureError(f"{folder}: no such folder; expected cameras/<id>/video.mp4 or frames/")
+        raise CaptureError(
+            f"{folder}: {no_folder(folder)}; expected cameras/<id>/video.mp4 or frames/"
+        )
     cameras, dropped = {}, {}
     for path in sorted(p for p in folder.iterdir() if not p.name.startswith(".")):
         if not path.is_dir():
@@ -175,7 +178,7 @@ def read_meta(root: Path) -> dict:
     """
     path = root / "capture.toml"
     if not path.is_file():
-        what = "no such folder" if not root.is_dir() else "has no capture.toml"
+        what = "has no capture.toml" if root.is_dir() else no_folder(root)
         raise CaptureError(
             f"{root}: {what}; expected a capture folder whose capture.toml gives subject and fps"
         )

@@ -215,11 +215,12 @@ def existing_dataset(path: Path) -> Dataset:
 
 
 def check_folder(dataset: Dataset) -> None:
-    """Raise ConfigError if the dataset's folder does not exist."""
-    if not dataset.root.is_dir():
-        raise ConfigError(
-            f"{dataset.root}: no such dataset; run 'express50 ingest {dataset.root} CAPTURE'"
-        )
+    """Raise ConfigError if the dataset's folder does not exist, or is a file."""
+    root = dataset.root
+    if root.is_file():
+        raise ConfigError(f"{root}: is a file, expected the folder of a dataset")
+    if not root.is_dir():
+        raise ConfigError(f"{root}: no such dataset; run 'express50 ingest {root} CAPTURE'")
 
 
 def exclusion_reason(dataset: Dataset, subject: str) -> str | None:

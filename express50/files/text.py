@@ -65,6 +65,11 @@ def read_bytes(path: Path, kind: Kind, limit: int = TEXT_LIMIT, fix: str = AGAIN
         raise kind(f"{path}: {why}") from None
 
 
+def no_folder(path: Path) -> str:
+    """Say why a path is not a folder: nothing is there, or a file."""
+    return "is a file, not a folder" if path.exists() else "no such folder"
+
+
 def not_fetched(path: Path) -> str:
     """Return what to do about a file that lacks its content; "" for any other file.
 

@@ -31,7 +31,7 @@ from express50.contract.segmentation_labels import COLOURS
 from express50.errors import FormatError, check_known
 from express50.files.arrays import read_arrays, read_npy
 from express50.files.images import contact_sheet
-from express50.files.text import KEY_LENGTH, parse_json, read_json
+from express50.files.text import KEY_LENGTH, no_folder, parse_json, read_json
 from express50.geometry.shapes import check_finite, check_shape
 from express50.shards.codecs import AGAIN, ALPHA, DEPTH, PARTS, RGB, crc32, decode_picture
 
@@ -267,7 +267,7 @@ def read_entries(root: Path) -> tuple[Entry, ...]:
     """
     path = root / "index.json"
     if not path.exists():
-        what = f"{path}: the index is missing" if root.is_dir() else f"{root}: no such folder"
+        what = f"{path}: the index is missing" if root.is_dir() else f"{root}: {no_folder(root)}"
         packed = root / "pack" / "shards"
         place = packed if packed.is_dir() else "DATASET/pack/shards"
         raise FormatError(f"{what}; name the folder that 'pack' wrote, {place}")

@@ -17,7 +17,7 @@ from typing import BinaryIO
 from express50.errors import FormatError
 from express50.files.atomic import folder_in_one_step, link_file, write_json
 from express50.files.digests import file_sha256
-from express50.files.text import KEY_LENGTH, NAME, read_json
+from express50.files.text import KEY_LENGTH, NAME, no_folder, read_json
 from express50.shards.codecs import AGAIN, crc32
 from express50.shards.reader import (
     KEY,
@@ -253,6 +253,8 @@ def verify(root: Path) -> list[str]:
     headers name the members that the index places there.
     """
     root = Path(root)
+    if not root.is_dir():
+        return [f"{root}: {no_folder(root)}; name the folder that 'pack' wrote"]
     faults = _manifest_faults(root)
     try:
         reader = ShardReader(root)

@@ -25,7 +25,7 @@ import numpy as np
 from express50.errors import ConfigError, FormatError
 from express50.files.atomic import write_bytes, write_json
 from express50.files.images import encode_png, read_image
-from express50.files.text import markdown_table, parse_json, read_json_table
+from express50.files.text import markdown_table, no_folder, parse_json, read_json_table
 from express50.local_server import NOT_FOUND, PageServer, Reply
 
 FORMAT = "grmm.study/1"
@@ -107,7 +107,7 @@ def _pictures(folder: Path) -> dict[str, Path]:
     """Find the pictures of a folder by their stems."""
     if not folder.is_dir():
         raise ConfigError(
-            f"{folder}: no such folder; expected pictures with the same names as the others"
+            f"{folder}: {no_folder(folder)}; expected pictures with the same names as the others"
         )
     found = sorted(folder.iterdir(), reverse=True)
     return {path.stem: path for path in found if path.suffix.lower() in SUFFIXES}

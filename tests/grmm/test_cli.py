@@ -206,6 +206,8 @@ def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
         (["train", "{out}", "{out}", "--budget=9s"], 1, "the index is missing"),
         (["train", "{out}", "{out}"], 1, "the index is missing"),
         (["train", "{out}/absent", "{out}"], 1, "absent: no such folder; name the folder that"),
+        (["train", "{checkpoint}", "{out}"], 1, "checkpoint.pt: is a file, not a folder; name"),
+        (["score", "{checkpoint}", "{shards}", "{out}"], 1, "checkpoint.pt: is a file, not a"),
         (["train", "{shards}", "{out}", *TINY, "--holdout-cameras=x"], 2,
          "data.holdout_cameras names x; expected some of cam00, cam01, cam02"),
         (["fit", "{checkpoint}", "{shards}", "{out}", "--subject=S9"], 2, "no subject is"),

@@ -183,6 +183,10 @@ def test_bad_item_gives_exit_code_1_and_is_named(run, data, capture, tmp_path):
         (["run", "DATA", "CAP", "--preset", ""], 2, "argument --preset: got ''"),
         (["twin", "record", "DATA", "--expressions", " ,"], 2, "--expressions: got ' ,', expected"),
         (["subject", "withdraw", "DATA", "S001"], 2, "no such dataset"),
+        (["annotate", "status", "DATA"], 2, "no such dataset"),
+        (["annotate", "status", "FILE"], 2, "is a file, expected the folder of a dataset"),
+        (["check", "FILE"], 2, "is a file, expected the folder of a dataset"),
+        (["shards", "ls", "FILE"], 1, "cues.csv: is a file, not a folder; name the folder that"),
         (["head", "preview", "DATA/x.xyz"], 1, "expected .png, .jpg, .tif or .exr as its ending"),
         (["config", "trak"], 2, "no stage 'trak'"),
         (["ingest"], 2, "required: DATASET"),
@@ -217,7 +221,7 @@ def test_bad_item_gives_exit_code_1_and_is_named(run, data, capture, tmp_path):
     ],
 )
 def test_errors_are_one_line_with_their_exit_code(run, data, capture, arguments, code, message):
-    places = {"DATA": data, "CAP": capture}
+    places = {"DATA": data, "CAP": capture, "FILE": capture / "cues.csv"}
     found, out, err = run(*[places.get(a, a) for a in arguments])
     assert (found, out) == (code, "")
     last = err.strip().splitlines()[-1]

@@ -195,6 +195,13 @@ def test_a_flipped_byte_is_found_and_named(shards, tmp_path, capsys):
     assert main(["shards", "verify", str(shards)]) == 0
 
 
+def test_verifying_no_folder_says_so_once(tmp_path):
+    (tmp_path / "file").touch()
+    for name, what in (("file", "is a file, not a folder"), ("absent", "no such folder")):
+        (fault,) = verify(tmp_path / name)
+        assert f"{name}: {what}; name" in fault
+
+
 def test_a_header_that_names_another_member_is_found(shards, tmp_path):
     root = shutil.copytree(shards, tmp_path / "bad")
     entry = ShardReader(root).entries[0]
