@@ -42,7 +42,7 @@ from annotations.validate import (
 )
 from annotations.worklist import ORDERS, coverage, effort, progress, worklist
 from express50.capture.index import Index, read_index
-from express50.console import FAILED, OK, add_command, answer, count, format_table, number
+from express50.console import FAILED, OK, add_command, answer, count, format_table, log, number
 from express50.contract.layout import Dataset, check_folder, exclusion_reason, included_subjects
 from express50.errors import AnnotationError, ConfigError, UnknownNameError, check_known
 
@@ -414,6 +414,7 @@ def run_sheet(args: argparse.Namespace) -> int:
     chosen = args.subject or args.expression
     around = args.around if args.around is not None else AROUND if chosen else 0
     faces = FaceFinder(args.dataset)
+    log(f"{args.file}: drawing {count(len(sheet.tiles), 'label')}")
     faces.load()
     page = render_sheet(args.dataset, sheet, faces=faces, around=around).encode()
     args.file.parent.mkdir(parents=True, exist_ok=True)

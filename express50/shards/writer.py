@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+from express50.console import count, log
 from express50.errors import FormatError
 from express50.files.atomic import folder_in_one_step, link_file, write_json
 from express50.files.digests import file_sha256
@@ -329,7 +330,8 @@ def copy_samples(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> in
         raise FormatError(f"{out}: is not empty; expected an empty or absent folder")
     if not any(len(reader) for reader in readers):
         raise FormatError(f"{readers[0].root}: no sample matches; 'express50 shards ls' lists them")
-    splits = _checked_splits(readers)
+    splits, samples_in_all = _checked_splits(readers), sum(map(len, readers))
+    log(f"{out}: copying {count(samples_in_all, 'sample')}")
     groups = [(reader, *row) for reader in readers for row in reader.groups().items()]
     groups.sort(key=lambda group: splits[group[1][0]])
     names = {s: sorted(k for k, v in splits.items() if v == s) for s in set(splits.values())}
@@ -351,7 +353,7 @@ def copy_samples(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> in
         write_manifest(aside, writer.digests)
         if out.exists():
             out.rmdir()  # fails if somebody has filled the folder meanwhile
-    return sum(len(reader) for reader in readers)
+    return samples_in_all
 
 
 def _checked_splits(readers: Sequence[ShardReader]) -> dict[str, str]:
@@ -407,7 +409,7 @@ def _write_card(readers: Sequence[ShardReader], out: Path) -> None:
     for reader in readers:
         card = reader.root / "card.md"
         parts.append(card.read_text(encoding="utf-8") if card.is_file() else "(no card)\n")
-    count = len({entry.key for reader in readers for entry in reader.entries})
-    folders = f"{len(readers)} folder{'s' if len(readers) > 1 else ''}"
-    text = f"# {count} samples of {folders} of shards\n\nTheir cards, as they were:\n\n"
+    samples = count(len({entry.key for reader in readers for entry in reader.entries}), "sample")
+    folders = count(len(readers), "folder")
+    text = f"# {samples} of {folders} of shards\n\nTheir cards, as they were:\n\n"
     (out / "card.md").write_text(text + "\n".join(parts), encoding="utf-8")

@@ -11,7 +11,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from express50.console import FAILED, OK, add_command, number, picture_size, say, say_json
+from express50.console import (
+    FAILED,
+    OK,
+    add_command,
+    count,
+    log,
+    number,
+    picture_size,
+    say,
+    say_json,
+)
 from express50.errors import CalibrationError, ConfigError
 from express50.files.calibration import camera_rows, read_cameras, write_cameras
 from express50.geometry.cameras import Camera
@@ -90,6 +100,7 @@ def run_check(args: argparse.Namespace) -> int:
         from pipelines.calibrate.footage import find_points, read_raw_footage
         from pipelines.calibrate.given_rig import check_footage
 
+        log(f"{args.footage}: looking for points in {count(len(cameras), 'camera')}")
         seen = find_points(partial(read_raw_footage, args.footage, cameras, args.frames))
         shown = {name for points in seen.values() for name in points.features}
         footage = check_footage({n: c for n, c in cameras.items() if n in shown}, seen)

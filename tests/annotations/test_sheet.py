@@ -153,7 +153,9 @@ def test_the_command_writes_the_page_and_counts(labelled, tmp_path, capsys):
     file = tmp_path / "new" / "sheet.html"
     words = ["annotate", "sheet", str(labelled.root), str(file), "--subject", "S002", "--json"]
     assert main(words) == 0
-    said = json.loads(capsys.readouterr().out)
+    printed = capsys.readouterr()
+    assert "sheet.html: drawing 6 labels\n" in printed.err  # before what may take minutes
+    said = json.loads(printed.out)
     assert said["bytes"] == file.stat().st_size
     assert said["tiles"]["flagged"] == 1 and said["tiles"]["missing"] == 1
     page = Page(file.read_text())

@@ -257,7 +257,10 @@ def test_the_command_names_the_camera(footage, tmp_path, capsys):
     write_cameras(tmp_path / "c.json", rig)
     command = ["cameras", "check", str(tmp_path / "c.json"), "--footage", str(tmp_path / "capture")]
     assert main(command) == 0
-    assert "moved" not in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert (
+        "moved" not in said.out and f"capture: looking for points in {len(rig)} cameras" in said.err
+    )
     write_cameras(tmp_path / "c.json", bumped(rig, "cam03", (0, TURN, 0)))
     assert main([*command, "--json"]) == 1
     checked = json.loads(capsys.readouterr().out)["footage"]

@@ -77,8 +77,11 @@ def _work(stage: str, item: str, steps: int, times: int) -> None:
     pause(float(os.environ.get(PAUSE, "0.004")) * steps * times)
 
 
-def count_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a step take one second of processor time, and nothing else any, without waiting."""
+def count_pauses(monkeypatch: pytest.MonkeyPatch, working: float = 1.0) -> None:
+    """Let a step take one second, and nothing else any, without waiting.
+
+    ``working`` is the share of it that is processor time.
+    """
     spent = [0.0]
 
     def pass_by(seconds: float) -> None:
@@ -86,7 +89,8 @@ def count_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setenv(PAUSE, "1")
     monkeypatch.setattr("tests.express50.dial.toy_chain.pause", pass_by)
-    monkeypatch.setattr("express50.runner.worker.core_seconds", lambda: spent[0])
+    monkeypatch.setattr("express50.runner.worker.core_seconds", lambda: working * spent[0])
+    monkeypatch.setattr("express50.runner.worker.time.perf_counter", lambda: spent[0])
 
 
 def added(size: float, steps: int) -> float:

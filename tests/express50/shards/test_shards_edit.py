@@ -19,14 +19,17 @@ def content(root: Path) -> dict[str, dict[str, bytes]]:
     return {entry.key: reader.members(n) for n, entry in enumerate(reader.entries)}
 
 
-def test_a_split_folder_merges_to_the_same_samples(tmp_path: Path) -> None:
+def test_a_split_folder_merges_to_the_same_samples(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
     whole = write(tmp_path / "whole")
     parts = [tmp_path / "train", tmp_path / "test"]
     for part in parts:
         assert main(["shards", "split", str(whole), str(part), "--split", part.name]) == 0
         assert verify(part) == []
     assert main(["shards", "merge", *map(str, parts), str(tmp_path / "again")]) == 0
-    again = tmp_path / "again"
+    again, said = tmp_path / "again", capsys.readouterr().err
+    assert f"{parts[1]}: copying 6 samples\n" in said and f"{again}: copying 18 samples\n" in said
     assert verify(again) == [] and content(again) == content(whole)
     splits = json.loads((again / "splits.json").read_text())
     assert splits["train"] == ["S001", "S002"] and splits["test"] == ["S003"]
