@@ -87,18 +87,16 @@ def reconstruction(
     return loss
 
 
-def depth_dm2(
-    depth: Tensor, alpha: Tensor, target: Tensor, valid: Tensor, erode_px: int = DEPTH_ERODE_PX
-) -> Tensor:
+def depth_dm2(depth: Tensor, alpha: Tensor, target: Tensor, valid: Tensor) -> Tensor:
     """Compute the mean squared depth error, dm^2, over pixels where both depths are known.
 
     Depths (H, W) are camera z, metres. Rendered ones count where ``alpha`` is over 0.5, targets
-    where ``valid``; ``erode_px`` pixels next to the border of both are left out. In metres the term
-    would vanish (5 mm -> 2.5e-5), in millimetres it would dominate (G11).
+    where ``valid``; `DEPTH_ERODE_PX` pixels next to the border of both are left out. In metres the
+    term would vanish (5 mm -> 2.5e-5), in millimetres it would dominate (G11).
     """
     mask = valid & (alpha.detach() > 0.5)
-    outside = nn.functional.pad((~mask)[None, None].float(), [erode_px] * 4)
-    mask = mask & (nn.functional.max_pool2d(outside, 2 * erode_px + 1, 1)[0, 0] == 0)
+    outside = nn.functional.pad((~mask)[None, None].float(), [DEPTH_ERODE_PX] * 4)
+    mask = mask & (nn.functional.max_pool2d(outside, 2 * DEPTH_ERODE_PX + 1, 1)[0, 0] == 0)
     # No branch, which would wait for the GPU: an empty mask gives 0 over 1.
     squares = (10.0 * torch.where(mask, depth - target, 0.0)).square()
     return squares.sum() / mask.sum().clamp_min(1)

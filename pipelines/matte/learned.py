@@ -37,7 +37,7 @@ ITERATIONS = 30
 
 
 def background_alpha(
-    network: Network, frame: np.ndarray, plate: np.ndarray, tile: int, overlap: int = OVERLAP
+    network: Network, frame: np.ndarray, plate: np.ndarray, tile: int
 ) -> np.ndarray:
     """Return opacity (H, W) float32 of a frame and its plate (H, W, 3), both in 8-bit steps.
 
@@ -54,7 +54,7 @@ def background_alpha(
         _check_shape(network, answer, pair[0].shape[:2])
         return answer[0, : rows.stop - rows.start, : columns.stop - columns.start]
 
-    alpha = in_tiles(frame.shape[:2], tile, overlap, compute)
+    alpha = in_tiles(frame.shape[:2], tile, OVERLAP, compute)
     return np.clip(alpha, 0, 1)
 
 

@@ -207,13 +207,9 @@ class HeadGeometry:
 
 
 def head_geometry(
-    head: TrackedHead,
-    camera: Camera,
-    alpha: np.ndarray,
-    depth: np.ndarray | None,
-    rim_m: float = RIM_M,
+    head: TrackedHead, camera: Camera, alpha: np.ndarray, depth: np.ndarray | None
 ) -> HeadGeometry:
-    """Place a pinhole camera's pixels relative to a head, with a rim of `rim_m` metres.
+    """Place a pinhole camera's pixels relative to a head, with a rim of `RIM_M` metres.
 
     Depth (H, W) is camera z, metres. Where it is 0, unknown, the nearest known pixel of the matte
     (H, W) replaces it; without a depth map, the mesh's own depth does. If no pixel shows the mesh,
@@ -226,7 +222,7 @@ def head_geometry(
         return HeadGeometry(mesh, mesh_depth, mesh, hit, height, np.zeros_like(height))
     row, column, pixels = nearest(hit)
     surface = mesh_depth[row, column]
-    rim = ~hit & (pixels * surface / camera.K[0, 0] <= rim_m)
+    rim = ~hit & (pixels * surface / camera.K[0, 0] <= RIM_M)
     known = hit if depth is None else (alpha > 0) & (depth > 0)
     if depth is not None and known.any():
         there = nearest(known)[:2]

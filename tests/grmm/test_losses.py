@@ -51,18 +51,20 @@ def test_ssim_gradient():
     assert gradcheck(losses.ssim, (a.requires_grad_(True), b.requires_grad_(True)))
 
 
-def test_depth_is_in_decimetres_and_masked():
+def test_depth_is_in_decimetres_and_masked(monkeypatch):
+    monkeypatch.setattr(losses, "DEPTH_ERODE_PX", 0)
     depth = torch.full((8, 8), 1.005, dtype=torch.float64)
     target = torch.ones(8, 8, dtype=torch.float64)
     valid = torch.ones(8, 8, dtype=torch.bool)
     alpha = torch.ones(8, 8, dtype=torch.float64)
-    assert float(losses.depth_dm2(depth, alpha, target, valid, 0)) == pytest.approx(0.05**2)
+    assert float(losses.depth_dm2(depth, alpha, target, valid)) == pytest.approx(0.05**2)
     valid[:, :4] = False
     spoiled = depth.clone()
     spoiled[:, :4] = 50.0
-    assert float(losses.depth_dm2(spoiled, alpha, target, valid, 0)) == pytest.approx(0.05**2)
+    assert float(losses.depth_dm2(spoiled, alpha, target, valid)) == pytest.approx(0.05**2)
     spoiled[:, 4:6] = 50.0  # next to the border of the mask
-    assert float(losses.depth_dm2(spoiled, alpha, target, valid, 2)) == pytest.approx(0.05**2)
+    monkeypatch.setattr(losses, "DEPTH_ERODE_PX", 2)
+    assert float(losses.depth_dm2(spoiled, alpha, target, valid)) == pytest.approx(0.05**2)
 
 
 def test_depth_without_a_common_pixel_is_zero_with_zero_gradient():
@@ -74,11 +76,12 @@ def test_depth_without_a_common_pixel_is_zero_with_zero_gradient():
     assert loss.item() == 0 and torch.equal(depth.grad, torch.zeros(6, 6))
 
 
-def test_depth_gradient():
+def test_depth_gradient(monkeypatch):
+    monkeypatch.setattr(losses, "DEPTH_ERODE_PX", 0)
     depth = torch.rand(7, 7, dtype=torch.float64, requires_grad=True)
     target, alpha = torch.rand(7, 7, dtype=torch.float64), torch.ones(7, 7)
     valid = torch.rand(7, 7) > 0.2
-    assert gradcheck(lambda d: losses.depth_dm2(d, alpha, target, valid, 0), (depth,))
+    assert gradcheck(lambda d: losses.depth_dm2(d, alpha, target, valid), (depth,))
 
 
 def test_scale_term_follows_the_papers_cases_in_millimetres():

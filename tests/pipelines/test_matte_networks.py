@@ -75,12 +75,13 @@ def test_background_matting_as_onnx_goes_by_names(tmp_path, rng, order) -> None:
     assert alpha == pytest.approx(expected_difference(frame, plate, False), abs=1e-5)
 
 
-def test_tiles_give_exactly_the_whole(tmp_path, rng) -> None:
+def test_tiles_give_exactly_the_whole(tmp_path, rng, monkeypatch) -> None:
     network = load_network(torchscript(Difference(), tmp_path / "net.pt"), BGMV2)
     frame, plate = pair(rng, 333, 501)
     frame = cv2.addWeighted(frame, 0.1, plate, 0.9, 0)
     whole = background_alpha(network, frame, plate, 1024)
-    tiled = background_alpha(network, frame, plate, 192, overlap=64)
+    monkeypatch.setattr("pipelines.matte.learned.OVERLAP", 64)
+    tiled = background_alpha(network, frame, plate, 192)
     assert np.array_equal(whole, tiled) and whole.std() > 0.02
 
 

@@ -117,15 +117,17 @@ def test_the_mesh_alone_labels_itself_exactly() -> None:
         assert overlap(labels, scene.labels, name) > 0.98, name
 
 
-def test_a_rim_beyond_the_mesh_is_as_the_mesh_and_what_is_far_off_is_hair() -> None:
+def test_a_rim_beyond_the_mesh_is_as_the_mesh_and_what_is_far_off_is_hair(monkeypatch) -> None:
     scene = make_scene(0, hair=False)
     small = make_head(0.93 * scene.head.vertices, np.eye(3), scene.head.labels)
     cheek = np.flatnonzero(scene.labels[92])[0]  # leftmost pixel of the head at the mouth's height
     wide = scene.alpha.copy()
     wide[20:60, 10:15] = 1  # something 10 cm beside the head
-    labels = head_geometry(small, scene.camera, wide, None, rim_m=0.008).labels()
+    monkeypatch.setattr("pipelines.regions.geometry.RIM_M", 0.008)
+    labels = head_geometry(small, scene.camera, wide, None).labels()
     assert LABELS[labels[92, cheek]] in ("skin", "neck") and LABELS[labels[40, 12]] == "hair"
-    none = head_geometry(small, scene.camera, wide, None, rim_m=0).labels()
+    monkeypatch.setattr("pipelines.regions.geometry.RIM_M", 0.0)
+    none = head_geometry(small, scene.camera, wide, None).labels()
     assert LABELS[none[92, cheek]] == "hair"
 
 
