@@ -147,7 +147,7 @@ def run_report(args: argparse.Namespace) -> int:
 
 def run_preview(args: argparse.Namespace) -> int:
     """Write a contact sheet of a head model."""
-    from express50.files.images import write_image
+    from express50.files.images import check_ending, write_image
     from express50.head.load import load_head
     from express50.head.preview import contact_sheet
 
@@ -157,6 +157,7 @@ def run_preview(args: argparse.Namespace) -> int:
         yaws = (math.nan,)
     if not all(map(math.isfinite, yaws)):
         raise ConfigError(f"--yaws {args.yaws!r}: expected numbers with commas, such as 0,40,90")
+    check_ending(args.out)
     model = load_head(args.model)
     args.out.parent.mkdir(parents=True, exist_ok=True)
     write_image(args.out, contact_sheet(model, yaws, args.size))

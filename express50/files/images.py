@@ -198,14 +198,22 @@ def write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:
     spec.attribute("oiio:UnassociatedAlpha", 1)
     if ending == ".exr":  # otherwise its header would hold the time of writing
         spec.attribute("DateTime", "1970:01:01 00:00:00")
+    check_ending(path)
     target = oiio.ImageOutput.create(str(path))
-    if target is None or not target.open(str(path), spec):
-        why = (target or oiio).geterror()
-        why = why if target else "expected .png, .jpg, .tif or .exr as its ending"
-        raise FormatError(f"{path}: cannot be written ({why.strip()}); give another name")
+    if not target.open(str(path), spec):
+        why = target.geterror().strip()
+        raise FormatError(f"{path}: cannot be written ({why}); give another name")
     written = target.write_image(image.reshape(image.shape[0], image.shape[1], channels))
     if not target.close() or not written:
         raise FormatError(f"{path}: writing failed ({target.geterror().strip()})")
+
+
+def check_ending(path: Path) -> None:
+    """Raise FormatError unless a picture's name ends as one of the formats that are written."""
+    if oiio.ImageOutput.create(str(path)) is None:
+        oiio.geterror()  # otherwise it is printed when the process ends
+        why = "expected .png, .jpg, .tif or .exr as its ending"
+        raise FormatError(f"{path}: cannot be written ({why}); give another name")
 
 
 def encode_jpeg(image: np.ndarray, quality: int = 95) -> bytes:
