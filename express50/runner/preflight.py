@@ -68,8 +68,8 @@ def _folder_problems(dataset: Dataset, stages: Iterable[Stage]) -> Iterator[str]
             refused.setdefault(str(error.strerror), (error, []))[1].append(str(folder))
             if folder == root:
                 break  # on a read-only disk, those inside are refused too
-    for error, folders in refused.values():
-        yield not_writable(few(folders), error)
+    for first, folders in refused.values():
+        yield not_writable(few(folders), first)
 
 
 def _worker_problems(work: Sequence[tuple[Stage, Any]], pool: Pool) -> Iterator[str]:
