@@ -275,7 +275,7 @@ def estimate(
     Workers are processes of one core each. Only datasets of the first one's preset count.
     """
     # Imported here, because NumPy would slow every command.
-    from express50.dial.figures import MeasuredSize, forecast, typical_seconds
+    from express50.dial.laws import MeasuredSize, forecast, typical_seconds
 
     rows = []
     for stage in known:

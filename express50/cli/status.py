@@ -88,7 +88,7 @@ def add_commands(subparsers: Any) -> None:
     how.add_argument("--json", action="store_true", help="print the receipts as JSON")
     how.add_argument("--page", type=Path, metavar="FILE", help=page)
     serve = "serve this page, on this machine only"
-    how.add_argument("--serve", type=number(1, 65535), metavar="PORT", help=serve)
+    how.add_argument("--serve", type=number(0, 65535), metavar="PORT", help=serve)
 
 
 def show_status(args: argparse.Namespace) -> int:

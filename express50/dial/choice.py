@@ -18,7 +18,8 @@ import numpy as np
 from express50.console import count, format_seconds, format_table
 from express50.contract.stage import Stage
 from express50.dial.budget import Goal
-from express50.dial.figures import Cost, Footage, MeasuredSize, PilotFigures, Trial, typical_seconds
+from express50.dial.figures import Cost, Footage, PilotFigures, Trial
+from express50.dial.laws import MeasuredSize, typical_seconds
 from express50.dial.pilot import Ladder, standard_of
 from express50.dial.results import RESULTS, ResultKind
 from express50.errors import ConfigError

@@ -104,7 +104,7 @@ def test_what_counts_as_certain_lies_inside_the_head_model() -> None:
 
 
 def test_what_shows_no_face_is_refused() -> None:
-    with pytest.raises(StageError, match="no face found.*matte.method to salient"):
+    with pytest.raises(StageError, match="no face found.*matte.method=salient"):
         alpha_of(np.repeat(data.brick()[..., None], 3, axis=2))
     with pytest.raises(ConfigError, match="key and grabcut take no weights"):
         MatteConfig(method="grabcut", weights="net.pt")

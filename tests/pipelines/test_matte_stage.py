@@ -151,7 +151,7 @@ def test_keying_without_a_plate_or_a_face_is_refused(tmp_path) -> None:
     summary = run(dataset)
     assert [o.status for o in summary.outcomes] == ["failed"] * 2
     assert "no face found" in summary.outcomes[0].reason
-    assert "give plates" in summary.outcomes[0].reason
+    assert "record plates" in summary.outcomes[0].reason
 
 
 def test_keyed_mattes_are_8_bit_and_the_same_twice(aligned) -> None:

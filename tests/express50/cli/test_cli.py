@@ -213,7 +213,7 @@ def test_bad_item_gives_exit_code_1_and_is_named(run, data, capture, tmp_path):
         ),
         (["twin", "record", "DATA", "--workers", "0"], 2, "--workers: got '0', expected a whole"),
         (["shards", "split", "DATA", "OUT", "--shard-mb", "0"], 2, "--shard-mb: got '0'"),
-        (["status", "DATA", "--serve", "0"], 2, "expected a whole number, 1 to 65535"),
+        (["status", "DATA", "--serve=-1"], 2, "expected a whole number, 0 to 65535"),
         (["plan", "DATA", "--size=-9x-9"], 2, "got '-9x-9', expected WIDTHxHEIGHT"),
         (["ingest", "CAP"], 2, "is a capture; expected 'express50 ingest DATASET "),
         (["matte", "CAP"], 2, "is a capture; expected 'express50 matte DATASET'"),

@@ -17,7 +17,6 @@ from tests.express50.dial.toy_chain import PAUSE, captures_of, chain_of
         (["--error", "0.5"], "such as 0.5mm"),
         (["--budget", "1h", "--first", "align"], "omit --first and --last"),
         (["--budget", "1h", "--preset", "draft"], "--error choose the settings"),
-        (["--budget", "1h", "--workers", "-1"], "--workers"),
         (["--budget", "1h", "--set", "track.sampels=1"], "did you mean 'samples'"),
     ],
 )

@@ -265,7 +265,7 @@ def test_a_file_that_is_not_a_ledger_is_one_error_without_advice_to_delete_it(tm
 def test_a_port_that_cannot_be_is_one_error(tmp_path, capsys):
     of(tmp_path, None, [], 2.0)
     assert main(["status", str(tmp_path), "--serve", "70000"]) == 2
-    assert "expected 0 to 65535" in capsys.readouterr().err
+    assert "expected a whole number, 0 to 65535" in capsys.readouterr().err
 
 
 def test_status_reads_ledgers_of_before_runs_were_kept_and_writes_nothing(tmp_path, capsys):
