@@ -235,7 +235,7 @@ def _predictor(
     """Return a function from a relative pose to its prediction's error (F,), pixels, per view."""
     counts = np.array([len(view.points) for view in views])
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    ideal = np.concatenate([view.ideal for view in views])
+    ideal, focal = np.concatenate([view.ideal for view in views]), camera.focal
     # One stack of points per alternative; a view with a single pose repeats it.
     stacks = [
         np.concatenate(
@@ -253,7 +253,7 @@ def _predictor(
             placed = transform_points(pose, stack)
             ahead = np.where(placed[:, 2:] > 0, placed[:, 2:], 1e-9)
             squared = np.sum((placed[:, :2] / ahead - ideal) ** 2, axis=1)
-            errors.append(np.sqrt(np.add.reduceat(squared, starts) / counts) * camera.focal)
+            errors.append(np.sqrt(np.add.reduceat(squared, starts) / counts) * focal)
         return np.minimum(*errors)
 
     return predict
