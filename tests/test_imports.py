@@ -147,6 +147,16 @@ def test_there_is_no_import_cycle():
         visit(name, [])
 
 
+def test_a_program_starts_when_its_module_is_complete():
+    wrong = [
+        name
+        for name, tree in trees().items()
+        for node in tree.body[:-1]
+        if isinstance(node, ast.If) and "__main__" in ast.unparse(node.test)
+    ]
+    assert wrong == [], "the call of main() comes last"
+
+
 def test_class_names_are_unique():
     counts = Counter(
         node.name for tree in trees().values() for node in tree.body

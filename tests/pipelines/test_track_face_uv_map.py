@@ -237,7 +237,7 @@ def test_the_window_holds_every_landmark(chart) -> None:
 def test_training_goes_on_where_it_was_stopped(tmp_path, monkeypatch, head) -> None:
     monkeypatch.setattr("pipelines.track.face_uv_training.train.FILE_CASES", 2)
     monkeypatch.setattr("pipelines.track.face_uv_training.train.BATCH", 2)
-    monkeypatch.setattr("express50.landmarks.training.train.KEEP_EVERY", 2)
+    monkeypatch.setattr("express50.landmarks.training.descent.KEEP_EVERY", 2)
     plan = UvTrainingPlan(steps=4, files=1)
     whole = train([head], plan, tmp_path / "one").state_dict()
     steps = iter(range(3))

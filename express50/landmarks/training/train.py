@@ -14,12 +14,10 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -27,8 +25,6 @@ import torch
 from torch.nn import functional
 
 from express50.contract.config import field_documents
-from express50.errors import TrainError
-from express50.files.arrays import read_weights
 from express50.head import BUILTIN_NAME
 from express50.head.load import load_head
 from express50.head.model import HeadModel
@@ -45,11 +41,11 @@ from express50.landmarks.network import (
     Output,
     as_input,
     eye_net,
-    heat_loss,
     mouth_net,
     save_network,
     trainable_network,
 )
+from express50.landmarks.training.descent import laplace_loss, minimise, place_loss, point_loss
 from express50.landmarks.training.random_heads import BLINKS, random_head
 from express50.landmarks.training.scene import HeadScene, TrainingView
 from express50.landmarks.training.views import (
@@ -74,10 +70,6 @@ FILE_HEADS = 100
 SHIFT, GROWTH, TURN = 0.05, 0.12, 0.08
 Rng = np.random.Generator
 SMALL_EVERY = 4  # after the small steps, one in this many stays small, for blurred faces
-WARM_UP = 100
-HIGH_SHARE = 0.65  # of the run; then the learning rate falls linearly
-KEEP_EVERY = 100
-Net = TypeVar("Net", bound=torch.nn.Module)
 
 
 @dataclass(frozen=True)
@@ -215,7 +207,7 @@ def train(
         return crop_loss(net, crops)
 
     rate, steps = RATE_ON if start else RATE, plan.steps if set(parts) - set(CLOSE_UPS) else 0
-    return descend(net, steps, rate, folder / f"training-{name}.pt", loss_at)
+    return minimise(net, steps, rate, folder / f"training-{name}.pt", loss_at)
 
 
 def draw_close_ups(part: Part, model: HeadModel, heads: int, rng: Rng) -> list[CloseView]:
@@ -273,26 +265,7 @@ def train_part(part: Part, models: list[HeadModel], folder: Path, seed: int) -> 
 
     names = "-".join(model.name for model in models)
     state = folder / f"{part.name}-training-{names}-{seed}.pt"
-    return descend(net, part.steps, RATE, state, loss_at)
-
-
-def point_loss(
-    output: Output, points: torch.Tensor, first: int = 0
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return losses and distances (B, N) of the landmarks from `first` on to points (B, N, 2).
-
-    The loss sums distance, likelihood and cross entropy; distances are in crop pixels.
-    """
-    found = output.points[:, first:], output.log_scale[:, first:], output.heat[:, first:]
-    return place_loss(*found, points)
-
-
-def place_loss(
-    found: torch.Tensor, log_scale: torch.Tensor, heat: torch.Tensor, points: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return losses and distances (B, N) of found points (B, N, 2), see `point_loss`."""
-    loss, distance = laplace_loss(found, log_scale, points)
-    return loss + heat_loss(heat, points), distance
+    return minimise(net, part.steps, RATE, state, loss_at)
 
 
 def crop_loss(net: LandmarkNet, crops: list[TrainingCrop]) -> torch.Tensor:
@@ -315,61 +288,3 @@ def crop_loss(net: LandmarkNet, crops: list[TrainingCrop]) -> torch.Tensor:
 
 if __name__ == "__main__":
     raise SystemExit(main())
-
-
-def descend(
-    net: Net, steps: int, rate: float, state: Path, loss_at: Callable[[int], torch.Tensor]
-) -> Net:
-    """Minimise the loss of every step; an interrupted run continues from the file `state`.
-
-    Parameters that require no gradient do not change.
-    """
-    trained = [part for part in net.parameters() if part.requires_grad]
-    optimiser = torch.optim.AdamW(trained, lr=rate, weight_decay=1e-3)
-    first = load_state(state, net, optimiser)
-    began, losses = time.monotonic(), []
-    for step in range(first, steps):
-        fall = (steps - step) / (steps * (1.0 - HIGH_SHARE))
-        optimiser.param_groups[0]["lr"] = rate * min(1.0, (step + 1) / WARM_UP, max(fall, 0.01))
-        loss = loss_at(step)
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(trained, 5.0)
-        optimiser.step()
-        losses.append(loss.item())
-        if (step + 1) % KEEP_EVERY == 0:
-            seconds = (time.monotonic() - began) / (step + 1 - first)
-            recent = np.mean(losses[-KEEP_EVERY:])
-            print(f"step {step + 1}: loss {recent:.3f}, {seconds:.2f} s", flush=True)
-            save_state(state, net, optimiser, step + 1)
-    return net.eval()
-
-
-def laplace_loss(
-    found: torch.Tensor, log_scale: torch.Tensor, points: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return losses and distances (B, N) of found points (B, N, 2), pixels.
-
-    The loss sums the distance and the negative log-likelihood of a Laplace distribution.
-    """
-    # The added 0.01 px^2 bounds the slope at zero distance.
-    distance = ((found - points).square().sum(-1) + 0.01).sqrt()
-    return 0.2 * distance + (2 * log_scale + distance * torch.exp(-log_scale)), distance
-
-
-def save_state(path: Path, net: Net, optimiser: torch.optim.Optimizer, step: int) -> None:
-    """Write the state of a run before its step of this number."""
-    part = path.with_suffix(".part")
-    torch.save({"net": net.state_dict(), "optimiser": optimiser.state_dict(), "step": step}, part)
-    part.replace(path)
-
-
-def load_state(path: Path, net: Net, optimiser: torch.optim.Optimizer) -> int:
-    """Read a state of `save_state` if there is one; return the next step."""
-    if not path.exists():
-        return 0
-    state = read_weights(path, TrainError, str(path), "a training state", "delete it")
-    net.load_state_dict(state["net"])
-    optimiser.load_state_dict(state["optimiser"])
-    print(f"continuing from step {state['step']} ({path}; delete it to start over)")
-    return state["step"]

@@ -32,7 +32,7 @@ from express50.landmarks.network import (
     save_network,
     trainable_network,
 )
-from express50.landmarks.training.train import descend, point_loss
+from express50.landmarks.training.descent import minimise, point_loss
 from express50.landmarks.training.views import made_once
 from pipelines.track.config import UV_WEIGHTS
 from pipelines.track.face_uv import (
@@ -130,7 +130,7 @@ def train(
         batch = make_batch([warped(cases[pick], rng) for pick in picks], rng)
         return marks_loss(net, batch)[0]
 
-    return descend(net, plan.steps, RATE, folder / f"uv_map-training-{name}.pt", loss_at)
+    return minimise(net, plan.steps, RATE, folder / f"uv_map-training-{name}.pt", loss_at)
 
 
 def open_cases(folder: Path, model: HeadModel, number: int, seed: int) -> list[Case]:

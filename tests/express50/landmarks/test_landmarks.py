@@ -33,9 +33,10 @@ from express50.landmarks.network import (
     load_network,
     save_network,
 )
+from express50.landmarks.training.descent import minimise
 from express50.landmarks.training.random_heads import random_head, random_parameters
 from express50.landmarks.training.scene import HeadScene, TrainingView
-from express50.landmarks.training.train import crop_loss, descend, main, start_network
+from express50.landmarks.training.train import crop_loss, main, start_network
 from express50.landmarks.training.views import (
     FACE_YAW,
     draw_views,
@@ -214,7 +215,7 @@ def test_training_a_part_holds_all_else(tmp_path: Path) -> None:
     crops = [random_crop(view, backgrounds, rng) for view in views]
     net = start_network(WEIGHTS, ("outline",))
     before = {name: value.clone() for name, value in net.state_dict().items()}
-    descend(net, 2, 1e-2, tmp_path / "state.pt", lambda step: crop_loss(net, crops))
+    minimise(net, 2, 1e-2, tmp_path / "state.pt", lambda step: crop_loss(net, crops))
     changed = {name for name, value in net.state_dict().items() if not value.equal(before[name])}
     assert changed == {name for name, _ in net.named_parameters() if name.startswith("outline.")}
 
