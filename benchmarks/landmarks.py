@@ -27,6 +27,7 @@ import numpy as np
 import torch
 
 from benchmarks.common import make_parser
+from express50.files.images import contact_sheet, write_image
 from express50.head.load import load_head
 from express50.landmarks import WEIGHTS
 from express50.landmarks.detector import detect, detect_many
@@ -199,17 +200,14 @@ def write_sheet(path: Path, net: LandmarkNet, frames: list[Frame], side: int = 2
     tiles = []
     for frame in frames:
         scale = side / max(frame.image.shape[:2])
-        tile = np.zeros((side, side, 3), np.uint8)
-        part = cv2.resize(frame.image, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-        tile[: part.shape[0], : part.shape[1]] = part[:side, :side]
+        tile = cv2.resize(frame.image, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
         found = detect(net, frame.image).marks()
         for points, color in ((frame.points, (0, 255, 0)), (found, (255, 0, 0))):
             for x, y in points * scale:
                 cv2.circle(tile, (int(x), int(y)), 1, color, -1)
         tiles.append(tile)
-    tiles += [np.zeros((side, side, 3), np.uint8)] * (-len(tiles) % 9)
-    rows = [np.hstack(tiles[start : start + 9]) for start in range(0, len(tiles), 9)]
-    cv2.imwrite(str(path), np.vstack(rows)[..., ::-1])
+    rows = [tiles[start : start + 9] for start in range(0, len(tiles), 9)]
+    write_image(path, contact_sheet(rows, tile=(side, side)))
 
 
 if __name__ == "__main__":

@@ -60,7 +60,7 @@ from express50.geometry.sampling import evenly
 from express50.twin import TwinConfig
 from express50.twin.truth import Truth
 from pipelines.matte import MatteConfig
-from pipelines.matte.consensus import agree
+from pipelines.matte.consensus import compare_mattes
 from pipelines.matte.cutout import CutView, cut_out, make_cut_view, soft_alpha
 from pipelines.matte.key import key_alpha
 from pipelines.matte.plates import LEAST_SHARE, match_plate
@@ -164,7 +164,7 @@ def measure(keyed: list[Keyed], sheet: Path | None) -> Figures:
     if ball is None:
         sys.exit("the rig looks at no one place; name another --dataset")
     views = [make_view(k.shot.camera, ball, k.shot.frame, k.alpha) for k in keyed]
-    found = agree(views)
+    found = compare_mattes(views)
     after = [
         corrected(k.alpha, found.removed.get(k.shot.camera.id), found.filled.get(k.shot.camera.id))
         for k in keyed

@@ -149,7 +149,7 @@ def run_preview(args: argparse.Namespace) -> int:
     """Write a contact sheet of a head model."""
     from express50.files.images import check_ending, write_image
     from express50.head.load import load_head
-    from express50.head.preview import contact_sheet
+    from express50.head.preview import pose_sheet
 
     try:
         yaws = tuple(float(part) for part in args.yaws.split(","))
@@ -160,6 +160,6 @@ def run_preview(args: argparse.Namespace) -> int:
     check_ending(args.out)
     model = load_head(args.model)
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    write_image(args.out, contact_sheet(model, yaws, args.size))
+    write_image(args.out, pose_sheet(model, yaws, args.size))
     say(f"wrote {args.out}: {model.name}, {len(model.template)} vertices")
     return OK

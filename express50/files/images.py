@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import mmap
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -198,8 +198,7 @@ def write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:
     spec.attribute("oiio:UnassociatedAlpha", 1)
     if ending == ".exr":  # otherwise its header would hold the time of writing
         spec.attribute("DateTime", "1970:01:01 00:00:00")
-    check_ending(path)
-    target = oiio.ImageOutput.create(str(path))
+    target = _make_output(path)
     if not target.open(str(path), spec):
         why = target.geterror().strip()
         raise FormatError(f"{path}: cannot be written ({why}); give another name")
@@ -210,10 +209,16 @@ def write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:
 
 def check_ending(path: Path) -> None:
     """Raise FormatError unless a picture's name ends as one of the formats that are written."""
-    if oiio.ImageOutput.create(str(path)) is None:
+    _make_output(path)
+
+
+def _make_output(path: Path) -> oiio.ImageOutput:
+    output = oiio.ImageOutput.create(str(path))
+    if output is None:
         oiio.geterror()  # otherwise it is printed when the process ends
         why = "expected .png, .jpg, .tif or .exr as its ending"
         raise FormatError(f"{path}: cannot be written ({why}); give another name")
+    return output
 
 
 def encode_jpeg(image: np.ndarray, quality: int = 95) -> bytes:
@@ -482,7 +487,7 @@ def fit_into(image: np.ndarray, height: int, width: int) -> np.ndarray:
     return tile
 
 
-_LABEL = (cv2.FONT_HERSHEY_SIMPLEX, 0.42, (255, 255, 255), 1, cv2.LINE_AA)
+WHITE, ALARM = (255, 255, 255), (255, 120, 90)
 
 
 def contact_sheet(
@@ -490,10 +495,12 @@ def contact_sheet(
     labels: Sequence[str | Sequence[str]] = (),
     tile: tuple[int, int] = (160, 160),
     captions: Sequence[str] = (),
+    alarming: Collection[str] = (),
 ) -> np.ndarray:
     """Lay out rows of images as one picture (H, W, 3) uint8.
 
-    A row's label is one text, or one per image; ``captions`` stand above the columns.
+    A row's label is one text, or one per image; ``captions`` stand above the columns. Labels that
+    are ``alarming`` are red.
     """
     columns = max((len(row) for row in rows), default=1)
     blank = np.full((*tile, 3), 24, np.uint8)
@@ -507,20 +514,30 @@ def contact_sheet(
         if number < len(labels) and labels[number]:
             line[:20] //= 3  # a dark band, so that white text is legible on any picture
             label = labels[number]
-            _write_texts(line, [label] if isinstance(label, str) else label, tile[1])
+            texts = [label] if isinstance(label, str) else label
+            _write_texts(line, texts, tile[1], alarming)
         lines.append(line)
     return np.concatenate(lines, axis=0) if lines else blank
 
 
-def _write_texts(line: np.ndarray, texts: Sequence[str], step: int) -> None:
+def _write_texts(
+    line: np.ndarray, texts: Sequence[str], step: int, alarming: Collection[str] = ()
+) -> None:
     for number, text in enumerate(texts):
         end = None if len(texts) == 1 else (number + 1) * step
-        cv2.putText(line[:, number * step : end], text, (5, 14), *_LABEL)
+        colour = ALARM if text in alarming else WHITE
+        font = cv2.FONT_HERSHEY_SIMPLEX
+        cv2.putText(line[:, number * step : end], text, (5, 14), font, 0.42, colour, 1, cv2.LINE_AA)
 
 
-def tile_sheet(pictures: Mapping[str, np.ndarray], columns: int, side: int) -> np.ndarray:
-    """Lay out named pictures in rows of square tiles, each with its name above it."""
+def tile_sheet(
+    pictures: Mapping[str, np.ndarray], columns: int, side: int, alarming: Collection[str] = ()
+) -> np.ndarray:
+    """Lay out named pictures in rows of square tiles, each with its name above it.
+
+    Names that are ``alarming`` are red.
+    """
     names = list(pictures)
     rows = [names[k : k + columns] for k in range(0, len(names), columns)]
     tiles = [[pictures[name] for name in row] for row in rows]
-    return contact_sheet(tiles, rows, (side, side))
+    return contact_sheet(tiles, rows, (side, side), alarming=alarming)

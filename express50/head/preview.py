@@ -126,7 +126,7 @@ def _shade(
     return np.stack([total, gloss], 1)
 
 
-def contact_sheet(
+def pose_sheet(
     model: HeadModel, yaws: tuple[float, ...] = (0.0, 40.0, 90.0), size: int = 256
 ) -> Array:
     """Render a row per pose of POSES and a column per yaw as one picture (H, W, 3) uint8."""

@@ -75,7 +75,7 @@ class Agreement:
     unchanged: str = ""
 
 
-def agree(views: Sequence[MatteView], cells: int = CELLS) -> Agreement:
+def compare_mattes(views: Sequence[MatteView], cells: int = CELLS) -> Agreement:
     """Compare the views of one frame set, on `cells` cells along each side of space."""
     doubted = {view.name: why for view in views if (why := _why_useless(view))}
     # Most of the others must be right; otherwise the wrong ones cannot be identified.

@@ -19,7 +19,7 @@ from express50.errors import CaptureError, NoFaceError, StageError
 from express50.files.images import box_about, shrink, tile_sheet, write_image
 from express50.geometry.cameras import Camera, pinhole, resized
 from express50.geometry.sampling import local_moments, undistorted_mask
-from pipelines.matte.consensus import SIDE, Agreement, agree
+from pipelines.matte.consensus import SIDE, Agreement, compare_mattes
 from pipelines.matte.cutout import CutView, cut_out, make_cut_view, soft_alpha
 from pipelines.matte.key import dilated, key_alpha
 from pipelines.matte.plates import (
@@ -85,7 +85,7 @@ def run(
         found = Agreement(unchanged="the cameras do not look at one place")
     else:
         views = [make_view(cameras[n], ball, m.rgb, m.alpha) for n, m in mattes.items()]
-        found = agree(views)
+        found = compare_mattes(views)
     final = {
         name: corrected(alpha, found.removed.get(name), found.filled.get(name))
         for name, alpha in alphas.items()

@@ -176,8 +176,8 @@ def splat(shape: tuple[int, int], pixels: np.ndarray, spread: int) -> np.ndarray
 VOTES = 2  # other cameras that must see clear background for a place to be empty
 MARGIN = 0.01  # share of the longer side: distance from a silhouette that proves nothing
 COLOUR = 0.1  # share of full scale by which one surface may differ between neighbouring cameras
-MOST = 0.75  # share of the other views that must see a place for it to be solid
-ERRING = 8  # one in this many views may miss the same spot
+SEEING_SHARE = 0.75  # share of the other views that must see a place for it to be solid
+VIEWS_PER_MISS = 8  # one in this many views may miss the same spot
 THICK = 0.5  # share of a ray's median length in the hull under which it only grazes a corner
 NEIGHBOURS = 4  # cameras in which a surface's colour is looked up
 WIDEST = 0.2  # cosine of the largest angle to them
@@ -213,8 +213,8 @@ def evidence_of(view: MatteView, space: Space, place: np.ndarray) -> Evidence:
     against = space.clear - (own == CLEAR)
     possible = place & (against < VOTES)
     seen = space.seen - (own != OUT)
-    sure = (space.solid - (own == SOLID) >= seen - seen // ERRING) & (
-        seen >= max(3.0, MOST * (len(space.labels) - 1))
+    sure = (space.solid - (own == SOLID) >= seen - seen // VIEWS_PER_MISS) & (
+        seen >= max(3.0, SEEING_SHARE * (len(space.labels) - 1))
     )
     # Neighbouring cells fall within this many pixels, so splats of this size leave no gaps.
     step = float(np.linalg.norm(view.projection[0, :3])) * float(space.axis[1] - space.axis[0])

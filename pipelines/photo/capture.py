@@ -42,7 +42,7 @@ from pipelines.calibrate.footage import focal_of_film
 from pipelines.track.basis import Basis, make_basis
 from pipelines.track.config import TrackConfig
 from pipelines.track.fit import fit
-from pipelines.track.observe import LandmarkView, agree, landmark_sigma
+from pipelines.track.observe import LandmarkView, landmark_sigma, triangulate_views
 from pipelines.track.read_inputs import DETECTOR_PASSES, open_landmarks
 from pipelines.track.report import draw_column
 from pipelines.track.schedule import LANDMARK_STEPS
@@ -313,7 +313,7 @@ def _cost(basis: Basis, detections: list[Detection], size: tuple[int, int], foca
     targets, poses = [], []
     for number, seen in enumerate(detections):
         view = LandmarkView(camera.id, camera, seen.points, seen.sigma, seen.score)
-        observation, _ = agree(f"frame {number}", number, [view])
+        observation, _ = triangulate_views(f"frame {number}", number, [view])
         try:
             poses.append(initial_pose(observation, template))
         except StageError:

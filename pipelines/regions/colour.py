@@ -35,7 +35,7 @@ DARK = 1e-3  # root of light that is added to pixels: keeps logarithms finite
 # Least spreads of the logarithms of brightness and of two ratios of colours; and how many are skin.
 LEAST_SPREAD, WITHIN = np.array([0.2, 0.03, 0.03]), 3.0
 RARE = 1e-6  # share of a cell without samples: keeps logarithms finite
-UNTAUGHT = 1.2e-4  # share of every cell of a class without samples: spread over 8000 cells
+UNSEEN_CLASS_SHARE = 1.2e-4  # of every cell of a class without samples: spread over 8000 cells
 
 # Places, metres above the neck's end, where geometry is sure of a class.
 SURE_BELOW, SURE_ABOVE = -0.01, 0.10
@@ -52,7 +52,7 @@ _ON_MESH = {
 }
 
 # Bare scalps.
-MOST = 4000  # pixels of scalp and of face that a view compares
+COMPARED_PIXELS = 4000  # pixels of scalp and of face that a view compares
 FLOOR = 2.0  # steps of Lab under which a spread of colours is noise
 ALIKE = 4.0  # spreads of the face's own colours from their middle
 BARE = 0.7  # share of the scalp in the face's colours that makes it bare
@@ -137,7 +137,7 @@ def label_by_colour(
         own, others = (c / np.float32(max(c.sum(), 1.0)) for c in (counts[1], skin_colours))
         counts[1] = SHARED * (own + others)
     # Log-likelihoods (3, H, W) of hair, skin and torso.
-    likely = np.full((3, *cells[0].shape), np.log(UNTAUGHT), np.float32)
+    likely = np.full((3, *cells[0].shape), np.log(UNSEEN_CLASS_SHARE), np.float32)
     for row, taught in zip(likely, counts, strict=True):
         if taught.sum() >= LEAST:
             shares = gaussian_filter(taught, SMOOTH) / taught.sum()
@@ -201,7 +201,7 @@ def scalp_votes(rgb: np.ndarray, labels: np.ndarray, alpha: np.ndarray) -> tuple
     """
 
     def evenly(rows: np.ndarray) -> np.ndarray:
-        chosen = np.linspace(0, len(rows) - 1, MOST).astype(int)
+        chosen = np.linspace(0, len(rows) - 1, COMPARED_PIXELS).astype(int)
         return rows[np.unique(chosen)] if len(rows) else rows
 
     lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB)

@@ -43,7 +43,8 @@ CELL_M = 0.002
 # Ends of the searched box about the middle of the eyes: to the sides, upwards, along the gaze.
 BOX_M = ((-0.08, 0.08), (-0.045, 0.04), (-0.03, 0.045))
 CLEAR_M, FAR_M = 0.003, 0.03  # from the mesh, between which glasses are looked for
-LEAST_VIEWS, ERRING = 4, 16  # views that see an odd colour; one in ERRING may see skin
+LEAST_VIEWS = 4  # that see an odd colour
+VIEWS_PER_MISS = 16  # one in this many views of odd colours may see skin
 LEAST_SKIN = 200  # pixels of skin in a view that is asked
 LEAST_CELLS = 20  # in a connected part that is kept
 FRONT_M, BRIDGE_M, REACH_M = 0.015, 0.005, 0.045  # depth of a rim, half a bridge, rim from its eye
@@ -106,7 +107,8 @@ def _unlike_skin(head: TrackedHead, pictures: Sequence[Picture], grid: np.ndarra
     ids = np.flatnonzero((apart > CLEAR_M) & (apart < FAR_M))
     odd, seen = np.zeros(len(ids), int), np.zeros(len(ids), int)
     for camera, rgb, alpha in pictures:
-        open_still = seen - odd <= len(pictures) // ERRING  # the others are skin, or beside it
+        # The others are skin, or beside it.
+        open_still = seen - odd <= len(pictures) // VIEWS_PER_MISS
         ids, odd, seen = ids[open_still], odd[open_still], seen[open_still]
         places = local[ids]
         mesh, _ = render_head(head, camera)
@@ -123,7 +125,7 @@ def _unlike_skin(head: TrackedHead, pictures: Sequence[Picture], grid: np.ndarra
         seen += inside
         odd += inside & (shown[row, column] > 0)
     found = np.zeros(len(grid), bool)
-    found[ids[(odd >= LEAST_VIEWS) & (seen - odd <= seen // ERRING)]] = True
+    found[ids[(odd >= LEAST_VIEWS) & (seen - odd <= seen // VIEWS_PER_MISS)]] = True
     return found
 
 

@@ -35,7 +35,7 @@ from pipelines.register.lay import (
 from pipelines.register.scan_input import GIVEN_M, Scan, check_face
 from pipelines.track.basis import OFF, Basis, make_basis
 from pipelines.track.fit import fit
-from pipelines.track.observe import JAW_LINE_WEIGHT, LandmarkView, Observation, agree
+from pipelines.track.observe import JAW_LINE_WEIGHT, LandmarkView, Observation, triangulate_views
 from pipelines.track.stage import fit_landmarks
 from pipelines.track.state import INNER, MIN_TRIANGULATED, State, Target, all_vertices
 from pipelines.track.terms import MeshPlaces, NormalTerm, PointTerm, landmark_anchors
@@ -141,7 +141,7 @@ def find_landmarks(scan: Scan, template: np.ndarray, given: np.ndarray) -> Obser
         raise StageError(INWARDS)
     views = views_about_face(source, painter, pose)
     if len(views) >= 2:
-        found = agree("scan", 0, views)[0]
+        found = triangulate_views("scan", 0, views)[0]
     elif known[INNER].sum() >= MIN_TRIANGULATED:
         nothing = np.full((68, 3), np.nan), np.full((68, 3, 3), np.nan)
         found = Observation("scan", 0, (), np.zeros((0, 68), bool), *nothing)

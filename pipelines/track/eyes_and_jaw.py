@@ -31,7 +31,7 @@ from express50.geometry.transforms import unit
 from express50.head.model import HeadModel, normals_of
 from express50.landmarks.irises import EYES
 from express50.landmarks.network import INNER_LIPS
-from pipelines.track.observe import LandmarkView, Observation, agree
+from pipelines.track.observe import LandmarkView, Observation, triangulate_views
 from pipelines.track.state import Target
 from pipelines.track.terms import MeshPlaces, PixelTerm, ShutTerm, Sighting, landmark_anchors
 
@@ -236,7 +236,7 @@ def shut_lids(
                 points[upper] = points[lower] + GAP * (points[upper] - points[lower])
             views.append(replace(view, points=points))
         if views:
-            observation, _ = agree(observation.expression, observation.frame, views)
+            observation, _ = triangulate_views(observation.expression, observation.frame, views)
             observation = replace(observation, shut=tuple(np.flatnonzero(sides).tolist()))
         found.append(observation)
     return found

@@ -78,7 +78,9 @@ class Observation:
     shut: tuple[int, ...] = ()
 
 
-def agree(expression: str, frame: int, views: list[LandmarkView]) -> tuple[Observation, list[str]]:
+def triangulate_views(
+    expression: str, frame: int, views: list[LandmarkView]
+) -> tuple[Observation, list[str]]:
     """Triangulate robustly and leave out whole views that disagree with the rest.
 
     Returns:

@@ -27,7 +27,7 @@ from express50.landmarks.network import LandmarkNet, face_box, load_network
 from express50.landmarks.sources import Marked, Source, open_source
 from pipelines.calibrate.footage_rig import mean_landmarks
 from pipelines.track.eyes_and_jaw import shut_lids
-from pipelines.track.observe import LandmarkView, Observation, agree, place_head
+from pipelines.track.observe import LandmarkView, Observation, place_head, triangulate_views
 from pipelines.track.outline import matte_distance
 from pipelines.track.surface import CutCrops, FrameSetCrops, cut_crop, root_light
 
@@ -103,7 +103,7 @@ def observe_peaks(
         if not views:
             dropped.append(Note(expression, "no camera sees a face"))
             continue
-        observation, refused = agree(expression, peaks[expression], views)
+        observation, refused = triangulate_views(expression, peaks[expression], views)
         why = "its landmarks disagree with the other cameras"
         dropped += [Note(f"{expression}/{camera_id}", why) for camera_id in refused]
         count = int(observation.inliers.sum(1).max())
@@ -168,7 +168,7 @@ def _find_face(
 
 def agreed(cue: str, frame: int, views: list[LandmarkView]) -> Observation | None:
     """Return what the views agree on; None if that is not a face."""
-    observation = agree(cue, frame, views)[0] if views else None
+    observation = triangulate_views(cue, frame, views)[0] if views else None
     if observation is None or observation.inliers.sum(1).max() < MIN_LANDMARKS:
         return None
     return observation

@@ -12,7 +12,7 @@ import torch
 
 from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.contract.layout import Dataset
-from express50.files.images import fit_into, write_image
+from express50.files.images import ALARM, tile_sheet, write_image
 from express50.geometry.cameras import Camera, pinhole_camera, project_pinhole
 from express50.geometry.conventions import affine_to_opencv
 from express50.geometry.raycast import camera_rays, mesh_scene
@@ -25,9 +25,9 @@ from pipelines.track.terms import PixelTerm
 
 TILE = 384
 SHEET_TILE, COLUMNS = 192, 8
-BAND, BAR = 20, 18  # heights of a tile's label and of a camera's row, pixels
+BAR = 18  # height of a camera's row, pixels
 ODD = 1.5  # times the median: such residuals are drawn in ALARM
-PLAIN, ALARM, GROUND, DIM = (225, 225, 225), (255, 120, 90), 24, (110, 160, 210)
+PLAIN, GROUND, DIM = (225, 225, 225), 24, (110, 160, 210)
 ResidualTable = Mapping[str, Mapping[str, float]]
 SEEN_COLOR, FITTED_COLOR = (255, 210, 0), (0, 255, 120)
 
@@ -128,7 +128,7 @@ def write_sheet(folder: Path, tiles: Mapping[str, np.ndarray], table: ResidualTa
     their landmarks, pixels (`landmark_rms_px`).
     """
     folder.mkdir(parents=True, exist_ok=True)
-    parts = [contact_sheet(tiles, expression_residuals(table)), camera_bars(table)]
+    parts = [expression_sheet(tiles, expression_residuals(table)), camera_bars(table)]
     width = max(part.shape[1] for part in parts)
     padded = [
         np.pad(part, ((0, 0), (0, width - part.shape[1]), (0, 0)), constant_values=GROUND)
@@ -151,31 +151,20 @@ def camera_residuals(table: ResidualTable) -> dict[str, tuple[float, int]]:
     return {camera: (_rms(found[camera]), len(found[camera])) for camera in sorted(found)}
 
 
-def contact_sheet(
-    tiles: Mapping[str, np.ndarray], residuals: Mapping[str, float] | None = None
-) -> np.ndarray:
-    """Draw all expressions (H, W, 3) uint8 as tiles, each with its name and residual in pixels.
+def expression_sheet(tiles: Mapping[str, np.ndarray], residuals: Mapping[str, float]) -> np.ndarray:
+    """Draw expressions (H, W, 3) uint8 as tiles, each with its residual in pixels and its name.
 
     Residuals far above the median stand out.
     """
-    known = residuals or {}
-    limit = ODD * float(np.median(list(known.values()))) if known else math.inf
+    limit = ODD * float(np.median(list(residuals.values()))) if residuals else math.inf
+    labels = {
+        name: f"{residuals[name]:.2f} px  {name}" if name in residuals else f"{name}: no landmarks"
+        for name in tiles
+    }
+    odd = [label for name, label in labels.items() if residuals.get(name, 0.0) > limit]
     columns = min(COLUMNS, max(1, math.ceil(math.sqrt(1.6 * len(tiles)))))
-    rows, height = -(-max(len(tiles), 1) // columns), SHEET_TILE + BAND
-    sheet = np.full((rows * height, columns * SHEET_TILE, 3), GROUND, np.uint8)
-    for number, (name, image) in enumerate(tiles.items()):
-        y, x = height * (number // columns), SHEET_TILE * (number % columns)
-        cell = sheet[y : y + height, x : x + SHEET_TILE]
-        cell[:SHEET_TILE] = fit_into(image, SHEET_TILE, SHEET_TILE)
-        residual = known.get(name)
-        colour = ALARM if residual is not None and residual > limit else PLAIN
-        value = "no landmarks" if residual is None else f"{residual:.2f} px"
-        room = SHEET_TILE - 10 - _width(value)
-        while len(name) > 1 and _width(name) > room:
-            name = name[:-1]
-        _write(cell, value, SHEET_TILE - 4 - _width(value), SHEET_TILE + 14, colour)
-        _write(cell, name, 4, SHEET_TILE + 14, colour)
-    return sheet
+    pictures = {labels[name]: image for name, image in tiles.items()}
+    return tile_sheet(pictures, columns, SHEET_TILE, odd)
 
 
 def camera_bars(table: ResidualTable) -> np.ndarray:

@@ -10,7 +10,7 @@ import pytest
 from express50.geometry.cameras import pinhole_camera, scale_camera, transform_camera
 from express50.geometry.transforms import look_at, make_transform
 from pipelines.matte import visual_hull
-from pipelines.matte.consensus import Agreement, agree
+from pipelines.matte.consensus import Agreement, compare_mattes
 from pipelines.matte.stage import corrected, make_view
 from pipelines.matte.visual_hull import MatteView, ball_of
 from tests.pipelines.bump_head import ring
@@ -34,7 +34,7 @@ def same(one: Agreement, other: Agreement) -> bool:
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_so_few_cameras_do_not_overrule_each_other(count):
-    found = agree(disturbed(make_views())[3 : 3 + count])
+    found = compare_mattes(disturbed(make_views())[3 : 3 + count])
     assert not found.removed and not found.filled
     assert f"{count} usable" in found.unchanged
 
@@ -42,7 +42,7 @@ def test_so_few_cameras_do_not_overrule_each_other(count):
 @pytest.mark.parametrize("value", [0.0, 1.0])
 def test_empty_and_full_mattes_are_all_reported_and_left(value):
     views = make_views()
-    found = agree([replace(v, alpha=np.full_like(v.alpha, value)) for v in views])
+    found = compare_mattes([replace(v, alpha=np.full_like(v.alpha, value)) for v in views])
     assert not found.removed and not found.filled and "0 usable" in found.unchanged
     assert len(found.warnings) == len(views)
 
@@ -51,19 +51,19 @@ def test_mattes_without_a_common_subject_change_nothing():
     views = make_views()
     rng = np.random.default_rng(0)
     scattered = {k: disc(*rng.uniform(0.1, 0.9, 2), 0.06) for k in range(len(views))}
-    found = agree(with_alpha(views, scattered))
+    found = compare_mattes(with_alpha(views, scattered))
     # Where nothing is possible nothing is ruled out: nobody knows who is wrong.
     assert not found.filled and not found.removed
     assert len(found.warnings) <= len(views) // 3
 
 
 def test_a_camera_amid_the_subject_or_turned_away_is_left_out():
-    clean = agree(disturbed(make_views()))
+    clean = compare_mattes(disturbed(make_views()))
     for center in (np.array([0.0, 0.0, 0.05]), np.array([0.0, 0.0, 1.1])):
         rig = [camera for camera, _, _ in shots()]
         pose = look_at(center, center + [0, 0, 1.0], np.array([0.0, 1.0, 0.0]))
         rig[0] = pinhole_camera("cam00", rig[0].K, SIZE, SIZE, pose)
-        found = agree(disturbed(make_views(cameras=rig)))
+        found = compare_mattes(disturbed(make_views(cameras=rig)))
         assert [note.what for note in found.warnings] == ["cam00"]
         assert set(found.removed) == set(clean.removed) and set(found.filled) == set(clean.filled)
 
@@ -85,7 +85,7 @@ def test_a_subject_cut_by_the_frames_edge_is_not_eaten():
         alpha[SIZE // 2 :], valid[SIZE // 2 :] = 0, False
         views.append(replace(view, alpha=alpha, valid=valid))
     assert len(rig) == len(views)
-    found = agree(views)
+    found = compare_mattes(views)
     assert not found.removed and not found.filled and not found.warnings
 
 
@@ -98,7 +98,7 @@ def test_pictures_a_pixel_wide_are_survived(size):
         alpha = np.full((size[1], size[0]), value, np.uint8)
         alpha[: size[1] // 2] = 255
         views = [make_view(camera, ball, image, alpha, 192) for camera in rig]
-        found = agree(views, 96)
+        found = compare_mattes(views, 96)
         for view in views:
             out = corrected(alpha, found.removed.get(view.name), found.filled.get(view.name))
             assert out.shape == alpha.shape and out.dtype == np.uint8
@@ -112,8 +112,8 @@ def test_units_and_the_worlds_origin_do_not_matter(scale, far):
         pose = transform_camera(camera, make_transform(np.eye(3), [far, -far, far])).cam_from_world
         pose[:3, 3] *= scale
         rig.append(replace(camera, cam_from_world=pose))
-    found = agree(disturbed(make_views(cameras=rig)))
-    clean = agree(disturbed(make_views()))
+    found = compare_mattes(disturbed(make_views(cameras=rig)))
+    clean = compare_mattes(disturbed(make_views()))
     assert clean.removed and clean.filled and same(found, clean)
 
 
@@ -121,6 +121,6 @@ def test_more_cameras_than_a_byte_counts(monkeypatch):
     monkeypatch.setattr(visual_hull, "VOTES", 40)  # each view is there 23 times
     views = disturbed(make_views())
     many = [replace(v, name=f"{v.name}-{k}") for k in range(23) for v in views]
-    found = agree(many, cells=16)
+    found = compare_mattes(many, cells=16)
     assert len(many) == 276
     assert {name[:5] for name in found.removed} == {"cam04"}

@@ -25,7 +25,7 @@ from pipelines.track.basis import Basis, Points, make_basis
 from pipelines.track.config import TrackConfig
 from pipelines.track.eyes_and_jaw import contour_points
 from pipelines.track.fit import fit
-from pipelines.track.observe import LandmarkView, agree, landmark_sigma
+from pipelines.track.observe import LandmarkView, landmark_sigma, triangulate_views
 from pipelines.track.state import Target, initial_pose, start_state
 from pipelines.track.terms import landmark_anchors
 
@@ -45,7 +45,7 @@ def seen() -> Detection:
 def fit_one(basis: Basis, face: Detection, camera: Camera) -> tuple[np.ndarray, float]:
     """World landmarks (68, 3) of a single-view fit, and their error between brows and mouth, px."""
     view = LandmarkView(camera.id, camera, face.points, face.sigma, face.score)
-    observation, _ = agree("photo", 0, [view])
+    observation, _ = triangulate_views("photo", 0, [view])
     template = landmarks_of(basis.model)
     start = start_state(basis, [initial_pose(observation, template)])
     target = Target(observation, landmark_sigma(observation), False)

@@ -20,7 +20,7 @@ from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head
 
 
 class Dressed(EllipsoidSource):
-    """The toy head with a bright shirt before its lower end."""
+    """The toy head with a bright shirt in front of its lower end."""
 
     def read(self, index):
         sample = super().read(index)
@@ -70,7 +70,7 @@ def test_a_matte_without_torso_or_labels_is_taken_as_it_is():
         assert float(item.target[:, 58:, 20:44].min()) == 1 and item.mask[58:].all()
 
 
-def test_nothing_is_drawn_behind_the_torso_and_all_before_it():
+def test_nothing_is_drawn_behind_the_torso_and_all_in_front_of_it():
     hiding = DataConfig(hide_behind_torso=True, background=0.25)
     item = HeadViews(Behind(size=64), ellipsoid_head(), hiding).item(0)
     picture, depth = torch.full((3, 64, 64), 0.5), torch.full((64, 64), 0.6)
@@ -90,7 +90,7 @@ def necked_head():
     return replace(head, regions=head.regions | {"neck": head.template[:, 1] < -0.03})
 
 
-def test_a_torso_before_the_neck_hides_it_and_beside_it_nothing():
+def test_a_torso_in_front_of_the_neck_hides_it_and_nothing_beside_it():
     head = necked_head()
     K = torch.tensor([[140.0, 0, 32], [0, 140, 32], [0, 0, 1]], dtype=torch.float64)
     camera = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.matte.consensus import agree
+from pipelines.matte.consensus import compare_mattes
 from pipelines.matte.stage import corrected
 from tests.pipelines.matte_rig import SIZE, disc, make_views, with_alpha
 
@@ -22,7 +22,7 @@ def changed(found) -> set[str]:
 
 
 def test_views_that_agree_are_left_alone():
-    found = agree(make_views())
+    found = compare_mattes(make_views())
     assert changed(found) == set() and found.warnings == [] and found.unchanged == ""
 
 
@@ -30,7 +30,9 @@ def test_views_that_agree_are_left_alone():
 def test_what_only_some_cameras_see_is_removed_whole(cameras):
     views = make_views()
     shade = disc(0.12, 0.3, 0.09)
-    found = agree(with_alpha(views, {k: np.maximum(views[k].alpha, shade) for k in cameras}))
+    found = compare_mattes(
+        with_alpha(views, {k: np.maximum(views[k].alpha, shade) for k in cameras})
+    )
     assert changed(found) == {views[k].name for k in cameras} and found.warnings == []
     for k in cameras:
         gone = found.removed[views[k].name]
@@ -43,7 +45,7 @@ def test_a_shadow_that_touches_the_head_goes_up_to_the_hull():
     head = views[5].alpha > 0
     shade = disc(0.2, 0.45, 0.15) & ~head
     assert cv2.dilate(head.astype(np.uint8), np.ones((3, 3)))[shade].any()
-    found = agree(with_alpha(views, {5: np.maximum(views[5].alpha, 0.7 * shade)}))
+    found = compare_mattes(with_alpha(views, {5: np.maximum(views[5].alpha, 0.7 * shade)}))
     gone = found.removed[views[5].name]
     assert gone[shade].mean() > 0.6 and not gone[head].any()
 
@@ -55,8 +57,8 @@ def test_hair_at_the_rim_stays_and_a_cable_goes():
     hair, cable = views[5].alpha.copy(), views[5].alpha.copy()
     hair[top - 3 : top, column] = 0.8
     cable[:top, column] = 0.8
-    assert changed(agree(with_alpha(views, {5: hair}))) == set()
-    gone = agree(with_alpha(views, {5: cable})).removed[views[5].name]
+    assert changed(compare_mattes(with_alpha(views, {5: hair}))) == set()
+    gone = compare_mattes(with_alpha(views, {5: cable})).removed[views[5].name]
     assert gone[: top // 2, column].all() and not gone[views[5].alpha > 0].any()
 
 
@@ -64,7 +66,7 @@ def test_a_hole_is_filled_where_the_camera_shows_the_surface_the_others_see():
     views = make_views()
     hole = disc(0.5, 0.5, 0.09)
     holed = with_alpha(views, {5: np.where(hole, 0, views[5].alpha)})
-    found = agree(holed)
+    found = compare_mattes(holed)
     assert changed(found) == {views[5].name} and not found.removed
     assert found.filled[views[5].name][hole].mean() > 0.95
 
@@ -74,13 +76,13 @@ def test_a_gap_that_shows_the_backdrop_stays_open():
     hole = disc(0.5, 0.5, 0.09)
     holed = with_alpha(views, {5: np.where(hole, 0, views[5].alpha)})
     holed[5] = replace(holed[5], rgb=np.where(hole[..., None], BACKDROP, holed[5].rgb))
-    assert changed(agree(holed)) == set()
+    assert changed(compare_mattes(holed)) == set()
 
 
 def test_a_spot_that_neighbours_lack_too_is_filled_where_the_rig_is_dense():
     views = make_views()
     holes = {k: np.where(disc(0.5, 0.5, 0.06), 0, views[k].alpha) for k in (5, 6)}
-    found = agree(with_alpha(views, holes))
+    found = compare_mattes(with_alpha(views, holes))
     assert set(found.filled) == {views[5].name, views[6].name}
 
 
@@ -95,7 +97,7 @@ def test_one_wrong_camera_is_named_and_other_mattes_stay(wrong):
         "full": np.ones_like(alpha),
         "upside down": 1 - alpha,
     }[wrong]
-    found = agree(with_alpha(views, {3: bad}))
+    found = compare_mattes(with_alpha(views, {3: bad}))
     assert [note.what for note in found.warnings] == [views[3].name]
     assert changed(found) == set()
 
@@ -104,7 +106,7 @@ def test_empty_mattes_do_not_keep_a_wrong_one_from_being_named():
     views = make_views()
     nothing = {k: np.zeros((SIZE, SIZE)) for k in (0, 3, 6, 9)}
     wrong = np.roll(views[5].alpha, SIZE // 3, axis=1)
-    found = agree(with_alpha(views, nothing | {5: wrong}))
+    found = compare_mattes(with_alpha(views, nothing | {5: wrong}))
     assert {note.what for note in found.warnings} == {views[k].name for k in (*nothing, 5)}
     assert views[5].name not in changed(found)
 
@@ -113,7 +115,7 @@ def test_a_wrong_camera_does_not_hide_what_another_must_remove():
     views = make_views()
     shade = disc(0.12, 0.3, 0.09)
     bad = {3: 1 - views[3].alpha, 8: np.maximum(views[8].alpha, shade)}
-    found = agree(with_alpha(views, bad))
+    found = compare_mattes(with_alpha(views, bad))
     assert set(found.removed) == {views[8].name} and len(found.warnings) == 1
 
 
@@ -123,7 +125,7 @@ def test_no_blob_in_one_camera_removes_any_of_the_head(k, x, y, radius, hole):
     views = make_views()
     alpha, blob = views[k].alpha, disc(x, y, radius)
     bad = np.where(blob, 0, alpha) if hole else np.maximum(alpha, blob)
-    found = agree(with_alpha(views, {k: bad}))
+    found = compare_mattes(with_alpha(views, {k: bad}))
     for view in views:
         if view.name in found.removed:
             assert not found.removed[view.name][view.alpha > 0.5].any()

@@ -23,7 +23,7 @@ from express50.landmarks.irises import Irises
 from express50.landmarks.sources import Marked
 from pipelines.track import sequence
 from pipelines.track.basis import Points, freeze_shape
-from pipelines.track.observe import LandmarkView, Observation, agree
+from pipelines.track.observe import LandmarkView, Observation, triangulate_views
 from pipelines.track.read_inputs import read_clip
 from pipelines.track.sequence import (
     ClipTracker,
@@ -67,7 +67,7 @@ def observations(scene, noise: float, cameras=RIG, order: int = 1) -> list[Obser
         for camera in cameras:
             pixels = project(camera, marks)[0] + noise * rng.normal(size=(68, 2))
             views.append(LandmarkView(camera.id, camera, pixels, np.ones(68), 0.9))
-        found.append(agree("clip", frame, views)[0])
+        found.append(triangulate_views("clip", frame, views)[0])
     return found if order > 0 else found[::-1]
 
 

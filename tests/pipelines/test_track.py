@@ -22,7 +22,12 @@ from express50.landmarks.sources import Marked
 from pipelines.track.basis import Basis, Points, make_basis
 from pipelines.track.config import TrackConfig
 from pipelines.track.fit import consistent_sigma, fit
-from pipelines.track.observe import LandmarkView, agree, landmark_sigma, robust_triangulate
+from pipelines.track.observe import (
+    LandmarkView,
+    landmark_sigma,
+    robust_triangulate,
+    triangulate_views,
+)
 from pipelines.track.stage import shape_warnings
 from pipelines.track.state import EXPRESSION_MEAN, State, Target, initial_pose, prior, start_state
 from pipelines.track.terms import landmark_anchors
@@ -165,7 +170,7 @@ def test_a_view_that_shows_something_else_is_left_out() -> None:
     scene = make_scene()
     views = make_views(scene.marks, 0.3, [make_camera(angle) for angle in (-0.8, -0.3, 0.2, 0.7)])
     views[2].points[:] = np.random.default_rng(0).uniform(0, 400, (68, 2))
-    observation, refused = agree("smile", 3, views)
+    observation, refused = triangulate_views("smile", 3, views)
     assert refused == [views[2].camera_id]
     assert len(observation.views) == 3
 
@@ -178,7 +183,7 @@ def test_a_rig_in_another_unit_is_named(scale: float) -> None:
         moved = camera.cam_from_world.copy()
         moved[:3, 3] *= scale
         cameras.append(dataclasses.replace(camera, cam_from_world=moved))
-    observation, _ = agree("smile", 0, make_views(scene.marks * scale, 0.0, cameras))
+    observation, _ = triangulate_views("smile", 0, make_views(scene.marks * scale, 0.0, cameras))
     template = landmarks_of(scene.basis.model)
     words = f"the rig seems {scale:g}x off.* divide the camera translations by {scale:g} and"
     with pytest.raises(StageError, match=words):
@@ -186,7 +191,7 @@ def test_a_rig_in_another_unit_is_named(scale: float) -> None:
 
 
 def targets_of(scene: Scene, views: list[LandmarkView]) -> tuple[list[Target], list]:
-    observation, _ = agree("smile", 0, views)
+    observation, _ = triangulate_views("smile", 0, views)
     model = scene.basis.model
     start = initial_pose(observation, landmarks_of(model))
     return [Target(observation, landmark_sigma(observation), False)], [start]
@@ -195,7 +200,7 @@ def targets_of(scene: Scene, views: list[LandmarkView]) -> tuple[list[Target], l
 def test_exact_landmarks_give_the_mesh_back() -> None:
     """Weak priors, exact data: the fitted mesh is the true one, vertices without landmarks too."""
     scene = make_scene()
-    observation, _ = agree("smile", 0, make_views(scene.marks))
+    observation, _ = triangulate_views("smile", 0, make_views(scene.marks))
     views = tuple(dataclasses.replace(view, sigma=np.full(68, 0.02)) for view in observation.views)
     observation = dataclasses.replace(observation, views=views)
     template = landmarks_of(scene.basis.model)

@@ -21,7 +21,12 @@ from pipelines.track.eyes_and_jaw import (
     with_irises_and_jaw,
 )
 from pipelines.track.fit import fit
-from pipelines.track.observe import LandmarkView, agree, landmark_sigma, point_covariance
+from pipelines.track.observe import (
+    LandmarkView,
+    landmark_sigma,
+    point_covariance,
+    triangulate_views,
+)
 from pipelines.track.state import Target, initial_pose, start_state
 from pipelines.track.terms import MeshPlaces, PixelTerm, Sighting
 from tests.pipelines.test_track import RIG, make_camera, make_scene, make_views
@@ -98,7 +103,7 @@ def observed(head: HeadModel, mesh: np.ndarray, shift: np.ndarray) -> Target:
         irises = Irises(centres, np.full(2, 0.5), np.full(2, 0.9))
         points = project(camera, marks)[0]
         views.append(LandmarkView(camera.id, camera, points, np.ones(68), 0.9, irises))
-    observation, _ = agree("gaze", 0, views)
+    observation, _ = triangulate_views("gaze", 0, views)
     return Target(observation, landmark_sigma(observation), False)
 
 
@@ -172,7 +177,7 @@ def test_a_camera_given_ten_times_counts_as_one() -> None:
     bad = make_camera(0.0)
     points = project(bad, scene.marks)[0] + [5.0, 0.0]
     copies = [LandmarkView(f"copy{n}", bad, points, np.ones(68), 0.9) for n in range(9)]
-    observation, _ = agree("smile", 0, [*good, *copies])
+    observation, _ = triangulate_views("smile", 0, [*good, *copies])
     crowds = {view.camera_id: view.redundancy for view in observation.views}
     assert crowds[good[0].camera_id] == pytest.approx(1.0, abs=0.01)
     for view in observation.views:

@@ -12,7 +12,7 @@ from express50.geometry.cameras import project
 from express50.geometry.transforms import axis_angle_to_matrix
 from pipelines.track.basis import OFF, Basis, Points, make_basis
 from pipelines.track.fit import fit
-from pipelines.track.observe import LandmarkView, agree, landmark_sigma
+from pipelines.track.observe import LandmarkView, landmark_sigma, triangulate_views
 from pipelines.track.state import Pose, State, Target
 from pipelines.track.terms import MeshPlaces, NormalTerm
 from tests.express50.head.tiny_head import tiny_head
@@ -47,7 +47,7 @@ def shifted_targets(count: int, relief: bool) -> tuple[Basis, list[Target], Stat
         scene = make_scene(seed)
         marks = scene.marks + ERROR @ scene.rotation.T
         views = [LandmarkView(c.id, c, project(c, marks)[0], np.full(68, 0.3), 0.9) for c in RIG]
-        observation, _ = agree("smile", 0, views)
+        observation, _ = triangulate_views("smile", 0, views)
         target = Target(observation, landmark_sigma(observation), False)
         if relief:
             target = dataclasses.replace(target, terms=(exact_surface(scene),))

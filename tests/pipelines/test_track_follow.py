@@ -17,7 +17,7 @@ from express50.landmarks.sources import Marked
 from express50.landmarks.training.random_heads import random_head
 from express50.landmarks.training.views import HeadScene
 from pipelines.track.basis import freeze_shape
-from pipelines.track.observe import agree
+from pipelines.track.observe import triangulate_views
 from pipelines.track.read_inputs import (
     FOLLOWED_VIEWS,
     _facing_cameras,
@@ -95,7 +95,7 @@ def test_a_face_that_the_search_misses_is_found_where_the_rig_says(
     views = search_all_views(str, CAMERAS, 7, [search, search], stage.follow)
     assert stage.searched == searches * len(CAMERAS) - (searches - 1) * len(found)
     assert {view.camera_id for view in views} == set(_facing_cameras(CAMERAS, marks()))
-    observation, refused = agree("smile", 7, views)
+    observation, refused = triangulate_views("smile", 7, views)
     np.testing.assert_allclose(observation.points, marks(), atol=1e-6)
     assert not refused
     searched = search_all_views(str, CAMERAS, 7, [search], None)
@@ -110,7 +110,7 @@ def test_a_face_that_one_of_several_cameras_shows_is_warned_of() -> None:
         return seen if camera_id == "cam-0.50" else Stage(None).seen(camera_id)
 
     (view,) = search_all_views(str, CAMERAS, 7, [search], None)
-    alone, _ = agree("smile", 7, [view])
+    alone, _ = triangulate_views("smile", 7, [view])
     (note,) = single_view_warnings([alone], CAMERAS)
     assert note.what == "smile" and f"only cam-0.50 of {len(CAMERAS)} cameras shows" in note.why
     assert single_view_warnings([alone], {"cam-0.50": CAMERAS["cam-0.50"]}) == []
@@ -142,7 +142,7 @@ def test_after_a_cut_the_face_is_searched_for_anew(cut: float) -> None:
 
 def test_a_clip_begins_where_its_peak_was() -> None:
     views = make_views(marks(), cameras=list(CAMERAS.values())[1:-1])
-    peak = agree("smile", 3, views)[0]
+    peak = triangulate_views("smile", 3, views)[0]
     stage = Stage(marks(0.004))
     assert stage.look(None, [peak]) is not None and stage.searched == 0
     gone = Stage(marks(0.3))

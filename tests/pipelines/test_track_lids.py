@@ -19,7 +19,7 @@ from express50.landmarks.network import INNER_LIPS
 from pipelines.track.basis import make_basis
 from pipelines.track.eyes_and_jaw import shut_lids, shut_terms
 from pipelines.track.fit import fit
-from pipelines.track.observe import LandmarkView, Observation, agree, landmark_sigma
+from pipelines.track.observe import LandmarkView, Observation, landmark_sigma, triangulate_views
 from pipelines.track.state import Target, initial_pose, start_state
 from tests.express50.head.tiny_head import tiny_head
 from tests.pipelines.term_checks import cost_at, gradient_at, slope_along
@@ -55,7 +55,7 @@ def observe(found: np.ndarray, time: str, marks: np.ndarray | None = None) -> Ob
         irises = Irises(np.zeros((2, 2)), sigma, np.where(sides, 0.5, 0.0))
         pixels = project(camera, marks)[0]
         views.append(LandmarkView(camera.id, camera, pixels, np.ones(68), 0.9, irises))
-    return agree(time, TIMES.index(time), views)[0]
+    return triangulate_views(time, TIMES.index(time), views)[0]
 
 
 def gap(observation: Observation, side: int) -> float:

@@ -10,7 +10,7 @@ from express50.__main__ import main
 from express50.errors import HeadModelError
 from express50.files.images import read_image
 from express50.head.load import load_builtin
-from express50.head.preview import POSES, contact_sheet, expression_vector, render_preview
+from express50.head.preview import POSES, expression_vector, pose_sheet, render_preview
 
 
 def test_a_head_fills_the_middle_of_the_picture():
@@ -31,8 +31,8 @@ def test_a_name_without_a_side_sets_both():
         expression_vector(head, {"eyeBlonk": 1.0})
 
 
-def test_contact_sheet_has_a_row_per_pose():
-    sheet = contact_sheet(load_builtin(), yaws=(0.0,), size=24)
+def test_the_sheet_has_a_row_per_pose():
+    sheet = pose_sheet(load_builtin(), yaws=(0.0,), size=24)
     assert sheet.shape == (24 * len(POSES), 24, 3)
 
 
