@@ -120,7 +120,7 @@ def main() -> int:
     }
     row: dict[str, object] = {
         **figures(solution.cameras, true),
-        "stated_to_true_error": rounded(stated_figures(observations, points, sizes, true)),
+        "stated_to_true_error": stated_figures(observations, points, sizes, true),
         "reprojection_px_rms": rms(np.linalg.norm(solution.errors, axis=1)),
         **bump_figures(solution.cameras, index, args.bumps),
         "seconds": solved - start,
@@ -128,7 +128,7 @@ def main() -> int:
         "corners": len(solution.errors),
         "dropped": len(solution.dropped),
         **footage_figures(index, true, config, args.recording),
-        "baseline": {"opencv_chain": rounded(baseline)},
+        "baseline": {"opencv_chain": baseline},
     }
     if args.dataset is None:
         row |= gain_figures(palette, sorted(solution.cameras))

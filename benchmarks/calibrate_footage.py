@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common import rounded
 from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera, project, triangulate
 from express50.geometry.transforms import matrix_to_axis_angle, similarity_fit
@@ -59,7 +58,7 @@ def sfm_figures(
                 eye_distance_mm=config.eye_distance_mm,
             )  # fmt: skip
             row = similar(solved.cameras, rig) | {"weak": len(solved.weak)}
-            row |= rounded({"stated_to_true_error": stated_to_true(solved, rig)})
+            row |= {"stated_to_true_error": stated_to_true(solved, rig)}
         except CalibrationError as error:
             row = {"cameras_registered": 0, "cameras": len(rig), "refused": str(error)}
         rows[key] = row | {"seconds": round(time.process_time() - started, 2)}
@@ -108,7 +107,7 @@ def similar(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> dict
         "scale_error_percent": float(100 * abs(1 / scale - 1)),
         "focal_error_percent": float(np.mean(focals)),
     }
-    return count | rounded(errors)
+    return count | errors
 
 
 def refine_figures(
@@ -134,14 +133,14 @@ def refine_figures(
         "true_rig_left": bool(quiet.kept),
         "true_rig_head_px": judge(quiet.cameras, true)["head_px"],
     }
-    row = _of(judge(found.cameras, true)) | rounded(row) | {"seconds": round(seconds, 2)}
+    row = _of(judge(found.cameras, true)) | row | {"seconds": round(seconds, 2)}
     return {"before": _of(judge(bumped, true)), "footage": row}
 
 
 def _of(row: Mapping[str, float]) -> dict[str, object]:
     keys = ("rotation_error_deg", "rotation_error_deg_max", "translation_error_mm",
             "translation_error_mm_max", "head_px")  # fmt: skip
-    return rounded({key: row[key] for key in keys})
+    return {key: row[key] for key in keys}
 
 
 def perturbed(rig: Mapping[str, Camera]) -> dict[str, Camera]:

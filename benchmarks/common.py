@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+import shutil
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -20,6 +21,7 @@ from express50.capture.index import read_index
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
+from express50.files.calibration import read_cameras, write_cameras
 from express50.geometry.cameras import Camera, pinhole
 from express50.geometry.sampling import undistort_image, undistorted_mask
 from express50.runner.runner import run_stage
@@ -101,6 +103,16 @@ def write_peaks(
     path.write_text(json.dumps(rows))
 
 
+def keep_cameras(capture: Path, kept: Sequence[str]) -> None:
+    """Take all other cameras out of a capture with given calibration."""
+    cameras = read_cameras(capture / "calibration.json")
+    for name in set(cameras) - set(kept):
+        shutil.rmtree(capture / "cameras" / name)
+        (capture / "plates" / f"{name}.png").unlink(missing_ok=True)
+    (capture / "calibration.json").unlink()
+    write_cameras(capture / "calibration.json", {name: cameras[name] for name in kept})
+
+
 def in_own_process(function: Callable[..., T], *arguments: object) -> T:
     """Call a function in a new process, so that its memory can be measured."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
@@ -140,8 +152,14 @@ def means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def rounded(row: Mapping[str, object]) -> dict[str, object]:
-    """Return the row with floats to five significant digits."""
-    return {k: float(f"{v:.5g}") if isinstance(v, float) else v for k, v in row.items()}
+    """Return the row, and rows in it, with floats to five significant digits."""
+
+    def short(value: object) -> object:
+        if isinstance(value, Mapping):
+            return rounded(value)
+        return float(f"{value:.5g}") if isinstance(value, float) else value
+
+    return {key: short(value) for key, value in row.items()}
 
 
 def replace_section(path: Path, heading: str, lines: list[str]) -> None:

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from annotations import align, observe
-from benchmarks.common import run_or_stop, write_peaks
+from benchmarks.common import keep_cameras, run_or_stop, write_peaks
 from benchmarks.matte_disturbances import Shot, before_wall
 from benchmarks.matte_scenes import cluttered
 from express50.contract.config import build_config
@@ -168,16 +168,6 @@ def _change_walls(capture: Path, truth: Truth) -> None:
                 valid=np.ones(alpha.shape, bool),
             )  # fmt: skip
             write_image(path, before_wall(shot, cluttered, np.random.default_rng([11, k])).frame)
-
-
-def keep_cameras(capture: Path, kept: Sequence[str]) -> None:
-    """Take all other cameras out of a capture with given calibration."""
-    cameras = read_cameras(capture / "calibration.json")
-    for name in set(cameras) - set(kept):
-        shutil.rmtree(capture / "cameras" / name)
-        (capture / "plates" / f"{name}.png").unlink(missing_ok=True)
-    (capture / "calibration.json").unlink()
-    write_cameras(capture / "calibration.json", {name: cameras[name] for name in kept})
 
 
 SCRIPT = (

@@ -68,7 +68,7 @@ def main() -> int:
     if args.twin:
         twin = pictures(*dataset_and_truth(args), args.pictures)
         result["twin"] = measured(twin, textbook=False)
-    print(json.dumps(result))
+    print(json.dumps(rounded(result)))
     return 0
 
 
@@ -89,7 +89,7 @@ def measured(found: Iterable[Scene], textbook: bool = True) -> dict[str, object]
         short = key.replace("_error", "").replace("_rim", "")
         end = "_rim" if key.endswith("_rim") else ""
         ours[f"{short}_ratio_to_soft_key{end}"] = ours[key] / soft[key]
-    return {"pictures": len(rows["soft_key"])} | {n: rounded(m) for n, m in table.items()}
+    return {"pictures": len(rows["soft_key"]), **table}
 
 
 def _add(rows: Rows, name: str, alpha: np.ndarray, picture: Scene, seconds: float) -> None:

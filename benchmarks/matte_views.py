@@ -123,13 +123,14 @@ def main() -> int:
                     plates.setdefault(f"{scene}_{wrong}", []).append(
                         with_plates(plated, shots[::4])
                     )
+    unplated = by_scene(bare, "plate")
     result = {
         "benchmark": "matte_views",
-        **summary(rows),
-        "no_plate": bare_summary(bare),
-        "plates": {name: rounded(means(mine)) for name, mine in plates.items()},
+        **by_scene(rows, "key"),
+        "no_plate": unplated | together(unplated),
+        "plates": {name: means(mine) for name, mine in plates.items()},
     }
-    print(json.dumps(result))
+    print(json.dumps(rounded(result)))
     return 0
 
 
@@ -235,20 +236,24 @@ def with_plates(wrong: list[Shot], right: list[Shot]) -> Figures:
     return means(kept) | {"refused": 1 - len(kept) / len(wrong)}
 
 
-def bare_summary(rows: dict[tuple[int, str], list[Figures]]) -> dict[str, Any]:
-    """Return means over the peaks by number of cameras and scene, and of all scenes together."""
+def by_scene(rows: dict[tuple[int, str], list[Figures]], base: str) -> dict[str, Any]:
+    """Return means over the peaks by number of cameras and scene, with SAD's ratio to a base's."""
     table: dict[str, Any] = {}
-    every = []
     for (count, scene), mine in rows.items():
         row = means(mine)
-        row["sad_ratio_to_plate"] = row["sad"] / row["sad_plate"]
-        table.setdefault(f"cameras_{count}", {})[scene] = rounded(row)
-        every.append(row)
-    if every:
-        total, plates = (sum(row[name] for row in every) for name in ("sad", "sad_plate"))
-        worst = max(row["worst_ratio"] for row in every)
-        table |= rounded({"sad_ratio_to_plate": total / plates, "worst_ratio": worst})
+        row[f"sad_ratio_to_{base}"] = row["sad"] / row[f"sad_{base}"]
+        table.setdefault(f"cameras_{count}", {})[scene] = row
     return table
+
+
+def together(table: dict[str, Any]) -> Figures:
+    """Return the ratios to mattes with plates of all scenes together."""
+    rows = [row for scenes in table.values() for row in scenes.values()]
+    if not rows:
+        return {}
+    total, plates = (sum(row[name] for row in rows) for name in ("sad", "sad_plate"))
+    worst = max(row["worst_ratio"] for row in rows)
+    return {"sad_ratio_to_plate": total / plates, "worst_ratio": worst}
 
 
 def sheet_of(args: argparse.Namespace, scene: str, step: int, frame: int) -> Path | None:
@@ -256,16 +261,6 @@ def sheet_of(args: argparse.Namespace, scene: str, step: int, frame: int) -> Pat
     if args.pictures is None or step == 1:
         return None
     return args.pictures / f"{scene}-{frame}.png"
-
-
-def summary(rows: dict[tuple[int, str], list[Figures]]) -> dict[str, object]:
-    """Return means over the peaks by number of cameras and scene, with their ratios."""
-    table: dict[str, Any] = {}
-    for (count, scene), mine in rows.items():
-        row = means(mine)
-        row["sad_ratio_to_key"] = row["sad"] / row["sad_key"]
-        table.setdefault(f"cameras_{count}", {})[scene] = rounded(row)
-    return table
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ def main() -> int:
     args = parser.parse_args()
     cv2.setNumThreads(1)
     row = rig4_figures(args.rig4) if args.rig4 else dict.fromkeys(RIG4, "n/a: name --rig4 DIR")
-    print(json.dumps({"benchmark": "real", "rig4": row}))
+    print(json.dumps(rounded({"benchmark": "real", "rig4": row})))
     return 0
 
 
@@ -55,8 +55,8 @@ def rig4_figures(folder: Path) -> dict[str, object]:
         "cameras_dropped": len(peer) - len(solved.cameras),
         **judged(solved.cameras, even, board),
         "peer": judged({name: peer[name] for name in solved.cameras}, even, board),
-        "stated": {n: rounded(asdict(e)) for n, e in state_uncertainty(solved, points).items()},
-        "timing": {n: rounded(asdict(t)) for n, t in solved.timing.items()},
+        "stated": {n: asdict(e) for n, e in state_uncertainty(solved, points).items()},
+        "timing": {n: asdict(t) for n, t in solved.timing.items()},
         "dropped": solved.dropped,
         "weak": solved.weak,
     }
@@ -108,13 +108,13 @@ def judged(rig: Mapping[str, Camera], corners: BoardCorners, board: Board) -> di
     rows = points.reshape(-1, board.squares_y - 1, board.squares_x - 1, 3)
     sides = [np.linalg.norm(np.diff(rows, axis=axis), axis=-1).ravel() for axis in (1, 2)]
     off = 1e3 * (np.concatenate(sides) - board.square_length_m)
-    return rounded({
+    return {
         "reprojection_rms_px": float(np.sqrt(np.nanmean(squared))),
         "square_error_mm": float(np.sqrt(np.nanmean(off**2))),
         "square_bias_mm": float(np.nanmean(off)),
-        "per_camera_px": rounded(per_camera),
+        "per_camera_px": per_camera,
         "corners": int(np.isfinite(squared).sum()),
-    })  # fmt: skip
+    }
 
 
 if __name__ == "__main__":

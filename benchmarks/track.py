@@ -29,6 +29,7 @@ import numpy as np
 from benchmarks.common import (
     add_twin_options,
     check_twin_options,
+    keep_cameras,
     make_parser,
     run_or_stop,
     write_peaks,
@@ -144,12 +145,7 @@ def hold_out(capture: Path, out: Path) -> None:
     names = sorted(path.name for path in (capture / "cameras").iterdir())
     held = [names[len(names) * (k + 1) // (HELD_OUT + 1) - k] for k in range(HELD_OUT)]
     shutil.copytree(capture, out, copy_function=os.link)
-    for name in held:
-        shutil.rmtree(out / "cameras" / name)
-        (out / "plates" / f"{name}.png").unlink(missing_ok=True)
-    cameras = read_cameras(out / "calibration.json")
-    (out / "calibration.json").unlink()  # a link to the recording's own
-    write_cameras(out / "calibration.json", {k: v for k, v in cameras.items() if k not in held})
+    keep_cameras(out, [name for name in names if name not in held])
 
 
 def benchmark(source: Reference, presets: tuple[str, ...], count: int, clip: bool) -> dict:
