@@ -17,12 +17,13 @@ from benchmarks.common import rms
 from benchmarks.track_views import HeldOut, face_of, mask_of, psnr_db
 from express50.capture.frames import read_cameras_of
 from express50.contract.layout import Dataset
-from express50.dataset.tracks import Track, read_track
+from express50.dataset.export import clip_vertices
+from express50.dataset.tracks import Track, read_sequence, read_track
 from express50.errors import Express50Error
 from express50.geometry.cameras import Camera, pinhole, project, transform_camera
 from express50.geometry.transforms import axis_angle_to_matrix, rigid_fit, transform_points
 from express50.head.load import load_head
-from express50.head.model import HeadModel, landmarks, pose
+from express50.head.model import HeadModel, landmarks
 from express50.twin.truth import Truth, align_worlds
 
 NO_SKIN = ("mouth_interior", "teeth", "neck", "boundary")
@@ -222,32 +223,19 @@ def clip_errors(dataset: Dataset, truth: Truth, subject: str, cue: str, folder: 
     motion does not count. `folder` holds sequence.npz and the track.npz of the same run.
     """
     track = read_track(folder / "track.npz")
-    with np.load(folder / "sequence.npz", allow_pickle=False) as file:
-        chosen = file["cues"] == cue
-        rows = {
-            k: file[k][chosen] for k in ("frames", "expression", "neck", "jaw", "eyes", "R", "t")
-        }
-    if len(rows["frames"]) < 3 or (np.diff(rows["frames"]) != 1).any():
-        why = f"{cue}: {len(rows['frames'])} frames in a row were tracked, fewer than 3"
+    clips = read_sequence(folder / "sequence.npz")
+    chosen = [i for i, name in enumerate(clips.cues) if name == cue]
+    frames = clips.frames[chosen]
+    if len(frames) < 3 or (np.diff(frames) != 1).any():
+        why = f"{cue}: {len(frames)} frames in a row were tracked, fewer than 3"
         return {"jitter_mm": None, "clip_face_rmse_mm": None, "jitter_reason": why}
     motion = align_worlds(read_cameras_of(dataset, subject), truth.cameras(subject))
     model = load_head(track.head)
-    meshes = transform_points(motion, clip_meshes(model, track, rows))
-    true = np.stack([truth.vertices(subject, int(frame)) for frame in rows["frames"]])
+    every = list(clip_vertices(model, track, clips))
+    meshes = transform_points(motion, np.stack([every[i] for i in chosen]))
+    true = np.stack([truth.vertices(subject, int(frame)) for frame in frames])
     error = 1e3 * (meshes - true)[:, face_of(model)]
     return {
         "jitter_mm": round(float(np.linalg.norm(np.diff(error, n=2, axis=0), axis=2).mean()), 4),
         "clip_face_rmse_mm": round(rms(np.linalg.norm(error, axis=2)), 3),
     }
-
-
-def clip_meshes(model: HeadModel, track: Track, rows: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return world vertices (F, V, 3) of a clip's parameters with a track's shape and offsets."""
-    model = model.to(dtype=torch.float64)
-    own = {name: torch.from_numpy(rows[name]).double() for name in ("neck", "jaw", "eyes")}
-    expression = torch.from_numpy(rows["expression"]).double()
-    shape = torch.from_numpy(track.shape)[None].expand(len(expression), -1)
-    offsets = torch.from_numpy(track.offsets).double()[None]
-    with torch.inference_mode():
-        head = pose(model, shape, expression, offsets=offsets, **own).numpy()
-    return np.einsum("fij,fvj->fvi", rows["R"], head) + rows["t"][:, None]

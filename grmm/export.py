@@ -21,12 +21,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import trimesh
 from PIL import Image
 
 from express50.errors import ConfigError
 from express50.files.atomic import write_bytes
 from express50.files.images import srgb_to_linear
+from express50.geometry.meshes import encode_glb, split_seams
 from express50.geometry.shapes import check_finite
 from express50.head.model import HeadModel
 from grmm.checkpoint import Checkpoint
@@ -174,18 +174,12 @@ def mesh_glb(
 
     ``targets`` (V, 3) by name become morph targets.
     """
-    corners = np.stack([head.faces.cpu().reshape(-1), head.uv_faces.cpu().reshape(-1)], 1)
-    pairs, faces = np.unique(corners, axis=0, return_inverse=True)
-    material = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=Image.fromarray(texture), metallicFactor=0.0, roughnessFactor=1.0
+    places, uv_places, faces = split_seams(head.faces.cpu().numpy(), head.uv_faces.cpu().numpy())
+    uv, picture = head.uv.cpu().numpy()[uv_places], Image.fromarray(texture)
+    content = encode_glb(
+        "head", vertices[places], faces, uv=uv, baseColorTexture=picture, roughnessFactor=1.0
     )
-    uv = head.uv.cpu().numpy()[pairs[:, 1]]
-    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
-    mesh = trimesh.Trimesh(
-        vertices[pairs[:, 0]], faces.reshape(-1, 3), visual=visual, process=False
-    )
-    content = bytes(mesh.export(file_type="glb"))
-    return with_morph_targets(content, pairs[:, 0], targets) if targets else content
+    return with_morph_targets(content, places, targets) if targets else content
 
 
 def arkit_controls(names: tuple[str, ...]) -> dict[str, list[tuple[str, float]]]:

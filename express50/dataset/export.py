@@ -19,6 +19,7 @@ from PIL import Image
 from express50.contract.layout import Dataset, exclusion_reason, included_subjects
 from express50.dataset.tracks import (
     OF_FRAMES,
+    HeadPoses,
     Track,
     best_vertices,
     existing_track,
@@ -29,7 +30,7 @@ from express50.errors import FormatError, StageError, check_known
 from express50.files.atomic import dump_json, folder_in_one_step
 from express50.files.images import encode_png, read_image
 from express50.geometry.conventions import corner_to_cell
-from express50.geometry.meshes import write_glb, write_obj, write_ply
+from express50.geometry.meshes import encode_glb, split_seams, write_obj, write_ply
 from express50.head.load import load_head
 from express50.head.model import HeadModel, pose
 
@@ -141,20 +142,27 @@ def with_clips(dataset: Dataset, head: Head, wanted: Sequence[str]) -> Head:
         raise StageError(f"{path}: holds no frames of {', '.join(wanted) or 'any clip'}")
     own = {name: getattr(clips, name)[rows] for name in OF_FRAMES}
     names = tuple(f"{clips.cues[i]}_{clips.frames[i]:06d}" for i in rows)
-    model = head.model.to(dtype=torch.float64)
-    vertices = []
-    for i in range(len(rows)):  # one at a time: all frames together may not fit in memory
-        shape, expression, neck, jaw, eyes, offsets = (
-            torch.from_numpy(np.asarray(array, np.float64))[None]
-            for array in (
-                track.shape, own["expression"][i], own["neck"][i], own["jaw"][i], own["eyes"][i],
-                track.offsets,
-            )
-        )  # fmt: skip
-        posed = pose(model, shape, expression, neck=neck, jaw=jaw, eyes=eyes, offsets=offsets)[0]
-        vertices.append((posed.numpy() @ own["R"][i].T + own["t"][i]).astype(np.float32))
+    chosen = replace(clips, cues=tuple(clips.cues[i] for i in rows), **own)
+    vertices = [v.astype(np.float32) for v in clip_vertices(head.model, track, chosen)]
     track = replace(track, expressions=names, vertices=np.stack(vertices), **own)
     return replace(head, track=track)
+
+
+def clip_vertices(model: HeadModel, track: Track, clips: HeadPoses) -> Iterator[np.ndarray]:
+    """Yield world vertices (V, 3) of each frame of clips, with the shape and offsets of a track.
+
+    All frames together may not fit in memory.
+    """
+    model = model.to(dtype=torch.float64)
+
+    def row(values: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(np.asarray(values, np.float64))[None]
+
+    shape, offsets = row(track.shape), row(track.offsets)
+    for i, (R, t) in enumerate(zip(clips.R, clips.t, strict=True)):
+        angles = {name: row(getattr(clips, name)[i]) for name in ("neck", "jaw", "eyes")}
+        posed = pose(model, shape, row(clips.expression[i]), offsets=offsets, **angles)[0]
+        yield posed.numpy() @ R.T + t
 
 
 def read_albedo(folder: Path) -> np.ndarray | None:
@@ -204,17 +212,16 @@ def export_meshes(head: Head, kind: str, out: Path) -> dict:
             columns = {} if head.albedo is None else _vertex_colours(model, head.albedo)
             write_ply(path, vertices, faces, columns)
         else:
-            pairs = np.stack([model.faces.numpy(), model.uv_faces.numpy()], -1).reshape(-1, 2)
-            unique, corners = np.unique(pairs, axis=0, return_inverse=True)
-            write_glb(
-                path,
+            places, uv_places, corners = split_seams(faces, model.uv_faces.numpy())
+            glb = encode_glb(
                 "head",
-                vertices[unique[:, 0]],
-                corners.reshape(-1, 3),
-                uv=model.uv.numpy()[unique[:, 1]],
+                vertices[places],
+                corners,
+                uv=model.uv.numpy()[uv_places],
                 baseColorTexture=None if head.albedo is None else Image.fromarray(head.albedo),
                 baseColorFactor=[190 if head.albedo is None else 255] * 3 + [255],
             )
+            path.write_bytes(glb)
     meta = head.meta(kind) | {
         "expressions": list(head.track.expressions),
         "frames": head.track.frames.tolist(),

@@ -124,8 +124,20 @@ def write_obj(
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
-def write_glb(
-    path: Path,
+def split_seams(
+    faces: np.ndarray, uv_faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Repeat vertices along a texture's seams: glTF has one texture coordinate per vertex.
+
+    Of faces (F, 3) and their texture coordinates (F, 3), returns the new vertices' old numbers
+    (N,), their texture coordinates (N,), and faces (F, 3).
+    """
+    corners = np.stack([faces, uv_faces], -1).reshape(-1, 2)
+    pairs, split = np.unique(corners, axis=0, return_inverse=True)
+    return pairs[:, 0], pairs[:, 1], split.reshape(-1, 3)
+
+
+def encode_glb(
     name: str,
     vertices: np.ndarray,
     faces: np.ndarray,
@@ -134,8 +146,8 @@ def write_glb(
     colours: np.ndarray | None = None,
     uv: np.ndarray | None = None,
     **material: Any,
-) -> None:
-    """Write a binary glTF file of one rough, non-metallic mesh: vertices (V, 3) and faces (F, 3).
+) -> bytes:
+    """Encode as binary glTF one rough, non-metallic mesh: vertices (V, 3) and faces (F, 3).
 
     Normals (V, 3) have unit length; colours (V, 4) are uint8, linear light, as glTF 2.0 (3.9.2)
     defines COLOR_0; ``uv`` is (V, 2). ``material`` holds further properties of trimesh's
@@ -143,13 +155,14 @@ def write_glb(
     """
     import trimesh
 
-    skin = trimesh.visual.material.PBRMaterial(metallicFactor=0.0, roughnessFactor=0.8, **material)
+    material = {"metallicFactor": 0.0, "roughnessFactor": 0.8} | material
+    skin = trimesh.visual.material.PBRMaterial(**material)
     visual = trimesh.visual.TextureVisuals(uv=uv, material=skin)
     if colours is not None:
         visual.vertex_attributes["color"] = colours
     mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, visual=visual, process=False)
     scene = trimesh.Scene({name: mesh})
-    path.write_bytes(scene.export(file_type="glb", include_normals=normals is not None))
+    return bytes(scene.export(file_type="glb", include_normals=normals is not None))
 
 
 def cotangent_laplacian(

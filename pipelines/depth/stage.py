@@ -18,7 +18,7 @@ from express50.dataset.tracks import read_track
 from express50.error_model import error_models, expect, single_camera_sigma
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.images import contact_sheet, shrink, srgb_to_linear, write_image
-from express50.geometry.meshes import write_glb, write_surface
+from express50.geometry.meshes import encode_glb, write_surface
 from express50.geometry.sampling import evenly
 from express50.head.load import load_topology
 from pipelines.depth.maps import (
@@ -186,7 +186,8 @@ def write_meshes(out: Path, surface: HeadSurface) -> None:
     write_surface(out / "surface.ply", vertices, faces, normals, surface.colors, surface.confidence)
     light = np.rint(255 * srgb_to_linear(surface.colors / 255.0))
     colours = np.hstack([light, np.full((len(light), 1), 255)]).astype(np.uint8)
-    write_glb(out / "surface.glb", "surface", vertices, faces, normals=normals, colours=colours)
+    glb = encode_glb("surface", vertices, faces, normals=normals, colours=colours)
+    (out / "surface.glb").write_bytes(glb)
 
 
 def figures_of(surface: HeadSurface, rows: dict[str, dict], photo: Sequence[PhotoErrors]) -> dict:

@@ -15,7 +15,7 @@ from benchmarks.track_truth import clip_errors, compare, r_squared, summary
 from benchmarks.track_views import held_out_views
 from express50.capture.frames import read_cameras_of
 from express50.capture.index import read_index, read_peaks
-from express50.dataset.tracks import SCHEMA
+from express50.dataset.tracks import SCHEMA, SEQUENCE_SCHEMA
 
 CAMERAS, SUBJECT = 7, "S041"
 SHIFT = np.array([0.0, 0.008, 0.0])
@@ -84,11 +84,13 @@ def test_jitter_is_of_the_error_not_of_the_motion(source, tmp_path) -> None:
     write_truth_as_track(truth, frames, tmp_path / "track.npz", np.zeros(3))
     with np.load(tmp_path / "track.npz") as track:
         rows = {name: track[name] for name in OWN}
+        shared = {"schema": SEQUENCE_SCHEMA, "head": track["head"], "shape": track["shape"]}
 
     def jitter(wobble: float, count: int = 4) -> dict:
         t = rows["t"] + wobble * np.array([[1.0], [-1.0], [1.0], [-1.0]]) * [1.0, 0.0, 0.0]
         sequence = {k: v[:count] for k, v in (rows | {"t": t, "frames": np.array(frames)}).items()}
-        np.savez(tmp_path / "sequence.npz", cues=np.array(["smile"] * count), **sequence)
+        sequence["cues"] = np.array(["smile"] * count)
+        np.savez(tmp_path / "sequence.npz", **shared, **sequence)
         return clip_errors(dataset, truth, SUBJECT, "smile", tmp_path)
 
     assert jitter(0.0)["jitter_mm"] < 1e-2
