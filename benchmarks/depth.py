@@ -34,7 +34,7 @@ from benchmarks.common import (
 )
 from benchmarks.depth_fusion import sweep_and_fuse
 from benchmarks.depth_score import Mesh, score, summary
-from benchmarks.depth_sweep import sweep
+from benchmarks.depth_sweep import AXES, sweep
 from benchmarks.track import prepare, twin_config
 from express50.capture.index import read_peaks
 from express50.contract.config import build_config
@@ -68,7 +68,7 @@ def main(arguments: list[str] | None = None) -> int:
             print(json.dumps(sweep(options, items[0])))
             return 0
         result: dict = {"benchmark": "depth", "items": items}
-        for name in (*options.presets.split(","), *BASELINES):
+        for name in (*options.presets, *BASELINES):
             rows = [
                 in_own_process(measure, options.dataset, options.truth, item, name)
                 for item in items
@@ -88,17 +88,15 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     """Parse the command line."""
     parser = make_parser("depth", __doc__)
     add_twin_options(parser)
-    parser.add_argument("--presets", default=",".join(PRESETS))
+    parser.add_argument("--presets", nargs="*", default=PRESETS, choices=PRESETS)
     parser.add_argument("--items", type=int, default=0, help="only so many; 0: all")
     parser.add_argument("--cameras", type=int, default=26, help="recorded; two are not used")
     parser.add_argument("--side", type=int, default=512, help="pixels of the recorded footage")
     parser.add_argument("--sweep", action="store_true", help="one setting at a time, a table")
-    parser.add_argument("--axes", help="settings to sweep, of views,pixels,voxel")
+    parser.add_argument("--axes", nargs="+", default=AXES, choices=AXES, help="settings to sweep")
     parser.add_argument("--doc", type=Path, help="document whose section the sweep replaces")
     options = parser.parse_args(arguments)
     check_twin_options(parser, options)
-    if not set(options.presets.split(",")) <= set(PRESETS):
-        parser.error(f"--presets {options.presets!r}, expected some of {','.join(PRESETS)}")
     return options
 
 

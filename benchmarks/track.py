@@ -19,7 +19,7 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
@@ -87,7 +87,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = make_parser("track", __doc__)
     add_twin_options(parser)
     parser.add_argument("--captures", type=Path, help="its captures, with the held-out cameras")
-    parser.add_argument("--presets", default="draft,standard", type=preset_names)
+    parser.add_argument("--presets", nargs="*", default=PRESETS, choices=PRESETS)
     parser.add_argument("--subjects", type=int, default=2)
     parser.add_argument("--cameras", type=int, default=18, help=f"of these {HELD_OUT} are held out")
     parser.add_argument("--side", type=int, default=512, help="pixels of the recorded footage")
@@ -104,14 +104,6 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         if getattr(options, name) < count:
             parser.error(f"--{name} is {getattr(options, name)}, expected {count} or more")
     return options
-
-
-def preset_names(text: str) -> tuple[str, ...]:
-    """Split names of presets at commas; none are left for landmark_only alone."""
-    names = tuple(name for name in text.split(",") if name and name != "landmark_only")
-    if not set(names) <= set(PRESETS):
-        raise argparse.ArgumentTypeError(f"{text!r}, expected some of {','.join(PRESETS)}")
-    return names
 
 
 def twin_config(subjects: int, cameras: int, side: int, frames: int = 4) -> TwinConfig:
@@ -148,7 +140,7 @@ def hold_out(capture: Path, out: Path) -> None:
     keep_cameras(out, [name for name in names if name not in held])
 
 
-def benchmark(source: Reference, presets: tuple[str, ...], count: int, clip: bool) -> dict:
+def benchmark(source: Reference, presets: Sequence[str], count: int, clip: bool) -> dict:
     """Return figures of `landmark_only` and of the presets on the first `count` subjects."""
     dataset, truth, captures = source
     subjects = dataset.subjects()[:count]

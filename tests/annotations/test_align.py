@@ -21,7 +21,7 @@ from express50.__main__ import main
 from express50.capture.index import read_index
 from express50.errors import ConfigError, FormatError
 from tests.annotations.footage import EXPRESSIONS, FRAMES_EACH
-from tests.stages import run_here
+from tests.stages import metrics_of, run_here
 
 FACE_POINTS = np.random.default_rng(0).uniform(0, 100, (68, 2))
 SMILE = {"S001": 22, "S002": 26}
@@ -67,7 +67,7 @@ def test_a_damaged_line_of_labels_is_a_warning(watched):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text('{"cut off\n')
     assert run(watched, ["S001"]).ok
-    found = json.loads((watched.item_dir("align", "S001") / "metrics.json").read_text())
+    found = metrics_of(watched, "align", "S001")
     assert "line 1 of S001" in found["warnings"][0]["why"]
 
 
@@ -127,7 +127,7 @@ def test_unsure_suggestions_wait_for_a_person(dataset):
     assert unsure
     assert set(peaks(dataset, "S001")) == set(EXPRESSIONS) - unsure
     assert not unsure & set(current_labels(read_labels(dataset, "S001")))
-    metrics = json.loads((dataset.item_dir("align", "S001") / "metrics.json").read_text())
+    metrics = metrics_of(dataset, "align", "S001")
     assert {row["what"] for row in metrics["dropped"]} == unsure
     assert all("align.accept" in row["why"] for row in metrics["dropped"])
     assert run(dataset, ["S001"]).ok
@@ -151,7 +151,7 @@ def test_unobserved_reference_leaves_every_subject_its_own_peak(dataset):
     act(dataset, "S002")
     assert run(dataset, ["S002"]).ok
     assert read_suggestions(dataset, "S002")["smile"].kind == "peak"
-    metrics = json.loads((dataset.item_dir("align", "S002") / "metrics.json").read_text())
+    metrics = metrics_of(dataset, "align", "S002")
     assert "S001 is not observed" in metrics["dropped"][0]["why"]
 
 

@@ -20,7 +20,7 @@ from pipelines.calibrate import STAGE as CALIBRATE
 from pipelines.calibrate.board import detect_corners, make_detector
 from pipelines.calibrate.colour_gains import WhiteCollector, fit_gains, white_light, white_squares
 from tests.pipelines.board_rigs import BOARD, render_board
-from tests.stages import ingest_captures, run_here
+from tests.stages import ingest_captures, metrics_of, run_here
 from tests.synth import make_capture
 
 FACING = make_transform(np.eye(3), np.array([-0.14, -0.1, 0.55]))
@@ -164,7 +164,7 @@ def test_a_bad_board_beside_given_cameras_leaves_out_the_colours_only(tmp_path):
     (root / "board" / "board.toml").write_text("\n".join(lines) + "\n")
     dataset = ingest_captures(tmp_path / "data", root, preset="standard")
     assert run_here(CALIBRATE, dataset).ok
-    metrics = json.loads((dataset.item_dir("calibrate", "S001") / "metrics.json").read_text())
+    metrics = metrics_of(dataset, "calibrate", "S001")
     (warning,) = [row for row in metrics["warnings"] if row["what"] == "board"]
     assert "30x20" in warning["why"]
     assert read_gains(dataset, "S001") == {}

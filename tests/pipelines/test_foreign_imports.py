@@ -23,7 +23,6 @@ from express50.geometry.conventions import FLIP_YZ
 from express50.geometry.meshes import read_surface
 from express50.geometry.transforms import make_transform
 from express50.runner.ledger import Ledger
-from express50.runner.runner import run_stage
 from pipelines.depth import STAGE as DEPTH
 from pipelines.frames import STAGE as FRAMES
 from pipelines.imports.footage_check import (
@@ -40,6 +39,7 @@ from tests.express50.dataset.tracked import track_arrays, world_vertices, write_
 from tests.express50.head.flame_files import write_flame
 from tests.pipelines.bump_dataset import make_dataset
 from tests.pipelines.bump_head import render
+from tests.stages import run_here
 
 pytestmark = pytest.mark.usefixtures("no_faces")
 CAMERAS, SIZE = 6, 96
@@ -275,7 +275,7 @@ def test_runs_keep_an_import_until_its_cameras_change(original, dataset, capsys)
     path = dataset.track_file("S001")
     before = path.read_bytes()
     for settings in ({}, {"samples": 999}):
-        done = run_stage(TRACK, dataset, TRACK.config(**settings), workers=0, progress=False)
+        done = run_here(TRACK, dataset, **settings)
         assert done.ok and done.count("skipped") == 1
         assert any("kept 1 imported" in line for line in done.lines())
     assert path.read_bytes() == before
@@ -291,7 +291,7 @@ def test_runs_keep_an_import_until_its_cameras_change(original, dataset, capsys)
     main(["check", str(dataset.root), "--fix"])
     assert "since then these changed: cameras" in capsys.readouterr().out and path.is_file()
     for _ in range(2):  # the second time, too, the stage makes nothing in its place
-        failed = run_stage(TRACK, dataset, TRACK.config(), workers=0, progress=False)
+        failed = run_here(TRACK, dataset)
         assert "since then these changed: cameras" in failed.outcomes[0].reason
         assert not path.exists()
     assert (dataset.stale_dir / "track/S001/track.npz").read_bytes() == before
@@ -331,22 +331,22 @@ def test_masks_of_every_kind_become_mattes(original, dataset, tmp_path, kind) ->
         true = read_alpha(original[0].matte_file("S001", "smile", camera))
         expected = np.where(true > 127, 255, 0) if kind == "binary" else true
         np.testing.assert_array_equal(found, expected)
-    done = run_stage(MATTE, dataset, MATTE.config(), workers=0, progress=False)
+    done = run_here(MATTE, dataset)
     assert done.count("skipped") == 2
 
 
 def test_masks_of_recorded_or_reduced_size_fit_reduced_pictures(dataset, tmp_path, capsys) -> None:
     pattern = masks_of(dataset, tmp_path / "masks", write_image)
     true = read_alpha(dataset.matte_file("S001", "smile", "cam01"))
-    assert run_stage(FRAMES, dataset, FRAMES.config(image_side=48), workers=0, progress=False).ok
+    assert run_here(FRAMES, dataset, image_side=48).ok
     reduced = tmp_path / "masks" / "smile" / "cam02.png"
     write_image(reduced, shrink(read_alpha(reduced), 48))
     assert take("matte", dataset, pattern) == 0
     found = read_alpha(dataset.matte_file("S001", "smile", "cam01"))
     np.testing.assert_array_equal(found, shrink(true, 48))
     assert read_alpha(dataset.matte_file("S001", "smile", "cam02")).shape == (48, 48)
-    assert run_stage(FRAMES, dataset, FRAMES.config(), workers=0, progress=False).ok
-    failed = run_stage(MATTE, dataset, MATTE.config(), workers=0, progress=False)
+    assert run_here(FRAMES, dataset).ok
+    failed = run_here(MATTE, dataset)
     assert failed.count("failed") == 2
     for outcome in failed.outcomes:  # no later stage may read a matte of other pictures
         assert "since then these changed: size of pictures" in outcome.reason
@@ -369,7 +369,7 @@ def test_a_subject_without_masks_does_not_stop_the_others(tmp_path, capsys) -> N
     said = capsys.readouterr().out
     assert "= 2 done + 1 failed" in said
     assert "failed S001: StageError: S001: 12 of 12 files are missing" in said
-    done = run_stage(MATTE, dataset, MATTE.config(), ["S002/smile"], workers=0, progress=False)
+    done = run_here(MATTE, dataset, ["S002/smile"])
     assert any("kept 1 imported" in line for line in done.lines())
 
 
@@ -378,7 +378,7 @@ def test_tracks_and_depth_of_the_recorded_size_fit_reduced_pictures(
 ) -> None:
     pattern = depths_of(dataset, tmp_path / "depth", as_exr)
     track = read_track(dataset.track_file("S001"))
-    assert run_stage(FRAMES, dataset, FRAMES.config(image_side=48), workers=0, progress=False).ok
+    assert run_here(FRAMES, dataset, image_side=48).ok
     assert take("track", dataset, original[1], f"--head={original[2]}") == 0
     found = read_track(dataset.track_file("S001"))
     np.testing.assert_allclose(found.vertices, track.vertices, atol=1e-5)
@@ -463,7 +463,7 @@ def test_depth_of_every_kind_becomes_depth_and_surface(dataset, tmp_path, kind) 
 
     assert len(surface.faces) > 500
     assert np.median(np.abs(distance(surface.vertices))) < 2e-3  # pixels of 3.4 mm
-    done = run_stage(DEPTH, dataset, DEPTH.config(), workers=0, progress=False)
+    done = run_here(DEPTH, dataset)
     assert done.count("skipped") == 2
 
 

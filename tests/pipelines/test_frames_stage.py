@@ -33,16 +33,12 @@ from express50.geometry.cameras import pinhole, project
 from express50.geometry.sampling import undistort_image
 from pipelines.frames import STAGE
 from tests.pipelines.test_matte_stage import make_dataset
-from tests.stages import run_here
+from tests.stages import metrics_of, notes_of, run_here
 from tests.synth import make_capture, make_rig, read_frame
 
 
 def run(dataset, **settings):
     return run_here(STAGE, dataset, **settings)
-
-
-def metrics_of(dataset, item):
-    return json.loads((dataset.item_dir("frames", item) / "metrics.json").read_text())
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +66,7 @@ def test_a_lens_that_folds_leaves_black_and_says_so(dataset):
     rig[name] = replace(rig[name], params=(*rig[name].params[:4], -3.0, 0.0, 0.0, 0.0))
     write_cameras(dataset.cameras_file("S001"), rig)
     assert run(dataset).ok
-    [warning] = metrics_of(dataset, "S001/neutral")["warnings"]
+    [warning] = metrics_of(dataset, "frames", "S001/neutral")["warnings"]
     assert warning["what"] == name and "folds within the image" in warning["why"]
     written = read_peak_frame(dataset, "S001", "neutral", name)
     assert not written[0, 0].any() and written[written.shape[0] // 2].any()
@@ -79,7 +75,7 @@ def test_a_lens_that_folds_leaves_black_and_says_so(dataset):
 def test_a_corner_beyond_the_lens_that_hides_nobody_is_no_warning(dataset, monkeypatch):
     monkeypatch.setattr("pipelines.frames.stage.pictured_share", lambda camera: 0.9995)
     summary = run(dataset, image_side=64)
-    assert summary.ok and metrics_of(dataset, "S001/neutral").get("warnings", []) == []
+    assert summary.ok and not notes_of(dataset, "frames", "S001/neutral")
 
 
 def test_written_frames_are_the_undistorted_footage(dataset):
@@ -124,8 +120,8 @@ def test_a_camera_whose_footage_changed_is_dropped(tmp_path):
     write_image(tmp_path / "raw/plates/cam02.png", np.zeros((20, 30, 3), np.uint8))
     shutil.rmtree(dataset.stage_dir("frames"))
     assert run(dataset).ok
-    assert [row["what"] for row in metrics_of(dataset, "S001/smile")["dropped"]] == ["cam01"]
-    assert [row["what"] for row in metrics_of(dataset, f"S001/{PLATES}")["dropped"]] == ["cam02"]
+    assert [*notes_of(dataset, "frames", "S001/smile", "dropped")] == ["cam01"]
+    assert [*notes_of(dataset, "frames", f"S001/{PLATES}", "dropped")] == ["cam02"]
     with pytest.raises(CaptureError):
         read_peak_frame(dataset, "S001", "smile", "cam01")
     assert read_plate_image(dataset, "S001", "cam02") is None

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
@@ -19,16 +20,12 @@ from pipelines import ingest
 from pipelines.calibrate.footage import has_one_lens
 from pipelines.ingest.scan import time_gaps
 from pipelines.ingest.stage import usual_count
-from tests.stages import run_here
+from tests.stages import metrics_of, notes_of, run_here
 from tests.synth import make_capture, noise_video_images, turn_video, write_frames, write_video
 
-
-def run(dataset, **values):
-    return run_here(ingest.STAGE, dataset, **values)
-
-
-def metrics(dataset, subject="S001"):
-    return json.loads((dataset.item_dir("ingest", subject) / "metrics.json").read_text())
+run = partial(run_here, ingest.STAGE)
+metrics = partial(metrics_of, stage="ingest", item="S001")
+notes = partial(notes_of, stage="ingest", item="S001")
 
 
 @pytest.fixture
@@ -115,7 +112,7 @@ def test_missing_camera_is_dropped(dataset):
     (camera_folder(dataset, "cam02") / "video.mp4").unlink()
     camera_folder(dataset, "cam02").rmdir()
     assert run(dataset).ok
-    assert [d["what"] for d in metrics(dataset)["dropped"]] == ["camera cam02"]
+    assert [*notes(dataset, kind="dropped")] == ["camera cam02"]
 
 
 def test_capture_without_a_usable_camera_fails(dataset):
@@ -304,8 +301,8 @@ def test_real_size_captures(shared, tmp_path):
     dataset = Dataset(tmp_path / "data")
     ingest.add_captures(dataset, [shared("captures/H900")])
     assert run(dataset).ok
-    assert metrics(dataset, "H900")["frames"] == 8 * 48
-    assert metrics(dataset, "H900")["dropped"] == []
+    assert metrics(dataset, item="H900")["frames"] == 8 * 48
+    assert metrics(dataset, item="H900")["dropped"] == []
 
 
 def test_footage_unlike_what_is_said_of_it_is_a_warning(tmp_path):
@@ -325,7 +322,7 @@ def test_footage_unlike_what_is_said_of_it_is_a_warning(tmp_path):
     dataset = Dataset(tmp_path / "data")
     ingest.add_captures(dataset, [root])
     assert run(dataset).ok
-    said = {row["what"]: row["why"] for row in metrics(dataset)["warnings"]}
+    said = notes(dataset)
     assert "is a video at 24 fps, the capture says 12" in said["camera cam00"]
     assert "used as stored" in said["camera cam00"] and "stored" not in said["camera cam01"]
     assert "variable" not in said["camera cam00"]
@@ -344,7 +341,7 @@ def test_videos_whose_pictures_are_not_what_they_seem_are_warned_of(tmp_path):
     dataset = Dataset(tmp_path / "data")
     ingest.add_captures(dataset, [root])
     assert run(dataset).ok
-    said = {row["what"]: row["why"] for row in metrics(dataset)["warnings"]}
+    said = notes(dataset)
     assert "is HDR (HLG)" in said["camera cam00"]
     assert "is interlaced" in said["camera cam01"]
     assert "pixels 1.07 times as wide as high" in said["camera cam01"]
@@ -357,7 +354,7 @@ def test_pictures_of_twelve_bits_in_sixteen_are_warned_of(dataset):
     source.unlink()
     write_frames(source.parent / "frames", images)
     assert run(dataset).ok
-    said = {row["what"]: row["why"] for row in metrics(dataset)["warnings"]}
+    said = notes(dataset)
     assert "is very dark" in said["camera cam01"] and list(said) == ["camera cam01"]
 
 

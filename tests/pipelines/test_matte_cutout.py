@@ -27,7 +27,7 @@ from pipelines.matte.cutout import cut_out, make_cut_view, parts_of_a_person, so
 from pipelines.matte.stage import valid_pixels
 from pipelines.photo.capture import make_photo_capture, open_picture, single_camera
 from pipelines.track.config import TrackConfig
-from tests.stages import run_here
+from tests.stages import metrics_of, run_here
 from tests.synth import write_video
 
 data = pytest.importorskip("skimage.data")
@@ -115,7 +115,7 @@ def test_a_photograph_becomes_a_sample_of_shards_without_plate_or_weights(tmp_pa
     assert main(["photo", str(tmp_path / "eva.png"), str(tmp_path / "out"), "--matte",
                  "--preset", "draft"]) == 0  # fmt: skip
     dataset = Dataset(tmp_path / "out")
-    figures = json.loads((dataset.item_dir("matte", "eva/photo") / "metrics.json").read_text())
+    figures = metrics_of(dataset, "matte", "eva/photo")
     assert figures["method"] == "grabcut"
     matte = read_alpha(dataset.matte_file("eva", "photo", "photo"))
     assert all(matte[y, x] > 240 for x, y in HEAD) and all(matte[y, x] < 12 for x, y in BEHIND)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
@@ -28,7 +27,7 @@ from tests.pipelines.bump_dataset import make_dataset as bump_dataset
 from tests.pipelines.matte_rig import disc
 from tests.pipelines.matte_scenes import make_scene
 from tests.pipelines.stand_ins import Bad, Difference, onnx_bright, torchscript
-from tests.stages import ingest_captures, run_here
+from tests.stages import ingest_captures, metrics_of, notes_of, run_here
 from tests.synth import make_capture
 
 pytestmark = pytest.mark.usefixtures("no_faces")
@@ -38,11 +37,6 @@ BACKDROP = np.array([77, 128, 102], np.uint8)
 def run(dataset: Dataset, **settings) -> Summary:
     """The stage over every item, in this process."""
     return run_here(STAGE, dataset, **settings)
-
-
-def metrics_of(dataset: Dataset, item: str = "S001/smile") -> dict:
-    """Figures of one item."""
-    return json.loads((dataset.item_dir("matte", item) / "metrics.json").read_text())
 
 
 def make_dataset(root: Path, captures: list[Path]) -> Dataset:
@@ -83,7 +77,7 @@ def test_background_matting_sees_frame_and_plate(aligned, tmp_path) -> None:
     weights = torchscript(Difference(), tmp_path / "net.pt")
     assert run(aligned, method="bgmv2", weights=str(weights)).ok
     learned = read_image(aligned.matte_file("S001", "smile", "cam00"))
-    figures = metrics_of(aligned)
+    figures = metrics_of(aligned, "matte", "S001/smile")
     assert figures["method"] == "bgmv2"
     assert run(aligned).ok
     keyed = read_image(aligned.matte_file("S001", "smile", "cam00"))
@@ -140,7 +134,7 @@ def test_a_camera_without_a_plate_or_a_frame_is_dropped(aligned) -> None:
     aligned.plate_file("S001", "cam01").unlink()
     aligned.frame_file("S001", "smile", "cam02").unlink()
     assert run(aligned).ok
-    dropped = {e: [row["what"] for row in metrics_of(aligned, f"S001/{e}")["dropped"]]
+    dropped = {e: [*notes_of(aligned, "matte", f"S001/{e}", "dropped")]
                for e in ("neutral", "smile")}  # fmt: skip
     assert dropped == {"neutral": ["cam01"], "smile": ["cam01", "cam02"]}
     assert not aligned.matte_file("S001", "smile", "cam02").exists()
@@ -157,7 +151,7 @@ def test_keying_without_a_plate_or_a_face_is_refused(tmp_path) -> None:
 def test_keyed_mattes_are_8_bit_and_the_same_twice(aligned) -> None:
     assert run(aligned).ok
     folder = aligned.item_dir("matte", "S001/smile")
-    figures = metrics_of(aligned)
+    figures = metrics_of(aligned, "matte", "S001/smile")
     alpha = read_image(folder / "cam00.png")
     assert alpha.shape == (64, 64) and alpha.dtype == np.uint8
     assert figures["coverage"]["cam00"] == pytest.approx(alpha.mean() / 255, abs=1e-6)
@@ -190,13 +184,14 @@ def shaded(tmp_path_factory) -> Dataset:
 
 def test_what_one_camera_alone_shows_is_removed(shaded) -> None:
     assert run(shaded).ok
-    figures = metrics_of(shaded)
+    figures = metrics_of(shaded, "matte", "S001/smile")
     assert figures["views"] == 8 and figures["dropped"] == []
     assert set(figures["removed"]) == {"cam02"}
     assert figures["removed"]["cam02"] == pytest.approx(np.pi * 0.09**2, rel=0.2)
     corrected = read_image(shaded.matte_file("S001", "smile", "cam02"))
     assert run(shaded, agree=False).ok
-    assert metrics_of(shaded)["unchanged"] and metrics_of(shaded)["views"] == 0
+    figures = metrics_of(shaded, "matte", "S001/smile")
+    assert figures["unchanged"] and figures["views"] == 0
     own = read_image(shaded.matte_file("S001", "smile", "cam02"))
     patch = disc(0.12, 0.3, 0.07)
     assert own[patch].mean() > 200 and corrected[patch].mean() < 20

@@ -17,7 +17,7 @@ from express50.geometry.cameras import project
 from pipelines import calibrate
 from tests.express50.capture import layouts
 from tests.express50.capture.layouts import picture, rig
-from tests.stages import ingest_captures, run_here
+from tests.stages import ingest_captures, notes_of, run_here
 from tests.synth import noise_video_images, read_frame, turn_video, write_video
 
 HEAD = np.array([[0.02, 1.22, 0.05], [-0.05, 1.15, -0.03], [0.0, 1.2, 0.0]])
@@ -27,14 +27,6 @@ def ingested(tmp_path, *captures):
     """Return a dataset of captures, and the first one's subject."""
     dataset = ingest_captures(tmp_path / "data", *captures)
     return dataset, subject_of(captures[0])
-
-
-def metrics(dataset, subject):
-    return json.loads((dataset.item_dir("ingest", subject) / "metrics.json").read_text())
-
-
-def notes_of(dataset, subject, kind="dropped"):
-    return {row["what"]: row["why"] for row in metrics(dataset, subject).get(kind, [])}
 
 
 def assert_rig(dataset, subject, expected):
@@ -85,7 +77,7 @@ def test_renderme_key_frames_and_what_is_left_out(tmp_path):
     assert index.cues == (Cue("neutral", 0, 3), Cue("e10", 4, 7))
     assert index.meta["renderme360"]["e10"]["release"] == "key frames"
     assert index.cameras["cam00"].pts[7] == index.meta["renderme360"]["e10"]["last_frame"] == 119
-    lost = notes_of(dataset, subject)
+    lost = notes_of(dataset, "ingest", subject, "dropped")
     assert "e10 119" in lost["camera cam03"]
     assert "num_frame is 13" in lost["sequence e2"]
     assert "not a scripted expression" in lost["sequence s1_all"]
@@ -145,7 +137,7 @@ def test_nersemble_cameras_of_unequal_length(tmp_path):
         read_proxy(dataset, subject, "222200036", 6),
         correct_srgb(picture(0, 1, (160, 110, 3)), layouts.CCM), 8,
     )  # fmt: skip
-    lost = notes_of(dataset, subject)
+    lost = notes_of(dataset, "ingest", subject, "dropped")
     assert "has 4 frames of EXP_1_head, most cameras have 5" in lost["camera 222200038"]
     assert lost["last frames of EMO_1_shout_laugh in camera 222200036"]
 
@@ -183,7 +175,7 @@ def test_ava_reads_transposed_millimetres_and_names_unpublished_frames(tmp_path)
     assert index.cameras["cam401045"].pts == (100, 106, 250, 260, 261)
     assert index.cues == (Cue("EXP_neutral_peak", 0, 1), Cue("EXP_free_face", 2, 4))
     assert near(read_frame(dataset, subject, "cam401031", 3, False), picture(1, 260, (256, 167, 3)))
-    words = " ".join(notes_of(dataset, subject).values())
+    words = " ".join(notes_of(dataset, "ingest", subject, "dropped").values())
     assert "no camera has a picture of EXP_neutral_peak 103" in words
     assert "cam401045 has no picture of EXP_free_face 251" in words
     names = [f"cam{n}" for n in (400981, 401031, 401045, 401163)]
@@ -212,7 +204,7 @@ def test_ravdess_names(tmp_path):
     assert (subject, index.fps) == ("Actor_05", 24.0) and "gender" not in index.meta
     assert read_people(dataset, [subject]) == [{"gender": "male"}]
     assert index.cues == (Cue("song_sad_normal_dogs_1", 0, 4), Cue("happy_strong_kids_1", 5, 8))
-    lost = notes_of(dataset, subject)
+    lost = notes_of(dataset, "ingest", subject, "dropped")
     assert "the same clip as 01-01-03" in lost["file 02-01-03-02-01-01-05.mp4"]
     assert "not one of RAVDESS" in lost["file take.mp4"]
 
@@ -227,7 +219,7 @@ def test_transforms_and_colmap(tmp_path):
     assert_rig(dataset, subject, rig([f"cam{n:02d}" for n in range(4)]))
     assert np.array_equal(read_frame(dataset, "scan", "p2", 0, False), picture(2, 0))
     assert_rig(dataset, "scan", rig([f"p{n}" for n in range(4)]))
-    assert "metres_per_unit" in notes_of(dataset, "scan", "warnings")["scale"]
+    assert "metres_per_unit" in notes_of(dataset, "ingest", "scan")["scale"]
 
 
 def test_photos_and_a_video(tmp_path):
@@ -303,7 +295,9 @@ def test_capture_toml_points_at_read_only_data_and_chooses(tmp_path):
     assert (subject, index.fps, index.meta["consent_id"]) == ("S007", 7.5, "C7")
     assert "source" not in index.meta
     assert len(index.cameras) == 3 and index.cues == (Cue("neutral", 0, 2),)
-    assert notes_of(dataset, subject)["sequence EXP_free_face"] == "not selected"
+    assert (
+        notes_of(dataset, "ingest", subject, "dropped")["sequence EXP_free_face"] == "not selected"
+    )
     assert near(read_frame(dataset, subject, "cam401163", 2, False), picture(3, 106, (256, 167, 3)))
     file = wishes / "capture.toml"
     file.write_text(file.read_text().replace("EXP_n*", "EXP_x*"))

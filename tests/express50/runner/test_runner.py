@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import functools
-import json
 import logging
 import os
 import resource
@@ -31,6 +30,7 @@ from express50.runner.runner import run_stage, select_items
 from express50.runner.worker import Task, keep_freed_memory, peak_memory, reset_peak_memory
 from tests.faults import toy
 from tests.faults.toy import make_dataset, run_toy, tree
+from tests.stages import metrics_of
 
 
 def statuses(summary):
@@ -382,9 +382,7 @@ def test_receipt_counts_time_and_memory(tmp_path):
     assert receipt.seconds >= 0.15
     assert 1e6 < receipt.peak_memory < 1e11
     assert receipt.metrics == {"length": 1, "dropped": [], "warnings": []}
-    assert json.loads((dataset.item_dir("toy", "a") / "metrics.json").read_text()) == (
-        receipt.metrics
-    )
+    assert metrics_of(dataset, "toy", "a") == (receipt.metrics)
 
 
 def test_receipt_and_metrics_hold_the_expected_error(tmp_path):
@@ -395,7 +393,7 @@ def test_receipt_and_metrics_hold_the_expected_error(tmp_path):
     )
     dataset = make_dataset(tmp_path / "data", ["a"])
     run_toy(dataset, stage=stage)
-    metrics = json.loads((dataset.item_dir("toy", "a") / "metrics.json").read_text())
+    metrics = metrics_of(dataset, "toy", "a")
     assert receipts(dataset)["a"].metrics == metrics
     assert metrics["expected_error"] == {"value": 0.4, "low": 0.3, "high": 0.6, "unit": "mm"}
 
