@@ -408,8 +408,9 @@ def run_sheet(args: argparse.Namespace) -> int:
     """Write the page."""
     from annotations.sheet import make_sheet, render_sheet
     from annotations.ui.frames import FaceFinder
-    from express50.files.atomic import write_bytes
+    from express50.files.atomic import check_file_writable, write_bytes
 
+    check_file_writable(args.file)
     sheet = make_sheet(args.dataset, args.subject, args.expression, args.camera, args.sure)
     chosen = args.subject or args.expression
     around = args.around if args.around is not None else AROUND if chosen else 0
@@ -417,7 +418,6 @@ def run_sheet(args: argparse.Namespace) -> int:
     log(f"{args.file}: drawing {count(len(sheet.tiles), 'label')}")
     faces.load()
     page = render_sheet(args.dataset, sheet, faces=faces, around=around).encode()
-    args.file.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(args.file, page)
     counts = sheet.counts()
     said = ", ".join(f"{count} {name}" for name, count in counts.items() if count)

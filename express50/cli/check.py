@@ -124,7 +124,8 @@ def run_withdraw(args: argparse.Namespace) -> int:
         paths = {str(path): why for path, why in plan(dataset, args.subject).items()}
         models = [*sorted((dataset.root / "grmm").rglob("*.pt")), *args.checkpoint]
         lines = [f"would remove {p}" + (f" ({why})" if why else "") for p, why in paths.items()]
-        lines += [f"would take codes and frames out of {path}" for path in models]
+        ways = "would take the person's codes and frames, if there are any, out of"
+        lines += [f"{ways} {path}" for path in models]
         data = {"subject": args.subject, "would_remove": list(paths), "why": paths}
         return answer(args, data, *lines, "add --yes to remove")
     done = withdraw(dataset, args.subject, args.checkpoint, hook("redact_checkpoint"))
@@ -137,14 +138,19 @@ def run_withdraw(args: argparse.Namespace) -> int:
         "raw_capture": str(done.capture) if done.capture else None,
     }
     lines = [f"removed {path}" for path in done.removed]
-    lines += [f"took codes and frames out of {path}" for path in done.checkpoints]
+    lines += [
+        f"took codes and frames out of {path}"
+        if path.exists()
+        else f"removed {path}, which held this person alone"
+        for path in done.checkpoints
+    ]
     lines += [f"STILL NAMES {done.subject}: {path}" for path in done.remaining]
     if done.capture:
         lines.append(f"the raw capture {done.capture} is outside the dataset: delete it yourself")
     lines.append(
-        "run 'express50 run' to make again what was removed, then 'express50 report'; train "
-        "models that saw the person again (their other weights keep an influence), and delete "
-        "exports outside the dataset"
+        "run 'express50 run' with the settings of your last run to make again what was removed, "
+        "then 'express50 report'; train models that saw the person again (their other weights keep "
+        "an influence), and delete exports outside the dataset"
     )
     answer(args, data, *lines)
     return FAILED if done.remaining else OK

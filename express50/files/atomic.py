@@ -10,13 +10,14 @@ import errno
 import json
 import os
 import shutil
+import tempfile
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from express50.errors import DiskFullError
+from express50.errors import ConfigError, DiskFullError
 
 LEAST_FREE = 100e6  # bytes; a disk with less free space counts as full
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # Linux constants
@@ -55,13 +56,49 @@ def write_with(path: Path, write: Callable[[BinaryIO], object]) -> None:
                 error.filename = str(path)
             raise
         finally:
-            aside.unlink(missing_ok=True)
+            with suppress(OSError):  # of a read-only disk: the first error says so
+                aside.unlink()
         sync_directory(path.parent)
 
 
 def write_json(path: Path, value: object) -> None:
     """Write deterministic JSON in one step."""
     write_bytes(path, dump_json(value))
+
+
+def nearest_existing(path: Path) -> Path:
+    """Return a path, or the nearest folder above it that exists."""
+    path = path.resolve()
+    return next(one for one in (path, *path.parents) if one.exists())
+
+
+def check_folder_writable(folder: Path) -> None:
+    """Refuse, before any work, a folder that cannot be made or written to; nothing is left in it.
+
+    Raises:
+        ConfigError: it is a file, or lies below one.
+        OSError: the system refuses.
+    """
+    place = nearest_existing(folder)
+    if not place.is_dir():
+        raise ConfigError(f"{place}: is a file, expected a folder to write to; name another")
+    try:
+        with tempfile.TemporaryFile(dir=place):
+            pass
+    except OSError as error:  # its own name is one that nobody has given
+        raise OSError(error.errno, error.strerror, str(folder)) from None
+
+
+def check_file_writable(path: Path) -> None:
+    """Refuse, before any work, a file that cannot be written.
+
+    Raises:
+        ConfigError: it lies below a file.
+        OSError: it is a folder, or the system refuses.
+    """
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    check_folder_writable(path.parent)
 
 
 def check_space(folder: Path) -> None:
@@ -114,25 +151,26 @@ def folder_in_one_step(
     left behind is deleted. The parent folder of ``aside`` must exist, or be the target's.
     """
     former = aside.with_name(aside.name + FORMER)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    put_back(former, target)
-    for left in (aside, former):
-        shutil.rmtree(left, ignore_errors=True)
-    aside.mkdir()
-    try:
-        yield aside
-        for folder, _, names in os.walk(aside, topdown=False):
-            for name in names:
-                _sync(Path(folder) / name, os.O_RDONLY)
-            sync_directory(Path(folder))
-        _replace(aside, target, former)
-        sync_directory(target.parent)
-        for replaced in (aside, former):
-            if keep is not None and replaced.exists():
-                keep(replaced)
-        shutil.rmtree(former, ignore_errors=True)
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
+    with naming_full_disk(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        put_back(former, target)
+        for left in (aside, former):
+            shutil.rmtree(left, ignore_errors=True)
+        aside.mkdir()
+        try:
+            yield aside
+            for folder, _, names in os.walk(aside, topdown=False):
+                for name in names:
+                    _sync(Path(folder) / name, os.O_RDONLY)
+                sync_directory(Path(folder))
+            _replace(aside, target, former)
+            sync_directory(target.parent)
+            for replaced in (aside, former):
+                if keep is not None and replaced.exists():
+                    keep(replaced)
+            shutil.rmtree(former, ignore_errors=True)
+        finally:
+            shutil.rmtree(aside, ignore_errors=True)
 
 
 def put_back(former: Path, target: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import shutil
-import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -16,8 +15,8 @@ from rich.filesize import decimal
 from express50.console import count, not_writable
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
-from express50.errors import Express50Error, FormatError, StageError, few
-from express50.files.atomic import LEAST_FREE
+from express50.errors import ConfigError, Express50Error, FormatError, StageError, few
+from express50.files.atomic import LEAST_FREE, check_folder_writable, nearest_existing
 from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger
 from express50.runner.publish import size_of
@@ -57,13 +56,12 @@ def _folder_problems(dataset: Dataset, stages: Iterable[Stage]) -> Iterator[str]
     """Yield a line per reason for which folders that the stages write to are not writable."""
     inside = [dataset.stage_dir(stage.name) for stage in stages]
     inside += [dataset.staging_dir, dataset.config_file("").parent]
-    root, refused = _existing(dataset.root), dict[str, tuple[OSError, list[str]]]()
+    root, refused = nearest_existing(dataset.root), dict[str, tuple[OSError, list[str]]]()
     for folder in [root, *(one for one in inside if one.exists())]:
         try:
-            with tempfile.TemporaryFile(dir=folder):
-                pass
-        except NotADirectoryError:
-            yield f"{folder}: is a file, expected a writable folder"
+            check_folder_writable(folder)
+        except ConfigError as error:
+            yield str(error)
         except OSError as error:
             refused.setdefault(str(error.strerror), (error, []))[1].append(str(folder))
             if folder == root:
@@ -125,7 +123,7 @@ def expected_shortage(
 
 
 def _space_problems(dataset: Dataset, needs: Sequence[tuple[str, int, float]]) -> Iterator[str]:
-    usage = shutil.disk_usage(_existing(dataset.root))
+    usage = shutil.disk_usage(nearest_existing(dataset.root))
     if not usage.total:  # some network drives do not report their size
         return
     need = sum(new * size for _, new, size in needs)
@@ -143,9 +141,3 @@ def _space_problems(dataset: Dataset, needs: Sequence[tuple[str, int, float]]) -
             f"({count(largest[1], 'item')} of {decimal(int(largest[2]))}), and "
             f"{decimal(int(room))} are free; free some space, or make fewer items with --items"
         )
-
-
-def _existing(path: Path) -> Path:
-    """Return a path, or the nearest folder above it that exists."""
-    path = path.resolve()
-    return next(one for one in (path, *path.parents) if one.exists())

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from express50.capture.expressions import select
-from express50.console import add_command, answer, count, number
+from express50.console import add_command, answer, count, log, number
 from express50.contract.config import field_documents
 from express50.errors import CaptureError
 from express50.files.atomic import dump_json, link_file, write_json
@@ -32,6 +32,9 @@ _EXAMPLE = """express50 twin record build/twin --subjects 4 --cameras 8 \\
       --width 320 --height 320 --expressions neutral,smile,jaw_open
 writes build/twin/captures/S001... (for 'express50 ingest') and build/twin/truth/S001..."""
 _NUMBERS = [setting.name for setting in fields(TwinConfig) if setting.type in ("int", "float")]
+BOARD_PX = (
+    224  # shorter side; with 160 px no camera sees a corner, with 192 one in four sees enough
+)
 
 Task = tuple[str, list[int]]
 _counter: Any = None  # shared count of pictures, set in every worker
@@ -83,6 +86,12 @@ def record_command(args: argparse.Namespace) -> int:
         plates=not args.no_plates,
         hair=not args.no_hair,
     )
+    short = min(config.width, config.height)
+    if config.board_frames and not config.give_calibration and short < BOARD_PX:
+        log(
+            f"warning: in pictures of {short} px the board is too small to calibrate cameras from;"
+            f" use {BOARD_PX} px or more, or --give-calibration"
+        )
     with _alone(args.out):
         recorded = record(config, args.out, args.workers, print_progress())
     captures, kept = args.out / "captures", args.subjects - len(recorded)

@@ -15,7 +15,12 @@ from typing import TYPE_CHECKING, Any
 from express50.console import OK, answer, count, figure_label, log, say
 from express50.contract.config import config_toml, known_assignments
 from express50.errors import ConfigError, check_known
-from express50.files.atomic import write_bytes, write_json
+from express50.files.atomic import (
+    check_file_writable,
+    check_folder_writable,
+    write_bytes,
+    write_json,
+)
 from grmm.config import TABLES, Config, as_tables, choose, from_tables, resolve
 from grmm.deviations import paper_diff
 
@@ -39,7 +44,7 @@ def train(args: argparse.Namespace) -> int:
     from grmm.shard_source import open_shards
     from grmm.train import train
 
-    _no_file(args.out)
+    check_folder_writable(args.out)
     # First, because most wrong commands name a wrong folder, and no budget helps against that.
     source = open_shards([args.shards, *args.also], "train")
     config = train_config(args)
@@ -107,7 +112,7 @@ def fit(args: argparse.Namespace) -> int:
     from grmm.fit import fit
     from grmm.shard_source import ShardSource, select
 
-    _no_file(args.out)
+    check_folder_writable(args.out)
     made = args.out / "checkpoint.pt"
     if made.exists() and made.samefile(args.checkpoint):
         raise ConfigError(f"{made} is the checkpoint to fit from; name another folder")
@@ -137,7 +142,7 @@ def render(args: argparse.Namespace) -> int:
     from express50.files.images import write_image
     from grmm import render
 
-    _no_file(args.out)
+    check_folder_writable(args.out)
     _require(args, "drive", "drive_cue")
     loaded = _load(args.checkpoint)
     model, head = loaded.model, _edited_head(loaded, args)
@@ -209,7 +214,7 @@ def export(args: argparse.Namespace) -> int:
     if form != "html" and (unused := [n for n in ("drive", "shards") if getattr(args, n)]):
         raise ConfigError(f"--{unused[0]} is only for .html pages, not for {args.out.name}")
     _require(args, "drive", "drive_cue")
-    _no_file(args.out.parent)
+    check_file_writable(args.out)
     loaded = _load(args.checkpoint)
     head, view = _edited_head(loaded, args), camera_of(loaded, args.camera, args.size)
     if form == "html":
@@ -244,7 +249,7 @@ def evaluate(args: argparse.Namespace) -> int:
     from grmm.metrics import PerceptualMetrics
     from grmm.shard_source import ShardSource
 
-    _no_file(args.out)
+    check_folder_writable(args.out)
     _require(args, "fit_cameras", "fit_budget")
     loaded = _load(args.checkpoint, _metric_settings(args), args.fit_budget)
     source = ShardSource(args.shards, "*")
@@ -309,7 +314,7 @@ def score(args: argparse.Namespace) -> int:
     from grmm.metrics import PerceptualMetrics
     from grmm.shard_source import ShardSource, select
 
-    _no_file(args.out)
+    check_folder_writable(args.out)
     # `evaluate` leaves these pixels out too, of all presets but `paper`.
     data = DataConfig(background=args.background, skip_hidden_neck=True)
     source = ShardSource(args.shards, "*")
@@ -337,6 +342,7 @@ def ablate(args: argparse.Namespace) -> int:
     from grmm.ablate import Ablation, ablate
     from grmm.shard_source import open_shards
 
+    check_folder_writable(args.out)
     open_shards([args.shards, *args.also], "train")  # first, as in `train`
     config = train_config(args)
     if args.fit_budget is not None:
@@ -401,15 +407,6 @@ def _require(args: argparse.Namespace, needed: str, *options: str) -> None:
         if getattr(args, option) is not None and not getattr(args, needed):
             first, second = (f"--{name.replace('_', '-')}" for name in (option, needed))
             raise ConfigError(f"{first} needs {second}; give both")
-
-
-def _no_file(out: Path) -> None:
-    """Refuse, before any work, a folder to write to that is a file or lies below one."""
-    for path in (out, *out.parents):
-        if path.is_dir():
-            return
-        if path.exists():
-            raise ConfigError(f"{path} is a file, expected a folder to write to; name another")
 
 
 def _metric_settings(args: argparse.Namespace) -> list[str]:

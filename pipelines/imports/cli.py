@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from express50.capture.frames import read_cameras_of, read_peak_frame, read_recorded_cameras
-from express50.console import FAILED, OK, add_command, answer, count
+from express50.console import FAILED, OK, add_command, answer, count, log
 from express50.contract.layout import Dataset, existing_dataset, included_subjects
 from express50.contract.stage import Note, Result, stages
 from express50.dataset.depth_files import encode_depth, write_depth
@@ -27,6 +27,7 @@ from express50.head.load import load_head
 from express50.head.model import landmarks
 from express50.runner.imported import publish_import, remove_imports
 from express50.runner.ledger import Ledger
+from express50.runner.progress import showing
 from express50.runner.publish import clean_leftovers, stage_lock
 from pipelines.imports.footage_check import (
     check_face_depth,
@@ -128,18 +129,22 @@ def run_import(args: argparse.Namespace) -> int:
     """Import every item of the chosen subjects; what is wrong is named, the others continue."""
     dataset, stage = existing_dataset(args.dataset.resolve()), stages()[args.action]
     subjects, rows = _subjects(dataset, args), list[dict[str, Any]]()
+    plan = dict[str, Write]()
     with stage_lock(dataset, stage.name), Ledger(dataset.ledger) as ledger:
         clean_leftovers(dataset, stage.name)
         for subject in subjects:
             try:
                 peaks = peak_frames(dataset, subject)
-                plan = _PLANS[args.action](dataset, subject, peaks, args)
+                plan |= _PLANS[args.action](dataset, subject, peaks, args)
             except Express50Error as error:
                 reason = f"{type(error).__name__}: {error}"
                 rows.append({"item": subject, "reason": reason, "warnings": [], "checks": {}})
-                continue
+        if plan:
+            log(f"import {stage.name}: checking {count(len(plan), 'item')} against the footage")
+        with showing(stage.name, len(plan), enabled=True) as show:
             for item, write in plan.items():
                 receipt = publish_import(dataset, stage, item, write, ledger)
+                show(receipt)
                 found = receipt.metrics
                 rows.append({
                     "item": item, "reason": receipt.reason,

@@ -162,3 +162,7 @@ def test_the_command_writes_the_page_and_counts(labelled, tmp_path, capsys):
     assert set(page.tiles["S002", "neutral"]) >= {"data-strip"}
     assert main([*words[:4], "--camera", "top"]) == 2
     assert "top" in capsys.readouterr().err
+    (tmp_path / "taken").write_text("x")
+    for wrong in (tmp_path, tmp_path / "taken" / "sheet.html"):
+        assert main([*words[:3], str(wrong)]) != 0
+        assert "drawing" not in capsys.readouterr().err, "refused before the work"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -82,7 +83,7 @@ def error_of(capsys) -> str:
     """The one line that says what is wrong."""
     seen = capsys.readouterr()
     lines = [line for line in (seen.err + seen.out).splitlines() if "  warning" not in line]
-    lines = [line for line in lines if " done + " not in line]  # the account
+    lines = [line for line in lines if not re.match(r"import |\w+ \d/\d ", line)]  # the account
     assert len(lines) == 1, lines
     return lines[0]
 
@@ -366,7 +367,9 @@ def test_a_subject_without_masks_does_not_stop_the_others(tmp_path, capsys) -> N
     pattern = pattern.replace("/S002/", "/{subject}/")
     capsys.readouterr()
     assert take("matte", dataset, pattern) == 1
-    said = capsys.readouterr().out
+    said, shown = capsys.readouterr()
+    begun = "import matte: checking 2 items against the footage\n"
+    assert f"{begun}matte 1/2 S002/neutral done" in shown
     assert "= 2 done + 1 failed" in said
     assert "failed S001: StageError: S001: 12 of 12 files are missing" in said
     done = run_here(MATTE, dataset, ["S002/smile"])

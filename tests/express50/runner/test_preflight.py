@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import shutil
 import socket
+import tempfile
 import threading
 import time
 from types import SimpleNamespace
@@ -75,14 +76,14 @@ def test_all_problems_are_said_at_once_and_nothing_is_started(dataset, monkeypat
 def test_folders_are_tried_and_named_in_one_line(dataset, refused, named, monkeypatch):
     run_toy(dataset)
     root = dataset.root.resolve()
-    real = preflight.tempfile.TemporaryFile
+    real = tempfile.TemporaryFile
 
     def read_only(dir):  # noqa: A002  (tests may run as root, to whom everything is permitted)
         if dir in [root / folder for folder in refused]:
             raise PermissionError(13, "Permission denied")
         return real(dir=dir)
 
-    monkeypatch.setattr(preflight.tempfile, "TemporaryFile", read_only)
+    monkeypatch.setattr(tempfile, "TemporaryFile", read_only)
     line = f"{named.format(root)}: not writable (Permission denied); check its owner and"
     assert found(type(dataset)(root)) == [f"{line} permissions"]
 
@@ -90,7 +91,7 @@ def test_folders_are_tried_and_named_in_one_line(dataset, refused, named, monkey
 def test_a_file_in_place_of_a_dataset(tmp_path, capsys):
     (tmp_path / "data").write_text("x")
     assert main(["matte", str(tmp_path / "data")]) == 2
-    assert "data: is a file, expected a writable folder" in capsys.readouterr().err
+    assert "data: is a file, expected a folder to write to" in capsys.readouterr().err
 
 
 def test_space_is_compared_with_what_items_took(dataset, monkeypatch):

@@ -145,6 +145,18 @@ def test_two_recordings_into_one_folder_are_refused(tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
+def test_pictures_too_small_to_calibrate_from_are_warned_of(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("express50.twin.record.record", lambda *given: [])
+    small = ["twin", "record", str(tmp_path), "--width=160", "--height=400"]
+    for more, warned in (
+        ([], True),
+        (["--give-calibration"], False),
+        (["--board-frames=0"], False),
+    ):
+        assert main([*small, *more]) == 0
+        assert ("160 px the board is too small" in capsys.readouterr().err) == warned
+
+
 def test_wrong_settings_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="cameras is 0"):
         TwinConfig(cameras=0)

@@ -1,0 +1,64 @@
+"""Places to write to are tried before any work; errors of the disk name what the user gave."""
+
+import errno
+import os
+import tempfile
+
+import pytest
+
+from express50.console import system_error_line
+from express50.errors import ConfigError, DiskFullError
+from express50.files.atomic import (
+    check_file_writable,
+    check_folder_writable,
+    folder_in_one_step,
+    write_bytes,
+)
+
+
+def refuse(number):
+    def refused(*args, **kwargs):
+        raise OSError(number, os.strerror(number), "/a/temporary/name")
+
+    return refused
+
+
+def test_what_can_be_written_is_left_as_it_was(tmp_path):
+    (tmp_path / "page.html").write_text("old")
+    check_file_writable(tmp_path / "page.html")
+    check_file_writable(tmp_path / "new" / "deep" / "page.html")
+    check_folder_writable(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
+
+
+def test_what_cannot_be_written_is_named_as_it_was_given(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(ConfigError, match="file: is a file, expected a folder to write to"):
+        check_file_writable(tmp_path / "file" / "deep" / "page.html")
+    with pytest.raises(IsADirectoryError):
+        check_file_writable(tmp_path)
+    monkeypatch.setattr(tempfile, "TemporaryFile", refuse(errno.EROFS))
+    with pytest.raises(OSError) as caught:  # noqa: PT011  (its line is compared)
+        check_folder_writable(tmp_path / "out")
+    assert system_error_line(caught.value).startswith(f"{tmp_path / 'out'}: not writable (Read-")
+
+
+def test_a_read_only_disk_is_named_by_the_file_that_was_given(tmp_path, monkeypatch):
+    """Even to delete a file that does not exist fails there, and hid the first error."""
+
+    def read_only(path, *args, **kwargs):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+
+    monkeypatch.setattr("pathlib.Path.open", read_only)
+    monkeypatch.setattr("pathlib.Path.unlink", read_only)
+    with pytest.raises(OSError) as caught:  # noqa: PT011
+        write_bytes(tmp_path / "page.html", b"x")
+    assert caught.value.filename == str(tmp_path / "page.html")
+
+
+def test_a_disk_that_fills_up_under_a_folder_is_named(tmp_path):
+    out = tmp_path / "out"
+    folder = folder_in_one_step(tmp_path / ".out.part", out)
+    with pytest.raises(DiskFullError, match="out: the disk is full"), folder:
+        refuse(errno.ENOSPC)()
+    assert list(tmp_path.iterdir()) == []
