@@ -5,10 +5,11 @@ of 3840 x 2160, without a board, and runs every stage with each preset, every st
 its own. ``--cameras`` and ``--size`` make smaller ones; the footage is recorded again if they
 change. What a stage does once per subject counts in full, as if the subject had one expression.
 ``--smaller`` names sizes at which the same is run; from their receipts `express50.cli.plan`
-predicts the large one. The last line printed is one JSON object: ``<preset>``'s
-``core_seconds_per_moment`` and ``peak_memory_gib``, both also by stage, the errors against the
-truth, those at the smaller sizes, and ``plan_core_seconds``, ``plan_off_percent``: prediction
-against what the items took.
+predicts the large one, and from the receipts of all sizes EXPRESS-50 with clips as short as these.
+The last line printed is one JSON object: ``<preset>``'s ``core_seconds_per_moment`` and
+``peak_memory_gib``, both also by stage, the errors against the truth, those at the smaller sizes,
+``plan_core_seconds``, ``plan_off_percent``: prediction against what the items took, and
+``express_50``: core hours with their interval, and core seconds per moment, by stage too.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-from express50.cli.plan import estimate, measure, measure_sizes
+from express50.cli.plan import estimate, measure, measure_sizes, target_of, totals
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import stages
@@ -97,6 +98,21 @@ def compare_plan(large: Dataset, smaller: list[Dataset]) -> dict:
     }
 
 
+def plan_campaign(datasets: list[Dataset]) -> dict:
+    """Estimate EXPRESS-50 from datasets of several sizes, the largest first."""
+    known = list(stages().values())
+    sizes = [pair for dataset in datasets for pair in measure_sizes(dataset, known)]
+    target = target_of("express-50", {}, sizes[0][0])
+    moments = target.subjects * target.expressions
+    rows = estimate(known, target, sizes, 1)
+    hours = {row.stage: row.core_hours or 0.0 for row in rows}
+    total = {key: value for key, value in totals(rows).items() if key.startswith("core_hours")}
+    return {key: round(value, 1) for key, value in total.items()} | {
+        "core_seconds_per_moment": round(3600 * total["core_hours"] / moments, 1),
+        "by_stage": {name: round(3600 * value / moments, 2) for name, value in hours.items()},
+    }
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Record, measure and print."""
     from benchmarks.common import make_parser
@@ -122,7 +138,9 @@ def main(arguments: list[str] | None = None) -> int:
         ]
         found[preset] = rows[0]
         if smaller := [Dataset(root / preset) for root in roots[1:]]:
-            found[preset] |= compare_plan(Dataset(roots[0] / preset), smaller)
+            large = Dataset(roots[0] / preset)
+            found[preset] |= compare_plan(large, smaller)
+            found[preset]["express_50"] = plan_campaign([large, *smaller])
             found[preset]["smaller"] = dict(zip(sizes[1:], rows[1:], strict=True))
     print(json.dumps({"cameras": args.cameras, "size": args.size} | found))
     return 0
