@@ -38,7 +38,8 @@ from pipelines.ingest.scan import odd_footage, remove_proxies, scan_camera, time
 
 QC_CAMERAS, QC_COLUMNS = 24, 6
 BLACK_LIGHT = 1e-3  # linear light, 3 of 255 levels
-KNOWN_KEYS = PUBLIC_KEYS | {"gender", "age"}  # of capture.toml
+# Keys of capture.toml, with one that 'express50 photo' writes.
+KNOWN_KEYS = PUBLIC_KEYS | {"gender", "age", "picture_sha256"}
 CHOICES = {"sequences", "cameras", "expressions"}  # of parts, in all layouts but ours
 UNITLESS = ("colmap", "transforms")  # layouts that do not state their unit
 METRES = ("m", "metre", "metres", "meter", "meters")

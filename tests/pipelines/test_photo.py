@@ -57,6 +57,8 @@ def test_a_bare_photograph_is_tracked(tracked: tuple[Path, dict], capsys) -> Non
     assert metrics["marked_views"] == 1
     meta = (out / "photos/eva_1/capture.toml").read_text()
     assert 'focal_source = "guess"' in meta
+    found = json.loads((out / "ingest/eva_1/metrics.json").read_text())
+    assert not found["warnings"], "what we wrote ourselves is not odd"
 
 
 def test_the_head_has_the_dimensions_of_an_adults(tracked: tuple[Path, dict]) -> None:
