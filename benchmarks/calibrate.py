@@ -53,7 +53,13 @@ from express50.twin import TwinConfig
 from express50.twin.rig import make_rig, make_sensor
 from express50.twin.truth import align_worlds
 from pipelines.calibrate import STAGE
-from pipelines.calibrate.board import BoardCorners, board_from_table, board_points, read_corners
+from pipelines.calibrate.board import (
+    BoardCorners,
+    board_from_table,
+    board_points,
+    footage_of_board,
+    read_corners,
+)
 from pipelines.calibrate.board_adjust import BoardRig, corner_errors
 from pipelines.calibrate.board_guess import (
     BoardView,
@@ -106,7 +112,9 @@ def main() -> int:
     sizes = {name: (source.width, source.height) for name, source in index.cameras.items()}
     start = time.process_time()
     palette = WhiteCollector(board)
-    observations = read_corners(board, board_files(index), sizes, config.board_frames, palette.look)
+    observations = read_corners(
+        board, footage_of_board(index), sizes, config.board_frames, palette.look
+    )
     detected = time.process_time()
     solution = solve_rig(observations, points, sizes, config.camera_model, config.rounds)
     solved = time.process_time()
@@ -194,15 +202,6 @@ def bump_figures(cameras: Mapping[str, Camera], index: Index, bumps: int) -> dic
         "bumps_found": accused,
         "moved_in_the_rig_as_solved": sorted(quiet.moved),
         "unchecked": sorted(quiet.unchecked),
-    }
-
-
-def board_files(index: Index) -> dict[str, list[Path]]:
-    """Return the board images of every camera."""
-    table = index.board or {"cameras": {}}
-    return {
-        name: [index.capture / file for file in table["cameras"].get(name, [])]
-        for name in index.cameras
     }
 
 

@@ -26,7 +26,13 @@ from express50.files.images import write_image
 from express50.files.video import iterate_video
 from express50.geometry.cameras import Camera, project, triangulate
 from express50.rigs.read import read_rig
-from pipelines.calibrate.board import Board, BoardCorners, board_points, read_corners
+from pipelines.calibrate.board import (
+    Board,
+    BoardCorners,
+    board_footage,
+    board_points,
+    read_corners,
+)
 from pipelines.calibrate.board_rig import solve_rig
 from pipelines.calibrate.uncertainty import state_uncertainty
 
@@ -86,7 +92,10 @@ def seen_board(
                 write_image(files[name][-1], image)
         sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
         odd, even = (
-            {n: [path for path in mine if int(path.stem) % 2 == side] for n, mine in files.items()}
+            {
+                n: board_footage([p for p in mine if int(p.stem) % 2 == side])
+                for n, mine in files.items()
+            }
             for side in (1, 0)
         )
         return board, read_corners(board, odd, sizes, 0), read_corners(board, even, sizes, 0)

@@ -1,14 +1,15 @@
 """Read a raw capture as it comes off the rig: check the folder and report every fault.
 
 Layout: capture.toml, cameras/<id>/video.mp4 or cameras/<id>/frames/000000.png..., and optionally
-calibration.json, plates/<id>.png, board/<id>/*.png with board/board.toml, cues.csv.
+calibration.json, plates/<id>.png, board/<id>.mp4 or board/<id>/*.png with board/board.toml, and
+cues.csv.
 """
 
 from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Container
+from collections.abc import Container, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -75,7 +76,7 @@ class RawCapture:
         dropped: cameras that cannot be used, with the reason.
         calibration: given cameras, or None if they are to be calibrated.
         plates: background plates by camera id, relative to the root.
-        board: content of board.toml and image files by camera, or None.
+        board: content of board.toml and files by camera, images or one video, or None.
         cues: scripted expressions in file order.
         layout: name of the layout in `express50.capture.readers.read`; ours is ``express50``.
         clips: expression of each clip, if the footage comes in clips; the cues follow from them.
@@ -139,12 +140,8 @@ def read_capture(root: Path) -> RawCapture:
         cameras=cameras,
         dropped=dropped,
         calibration=calibration,
-        plates={
-            Path(name).stem: f"plates/{name}"
-            for name in image_names(root / "plates")
-            if Path(name).stem in cameras
-        },
-        board=_read_board(root, cameras),
+        plates=read_plates(root, cameras),
+        board=read_board(root, cameras),
         cues=read_cues(root / "cues.csv"),
     )
 
@@ -282,7 +279,20 @@ def image_names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir() if is_shown(path, IMAGE_SUFFIXES))
 
 
-def _read_board(root: Path, cameras: dict[str, RawCamera]) -> dict | None:
+def read_plates(root: Path, cameras: Container[str]) -> dict[str, str]:
+    """Return the background plate of each camera that has one, relative to the capture."""
+    plates = {Path(name).stem: f"plates/{name}" for name in image_names(root / "plates")}
+    return {camera: plate for camera, plate in plates.items() if camera in cameras}
+
+
+def read_board(root: Path, cameras: Iterable[str]) -> dict | None:
+    """Return the content of board.toml and each camera's files, relative to the capture, or None.
+
+    The files are images of the board, or one video.
+
+    Raises:
+        CaptureError: there is no board.toml, or a camera has a video and something else.
+    """
     folder = root / "board"
     if not folder.is_dir():
         return None
@@ -294,11 +304,22 @@ def _read_board(root: Path, cameras: dict[str, RawCamera]) -> dict | None:
             " docs/FORMAT.md"
         )
     config = read_toml(path, CaptureError)
-    files = {name: image_names(folder / name) for name in cameras}
-    return {
-        "config": dates_as_text(config),
-        "cameras": {k: [f"board/{k}/{name}" for name in v] for k, v in files.items() if v},
-    }
+    files = {camera: _board_files(folder, camera) for camera in cameras}
+    return {"config": dates_as_text(config), "cameras": {k: v for k, v in files.items() if v}}
+
+
+def _board_files(folder: Path, camera: str) -> list[str]:
+    inner = folder / camera
+    videos = [video for video in _videos(folder) if identifier(video.stem) == camera]
+    videos += _videos(inner) if inner.is_dir() else []
+    images = [inner / name for name in image_names(inner)]
+    if len(videos) > 1 or (videos and images):
+        names = ", ".join(path.name for path in [*videos, *images][:4])
+        raise CaptureError(
+            f"{folder}: {camera} has {names}, expected one video or only images; move the others"
+            " away"
+        )
+    return [f"board/{path.relative_to(folder).as_posix()}" for path in videos or images]
 
 
 def read_cues(path: Path) -> tuple[Cue, ...]:

@@ -38,6 +38,7 @@ HDR_CURVES = {16: "PQ", 18: "HLG"}
 # Weights of red and blue in luma by H.273's matrix coefficients: BT.709, BT.601 (two), BT.2020.
 LUMA = {1: (0.2126, 0.0722), 5: (0.299, 0.114), 6: (0.299, 0.114), 9: (0.2627, 0.0593)}
 LIMITED = 1  # colour range of 16 to 235 and 16 to 240, as cameras record
+UNTIMED = "frames have no time stamps; remux it, for example with 'ffmpeg -i IN -c copy OUT.mp4'"
 BOXES = 1_000_000  # per file; a fragment of one second has two
 DAMAGE = (av.FFmpegError, OSError, ValueError, MemoryError, OverflowError)
 
@@ -162,10 +163,7 @@ def _decode(
                 )
             for frame in packet.decode():
                 if frame.pts is None:
-                    raise CaptureError(
-                        f"{path}: frames have no time stamps; remux it, for example with "
-                        "'ffmpeg -i IN -c copy OUT.mp4'"
-                    )
+                    raise CaptureError(f"{path}: {UNTIMED}")
                 yield frame
     except DAMAGE as error:
         raise CaptureError(
@@ -185,6 +183,26 @@ def video_fps(path: Path) -> float:
     if not 0 < rate <= 10_000:
         raise CaptureError(f"{path}: has no frame rate; set fps in capture.toml")
     return rate
+
+
+def frame_times(path: Path) -> tuple[int, ...]:
+    """List the time stamps of a video's frames in display order, without decoding a frame.
+
+    Raises:
+        CaptureError: the file is not a video, is truncated, or its frames have no time stamps.
+    """
+    check_whole(path)
+    container, stream = _open(path)
+    with container:
+        try:
+            packets = [packet for packet in container.demux(stream) if packet.size]
+        except DAMAGE as error:
+            raise CaptureError(
+                f"{path}: cannot be read ({reason(error)}); copy it again"
+            ) from error
+        if any(packet.pts is None for packet in packets):
+            raise CaptureError(f"{path}: {UNTIMED}")
+        return tuple(sorted(packet.pts for packet in packets if not packet.is_discard))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ OpenCV counts from that pixel's centre. Corners are refined to the saddle point 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -17,8 +18,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from express50.capture.index import Index
+from express50.capture.raw import VIDEO_SUFFIXES, is_shown
 from express50.errors import CalibrationError
 from express50.files.containers import read_picture
+from express50.files.images import upright
+from express50.files.video import VideoReader, frame_times
 from express50.geometry.conventions import mirror_opencv_pixels, opencv_pixels_to_corner
 from express50.geometry.sampling import evenly
 
@@ -253,30 +258,74 @@ def gather(
     )
 
 
+@dataclass(frozen=True)
+class BoardFootage:
+    """One camera's pictures of the board: image files, or the frames of a video, by name.
+
+    `times` are the video's time stamps, none for images; `orientation` is how its frames lie.
+    """
+
+    pictures: Mapping[str, Path]
+    times: tuple[int, ...] = ()
+    orientation: int = 1
+
+    def read(self, names: Sequence[str]) -> Iterator[tuple[str, Path, np.ndarray]]:
+        """Yield name, file and image (H, W, 3) uint8 of the pictures that there are, in order."""
+        known = [name for name in names if name in self.pictures]
+        if self.times and known:
+            path = self.pictures[known[0]]
+            with closing(VideoReader(path, self.times)) as video:
+                for name in known:
+                    yield name, path, upright(video.read(int(name)), self.orientation)
+            return
+        for name in known:
+            path = self.pictures[name].resolve()  # it may be a link to elsewhere
+            yield name, self.pictures[name], read_picture(path.parent, path.name)
+
+
+def board_footage(files: Sequence[Path], orientation: int = 1) -> BoardFootage:
+    """Name a camera's pictures of the board: image files by stem, a video's frames by number.
+
+    Raises:
+        CaptureError: the video cannot be read.
+    """
+    if len(files) == 1 and is_shown(files[0], VIDEO_SUFFIXES):
+        times = frame_times(files[0])
+        pictures = {f"{number:06d}": files[0] for number in range(len(times))}
+        return BoardFootage(pictures, times, orientation)
+    return BoardFootage({path.stem: path for path in files})
+
+
+def footage_of_board(index: Index) -> dict[str, BoardFootage]:
+    """Return each camera's pictures of the board; none of a camera that has no file."""
+    files = index.board["cameras"] if index.board else {}
+    return {
+        name: board_footage([index.capture / file for file in files.get(name, [])], one.orientation)
+        for name, one in index.cameras.items()
+    }
+
+
 def read_corners(
     board: Board,
-    files: Mapping[str, Iterable[Path]],
+    footage: Mapping[str, BoardFootage],
     sizes: Mapping[str, tuple[int, int]],
     limit: int,
     look: Callable[[str, str, np.ndarray, np.ndarray, np.ndarray], None] | None = None,
 ) -> BoardCorners:
-    """Detect the board in each camera's `files`; files of one name were taken at one time.
+    """Detect the board in each camera's `footage`; pictures of one name were taken at one time.
 
-    At most `limit` images are read per camera, evenly spaced over all names (0 = all); `sizes` are
-    the footage's (width, height). `look` gets camera, frame, image, ids and pixels of each.
+    At most `limit` pictures are read per camera, evenly spaced over all names (0 = all); `sizes`
+    are the footage's (width, height). `look` gets camera, name, image, ids and pixels of each.
     """
-    by_name = {camera: {path.stem: path for path in paths} for camera, paths in files.items()}
-    names = sorted(set().union(*by_name.values()))
+    names = sorted(set().union(*(one.pictures for one in footage.values())))
     names = evenly(names, limit or len(names))
     detector = make_detector(board)
     found = []
-    for camera, paths in sorted(by_name.items()):
-        for name in (n for n in names if n in paths):
-            path = paths[name].resolve()  # it may be a link to elsewhere
-            image = read_picture(path.parent, path.name)
+    for camera, one in sorted(footage.items()):
+        for name, path, image in one.read(names):
             if (image.shape[1], image.shape[0]) != tuple(sizes[camera]):
                 raise CalibrationError(
-                    f"{paths[name]}: image is {image.shape[1]}x{image.shape[0]}, the footage "
+                    f"{path}: image is {image.shape[1]}x{image.shape[0]}, the footage "
                     f"of {camera} is {sizes[camera][0]}x{sizes[camera][1]}; record the board "
                     "with the settings of the capture"
                 )
@@ -284,4 +333,4 @@ def read_corners(
             found.append((camera, name, ids, pixels))
             if look is not None:
                 look(camera, name, image, ids, pixels)
-    return gather(found, by_name)
+    return gather(found, footage)

@@ -156,10 +156,10 @@ def solve_footage(
     faces = {name for points in seen.values() for name, _, _ in points.landmarks}
     if len(rig) < 2:
         raise CalibrationError(
-            f"{where}: has neither calibration.json nor board images, and solving from footage"
+            f"{where}: has neither calibration.json nor a board, and solving from footage"
             f" needs two cameras that see a face at the same time; a face is seen by"
-            f" {', '.join(sorted(faces)) or 'none'}: add calibration.json or board/<camera>/*.png"
-            " with board.toml, then run 'express50 ingest' again"
+            f" {', '.join(sorted(faces)) or 'none'}: add calibration.json, or pictures or videos of"
+            " a ChArUco board (docs/FORMAT.md), then run 'express50 ingest' again"
         )
     priors = RigPriors(
         focal=KNOWN_FOCAL if all(name in focals for name in sizes) else GUESSED_FOCAL,

@@ -26,7 +26,13 @@ from express50.files.images import write_image
 from express50.geometry.cameras import Camera, pinhole, unproject
 from express50.geometry.conventions import cell_to_corner
 from express50.rigs.world_frame import check_meeting, judge, meeting_point
-from pipelines.calibrate.board import BoardCorners, board_from_table, board_points, read_corners
+from pipelines.calibrate.board import (
+    BoardCorners,
+    board_from_table,
+    board_points,
+    footage_of_board,
+    read_corners,
+)
 from pipelines.calibrate.board_rig import BoardSolution, solve_rig
 from pipelines.calibrate.colour_gains import ColourGains, WhiteCollector
 from pipelines.calibrate.config import CalibrateConfig
@@ -274,10 +280,8 @@ def _read_board(index: Index, limit: int) -> tuple[BoardCorners, np.ndarray, Whi
     """Read the board's corners, their places on it (P, 3), and its white squares."""
     table = index.board or {}
     board = board_from_table(table["config"], f"{index.capture}: board.toml")
-    files = {n: [index.capture / file for file in table["cameras"].get(n, [])]
-             for n in index.cameras}  # fmt: skip
     whites = WhiteCollector(board)
-    corners = read_corners(board, files, sizes_of(index), limit, whites.look)
+    corners = read_corners(board, footage_of_board(index), sizes_of(index), limit, whites.look)
     return corners, board_points(board), whites
 
 

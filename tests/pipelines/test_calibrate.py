@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from express50.errors import CalibrationError
+from express50.errors import CalibrationError, CaptureError
 from express50.files.calibration import write_cameras
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
 from express50.rigs.camera_builder import in_metres
@@ -18,11 +18,13 @@ from express50.rigs.world_frame import canonical_from_rig, meeting_point, move_c
 from pipelines import calibrate
 from pipelines.calibrate.board import (
     BoardCorners,
+    board_footage,
     board_from_table,
     detect_corners,
     gather,
     make_detector,
     opencv_board,
+    read_corners,
 )
 from pipelines.calibrate.board_adjust import BoardRig, corner_errors
 from pipelines.calibrate.board_rig import solve_rig
@@ -38,7 +40,7 @@ from tests.pipelines.board_rigs import (
     sizes_of,
 )
 from tests.stages import ingest_captures, run_here
-from tests.synth import make_capture
+from tests.synth import make_capture, write_video
 
 
 def solve(rig, observations: BoardCorners, model: str = "auto"):
@@ -230,6 +232,34 @@ def test_corners_of_an_image_are_found_to_a_fraction_of_a_pixel() -> None:
     # A forgotten half pixel would show as a mean of 0.5.
     assert np.abs(errors.mean(axis=0)).max() < 0.02
     assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 0.08
+
+
+def test_corners_in_a_video_are_those_in_its_frames(tmp_path) -> None:
+    """The video lies on its side, as a phone stores it; B-frames put its packets out of order."""
+    rig, path = make_rig(1, focal=500.0), tmp_path / "cam00.mp4"
+    board, images = board_motion(1, 12, shift=0.0)[0], []
+    for _ in range(5):
+        images.append(render_board(rig["cam00"], board, 2))
+        board = make_transform(board[:3, :3], board[:3, 3] + [0.006, 0.002, 0.0])
+    turned = [np.ascontiguousarray(np.rot90(image)) for image in images]
+    write_video(path, turned, options={"crf": "1"})
+    footage = {"cam00": board_footage([path], orientation=6)}
+    found = read_corners(BOARD, footage, sizes_of(rig), limit=3)
+    assert found.frames == ("000000", "000002", "000004")
+    for frame, image in enumerate(images[::2]):
+        ids, pixels = detect_corners(image, make_detector(BOARD), BOARD)
+        mine = found.frame == frame
+        assert len(ids) > 20 and found.corner[mine].tolist() == ids.tolist()
+        assert np.abs(found.pixels[mine] - pixels).max() < 0.1
+
+
+def test_a_truncated_video_of_the_board_is_one_clear_error(tmp_path) -> None:
+    write_video(tmp_path / "cam00.mp4", [np.zeros((48, 64, 3), np.uint8)] * 5)
+    data = (tmp_path / "cam00.mp4").read_bytes()
+    (tmp_path / "cam00.mp4").write_bytes(data[: len(data) // 2])
+    with pytest.raises(CaptureError, match="cam00.mp4: video") as error:
+        board_footage([tmp_path / "cam00.mp4"])
+    assert "\n" not in str(error.value)
 
 
 def test_white_on_black_and_mirrored_boards_are_found() -> None:

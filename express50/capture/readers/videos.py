@@ -22,8 +22,10 @@ from express50.capture.raw import (
     RawCamera,
     RawCapture,
     is_shown,
+    read_board,
     read_calibration,
     read_cues,
+    read_plates,
 )
 from express50.capture.readers.selection import (
     Moment,
@@ -255,12 +257,12 @@ def fits_videos(path: Path) -> bool:
 def read_videos(path: Path, selection: Selection) -> RawCapture:
     """Read each video of a folder as a camera; frame 17 of all shows the same moment.
 
-    ``cues.csv`` and ``calibration.json`` beside them are those of our own layout (docs/FORMAT.md);
-    without cues, the whole footage is one clip.
+    ``cues.csv``, ``calibration.json``, ``board`` and ``plates`` beside them are those of our own
+    layout (docs/FORMAT.md); without cues, the whole footage is one clip.
 
     Raises:
-        CaptureError: one of them is not a video, two names become one camera id, or the cues are
-            malformed.
+        CaptureError: one of them is not a video, two names become one camera id, or the cues or the
+            board's files are malformed.
         CalibrationError: calibration.json is malformed.
     """
     files = sorted(filter(fits_video, path.iterdir()))
@@ -273,5 +275,6 @@ def read_videos(path: Path, selection: Selection) -> RawCapture:
     return RawCapture(
         root=path, subject=folder_id(path), fps=video_fps(files[0]), meta={}, cues=cues,
         cameras=cameras, dropped=dropped, calibration=calibration,
+        plates=read_plates(path, cameras), board=read_board(path, cameras),
         clips=() if cues else (selection.expression(CLIP),),
     )  # fmt: skip

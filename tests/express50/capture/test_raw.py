@@ -137,6 +137,13 @@ def test_board_is_listed_by_camera(raw):
     board = read_capture(raw).board
     assert board["config"] == {"squares_x": 5}
     assert board["cameras"] == {"cam00": ["board/cam00/000.png"], "cam02": ["board/cam02/000.png"]}
+    (raw / "board/cam01").mkdir()
+    (raw / "board/cam01/wand.mp4").touch()
+    assert read_capture(raw).board["cameras"]["cam01"] == ["board/cam01/wand.mp4"]
+    (raw / "board/cam00.mp4").touch()
+    message = "cam00 has cam00.mp4, 000.png, expected one video or only images"
+    with pytest.raises(CaptureError, match=message):
+        read_capture(raw)
 
 
 @pytest.mark.parametrize(

@@ -246,7 +246,7 @@ def test_a_telephones_video_is_read_upright(tmp_path):
     assert near(read_frame(dataset, "talk", "video", 2, False), images[2], 20)
 
 
-def test_a_folder_of_videos_is_a_rig_with_cues_and_cameras_beside_them(tmp_path):
+def test_a_folder_of_videos_is_a_rig_with_what_lies_beside_them(tmp_path):
     folder, images = tmp_path / "rig", noise_video_images(4)
     folder.mkdir()
     for name in ("GoPro 1.MP4", "left.mov"):
@@ -259,6 +259,13 @@ def test_a_folder_of_videos_is_a_rig_with_cues_and_cameras_beside_them(tmp_path)
     found = read_any(folder)
     assert found.cues == (Cue("smile", 1, 2),) and list(found.calibration) == ["left"]
     assert list(found.cameras) == ["left"] and "GoPro_1" in found.dropped
+    (folder / "calibration.json").unlink()
+    for name in ("board/GoPro 1.mov", "board/board.toml", "plates/left.png"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).touch()
+    found = read_any(folder)
+    assert found.board == {"config": {}, "cameras": {"GoPro_1": ["board/GoPro 1.mov"]}}
+    assert found.plates == {"left": "plates/left.png"}
     write_video(folder / "left.mp4", images)
     with pytest.raises(CaptureError, match="left.mov and left.mp4 both become camera left"):
         read_any(folder)
