@@ -228,13 +228,21 @@ def _row(run: Ablation, name: str, variant: Variant, seed: int) -> dict:
 
 
 def _train(used: Sequence[Path], folder: Path, settings: Config) -> None:
-    """Train or resume a row; start over if its settings or samples have changed."""
+    """Train or resume a row.
+
+    Raises:
+        ConfigError: it was trained with other settings or samples.
+    """
     source = open_shards(used, "train")
     tables = {k: v for k, v in as_tables(settings).items() if k not in ("fit", "metrics")}
     wanted = dump_json({"tables": tables, "samples": source.digest})
     mark, checkpoint = folder / "settings.json", folder / "checkpoint.pt"
     if not mark.exists() or mark.read_bytes() != wanted:
-        checkpoint.unlink(missing_ok=True)
+        if checkpoint.exists():  # it may have taken hours
+            raise ConfigError(
+                f"{folder}: was trained with other settings or samples (settings.json has them);"
+                " name another OUT, or delete this folder to train the row again"
+            )
         write_bytes(mark, wanted)
     log(f"ablate: training {folder.name}")
     train(source, load_head(source.head), folder, settings, resume=checkpoint.exists())

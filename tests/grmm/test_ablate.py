@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from benchmarks.ablate import differences, earned
-from express50.errors import FormatError
+from express50.errors import ConfigError, FormatError
 from express50.files.images import read_image, write_image
 from grmm import ablate as ablate_module
 from grmm.ablate import VARIANTS
@@ -82,7 +82,7 @@ def test_finished_rows_are_kept_and_changed_ones_measured_again(table, roots, mo
     assert trained == ["no_residuals"]
 
 
-def test_rows_of_other_samples_are_trained_afresh(tmp_path, monkeypatch):
+def test_rows_of_other_samples_are_not_replaced(tmp_path, monkeypatch):
     gone_on = []
     monkeypatch.setattr(ablate_module, "train", lambda *a, resume, **k: gone_on.append(resume))
     config = tiny_config()
@@ -90,10 +90,12 @@ def test_rows_of_other_samples_are_trained_afresh(tmp_path, monkeypatch):
         write_shards(tmp_path / str(size), EllipsoidSource(subjects=3, size=size))
         for size in (32, 24)
     ]
-    for shards in (packed[0], packed[0], packed[1]):
-        ablate_module._train([shards], tmp_path / "row", config)
+    for _ in range(2):
+        ablate_module._train([packed[0]], tmp_path / "row", config)
         (tmp_path / "row" / "checkpoint.pt").touch()
-    assert gone_on == [False, True, False]
+    with pytest.raises(ConfigError, match="row: was trained with other settings or samples"):
+        ablate_module._train([packed[1]], tmp_path / "row", config)
+    assert gone_on == [False, True] and (tmp_path / "row" / "checkpoint.pt").exists()
 
 
 def test_unknown_rows_are_named(roots, tmp_path, capsys):
