@@ -10,7 +10,7 @@ import numpy as np
 
 from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera
-from express50.geometry.sampling import evenly
+from express50.geometry.sampling import evenly, pictured_share
 from express50.geometry.shapes import check_finite
 from express50.rigs.world_frame import canonical_from_rig, move_cameras
 from pipelines.calibrate.board import BoardCorners
@@ -42,6 +42,7 @@ FITTING = 0.75
 """Least share of a camera's corners that fit; cameras that moved have less. If half of the cameras
 have less, there is no rig: wrong ones have up to 0.59 in the median camera, a real one 0.87."""
 LEAST_CORNERS = 24  # that must fit the other cameras, or a camera is dropped
+STEADY = 1.5  # times the least cost that a lens model may have instead of one that folds
 REJECT_SIGMA = 4.0
 """Corners further off than this many robust standard deviations are rejected; 3 to 6 gave the same
 rig within 0.005 degrees."""
@@ -252,7 +253,8 @@ def _simplest_models(
 
     Superfluous distortion terms trade with the principal point and the rotation: tangential terms
     alone triple the rotation's error. The lowest Bayesian information criterion wins (Schwarz
-    1978), with a robust sum of squares.
+    1978), with a robust sum of squares. No lens folds within its image, but polynomials do where
+    corners are missing, so a model that does not fold and fits nearly as well comes first.
     """
     rigs: list[BoardRig] = []
     costs: list[np.ndarray] = []
@@ -268,11 +270,13 @@ def _simplest_models(
     for name in rig.cameras:
         index = kept.cameras.index(name)
         count = 2 * int((kept.camera == index).sum())
-        scores = [
-            count * np.log(cost[index] / count) + len(solved.cameras[name].params) * np.log(count)
-            for solved, cost in zip(rigs, costs, strict=True)
-        ]
-        cameras[name] = rigs[int(np.argmin(scores))].cameras[name]
+        least, rows = min(cost[index] for cost in costs), []
+        for solved, cost in zip(rigs, costs, strict=True):
+            camera = solved.cameras[name]
+            sound = cost[index] <= STEADY * least and pictured_share(camera) == 1
+            score = count * np.log(cost[index] / count) + len(camera.params) * np.log(count)
+            rows.append((not sound, score, camera))
+        cameras[name] = min(rows, key=lambda row: row[:2])[2]
     return BoardRig(cameras, rigs[-1].boards)
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from express50.errors import CalibrationError, CaptureError
 from express50.files.calibration import write_cameras
+from express50.geometry.sampling import pictured_share
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
 from express50.rigs.camera_builder import in_metres
 from express50.rigs.world_frame import canonical_from_rig, meeting_point, move_cameras
@@ -84,6 +85,20 @@ def test_scale_is_the_boards() -> None:
             once[a].center - once[b].center
         )
         assert ratio == pytest.approx(2.0, rel=1e-5)
+
+
+def test_a_lens_seen_in_its_middle_alone_does_not_fold_further_out() -> None:
+    rig = make_rig(3, focal=500.0)
+    found = observe(rig, board_motion(30, 0), 0.3)
+    off = found.pixels - [320, 240]
+    square = np.sum((off / 500) ** 2, axis=1, keepdims=True)
+    # The polynomial that fits best turns back at 0.84 of a focal length from the middle.
+    bent = [320, 240] + off * (1 + 0.1 * square - 0.8 * square**2)
+    mine, wide = found.camera == 0, np.linalg.norm(off, axis=1) > 130
+    found = replace(found, pixels=np.where(mine[:, None], bent, found.pixels))
+    solution = solve(rig, found.select(~(mine & wide)))
+    assert all(pictured_share(camera) == 1 for camera in solution.cameras.values())
+    assert np.sqrt(np.mean(np.sum(solution.errors**2, axis=1))) < 0.45
 
 
 def test_bad_corners_do_not_move_the_rig() -> None:
