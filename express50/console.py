@@ -158,7 +158,7 @@ def run_handler(
         return USAGE if isinstance(error, ConfigError) else FAILED
     except KeyboardInterrupt:
         sys.stderr.write(
-            f"{program}: interrupted; finished work is kept; run the same command again\n"
+            f"{program}: interrupted; finished work is kept, the same command makes the rest\n"
         )
         return INTERRUPTED
 

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from express50.console import figure_label, log
+from express50.console import figure_label, format_seconds, log
 from express50.errors import ConfigError, TrainError
 from express50.files.atomic import check_space, write_json
 from express50.geometry.sampling import evenly
@@ -37,6 +37,7 @@ from grmm.shard_source import select
 from grmm.warm_start import LOGIT_LIMIT, project_texture, spread_change
 
 Scores = dict[str, float | None]
+SAY_SECONDS = 10.0  # between lines of progress
 SCORED_PICTURES = 12  # pictures scored between the stages
 STAGE1_SHARE = 0.35  # of a time budget (G22)
 STAGE1_LR = 1e-2  # learning rate of the codes: they are few and start at a mean (G22)
@@ -173,7 +174,7 @@ def invert_codes(state: FitState, until: float = math.inf) -> int:
         code.requires_grad_(True)
     done = 0
     optimizer = torch.optim.Adam(codes, lr=STAGE1_LR)
-    for number, share, item in _items(state, settings.stage1_iterations, until):
+    for number, share, item in _items(state, 1, settings.stage1_iterations, until):
         optimizer.param_groups[0]["lr"] = STAGE1_LR * STAGE1_FINAL_LR**share
         optimizer.zero_grad()
         rendering, z_exp = state.render(item), state.z_exp[item.key.expression]
@@ -197,7 +198,7 @@ def tune_decoders(state: FitState, until: float = math.inf) -> int:
     groups = [{"params": parameters[name], "lr": rate} for name, rate in rates.items()]
     optimizer, rng = torch.optim.Adam(groups, fused=True), np.random.default_rng(train.seed)
     done = 0
-    for number, _, item in _items(state, settings.stage2_iterations, until):
+    for number, _, item in _items(state, 2, settings.stage2_iterations, until):
         optimizer.zero_grad()
         shade = random_camera(state, rng) if rng.random() < settings.shuffle_directions else None
         rendering = state.render(item, shade)
@@ -214,18 +215,26 @@ def tune_decoders(state: FitState, until: float = math.inf) -> int:
     return done
 
 
-def _items(state: FitState, iterations: int, until: float) -> Iterator[tuple[int, float, HeadView]]:
+def _items(
+    state: FitState, stage: int, iterations: int, until: float
+) -> Iterator[tuple[int, float, HeadView]]:
     """Yield given views in shuffled order until iterations or time run out; at least one.
 
     Each comes with its number and the share of the iterations or of the time that is used up.
     """
-    shuffle, began = Shuffle(state.given, state.config.train.seed), time.perf_counter()
+    shuffle = Shuffle(state.given, state.config.train.seed)
+    began = said = time.perf_counter()
     for number in range(iterations):
-        used = (time.perf_counter() - began) / max(until - began, 1e-9)
+        now = time.perf_counter()
+        used = (now - began) / max(until - began, 1e-9)
         if number > 0 and used >= 1:
             return
-        item = state.views.item(shuffle.next(), crop=True)
-        yield number, max(number / iterations, min(used, 1.0)), item
+        share = max(number / iterations, min(used, 1.0))
+        if number > 0 and now - said >= SAY_SECONDS:
+            left = format_seconds((now - began) * (1 - share) / share)
+            log(f"fit: stage {stage}, iteration {number}, {left} of this stage left")
+            said = now
+        yield number, share, state.views.item(shuffle.next(), crop=True)
 
 
 def start_texture(state: FitState) -> None:

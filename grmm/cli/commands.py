@@ -174,6 +174,8 @@ def render(args: argparse.Namespace) -> int:
         log(f"drawing {name}.jpg, {view.width} x {view.height} px per picture")
         sheets[name] = function(loaded, *values)
 
+    if args.samples:  # first, because it needs several people
+        draw("samples", render.sample_sheet, head, view, args.samples, args.seed, args.spread)
     if args.views:
         draw("views", render.novel_views, head, view)
     if args.controls:
@@ -182,8 +184,6 @@ def render(args: argparse.Namespace) -> int:
         plain = _frame_head(loaded, args.subject or model.subjects[0])
         donor = _frame_head(loaded, args.expression_of)
         draw("transfer", render.residual_sheet, plain, donor, view)
-    if args.samples:
-        draw("samples", render.sample_sheet, head, view, args.samples, args.seed, args.spread)
     draw("grid", render.expression_grid, subjects, expressions, view)
     picture = render.picture(loaded, head, view)
     args.out.mkdir(parents=True, exist_ok=True)

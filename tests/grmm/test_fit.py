@@ -160,6 +160,13 @@ def test_a_person_of_the_training_keeps_the_fitted_head(loaded, tmp_path):
         np.testing.assert_array_equal(shown, offsets)
 
 
+def test_a_fit_shows_its_progress(loaded, views, monkeypatch, capsys):
+    monkeypatch.setattr("grmm.fit.SAY_SECONDS", 0.0)
+    assert invert_codes(start(loaded, views, [0, 1])) > 1
+    said = capsys.readouterr().err
+    assert "fit: stage 1, iteration 1, " in said and " of this stage left" in said
+
+
 def test_fit_stops_at_its_time_budget(loaded, views, tmp_path):
     settings = replace(
         loaded.config.fit, stage1_iterations=10_000, stage2_iterations=10_000, seconds=0.4
@@ -173,9 +180,11 @@ def test_fit_stops_at_its_time_budget(loaded, views, tmp_path):
 
 def test_a_short_budget_decays_by_time(loaded, views):
     state = start(loaded, views, unseen(views))
-    shares = [share for _, share, _ in fit_module._items(state, 10**6, time.perf_counter() + 0.3)]
+    until = time.perf_counter() + 0.3
+    shares = [share for _, share, _ in fit_module._items(state, 1, 10**6, until)]
     assert shares[0] < 0.3 and 0.7 < shares[-1] <= 1 and shares == sorted(shares)
-    assert [share for _, share, _ in fit_module._items(state, 4, math.inf)] == [0, 0.25, 0.5, 0.75]
+    shares = [share for _, share, _ in fit_module._items(state, 1, 4, math.inf)]
+    assert shares == [0, 0.25, 0.5, 0.75]
 
 
 def test_views_of_two_subjects_are_refused(loaded, views, tmp_path):
