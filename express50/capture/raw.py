@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from express50.capture.index import Cue
-from express50.errors import CalibrationError, CaptureError
+from express50.errors import CalibrationError, CaptureError, few
 from express50.files.calibration import read_cameras
 from express50.files.text import (
     ID,
@@ -143,6 +143,7 @@ def read_capture(root: Path) -> RawCapture:
         plates=read_plates(root, cameras),
         board=read_board(root, cameras),
         cues=read_cues(root / "cues.csv"),
+        warnings=strangers(root, [*cameras, *dropped]),
     )
 
 
@@ -281,7 +282,9 @@ def image_names(folder: Path) -> list[str]:
 
 def read_plates(root: Path, cameras: Container[str]) -> dict[str, str]:
     """Return the background plate of each camera that has one, relative to the capture."""
-    plates = {Path(name).stem: f"plates/{name}" for name in image_names(root / "plates")}
+    plates = {
+        identifier(Path(name).stem): f"plates/{name}" for name in image_names(root / "plates")
+    }
     return {camera: plate for camera, plate in plates.items() if camera in cameras}
 
 
@@ -309,10 +312,12 @@ def read_board(root: Path, cameras: Iterable[str]) -> dict | None:
 
 
 def _board_files(folder: Path, camera: str) -> list[str]:
-    inner = folder / camera
     videos = [video for video in _videos(folder) if identifier(video.stem) == camera]
-    videos += _videos(inner) if inner.is_dir() else []
-    images = [inner / name for name in image_names(inner)]
+    images: list[Path] = []
+    for inner in (path for path in sorted(folder.iterdir()) if identifier(path.name) == camera):
+        if inner.is_dir():
+            videos += _videos(inner)
+            images += [inner / name for name in image_names(inner)]
     if len(videos) > 1 or (videos and images):
         names = ", ".join(path.name for path in [*videos, *images][:4])
         raise CaptureError(
@@ -320,6 +325,24 @@ def _board_files(folder: Path, camera: str) -> list[str]:
             " away"
         )
     return [f"board/{path.relative_to(folder).as_posix()}" for path in videos or images]
+
+
+def strangers(root: Path, cameras: Iterable[str]) -> dict[str, str]:
+    """Return which files of ``plates`` and ``board`` belong to no camera, with what to do."""
+    known, found = list(cameras), {}
+    for part, suffixes in (("plates", IMAGE_SUFFIXES), ("board", VIDEO_SUFFIXES)):
+        folder = root / part
+        names = [
+            path.name
+            for path in (sorted(folder.iterdir()) if folder.is_dir() else ())
+            if is_shown(path, suffixes) or (part == "board" and path.is_dir())
+            if identifier(path.name if path.is_dir() else path.stem) not in known
+        ]
+        if names:
+            found[part] = (
+                f"holds {few(names)}, but cameras are {few(known, 8)}; rename it after its camera"
+            )
+    return found
 
 
 def read_cues(path: Path) -> tuple[Cue, ...]:

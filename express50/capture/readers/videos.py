@@ -26,6 +26,7 @@ from express50.capture.raw import (
     read_calibration,
     read_cues,
     read_plates,
+    strangers,
 )
 from express50.capture.readers.selection import (
     Moment,
@@ -277,4 +278,5 @@ def read_videos(path: Path, selection: Selection) -> RawCapture:
         cameras=cameras, dropped=dropped, calibration=calibration,
         plates=read_plates(path, cameras), board=read_board(path, cameras),
         clips=() if cues else (selection.expression(CLIP),),
+        warnings=strangers(path, ids.values()),
     )  # fmt: skip

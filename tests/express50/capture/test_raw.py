@@ -134,7 +134,14 @@ def test_board_is_listed_by_camera(raw):
     with pytest.raises(CaptureError, match=r"no board\.toml"):
         read_capture(raw)
     (raw / "board/board.toml").write_text("squares_x = 5\n")
-    board = read_capture(raw).board
+    (raw / "plates").mkdir(exist_ok=True)
+    (raw / "plates/cam1.png").touch()
+    found = read_capture(raw)
+    cameras = "cameras are cam00, cam01, cam02; rename it after its camera"
+    assert found.warnings == {
+        "plates": f"holds cam1.png, but {cameras}", "board": f"holds stranger, but {cameras}"
+    }  # fmt: skip
+    board = found.board
     assert board["config"] == {"squares_x": 5}
     assert board["cameras"] == {"cam00": ["board/cam00/000.png"], "cam02": ["board/cam02/000.png"]}
     (raw / "board/cam01").mkdir()

@@ -265,7 +265,7 @@ def test_a_folder_of_videos_is_a_rig_with_what_lies_beside_them(tmp_path):
         (folder / name).touch()
     found = read_any(folder)
     assert found.board == {"config": {}, "cameras": {"GoPro_1": ["board/GoPro 1.mov"]}}
-    assert found.plates == {"left": "plates/left.png"}
+    assert found.plates == {"left": "plates/left.png"} and not found.warnings
     write_video(folder / "left.mp4", images)
     with pytest.raises(CaptureError, match="left.mov and left.mp4 both become camera left"):
         read_any(folder)
