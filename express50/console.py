@@ -35,6 +35,7 @@ REMEDIES = {
     errno.EROFS: "make its disk writable, or use another one",
     errno.ENOSPC: "free some space",
     errno.EDQUOT: "free some space, your quota is used up",
+    errno.EFBIG: "its disk or 'ulimit -f' limits the size of files; use another disk or limit",
 }
 
 LATER = 0.05  # seconds, after which a callback of the garbage collection has ended

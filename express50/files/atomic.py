@@ -115,6 +115,7 @@ def naming_full_disk(path: Path) -> Iterator[None]:
 
     Raises:
         DiskFullError: the body raised such an error.
+        OSError: the body raised one of a file that became too large, which then names the path.
     """
     try:
         yield
@@ -123,7 +124,10 @@ def naming_full_disk(path: Path) -> Iterator[None]:
     except Exception as error:
         cause: BaseException | None = error
         while cause is not None:
-            full = getattr(cause, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
+            number = getattr(cause, "errno", None)
+            if number == errno.EFBIG:  # torch hides it behind an error of its own
+                raise OSError(number, os.strerror(number), str(path)) from error
+            full = number in (errno.ENOSPC, errno.EDQUOT)
             if full or NO_SPACE in str(cause):
                 raise _full(path, str(cause)) from error
             cause = cause.__cause__ or cause.__context__

@@ -13,6 +13,7 @@ from express50.files.atomic import (
     check_folder_writable,
     folder_in_one_step,
     write_bytes,
+    write_with,
 )
 
 
@@ -54,6 +55,19 @@ def test_a_read_only_disk_is_named_by_the_file_that_was_given(tmp_path, monkeypa
     with pytest.raises(OSError) as caught:  # noqa: PT011
         write_bytes(tmp_path / "page.html", b"x")
     assert caught.value.filename == str(tmp_path / "page.html")
+
+
+def test_a_limit_on_the_size_of_files_is_named_even_behind_an_error_of_torch(tmp_path):
+    def write(file):
+        try:
+            refuse(errno.EFBIG)()
+        finally:
+            raise RuntimeError("[enforce fail at inline_container.cc:672] . unexpected pos")
+
+    with pytest.raises(OSError) as caught:  # noqa: PT011
+        write_with(tmp_path / "checkpoint.pt", write)
+    line = system_error_line(caught.value)
+    assert line.startswith(f"OSError: {tmp_path / 'checkpoint.pt'}: File too large; its disk or")
 
 
 def test_a_disk_that_fills_up_under_a_folder_is_named(tmp_path):
