@@ -17,7 +17,6 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-import numpy as np
 import torch
 
 from benchmarks.common import make_parser
@@ -57,7 +56,7 @@ def scene(device: torch.device, n_g: int, size: int) -> tuple[GRMM, HeadState, P
     focal = FILL * size * DISTANCE_M / height
     K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]], dtype=torch.float64)
     centre = model.head_centre.cpu().double().numpy()
-    pose = look_at(centre + [0.0, 0.0, DISTANCE_M], centre, np.array([0.0, 1.0, 0.0]))
+    pose = look_at(centre + [0.0, 0.0, DISTANCE_M], centre)
     camera = torch.from_numpy(pose)
     return (
         model,

@@ -17,6 +17,7 @@ from express50.files.calibration import write_cameras
 from express50.files.images import write_image
 from express50.geometry.cameras import Camera, rays
 from express50.geometry.transforms import look_at
+from tests.balls import meet_ball
 
 RADIUS_M = 0.1
 EXPRESSIONS = ("neutral", "smile")
@@ -39,7 +40,7 @@ def make_rig(cameras: int = 3, size: int = 64) -> dict[str, Camera]:
     for number in range(cameras):
         angle = (number - (cameras - 1) / 2) * 0.5
         eye = 0.6 * np.array([np.sin(angle), 0.1, np.cos(angle)])
-        pose = look_at(eye, np.zeros(3), np.array([0.0, 1.0, 0.0]))
+        pose = look_at(eye, np.zeros(3))
         name = f"cam{number:02d}"
         params = (1.6 * size, 1.6 * size, size / 2, size / 2, 0.0, 0.0, 0.0, 0.0)
         rig[name] = Camera(name, size, size, "OPENCV", params, pose)
@@ -54,18 +55,14 @@ def render_ball(camera: Camera, frame: int | None) -> np.ndarray:
     image = np.stack([60 + 40 * (row // 8 % 2), 70 + 30 * (column // 8 % 2), 90 + row % 16], -1)
     if frame is None:
         return image.astype(np.uint8)
-    direction = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    b = direction @ origin
-    root = b**2 - (origin @ origin - RADIUS_M**2)
-    hit = root > 0
-    point = origin + (-b - np.sqrt(np.maximum(root, 0)))[..., None] * direction
-    normal = point / RADIUS_M
+    depth, through = meet_ball(origin, directions, RADIUS_M)
+    normal = (origin + depth[..., None] * directions) / RADIUS_M
     shade = 0.4 + 0.6 * np.clip(normal @ np.array([0.3, 0.5, 0.8]), 0, 1)
     mark_angle = 0.35 * frame
     mark = np.array([np.sin(mark_angle), 0.3 * np.cos(mark_angle), 0.8])
     marked = normal @ (mark / np.linalg.norm(mark)) > 0.85
     colour = np.where(marked[..., None], [240, 60, 40], [210, 170, 140])
-    return np.where(hit[..., None], colour * shade[..., None], image).astype(np.uint8)
+    return np.where(through[..., None] > 0, colour * shade[..., None], image).astype(np.uint8)
 
 
 def make_capture(

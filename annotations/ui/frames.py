@@ -169,13 +169,11 @@ class Face:
     Attributes:
         x, y: middle of the eyes' corners.
         unit: distance of the outer corners of the eyes as a frontal view would have it.
-        aspect: height of the picture over its width.
     """
 
     x: float
     y: float
     unit: float
-    aspect: float
 
 
 def zoom_box(face: Face | None, zoom: str, pane_aspect: float, image_aspect: float) -> Box:
@@ -187,7 +185,6 @@ def zoom_box(face: Face | None, zoom: str, pane_aspect: float, image_aspect: flo
         height = max(image_aspect, pane_aspect)
         width = height / pane_aspect
         x, y = 0.5, image_aspect / 2
-        aspect = image_aspect
     else:
         below, size = _BOXES[zoom]
         height = size * face.unit
@@ -195,9 +192,9 @@ def zoom_box(face: Face | None, zoom: str, pane_aspect: float, image_aspect: flo
         if zoom in ("mouth", "eyes") and width < 1.25 * face.unit:
             width = 1.25 * face.unit  # a narrow pane must still show both corners
             height = width * pane_aspect
-        x, y, aspect = face.x, face.y + below * face.unit, face.aspect
-    left, top = x - width / 2, (y - height / 2) / aspect
-    right, bottom = x + width / 2, (y + height / 2) / aspect
+        x, y = face.x, face.y + below * face.unit
+    left, top = x - width / 2, (y - height / 2) / image_aspect
+    right, bottom = x + width / 2, (y + height / 2) / image_aspect
     return round(left, 4), round(top, 4), round(right, 4), round(bottom, 4)
 
 
@@ -244,10 +241,10 @@ class FaceFinder:
         found = detect(network, image)
         if found.score < MIN_SCORE or not np.isfinite(found.points).all():
             return None
-        points, (height, width) = found.points, image.shape[:2]
+        points, width = found.points, image.shape[1]
         eyes = points[list(_EYE_CORNERS)].mean(0)
         across = float(np.linalg.norm(points[45] - points[36]))
         nose = float(np.linalg.norm(points[_NOSE_BASE] - points[_BRIDGE])) / _NOSE_SHARE
         # From the side the eyes close up but the nose does not; from above, the other way round.
         unit = max(across, nose, 2.0)
-        return Face(eyes[0] / width, eyes[1] / width, unit / width, height / width)
+        return Face(eyes[0] / width, eyes[1] / width, unit / width)

@@ -9,6 +9,7 @@ from typing import Any
 
 from express50.cli.stages import (
     add_run_options,
+    exit_code,
     refuse_swapped,
     run_all,
     say_account,
@@ -16,7 +17,6 @@ from express50.cli.stages import (
 )
 from express50.console import (
     FAILED,
-    OK,
     USAGE,
     add_command,
     answer,
@@ -76,9 +76,7 @@ def run_chain(args: argparse.Namespace) -> int:
         say_json({"run": vars(state), "stages": [summary.to_json() for summary in summaries]})
     else:
         say(*closing_lines(state, summaries))
-    dropped = args.strict and any(o.dropped for summary in summaries for o in summary.outcomes)
-    whole = state.finished and all(summary.ok for summary in summaries) and not dropped
-    return OK if whole else FAILED
+    return exit_code(summaries, args.strict) if state.finished else FAILED
 
 
 def run_tune(args: argparse.Namespace) -> int:

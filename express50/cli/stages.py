@@ -164,7 +164,12 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
         accounts = [summary.to_json() for summary in summaries]
         before = {"before": accounts[:-1]} if len(accounts) > 1 else {}
         say_json(accounts if args.command == "run" else accounts[-1] | before)
-    dropped = args.strict and any(o.dropped for summary in summaries for o in summary.outcomes)
+    return exit_code(summaries, args.strict)
+
+
+def exit_code(summaries: Sequence[Any], strict: bool) -> int:
+    """Return whether no item failed or, with ``strict``, lost a part."""
+    dropped = strict and any(o.dropped for summary in summaries for o in summary.outcomes)
     return OK if all(summary.ok for summary in summaries) and not dropped else FAILED
 
 

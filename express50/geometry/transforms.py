@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import scipy
+from numpy.typing import ArrayLike
 
 from express50.geometry.shapes import check_shape
 
@@ -102,8 +103,10 @@ def is_rigid(T: np.ndarray) -> bool:
     return bool(turns and np.linalg.det(R) > 0)
 
 
-def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 1.0, 0.0)) -> np.ndarray:
     """Return ``cam_from_world`` (4, 4), OpenCV axes, at ``eye`` (3,) looking at ``target``.
+
+    By default, +y is up.
 
     Raises:
         ValueError: the eye is at the target, or ``up`` is parallel to the viewing direction.

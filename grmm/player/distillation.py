@@ -259,7 +259,7 @@ def front_view(loaded: Checkpoint, size: int) -> PinholeView:
     distance = float((camera[:3, :3] @ centre + camera[:3, 3]).norm())
     height = float(template[:, 1].max() - template[:, 1].min())
     target = turning_point(loaded).numpy()
-    pose = look_at(target + [0.0, 0.0, distance], target, np.array([0.0, 1.0, 0.0]))
+    pose = look_at(target + [0.0, 0.0, distance], target)
     focal = 0.75 * size * distance / height
     K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]], dtype=torch.float64)
     K, cam_from_head = K.to(template.device), torch.from_numpy(pose).to(template.device)

@@ -56,11 +56,11 @@ def open_landmarks(dataset: Dataset, subject: str, landmarks: str, search: float
 
 
 def open_follower(
-    landmarks: str, look_at: Callable[[LandmarkNet, np.ndarray, np.ndarray], Detection] = follow
+    landmarks: str, detector: Callable[[LandmarkNet, np.ndarray, np.ndarray], Detection] = follow
 ) -> Follow | None:
     """Return the function that follows a face through a clip; None for sources that have none.
 
-    `look_at` is `follow`, or `detect_at`, which takes longer and scores as `detect` does.
+    `detector` is `follow`, or `detect_at`, which takes longer and scores as `detect` does.
     """
     if landmarks != EMBEDDED:
         return None
@@ -68,10 +68,10 @@ def open_follower(
 
     def look(image: np.ndarray, expected: np.ndarray) -> Marked:
         window = window_about(expected)
-        face = look_at(net, image, window)
+        face = detector(net, image, window)
         middle, side = face_box(face.points)
         if np.linalg.norm(middle - face_box(expected)[0]) > RECENTRE_SHARE * side:
-            face = look_at(net, image, window_about(face.points))
+            face = detector(net, image, window_about(face.points))
         return Marked(face, find_irises(image, face), visible_contour=False)
 
     return look

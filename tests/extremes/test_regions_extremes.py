@@ -33,7 +33,7 @@ def turned_away():
     """A camera before the face that looks the other way."""
     eye = np.array([0.0, 0.0, 1.0])
     K = np.array([[100.0, 0, 32], [0, 100, 32], [0, 0, 1]])
-    pose = look_at(eye, 2 * eye, np.array([0.0, 1, 0]))
+    pose = look_at(eye, 2 * eye)
     return pinhole_camera("away", K, 64, 64, pose)
 
 

@@ -11,6 +11,7 @@ from express50.geometry.transforms import look_at
 from express50.head.model import REGIONS, HeadModel
 from grmm.config import Config, resolve
 from grmm.data import Place, Sample, SampleKey, Tracked
+from tests.balls import meet_ball
 
 AXES = np.array([0.08, 0.11, 0.09])  # metres
 STRETCH = 0.015  # metres the first expression coefficient adds to the y axis
@@ -76,7 +77,7 @@ class EllipsoidSource:
     def _camera(self, number: int, count: int) -> np.ndarray:
         angle = 2 * np.pi * number / count
         eye = self.offset + 0.6 * np.array([np.sin(angle), 0.2, np.cos(angle)])
-        return look_at(eye, self.offset, np.array([0.0, 1.0, 0.0]))
+        return look_at(eye, self.offset)
 
     def read(self, index: int) -> Sample:
         key = self.keys[index]
@@ -111,10 +112,9 @@ def cast(axes, K, camera, turn, offset, size, subject):
     rotation = turn.T @ camera[:3, :3].T  # head from camera
     directions = rays @ rotation.T / axes
     origin = turn.T @ (-camera[:3, :3].T @ camera[:3, 3] - offset) / axes
-    a, b = (directions**2).sum(-1), directions @ origin
-    root = b**2 - a * (origin @ origin - 1)
-    hit = root > 0
-    depth = np.where(hit, (-b - np.sqrt(np.maximum(root, 0))) / a, 0.0)
+    depth, through = meet_ball(origin, directions)
+    hit = through > 0
+    depth = np.where(hit, depth, 0.0)
     point = origin + depth[..., None] * directions
     tint = np.array([[0.9, 0.5, 0.4], [0.4, 0.6, 0.9], [0.5, 0.8, 0.4]])[subject % 3]
     pattern = 0.6 + 0.25 * np.sin(4 * point[..., :1]) + 0.15 * np.sign(point[..., 1:2])

@@ -27,7 +27,7 @@ def make_rig(
     for i in range(count):
         angle = np.radians(span_deg * ((i + 0.5) / count - 0.5))
         eye = distance * np.array([np.sin(angle), 0.2 * np.sin(3 * angle), np.cos(angle)])
-        pose = look_at(middle + eye, middle + [0.02 * np.sin(i), 0.01 * i, 0], np.array([0, 1, 0]))
+        pose = look_at(middle + eye, middle + [0.02 * np.sin(i), 0.01 * i, 0])
         f = focal * (1 + 0.03 * np.sin(2 * i))
         cx, cy = size[0] * (0.5 + 0.01 * np.sin(i)), size[1] * (0.5 - 0.01 * np.cos(i))
         # Radial terms bend the image's corner by a few pixels at any focal length.

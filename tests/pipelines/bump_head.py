@@ -48,7 +48,7 @@ def ring(count: int, size: int, arc_deg: float = 300.0, offset=(0.0, 0.0, 0.0)) 
         rise = (-0.2, 0.1, 0.4)[k % 3]
         way = [np.sin(angle) * np.cos(rise), np.sin(rise), np.cos(angle) * np.cos(rise)]
         target = np.asarray(offset, float)
-        pose = look_at(target + 1.1 * np.array(way), target, np.array([0.0, 1.0, 0.0]))
+        pose = look_at(target + 1.1 * np.array(way), target)
         K = np.array([[3.4 * size, 0, size / 2 + 1.3], [0, 3.4 * size, size / 2], [0, 0, 1.0]])
         cameras.append(pinhole_camera(f"cam{k:02d}", K, size, size, pose))
     return cameras

@@ -32,7 +32,7 @@ def face_cameras(count: int = 6, span_deg: float = 90.0) -> dict:
     for i in range(count):
         angle = np.radians(span_deg) * (i / max(count - 1, 1) - 0.5)
         eye = 1.1 * np.array([np.sin(angle), 0.2 * (-1) ** i, np.cos(angle)])
-        pose = look_at(eye, np.zeros(3), np.array([0.0, 1.0, 0.0]))
+        pose = look_at(eye, np.zeros(3))
         f = 1100.0 * (1 + 0.02 * np.sin(3 * i))
         params = (f, SIZE[0] / 2, SIZE[1] / 2, -0.05)
         rig[f"cam{i:02d}"] = Camera(f"cam{i:02d}", *SIZE, "SIMPLE_RADIAL", params, pose)

@@ -50,7 +50,7 @@ def camera_at(azimuth_deg: float, size: int = 160, distance: float = 1.0) -> Cam
     eye = target + distance * np.array([np.sin(angle), 0.05, np.cos(angle)])
     K = np.array([[distance * size / 0.45, 0, size / 2], [0, distance * size / 0.45, size / 2],
                   [0, 0, 1.0]])  # fmt: skip
-    return pinhole_camera("cam", K, size, size, look_at(eye, target, np.array([0.0, 1, 0])))
+    return pinhole_camera("cam", K, size, size, look_at(eye, target))
 
 
 def shirt() -> tuple[np.ndarray, np.ndarray]:

@@ -39,7 +39,7 @@ def make_rig(model="OPENCV", count=5, far=0.0, focal=1.0):
         params = list(LENSES[model])
         for k in range(2 if params[1] > 800 else 1):
             params[k] *= focal
-        pose = look_at(eye, np.array([far, 0, 0]), np.array([0.0, 1.0, 0.0]))
+        pose = look_at(eye, np.array([far, 0, 0]))
         rig[f"c{i}"] = Camera(f"c{i}", 640, 480, model, tuple(params), pose)
     return rig
 

@@ -33,6 +33,7 @@ from pipelines.calibrate.tracks import (
     mirror_features,
     mirrored_cameras,
 )
+from tests.balls import meet_ball
 from tests.pipelines.face_rigs import face_cameras, see
 
 pytestmark = pytest.mark.usefixtures("no_faces")
@@ -45,7 +46,7 @@ def make_rig(count=7, size=320):
         angle = np.radians(18) * (i - (count - 1) / 2)
         eye = [np.sin(angle), 0.15 * (-1) ** i, np.cos(angle)]
         params = (2.3 * size, 2.3 * size, size / 2 + i, size / 2 - i, -0.1, 0.1, 1e-3, -1e-3)
-        pose = look_at(np.array(eye), np.zeros(3), np.array([0.0, 1.0, 0.0]))
+        pose = look_at(np.array(eye), np.zeros(3))
         rig[f"cam{i:02d}"] = Camera(f"cam{i:02d}", size, size, "OPENCV", params, pose)
     return rig
 
@@ -55,15 +56,13 @@ def picture(camera):
     rng = np.random.default_rng(0)
     volume = rng.uniform(0, 1, (40, 40, 40))
     origin, directions = rays(camera)
-    d = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    b = d @ origin
-    root = b**2 - (origin @ origin - 0.12**2)
-    hit = origin + (-b - np.sqrt(np.maximum(root, 0)))[..., None] * d
+    depth, through = meet_ball(origin, directions, 0.12)
+    hit = origin + depth[..., None] * directions
     tone = sum(
         map_coordinates(volume, np.moveaxis(hit * scale + 20, -1, 0), order=1, mode="wrap") / k
         for k, scale in ((1, 90.0), (2, 230.0))
     )
-    image = np.where(root > 0, 170 * tone, 90) + rng.normal(size=tone.shape) * 2
+    image = np.where(through > 0, 170 * tone, 90) + rng.normal(size=tone.shape) * 2
     return np.repeat(np.clip(image, 0, 255)[..., None], 3, axis=2).astype(np.uint8)
 
 

@@ -10,6 +10,7 @@ from express50.geometry.raycast import mesh_scene
 from pipelines.depth.blocks import build
 from pipelines.depth.maps import cast_maps
 from pipelines.depth.surface import HeadSurface, extract_mesh
+from tests.balls import meet_ball
 from tests.pipelines.bump_head import ring
 
 RADIUS, VOXEL = 0.09, 0.003
@@ -30,12 +31,10 @@ def test_a_ball_is_found_where_it_is(surface, camera):
     alpha = np.ones((camera.height, camera.width), np.float32)
     found = cast_maps(surface, mesh_scene(surface.vertices, surface.faces), camera, alpha)
     origin, way = rays(camera)
-    a, b = (way * way).sum(-1), (way * origin).sum(-1)
-    root = b * b - a * (origin @ origin - RADIUS**2)
-    true = (-b - np.sqrt(np.maximum(root, 0))) / a
-    both = found.valid & (root > 0)
+    true, through = meet_ball(origin, way, RADIUS)
+    both = found.valid & (through > 0)
     assert both.sum() > 500
-    assert (found.valid != (root > 0)).sum() < 0.02 * both.sum()  # the very rim
+    assert (found.valid != (through > 0)).sum() < 0.02 * both.sum()  # the very rim
     off = np.abs(found.depth - true)[both]
     assert np.median(off) < 0.02 * VOXEL and np.percentile(off, 99) < 0.25 * VOXEL
     outward = (origin + true[..., None] * way) / RADIUS @ camera.cam_from_world[:3, :3].T

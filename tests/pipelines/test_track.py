@@ -37,7 +37,7 @@ from tests.stages import run_here
 
 def make_camera(angle: float, size: int = 400, name: str = "") -> Camera:
     eye = 1.2 * np.array([np.sin(angle), 0.1, np.cos(angle)])
-    pose_ = look_at(eye, np.zeros(3), np.array([0.0, 1.0, 0.0]))
+    pose_ = look_at(eye, np.zeros(3))
     params = (1.8 * size, 1.8 * size, size / 2, size / 2)
     return Camera(name or f"cam{angle:+.2f}", size, size, "PINHOLE", params, pose_)
 

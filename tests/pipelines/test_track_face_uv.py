@@ -159,7 +159,7 @@ def shot_of(mesh: np.ndarray, angle: float) -> HeadCrop:
     """A grey picture from an angle about the head, radians; 0 in front."""
     centre = mesh.mean(0)
     eye = centre + np.array([np.sin(angle), 0.0, np.cos(angle)])
-    view = look_at(eye, centre, np.array([0.0, 1.0, 0.0]))
+    view = look_at(eye, centre)
     camera = Camera(f"{angle}", 128, 128, "PINHOLE", (250.0, 250.0, 64.0, 64.0), view)
     return HeadCrop(camera, np.full((128, 128, 3), 128, np.uint8), None)
 

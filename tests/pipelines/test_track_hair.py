@@ -77,7 +77,7 @@ def scene():
     still = torch.zeros(1, 1)
     mesh = pose(head, still, still)[0].double().numpy()
     eye = mesh.mean(0) + [0.0, 0.25, 0.9]
-    camera_pose = look_at(eye, mesh.mean(0), np.array([0.0, 1.0, 0.0]))
+    camera_pose = look_at(eye, mesh.mean(0))
     params = (FOCAL, FOCAL, SIZE / 2, SIZE / 2)
     camera = Camera("cam", SIZE, SIZE, "PINHOLE", params, camera_pose)
     pixels = project(camera, mesh)[0]

@@ -95,7 +95,7 @@ def test_a_plate_hides_another_however_near_the_camera(distance: float) -> None:
     faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
     camera = Camera(
         "cam", 100, 100, "PINHOLE", (100.0, 100.0, 50.0, 50.0),
-        look_at(np.array([0.0, 0, 0.02 + distance]), np.zeros(3), np.array([0.0, 1, 0])),
+        look_at(np.array([0.0, 0, 0.02 + distance]), np.zeros(3)),
     )  # fmt: skip
     places = np.array([[0.001, 0.002, 0.0], [0.001, 0.002, 0.02]])
     normals = np.tile([0.0, 0.0, 1.0], (2, 1))

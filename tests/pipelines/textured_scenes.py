@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from express50.geometry.cameras import Camera
+from express50.geometry.cameras import Camera, rays
 from express50.geometry.transforms import look_at
 from express50.head.model import HeadModel
 from pipelines.track.surface import Visibility, sample_normals
 from pipelines.track.terms import MeshPlaces
+from tests.balls import meet_ball
 from tests.express50.head.tiny_head import tiny_head
 
 RADIUS = 0.1
@@ -52,7 +53,7 @@ def rig(
     made = []
     for index, angle in enumerate(angles):
         eye = distance * np.array([np.sin(angle), 0.2 * np.cos(7 * angle), np.cos(angle)])
-        pose = look_at(eye + centre, centre, np.array([0.0, 1.0, 0.0]))
+        pose = look_at(eye + centre, centre)
         made.append(Camera(f"cam{index}", size, size, "PINHOLE", params, pose))
     return made
 
@@ -72,16 +73,11 @@ def picture(
     camera: Camera, centre: np.ndarray = ORIGIN, colour=paint, radius: float = RADIUS
 ) -> np.ndarray:
     """Root of light (H, W, 3) float32 of a sphere before black, one ray a pixel."""
-    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    K, R = camera.K, camera.cam_from_world[:3, :3]
-    ray = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1) @ R
-    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    to = camera.center - centre
-    half = ray @ to
-    root = half**2 - (to @ to - radius**2)
-    hit = (root > 0) & (half < 0)
+    origin, ways = rays(camera)
+    depth, through = meet_ball(origin - centre, ways, radius)
+    hit = (through > 0) & (depth > 0)
     image = np.zeros((*hit.shape, 3), np.float32)
-    image[hit] = colour(to + (-half - np.sqrt(np.maximum(root, 0)))[hit][:, None] * ray[hit])
+    image[hit] = colour(origin - centre + depth[hit][:, None] * ways[hit])
     return image
 
 

@@ -124,7 +124,7 @@ def test_crop_beyond_the_border_is_black():
 @pytest.mark.parametrize("zoom", ["face", "mouth", "eyes", "head", "frame"])
 @pytest.mark.parametrize("pane_aspect", [0.3, 1.0, 2.5])
 def test_zoom_does_not_distort(zoom, pane_aspect):
-    face = Face(0.4, 0.3, 0.12, 0.5625)
+    face = Face(0.4, 0.3, 0.12)
     left, top, right, bottom = zoom_box(face, zoom, pane_aspect, 0.5625)
     assert (bottom - top) * 0.5625 / (right - left) == pytest.approx(pane_aspect, rel=0.02)
     if zoom == "frame":
@@ -134,7 +134,7 @@ def test_zoom_does_not_distort(zoom, pane_aspect):
 
 
 def test_mouth_and_eyes_are_inside_the_face_and_the_face_inside_the_head():
-    face = Face(0.5, 0.4, 0.1, 1.0)
+    face = Face(0.5, 0.4, 0.1)
     mouth, eyes, whole, head = (
         zoom_box(face, z, 0.75, 1.0) for z in ("mouth", "eyes", "face", "head")
     )

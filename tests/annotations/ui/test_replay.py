@@ -60,7 +60,7 @@ def test_faces_found_late_are_drawn(suggested):
         def find(self, subject, camera, frame):
             from annotations.ui.frames import Face
 
-            return Face(0.5, 0.5, 0.2, 1.0) if self.ready else None
+            return Face(0.5, 0.5, 0.2) if self.ready else None
 
     app = AnnotateApp(Session(suggested, "ann"), faces=Finder())
 

@@ -29,7 +29,7 @@ def rig(names, size=(WIDTH, HEIGHT)):
     for number, name in enumerate(names):
         angle = np.radians(-50 + 100 * number / max(1, len(names) - 1))
         eye = np.array([1.1 * np.sin(angle), 1.25, 1.1 * np.cos(angle)])
-        pose = look_at(eye, np.array([0, 1.2, 0]), np.array([0, 1.0, 0]))
+        pose = look_at(eye, np.array([0, 1.2, 0]))
         focal = 1.9 * size[0] + number
         params = (focal, focal, size[0] / 2 + 1.0, size[1] / 2 - 1.0)
         found[name] = Camera(name, *size, "PINHOLE", params, pose)

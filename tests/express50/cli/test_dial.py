@@ -38,7 +38,11 @@ def test_tune_has_no_option_that_needs_chosen_settings(capsys):
 def test_the_report_shows_the_front(tmp_path, monkeypatch):
     monkeypatch.setenv(PAUSE, "0.02")  # seconds that a busy machine does not drown
     captures = captures_of(tmp_path / "captures", subjects=1, expressions=2)
-    tune(chain_of(tmp_path / "data", captures))
+    table, _ = tune(chain_of(tmp_path / "data", captures))
     page = render_page(Dataset(tmp_path / "data"))
-    assert "What time buys" in page and "value, mm" in page and "solve draft" in page
+    assert "What time buys" in page and "value, mm" in page
+    usual = table["presets"]["standard"]["settings"]
+    for point in table["front"]:
+        chosen = point["settings"].items() - usual.items()
+        assert all(f"{stage} {setting}" in page for stage, setting in chosen)
     assert "nine times in ten" in page and "none does" not in page

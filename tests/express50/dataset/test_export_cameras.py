@@ -19,8 +19,7 @@ shift = st.floats(-15.0, 15.0)
 @given(dx=shift, dy=shift, ratio=st.floats(0.9, 1.1), x=st.floats(-0.04, 0.04))
 def test_a_reader_that_knows_the_angle_of_view_only_sees_the_same_point(dx, dy, ratio, x) -> None:
     K = np.array([[200.0, 0, 32 + dx], [0, 200.0 * ratio, 24 + dy], [0, 0, 1]])
-    camera = pinhole_camera("c", K, 64, 48, look_at(np.array([0, 0.1, 1.0]), np.zeros(3),
-                                                    np.array([0, 1.0, 0])))  # fmt: skip
+    camera = pinhole_camera("c", K, 64, 48, look_at([0, 0.1, 1.0], [0, 0, 0]))
     target = centred(camera)
     point = np.array([[x, 0.02, 0.01]])
     pixel, _ = project(camera, point)

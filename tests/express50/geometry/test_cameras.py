@@ -11,7 +11,7 @@ from express50.files import calibration as calibration_file
 from express50.geometry import cameras, conventions, sampling, transforms
 from express50.geometry.cameras import Camera
 
-POSE = transforms.look_at(np.array([0.1, 0.2, 1.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
+POSE = transforms.look_at(np.array([0.1, 0.2, 1.0]), np.zeros(3))
 OPENCV = Camera("a", 64, 48, "OPENCV", (80, 82, 31, 25, 0.1, -0.05, 0.001, 0.002), POSE)
 POINTS = np.random.default_rng(0).normal(size=(20, 3)) * 0.1
 
@@ -97,9 +97,7 @@ def test_rays_that_part_meet_nowhere():
 
 
 def test_triangulate_recovers_points_and_says_nan_for_one_view():
-    other_pose = transforms.look_at(
-        np.array([0.8, 0.2, 0.6]), np.zeros(3), np.array([0.0, 1.0, 0.0])
-    )
+    other_pose = transforms.look_at(np.array([0.8, 0.2, 0.6]), np.zeros(3))
     other = Camera("b", 64, 48, "PINHOLE", (80, 80, 31, 25), other_pose)
     pixels = np.stack([cameras.project(c, POINTS)[0] for c in (OPENCV, other)])
     np.testing.assert_allclose(cameras.triangulate([OPENCV, other], pixels), POINTS, atol=1e-8)

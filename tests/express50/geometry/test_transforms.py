@@ -83,7 +83,7 @@ def test_fits_refuse_points_that_are_not_finite(bad):
 
 
 def test_look_at_puts_the_target_ahead_with_up_upwards():
-    T = transforms.look_at(np.array([0.0, 1, 2]), np.array([0.0, 1, 0]), np.array([0.0, 1, 0]))
+    T = transforms.look_at(np.array([0.0, 1, 2]), np.array([0.0, 1, 0]))
     np.testing.assert_allclose(T @ [0, 1, 0, 1], [0, 0, 2, 1], atol=1e-12)
     assert (T @ [0, 2, 0, 1])[1] < 0  # up in the world is -y in an OpenCV camera
     np.testing.assert_allclose(transforms.invert_transform(T) @ T, np.eye(4), atol=1e-12)

@@ -72,7 +72,7 @@ def seen_shares(head, vertices, regions, centre, span, yaw=0.0, pitch=0.0):
     """Shares of 160 x 160 pixels, `span` metres wide at `centre`, that see a face of a region."""
     a, b = np.radians(yaw), np.radians(pitch)
     back = np.array([np.sin(a) * np.cos(b), np.sin(b), np.cos(a) * np.cos(b)])
-    pose = look_at(np.array(centre) + 1.2 * back, np.array(centre), np.array([0.0, 1.0, 0.0]))
+    pose = look_at(np.array(centre) + 1.2 * back, np.array(centre))
     focal = 160 * 1.2 / span
     K = np.array([[focal, 0, 80], [0, focal, 80], [0, 0, 1.0]])
     faces = head.faces.numpy()

@@ -25,7 +25,7 @@ def make_rig(count=4, dist=(-0.11, 0.07, 0.001, -0.002), size=(640, 480)):
     for k in range(count):
         angle = np.radians(-60 + 40 * k)
         eye = np.array([np.sin(angle), 1.3 + 0.05 * k, np.cos(angle)])
-        pose = look_at(eye, np.array([0, 1.25, 0]), np.array([0, 1.0, 0]))
+        pose = look_at(eye, np.array([0, 1.25, 0]))
         params = (900.0 + k, 905.0, size[0] / 2 + 3, size[1] / 2 - 2, *dist)
         model = "OPENCV" if dist else "PINHOLE"
         rig[f"cam{k:02d}"] = Camera(f"cam{k:02d}", *size, model, params, pose)

@@ -13,8 +13,6 @@ from express50.geometry.transforms import look_at
 from express50.rigs.world_frame import judge
 from tests.express50.rigs.test_read import make_rig, write_transforms
 
-UP = np.array([0, 1.0, 0])
-
 
 def changed(rig, change):
     return {n: replace(c, cam_from_world=change(c.cam_from_world)) for n, c in rig.items()}
@@ -32,7 +30,7 @@ def rig_around_the_origin():
     places = zip(list(rig), (-0.9, -0.2, 0.3, 1.2), (0.1, -0.1, 0.2, 0.0), strict=True)
     for camera, angle, lift in places:
         eye = 1.1 * np.array([np.sin(angle), lift, np.cos(angle)])
-        rig[camera] = replace(rig[camera], cam_from_world=look_at(eye, np.zeros(3), UP))
+        rig[camera] = replace(rig[camera], cam_from_world=look_at(eye, np.zeros(3)))
     return rig
 
 

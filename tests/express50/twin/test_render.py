@@ -6,9 +6,10 @@ from express50.geometry.cameras import Camera, rays
 from express50.geometry.transforms import look_at
 from express50.twin import render
 from express50.twin.surface import Caster
+from tests.balls import meet_ball
 
 RADIUS = 0.1
-POSE = look_at(np.array([0.3, 0.1, 0.8]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
+POSE = look_at(np.array([0.3, 0.1, 0.8]), np.zeros(3))
 
 
 def camera(width=80, height=60, focal=220.0, dist=(-0.2, 0.1, 1e-3, -1e-3)):
@@ -26,12 +27,9 @@ def test_depth_of_a_sphere_is_the_analytic_one(ball):
     view = camera()
     depth, valid = render.render_depth(Caster(*ball), view)
     origin, directions = rays(view)
-    a = (directions**2).sum(-1)
-    b, c = directions @ origin, origin @ origin - RADIUS**2
-    root = b * b - a * c
-    analytic = (-b - np.sqrt(np.maximum(root, 0))) / a
-    sure = root > 2e-3 * a
-    assert sure.sum() > 500 and valid[sure].all() and not valid[root < -1e-3 * a].any()
+    analytic, through = meet_ball(origin, directions, RADIUS)
+    sure = through > 2e-3
+    assert sure.sum() > 500 and valid[sure].all() and not valid[through < -1e-3].any()
     assert np.abs(depth - analytic)[sure].max() < 2e-5
 
 
