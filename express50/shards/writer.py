@@ -337,6 +337,9 @@ def copy_samples(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> in
     names = {s: sorted(k for k, v in splits.items() if v == s) for s in set(splits.values())}
     aside = out.with_name(f".{out.name}.unfinished")
     with folder_in_one_step(aside, out):
+        for reader in readers:  # first: they are small, and may contradict each other
+            for subject in sorted({entry.subject for entry in reader.entries}):
+                _copy_subject_files(reader, subject, aside)
         writer = ShardWriter(aside, shard_mb * 10**6)
         for reader, (subject, expression), numbers in groups:
             samples = [
@@ -345,9 +348,6 @@ def copy_samples(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> in
             ]
             writer.add_group(splits[subject], samples)
         writer.close()
-        for reader in readers:
-            for subject in sorted({entry.subject for entry in reader.entries}):
-                _copy_subject_files(reader, subject, aside)
         write_json(aside / "splits.json", names | {"chosen_by": "the shards these are made of"})
         _write_card(readers, aside)
         write_manifest(aside, writer.digests)
