@@ -143,7 +143,7 @@ def read_capture(root: Path) -> RawCapture:
         plates=read_plates(root, cameras),
         board=read_board(root, cameras),
         cues=read_cues(root / "cues.csv"),
-        warnings=strangers(root, [*cameras, *dropped]),
+        warnings=files_of_no_camera(root, [*cameras, *dropped]),
     )
 
 
@@ -327,7 +327,7 @@ def _board_files(folder: Path, camera: str) -> list[str]:
     return [f"board/{path.relative_to(folder).as_posix()}" for path in videos or images]
 
 
-def strangers(root: Path, cameras: Iterable[str]) -> dict[str, str]:
+def files_of_no_camera(root: Path, cameras: Iterable[str]) -> dict[str, str]:
     """Return which files of ``plates`` and ``board`` belong to no camera, with what to do."""
     known, found = list(cameras), {}
     for part, suffixes in (("plates", IMAGE_SUFFIXES), ("board", VIDEO_SUFFIXES)):

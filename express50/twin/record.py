@@ -32,9 +32,8 @@ _EXAMPLE = """express50 twin record build/twin --subjects 4 --cameras 8 \\
       --width 320 --height 320 --expressions neutral,smile,jaw_open
 writes build/twin/captures/S001... (for 'express50 ingest') and build/twin/truth/S001..."""
 _NUMBERS = [setting.name for setting in fields(TwinConfig) if setting.type in ("int", "float")]
-BOARD_PX = (
-    224  # shorter side; with 160 px no camera sees a corner, with 192 one in four sees enough
-)
+# Shorter side: with 160 px no camera sees a corner of the board, with 192 one in four sees enough.
+BOARD_PX = 224
 
 Task = tuple[str, list[int]]
 _counter: Any = None  # shared count of pictures, set in every worker
