@@ -5,6 +5,7 @@ docs/TRACKING.md describes the method.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import lru_cache, partial
@@ -147,9 +148,10 @@ def shape_warnings(shape: np.ndarray) -> list[Note]:
     if spread <= LARGEST_SPREAD:
         return []
     why = (
-        f"its coefficients are {spread:.1f} standard deviations on average (people's are about 0.5,"
-        f" expected {LARGEST_SPREAD} at most), so cameras, synchronisation, mattes or landmarks are"
-        " wrong, and no error is stated; look at qc/overlay_*.jpg"
+        f"its coefficients are {math.ceil(100 * spread) / 100:.2f} standard deviations on average"
+        f" (people's are about 0.5, expected {LARGEST_SPREAD} at most), so cameras,"
+        " synchronisation, mattes or landmarks are wrong, and no error is stated; look at"
+        " qc/overlay_*.jpg"
     )
     return [Note("head shape", why)]
 

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from express50.contract.config import build_config
+from express50.dataset.tracks import shape_spread
 from express50.errors import CaptureError, ConfigError, StageError
 from express50.geometry.cameras import Camera, project, project_with_slope
 from express50.geometry.transforms import axis_angle_to_matrix, look_at
@@ -380,3 +381,5 @@ def test_a_shape_that_nobody_has_is_named():
     assert shape_warnings(0.6 * person) == shape_warnings(np.zeros(0)) == []
     (note,) = shape_warnings(2 * person)
     assert "qc/overlay" in note.why
+    (note,) = shape_warnings(1.2004 / shape_spread(person) * person)
+    assert "coefficients are 1.21 standard" in note.why, "not like the limit, 1.2"
