@@ -162,7 +162,9 @@ def test_trials_of_a_core_hour_budget_are_guessed_in_core_hours(tmp_path, captur
 
 
 def test_a_budget_below_the_cheapest_settings_says_what_the_least_is(tmp_path, captures):
-    with pytest.raises(ConfigError, match=r"(the cheapest settings need|ended before) .*; give"):
+    # A quick machine needs less than this once it has measured.
+    words = r"(the cheapest settings need|ended before) .*; (give|the same command again)"
+    with pytest.raises(ConfigError, match=words):
         go(tmp_path / "d", captures[:2], "0.2s")
     assert not (tmp_path / "d" / "map").exists()
     with pytest.raises(ConfigError, match="nothing but trials has been made yet"):
@@ -190,7 +192,8 @@ def test_a_budget_that_ends_while_measuring_is_called_too_small(tmp_path, captur
         go(tmp_path / "d", captures, budget)
 
 
-def test_a_goal_is_reached_in_the_least_time_or_refused(tmp_path, captures):
+def test_a_goal_is_reached_in_the_least_time_or_refused(tmp_path, captures, monkeypatch):
+    count_pauses(monkeypatch)
     _, state = go(tmp_path / "d", captures, goal="0.8mm")
     assert error_of(state.settings) <= 0.8
     assert state.settings["solve"] == "standard" and state.settings["map"] == "standard"
