@@ -122,4 +122,10 @@ def summary(rows: list[dict]) -> dict:
         figures["voxel_mm"] = round(rows[0]["voxel_mm"], 3)
         for key in ("voxels_allocated", "voxels_dense", "grid_bytes"):
             figures[key] = max(row[key] for row in rows)
+        figures["raycast_ms_per_megapixel"] = {
+            way: round(float(np.mean([row["raycast"]["ms"][way] for row in rows])), 1)
+            for way in ("mesh", "sdf")
+        }
+        apart = [row["raycast"]["difference_mm"] for row in rows]
+        figures["raycast_difference_mm"] = round(float(np.mean(apart)), 4)
     return figures

@@ -2,9 +2,12 @@
 
 For every N, image size and channel count it prints the CPU seconds of one thread, the least of
 several runs so that other work on the machine disturbs them little: forward, and forward and
-backward with the projection and the gradients of every input. Errors are the kernel's, in float32
-and in float64, against the float64 reference. ``prototype_s`` holds figures to stay within 1.25x
-of; an AVX-512 Xeon at 2.1 GHz took them, without the projection. The last line is one JSON object.
+backward with the projection and the gradients of every input. The same is measured once for
+autograd over explicit Gaussian-pixel pairs in torch, not counting the time to find the pairs; it is
+``n/a`` with the reason where they would take more than half of the free memory. Errors are the
+kernel's, in float32 and in float64, against the float64 reference. ``prototype_s`` holds figures to
+stay within 1.25x of; an AVX-512 Xeon at 2.1 GHz took them, without the projection. The last line is
+one JSON object.
 """
 
 from __future__ import annotations
@@ -13,41 +16,83 @@ import json
 import math
 import platform
 import time
+from collections.abc import Callable
+from functools import partial
 
+import psutil
 import torch
 from torch import Tensor
 
 from benchmarks.common import make_parser
 from express50 import native
+from express50.geometry.conventions import corner_to_cell
 from grmm.rasterize import RenderOutput, rasterize
+from grmm.rasterize.projection import (
+    ALPHA_MIN,
+    TRANSMITTANCE_MIN,
+    Pinhole,
+    Splats,
+    pair_alphas,
+    pair_offsets,
+    project,
+)
 
 COUNTS = (16_384, 65_536, 262_144)
 SIZES = (256, 512, 1024)
 CHANNELS = (3, 38)
-MAIN = (65_536, 512, 38)  # the case whose figures stand beside the table
+MAIN = (65_536, 512, 38)  # the case of speedup_forward_backward
 PROTOTYPE = {(65_536, 512, 38): 0.12, (262_144, 1024, 38): 0.53}  # seconds, forward and backward
+Run = Callable[[dict[str, Tensor]], tuple[Tensor, ...]]
 
 
-def measure(scene: dict[str, Tensor], size: int) -> tuple[float, float]:
+def measure(scene: dict[str, Tensor], run: Run) -> tuple[float, float]:
     """Return CPU seconds of forward, and of forward and backward, of one run on a float32 scene."""
     leaves = {name: tensor.float().requires_grad_() for name, tensor in scene.items()}
     start = time.process_time()
-    out = rasterize(**leaves, width=size, height=size, backend="cpu")
+    images = run(leaves)
     forward = time.process_time() - start
-    images = out.colors, out.depth, out.alpha
     cotangents = [torch.ones_like(image) for image in images]
     start = time.process_time()
     torch.autograd.grad(images, list(leaves.values()), cotangents)
     return forward, forward + time.process_time() - start
 
 
-def case(n: int, size: int, channels: int, repeats: int) -> dict[str, object]:
+def native_images(leaves: dict[str, Tensor], size: int) -> tuple[Tensor, ...]:
+    """Return colours, depth and alpha of the native kernel."""
+    out = rasterize(**leaves, width=size, height=size, backend="cpu")
+    return out.colors, out.depth, out.alpha
+
+
+def rival(
+    scene: dict[str, Tensor], pairs: tuple[Tensor, Tensor], size: int, ours: float
+) -> dict[str, object]:
+    """Return autograd's seconds over explicit pairs and how often ours fit in, or why not."""
+    channels = scene["colors"].shape[1]
+    # Gathered colours, their products and both gradients; then some 40 numbers for each pair.
+    needed, free = len(pairs[0]) * (4 * 4 * channels + 300), psutil.virtual_memory().available
+    if needed > free / 2:
+        reason = f"needs about {needed / 2**30:.0f} GiB, half the free memory is {free / 2**31:.0f}"
+        return {"torch_pairs": "n/a", "torch_pairs_reason": reason}
+    forward, both = measure(scene, partial(render_pairs, pairs=pairs, size=size))
+    return {
+        "torch_pairs_forward_s": round(forward, 4),
+        "torch_pairs_forward_backward_s": round(both, 4),
+        "speedup_forward_backward": round(both / ours, 1),
+    }
+
+
+def case(
+    n: int, size: int, channels: int, pairs: tuple[Tensor, Tensor], repeats: int
+) -> dict[str, object]:
     """Measure one row of the table."""
-    scene = head(n, size, channels)
-    runs = [measure(scene, size) for _ in range(repeats + 1)][1:]
+    scene, run = head(n, size, channels), partial(native_images, size=size)
+    runs = [measure(scene, run) for _ in range(repeats + 1)][1:]
     forward, both = min(f for f, _ in runs), min(b for _, b in runs)
-    row: dict[str, object] = {"gaussians": n, "size": size, "channels": channels}
-    return row | {"forward_s": round(forward, 4), "forward_backward_s": round(both, 4)}
+    hits = len(pairs[0])
+    row: dict[str, object] = {"gaussians": n, "size": size, "channels": channels, "hits": hits}
+    row |= {"forward_s": round(forward, 4), "forward_backward_s": round(both, 4)}
+    row["hit_channels_per_second"] = round(hits * channels / both)
+    return row | rival(scene, pairs, size, both)
 
 
 def render(scene: dict[str, Tensor], size: int, backend: str, dtype: torch.dtype) -> RenderOutput:
@@ -99,17 +144,19 @@ def main() -> int:
     rows = []
     for n in COUNTS[: 1 if args.quick else None]:
         for size in SIZES[: 1 if args.quick else None]:
+            pairs = blended_pairs(head(n, size, 0), size)
             for channels in CHANNELS:
-                row = case(n, size, channels, args.repeats)
+                row = case(n, size, channels, pairs, args.repeats)
                 if (n, size, channels) in PROTOTYPE:
                     row["prototype_s"] = PROTOTYPE[n, size, channels]
                 rows.append(row)
                 print(json.dumps(row), flush=True)
     main_case = MAIN if not args.quick else (COUNTS[0], SIZES[0], CHANNELS[1])
+    row = next(r for r in rows if (r["gaussians"], r["size"], r["channels"]) == main_case)
     report: dict[str, object] = {"benchmark": "raster", "threads": 1}
     report |= {"machine": platform.machine(), "variant": native.load()._name.split("_")[-1][:-3]}
-    shown = dict(zip(("gaussians", "size", "channels"), main_case, strict=True))
-    report |= next(row for row in rows if shown.items() <= row.items())
+    for key in ("speedup_forward_backward", "hit_channels_per_second", "forward_backward_s"):
+        report[key] = row.get(key, "n/a")
     report |= errors(COUNTS[0], SIZES[0], CHANNELS[1])
     report["threads_bit_identical"] = threads_bit_identical(*main_case)
     print(json.dumps(report | {"cases": rows}))
@@ -150,6 +197,62 @@ def head(n: int, size: int, channels: int) -> dict[str, Tensor]:
         "K": torch.tensor([[f, 0, size / 2], [0, f, size / 2], [0, 0, 1]], dtype=torch.float64),
         "cam_from_world": pose,
     }
+
+
+def records(scene: dict[str, Tensor], size: int) -> tuple[Splats, Pinhole]:
+    """Return the scene as the rasteriser's records."""
+    camera = {name: scene[name] for name in ("K", "cam_from_world")}
+    splats = {name: tensor for name, tensor in scene.items() if name not in camera}
+    return Splats(**splats), Pinhole(**camera, width=size, height=size)
+
+
+@torch.no_grad()
+def blended_pairs(scene: dict[str, Tensor], size: int) -> tuple[Tensor, Tensor]:
+    """Return Gaussian and pixel numbers (M,) of every blend, by pixel, nearest first."""
+    splats = project(*records(scene, size))
+    visible = splats.visible.nonzero()[:, 0]
+    order = visible[torch.sort(splats.depths[visible], stable=True).indices]
+    mean, extent = splats.means2d[order].double(), splats.extents[order]
+    low = corner_to_cell(mean - extent).ceil().clamp(min=0).long()
+    high = corner_to_cell(mean + extent).floor().clamp(max=size - 1).long() + 1
+    wide, tall = (high - low).clamp(min=0).unbind(1)
+    ids = torch.repeat_interleave(torch.arange(len(order)), wide * tall)
+    place = torch.arange(len(ids)) - (torch.cumsum(wide * tall, 0) - wide * tall)[ids]
+    pixels = (low[ids, 1] + place // wide[ids]) * size + low[ids, 0] + place % wide[ids]
+    gaussians = order[ids]
+    shown = pair_alphas(splats, gaussians, pixels, size) >= ALPHA_MIN
+    gaussians, pixels = gaussians[shown], pixels[shown]
+    pixels, by_pixel = torch.sort(pixels, stable=True)
+    gaussians = gaussians[by_pixel]
+    alphas = pair_alphas(splats, gaussians, pixels, size)
+    kept = (1 - alphas) * before(alphas, pixels) > TRANSMITTANCE_MIN
+    return gaussians[kept], pixels[kept]
+
+
+def before(alphas: Tensor, pixels: Tensor) -> Tensor:
+    """Return the transmittance (M,) in front of each pair, from its pixel's earlier pairs."""
+    # One running sum of logarithms over all pixels; float64 keeps its end as exact as its start.
+    logs = torch.log1p(-alphas.double())
+    running = torch.cumsum(logs, 0) - logs
+    starts = torch.searchsorted(pixels, pixels)
+    return torch.exp(running - running[starts]).to(alphas.dtype)
+
+
+def render_pairs(
+    scene: dict[str, Tensor], pairs: tuple[Tensor, Tensor], size: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return colours (P, C), sums of weight * ray length (P,) and alpha (P,), by autograd."""
+    gaussians, pixels = pairs
+    splats = project(*records(scene, size))
+    alphas = pair_alphas(splats, gaussians, pixels, size)
+    weights = alphas * before(alphas, pixels)
+    delta = pair_offsets(splats, gaussians, pixels, size)
+    length = splats.planes[gaussians, 0] + (splats.planes[gaussians, 1:] * delta).sum(1)
+    colors = scene["colors"]
+    image = colors.new_zeros(size * size, colors.shape[1])
+    image = image.index_add(0, pixels, weights[:, None] * colors[gaussians])
+    flat = weights.new_zeros(size * size)
+    return image, flat.index_add(0, pixels, weights * length), flat.index_add(0, pixels, weights)
 
 
 if __name__ == "__main__":

@@ -294,7 +294,7 @@ def read_board(root: Path, cameras: Iterable[str]) -> dict | None:
     The files are images of the board, or one video.
 
     Raises:
-        CaptureError: there is no board.toml, or a camera has a video and something else.
+        CaptureError: board.toml is missing, or a camera has several videos, or images and a video.
     """
     folder = root / "board"
     if not folder.is_dir():
