@@ -177,8 +177,8 @@ class TrainConfig:
     seed: int = 0
     """Seed of the initial weights, the sample order and a fit's random cameras."""
     save_seconds: float = 120.0
-    """Training time between checkpoints, the most that a kill can lose, unless saving would take
-    over a twentieth of the time. 0 saves only at the end."""
+    """Time between checkpoints of training and of a fit, the most that a kill can lose, unless
+    saving would take over a twentieth of the time. 0 saves only at the end."""
     evaluate_images: int = 32
     """Images evaluated for metrics.json, evenly spaced."""
 

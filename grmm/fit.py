@@ -8,11 +8,12 @@ rates, cameras of the locality loss.
 
 from __future__ import annotations
 
-import copy
+import contextlib
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,18 +26,30 @@ from express50.errors import ConfigError, TrainError
 from express50.files.atomic import check_space, write_json
 from express50.geometry.sampling import evenly
 from grmm import losses
-from grmm.checkpoint import Checkpoint, Gallery, collect_gallery, save_checkpoint
-from grmm.config import Config
-from grmm.data import NO_OFFSETS, HeadView, HeadViews, Shuffle, with_codes
-from grmm.edit import HeadCodes, between, trained_head, transfer
+from grmm.checkpoint import Checkpoint
+from grmm.data import HeadView, HeadViews, Shuffle, with_codes
+from grmm.edit import HeadCodes, between, trained_head
 from grmm.evaluate import HELD_IDENTITY, Row, evaluate, mean
+from grmm.fit_state import (
+    FitState,
+    Scores,
+    inputs,
+    resume,
+    save_fit,
+    save_unfinished,
+    start,
+    use_optimizer,
+)
 from grmm.metrics import PerceptualMetrics
-from grmm.model import GRMM, PinholeView, Rendering
+from grmm.model import PinholeView, Rendering
 from grmm.render import comparison_sheet
 from grmm.shard_source import select
+from grmm.train_state import deferred_interrupt, saving
 from grmm.warm_start import LOGIT_LIMIT, project_texture, spread_change
 
-Scores = dict[str, float | None]
+Keep = Callable[[bool], None]
+"""Is called after each step, with whether it was the last; may save the fit."""
+Keeping = Callable[[], contextlib.AbstractContextManager[Keep | None]]
 SAY_SECONDS = 10.0  # between lines of progress
 SCORED_PICTURES = 12  # pictures scored between the stages
 STAGE1_SHARE = 0.35  # of a time budget (G22)
@@ -47,158 +60,143 @@ NOVEL_VIEW = f"{HELD_IDENTITY}, novel view"
 NOVEL_EXPRESSION = f"{HELD_IDENTITY}, other expression"
 
 
-@dataclass(kw_only=True)
-class FitState:
-    """Everything that a fit changes or reads: the tuned model and the codes sought."""
-
-    loaded: Checkpoint
-    model: GRMM
-    views: HeadViews
-    given: list[int]
-    z_id: Tensor
-    z_exp: dict[str, Tensor]
-    perceptual: torch.nn.Module | None
-
-    @property
-    def config(self) -> Config:
-        """Return the settings of the checkpoint fitted from."""
-        return self.loaded.config
-
-    def render(self, item: HeadView, shade_view: PinholeView | None = None) -> Rendering:
-        """Render the person in a view; an expression that is not fitted has its trained code."""
-        name, trained = item.key.expression, self.model.expressions
-        z_exp = self.z_exp[name] if name in self.z_exp else self.model.z_exp[trained.index(name)]
-        return self.model.render(
-            self.z_id, z_exp, item.state, item.view, self.views.background, shade_view
-        )
-
-
 def fit(
-    loaded: Checkpoint, views: HeadViews, given: Sequence[int], held_out: Sequence[int], out: Path
+    loaded: Checkpoint,
+    views: HeadViews,
+    given: Sequence[int],
+    held_out: Sequence[int],
+    out: Path,
+    *,
+    continued: bool = False,
 ) -> dict[str, object]:
     """Fit one subject from the views ``given``; report on them and on ``held_out``.
 
     Every expression among the views gets its own z_exp; z_id is common. Writes OUT/checkpoint.pt
-    (the tuned model, whose only subject is the fitted one), OUT/metrics.json and OUT/*.jpg.
+    (the tuned model, whose only subject is the fitted one), OUT/metrics.json and OUT/*.jpg. The
+    checkpoint is saved as `grmm train` saves its own. ``continued`` goes on from the one in OUT,
+    whose inputs and settings must be the same except for the budget.
 
     Raises:
         TrainError: no views, or views of several subjects.
+        ConfigError: the checkpoint in OUT is of a finished fit, or of another one.
     """
     judge = PerceptualMetrics(loaded.config.metrics)  # first, because it may reject its files
     out.mkdir(parents=True, exist_ok=True)
     check_space(out)
-    state = start(loaded, views, list(given))
+    state, checkpoint = start(loaded, views, list(given)), out / "checkpoint.pt"
+    made_from = inputs(state)
+    if continued:
+        resume(state, checkpoint, made_from)
     held_out = [i for i in held_out if views.keys[i].expression in state.z_exp]
-    stages, effort = run_stages(state, lambda: _scores(state, held_out))
-    save_fit(state, out)
-    rows = evaluate(views, held_out or state.given, state.render, judge)
-    metrics: dict[str, object] = {
-        "subject": views.keys[state.given[0]].subject,
-        "expressions": sorted(state.z_exp),
-        "cameras": sorted({views.keys[i].camera for i in state.given}),
-        "held_out_cameras": sorted({views.keys[i].camera for i in held_out}),
-        "psnr_db": mean(rows, "psnr_db"),
-        "psnr_is_of": "held-out views" if held_out else "given views: none was held out",
-        "stages": stages,
-        "lpips": mean(rows, "lpips"),
-        "rmse": mean(rows, "rmse"),
-        "fid": judge.fid(),
-    }
-    metrics |= effort | judge.missing()
+    save = partial(save_unfinished, state, made_from=made_from)
+    keeping = partial(_kept, checkpoint, save, state.config.train.save_seconds)
+    effort = run_stages(state, lambda: _scores(state, held_out), keeping)
+    metrics = _report(state, held_out, judge) | effort | judge.missing()
     comparison_sheet(out / "given.jpg", views, state.given[:6], state.render)
     if held_out:
         comparison_sheet(out / "held_out.jpg", views, held_out[:6], state.render)
     write_json(out / "metrics.json", metrics)
+    save_fit(state, checkpoint)  # last, because then the fit counts as finished
     return metrics
 
 
-def run_stages(
-    state: FitState, score: Callable[[], Scores]
-) -> tuple[dict[str, Scores], dict[str, object]]:
-    """Run both stages within the time budget; returns scores before, between and after, and effort.
-
-    The time that scoring takes does not count against the budget.
-    """
-    settings = state.config.fit
-    budget = settings.seconds or math.inf
-    torch.manual_seed(state.config.train.seed)
-    stages = {"mean_code": score()}
-    began = time.perf_counter()
-    first = invert_codes(state, began + STAGE1_SHARE * budget)
-    spent = time.perf_counter() - began
-    stages["stage1"] = score()
-    began = time.perf_counter() - spent
-    if settings.texture_warm_start and settings.stage2_iterations:
-        start_texture(state)
-    second = tune_decoders(state, began + budget)
-    spent = time.perf_counter() - began
-    stages["stage2"] = score()
-    return stages, {
-        "stage1_iterations": first,
-        "stage2_iterations": second,
-        "iterations": first + second,
-        "seconds": round(spent, 2),
+def _report(
+    state: FitState, held_out: Sequence[int], judge: PerceptualMetrics
+) -> dict[str, object]:
+    """Measure a fit on the held-out views, or on the given ones where none was held out."""
+    keys = state.views.keys
+    rows = evaluate(state.views, held_out or state.given, state.render, judge)
+    return {
+        "subject": keys[state.given[0]].subject,
+        "expressions": sorted(state.z_exp),
+        "cameras": sorted({keys[i].camera for i in state.given}),
+        "held_out_cameras": sorted({keys[i].camera for i in held_out}),
+        "psnr_db": mean(rows, "psnr_db"),
+        "psnr_is_of": "held-out views" if held_out else "given views: none was held out",
+        "stages": state.done.scores,
+        "lpips": mean(rows, "lpips"),
+        "rmse": mean(rows, "rmse"),
+        "fid": judge.fid(),
     }
 
 
-def start(loaded: Checkpoint, views: HeadViews, given: list[int]) -> FitState:
-    """Start from the mean codes and a copy of the model; known expressions keep their codes."""
-    subjects = sorted({views.keys[i].subject for i in given})
-    if len(subjects) != 1:
-        raise TrainError(
-            f"got views of {len(subjects)} subjects ({', '.join(subjects) or 'none'}), "
-            "expected one; check --subject, --expression and --cameras"
-        )
-    views.check_mattes(given)
-    model = loaded.model
-    codes = model.z_exp.detach()
-    known = dict(zip(model.expressions, codes, strict=True))
-    expressions = sorted({views.keys[i].expression for i in given})
-    return FitState(
-        loaded=loaded,
-        model=copy.deepcopy(model),
-        views=views,
-        given=given,
-        z_id=model.z_id.detach().mean(0),
-        z_exp={name: known.get(name, codes.mean(0)).clone() for name in expressions},
-        perceptual=losses.load_vgg(loaded.config.loss.vgg16, codes.device),
-    )
+def run_stages(
+    state: FitState, score: Callable[[], Scores], keeping: Keeping = contextlib.nullcontext
+) -> dict[str, object]:
+    """Run what is left of both stages within the time budget; returns the effort.
+
+    Scores before, between and after them go to ``state.done``; the time that scoring takes does
+    not count against the budget. ``keeping`` makes what surrounds a stage and saves its state.
+    """
+    settings, done = state.config.fit, state.done
+    budget = settings.seconds or math.inf
+    torch.manual_seed(state.config.train.seed)
+    if not done.scores:
+        done.scores["mean_code"] = score()
+    if done.stage == 1:
+        with keeping() as keep:
+            invert_codes(state, STAGE1_SHARE * budget, keep)
+        done.scores["stage1"] = score()
+        done.stage = 2
+        if settings.texture_warm_start and settings.stage2_iterations:
+            began = time.perf_counter()
+            start_texture(state)
+            done.seconds[2] = time.perf_counter() - began
+    with keeping() as keep:
+        tune_decoders(state, budget - done.seconds[1], keep)
+    done.scores["stage2"] = score()
+    return {
+        "stage1_iterations": done.iterations[1],
+        "stage2_iterations": done.iterations[2],
+        "iterations": sum(done.iterations.values()),
+        "seconds": round(sum(done.seconds.values()), 2),
+    }
 
 
-def invert_codes(state: FitState, until: float = math.inf) -> int:
-    """Optimise z_id and z_exp (stage 1) until this time; returns the iterations done."""
+@contextlib.contextmanager
+def _kept(path: Path, save: Callable[[Path], None], every: float) -> Iterator[Keep]:
+    """Yield a function that saves after steps, and ends the fit after one in which Ctrl-C came."""
+    with deferred_interrupt() as interrupt, saving(path, save, every) as after_step:
+
+        def keep(last: bool) -> None:
+            after_step(last or interrupt.is_set())
+            if interrupt.is_set():  # only now, after the save
+                raise KeyboardInterrupt
+
+        yield keep
+
+
+def invert_codes(state: FitState, limit: float = math.inf, keep: Keep | None = None) -> int:
+    """Optimise z_id and z_exp (stage 1) for at most this many seconds; returns all iterations."""
     settings = state.config.fit
     state.model.requires_grad_(False)
     codes = [state.z_id, *state.z_exp.values()]
     for code in codes:
         code.requires_grad_(True)
-    done = 0
-    optimizer = torch.optim.Adam(codes, lr=STAGE1_LR)
-    for number, share, item in _items(state, 1, settings.stage1_iterations, until):
+    optimizer = use_optimizer(state, torch.optim.Adam(codes, lr=STAGE1_LR))
+    for number, share, item in _items(state, 1, settings.stage1_iterations, limit, keep):
         optimizer.param_groups[0]["lr"] = STAGE1_LR * STAGE1_FINAL_LR**share
         optimizer.zero_grad()
         rendering, z_exp = state.render(item), state.z_exp[item.key.expression]
         loss = state.config.loss.codes * losses.codes(state.z_id, z_exp)
         _finite(_footage_loss(state, rendering, item) + loss, number, 1).backward()
         optimizer.step()
-        done = number + 1
     for code in codes:
         code.requires_grad_(False)
-    return done
+    return state.done.iterations[1]
 
 
-def tune_decoders(state: FitState, until: float = math.inf) -> int:
-    """Fine-tune the decoders with the locality loss (stage 2); returns the iterations done."""
-    settings, train = state.config.fit, state.config.train
+def tune_decoders(state: FitState, limit: float = math.inf, keep: Keep | None = None) -> int:
+    """Fine-tune the decoders with the locality loss (stage 2); returns all iterations."""
+    settings, train, rng = state.config.fit, state.config.train, state.rng
     # Adam moves the decoders; codes and refinement stay fixed.
     rates = {"decoders": settings.stage2_lr, "texels": settings.stage2_lr * train.texel_lr_scale}
     parameters = state.model.parameter_groups()
     for parameter in (*parameters["decoders"], *parameters["texels"]):
         parameter.requires_grad_(True)
     groups = [{"params": parameters[name], "lr": rate} for name, rate in rates.items()]
-    optimizer, rng = torch.optim.Adam(groups, fused=True), np.random.default_rng(train.seed)
-    done = 0
-    for number, _, item in _items(state, 2, settings.stage2_iterations, until):
+    optimizer = use_optimizer(state, torch.optim.Adam(groups, fused=True))
+    for number, _, item in _items(state, 2, settings.stage2_iterations, limit, keep):
         optimizer.zero_grad()
         shade = random_camera(state, rng) if rng.random() < settings.shuffle_directions else None
         rendering = state.render(item, shade)
@@ -210,31 +208,35 @@ def tune_decoders(state: FitState, until: float = math.inf) -> int:
             loss = loss + weight * locality_loss(state, item, rng)
         _finite(loss, number, 2).backward()
         optimizer.step()
-        done = number + 1
     state.model.requires_grad_(False)
-    return done
+    return state.done.iterations[2]
 
 
 def _items(
-    state: FitState, stage: int, iterations: int, until: float
+    state: FitState, stage: int, iterations: int, limit: float, keep: Keep | None = None
 ) -> Iterator[tuple[int, float, HeadView]]:
     """Yield given views in shuffled order until iterations or time run out; at least one.
 
     Each comes with its number and the share of the iterations or of the time that is used up.
+    After each, ``keep`` hears whether it was the last.
     """
-    shuffle = Shuffle(state.given, state.config.train.seed)
-    began = said = time.perf_counter()
-    for number in range(iterations):
-        now = time.perf_counter()
-        used = (now - began) / max(until - began, 1e-9)
-        if number > 0 and used >= 1:
-            return
+    done, shuffle = state.done, Shuffle(state.given, state.config.train.seed)
+    number = shuffle.taken = done.iterations[stage]
+    said = time.perf_counter()
+    began = said - done.seconds[stage]
+    used = done.seconds[stage] / max(limit, 1e-9)
+    while number < iterations and (number == 0 or used < 1):
         share = max(number / iterations, min(used, 1.0))
-        if number > 0 and now - said >= SAY_SECONDS:
-            left = format_seconds((now - began) * (1 - share) / share)
+        if number > 0 and time.perf_counter() - said >= SAY_SECONDS:
+            said = time.perf_counter()
+            left = format_seconds((said - began) * (1 - share) / share)
             log(f"fit: stage {stage}, iteration {number}, {left} of this stage left")
-            said = now
         yield number, share, state.views.item(shuffle.next(), crop=True)
+        number += 1
+        done.iterations[stage], done.seconds[stage] = number, time.perf_counter() - began
+        used = done.seconds[stage] / max(limit, 1e-9)
+        if keep is not None:
+            keep(number == iterations or used >= 1)
 
 
 def start_texture(state: FitState) -> None:
@@ -328,47 +330,6 @@ def _scores(state: FitState, held_out: Sequence[int]) -> Scores:
     return scores
 
 
-def save_fit(state: FitState, out: Path) -> None:
-    """Write a checkpoint of the tuned model, whose only subject is the fitted one.
-
-    It keeps the expressions of training (their codes, and one frame of parameters each), so that
-    they can be transferred to the subject.
-    """
-    subject = state.views.keys[state.given[0]].subject
-    former = state.loaded.model
-    trained_codes = zip(former.expressions, former.z_exp.detach(), strict=True)
-    known = {name: code for name, code in trained_codes if name not in state.z_exp}
-    model = GRMM(state.model.config, state.views.head, [subject], [*state.z_exp, *known])
-    content = state.model.state_dict()
-    content["z_id"] = state.z_id[None]
-    content["z_exp"] = torch.stack([*state.z_exp.values(), *known.values()])
-    model.load_state_dict(content)
-    own, trained = collect_gallery(state.views, state.given), state.loaded.gallery
-    # One training frame per expression, without its person's offsets.
-    donors: dict[str, tuple[str, str]] = {}
-    for frame in trained.frames:
-        if frame[1] in known:
-            donors.setdefault(frame[1], frame)
-    mine = next(iter(own.frames.values()))
-    frames = {
-        f: transfer(mine, trained.frames[f])
-        if f[0] == subject  # a person of the training keeps the head that was fitted now
-        else replace(trained.frames[f], offsets=NO_OFFSETS)
-        for f in donors.values()
-    }
-    # Training cameras stay for rendering; the subject's own come first.
-    cameras: dict[str, PinholeView] = own.cameras | {
-        f"training_{name}": view for name, view in trained.cameras.items()
-    }
-    save_checkpoint(
-        out / "checkpoint.pt",
-        model=model,
-        config=state.config,
-        head_spec=state.loaded.head_spec,
-        gallery=Gallery(frames=own.frames | frames, cameras=cameras),
-    )
-
-
 @dataclass(frozen=True, kw_only=True)
 class FitProtocol:
     """The views of an unseen person that a fit gets.
@@ -402,7 +363,7 @@ def evaluate_unseen(
     """
     given, own = unseen_views(loaded, views, subject, protocol, among)
     state = start(loaded, views, given)
-    _, effort = run_stages(state, lambda: {})
+    effort = run_stages(state, dict)
     rows = []
     for kind, fitted in ((NOVEL_VIEW, True), (NOVEL_EXPRESSION, False)):
         chosen = [i for i in own if (views.keys[i].expression in state.z_exp) == fitted]

@@ -44,18 +44,16 @@ from grmm.train_state import (
     deferred_interrupt,
     finished,
     prepare,
-    release,
     restore,
     save,
+    saving,
     set_rates,
-    spare_space,
     start_log,
     with_map_size,
 )
 from grmm.warm_start import warm_start
 
 LOG_EVERY = 20  # iterations between lines of progress
-SAVING_SHARE = 0.05  # at most this share of the training time
 DAY_STEPS = 10_000  # iterations that a CPU does in a day, at most
 GREY_DB = 10.0  # the score of a grey picture
 GLOO_SECONDS = 0.5  # for Gloo's threads to free tensors; 0.2 was enough in every run
@@ -120,8 +118,11 @@ def train(
             log("this takes days on a CPU; use '--preset auto --budget 1h' to train for an hour")
 
     # --- The loop ------------------------------------------------------------------------------
-    started, saved, cost = time.perf_counter() - state.seconds, state.seconds, 0.0
-    with deferred_interrupt() as interrupt, spare_space(checkpoint) as spare:
+    def save_to(path: Path) -> None:
+        save(state, path, config, source.head, gallery)
+
+    started, every = time.perf_counter() - state.seconds, config.train.save_seconds
+    with deferred_interrupt() as interrupt, saving(checkpoint, save_to, every) as keep:
         while not finished(state, config):
             set_rates(state, config)
             step(state, parallel, config)
@@ -130,18 +131,11 @@ def train(
             if world > 1:
                 synchronise(state, interrupt, device)
             last = finished(state, config) or interrupt.is_set()
-            pause = max(config.train.save_seconds, cost / SAVING_SHARE)
-            due = config.train.save_seconds > 0 and state.seconds - saved >= pause
             if rank == 0 and (state.iteration % LOG_EVERY == 0 or last):
                 log(progress_line(state, config))
                 append_log(out / "log.jsonl", state)
-            if rank == 0 and (due or last):
-                release(spare, checkpoint)
-                save(state, checkpoint, config, source.head, gallery)
-                saved = time.perf_counter() - started
-                cost = saved - state.seconds
-            elif rank == 0 and not spare.exists():  # reserve the size of a checkpoint
-                save(state, spare, config, source.head, gallery)
+            if rank == 0:
+                keep(last)
             if interrupt.is_set():  # only now, after the save
                 raise KeyboardInterrupt
     if world > 1:

@@ -8,6 +8,7 @@ import json
 import math
 import os
 import signal
+import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -29,6 +30,7 @@ from grmm.model import GRMM, Rendering
 
 COVERED_TEXELS = 0.75  # of a map that head models' layouts use
 LARGEST_MAP = 512  # the paper's
+SAVING_SHARE = 0.05  # at most this share of the time
 CHANGEABLE = {"iterations", "seconds", "save_seconds", "evaluate_images"}  # when a run is resumed
 
 
@@ -171,19 +173,37 @@ def set_rates(state: TrainState, config: Config) -> None:
 
 
 @contextlib.contextmanager
-def spare_space(path: Path) -> Iterator[Path]:
-    """Yield a file that reserves disk space for the next checkpoint; delete it after training.
+def saving(
+    path: Path, save: Callable[[Path], None], every: float
+) -> Iterator[Callable[[bool], None]]:
+    """Yield a function to call after each step, which saves when it is time, or if told it is last.
 
-    If others fill the disk meanwhile, the trained state can still be saved.
+    It is time when ``every`` seconds have passed (0: never), or more, if saving would otherwise
+    take more than `SAVING_SHARE` of the time. A spare file reserves the space for the next
+    checkpoint, so that the state can still be saved if others fill the disk meanwhile.
     """
     spare = path.with_name(f".{path.name}.spare")
+    saved, cost = time.perf_counter(), 0.0
+
+    def after_step(last: bool) -> None:
+        nonlocal saved, cost
+        now = time.perf_counter()
+        due = every > 0 and now - saved >= max(every, cost / SAVING_SHARE)
+        if due or last:
+            _release(spare, path)
+            save(path)
+            saved = time.perf_counter()
+            cost = saved - now
+        elif not spare.exists():
+            save(spare)
+
     try:
-        yield spare
+        yield after_step
     finally:
         spare.unlink(missing_ok=True)
 
 
-def release(spare: Path, path: Path) -> None:
+def _release(spare: Path, path: Path) -> None:
     """Free the spare's space for the next checkpoint; the former one becomes the spare after it.
 
     A second name keeps the former file when the next takes its place: no byte is copied.
@@ -219,28 +239,19 @@ def restore(state: TrainState, path: Path, config: Config, device: torch.device)
         ConfigError: settings, subjects or samples differ from those of the checkpoint.
     """
     loaded = load_checkpoint(path, device)
-    if not loaded.loop:
+    if "shuffle" not in loaded.loop:
         raise ConfigError(
             f"{path}: holds no state to resume from (a person was withdrawn from it, or it is a "
             "fit); train into another folder, or start over with --overwrite"
         )
-    old, new = as_tables(loaded.config), as_tables(config)
-    changed = [
-        f"{table}.{key} {old[table][key]!r} -> {value!r}"
-        for table in ("model", "loss", "data", "train")
-        for key, value in new[table].items()
-        if value != old[table][key] and not (table == "train" and key in CHANGEABLE)
-    ]
+    tables = ("model", "loss", "data", "train")
+    changed = differences(loaded.config, config, tables, {("train", key) for key in CHANGEABLE})
     names = (loaded.model.subjects, loaded.model.expressions)
     if names != (state.model.subjects, state.model.expressions):
         changed.append("the subjects or expressions of the shards")
     elif loaded.loop.get("samples", state.views.source.digest) != state.views.source.digest:
         changed.append("the samples of the shards")
-    if changed:
-        raise ConfigError(
-            f"{path}: cannot resume, these differ: {'; '.join(changed)}. "
-            "Keep these settings, train into another folder, or start over with --overwrite"
-        )
+    refuse_changes(path, changed, "train into another folder")
     state.model.load_state_dict(loaded.model.state_dict())
     state.optimizer.load_state_dict(loaded.optimizer)
     state.shuffle.restore(loaded.loop["shuffle"])
@@ -253,6 +264,28 @@ def restore(state: TrainState, path: Path, config: Config, device: torch.device)
         )
     else:
         log(f"{path}: resuming at iteration {state.iteration}")
+
+
+def differences(
+    old: Config, new: Config, tables: Iterable[str], but: Collection[tuple[str, str]]
+) -> list[str]:
+    """List the settings in these tables that differ, except for ``but``, as (table, key)."""
+    before, after = as_tables(old), as_tables(new)
+    return [
+        f"{table}.{key} {before[table][key]!r} -> {value!r}"
+        for table in tables
+        for key, value in after[table].items()
+        if value != before[table][key] and (table, key) not in but
+    ]
+
+
+def refuse_changes(path: Path, changed: Sequence[str], elsewhere: str) -> None:
+    """Raise ConfigError if anything differs from what an unfinished checkpoint was made with."""
+    if changed:
+        raise ConfigError(
+            f"{path}: cannot resume, these differ: {'; '.join(changed)}. "
+            f"Keep these settings, {elsewhere}, or start over with --overwrite"
+        )
 
 
 def start_log(path: Path, iteration: int) -> None:

@@ -265,7 +265,8 @@ COMMANDS = {
         f"--overwrite {METRICS} --json",
         help="fit an unseen subject",
         example="grmm fit run/checkpoint.pt shards out --subject S004 --expression neutral \\\n"
-        "      --cameras cam02,cam03 --budget 60s",
+        "      --cameras cam02,cam03 --budget 60s\n"
+        "the same command again continues a fit that was stopped",
         changes={
             "out": {"help": "folder for checkpoint.pt, metrics.json, pictures"},
             "--subject": {"required": True, "help": "person to fit"},

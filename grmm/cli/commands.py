@@ -116,10 +116,8 @@ def fit(args: argparse.Namespace) -> int:
     made = args.out / "checkpoint.pt"
     if made.exists() and made.samefile(args.checkpoint):
         raise ConfigError(f"{made} is the checkpoint to fit from; name another folder")
-    if made.exists() and not args.overwrite:
-        raise ConfigError(f"{made} exists; name another folder, or overwrite it with --overwrite")
     loaded = _load(args.checkpoint, [*args.set, *_metric_settings(args)], args.seconds)
-    if not loaded.loop and len(loaded.model.subjects) == 1:
+    if "iteration" not in loaded.loop and len(loaded.model.subjects) == 1:
         log(
             f"{args.checkpoint} is a fit of {loaded.model.subjects[0]}: it knows one person only; "
             "fit people from a checkpoint of 'grmm train'"
@@ -129,7 +127,8 @@ def fit(args: argparse.Namespace) -> int:
     views = loaded.views(ShardSource(args.shards, "*"))
     given = select(views.keys, args.subject, args.expression, args.cameras)
     rest = sorted({*select(views.keys, args.subject, args.expression, "*")} - {*given})
-    metrics = fit(loaded, views, given, rest, args.out)
+    continued = made.exists() and not args.overwrite
+    metrics = fit(loaded, views, given, rest, args.out, continued=continued)
     reached = f"{metrics['seconds']} s, {metrics['iterations']} iterations"
     psnr = f"{figure_label('psnr_db')}: {metrics['psnr_db']}"
     line = f"{psnr} ({metrics['psnr_is_of']}), after {reached}"

@@ -1,5 +1,6 @@
 import csv
 import json
+import os
 import re
 import subprocess
 import sys
@@ -106,6 +107,22 @@ def test_fit_reports_held_out_views_and_writes_over_nothing(checkpoint, shards, 
     before = made.read_bytes()
     assert main(fit) == 2 and main([fit[0], str(made), *fit[2:], "--overwrite"]) == 2
     assert made.read_bytes() == before, "neither a former fit nor the checkpoint read is replaced"
+
+
+def test_a_stopped_fit_goes_on_and_another_is_refused(
+    checkpoint, shards, tmp_path, monkeypatch, capsys
+):
+    fit = ["fit", str(checkpoint), str(shards), str(tmp_path), "--subject=S002"]
+    with monkeypatch.context() as patch:
+        patch.setattr("grmm.fit._finite", lambda loss, *_: os.kill(os.getpid(), 2) or loss)
+        assert main(fit) == 130
+    assert "the same command makes the rest" in capsys.readouterr().err
+    assert main([*fit, "--set=fit.stage2_lr=0.5"]) == 2
+    assert "cannot resume, these differ: fit.stage2_lr " in capsys.readouterr().err
+    assert main(fit) == 0
+    assert "resuming stage 1 at iteration 1\n" in capsys.readouterr().err
+    assert main(fit) == 2
+    assert "checkpoint.pt exists; name another folder" in capsys.readouterr().err
 
 
 def test_the_figure_of_a_held_out_expression_is_printed(shards, tmp_path, capsys):

@@ -1,13 +1,14 @@
 import json
 import math
-import time
+import os
+import signal
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from express50.errors import TrainError
+from express50.errors import ConfigError, TrainError
 from grmm import fit as fit_module
 from grmm.checkpoint import load_checkpoint
 from grmm.config import MetricsConfig
@@ -21,10 +22,9 @@ from grmm.fit import (
     invert_codes,
     locality_loss,
     reconstruction,
-    save_fit,
-    start,
     tune_decoders,
 )
+from grmm.fit_state import save_fit, start
 from grmm.metrics import PerceptualMetrics
 from grmm.render import expression_grid, frontal, interpolation, turntable
 from grmm.train import train
@@ -152,7 +152,7 @@ def test_a_person_of_the_training_keeps_the_fitted_head(loaded, tmp_path):
 
     offsets = np.full((len(ellipsoid_head().template), 3), 1e-3, np.float32)
     views = HeadViews(WithOffsets(size=32), ellipsoid_head())
-    save_fit(start(loaded, views, [0]), tmp_path)
+    save_fit(start(loaded, views, [0]), tmp_path / "checkpoint.pt")
     again = load_checkpoint(tmp_path / "checkpoint.pt")
     assert views.keys[0].frame == ("S000", "e0") and set(again.model.expressions) == {"e0", "e1"}
     for expression in again.model.expressions:
@@ -180,11 +180,116 @@ def test_fit_stops_at_its_time_budget(loaded, views, tmp_path):
 
 def test_a_short_budget_decays_by_time(loaded, views):
     state = start(loaded, views, unseen(views))
-    until = time.perf_counter() + 0.3
-    shares = [share for _, share, _ in fit_module._items(state, 1, 10**6, until)]
+    shares = [share for _, share, _ in fit_module._items(state, 1, 10**6, 0.3)]
     assert shares[0] < 0.3 and 0.7 < shares[-1] <= 1 and shares == sorted(shares)
+    state = start(loaded, views, unseen(views))
     shares = [share for _, share, _ in fit_module._items(state, 1, 4, math.inf)]
     assert shares == [0, 0.25, 0.5, 0.75]
+
+
+def interrupt_at(monkeypatch, stage, iteration, number=signal.SIGINT):
+    """Send a signal while a fit takes this step; returns how to end that."""
+    return at_step(monkeypatch, stage, iteration, lambda: os.kill(os.getpid(), number))
+
+
+def at_step(monkeypatch, stage, iteration, act):
+    """Do something while a fit takes this step; returns how to end that."""
+    real = fit_module._finite
+
+    def finite(loss, now, of):
+        if (of, now) == (stage, iteration):
+            act()
+        return real(loss, now, of)
+
+    monkeypatch.setattr(fit_module, "_finite", finite)
+    return lambda: monkeypatch.setattr(fit_module, "_finite", real)
+
+
+@pytest.mark.parametrize(
+    ("stage", "iteration", "number"),
+    [(1, 1, signal.SIGINT), (1, 2, signal.SIGINT), (2, 0, signal.SIGINT), (2, 1, signal.SIGTERM)],
+)
+def test_an_interrupted_fit_goes_on_and_gives_the_same_bytes(
+    loaded, views, tmp_path, monkeypatch, stage, iteration, number
+):
+    tables = replace(loaded.config.fit, texture_warm_start=True, shuffle_directions=0.5)
+    loaded = replace(loaded, config=replace(loaded.config, fit=tables))
+    given, held_out = unseen(views, "cam00"), unseen(views, "cam01")
+    straight, broken = tmp_path / "straight", tmp_path / "broken"
+    expected = fit(loaded, views, given, held_out, straight)
+    stop = interrupt_at(monkeypatch, stage, iteration, number)
+    with pytest.raises(KeyboardInterrupt):
+        fit(loaded, views, given, held_out, broken)
+    stop()
+    assert [path.name for path in broken.iterdir()] == ["checkpoint.pt"]
+    assert load_checkpoint(broken / "checkpoint.pt").model.subjects == ("S002",)
+    metrics = fit(loaded, views, given, held_out, broken, continued=True)
+    assert metrics | {"seconds": 0} == expected | {"seconds": 0}
+    made, wanted = ((folder / "checkpoint.pt").read_bytes() for folder in (broken, straight))
+    assert made == wanted
+
+
+def test_a_fit_stopped_while_it_is_measured_is_measured_later(loaded, views, tmp_path, monkeypatch):
+    def stop(*arguments):
+        raise KeyboardInterrupt
+
+    given = unseen(views)
+    expected = fit(loaded, views, given, [], tmp_path / "straight")
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(fit_module, "comparison_sheet", stop)
+        fit(loaded, views, given, [], tmp_path)
+    monkeypatch.setattr(fit_module, "_finite", stop)  # no step is taken again
+    metrics = fit(loaded, views, given, [], tmp_path, continued=True)
+    assert metrics | {"seconds": 0} == expected | {"seconds": 0}
+
+
+def test_a_fit_saves_at_intervals(loaded, views, tmp_path, monkeypatch):
+    tables = replace(loaded.config.train, save_seconds=1e-9)
+    loaded = replace(loaded, config=replace(loaded.config, train=tables))
+    monkeypatch.setattr("grmm.train_state.SAVING_SHARE", 1e9)
+
+    def fail():
+        raise MemoryError
+
+    at_step(monkeypatch, 1, 2, fail)
+    with pytest.raises(MemoryError):
+        fit(loaded, views, unseen(views), [], tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]
+    state = load_checkpoint(tmp_path / "checkpoint.pt").loop["fit"]["progress"]
+    assert state["stage"] == 1 and state["iterations"] == {1: 2, 2: 0}
+
+
+def test_a_fit_of_something_else_is_not_continued(loaded, views, tmp_path, monkeypatch):
+    stop = interrupt_at(monkeypatch, 1, 1)
+    with pytest.raises(KeyboardInterrupt):
+        fit(loaded, views, unseen(views), [], tmp_path)
+    stop()
+    before = (tmp_path / "checkpoint.pt").read_bytes()
+
+    def refused(words, loaded=loaded, views=views, given=None):
+        with pytest.raises(ConfigError, match=words) as error:
+            fit(loaded, views, given or unseen(views), [], tmp_path, continued=True)
+        assert "start over with --overwrite" in str(error.value)
+        assert (tmp_path / "checkpoint.pt").read_bytes() == before
+
+    faster = replace(loaded.config.fit, stage2_lr=0.5, seconds=60.0)  # the budget may change
+    changed = replace(loaded, config=replace(loaded.config, fit=faster))
+    refused("these differ: fit.stage2_lr 0.0001 -> 0.5. ", loaded=changed)
+    refused("the views to fit to", given=unseen(views, "cam01"))
+    source = EllipsoidSource(subjects=3, size=32)
+    source.digest = "others"
+    refused("the samples of the shards", views=HeadViews(source, ellipsoid_head()))
+    with torch.no_grad():
+        loaded.model.colour.bias += 1
+    refused("the checkpoint to fit from")
+
+
+def test_training_does_not_continue_an_unfinished_fit(loaded, views, tmp_path, monkeypatch):
+    interrupt_at(monkeypatch, 1, 1)
+    with pytest.raises(KeyboardInterrupt):
+        fit(loaded, views, unseen(views), [], tmp_path)
+    with pytest.raises(ConfigError, match="or it is a fit"):
+        train(EllipsoidSource(size=32), ellipsoid_head(), tmp_path, loaded.config, resume=True)
 
 
 def test_views_of_two_subjects_are_refused(loaded, views, tmp_path):
