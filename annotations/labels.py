@@ -17,7 +17,7 @@ from dataclasses import MISSING, asdict, dataclass, fields, replace
 from typing import get_type_hints
 
 from express50 import __version__
-from express50.capture.index import Cue, Index
+from express50.capture.index import Cue, Index, same_hash
 from express50.contract.layout import Dataset
 from express50.errors import AnnotationError, check_known
 from express50.files.atomic import sync_directory
@@ -157,7 +157,9 @@ def find_cue(index: Index, expression: str) -> Cue:
 def shows_labelled_frame(index: Index, label: Label) -> bool:
     """Return whether the footage still holds the frame that was labelled."""
     source, frame = index.cameras.get(label.camera or ""), label.frame or 0
-    return source is not None and 0 <= frame < source.frames and source.dhash[frame] == label.dhash
+    if source is None or not 0 <= frame < source.frames:
+        return False
+    return same_hash(source.dhash[frame], label.dhash)
 
 
 def check_texts(label: Label) -> None:

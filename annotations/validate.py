@@ -28,7 +28,7 @@ from annotations.labels import (
     unreadable_lines,
     voices,
 )
-from express50.capture.index import Index, read_index
+from express50.capture.index import Index, read_index, same_hash
 from express50.contract.layout import Dataset, included_subjects
 from express50.errors import AnnotationError
 
@@ -105,7 +105,7 @@ def footage_problems(index: Index, label: Label) -> Iterator[tuple[str, str]]:
         yield "identity", f"frame {label.frame} does not exist in {label.camera}"
         return
     pts, dhash = source.pts[label.frame], source.dhash[label.frame]
-    if (pts, dhash) != (label.pts, label.dhash):
+    if pts != label.pts or not same_hash(dhash, label.dhash):
         found = f"frame {label.frame} of {label.camera} has pts {pts} and hash {dhash}"
         yield "identity", f"{found}, the label says {label.pts} and {label.dhash}"
 

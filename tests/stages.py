@@ -41,6 +41,6 @@ def ingest_captures(root: Path, *captures: Path, preset: str = "draft") -> Datas
     """Make a dataset of raw captures."""
     dataset = Dataset(root)
     ingest.add_captures(dataset, captures)
-    summary = run_here(ingest.STAGE, dataset, preset=preset)
+    summary = run_here(ingest.STAGE, dataset, preset=preset, every=1)
     assert summary.ok, summary.lines()
     return dataset

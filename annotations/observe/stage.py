@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from express50.capture.expressions import NEUTRAL
 from express50.capture.frames import read_proxy
-from express50.capture.index import Cue, Index, read_index
+from express50.capture.index import Cue, Index, nearest_decoded, read_index
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
 from express50.errors import FormatError, StageError, rounded_down
@@ -96,7 +96,9 @@ def run(
     frames = np.unique(np.concatenate(seen))
 
     def score(camera: str, frame: int, smallest: float) -> float:
-        return detect(net, read_proxy(dataset, item, camera, frame), smallest=smallest).score
+        # A frame nearby shows as well whether the camera sees the face, and has been decoded.
+        image = read_proxy(dataset, item, camera, nearest_decoded(index.cameras[camera], frame))
+        return detect(net, image, smallest=smallest).score
 
     frames_tried = frames_to_try(rest, frames)
     attempts = [(search, frame) for frame in frames_tried]

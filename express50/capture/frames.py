@@ -10,26 +10,35 @@ settings say so. ``make_picture`` and ``read_cameras_of`` are where pictures and
 from __future__ import annotations
 
 from pathlib import Path
+from threading import Lock
 
 import cv2
 import numpy as np
 import tifffile
 
 from express50.capture.colour_correction import correct_srgb
-from express50.capture.index import CameraSource, Index, read_index
+from express50.capture.index import CameraSource, Index, nearest_decoded, read_index, same_hash
 from express50.capture.raw import RawCamera
 from express50.contract.layout import Dataset
 from express50.errors import CaptureError, FormatError, StageError, check_known
 from express50.files.calibration import read_cameras
 from express50.files.containers import inside, read_picture, read_srgb
 from express50.files.digests import cached_by_file
-from express50.files.images import decode_image, read_alpha, read_image, reduce_light, upright
+from express50.files.images import (
+    decode_image,
+    read_alpha,
+    read_image,
+    reduce_light,
+    shrink,
+    upright,
+)
 from express50.files.text import read_json, read_json_table
 from express50.files.video import VideoReader
 from express50.geometry.cameras import Camera, pinhole, resized
 from express50.geometry.sampling import undistort_image
 
 STRIP = 64  # rows that `write_frame` compresses together
+_READING = Lock()  # one thread at a time reads footage for `read_proxy`
 
 
 def dhash(image: np.ndarray) -> str:
@@ -87,11 +96,11 @@ class FrameReader:
             file = str(video.path)
             image = upright(video.read(number), orientation)
         found = dhash(image)
-        if found != expected and video is not None:
+        if not same_hash(found, expected) and video is not None:
             # After a seek a decoder may hide a missing reference frame; from the start it cannot.
             video.restart()
             found = dhash(image := upright(video.read(number), orientation))
-        if found != expected:
+        if not same_hash(found, expected):
             raise CaptureError(
                 f"{file}: frame {frame} has hash {found}, but the index has {expected}; "
                 "the footage, or how this version reads it, changed since it was ingested: run"
@@ -381,22 +390,44 @@ def read_gains(dataset: Dataset, subject: str) -> dict[str, np.ndarray]:
 def read_proxy(dataset: Dataset, subject: str, camera_id: str, frame: int) -> np.ndarray:
     """Read the small JPEG copy (h, w, 3) uint8 sRGB of a frame, which takes milliseconds.
 
+    The copy of a frame that ingest did not decode is made from the footage: a tenth of a second at
+    4K if the frames are read in order, or seconds.
+
     Raises:
         StageError: the subject is not ingested.
-        CaptureError: there is no such camera or frame.
+        CaptureError: there is no such camera or frame, or the footage changed.
     """
     folder = dataset.proxies_dir(subject)
     index = read_index(dataset, subject)
     if camera_id not in index.cameras or not 0 <= frame < index.cameras[camera_id].frames:
         raise CaptureError(f"{folder}: no frame {frame} of camera {camera_id!r}")
-    return decode_proxy(folder, camera_id, frame)
+    decoded = nearest_decoded(index.cameras[camera_id], frame)
+    proxy = decode_proxy(folder, camera_id, decoded)
+    if decoded == frame:
+        return proxy
+    side = max(proxy.shape)
+    path = dataset.index_file(subject)
+    with _READING:
+        return shrink(_reader(path, dataset, subject, camera_id, index.capture).read(frame), side)
+
+
+@cached_by_file(8)
+def _reader(
+    path: Path,  # noqa: ARG001
+    dataset: Dataset,
+    subject: str,
+    camera_id: str,
+    footage: Path,  # noqa: ARG001
+) -> FrameReader:
+    """Return a reader that stays open as long as index and footage are the same."""
+    return FrameReader(read_index(dataset, subject), camera_id)
 
 
 def decode_proxy(folder: Path, camera_id: str, frame: int) -> np.ndarray:
     """Read a proxy (h, w, 3) uint8 sRGB from a folder of indexed tars."""
     tar, table = folder / f"{camera_id}.tar", folder / f"{camera_id}.json"
     try:
-        offset, size = _proxy_table(table)[frame]
+        offset, size = _proxy_table(table)[frame] or (-1, -1)
         if min(offset, size) < 0 or offset + size > tar.stat().st_size:
             raise ValueError(f"frame {frame} lies outside {tar.name}")
         with tar.open("rb") as file:
@@ -410,5 +441,6 @@ def decode_proxy(folder: Path, camera_id: str, frame: int) -> np.ndarray:
 
 
 @cached_by_file(256)
-def _proxy_table(path: Path) -> list[tuple[int, int]]:
-    return [(int(a), int(b)) for a, b in read_json(path, FormatError, "ingest again")]
+def _proxy_table(path: Path) -> list[tuple[int, int] | None]:
+    rows = read_json(path, FormatError, "ingest again")
+    return [row and (int(row[0]), int(row[1])) for row in rows]

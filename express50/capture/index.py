@@ -15,6 +15,7 @@ from express50.files.text import NAME, read_json_table
 SCHEMA = "express50.index/1"
 # `Index.calibration` of a capture in another layout: ingest writes its cameras beside the index.
 TRANSLATED = "ingest:calibration.json"
+UNKNOWN_HASH = "-"  # of a frame that ingest did not decode
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,8 @@ class CameraSource:
     frames: int  # number of frames that decode
     # presentation time stamp of each frame (the frame's number for image files)
     pts: tuple[int, ...]
-    dhash: tuple[str, ...]  # 64-bit difference hash of each frame, 16 hexadecimal digits
+    # 64-bit difference hash of each frame, 16 hexadecimal digits, or UNKNOWN_HASH
+    dhash: tuple[str, ...]
     sha256: str  # digest of the video file, or of the image files' names and digests
     # images or videos in order, relative to the source; empty for a single video. An image may lie
     # in a container (`express50.files.containers`).
@@ -48,6 +50,14 @@ class CameraSource:
     # how images are rotated when they are read (`files.images`); width and height are those after
     # rotation
     orientation: int = 1
+
+
+def nearest_decoded(camera: CameraSource, frame: int) -> int:
+    """Return the frame nearest to this one among those that ingest decoded."""
+    if camera.dhash[frame] != UNKNOWN_HASH:
+        return frame
+    decoded = (n for n, value in enumerate(camera.dhash) if value != UNKNOWN_HASH)
+    return min(decoded, key=lambda n: abs(n - frame))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -236,6 +246,11 @@ def read_peak_rows(dataset: Dataset, subject: str) -> dict[str, Peak]:
         raise FormatError(f"{path}: not a table of peaks ({problem})") from error
 
 
+def same_hash(one: str, other: str | None) -> bool:
+    """Return whether two frames may be the same by their hashes; an unknown one fits any."""
+    return one == other or UNKNOWN_HASH in (one, other)
+
+
 def check_peak(index: Index, expression: str, peak: Peak) -> None:
     """Check that a label's frame matches the index.
 
@@ -245,7 +260,7 @@ def check_peak(index: Index, expression: str, peak: Peak) -> None:
     source = index.cameras.get(peak.camera)
     there = source is not None and 0 <= peak.frame < source.frames
     found = (source.pts[peak.frame], source.dhash[peak.frame]) if source and there else None
-    if found != (peak.pts, peak.dhash):
+    if not found or found[0] != peak.pts or not same_hash(found[1], peak.dhash):
         raise CaptureError(
             f"{index.subject}/{expression}: frame {peak.frame} of {peak.camera} has time and hash "
             f"{found}, but the label has {(peak.pts, peak.dhash)}; the footage or the "

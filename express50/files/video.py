@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import os
 from bisect import bisect_left
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from types import TracebackType
 
@@ -145,14 +145,16 @@ def _decode(
     container: av.container.InputContainer,
     stream: av.VideoStream,
     unneeded: Callable[[int], bool] | None = None,
+    packets: Iterable[av.Packet] | None = None,
 ) -> Iterator[av.VideoFrame]:
     """Yield frames in display order from the current position; raise CaptureError on damage.
 
     Frames whose time stamps are `unneeded` may be left out, if no other frame refers to them.
+    `packets` are those to decode, by default all that follow.
     """
     context = stream.codec_context
     try:
-        for packet in container.demux(stream):
+        for packet in packets or container.demux(stream):
             if unneeded and context.name in LEAVING_OUT:
                 left = packet.pts is not None and unneeded(packet.pts)
                 context.skip_frame = "NONREF" if left else "DEFAULT"
@@ -231,10 +233,14 @@ def video_tags(path: Path) -> VideoTags:
     Raises:
         CaptureError: the file is not a video, is damaged, or holds no frame.
     """
-    container, stream = _open(path)
-    with container:
-        for frame in _decode(path, container, stream):
-            return _tags(frame, stream)
+    for alone in (True, False):
+        container, stream = _open(path)
+        end = av.Packet()  # without it, the decoder waits for frames to be displayed earlier
+        end.stream = stream
+        with container:
+            packets = chain(islice(container.demux(stream), 1), [end]) if alone else None
+            for frame in _decode(path, container, stream, packets=packets):
+                return _tags(frame, stream)
     raise CaptureError(f"{path}: video holds no frame; record or copy it again")
 
 
@@ -271,6 +277,46 @@ def iterate_video(
             yield int(frame.pts), _pixels(path, frame)
     if count == 0:
         raise CaptureError(f"{path}: video holds no frame; record or copy it again")
+
+
+def iterate_sparsely(
+    path: Path, every: int, tell: Callable[[VideoTags], None]
+) -> Iterator[tuple[int, np.ndarray | None]]:
+    """List a video's frames in display order, and decode a few that need no other frame.
+
+    Of the frames that are coded alone, one is decoded in `every` frames, or all if they are further
+    apart. Arguments and errors are those of `iterate_video`.
+
+    Yields:
+        Time stamp and (H, W, 3) uint8 sRGB image; None for a frame that is not decoded.
+    """
+    stamps = frame_times(path)
+    container, stream = _open(path)
+
+    def choose() -> Iterator[av.Packet]:
+        wanted = 0
+        for packet in container.demux(stream):
+            if not packet.size:  # asks the decoder for the frames that it still holds
+                yield packet
+            elif packet.is_keyframe and (number := bisect_left(stamps, packet.pts)) >= wanted:
+                wanted = number + every
+                yield packet
+
+    done = 0
+    with container:
+        for frame in _decode(path, container, stream, packets=choose()):
+            number = bisect_left(stamps, frame.pts)
+            if not done:
+                tell(_tags(frame, stream))
+            yield from ((stamp, None) for stamp in stamps[done:number])
+            yield stamps[number], _pixels(path, frame)
+            done = number + 1
+    if not done:
+        raise CaptureError(
+            f"{path}: video has no frame that is coded alone; encode it again, or ingest it with"
+            " --set ingest.every=1"
+        )
+    yield from ((stamp, None) for stamp in stamps[done:])
 
 
 class VideoReader:

@@ -23,6 +23,10 @@ class IngestConfig:
     """Longer side of a proxy, pixels (16 to 4096); smaller footage is not enlarged."""
     proxy_quality: int = 85
     """JPEG quality of proxies, 1 to 100."""
+    every: int = 1
+    """Decode one of so many frames, 1 or more: in videos, frames that are coded alone. With more
+    than 1, sync is not checked, and the proxies of other frames are made when they are asked for.
+    """
     sync_frames: int = 8
     """Largest offset searched for in a camera out of step, frames, 1 to 100; 0: no check."""
     focus_every: int = 24
@@ -34,12 +38,13 @@ class IngestConfig:
         """Check ranges."""
         check_ranges(
             "ingest", self, proxy_long_side=(16, 4096), proxy_quality=(1, 100),
-            sync_frames=(0, 100), focus_every=(0, math.inf), blur_ratio=(1.01, 100),
+            every=(1, math.inf), sync_frames=(0, 100), focus_every=(0, math.inf),
+            blur_ratio=(1.01, 100),
         )  # fmt: skip
 
 
 PRESETS: dict[str, dict[str, object]] = {
-    "draft": {"proxy_long_side": 320, "proxy_quality": 80, "focus_every": 96},
+    "draft": {"proxy_long_side": 320, "proxy_quality": 80, "every": 24, "focus_every": 96},
     "reference": {"proxy_long_side": 960, "proxy_quality": 92, "focus_every": 8},
 }
 
@@ -69,7 +74,7 @@ def run(dataset: Dataset, item: str, config: IngestConfig, out: Path) -> Result:
 
     return work(
         dataset, item, out, proxy=(config.proxy_long_side, config.proxy_quality),
-        sync_frames=config.sync_frames, focus_every=config.focus_every,
+        every=config.every, sync_frames=config.sync_frames, focus_every=config.focus_every,
         blur_ratio=config.blur_ratio,
     )  # fmt: skip
 

@@ -47,12 +47,14 @@ class CameraMeasurements:
     """Measurements of one camera's frames.
 
     Attributes:
-        moves: (F,) movement since the frame before, grey levels.
-        cells: (F, 16, 16, 3) linear light.
+        frames: (N,) the frames that were decoded.
+        moves: (N,) movement since the one before, grey levels.
+        cells: (N, 16, 16, 3) linear light.
         widths: frame and width of its sharpest edges, pixels, of some frames.
         tags: what its first video says of its pictures; None if it has none.
     """
 
+    frames: np.ndarray
     moves: np.ndarray
     cells: np.ndarray
     widths: tuple[tuple[int, float], ...]
@@ -63,18 +65,27 @@ def check_quality(
     measured: Mapping[str, CameraMeasurements],
     digests: Mapping[str, str],
     clips: Sequence[int],
+    every: int,
     sync_frames: int,
     blur_ratio: float,
 ) -> tuple[dict, dict[str, str]]:
     """Return the figures for ``checks.json`` and the warnings by camera.
 
-    ``digests`` are of each camera's files, ``clips`` the frames of each recording.
+    ``digests`` are of each camera's files, ``clips`` the frames of each recording. Sync is checked
+    if ``every`` is 1: all frames were decoded.
     """
-    count = min(sum(clips), *(len(s.moves) for s in measured.values()))
-    moves = {name: s.moves[:count] for name, s in measured.items()}
-    steps, unjudged = find_steps(moves, clips, sync_frames) if sync_frames else ({}, {})
+    moves: dict[str, np.ndarray] = {}
+    steps: dict[str, list[Step]] = {}
+    unjudged: dict[str, str] = {}
+    if every > 1:
+        unjudged = dict.fromkeys(sorted(measured), "not all frames were decoded (ingest.every)")
+    else:
+        count = min(sum(clips), *(len(s.moves) for s in measured.values()))
+        moves = {name: s.moves[:count] for name, s in measured.items()}
+        if sync_frames:
+            steps, unjudged = find_steps(moves, clips, sync_frames)
     stuck = find_repeats(moves)
-    drifts = {name: measure_drift(s.cells.astype("float32")) for name, s in measured.items()}
+    drifts = {n: measure_drift(s.cells.astype("float32"), s.frames) for n, s in measured.items()}
     widths, blurred = judge_focus({n: s.widths for n, s in measured.items()}, blur_ratio)
     first: dict[str, str] = {}
     warnings = {}
@@ -324,8 +335,11 @@ def describe_dark(cells: np.ndarray) -> list[str]:
     ]
 
 
-def measure_drift(cells: np.ndarray) -> Drift | None:
-    """Measure the drift of a camera's cells (F, 16, 16, 3); None with too few frames or cells."""
+def measure_drift(cells: np.ndarray, frames: np.ndarray) -> Drift | None:
+    """Measure the drift of a camera's cells (N, 16, 16, 3); None with too few frames or cells.
+
+    ``frames`` (N,) are the frames' numbers.
+    """
     if len(cells) < FEWEST_DRIFT_FRAMES:
         return None
     usual = np.median(cells, axis=0)
@@ -339,8 +353,8 @@ def measure_drift(cells: np.ndarray) -> Drift | None:
         exposure=float(np.ptp(exposure)),
         red=float(np.ptp(curve[:, 0] - curve[:, 1])),
         blue=float(np.ptp(curve[:, 2] - curve[:, 1])),
-        brightest=int(exposure.argmax()),
-        darkest=int(exposure.argmin()),
+        brightest=int(frames[exposure.argmax()]),
+        darkest=int(frames[exposure.argmin()]),
     )
 
 

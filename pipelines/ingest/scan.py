@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 
 from express50.capture.frames import corrected, dhash
-from express50.capture.index import CameraSource
+from express50.capture.index import UNKNOWN_HASH, CameraSource
 from express50.capture.raw import RawCamera, RawCapture
 from express50.errors import CaptureError
 from express50.files.atomic import dump_json
 from express50.files.containers import WITHIN, inside, read_picture
 from express50.files.digests import file_sha256, text_digest
 from express50.files.images import ORIENTATION, encode_jpeg, has_alpha, read_exif, shrink, upright
-from express50.files.video import VideoTags, iterate_video, video_fps
+from express50.files.video import VideoTags, iterate_sparsely, iterate_video, video_fps
 from express50.geometry.sampling import edge_width
 from pipelines.ingest.quality import CameraMeasurements, light_cells, movement, small_grey
 
@@ -29,11 +29,18 @@ UNEVEN = 0.1  # share of the steps that differ; a lost frame now and then is cou
 
 
 def scan_camera(
-    raw: RawCapture, camera: RawCamera, folder: Path, proxy: tuple[int, int], focus_every: int
+    raw: RawCapture,
+    camera: RawCamera,
+    folder: Path,
+    proxy: tuple[int, int],
+    every: int,
+    focus_every: int,
 ) -> tuple[CameraSource, CameraMeasurements]:
     """Decode one camera and write its proxies; return its frames' identity and measurements.
 
-    ``proxy`` is the longer side and the JPEG quality of proxies.
+    ``proxy`` is the longer side and the JPEG quality of proxies. For ``every`` see
+    `iterate_camera`; the sharpness of a decoded frame is measured if that of the ``focus_every``
+    frames before it was not.
 
     Raises:
         CaptureError: the footage is truncated, damaged or changes its size.
@@ -41,23 +48,31 @@ def scan_camera(
     pts: list[int] = []
     hashes: list[str] = []
     clips: list[int] = []
+    decoded: list[int] = []
     moves: list[float] = []
     cells: list[np.ndarray] = []
     widths: list[tuple[int, float]] = []
     tags: list[VideoTags] = []
     before: np.ndarray | None = None
     size: tuple[int, ...] | None = None
+    next_look = 0
     with ProxyWriter(folder / f"{camera.id}.tar") as proxies:
-        for clip, stamp, image in iterate_camera(camera, tags.append):
-            size = size or image.shape[:2]
-            if image.shape[:2] != size:
-                raise CaptureError(
-                    f"{camera.path}: frame {len(pts)} is {image.shape[1]}x{image.shape[0]}, "
-                    f"the first is {size[1]}x{size[0]}; all frames must have the same size"
-                )
+        for clip, stamp, image in iterate_camera(camera, every, tags.append):
             clips += [0] * (clip + 1 - len(clips))
             clips[clip] += 1
             pts.append(stamp)
+            if image is None:
+                hashes.append(UNKNOWN_HASH)
+                proxies.leave_out()
+                continue
+            size = size or image.shape[:2]
+            if image.shape[:2] != size:
+                raise CaptureError(
+                    f"{camera.path}: frame {len(pts) - 1} is {image.shape[1]}x{image.shape[0]}, "
+                    f"the first is {size[1]}x{size[0]}; all frames must have the same size"
+                )
+            frame = len(pts) - 1
+            decoded.append(frame)
             hashes.append(dhash(image))
             small = shrink(image, proxy[0])
             proxies.add(encode_jpeg(corrected(small, camera), proxy[1]))
@@ -65,9 +80,10 @@ def scan_camera(
             moves.append(movement(before, grey))
             before = grey
             cells.append(light_cells(small).astype(np.float16))
-            looked_at = focus_every and (len(pts) - 1) % focus_every == 0
-            if looked_at and (width := edge_width(image)) is not None:
-                widths.append((len(pts) - 1, width))
+            if focus_every and frame >= next_look:
+                next_look = frame + focus_every
+                if (width := edge_width(image)) is not None:
+                    widths.append((frame, width))
     if size is None:
         raise CaptureError(f"{camera.path}: has no frames; record or copy it again")
     (folder / f"{camera.id}.json").write_bytes(dump_json(proxies.table))
@@ -85,7 +101,9 @@ def scan_camera(
         correction=camera.correction,
         orientation=camera.orientation,
     )
-    measured = CameraMeasurements(np.array(moves), np.stack(cells), tuple(widths), *tags[:1])
+    measured = CameraMeasurements(
+        np.array(decoded), np.array(moves), np.stack(cells), tuple(widths), *tags[:1]
+    )
     return source, measured
 
 
@@ -100,6 +118,7 @@ def trimmed(
     rows = zip(ends, source.clips, counts, strict=True)
     keep = np.concatenate([np.arange(end - n, end - n + count) for end, n, count in rows])
     chosen = keep.tolist()
+    kept = np.isin(measured.frames, keep)
     names = source.names if source.kind == "videos" else tuple(source.names[i] for i in chosen)
     number = {frame: place for place, frame in enumerate(chosen)}
     rows_of_all = json.loads(table.read_text(encoding="utf-8"))
@@ -113,31 +132,43 @@ def trimmed(
         clips=counts,
     ), replace(
         measured,
-        moves=measured.moves[keep],
-        cells=measured.cells[keep],
+        frames=np.array([number[frame] for frame in measured.frames[kept].tolist()]),
+        moves=measured.moves[kept],
+        cells=measured.cells[kept],
         widths=tuple((number[frame], width) for frame, width in measured.widths if frame in number),
     )
 
 
 def iterate_camera(
-    camera: RawCamera, tell: Callable[[VideoTags], None]
-) -> Iterator[tuple[int, int, np.ndarray]]:
+    camera: RawCamera, every: int, tell: Callable[[VideoTags], None]
+) -> Iterator[tuple[int, int, np.ndarray | None]]:
     """Yield clip, time stamp and recorded image (H, W, 3) uint8 sRGB of every frame.
 
+    Of ``every`` frames only one is decoded, if that is above 1; the image of the others is None.
     `tell` is called with the tags of every video.
     """
+
+    def read(path: Path) -> Iterator[tuple[int, np.ndarray | None]]:
+        return iterate_video(path, tell) if every == 1 else iterate_sparsely(path, every, tell)
+
     if camera.kind == "video":
-        yield from ((0, stamp, image) for stamp, image in iterate_video(camera.path, tell))
+        yield from ((0, stamp, image) for stamp, image in read(camera.path))
     elif camera.kind == "videos":
         for clip, name in enumerate(camera.names):
-            for stamp, image in iterate_video(inside(camera.path, name), tell):
-                yield clip, stamp, upright(image, camera.orientation)
+            for stamp, image in read(inside(camera.path, name)):
+                turned = None if image is None else upright(image, camera.orientation)
+                yield clip, stamp, turned
     else:
         ends = np.cumsum(camera.counts or (len(camera.names),))
         for number, name in enumerate(camera.names):
             clip = int(np.searchsorted(ends, number, side="right"))
             stamp = camera.stamps[number] if camera.stamps else number
-            yield clip, stamp, read_picture(camera.path, name, camera.orientation)
+            chosen = number % every == 0
+            yield (
+                clip,
+                stamp,
+                (read_picture(camera.path, name, camera.orientation) if chosen else None),
+            )
 
 
 def time_gaps(pts: tuple[int, ...], clips: tuple[int, ...] = ()) -> int:
@@ -239,13 +270,17 @@ class ProxyWriter:
 
     def __init__(self, path: Path) -> None:
         self._tar = tarfile.open(path, "w", format=tarfile.USTAR_FORMAT)  # noqa: SIM115
-        self.table: list[tuple[int, int]] = []
+        self.table: list[tuple[int, int] | None] = []
 
     def __enter__(self) -> ProxyWriter:
         return self
 
     def __exit__(self, *unused: object) -> None:
         self._tar.close()
+
+    def leave_out(self) -> None:
+        """Note that the next frame has no proxy."""
+        self.table.append(None)
 
     def add(self, data: bytes) -> None:
         """Append one JPEG; time and owner are 0, so that equal frames give equal bytes."""

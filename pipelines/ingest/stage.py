@@ -4,6 +4,10 @@ Every later stage names frames by decode index; the index holds each frame's tim
 so that a label can be checked against the footage it was made on. Proxies are small JPEGs in an
 indexed tar, because a random seek in 4K H.264 costs half a second. The same pass checks sync, focus
 and light: faults are warnings, and the figures go to checks.json.
+
+Decoding is most of the work for long clips, and later stages need few frames. With `every` above 1
+only some are decoded; the others have a time stamp but no hash, and their proxies are made when
+somebody asks for them (`express50.capture.frames.read_proxy`).
 """
 
 from __future__ import annotations
@@ -18,7 +22,14 @@ import numpy as np
 
 from express50.capture.demographics import PUBLIC_KEYS, public_meta
 from express50.capture.frames import decode_proxy
-from express50.capture.index import TRANSLATED, CameraSource, Cue, Index, index_to_json
+from express50.capture.index import (
+    TRANSLATED,
+    UNKNOWN_HASH,
+    CameraSource,
+    Cue,
+    Index,
+    index_to_json,
+)
 from express50.capture.raw import RawCapture, check_calibrated_sizes, check_focals
 from express50.capture.readers.read import OURS, read_any, subject_of, watched
 from express50.console import log
@@ -118,13 +129,15 @@ def run(
     out: Path,
     *,
     proxy: tuple[int, int],
+    every: int,
     sync_frames: int,
     focus_every: int,
     blur_ratio: float,
 ) -> Result:
     """Index one capture; an unusable camera is dropped with its reason.
 
-    ``proxy`` is the longer side and the JPEG quality of proxies.
+    ``proxy`` is the longer side and the JPEG quality of proxies. Of ``every`` frames one is
+    decoded.
     """
     raw = read_any(_capture_of(dataset, item))
     if raw.subject != item:
@@ -135,7 +148,7 @@ def run(
     check_focals(raw.root / "capture.toml", raw.meta.get("focal_px", {}))
     check_sample_names(raw)
     (out / "proxies").mkdir()
-    cameras, measured, dropped = _scan(raw, out / "proxies", proxy, focus_every)
+    cameras, measured, dropped = _scan(raw, out / "proxies", proxy, every, focus_every)
     calibration = _calibration(raw, cameras)
     raw, outside = _with_cues(raw, cameras, measured, dropped, out / "proxies")
     usual = usual_count([camera.frames for camera in cameras.values()])
@@ -155,7 +168,7 @@ def run(
     digests = {name: camera.sha256 for name, camera in cameras.items()}
     clips = next(iter(cameras.values())).clips or (index.frames,)
     kept = {name: measured[name] for name in cameras}
-    figures, warnings = check_quality(kept, digests, clips, sync_frames, blur_ratio)
+    figures, warnings = check_quality(kept, digests, clips, every, sync_frames, blur_ratio)
     for name, why in odd_footage(raw, cameras, measured).items():
         warnings[name] = "; ".join([why, *filter(None, [warnings.get(name)])])
     write_json(out / "checks.json", figures)
@@ -167,7 +180,7 @@ def run(
 
 
 def _scan(
-    raw: RawCapture, folder: Path, proxy: tuple[int, int], focus_every: int
+    raw: RawCapture, folder: Path, proxy: tuple[int, int], every: int, focus_every: int
 ) -> tuple[dict[str, CameraSource], dict[str, CameraMeasurements], dict[str, str]]:
     """Scan all cameras; return them, their measurements, and why the others are dropped.
 
@@ -178,7 +191,9 @@ def _scan(
     cameras, measured = {}, {}
     for name, camera in raw.cameras.items():
         try:
-            cameras[name], measured[name] = scan_camera(raw, camera, folder, proxy, focus_every)
+            cameras[name], measured[name] = scan_camera(
+                raw, camera, folder, proxy, every, focus_every
+            )
         except CaptureError as error:
             dropped[name] = str(error)
             remove_proxies(folder, name)
@@ -387,7 +402,11 @@ def make_result(
 def write_contact_sheet(index: Index, out: Path) -> None:
     """Draw a row per camera, with frames from all of its footage, to show dark or stuck cameras."""
     names = list(index.cameras)[:QC_CAMERAS]
-    picks = np.unique(np.linspace(0, index.frames - 1, QC_COLUMNS).astype(int))
-    rows = [[decode_proxy(out / "proxies", name, int(frame)) for frame in picks] for name in names]
+    rows = []
+    for name in names:
+        hashes = index.cameras[name].dhash[: index.frames]
+        decoded = [frame for frame, value in enumerate(hashes) if value != UNKNOWN_HASH]
+        picks = np.unique(np.linspace(0, len(decoded) - 1, QC_COLUMNS).astype(int))
+        rows.append([decode_proxy(out / "proxies", name, decoded[pick]) for pick in picks])
     (out / "qc").mkdir()
     write_image(out / "qc" / "cameras.jpg", contact_sheet(rows, names), quality=88)

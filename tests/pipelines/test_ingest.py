@@ -7,9 +7,10 @@ from functools import partial
 import numpy as np
 import pytest
 
+from annotations.labels import make_mark, shows_labelled_frame
 from express50.__main__ import main
-from express50.capture.frames import decode_proxy, dhash
-from express50.capture.index import Cue, read_index
+from express50.capture.frames import FrameReader, decode_proxy, dhash, read_proxy
+from express50.capture.index import UNKNOWN_HASH, Cue, Peak, check_peak, read_index
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note
@@ -378,3 +379,45 @@ def test_subjects_that_differ_by_case_alone_are_refused(dataset, tmp_path):
     with pytest.raises(CaptureError, match="s001 differs from S001 only in letter case"):
         ingest.add_captures(dataset, [tmp_path / "small"])
     ingest.add_captures(dataset, [tmp_path / "S001"])
+
+
+def sparse_and_whole(tmp_path, video):
+    """Ingest one capture of 8 frames twice: one of 3 frames decoded, and all."""
+    make_capture(tmp_path / "S001", cameras=3, frames=8, video=video)
+    sparse, whole = Dataset(tmp_path / "sparse"), Dataset(tmp_path / "whole")
+    for dataset, every in ((sparse, 3), (whole, 1)):
+        ingest.add_captures(dataset, [tmp_path / "S001"])
+        assert run(dataset, every=every).ok
+    return sparse, whole
+
+
+@pytest.mark.parametrize("video", [True, False])
+def test_frames_that_were_not_decoded_can_be_seen_labelled_and_read(tmp_path, video):
+    sparse, whole = sparse_and_whole(tmp_path, video)
+    some, every = read_index(sparse, "S001"), read_index(whole, "S001")
+    source, known = some.cameras["cam01"], every.cameras["cam01"]
+    assert source.pts == known.pts and source.sha256 == known.sha256
+    decoded = [n for n, value in enumerate(source.dhash) if value != UNKNOWN_HASH]
+    assert decoded == ([0] if video else [0, 3, 6])  # the video has one key frame
+    for frame in (7, 2, 4, 0):
+        proxies = [read_proxy(d, "S001", "cam01", frame).astype(int) for d in (sparse, whole)]
+        assert np.abs(proxies[0] - proxies[1]).mean() < 6  # JPEG
+        read = [FrameReader(index, "cam01").read(frame) for index in (some, every)]
+        assert np.array_equal(*read)
+    mark = make_mark(some, some.cues[0].expression_id, 1, "cam01", "ann")
+    assert shows_labelled_frame(every, mark)
+    figures = json.loads((sparse.item_dir("ingest", "S001") / "checks.json").read_text())
+    assert figures["sync"]["unjudged"]["cam00"] == "not all frames were decoded (ingest.every)"
+    check_peak(every, "e", Peak(1, "cam01", mark.pts, mark.dhash))
+    with pytest.raises(CaptureError, match="the label has changed"):
+        check_peak(every, "e", Peak(2, "cam01", mark.pts, mark.dhash))
+
+
+def test_footage_that_changed_after_a_sparse_ingest_is_refused_where_it_was_decoded(tmp_path):
+    sparse, _ = sparse_and_whole(tmp_path, video=False)
+    folder = camera_folder(sparse, "cam01") / "frames"
+    names = sorted(path.name for path in folder.iterdir())
+    other = camera_folder(sparse, "cam02") / "frames" / names[0]
+    shutil.copy(other, folder / names[3])
+    with pytest.raises(CaptureError, match="frame 3 has hash"):
+        FrameReader(read_index(sparse, "S001"), "cam01").read(3)

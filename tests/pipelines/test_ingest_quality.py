@@ -129,12 +129,15 @@ def lit(image, gains):
 def test_drift_of_light_is_measured_in_stops(footage, gain, exposure, red, blue):
     ramp = np.linspace(0, 1, FRAMES)[:, None] * (np.array(gain) - 1) + 1
     images = [lit(i, g) for i, g in zip(footage["cam02"], ramp, strict=True)]
-    drift = measure_drift(np.stack([light_cells(image) for image in images]))
+    drift = measure_drift(
+        np.stack([light_cells(image) for image in images]), np.arange(len(images))
+    )
     assert drift is not None
     assert drift.exposure == pytest.approx(exposure, abs=0.03)
     assert drift.red == pytest.approx(red, abs=0.03)
     assert drift.blue == pytest.approx(blue, abs=0.03)
-    steady = measure_drift(np.stack([light_cells(image) for image in footage["cam02"]]))
+    cells = np.stack([light_cells(image) for image in footage["cam02"]])
+    steady = measure_drift(cells, np.arange(len(cells)))
     assert max(steady.exposure, steady.red, steady.blue) < 0.02
 
 

@@ -7,7 +7,14 @@ import pytest
 from express50.capture.frames import dhash
 from express50.errors import CaptureError
 from express50.files import video as video_module
-from express50.files.video import VideoReader, check_whole, iterate_video
+from express50.files.video import (
+    VideoReader,
+    VideoTags,
+    check_whole,
+    iterate_sparsely,
+    iterate_video,
+    video_tags,
+)
 from tests.synth import noise_video_images, write_video
 
 FRAMES = 61
@@ -175,3 +182,22 @@ def test_sound_only_is_a_capture_error(tmp_path):
             container.mux(packet)
     with pytest.raises(CaptureError, match="no video stream"):
         list(iterate_video(path))
+
+
+@pytest.mark.parametrize("every", [2, 5, 1000])
+def test_sparse_reading_lists_all_frames_and_decodes_those_coded_alone(video, every):
+    whole = list(iterate_video(video))
+    told: list[VideoTags] = []
+    sparse = list(iterate_sparsely(video, every, told.append))
+    assert [stamp for stamp, _ in sparse] == [stamp for stamp, _ in whole]
+    decoded = [frame for frame, (_, image) in enumerate(sparse) if image is not None]
+    assert decoded[0] == 0 and min(np.diff(decoded), default=every) >= every
+    assert all(np.array_equal(sparse[frame][1], whole[frame][1]) for frame in decoded)
+    assert told == [video_tags(video)]
+
+
+def test_sparse_reading_of_videos_all_of_whose_frames_stand_alone_is_even(tmp_path):
+    write_video(tmp_path / "video.mp4", noise_video_images(FRAMES), gop=1)
+    rows = iterate_sparsely(tmp_path / "video.mp4", 7, lambda tags: None)
+    decoded = [frame for frame, (_, image) in enumerate(rows) if image is not None]
+    assert decoded == list(range(0, FRAMES, 7))
