@@ -38,6 +38,8 @@ from express50.geometry.cameras import Camera, pinhole, resized
 from express50.geometry.sampling import undistort_image
 
 STRIP = 64  # rows that `write_frame` compresses together
+BLOCK = 24  # neighbouring frames whose proxies are made together
+BLOCKS = 12  # kept in memory, 10 MB each at 480 pixels
 _READING = Lock()  # one thread at a time reads footage for `read_proxy`
 
 
@@ -390,8 +392,8 @@ def read_gains(dataset: Dataset, subject: str) -> dict[str, np.ndarray]:
 def read_proxy(dataset: Dataset, subject: str, camera_id: str, frame: int) -> np.ndarray:
     """Read the small JPEG copy (h, w, 3) uint8 sRGB of a frame, which takes milliseconds.
 
-    The copy of a frame that ingest did not decode is made from the footage: a tenth of a second at
-    4K if the frames are read in order, or seconds.
+    The copy of a frame that ingest did not decode is made from the footage, with those of the
+    frames around it: a tenth of a second per frame at 4K.
 
     Raises:
         StageError: the subject is not ingested.
@@ -405,10 +407,22 @@ def read_proxy(dataset: Dataset, subject: str, camera_id: str, frame: int) -> np
     proxy = decode_proxy(folder, camera_id, decoded)
     if decoded == frame:
         return proxy
-    side = max(proxy.shape)
-    path = dataset.index_file(subject)
+    several = 1 if index.cameras[camera_id].kind == "frames" else BLOCK
+    block, number = divmod(frame, several)
+    path, key = dataset.index_file(subject), (dataset, subject, camera_id, index.capture)
     with _READING:
-        return shrink(_reader(path, dataset, subject, camera_id, index.capture).read(frame), side)
+        copies = _block_of_proxies(path, key, block * several, several, max(proxy.shape))
+    return copies[number].copy()
+
+
+@cached_by_file(BLOCKS)
+def _block_of_proxies(
+    path: Path, key: tuple[Dataset, str, str, Path], first: int, count: int, side: int
+) -> list[np.ndarray]:
+    """Make the proxies of neighbouring frames: videos are decoded forward only."""
+    reader = _reader(path, *key)
+    frames = range(first, min(first + count, reader.source.frames))
+    return [shrink(reader.read(frame), side) for frame in frames]
 
 
 @cached_by_file(8)
