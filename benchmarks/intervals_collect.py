@@ -23,12 +23,7 @@ from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.capture.index import read_peaks
 from express50.contract.layout import Dataset
 from express50.dataset.tracks import read_registration, read_track
-from express50.error_model import (
-    HEAD_SIZE_SPREAD,
-    ErrorModel,
-    error_bounds,
-    single_camera_sigma,
-)
+from express50.error_model import HEAD_SIZE_SPREAD, ErrorModel, error_bounds, single_camera_sigma
 from express50.files.images import read_alpha, shrink
 from express50.geometry.cameras import Camera, transform_camera
 from express50.geometry.meshes import read_surface

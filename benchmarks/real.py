@@ -26,13 +26,7 @@ from express50.files.images import write_image
 from express50.files.video import iterate_video
 from express50.geometry.cameras import Camera, project, triangulate
 from express50.rigs.read import read_rig
-from pipelines.calibrate.board import (
-    Board,
-    BoardCorners,
-    board_footage,
-    board_points,
-    read_corners,
-)
+from pipelines.calibrate.board import Board, BoardCorners, board_footage, board_points, read_corners
 from pipelines.calibrate.board_rig import solve_rig
 from pipelines.calibrate.uncertainty import state_uncertainty
 

@@ -199,11 +199,7 @@ async def _settle(app: MeasuredApp, pilot: Pilot) -> None:
 
 
 def measure_steps(
-    dataset: Dataset,
-    presses: int,
-    *,
-    faces: bool = True,
-    size: tuple[int, int] = (160, 48),
+    dataset: Dataset, presses: int, *, faces: bool = True, size: tuple[int, int] = (160, 48)
 ) -> list[float]:
     """Return seconds of each of so many steps through a dataset, tasks, cameras and zooms mixed in.
 

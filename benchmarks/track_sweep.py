@@ -13,12 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks.common import (
-    add_twin_options,
-    check_twin_options,
-    make_parser,
-    replace_section,
-)
+from benchmarks.common import add_twin_options, check_twin_options, make_parser, replace_section
 from benchmarks.track import narrowed, prepare, track, twin_config
 from benchmarks.track_truth import summary
 from benchmarks.track_views import held_out_views

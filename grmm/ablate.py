@@ -36,13 +36,7 @@ from grmm.evaluate import (
     mean,
     training_render,
 )
-from grmm.fit import (
-    NOVEL_EXPRESSION,
-    NOVEL_VIEW,
-    FitProtocol,
-    evaluate_unseen,
-    given_views,
-)
+from grmm.fit import NOVEL_EXPRESSION, NOVEL_VIEW, FitProtocol, evaluate_unseen, given_views
 from grmm.metrics import PerceptualMetrics
 from grmm.shard_source import open_shards
 from grmm.train import train

@@ -41,11 +41,7 @@ from express50.dial.measuring import (
     time_words,
     workload,
 )
-from express50.dial.pilot import (
-    Chain,
-    keep_for_run,
-    stated_errors,
-)
+from express50.dial.pilot import Chain, keep_for_run, stated_errors
 from express50.dial.results import RESULTS
 from express50.errors import ConfigError, FormatError
 from express50.files.atomic import write_json

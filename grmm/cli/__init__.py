@@ -195,10 +195,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--format": {"choices": commands.FORMATS, "help": "format (default: by FILE's name)"},
     "--shards": value("SHARDS", "with .html: measure its loss on this footage", type=Path),
     "--still": value(
-        "N",
-        "height of still pictures, pixels (default: %(default)s)",
-        type=number(16),
-        default=512,
+        "N", "height of still pictures, pixels (default: %(default)s)", type=number(16), default=512
     ),
     "--host": value(
         "ADDRESS", "address to listen on (default: this machine only)", default="127.0.0.1"
@@ -344,9 +341,7 @@ COMMANDS = {
         help="train and measure the paper's ablations under one budget",
         example="grmm ablate express/pack/shards out --also renderme/pack/shards \\\n"
         "      --preset small --budget 2h --fit-cameras cam03 --fit-budget 60s",
-        changes={
-            "out": {"help": "folder for ablation.md, ablation.json and a folder per row"},
-        },
+        changes={"out": {"help": "folder for ablation.md, ablation.json and a folder per row"}},
     ),
 }
 STUDY_ACTIONS = {

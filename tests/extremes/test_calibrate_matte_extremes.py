@@ -17,14 +17,7 @@ from pipelines.calibrate.stage import check_given
 from pipelines.matte import MatteConfig
 from pipelines.matte.key import key_alpha
 from pipelines.matte.plates import exposure_gain
-from tests.pipelines.board_rigs import (
-    POINTS,
-    board_motion,
-    make_rig,
-    observe,
-    rig_errors,
-    sizes_of,
-)
+from tests.pipelines.board_rigs import POINTS, board_motion, make_rig, observe, rig_errors, sizes_of
 from tests.pipelines.matte_scenes import make_scene
 
 

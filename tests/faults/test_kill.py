@@ -76,10 +76,7 @@ def published(root: Path, names: list[str]) -> dict[str, dict[str, bytes]]:
 # Moments as parts of an undisturbed run: import, start of the workers, and the work itself.
 @pytest.mark.parametrize(
     ("workers", "parts"),
-    [
-        (0, [0.6, *(random.Random(n).uniform(0.1, 0.95) for n in range(9))]),
-        (2, [0.5, 0.7, 0.9]),
-    ],
+    [(0, [0.6, *(random.Random(n).uniform(0.1, 0.95) for n in range(9))]), (2, [0.5, 0.7, 0.9])],
     ids=["inline", "workers"],
 )
 def test_killed_driver_leaves_whole_items_and_a_rerun_completes(tmp_path, workers, parts):

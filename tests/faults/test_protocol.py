@@ -12,15 +12,7 @@ from express50.errors import StageError
 from express50.runner.ledger import Ledger
 from express50.runner.publish import stage_lock
 from tests.faults import toy
-from tests.faults.protocol import (
-    MISTAKES,
-    SET_ASIDE,
-    Rules,
-    State,
-    explore,
-    first_states,
-    steps,
-)
+from tests.faults.protocol import MISTAKES, SET_ASIDE, Rules, State, explore, first_states, steps
 from tests.faults.traced import Recorder
 
 ITEM = "S001/smile"

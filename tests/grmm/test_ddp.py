@@ -21,12 +21,7 @@ def test_two_processes_of_two_views_equal_one_that_accumulates_four(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
     subprocess.run(command, check=True, env=environment, cwd=REPOSITORY, timeout=240)
     settings = {"iterations": 2, "accumulate": 4}
-    train(
-        EllipsoidSource(size=32),
-        ellipsoid_head(),
-        tmp_path / "one",
-        tiny_config(train=settings),
-    )
+    train(EllipsoidSource(size=32), ellipsoid_head(), tmp_path / "one", tiny_config(train=settings))
     one, two = (
         torch.load(tmp_path / name / "checkpoint.pt", weights_only=True)["model"]
         for name in ("one", "two")

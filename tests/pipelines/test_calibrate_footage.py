@@ -16,11 +16,7 @@ from express50.errors import CalibrationError, ConfigError
 from express50.files.calibration import camera_rows
 from express50.files.images import write_image
 from express50.geometry.conventions import MIRROR_X
-from express50.geometry.transforms import (
-    axis_angle_to_matrix,
-    make_transform,
-    similarity_fit,
-)
+from express50.geometry.transforms import axis_angle_to_matrix, make_transform, similarity_fit
 from express50.rigs.camera_builder import in_metres
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.footage import has_one_lens

@@ -13,14 +13,7 @@ from skimage.measure import marching_cubes
 
 from express50.errors import StageError
 from pipelines.depth import blocks
-from pipelines.depth.blocks import (
-    BAND,
-    LevelSet,
-    build,
-    combined,
-    refined,
-    smoothed,
-)
+from pipelines.depth.blocks import BAND, LevelSet, build, combined, refined, smoothed
 from pipelines.depth.surface import advance, extract_mesh, fair, grid_normals
 from tests.pipelines.dense_grid import from_dense, is_held, to_dense
 

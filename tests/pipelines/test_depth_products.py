@@ -115,13 +115,7 @@ def test_metrics_and_contact_sheet_show_the_photo_error(written):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("voxel_mm", 0.1),
-        ("voxel_px", -1.0),
-        ("image_side", 4),
-        ("noise", 0.0),
-    ],
+    ("name", "value"), [("voxel_mm", 0.1), ("voxel_px", -1.0), ("image_side", 4), ("noise", 0.0)]
 )
 def test_values_out_of_range_are_named(name, value):
     with pytest.raises(ConfigError, match=name):

@@ -250,11 +250,6 @@ def test_a_file_that_changes_is_loaded_anew(tmp_path) -> None:
 
 
 def test_settings_that_do_not_go_together_are_refused() -> None:
-    for change in (
-        {"method": "bgmv2"},
-        {"weights": "net.pt"},
-        {"tile": 100},
-        {"tile": 0},
-    ):
+    for change in ({"method": "bgmv2"}, {"weights": "net.pt"}, {"tile": 100}, {"tile": 0}):
         with pytest.raises(ConfigError, match="matte"):
             MatteConfig(**change)

@@ -9,11 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.common import write_peaks
-from express50.capture.frames import (
-    read_cameras_of,
-    read_peak_frame,
-    write_frame,
-)
+from express50.capture.frames import read_cameras_of, read_peak_frame, write_frame
 from express50.capture.index import read_index
 from express50.contract.layout import Dataset
 from express50.error_model import error_bounds
@@ -100,10 +96,7 @@ def test_other_weights_run_again_and_the_same_do_not(aligned, tmp_path) -> None:
 
 def test_a_salient_network_needs_no_plate(tmp_path) -> None:
     dataset = make_dataset(tmp_path, [unplated(tmp_path / "raw")])
-    settings = {
-        "method": "salient",
-        "weights": str(onnx_bright(tmp_path / "net.onnx", 128)),
-    }
+    settings = {"method": "salient", "weights": str(onnx_bright(tmp_path / "net.onnx", 128))}
     assert run(dataset, **settings).ok
     folder = dataset.item_dir("matte", "S001/smile")
     alpha = read_image(folder / "cam00.png")

@@ -125,11 +125,7 @@ def worn(places: np.ndarray, mattes: bool = True) -> FrameSetCrops:
 
 
 def test_glasses_are_taken_out_of_the_crops() -> None:
-    model, mesh, pictures = (
-        load_head("procedural"),
-        scenes()[0].head.vertices,
-        worn(rims()),
-    )
+    model, mesh, pictures = (load_head("procedural"), scenes()[0].head.vertices, worn(rims()))
     found = find_worn_glasses(model, pictures, mesh, np.eye(3))
     assert len(found) > 500 and (found[:, 2] > eyes()[:, 2].min() - 0.04).all()
     front = pictures.crops[3]

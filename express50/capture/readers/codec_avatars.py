@@ -21,12 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from express50.capture.raw import RawCapture
-from express50.capture.readers.selection import (
-    Moment,
-    Selection,
-    check_selection,
-    common_timeline,
-)
+from express50.capture.readers.selection import Moment, Selection, check_selection, common_timeline
 from express50.errors import CalibrationError, CaptureError
 from express50.files.calibration import finite_array
 from express50.files.containers import WITHIN, open_zip

@@ -10,13 +10,7 @@ from textual.geometry import Size
 
 from annotations.ui.app import AnnotateApp
 from annotations.ui.frames import FrameCrop
-from annotations.ui.images import (
-    COLOURS,
-    SIXEL_PIXELS,
-    SixelPainter,
-    encode_sixel,
-    quantise,
-)
+from annotations.ui.images import COLOURS, SIXEL_PIXELS, SixelPainter, encode_sixel, quantise
 from annotations.ui.picture import PicturePane, shot_of
 from annotations.ui.session import Session
 

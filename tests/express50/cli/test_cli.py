@@ -201,16 +201,8 @@ def test_bad_item_gives_exit_code_1_and_is_named(run, data, capture, tmp_path):
         (["run", "DATA", "--buget=1h"], 2, "(did you mean '--budget'?)"),
         (["status", "DATA", "more"], 2, "express50 status: error: unknown argument 'more'"),
         (["config", "ingets"], 2, "no stage 'ingets' (did you mean 'ingest'?)"),
-        (
-            ["ingest", "DATA", "--workers=-1"],
-            2,
-            "got '-1', expected a whole number, 0 to",
-        ),
-        (
-            ["ingest", "DATA", "--threads", "-1"],
-            2,
-            "got '-1', expected a whole number, 1 to",
-        ),
+        (["ingest", "DATA", "--workers=-1"], 2, "got '-1', expected a whole number, 0 to"),
+        (["ingest", "DATA", "--threads", "-1"], 2, "got '-1', expected a whole number, 1 to"),
         (["twin", "record", "DATA", "--workers", "0"], 2, "--workers: got '0', expected a whole"),
         (["shards", "split", "DATA", "OUT", "--shard-mb", "0"], 2, "--shard-mb: got '0'"),
         (["status", "DATA", "--serve=-1"], 2, "expected a whole number, 0 to 65535"),

@@ -7,14 +7,7 @@ import numpy as np
 import pytest
 
 from express50.__main__ import main
-from express50.cli.plan import (
-    TARGETS,
-    Measured,
-    estimate,
-    measure,
-    measure_sizes,
-    target_of,
-)
+from express50.cli.plan import TARGETS, Measured, estimate, measure, measure_sizes, target_of
 from express50.contract.layout import Dataset
 from express50.contract.stage import stages
 from express50.dial.figures import Footage, footage_of

@@ -15,13 +15,7 @@ from express50.dial.choice import point_of
 from express50.dial.figures import Cost, Footage, Trial, dial_dir
 from express50.dial.measuring import measured_figures, tune, workload
 from express50.dial.pilot import Pilot, guessed, keep_for_run, trial_seconds
-from express50.dial.run import (
-    RunState,
-    closing_lines,
-    reserved,
-    run_file,
-    run_within,
-)
+from express50.dial.run import RunState, closing_lines, reserved, run_file, run_within
 from express50.errors import ConfigError, StageError
 from express50.files.atomic import write_json
 from express50.runner.runner import run_stage

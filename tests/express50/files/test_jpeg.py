@@ -40,10 +40,7 @@ def test_a_jpeg_cut_anywhere_is_found(share):
 def test_no_reader_takes_half_a_picture(tmp_path):
     half = PLAIN[: len(PLAIN) // 2]
     (tmp_path / "half.jpg").write_bytes(half)
-    for read in (
-        lambda: read_image(tmp_path / "half.jpg"),
-        lambda: decode_image(half, "half.jpg"),
-    ):
+    for read in (lambda: read_image(tmp_path / "half.jpg"), lambda: decode_image(half, "half.jpg")):
         with pytest.raises(FormatError, match=r"half.jpg: truncated"):
             read()
     with pytest.raises(CaptureError, match="truncated"):

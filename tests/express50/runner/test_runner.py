@@ -437,11 +437,7 @@ def test_given_scheduler_is_used_and_left_running(tmp_path):
         n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None
     ) as cluster:
         summary = run_stage(
-            toy.STAGE,
-            dataset,
-            toy.ToyConfig(),
-            scheduler=cluster.scheduler_address,
-            progress=False,
+            toy.STAGE, dataset, toy.ToyConfig(), scheduler=cluster.scheduler_address, progress=False
         )
         with Client(cluster) as client:
             assert len(client.nthreads()) == 1

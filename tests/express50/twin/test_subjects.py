@@ -8,13 +8,7 @@ from express50.errors import HeadModelError
 from express50.head.load import load_head
 from express50.twin.body import build_body, head_vertices, model_materials, pose_body
 from express50.twin.rig import TARGET, make_rig
-from express50.twin.subjects import (
-    OFFSET_RMS_M,
-    gaze_rotation,
-    make_subject,
-    perform,
-    soft_mask,
-)
+from express50.twin.subjects import OFFSET_RMS_M, gaze_rotation, make_subject, perform, soft_mask
 from express50.twin.surface import fractal, make_lattice, noise
 
 
