@@ -20,13 +20,7 @@ from express50.files.images import write_image
 from express50.files.video import iterate_video
 from express50.head.load import load_head
 from express50.head.model import landmarks, pose
-from pipelines.photo.capture import (
-    guess_focal,
-    make_photo_capture,
-    open_picture,
-    subject_id,
-    upright_frames,
-)
+from pipelines.photo.capture import make_photo_capture, open_picture, subject_id
 from pipelines.track.config import TrackConfig
 from tests.synth import turn_video, write_video
 
@@ -160,30 +154,6 @@ def write_exif(path: Path, image: np.ndarray, orientation: int, film: int) -> No
     file.open(str(path), spec)
     file.write_image(np.ascontiguousarray(image))
     file.close()
-
-
-@pytest.mark.parametrize(
-    ("orientation", "stored"),
-    [
-        (1, lambda i: i),
-        (2, lambda i: i[:, ::-1]),
-        (3, lambda i: i[::-1, ::-1]),
-        (4, lambda i: i[::-1]),
-        (5, lambda i: i.swapaxes(0, 1)),
-        (6, lambda i: np.rot90(i, 1)),
-        (7, lambda i: i[::-1, ::-1].swapaxes(0, 1)),
-        (8, lambda i: np.rot90(i, -1)),
-    ],
-)
-def test_exif_turns_pictures_upright(tmp_path: Path, orientation: int, stored) -> None:
-    """Orientation 6 is a camera held with its right side down: the picture lies turned left."""
-    y, x = np.mgrid[:48, :64]
-    upright = np.stack([4 * x, 5 * y, 0 * x + 90], -1).astype(np.uint8)
-    write_exif(tmp_path / "a.tif", stored(upright), orientation, 28)
-    picture = open_picture(tmp_path / "a.tif")
-    np.testing.assert_array_equal(next(upright_frames(picture)), upright)
-    focal, source = guess_focal(picture, 64, 48, 50.0)
-    assert source == "exif" and focal == pytest.approx(28 / np.hypot(36, 24) * 80)
 
 
 def test_a_photograph_on_its_side_is_tracked_as_an_upright_one(
