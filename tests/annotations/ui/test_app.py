@@ -24,18 +24,27 @@ from express50.errors import AnnotationError
 from tests.annotations.footage import suggest
 
 
-def drive(app, *keys, size=(80, 22), check=None):
-    """Press keys in the app; returns what ``check`` says of it at the end."""
+def piloted(app, act, size=(80, 22)):
+    """Run the app; returns what ``act`` returns, which gets the pilot once the screen is drawn."""
 
     async def run():
         async with app.run_test(size=size) as pilot:
             await pilot.pause()
-            for key in keys:
-                await pilot.press(key)
-            await pilot.pause()
-            return check(app) if check else None
+            return await act(pilot)
 
     return asyncio.run(run())
+
+
+def drive(app, *keys, size=(80, 22), check=None):
+    """Press keys in the app; returns what ``check`` says of it at the end."""
+
+    async def act(pilot):
+        for key in keys:
+            await pilot.press(key)
+        await pilot.pause()
+        return check(app) if check else None
+
+    return piloted(app, act, size)
 
 
 def line(app, name):
@@ -69,24 +78,22 @@ def test_every_movement_key_moves_the_cursor(suggested, make_app):
     ]  # fmt: skip
     app = make_app(suggested, expressions=["smile"], subjects=["S001"])
 
-    async def run():
-        async with app.run_test(size=(80, 22)) as pilot:
-            await pilot.pause()
-            for key, frame in table:
-                await pilot.press("1")
-                assert app.desk.view.cursor == 20
-                await pilot.press(key)
-                assert (key, app.desk.view.cursor) == (key, frame)
-                assert app.desk.query_one("#frame", PicturePane).look.frame == frame
-            await pilot.press("g", "2", "9", "enter")
-            assert app.desk.view.cursor == 29
-            await pilot.press("g", "7", "enter")
-            await pilot.pause()
-            assert "7 is outside" in app.screen.query_one(Input).placeholder
-            await pilot.press("escape")
-            assert app.desk.view.cursor == 29
+    async def act(pilot):
+        for key, frame in table:
+            await pilot.press("1")
+            assert app.desk.view.cursor == 20
+            await pilot.press(key)
+            assert (key, app.desk.view.cursor) == (key, frame)
+            assert app.desk.query_one("#frame", PicturePane).look.frame == frame
+        await pilot.press("g", "2", "9", "enter")
+        assert app.desk.view.cursor == 29
+        await pilot.press("g", "7", "enter")
+        await pilot.pause()
+        assert "7 is outside" in app.screen.query_one(Input).placeholder
+        await pilot.press("escape")
+        assert app.desk.view.cursor == 29
 
-    asyncio.run(run())
+    piloted(app, act)
 
 
 def test_plateau_is_stored_in_the_label(suggested, make_app):
@@ -169,20 +176,19 @@ def test_narrow_lines_keep_the_essential_parts():
 def test_help_scrolls_in_a_low_terminal(suggested, make_app):
     app = make_app(suggested)
 
-    async def run():
-        async with app.run_test(size=(80, 24)) as pilot:
-            await pilot.press("question_mark")
-            await pilot.pause()
-            box = app.screen.query_one(".help")
-            assert box.max_scroll_y > 0
-            await pilot.press("end")
-            await pilot.pause(0.5)
-            assert box.scroll_y == box.max_scroll_y and len(app.screen_stack) == 3
-            await pilot.press("x")
-            await pilot.pause()
-            assert len(app.screen_stack) == 2
+    async def act(pilot):
+        await pilot.press("question_mark")
+        await pilot.pause()
+        box = app.screen.query_one(".help")
+        assert box.max_scroll_y > 0
+        await pilot.press("end")
+        await pilot.pause(0.5)
+        assert box.scroll_y == box.max_scroll_y and len(app.screen_stack) == 3
+        await pilot.press("x")
+        await pilot.pause()
+        assert len(app.screen_stack) == 2
 
-    asyncio.run(run())
+    piloted(app, act, size=(80, 24))
 
 
 def test_looking_keys_do_not_label(suggested, make_app, monkeypatch):
@@ -191,36 +197,34 @@ def test_looking_keys_do_not_label(suggested, make_app, monkeypatch):
     )  # a busy machine must not reach the window's end
     app = make_app(suggested)
 
-    async def run():
-        async with app.run_test(size=(80, 22)) as pilot:
-            await pilot.pause()
-            frame = app.desk.query_one("#frame", PicturePane)
-            zooms, cameras = [], []
-            for _ in range(5):
-                await pilot.press("z")
-                zooms.append(frame.look.zoom)
-            assert zooms == ["mouth", "eyes", "head", "frame", "face"]
-            for key in "cc":
-                await pilot.press(key)
-                reference = app.desk.query_one("#reference", PicturePane).look
-                cameras.append((frame.look.camera, reference.camera))
-            assert cameras == [("cam00", "cam00"), ("cam01", "cam01")]
-            await pilot.press("n", "n", "n", "b")  # smile of S002, against S001
-            await pilot.pause()
-            assert frame.look.subject == "S001"
-            await pilot.press("left")
-            assert (frame.look.subject, app.desk.player.blinks) == ("S002", False)
-            await pilot.press("home", "space")
-            for _ in range(100):
-                await pilot.pause(0.1)
-                if app.desk.view.cursor > app.desk.view.first:
-                    break
-            await pilot.press("enter")  # stops; a moving frame cannot be meant
-            assert not app.desk.player.plays
-            assert labels(suggested, "S002") == []
-            await pilot.press("question_mark", "x")
+    async def act(pilot):
+        frame = app.desk.query_one("#frame", PicturePane)
+        zooms, cameras = [], []
+        for _ in range(5):
+            await pilot.press("z")
+            zooms.append(frame.look.zoom)
+        assert zooms == ["mouth", "eyes", "head", "frame", "face"]
+        for key in "cc":
+            await pilot.press(key)
+            reference = app.desk.query_one("#reference", PicturePane).look
+            cameras.append((frame.look.camera, reference.camera))
+        assert cameras == [("cam00", "cam00"), ("cam01", "cam01")]
+        await pilot.press("n", "n", "n", "b")  # smile of S002, against S001
+        await pilot.pause()
+        assert frame.look.subject == "S001"
+        await pilot.press("left")
+        assert (frame.look.subject, app.desk.player.blinks) == ("S002", False)
+        await pilot.press("home", "space")
+        for _ in range(100):
+            await pilot.pause(0.1)
+            if app.desk.view.cursor > app.desk.view.first:
+                break
+        await pilot.press("enter")  # stops; a moving frame cannot be meant
+        assert not app.desk.player.plays
+        assert labels(suggested, "S002") == []
+        await pilot.press("question_mark", "x")
 
-    asyncio.run(run())
+    piloted(app, act)
 
 
 def test_a_second_camera_shows_the_same_moment(suggested, make_app):
@@ -232,40 +236,38 @@ def test_a_second_camera_shows_the_same_moment(suggested, make_app):
         widths = [app.desk.query_one(f"#{name}").size.width for name in names]
         return app.desk.query_one("#middle").display, looks, widths
 
-    async def run():
-        async with app.run_test(size=(110, 30)) as pilot:
-            await pilot.pause()
-            assert not panes(app)[0]
-            await pilot.press("s", "right", "right")
-            await pilot.pause()
-            shown, (frame, second, _), widths = panes(app)
-            assert shown and max(widths) - min(widths) <= 1
-            assert (frame.camera, second.camera, frame.frame, second.frame) == (
-                "cam01", "cam00", 6, 6,
-            )  # fmt: skip
-            assert line(app, "second-title").split() == ["cam00", "the", "same", "moment"]
-            await pilot.press("c")  # the first camera takes the second one's place
-            assert [look.camera for look in panes(app)[1][:2]] == ["cam00", "cam01"]
-            await pilot.press("enter")  # the next task: the choice stays
-            await pilot.pause()
-            shown, (frame, second, _), _ = panes(app)
-            assert shown and (frame.frame, second.frame) == (20, 20)
-            assert frame.camera != second.camera
-            await pilot.resize_terminal(80, 24)
-            await pilot.pause()
-            async with asyncio.timeout(30):
-                while panes(app)[0]:
-                    await pilot.pause(0.01)
-            await pilot.press("s", "s")
-            assert "needs 90 columns, this terminal has 80" in line(app, "message")
-            await pilot.resize_terminal(110, 30)
-            async with asyncio.timeout(30):
-                while not panes(app)[0]:
-                    await pilot.pause(0.01)
-            await pilot.press("s")
-            assert not panes(app)[0]
+    async def act(pilot):
+        assert not panes(app)[0]
+        await pilot.press("s", "right", "right")
+        await pilot.pause()
+        shown, (frame, second, _), widths = panes(app)
+        assert shown and max(widths) - min(widths) <= 1
+        assert (frame.camera, second.camera, frame.frame, second.frame) == (
+            "cam01", "cam00", 6, 6,
+        )  # fmt: skip
+        assert line(app, "second-title").split() == ["cam00", "the", "same", "moment"]
+        await pilot.press("c")  # the first camera takes the second one's place
+        assert [look.camera for look in panes(app)[1][:2]] == ["cam00", "cam01"]
+        await pilot.press("enter")  # the next task: the choice stays
+        await pilot.pause()
+        shown, (frame, second, _), _ = panes(app)
+        assert shown and (frame.frame, second.frame) == (20, 20)
+        assert frame.camera != second.camera
+        await pilot.resize_terminal(80, 24)
+        await pilot.pause()
+        async with asyncio.timeout(30):
+            while panes(app)[0]:
+                await pilot.pause(0.01)
+        await pilot.press("s", "s")
+        assert "needs 90 columns, this terminal has 80" in line(app, "message")
+        await pilot.resize_terminal(110, 30)
+        async with asyncio.timeout(30):
+            while not panes(app)[0]:
+                await pilot.pause(0.01)
+        await pilot.press("s")
+        assert not panes(app)[0]
 
-    asyncio.run(run())
+    piloted(app, act, size=(110, 30))
     (label,) = labels(suggested)
     assert label.camera == "cam00"  # the mark names the first camera
 
@@ -291,21 +293,19 @@ def test_play_stops_at_the_end_of_the_window_and_restarts(suggested, make_app, m
     monkeypatch.setattr(app_module, "FASTEST", 4.0)
     app = make_app(suggested)
 
-    async def run():
-        async with app.run_test(size=(80, 22)) as pilot:
-            await pilot.pause()
-            await pilot.press("end", "left", "space")
-            for _ in range(100):
-                await pilot.pause(0.1)
-                if not app.desk.player.plays:
-                    break
-            assert app.desk.view.cursor == app.desk.view.last
-            assert not app.desk.player.plays
-            await pilot.press("space")
-            assert app.desk.player.plays
-            assert app.desk.view.cursor < app.desk.view.last
+    async def act(pilot):
+        await pilot.press("end", "left", "space")
+        for _ in range(100):
+            await pilot.pause(0.1)
+            if not app.desk.player.plays:
+                break
+        assert app.desk.view.cursor == app.desk.view.last
+        assert not app.desk.player.plays
+        await pilot.press("space")
+        assert app.desk.player.plays
+        assert app.desk.view.cursor < app.desk.view.last
 
-    asyncio.run(run())
+    piloted(app, act)
 
 
 def test_task_without_suggestion_opens_in_the_middle_with_a_message(dataset, make_app):
@@ -371,31 +371,27 @@ def test_app_runs_in_terminals_of_any_size(suggested, make_app, size):
 def test_resize_keeps_the_position(suggested, make_app):
     app = make_app(suggested)
 
-    async def run():
-        async with app.run_test(size=(80, 22)) as pilot:
-            await pilot.pause()
-            await pilot.press("right")
-            await pilot.resize_terminal(60, 18)
-            strip = app.desk.query_one(CurveStrip)
-            async with asyncio.timeout(30):  # the layout follows when the machine has time
-                while strip.size.width != 60:
-                    await pilot.pause(0.01)
-            assert app.desk.view.cursor == 5
-            assert all(len(text) == 60 for text in strip_text(app))
+    async def act(pilot):
+        await pilot.press("right")
+        await pilot.resize_terminal(60, 18)
+        strip = app.desk.query_one(CurveStrip)
+        async with asyncio.timeout(30):  # the layout follows when the machine has time
+            while strip.size.width != 60:
+                await pilot.pause(0.01)
+        assert app.desk.view.cursor == 5
+        assert all(len(text) == 60 for text in strip_text(app))
 
-    asyncio.run(run())
+    piloted(app, act)
 
 
 def test_click_on_the_strip_moves_the_cursor(suggested, make_app):
     app = make_app(suggested)
 
-    async def run():
-        async with app.run_test(size=(90, 26)) as pilot:
-            await pilot.pause()
-            await pilot.click(CurveStrip, offset=(10 + 5 * 9 + 1, 0))
-            assert app.desk.view.cursor == 9
+    async def act(pilot):
+        await pilot.click(CurveStrip, offset=(10 + 5 * 9 + 1, 0))
+        assert app.desk.view.cursor == 9
 
-    asyncio.run(run())
+    piloted(app, act, size=(90, 26))
 
 
 def test_reference_of_another_camera_set_falls_back_to_its_own(suggested, make_app):
