@@ -275,7 +275,7 @@ def measure(run: Ablation, loaded: Checkpoint, used: Sequence[Path]) -> dict:
     }
 
 
-def variants_of(roots: Sequence[Path], names: Sequence[str] = ()) -> dict[str, Variant]:
+def variants_of(roots: Sequence[Path], names: Sequence[str]) -> dict[str, Variant]:
     """Choose the rows asked for, by default all; with several datasets also one without each.
 
     Raises:

@@ -168,13 +168,10 @@ class HeadView:
 
     def hide_behind_torso(self, rendering: Rendering) -> Rendering:
         """Return a rendering that is background where the torso is in front of what was drawn."""
+        depth, behind = rendering.depth, self.background
         images = (rendering.rgb, rendering.image)
-        rgb, image = (self.hide_image_behind_torso(each, rendering.depth) for each in images)
+        rgb, image = (self.fill_behind_torso(each, depth, behind) for each in images)
         return replace(rendering, rgb=rgb, image=image)
-
-    def hide_image_behind_torso(self, image: Tensor, depth: Tensor) -> Tensor:
-        """Return ``image`` (3, H, W) with the background where it lies behind the torso."""
-        return self.fill_behind_torso(image, depth, self.background)
 
     def fill_behind_torso(self, values: Tensor, depth: Tensor, fill: float) -> Tensor:
         """Return values (..., H, W) with ``fill`` where ``depth`` (H, W) lies behind the torso."""

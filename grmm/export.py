@@ -245,7 +245,7 @@ def with_morph_targets(glb: bytes, positions: np.ndarray, targets: dict[str, np.
 
 
 def _add_array(
-    document: dict, body: bytearray, array: np.ndarray, bounds: bool = False, **view: int
+    document: dict, body: bytearray, array: np.ndarray, bounds: bool, **view: int
 ) -> int:
     """Append an array (N, 1, 3 or 4) to a glTF document's buffer; returns its accessor's number.
 

@@ -144,7 +144,7 @@ def draw_views(
 
 
 def turntable(
-    loaded: Checkpoint, head: HeadCodes, view: PinholeView, frames: int = 72, degrees: float = 360.0
+    loaded: Checkpoint, head: HeadCodes, view: PinholeView, frames: int, degrees: float = 360.0
 ) -> Iterable[np.ndarray]:
     """Yield (H, W, 3) frames of an orbit that starts at ``view``."""
     centre = loaded.model.head_centre
@@ -176,7 +176,7 @@ def expression_grid(
 
 
 def interpolation(
-    loaded: Checkpoint, start: HeadCodes, end: HeadCodes, view: PinholeView, frames: int = 48
+    loaded: Checkpoint, start: HeadCodes, end: HeadCodes, view: PinholeView, frames: int
 ) -> Iterable[np.ndarray]:
     """Yield frames from one head to another."""
     for number in range(frames):
@@ -264,17 +264,20 @@ def sample_sheet(
 def driven(
     loaded: Checkpoint, head: HeadCodes, clips: tracks.Sequence, view: PinholeView
 ) -> Iterable[np.ndarray]:
-    """Yield the head with the expression, jaw, neck and eyes of every frame of tracked clips.
+    """Return pictures of the head with expression, jaw, neck and eyes of tracked clips' frames.
 
-    Its own shape and residual codes stay.
+    They are drawn one by one; its own shape and residual codes stay.
 
     Raises:
         ConfigError: the clips were tracked with another head model.
     """
     check_clips(loaded, clips)
-    for row in range(len(clips.frames)):
+
+    def frame(row: int) -> np.ndarray:
         moved = {name: getattr(clips, name)[row] for name in ("expression", "neck", "jaw", "eyes")}
-        yield picture(loaded, replace(head, tracked=replace(head.tracked, **moved)), view)
+        return picture(loaded, replace(head, tracked=replace(head.tracked, **moved)), view)
+
+    return map(frame, range(len(clips.frames)))
 
 
 def check_clips(loaded: Checkpoint, clips: tracks.Sequence) -> None:

@@ -165,7 +165,6 @@ def render(args: argparse.Namespace) -> int:
         end = _frame_head(loaded, args.to, args.expression)
         videos["interpolation"] = render.interpolation(loaded, head, end, view, args.frames)
     if clips is not None:
-        render.check_clips(loaded, clips)
         videos["driven"], rates["driven"] = render.driven(loaded, head, clips, view), clips.rate
     sheets: dict[str, Any] = {}
 

@@ -160,7 +160,8 @@ def _loss(person: Person, avatar: Avatar, subject: str, views: HeadViews) -> dic
         item = views.item(index)
         pose = person.pose(views.place(index).tracked, keys[index].expression)
         page = drawn(avatar, pose, item.view, views.background)
-        picture = item.hide_image_behind_torso(page.colors.permute(2, 0, 1), page.depth)
+        colours = page.colors.permute(2, 0, 1)
+        picture = item.fill_behind_torso(colours, page.depth, item.background)
         ours.append(psnr_db(picture, item.target, ~item.hidden))
         picture = item.hide_behind_torso(full_rendering(person, pose, item.view)).image
         full.append(psnr_db(picture, item.target, ~item.hidden))
