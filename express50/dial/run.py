@@ -106,7 +106,7 @@ class _Run:
         )
 
     def asked(self) -> str:
-        """Write the budget and the goal with the result that it is for."""
+        """Write the budget, and the goal with the name of its result."""
         goal = f"error {self.state.goal} of the {self.wanted[0]}" if self.wanted else ""
         return ", ".join(filter(None, [self.state.budget and f"budget {self.state.budget}", goal]))
 
@@ -168,7 +168,7 @@ def _measure_and_run(
     load = run.workload()
     run.wanted = None if goal is None else (goal_result(load, goal), goal.value)
     if not state.settings:
-        point = _first_choice(run, load, goal)
+        point = _first_choice(run, load)
         promised = {name: asdict(error) for name, error in point.errors.items()}
         run.state = replace(
             state, settings=point.settings, seconds=clock.now() + point.seconds, promised=promised
@@ -216,29 +216,27 @@ def _resumed(chain: Chain, budget: Budget | None, goal: Goal | None) -> RunState
     return state if same else fresh
 
 
-def _first_choice(run: _Run, load: Workload, goal: Goal | None) -> Point:
-    clock, wanted, points = run.clock, run.wanted, front(load)
-    left = clock.left()
-    if points[0].seconds > max(0.0, left):
+def _first_choice(run: _Run, load: Workload) -> Point:
+    clock, points = run.clock, front(load)
+    if clock.budget is not None and points[0].seconds > max(0.0, clock.left()):
         spent, least = clock.now(), points[0].seconds
         words = time_words(load.cores, load.width)
-        asked = f"--budget {clock.budget.text if clock.budget else ''}"
-        more = 1.1 * least
-        give = f"give --budget {budget_text(more, load.cores)} or more"
-        if clock.budget is not None and more <= clock.budget.seconds:
+        give = f"give --budget {budget_text(1.1 * least, load.cores)} or more"
+        if 1.1 * least <= clock.budget.seconds:
             give = "the same command again will do"
         core = core_seconds(load, points[0].settings)
         if not load.cores and least > BUSY_RATIO * core / load.width:
             give += f"; only {format_seconds(core)} of it is processor time: where other programs"
             give += f" slowed the measuring, give --budget {budget_text(1.1 * core, True)} instead"
         raise ConfigError(
-            f"{asked}: the cheapest settings need about {format_seconds(least)} {words} after"
-            f" {format_seconds(spent)} of measuring, which is kept and not counted again; {give}"
+            f"--budget {clock.budget.text}: the cheapest settings need about"
+            f" {format_seconds(least)} {words} after {format_seconds(spent)} of measuring, which is"
+            f" kept and not counted again; {give}"
         )
-    point = choose(points, clock.plannable(), wanted)
-    if goal is not None and wanted is not None and point.errors[wanted[0]].value > goal.value:
-        name = wanted[0]
-        reaching = [p for p in points if p.errors[name].value <= goal.value]
+    point = choose(points, clock.plannable(), run.wanted)
+    if run.wanted is not None and point.errors[run.wanted[0]].value > run.wanted[1]:
+        name, goal = run.wanted
+        reaching = [p for p in points if p.errors[name].value <= goal]
         if reaching:
             need = format_seconds(clock.now() + reaching[0].seconds)
             how = f"takes about {need}, which is more than --budget"
@@ -248,7 +246,7 @@ def _first_choice(run: _Run, load: Workload, goal: Goal | None) -> Point:
             if untried := [f"{n} {' and '.join(more)}" for n, more in run.measured.untried.items()]:
                 how = f"the best of the settings that were tried is {error_text(name, best)};"
                 how += f" there was no time to try {', '.join(untried)}; give a larger --budget"
-        raise ConfigError(f"--error {goal.text}: {how}")
+        raise ConfigError(f"--error {run.state.goal}: {how}")
     return point
 
 

@@ -274,7 +274,7 @@ def has_alpha(path: Path) -> bool:
     """Return True if a file is a PNG whose header declares an alpha channel."""
     with path.open("rb") as file:
         head = file.read(26)
-    return head.startswith(b"\x89PNG") and head[25:] in (b"\x04", b"\x06")  # grey or RGB, alpha
+    return head.startswith(PNG_START) and head[25:] in (b"\x04", b"\x06")  # grey or RGB, alpha
 
 
 def decode_image(data: bytes, name: str = "image") -> np.ndarray:

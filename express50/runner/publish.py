@@ -53,9 +53,8 @@ def run_folder(dataset: Dataset, stage: str) -> Iterator[Path]:
 
 @contextmanager
 def publishing(
-    folder: Path, dataset: Dataset, stage: str, item: str,
-    keep: Callable[[Path], None] | None = None,
-) -> Iterator[Path]:  # fmt: skip
+    folder: Path, dataset: Dataset, stage: str, item: str, keep: Keep | None = None
+) -> Iterator[Path]:
     """Yield a temporary folder; on a clean exit it becomes the item's folder in one rename.
 
     It is made in a run's ``folder``. If the body raises, the item's former folder stays. A former
@@ -66,9 +65,7 @@ def publishing(
         yield aside
 
 
-def set_aside(
-    dataset: Dataset, stage: str, item: str, keep: Callable[[Path], None] | None = None
-) -> None:
+def set_aside(dataset: Dataset, stage: str, item: str, keep: Keep | None = None) -> None:
     """Move a published item to the stale folder, so that no later stage reads it.
 
     ``keep`` may move it on from there.
@@ -136,7 +133,7 @@ def clean_leftovers(dataset: Dataset, stage: str) -> None:
 
 
 def _empty(folder: Path, taken: Path) -> None:
-    """Rename what is in a run's folder, and remove that, while its workers may make more."""
+    """Move a run's files to ``taken`` and remove its folder; workers may still be adding files."""
     while folder.is_dir():
         for path in folder.iterdir():
             same = (taken / path.name).exists()

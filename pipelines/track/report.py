@@ -172,7 +172,8 @@ def camera_bars(table: ResidualTable) -> np.ndarray:
     rows = camera_residuals(table)
     values = [value for value, _ in rows.values()]
     limit = ODD * float(np.median(values)) if values else math.inf
-    left, length = 16 + max(map(_width, rows), default=0), 2 * SHEET_TILE
+    widths = [cv2.getTextSize(name, cv2.FONT_HERSHEY_SIMPLEX, 0.4, 1)[0][0] for name in rows]
+    left, length = 16 + max(widths, default=0), 2 * SHEET_TILE
     chart = np.full((BAR * (len(rows) + 1) + 8, left + length + 190, 3), GROUND, np.uint8)
     title = "landmark residual by camera, RMS px" if rows else "no camera has landmarks"
     _write(chart, title, 6, 14, PLAIN)
@@ -191,10 +192,6 @@ def camera_bars(table: ResidualTable) -> np.ndarray:
 def _write(image: np.ndarray, text: str, x: int, y: int, colour: tuple[int, int, int]) -> None:
     """Write a text with its baseline at (x, y)."""
     cv2.putText(image, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
-
-
-def _width(text: str) -> int:
-    return cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.4, 1)[0][0]
 
 
 def _rms(values: Iterable[float]) -> float:
