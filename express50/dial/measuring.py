@@ -157,7 +157,10 @@ def _subjects(chain: Chain) -> list[str]:
 
 
 def _measure_one(chain: Chain, clock: Clock, allowance: _Allowance) -> PilotFigures:
-    """Measure the first subject whose footage every stage can work on; raises what callers do."""
+    """Measure the first subject whose footage every stage can work on.
+
+    Raises as `measured_figures` does.
+    """
     subjects = _subjects(chain)
     for subject in subjects:
         try:

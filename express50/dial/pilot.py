@@ -194,7 +194,7 @@ class Pilot:
         return cost_of(dataset, stage.name, receipts, extra), why
 
 
-def cost_of(dataset: Dataset, stage: str, receipts: Sequence[Receipt], extra: float = 0.0) -> Cost:
+def cost_of(dataset: Dataset, stage: str, receipts: Sequence[Receipt], extra: float) -> Cost:
     """Sum up what items cost; a first item that loads libraries counts little in the median."""
     typical = median if len(receipts) > 2 else mean
     folders = [dataset.item_dir(stage, receipt.item) for receipt in receipts]
@@ -324,10 +324,10 @@ class Allowance(Protocol):
 
 
 def measure(pilot: Pilot, allowance: Allowance) -> PilotFigures:
-    """Run trials, the cheapest first, as long as they and a run with what they try fit the time.
+    """Run trials, the cheapest first, while there is time for them and for a run with the result.
 
-    The first one, at the cheapest settings, always runs to its end or to that of the budget. Where
-    a stage makes nothing whatever its settings, it stays the only one.
+    The first trial, at the cheapest settings, runs until it or the budget ends. It is the only one
+    if a stage makes nothing at any setting.
     """
     chain, names = pilot.chain, pilot.chain.names
     choices = tradable(chain)
@@ -416,13 +416,13 @@ def _item_seconds(pilot: Pilot, cost: Cost) -> float:
 
 
 def _charged(pilot: Pilot, cost: Cost) -> float:
-    """Return what a stage's items take of the budget."""
+    """Return the seconds of the budget that a stage's items take."""
     width = 1 if pilot.clock.cores else min(pilot.chain.pool.width(), cost.items)
     return cost.items * _item_seconds(pilot, cost) / width
 
 
 def guessed(pilot: Pilot, base: Trial, name: str, label: str, factor: float) -> Trial:
-    """Guess what a trial would measure that sets a stage higher, as if that took `factor` times.
+    """Guess the figures of a trial with a higher setting of a stage, `factor` times as slow.
 
     Later stages take as long as before, but longer where the setting makes their pictures larger.
     """
@@ -448,7 +448,7 @@ def trial_seconds(pilot: Pilot, guess: Trial, name: str) -> float:
 
 
 def one_peak_seconds(pilot: Pilot, base: Trial) -> float:
-    """Guess the seconds of a trial of one expression: what others have no part in is there."""
+    """Guess the seconds of a trial of one expression, which reuses what depends on no other."""
     seconds, changed = 0.0, False
     for stage in pilot.chain.stages:
         changed |= "expressions" in stage.growth.time

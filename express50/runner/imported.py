@@ -26,7 +26,7 @@ AGAIN = "import it again, or remove it with 'express50 import remove'"
 
 
 def import_inputs(dataset: Dataset, item: str, digest: Digest = path_digest) -> dict[str, str]:
-    """Return the digests of what an import belongs to: the cameras, and each peak's frame.
+    """Return the digests of the cameras and of each peak frame that an import belongs to.
 
     ``item`` is a subject, or an expression of one, whose import also belongs to pictures of a size.
 

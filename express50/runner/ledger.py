@@ -263,7 +263,7 @@ class Ledger:
             return {row[1] for row in self._database.execute("PRAGMA table_info(receipts)")}
 
     def made(self, stage: str, item: str | None = None) -> dict[str, Made]:
-        """Read what a stage's items, or one, were made from and with, and their files, sorted.
+        """Read inputs, settings and files of a stage's published items, sorted, or of one item.
 
         Raises:
             FormatError: a row is damaged.
@@ -403,7 +403,7 @@ class Ledger:
 
 
 def _of(table: str, stage: str, item: str | None) -> tuple[str, ...]:
-    """Return what selects a stage's rows of a table, sorted, or one item's, and its values."""
+    """Return the SQL that selects a stage's rows, sorted, or one item's row; and its values."""
     if item is None:
         return f"{table} WHERE stage = ? ORDER BY item", stage
     return f"{table} WHERE stage = ? AND item = ?", stage, item

@@ -22,7 +22,7 @@ NAMED = 3  # inputs or settings that are named
 
 
 def why_outdated(stage: Stage, config: Any, made: Made, inputs: Mapping[str, str]) -> str:
-    """Say how what an output was made from differs from the present stage, settings and inputs.
+    """Say which of version, settings and inputs changed since an output was made.
 
     ``inputs`` are digests of the present inputs by name.
     """

@@ -322,7 +322,7 @@ def _is_there(task: Task, made: Made | None, ledger: Ledger) -> bool:
 
 
 def _other_data(task: Task, before: Mapping[str, str]) -> bool:
-    """Return whether what earlier stages give an item differs from what its output was made of.
+    """Return whether inputs from earlier stages have changed since an item's output was made.
 
     A later stage must not read such an output beside the new data. Files outside of the dataset
     are different: settings name them, or they are footage, which only the first stage reads.

@@ -333,7 +333,7 @@ def eliminate(
     cameras: int,
     damping: float = 0.0,
 ) -> Normal:
-    """Eliminate what observations share in groups: points, or the board's poses.
+    """Eliminate the unknowns that groups of observations share: points, or the board's poses.
 
     `errors` (N, 2) are weighted and derived by the unknowns of the observation's camera (N, 2, K)
     and group (N, 2, M); `camera` and `group` (N,) number these. `damping` times the groups'

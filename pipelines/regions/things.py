@@ -312,7 +312,7 @@ def _disc(view: FaceView | _Sweep, radius_m: float) -> np.ndarray:
 
 
 def _shot(head: TrackedHead, picture: Picture) -> _Shot | None:
-    """Crop a picture to the head and what is near it, at most SIDE pixels; None if not in it."""
+    """Crop a picture to the head and what is near it, at most SIDE pixels; None without a head."""
     camera, rgb, alpha = picture
     pixels, ahead = project_pinhole(camera, head.vertices)
     if (ahead <= 1e-3).any():

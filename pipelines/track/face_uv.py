@@ -87,7 +87,7 @@ TEXELS_PER_PIXEL = SIDE / CROP
 
 
 def with_slide(target: Target, slide: SlideTerm | None) -> Target:
-    """Add a reading of the map, and trust the landmarks less that it contains."""
+    """Add a reading of the map; trust the detector less at landmarks that the map shows."""
     if slide is None:
         return target
     sigma = target.sigma.copy()

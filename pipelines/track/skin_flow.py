@@ -105,7 +105,7 @@ def flow_term(
 
 
 def _flow(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return how far (H, W, 2) what the first picture shows has moved in the second."""
+    """Return the optical flow (H, W, 2), pixels, from the first picture to the second."""
     search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     search.setFinestScale(0)
     return search.calc(first, second, np.zeros((*first.shape, 2), np.float32))
