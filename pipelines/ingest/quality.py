@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ import scipy
 
 from express50.files.images import linear_to_srgb, shrink, srgb_to_linear
 from express50.files.video import VideoTags
+from express50.geometry.sampling import edge_width
 
 SIDE = 96  # longer side, pixels, of the images in which movement is measured
 FEWEST_CAMERAS, FEWEST_FRAMES = 3, 24
@@ -59,6 +60,41 @@ class CameraMeasurements:
     cells: np.ndarray
     widths: tuple[tuple[int, float], ...]
     tags: VideoTags | None = None
+
+
+@dataclass
+class FrameMeasures:
+    """Measures the decoded frames of one camera one by one.
+
+    Sharpness is measured at most once in ``focus_every`` frames, and never if that is 0.
+    """
+
+    focus_every: int
+    frames: list[int] = field(default_factory=list)
+    moves: list[float] = field(default_factory=list)
+    cells: list[np.ndarray] = field(default_factory=list)
+    widths: list[tuple[int, float]] = field(default_factory=list)
+    before: np.ndarray | None = None
+    next_look: int = 0
+
+    def add(self, frame: int, image: np.ndarray, small: np.ndarray) -> None:
+        """Measure a frame (H, W, 3) uint8, given with its proxy (h, w, 3)."""
+        grey = small_grey(small)
+        self.frames.append(frame)
+        self.moves.append(movement(self.before, grey))
+        self.cells.append(light_cells(small).astype(np.float16))
+        self.before = grey
+        if self.focus_every and frame >= self.next_look:
+            self.next_look = frame + self.focus_every
+            if (width := edge_width(image)) is not None:
+                self.widths.append((frame, width))
+
+    def finish(self, tags: VideoTags | None) -> CameraMeasurements:
+        """Return the measurements of all frames."""
+        cells = np.stack(self.cells)
+        return CameraMeasurements(
+            np.array(self.frames), np.array(self.moves), cells, tuple(self.widths), tags
+        )
 
 
 def check_quality(

@@ -21,8 +21,7 @@ from express50.files.containers import WITHIN, inside, read_picture
 from express50.files.digests import file_sha256, text_digest
 from express50.files.images import ORIENTATION, encode_jpeg, has_alpha, read_exif, shrink, upright
 from express50.files.video import VideoTags, iterate_sparsely, iterate_video, video_fps
-from express50.geometry.sampling import edge_width
-from pipelines.ingest.quality import CameraMeasurements, light_cells, movement, small_grey
+from pipelines.ingest.quality import CameraMeasurements, FrameMeasures
 
 FPS_SLACK = 0.02  # of the rate: less than from 24 to 25 frames per second
 UNEVEN = 0.1  # share of the steps that differ; a lost frame now and then is counted as a gap
@@ -48,16 +47,11 @@ def scan_camera(
     pts: list[int] = []
     hashes: list[str] = []
     clips: list[int] = []
-    decoded: list[int] = []
-    moves: list[float] = []
-    cells: list[np.ndarray] = []
-    widths: list[tuple[int, float]] = []
     tags: list[VideoTags] = []
-    before: np.ndarray | None = None
+    measures = FrameMeasures(focus_every)
     size: tuple[int, ...] | None = None
-    next_look = 0
     with ProxyWriter(folder / f"{camera.id}.tar") as proxies:
-        for clip, stamp, image in iterate_camera(camera, every, tags.append):
+        for frame, (clip, stamp, image) in enumerate(iterate_camera(camera, every, tags.append)):
             clips += [0] * (clip + 1 - len(clips))
             clips[clip] += 1
             pts.append(stamp)
@@ -68,22 +62,13 @@ def scan_camera(
             size = size or image.shape[:2]
             if image.shape[:2] != size:
                 raise CaptureError(
-                    f"{camera.path}: frame {len(pts) - 1} is {image.shape[1]}x{image.shape[0]}, "
+                    f"{camera.path}: frame {frame} is {image.shape[1]}x{image.shape[0]}, "
                     f"the first is {size[1]}x{size[0]}; all frames must have the same size"
                 )
-            frame = len(pts) - 1
-            decoded.append(frame)
             hashes.append(dhash(image))
             small = shrink(image, proxy[0])
             proxies.add(encode_jpeg(corrected(small, camera), proxy[1]))
-            grey = small_grey(small)
-            moves.append(movement(before, grey))
-            before = grey
-            cells.append(light_cells(small).astype(np.float16))
-            if focus_every and frame >= next_look:
-                next_look = frame + focus_every
-                if (width := edge_width(image)) is not None:
-                    widths.append((frame, width))
+            measures.add(frame, image, small)
     if size is None:
         raise CaptureError(f"{camera.path}: has no frames; record or copy it again")
     (folder / f"{camera.id}.json").write_bytes(dump_json(proxies.table))
@@ -101,10 +86,7 @@ def scan_camera(
         correction=camera.correction,
         orientation=camera.orientation,
     )
-    measured = CameraMeasurements(
-        np.array(decoded), np.array(moves), np.stack(cells), tuple(widths), *tags[:1]
-    )
-    return source, measured
+    return source, measures.finish(next(iter(tags), None))
 
 
 def trimmed(
