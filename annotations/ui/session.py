@@ -58,8 +58,8 @@ class Session:
         self.annotator = annotator
         self.blind = blind
         self.tasks = worklist(dataset, annotator, subjects, expressions, order, everything=True)
-        todo = worklist(dataset, annotator, subjects, expressions, order)
-        self._open = {task.key for task in todo}
+        said = {subject: self._said(subject) for subject in {task.subject for task in self.tasks}}
+        self._open = {task.key for task in self.tasks if task.expression not in said[task.subject]}
         self._efforts: defaultdict[int, Effort] = defaultdict(Effort)  # by position
         self._decided: list[int] = []
         self._clock = time.monotonic
