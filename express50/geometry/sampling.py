@@ -9,13 +9,15 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from express50.geometry.cameras import Camera, in_field
+from express50.geometry.cameras import Camera, crop_camera, in_field, resized
 from express50.geometry.conventions import K_to_opencv, cell_centres, corner_to_cell
 
 T = TypeVar("T")
 
 # cv2.remap takes at most 32767 rows and columns; this many points per call fit in the cache.
 _COLUMNS, _ROWS = 4096, 2048
+MAPPED = 480  # places at least along the longer side where a lens is evaluated
+SLACK = 0.005  # pixels; `undistort_maps` may be so far off
 COARSE = 64  # points across an image that are tested for a fold of the lens
 OUTSIDE = -10.0  # pixels; too far outside for an interpolation to reach the image
 
@@ -29,10 +31,19 @@ SHARPEST = 20  # percentile of the widths: lashes and hair are sharp, a face is 
 def undistort_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Return maps (H, W) of x and y, float32, for ``cv2.remap`` from a camera to its pinhole.
 
-    Where the lens folds, the map points outside the image.
+    Where the lens folds, the map points outside the image. In large images it is computed once per
+    block of pixels and interpolated: at most 0.004 px off for a lens of 80 degrees.
     """
-    K, size = K_to_opencv(camera.K), (camera.width, camera.height)
-    x, y = cv2.initUndistortRectifyMap(K, camera.dist, None, K, size, cv2.CV_32FC1)
+    step = max(1, max(camera.width, camera.height) // MAPPED)
+    columns, rows = (-(-side // step) + 2 for side in (camera.width, camera.height))
+    size = step * columns, step * rows  # a block more on each side
+    blocks = resized(crop_camera(camera, -step, -step, *size), columns, rows)
+    K, of_blocks = K_to_opencv(camera.K), K_to_opencv(blocks.K)
+    maps = cv2.initUndistortRectifyMap(
+        K, camera.dist, None, of_blocks, (columns, rows), cv2.CV_32FC1
+    )
+    window = np.s_[step : step + camera.height, step : step + camera.width]
+    x, y = (cv2.resize(values, size, interpolation=cv2.INTER_LINEAR)[window] for values in maps)
     if pictured_share(camera) < 1:
         across, down = cell_centres(camera.width), cell_centres(camera.height)
         x[~_pictured(camera, across, down)] = OUTSIDE
@@ -75,7 +86,8 @@ def undistort_image(image: np.ndarray, camera: Camera) -> np.ndarray:
 def undistorted_mask(camera: Camera) -> np.ndarray:
     """Return a mask (H, W) of the pinhole camera's pixels that the distorted image covers."""
     x, y = undistort_maps(camera)
-    return (x >= 0) & (y >= 0) & (x <= camera.width - 1) & (y <= camera.height - 1)
+    inside = (x > -SLACK) & (x < camera.width - 1 + SLACK)
+    return inside & (y > -SLACK) & (y < camera.height - 1 + SLACK)
 
 
 def bilinear(image: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -73,7 +73,7 @@ def run(dataset: Dataset, item: str, config: FramesConfig, out: Path) -> Result:
 
 STAGE = Stage(
     name="frames",
-    version=5,
+    version=6,
     config=FramesConfig,
     items=items,
     inputs=inputs,

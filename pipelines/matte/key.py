@@ -18,7 +18,9 @@ import numpy as np
 from express50.files.images import LIGHT_OF_LEVEL, box_about, shrink
 from pipelines.matte.plates import (
     PlateModel,
+    block_means,
     blurred,
+    enlarged,
     fit_plate,
     light_noise,
     local_colours,
@@ -174,17 +176,16 @@ def _pixels(share: float, length: int) -> int:
 def eroded(mask: np.ndarray, radius: float) -> np.ndarray:
     """Return the pixels (H, W) bool further than `radius` from any pixel outside the mask.
 
-    The mask continues beyond the image's border. Distances take the same time for any radius.
+    The mask continues beyond the image's border. From 9 pixels on, which take the same time for any
+    radius, distances are up to 2 % off.
     """
     if mask.all():
         return mask > 0
-    if radius <= 2:  # eroding with small discs is faster
+    if radius <= 8:
         side = np.arange(-radius, radius + 1)
         disc = (side[:, None] ** 2 + side**2 <= radius**2).astype(np.uint8)
         return cv2.erode(mask.astype(np.uint8), disc) > 0
-    # Squared distances are integers; their roots may be a bit off (`edge_distance`).
-    rough = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return rough > math.sqrt(math.floor(radius * radius) + 0.5)
+    return cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5) > radius
 
 
 def eroded_about(mask: np.ndarray, radius: int) -> np.ndarray:
@@ -352,16 +353,10 @@ def subject_colour(image: np.ndarray, core: np.ndarray, length: int) -> np.ndarr
     """Return the mean colour (H, W, 3) of the core's rim, over the nearest reach that has any."""
     weight = _rim(core, length).astype(np.float32)
     factor = max(1, int(REACH * length / 3))  # the blur leaves no finer detail
-    height, width = core.shape
-    size = max(1, width // factor), max(1, height // factor)
-    colours, weight = (
-        cv2.resize(values, size, interpolation=cv2.INTER_AREA)
-        for values in (image * weight[..., None], weight)
-    )
+    colours, weight = (block_means(v, factor) for v in (image * weight[..., None], weight))
     reach = REACH * length / factor
     weights = nearest_first(weight, reach, 4, least=1e-12)
-    own = nearest_first(colours, reach, 4) / weights[..., None]
-    return cv2.resize(own, (width, height), interpolation=cv2.INTER_LINEAR)
+    return enlarged(nearest_first(colours, reach, 4) / weights[..., None], factor, core.shape)
 
 
 def _rim(core: np.ndarray, length: int) -> np.ndarray:

@@ -326,24 +326,37 @@ def local_colours(
         spread: share by which brightness may differ from the colours nearby.
     """
     # A wide blur has no detail, so it is computed at reduced size; by channel, to save memory.
-    factor = max(1, int(reach / 3))
-    height, width = weight.shape
-    size = (max(1, width // factor), max(1, height // factor))
+    factor, places = max(1, int(reach / 3)), np.flatnonzero(where)
 
     def nearby(values: np.ndarray) -> np.ndarray:
-        small = cv2.resize(values * weight, size, interpolation=cv2.INTER_AREA)
+        small = block_means(values, factor)
         least = 1e-3 * 1e-2**OCTAVES * small.mean()  # counts if none is near
         total = nearest_first(small, reach / factor, OCTAVES, least)
-        return cv2.resize(total, (width, height), interpolation=cv2.INTER_LINEAR)[where]
+        return enlarged(total, factor, where.shape).take(places)
 
-    share = np.maximum(nearby(np.ones_like(weight)), 1e-20)
-    channels = [np.ascontiguousarray(light[..., c]) for c in range(3)]
-    mean = np.stack([nearby(c) / share for c in channels], axis=1).astype(np.float64)
-    squares = [nearby(channels[i] * channels[j]) / share for i, j in _PAIRS]
+    share = np.maximum(nearby(weight), 1e-20)
+    channels = cv2.split(light)
+    weighted = [channel * weight for channel in channels]
+    mean = np.stack([nearby(c) / share for c in weighted], axis=1).astype(np.float64)
+    squares = [nearby(weighted[i] * channels[j]) / share for i, j in _PAIRS]
     outer = mean[:, :, None] * mean[:, None, :]
     covariance = np.stack(squares, axis=1)[:, _MATRIX] - outer
     tint = (TINT * spread) ** 2 * (mean**2).mean(axis=1)
     return mean, covariance + spread**2 * outer + tint[:, None, None] * np.eye(3)
+
+
+def block_means(values: np.ndarray, factor: int) -> np.ndarray:
+    """Average values (H, W[, C]) over blocks of a whole number of pixels; beyond them is 0."""
+    rest = [-side % factor for side in values.shape[:2]]
+    whole = cv2.copyMakeBorder(values, 0, rest[0], 0, rest[1], cv2.BORDER_CONSTANT)
+    size = whole.shape[1] // factor, whole.shape[0] // factor
+    return cv2.resize(whole, size, interpolation=cv2.INTER_AREA)
+
+
+def enlarged(means: np.ndarray, factor: int, shape: tuple[int, ...]) -> np.ndarray:
+    """Interpolate `block_means` at the pixels (H, W) that they were made of."""
+    size = means.shape[1] * factor, means.shape[0] * factor
+    return cv2.resize(means, size, interpolation=cv2.INTER_LINEAR)[: shape[0], : shape[1]]
 
 
 def nearest_first(image: np.ndarray, reach: float, octaves: int, least: float = 0) -> np.ndarray:

@@ -136,7 +136,7 @@ ENCODE = Stage(
 
 STAGE = Stage(
     name="pack",
-    version=13,
+    version=14,
     config=PackConfig,
     presets={"draft": {}, "standard": {}, "reference": {}},
     items=items,

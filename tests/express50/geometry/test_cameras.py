@@ -132,6 +132,21 @@ def test_undistort_image_moves_features_to_the_pinhole_projection():
     )
 
 
+@pytest.mark.parametrize("size", [(3840, 2160), (1917, 1081), (50, 40)])
+def test_interpolated_maps_are_close_to_the_lens(size):
+    width, height = size
+    params = (0.6 * width, 0.6 * width, 0.51 * width, 0.48 * height, -0.3, 0.1, 0.001, -0.001)
+    camera = Camera("a", width, height, "OPENCV", params, POSE)
+    x, y = sampling.undistort_maps(camera)
+    assert x.shape == y.shape == (height, width)
+    rows, columns = np.arange(0, height, 7), np.arange(0, width, 7)
+    pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2) + 0.5
+    xy = (pixels - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
+    exact = cameras.distort(camera, xy) * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2] - 0.5
+    found = np.stack([m[np.ix_(rows, columns)].ravel() for m in (x, y)], axis=1)
+    assert np.abs(found - exact).max() < 0.005
+
+
 def test_calibration_file_round_trip(tmp_path):
     path = tmp_path / "calibration.json"
     calibration_file.write_cameras(path, {"a": OPENCV})
