@@ -426,12 +426,10 @@ def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
         raise ValueError(f"resize of {had} to {width}x{height} pixels, expected 1x1 or more")
     shrinking = width <= image.shape[1] and height <= image.shape[0]
     mode = cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR
-    image, ratio = (
-        np.ascontiguousarray(image),
-        min(image.shape[1] // width, image.shape[0] // height),
-    )
+    image = np.ascontiguousarray(image)
     # OpenCV averages blocks of whole pixels three times as fast as parts of pixels.
-    step = max(k for k in range(1, max(ratio, 1) + 1) if not any(n % k for n in image.shape[:2]))
+    most = max(1, min(image.shape[1] // width, image.shape[0] // height))
+    step = max(k for k in range(1, most + 1) if image.shape[1] % k == image.shape[0] % k == 0)
     if step > 1:
         size = image.shape[1] // step, image.shape[0] // step
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
