@@ -39,6 +39,10 @@ HDR_CURVES = {16: "PQ", 18: "HLG"}
 LUMA = {1: (0.2126, 0.0722), 5: (0.299, 0.114), 6: (0.299, 0.114), 9: (0.2627, 0.0593)}
 LIMITED = 1  # colour range of 16 to 235 and 16 to 240, as cameras record
 UNTIMED = "frames have no time stamps; remux it, for example with 'ffmpeg -i IN -c copy OUT.mp4'"
+UNORDERED = (
+    "time stamps of frames are not in order, as in AVI files with H.264 B-frames; encode it again,"
+    " for example with 'ffmpeg -i IN -crf 14 OUT.mp4'"
+)
 BOXES = 1_000_000  # per file; a fragment of one second has two
 DAMAGE = (av.FFmpegError, OSError, ValueError, MemoryError, OverflowError)
 
@@ -173,6 +177,16 @@ def _decode(
         ) from error
 
 
+def _in_order(path: Path, frames: Iterable[av.VideoFrame]) -> Iterator[av.VideoFrame]:
+    """Yield frames; raise CaptureError if a time stamp is before that of the frame before."""
+    before: int | None = None
+    for frame in frames:
+        if before is not None and frame.pts < before:
+            raise CaptureError(f"{path}: {UNORDERED}")
+        before = frame.pts
+        yield frame
+
+
 def video_fps(path: Path) -> float:
     """Read the frames per second from a video's container.
 
@@ -190,21 +204,31 @@ def video_fps(path: Path) -> float:
 def frame_times(path: Path) -> tuple[int, ...]:
     """List the time stamps of a video's frames in display order, without decoding a frame.
 
+    Frames of AVI files are decoded, unless all stand alone: what such a file says of their order
+    may be wrong.
+
     Raises:
         CaptureError: the file is not a video, is truncated, or its frames have no time stamps.
     """
     check_whole(path)
     container, stream = _open(path)
     with container:
+        stamps, alone = [], True
         try:
-            packets = [packet for packet in container.demux(stream) if packet.size]
+            for packet in container.demux(stream):  # not kept: a clip may have gigabytes
+                if packet.size and not packet.is_discard:
+                    stamps.append(packet.pts)
+                    alone = alone and packet.is_keyframe
         except DAMAGE as error:
             raise CaptureError(
                 f"{path}: cannot be read ({reason(error)}); copy it again"
             ) from error
-        if any(packet.pts is None for packet in packets):
-            raise CaptureError(f"{path}: {UNTIMED}")
-        return tuple(sorted(packet.pts for packet in packets if not packet.is_discard))
+        if container.format.name == "avi" and not alone:
+            container.seek(0)
+            return tuple(f.pts for f in _in_order(path, _decode(path, container, stream)))
+    if None in stamps:
+        raise CaptureError(f"{path}: {UNTIMED}")
+    return tuple(sorted(stamps))
 
 
 @dataclass(frozen=True)
@@ -270,7 +294,7 @@ def iterate_video(
     container, stream = _open(path)
     with container:
         count = 0
-        for frame in _decode(path, container, stream):
+        for frame in _in_order(path, _decode(path, container, stream)):
             if tell and not count:
                 tell(_tags(frame, stream))
             count += 1
@@ -298,14 +322,20 @@ def iterate_sparsely(
         for packet in container.demux(stream):
             if not packet.size:  # asks the decoder for the frames that it still holds
                 yield packet
-            elif packet.is_keyframe and (number := bisect_left(stamps, packet.pts)) >= wanted:
-                wanted = number + every
-                yield packet
+            elif packet.is_keyframe and packet.pts is not None:
+                number = bisect_left(stamps, packet.pts)
+                if number >= wanted:
+                    wanted = number + every
+                    yield packet
 
     done = 0
     with container:
         for frame in _decode(path, container, stream, packets=choose()):
+            if not frame.key_frame:  # intra refresh: the container says that it stands alone
+                continue
             number = bisect_left(stamps, frame.pts)
+            if number < done or stamps[number : number + 1] != (frame.pts,):
+                raise CaptureError(f"{path}: {UNORDERED}")
             if not done:
                 tell(_tags(frame, stream))
             yield from ((stamp, None) for stamp in stamps[done:number])

@@ -201,3 +201,31 @@ def test_sparse_reading_of_videos_all_of_whose_frames_stand_alone_is_even(tmp_pa
     rows = iterate_sparsely(tmp_path / "video.mp4", 7, lambda tags: None)
     decoded = [frame for frame, (_, image) in enumerate(rows) if image is not None]
     assert decoded == list(range(0, FRAMES, 7))
+
+
+def encode(path, **options):
+    """Write FRAMES frames of a moving picture as H.264."""
+    picture = noise_video_images(1)[0]
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=24, options=options)
+        stream.width, stream.height, stream.pix_fmt = picture.shape[1], picture.shape[0], "yuv420p"
+        for shift in range(FRAMES):
+            image = np.roll(picture, 3 * shift, axis=1)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+
+
+def test_an_avi_file_whose_time_stamps_are_out_of_order_is_refused(tmp_path):
+    encode(tmp_path / "video.avi", bf="3", g="12")
+    for read in (iterate_video, lambda path: iterate_sparsely(path, 5, lambda tags: None)):
+        with pytest.raises(CaptureError, match="video.avi: time stamps of frames are not in order"):
+            list(read(tmp_path / "video.avi"))
+
+
+def test_frames_that_only_claim_to_stand_alone_are_not_decoded_sparsely(tmp_path):
+    encode(tmp_path / "video.mp4", **{"x264-params": "intra-refresh=1:keyint=10"})
+    whole = list(iterate_video(tmp_path / "video.mp4"))
+    sparse = list(iterate_sparsely(tmp_path / "video.mp4", 5, lambda tags: None))
+    assert [stamp for stamp, _ in sparse] == [stamp for stamp, _ in whole]
+    decoded = [frame for frame, (_, image) in enumerate(sparse) if image is not None]
+    assert decoded == [0] and np.array_equal(sparse[0][1], whole[0][1])
