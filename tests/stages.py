@@ -37,10 +37,10 @@ def notes_of(dataset: Dataset, stage: str, item: str, kind: str = "warnings") ->
     return {row["what"]: row["why"] for row in rows}
 
 
-def ingest_captures(root: Path, *captures: Path, preset: str = "draft") -> Dataset:
-    """Make a dataset of raw captures."""
+def ingest_captures(root: Path, *captures: Path, preset: str = "draft", every: int = 1) -> Dataset:
+    """Make a dataset of raw captures; every frame is decoded unless ``every`` is above 1."""
     dataset = Dataset(root)
     ingest.add_captures(dataset, captures)
-    summary = run_here(ingest.STAGE, dataset, preset=preset, every=1)
+    summary = run_here(ingest.STAGE, dataset, preset=preset, every=every)
     assert summary.ok, summary.lines()
     return dataset

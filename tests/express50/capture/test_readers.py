@@ -23,9 +23,9 @@ from tests.synth import noise_video_images, read_frame, turn_video, write_video
 HEAD = np.array([[0.02, 1.22, 0.05], [-0.05, 1.15, -0.03], [0.0, 1.2, 0.0]])
 
 
-def ingested(tmp_path, *captures):
+def ingested(tmp_path, *captures, every=1):
     """Return a dataset of captures, and the first one's subject."""
-    dataset = ingest_captures(tmp_path / "data", *captures)
+    dataset = ingest_captures(tmp_path / "data", *captures, every=every)
     return dataset, subject_of(captures[0])
 
 
@@ -123,12 +123,13 @@ def test_nersemble_colours_are_corrected_and_sizes_fitted(tmp_path):
     assert_rig(dataset, subject, rig(["222200036", "222200037", "222200038"], (110, 160)))
 
 
-def test_nersemble_cameras_of_unequal_length(tmp_path):
+@pytest.mark.parametrize("every", [1, 4])
+def test_nersemble_cameras_of_unequal_length(tmp_path, every):
     path = layouts.write_nersemble(tmp_path, write_video)
     videos = path / "sequences/EMO-1-shout+laugh/images"
     write_video(videos / "cam_222200036.mp4", noise_frames(7))
     write_video(path / "sequences/EXP-1-head/images/cam_222200038.mp4", noise_frames(4))
-    dataset, subject = ingested(tmp_path, path)
+    dataset, subject = ingested(tmp_path, path, every=every)
     index = read_index(dataset, subject)
     assert sorted(index.cameras) == ["222200036", "222200037"]
     assert index.cameras["222200036"].clips == (5, 5)
