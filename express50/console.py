@@ -146,10 +146,11 @@ def run_handler(
 
     Any error becomes one line on standard error; with EXPRESS50_DEBUG=1 the traceback follows.
     """
+    _open_standard_streams()
     try:
         with _stop_on_sigterm(), _warnings_on_one_line(program):
             code = handler(args)
-        with ignoring_closed_pipe(sys.stdout):
+        with _naming_output():
             sys.stdout.flush()
         return code
     except Exception as error:  # noqa: BLE001 (a page of a library's files helps no user)
@@ -162,6 +163,21 @@ def run_handler(
             f"{program}: interrupted; finished work is kept, the same command makes the rest\n"
         )
         return INTERRUPTED
+
+
+def _open_standard_streams() -> None:
+    """Give this process the standard streams that it was started without (``>&-``).
+
+    Otherwise, a file of ours would get their number, and libraries' messages.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+        if getattr(sys, name) is None:
+            stream = Path(os.devnull).open("w" if number else "r")  # noqa: SIM115 (stays)
+            setattr(sys, name, stream)
 
 
 @contextlib.contextmanager
@@ -280,9 +296,20 @@ def _stop_on_sigterm() -> Iterator[None]:
 
 def say(*lines: str) -> None:
     """Write lines to standard output."""
-    with ignoring_closed_pipe(sys.stdout):
+    with _naming_output():
         for line in lines:
             sys.stdout.write(printable(line) + "\n")
+
+
+@contextlib.contextmanager
+def _naming_output() -> Iterator[None]:
+    """Name standard output in errors of writing to it, except where its reader has closed it."""
+    try:
+        with ignoring_closed_pipe(sys.stdout):
+            yield
+    except OSError as error:
+        error.filename = error.filename or "standard output"
+        raise
 
 
 def log(line: str) -> None:

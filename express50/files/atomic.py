@@ -17,12 +17,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
+from rich.filesize import decimal
+
 from express50.errors import ConfigError, DiskFullError
 
 LEAST_FREE = 100e6  # bytes; a disk with less free space counts as full
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # Linux constants
 FORMER = ".former"  # suffix of a folder that was moved out of the way
-NO_SPACE = os.strerror(errno.ENOSPC)
 
 
 def dump_json(value: object) -> bytes:
@@ -106,12 +107,14 @@ def check_space(folder: Path) -> None:
     usage = shutil.disk_usage(folder)
     if usage.total and usage.free < LEAST_FREE:  # some network drives do not report their size
         left, least = f"{usage.free / 1e6:.0f}", f"{LEAST_FREE / 1e6:.0f}"
-        raise _full(folder, f"{left} MB are free, expected at least {least}")
+        raise _disk_full(folder, f"{left} MB are free, expected at least {least}")
 
 
 @contextmanager
-def naming_full_disk(path: Path) -> Iterator[None]:
+def naming_full_disk(path: Path, aside: Path | None = None) -> Iterator[None]:
     """Turn any error caused by a full disk, even in a library, into one that names the path.
+
+    ``aside`` is where the files lie until they are whole, which is nobody's name for them.
 
     Raises:
         DiskFullError: the body raised such an error.
@@ -119,22 +122,41 @@ def naming_full_disk(path: Path) -> Iterator[None]:
     """
     try:
         yield
-    except DiskFullError:
-        raise
+    except DiskFullError as error:
+        if aside is None or str(aside) not in str(error):
+            raise
+        raise DiskFullError(str(error).replace(str(aside), str(path))) from error
     except Exception as error:
-        cause: BaseException | None = error
-        while cause is not None:
-            number = getattr(cause, "errno", None)
-            if number == errno.EFBIG:  # torch hides it behind an error of its own
-                raise OSError(number, os.strerror(number), str(path)) from error
-            full = number in (errno.ENOSPC, errno.EDQUOT)
-            if full or NO_SPACE in str(cause):
-                raise _full(path, str(cause)) from error
-            cause = cause.__cause__ or cause.__context__
+        causes = list(_causes(error))
+        numbers = [getattr(cause, "errno", None) for cause in causes]
+        if errno.EFBIG in numbers:  # torch hides it behind an error of its own
+            raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path)) from error
+        for number in (errno.ENOSPC, errno.EDQUOT):
+            if number in numbers or any(os.strerror(number) in str(cause) for cause in causes):
+                raise disk_full(path, os.strerror(number)) from error
         raise
 
 
-def _full(path: Path, why: str) -> DiskFullError:
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """Yield an error and what caused it."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def is_full(path: Path, needed: float = 1e6) -> bool:
+    """Say whether a disk has fewer free bytes than needed, for libraries that do not say why."""
+    usage = shutil.disk_usage(nearest_existing(path))
+    return bool(usage.total) and usage.free < needed
+
+
+def disk_full(path: Path, why: str) -> DiskFullError:
+    """Make the error of a full disk, which names the path and says how much is free now."""
+    usage = shutil.disk_usage(nearest_existing(path))
+    return _disk_full(path, f"{why}; {decimal(int(usage.free))} are free now")
+
+
+def _disk_full(path: Path, why: str) -> DiskFullError:
     return DiskFullError(
         f"{path}: the disk is full ({why}); free some space and run the same command again; "
         "finished work is kept"
@@ -155,7 +177,7 @@ def folder_in_one_step(
     left behind is deleted. The parent folder of ``aside`` must exist, or be the target's.
     """
     former = aside.with_name(aside.name + FORMER)
-    with naming_full_disk(target):
+    with naming_full_disk(target, aside):
         target.parent.mkdir(parents=True, exist_ok=True)
         put_back(former, target)
         for left in (aside, former):

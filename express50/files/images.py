@@ -1,7 +1,7 @@
 """Read, write, encode and decode images; convert colour and depth; lay out contact sheets.
 
-OpenImageIO reads files with 8 and 16 bits, half and single floats, and writes all but PNG, which
-imagecodecs reads twice as fast; OpenCV decodes bytes in memory and encodes JPEG. Images are RGB
+OpenImageIO reads files with 8 and 16 bits, half and single floats, and encodes TIFF and EXR;
+imagecodecs reads PNG twice as fast; OpenCV decodes bytes in memory and encodes JPEG. Images are RGB
 (H, W, 3); files hold sRGB unless a name says linear.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import mmap
+import os
 import struct
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
@@ -20,6 +21,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from express50.errors import FormatError
+from express50.files.atomic import naming_full_disk
 from express50.files.text import not_fetched, reason
 from express50.geometry.shapes import PIXEL_LIMIT
 
@@ -28,6 +30,7 @@ REPAIR = "copy it again, or run 'express50 check --fix' if a stage wrote it"
 CUT = "truncated: the JPEG has no end marker; copy it again"
 DEPTH_UNIT_M = 5e-5  # one step of a 16-bit depth map; 3.28 m at most, 0.025 mm rounding
 DEPTH_LIMIT_M = DEPTH_UNIT_M * 65535
+JPEG_ENDINGS = (".jpg", ".jpeg")
 JPEG_SIDE, PNG_SIDE = 65500, 1_000_000  # pixels; encoder and decoder refuse longer sides
 PNG_START = b"\x89PNG\r\n\x1a\n"
 UP, PNG_LEVEL = 2, 3  # of PNG's filters the difference from the row above; libdeflate's level
@@ -178,33 +181,50 @@ def write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:
 
     Raises:
         FormatError: the file cannot be written.
+        DiskFullError: the disk is full.
     """
     image = np.ascontiguousarray(image)
     if image.dtype == np.float64:
         image = image.astype(np.float32)
-    channels = 1 if image.ndim == 2 else image.shape[2]
-    kind = _pixel_kind(image.dtype)
     ending = Path(path).suffix.lower()
-    if ending == ".png" and kind != "float":
-        try:
-            path.write_bytes(encode_png(image))
-        except OSError as error:
-            raise FormatError(f"{path}: cannot be written ({reason(error)})") from error
-        return
-    spec = oiio.ImageSpec(image.shape[1], image.shape[0], channels, kind)
-    spec.attribute("Compression", f"jpeg:{quality}" if ending in (".jpg", ".jpeg") else "zip")
-    if quality >= 95:
-        spec.attribute("jpeg:subsampling", "4:4:4")
-    spec.attribute("oiio:UnassociatedAlpha", 1)
-    if ending == ".exr":  # otherwise its header would hold the time of writing
-        spec.attribute("DateTime", "1970:01:01 00:00:00")
+    if ending in JPEG_ENDINGS:
+        data = encode_jpeg(image, quality)
+    elif ending == ".png" and image.dtype != np.float32:
+        data = encode_png(image)
+    else:
+        data = _encode_in_memory(path, image)
+    try:
+        with naming_full_disk(path):
+            path.write_bytes(data)
+    except OSError as error:
+        raise FormatError(f"{path}: cannot be written ({reason(error)})") from error
+
+
+def _encode_in_memory(path: Path, image: np.ndarray) -> bytes:
+    """Encode an image with OpenImageIO as its file's name says.
+
+    To a full disk it writes files without their end and does not say so, or ends the process.
+
+    Raises:
+        FormatError: it cannot.
+    """
     target = _make_output(path)
-    if not target.open(str(path), spec):
-        why = target.geterror().strip()
-        raise FormatError(f"{path}: cannot be written ({why}); give another name")
-    written = target.write_image(image.reshape(image.shape[0], image.shape[1], channels))
-    if not target.close() or not written:
-        raise FormatError(f"{path}: writing failed ({target.geterror().strip()})")
+    channels = 1 if image.ndim == 2 else image.shape[2]
+    spec = oiio.ImageSpec(image.shape[1], image.shape[0], channels, _pixel_kind(image.dtype))
+    spec.attribute("Compression", "zip")
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    if Path(path).suffix.lower() == ".exr":  # otherwise its header would hold the time of writing
+        spec.attribute("DateTime", "1970:01:01 00:00:00")
+    file = os.memfd_create("image")
+    try:
+        name = f"/proc/self/fd/{file}"
+        done = target.open(name, spec) and target.write_image(image.reshape(*image.shape[:2], -1))
+        if not target.close() or not done:
+            why = target.geterror().strip().replace(name, str(path))
+            raise FormatError(f"{path}: cannot be written ({why}); give another name")
+        return Path(name).read_bytes()
+    finally:
+        os.close(file)
 
 
 def check_ending(path: Path) -> None:
@@ -225,9 +245,12 @@ def encode_jpeg(image: np.ndarray, quality: int = 95) -> bytes:
     """Encode an RGB (H, W, 3) or grey (H, W) uint8 image as JPEG; 4:4:4 from quality 95 upwards.
 
     Raises:
-        FormatError: a side is empty, or longer than the format allows.
+        FormatError: a side is empty or longer than the format allows, or it is another image.
     """
     _check_sides("JPEG", image, JPEG_SIDE)
+    if image.dtype != np.uint8 or image.shape[2:] not in ((), (1,), (3,)):
+        kind = f"{image.dtype} {image.shape}"
+        raise FormatError(f"JPEG: {kind}, expected 8 bits, grey or RGB; use .png or .tif")
     flags = [cv2.IMWRITE_JPEG_QUALITY, quality]
     if quality >= 95:
         flags += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]

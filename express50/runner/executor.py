@@ -131,6 +131,7 @@ class Pool:
         from distributed.scheduler import KilledWorker
 
         waiting, killed, size = deque(tasks), [], 1
+        full: DiskFullError | None = None
         name, gpu = tasks[0].stage.name, tasks[0].stage.needs_gpu(tasks[0].config)
         resources = {GPU: 1} if gpu else None
         running: dict[Any, list[Task]] = {}
@@ -155,8 +156,8 @@ class Pool:
             for future, receipts, failure in ended:
                 batch = running.pop(future)
                 if isinstance(failure, DiskFullError):
-                    raise failure
-                if isinstance(failure, KilledWorker):
+                    full = failure
+                elif isinstance(failure, KilledWorker):
                     killed += batch
                 elif failure is not None:  # the tasks did not even start
                     words = f"worker: {type(failure).__name__}: {failure}"
@@ -168,6 +169,8 @@ class Pool:
                     for receipt in receipts:
                         # A restored output stays marked by 0 attempts.
                         settle(replace(receipt, attempts=receipt.attempts and attempt))
+            if full is not None:  # only now, when all that others finished is recorded
+                raise full
         return killed
 
     def _workers_for(self, task: Task) -> LocalWorkers | RemoteWorkers:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from express50.errors import FormatError
+from express50.files.atomic import disk_full, is_full
 from express50.files.digests import file_sha256
 from express50.files.text import parse_json
 
@@ -184,6 +185,8 @@ class Ledger:
         try:
             yield
         except (sqlite3.DatabaseError, ValueError, TypeError, OverflowError) as error:
+            if _of_full_disk(error, self._path):
+                raise disk_full(self._path, str(error)) from error
             if self._read_only:  # a reader must not be advised to delete
                 check = f"run 'express50 check {self._path.parent}'"
                 words = f"cannot be read as a ledger ({error}); {check}"
@@ -407,6 +410,12 @@ def _of(table: str, stage: str, item: str | None) -> tuple[str, ...]:
     if item is None:
         return f"{table} WHERE stage = ? ORDER BY item", stage
     return f"{table} WHERE stage = ? AND item = ?", stage, item
+
+
+def _of_full_disk(error: Exception, path: Path) -> bool:
+    """Say whether an error of SQLite's comes from a full disk; it often says "disk I/O error"."""
+    code = getattr(error, "sqlite_errorcode", 0) & 0xFF  # the rest says where
+    return code == sqlite3.SQLITE_FULL or (code == sqlite3.SQLITE_IOERR and is_full(path))
 
 
 def _open_to_read(path: Path) -> sqlite3.Connection:

@@ -22,7 +22,7 @@ from rich.progress import (
 )
 
 from express50.console import log
-from express50.errors import FormatError
+from express50.errors import DiskFullError, FormatError
 from express50.runner.ledger import Ledger, Receipt, Run
 
 BEAT_SECONDS = 2.0
@@ -94,12 +94,13 @@ class RunLog:
             self._run.running.pop(item, None)
 
     def _beat(self) -> None:
-        with Ledger(self._path) as ledger:
+        trouble = FormatError, DiskFullError  # the run itself will say so
+        with contextlib.suppress(*trouble), Ledger(self._path) as ledger:
             over = False
             while True:
                 with self._lock:
                     run = replace(self._run, seen=time.time(), running=dict(self._run.running))
-                with contextlib.suppress(FormatError):  # the run itself will say so
+                with contextlib.suppress(*trouble):
                     ledger.write_run(run)
                 if over:
                     return

@@ -101,10 +101,18 @@ def failed_receipt(task: Task, reason: str, attempts: int) -> Receipt:
 
 
 def run_tasks(tasks: list[Task]) -> list[Receipt]:
-    """Run items in turn for a while; returns the receipts of those begun, at least one."""
+    """Run items in turn for a while; returns the receipts of those begun, at least one.
+
+    If the disk is full, those made before are returned, and the next call says so.
+    """
     began, receipts = time.perf_counter(), []
     for task in tasks:
-        receipts.append(run_task(task))
+        try:
+            receipts.append(run_task(task))
+        except DiskFullError:
+            if not receipts:
+                raise
+            break
         if time.perf_counter() - began > BATCH_SECONDS:
             break
     return receipts

@@ -19,6 +19,7 @@ frame), ``torso`` (removed or kept in alpha), ``parts`` (whether there are label
 
 from __future__ import annotations
 
+import io
 import os
 import re
 from collections.abc import Collection, Iterator, Mapping
@@ -336,8 +337,9 @@ def subject_file(root: Path, subject: str, name: str) -> Path:
 
 def write_offsets(root: Path, subject: str, offsets: np.ndarray) -> None:
     """Write a subject's offsets (V, 3), metres, as float32."""
-    path = subject_file(root, subject, "offsets.npy")
-    np.save(path, offsets.astype(np.float32), allow_pickle=False)
+    path, data = subject_file(root, subject, "offsets.npy"), io.BytesIO()
+    np.save(data, offsets.astype(np.float32), allow_pickle=False)
+    path.write_bytes(data.getbuffer())  # straight to a file, NumPy does not say why it failed
 
 
 def write_registered(

@@ -10,6 +10,7 @@ import json
 import shutil
 import tarfile
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -92,7 +93,8 @@ class ShardWriter:
     def __del__(self) -> None:
         """Close the shard that an error left unfinished."""
         if file := getattr(self, "_file", None):
-            file.close()
+            with suppress(OSError):  # a full disk takes none of what is still in its buffer
+                file.close()
 
     def add_group(self, split: str, samples: Sequence[PackedSample]) -> None:
         """Append all samples of one (subject, expression), sorted by camera.

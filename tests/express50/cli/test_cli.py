@@ -371,6 +371,15 @@ def test_a_librarys_warning_is_one_line_without_its_place():
     assert done.stderr == "grmm: warning: slow\n"
 
 
+@pytest.mark.parametrize("stream", [">/dev/full", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_standard_streams_that_are_full_or_closed_are_one_line_at_most(stream):
+    python, full = shlex.quote(sys.executable), "full" in stream
+    command = f"{python} -m express50 config depth {stream}"
+    done = subprocess.run(["/bin/sh", "-c", command], capture_output=True, text=True)
+    words = "express50: OSError: standard output: No space left on device; free some space\n"
+    assert (done.returncode, done.stderr) == ((1, words) if full else (0, ""))
+
+
 def made_by(*arguments: str) -> list[str]:
     """Return the words of the last command that make would run."""
     command = ["make", "--dry-run", "--no-print-directory", "READY=", *arguments]

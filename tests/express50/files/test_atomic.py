@@ -76,3 +76,11 @@ def test_a_disk_that_fills_up_under_a_folder_is_named(tmp_path):
     with pytest.raises(DiskFullError, match="out: the disk is full"), folder:
         refuse(errno.ENOSPC)()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_named_by_the_place_that_a_folder_is_for(tmp_path):
+    out, aside = tmp_path / "out", tmp_path / ".out.part"
+    with pytest.raises(DiskFullError) as caught, folder_in_one_step(aside, out):
+        write_with(aside / "a.json", refuse(errno.ENOSPC))
+    assert str(caught.value).startswith(f"{out / 'a.json'}: the disk is full (No space left on ")
+    assert ".out.part" not in str(caught.value)

@@ -1,5 +1,6 @@
 """Image files: types kept, damage named, depth quantised as stated."""
 
+import re
 import struct
 import zlib
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from express50.errors import CaptureError, FormatError
+from express50.errors import CaptureError, DiskFullError, FormatError
 from express50.files import images
 from express50.files.containers import decode_picture
 
@@ -39,8 +40,24 @@ def test_same_image_gives_same_bytes(tmp_path):
 
 
 def test_an_unwritable_path_says_why(tmp_path):
-    with pytest.raises(FormatError, match="Could not open"):
+    with pytest.raises(FormatError, match="absent/a.jpg: cannot be written .No such file"):
         images.write_image(tmp_path / "absent" / "a.jpg", np.zeros((2, 2, 3), np.uint8))
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.tif", "a.exr"])
+def test_a_full_disk_is_an_error_that_names_the_file(tmp_path, name):
+    """OpenImageIO ended the process when a JPEG met a full disk, and cut an EXR short silently."""
+    (tmp_path / name).symlink_to("/dev/full")
+    with pytest.raises(DiskFullError) as caught:
+        images.write_image(tmp_path / name, np.zeros((2, 2, 3), np.uint8))
+    words = r"the disk is full \(No space left on device; [\d.]+ .?B are free now\); free some"
+    assert re.match(rf"{tmp_path / name}: {words}", str(caught.value))
+
+
+def test_jpeg_refuses_what_it_cannot_hold(tmp_path):
+    for image in (np.zeros((2, 2, 3), np.float32), np.zeros((2, 2, 4), np.uint8)):
+        with pytest.raises(FormatError, match="expected 8 bits, grey or RGB; use .png or .tif"):
+            images.write_image(tmp_path / "a.jpg", image)
 
 
 @pytest.mark.parametrize("kept", [4, 26, 60, -20])

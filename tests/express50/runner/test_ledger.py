@@ -1,10 +1,12 @@
 """The ledger: receipts come back as written; digests follow the content."""
 
 import os
+import sqlite3
+from unittest.mock import Mock
 
 import pytest
 
-from express50.errors import FormatError, StageError
+from express50.errors import DiskFullError, FormatError, StageError
 from express50.files.digests import file_sha256, path_digest, stat_digest
 from express50.runner.ledger import Ledger, Receipt
 
@@ -125,3 +127,22 @@ def test_receipts_are_gone_for_good_before_their_outputs_change(ledger):
     gone = [k for k, text in enumerate(words[:normal]) if text.startswith("DELETE")]
     assert full < gone[0] < gone[-1] < words.index("COMMIT") < normal
     assert [words[k].split()[2] for k in gone] == ["receipts", "made", "settings"]
+
+
+def test_a_full_disk_is_named_as_one(ledger):
+    pages = ledger._database.execute("PRAGMA page_count").fetchone()[0]
+    ledger._database.execute(f"PRAGMA max_page_count = {pages}")
+    with pytest.raises(DiskFullError, match="ledger.sqlite: the disk is full .database or disk"):
+        ledger.write(receipt(metrics={"long": "x" * 100_000}))
+
+
+def test_a_disk_error_is_a_full_disk_if_nothing_is_free(ledger, monkeypatch):
+    """SQLite says so when its memory map cannot grow."""
+    error = sqlite3.OperationalError("disk I/O error")
+    error.sqlite_errorcode = sqlite3.SQLITE_IOERR_SHMSIZE
+    monkeypatch.setattr(ledger, "_replace", Mock(side_effect=error))
+    for free, kind in ((0, DiskFullError), (10**9, FormatError)):
+        usage = Mock(total=10**12, free=free)
+        monkeypatch.setattr("shutil.disk_usage", lambda path, usage=usage: usage)
+        with pytest.raises(kind, match="disk I/O error"):
+            ledger.write(receipt())

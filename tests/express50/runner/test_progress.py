@@ -3,9 +3,15 @@
 import io
 import re
 import sys
+import threading
 from types import SimpleNamespace
+from unittest.mock import Mock
 
-from express50.runner.progress import showing
+import pytest
+
+from express50.errors import DiskFullError
+from express50.runner.ledger import Ledger
+from express50.runner.progress import RunLog, showing
 
 
 class Terminal(io.StringIO):
@@ -24,3 +30,16 @@ def test_the_bar_shows_elapsed_time_before_the_first_item_is_done(monkeypatch):
         assert "0/2 0:00:00 elapsed, -:--:-- left" in shown
         show(done)
     assert "1/2" in terminal.getvalue()
+
+
+@pytest.mark.parametrize("method", ["__init__", "write_run"])
+def test_a_full_disk_does_not_end_the_log_of_runs_with_a_traceback(tmp_path, monkeypatch, method):
+    def full(*arguments):
+        raise DiskFullError("ledger.sqlite: the disk is full")
+
+    ends = Mock()
+    monkeypatch.setattr(threading, "excepthook", ends)
+    monkeypatch.setattr(Ledger, method, full)
+    with RunLog(tmp_path / "ledger.sqlite", "toy", 1):
+        pass
+    ends.assert_not_called()

@@ -299,3 +299,13 @@ def test_ls_and_show(shards, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["key"] == "S002_neutral_cam01"
     assert image_size(picture.read_bytes(), "x") == (3 * SIZE, SIZE)
     assert main(["shards", "show", str(shards), "nobody"]) == 1
+
+
+def test_a_shard_that_a_full_disk_left_is_closed_in_silence(tmp_path, capfd):
+    (tmp_path / "train-000000.tar").symlink_to("/dev/full")
+    writer = ShardWriter(tmp_path, 10**6)
+    writer._file = (tmp_path / "train-000000.tar").open("wb")
+    writer._file.write(b"x")
+    del writer
+    gc.collect()
+    assert capfd.readouterr().err == ""
