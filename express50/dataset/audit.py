@@ -47,6 +47,7 @@ from express50.shards.writer import verify
 
 WRONG_LABELS = ("identity", "window", "unknown", "unreadable")
 REPAIR = "run this check with --fix"
+OUTDATED = "outdated"
 LabelProblems = Callable[[Dataset, list[str]], Iterable[Any]]
 
 
@@ -362,6 +363,8 @@ class _StageAudit:
             fixed, how = True, f"set aside; to make it again, {again}"
             set_aside(self.dataset, stage, fault.item)
             self.ledger.forget(stage, [fault.item])
+        elif fault.kind == OUTDATED:  # a run finds this by itself
+            how = again
         else:
             how = (
                 f"{REPAIR}, then {again}" if known else f"{REPAIR}; the stage has no such item now"
@@ -383,7 +386,7 @@ class _StageAudit:
             if receipt.imported:
                 made = self.made[name].get(item)
                 if why := import_trouble(self.dataset, receipt, made, self.digest):
-                    self._find("outdated", f"{name} {item}", why, AGAIN)
+                    self._find(OUTDATED, f"{name} {item}", why, AGAIN)
                 continue
             try:
                 now = input_digests(stage, self.dataset, item, config, self.digest)
@@ -400,7 +403,7 @@ class _StageAudit:
                 self._note(stage, f"{item} cannot be checked until its inputs are made again")
             else:
                 what = f"these inputs changed since it was made: {few(changed)}"
-                self._settle(name, Fault(item, "outdated", what), True)
+                self._settle(name, Fault(item, OUTDATED, what), True)
         for reason, items in unreadable.items():
             if not all(self._waits(item) for item in items):
                 what = f"its inputs cannot be read: {reason}"

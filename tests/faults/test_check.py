@@ -132,8 +132,16 @@ def test_upstream_made_anew_with_other_bytes_blames_what_was_made_of_the_old(dat
     assert toy.run_toy(dataset, word="b").ok
     found, _ = look(dataset)
     assert set(found) == {("outdated", "after S001"), ("outdated", "after S002")}
-    assert "changed since it was made: toy" in found["outdated", "after S001"].what
+    one = found["outdated", "after S001"]
+    assert "changed since it was made: toy" in one.what
+    assert one.fix == f"run 'express50 after {dataset.root}' with the same settings as before"
     assert look(dataset, fix=True)[1].sound
+    assert toy.run_toy(dataset, stage=LATER).count("done") == 2
+    assert look(dataset)[0] == {}
+
+
+def test_a_run_alone_makes_outdated_outputs_again(dataset):
+    assert toy.run_toy(dataset, word="b").ok
     assert toy.run_toy(dataset, stage=LATER).count("done") == 2
     assert look(dataset)[0] == {}
 
