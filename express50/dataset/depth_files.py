@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from express50.errors import FormatError
@@ -79,13 +80,12 @@ def encode_normals(normals: np.ndarray, valid: np.ndarray) -> np.ndarray:
     Raises:
         ValueError: a valid normal is not finite or not of unit length.
     """
-    known = normals[valid]
-    square = np.einsum("ni,ni->n", known, known)
+    square = np.einsum("hwi,hwi->hw", normals, normals)[valid]
     if square.size and not np.abs(square - 1).max() < 2e-3:  # NaN fails as well
         raise ValueError("valid normals must be finite and of unit length")
-    code = np.zeros(normals.shape, np.uint8)
-    code[valid] = np.clip(np.rint(known * NORMAL_STEPS) + NORMAL_STEPS + 1, 1, 255)
-    return code
+    # It rounds, cuts at 255 and converts in one pass.
+    code = cv2.convertScaleAbs(normals, alpha=NORMAL_STEPS, beta=NORMAL_STEPS + 1)
+    return np.where(valid[..., None], code, np.uint8(0))
 
 
 def read_normals(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -272,12 +272,13 @@ def encode_png(image: np.ndarray) -> bytes:
     (height, width), channels = image.shape[:2], math.prod(image.shape[2:])
     rows = np.ascontiguousarray(image.astype(image.dtype.newbyteorder(">"), copy=False))
     rows = rows.view(np.uint8).reshape(height, -1)
-    filtered = np.empty((height, rows.shape[1] + 1), np.uint8)
+    body = bytearray(height * (rows.shape[1] + 1))
+    filtered = np.frombuffer(body, np.uint8).reshape(height, -1)
     filtered[:, 0], filtered[0, 1:] = UP, rows[0]
     np.subtract(rows[1:], rows[:-1], out=filtered[1:, 1:])
     colour = {1: 0, 2: 4, 3: 2, 4: 6}[channels]
     header = struct.pack(">IIBBBBB", width, height, 8 * image.itemsize, colour, 0, 0, 0)
-    pixels = imagecodecs.deflate_encode(filtered.tobytes(), level=PNG_LEVEL)
+    pixels = imagecodecs.deflate_encode(body, level=PNG_LEVEL)
     chunks = ((b"IHDR", header), (b"IDAT", pixels), (b"IEND", b""))
     return PNG_START + b"".join(
         struct.pack(">I", len(data)) + kind + data

@@ -19,7 +19,7 @@ import open3d as o3d
 from express50.error_model import HEAD_SIZE_SPREAD, Bounds, error_bounds
 from express50.files.images import box_about
 from express50.geometry.cameras import Camera, crop_camera, rays, resized, unproject
-from express50.geometry.conventions import cell_to_corner
+from express50.geometry.conventions import cell_centres, cell_to_corner
 from express50.geometry.raycast import barycentrics, camera_rays, join_rays, mesh_scene
 from express50.geometry.sampling import bilinear, edge_width, local_moments
 from pipelines.depth.prior import TrackedSolid
@@ -295,9 +295,12 @@ def make_maps(
     known = (normals / np.maximum(_lengths(normals), 1e-9)[:, None]) @ turn
     y, x = np.nonzero(valid)
     K = camera.K
-    way = ((cell_to_corner(np.stack([x, y], 1)) - K[:2, 2]) / K[[0, 1], [0, 1]]).astype(np.float32)
-    cosine = -(np.einsum("ni,ni->n", known[:, :2], way) + known[:, 2])
-    cosine /= np.sqrt(1 + np.einsum("ni,ni->n", way, way))
+    across, down = (
+        ((cell_centres(side) - K[axis, 2]) / K[axis, axis]).astype(np.float32).take(place)
+        for axis, (side, place) in enumerate(((camera.width, x), (camera.height, y)))
+    )
+    cosine = -(known[:, 0] * across + known[:, 1] * down + known[:, 2])
+    cosine /= np.sqrt(1 + across * across + down * down)
     depth = np.where(valid, depth, 0).astype(np.float32)
     turned = np.zeros((*depth.shape, 3), np.float32)
     turned[valid] = known

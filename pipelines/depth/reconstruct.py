@@ -340,14 +340,14 @@ def _patch_values(
     # Vertices come last, for long inner loops.
     center = ((line - view.camera.center).astype(np.float32) @ M.T).T[:, :, None]  # (3, D, 1, n)
     along = np.ascontiguousarray((patch @ M.T).T)[:, None]  # (3, 1, P, n)
-    center, depth = np.ascontiguousarray(center), np.maximum(center[2], 1e-6)
+    inverse = 1 / np.maximum(center[2], np.float32(1e-6))
     maps = []
     for axis in range(2):
-        middle = center[axis] / depth
+        middle = center[axis] * inverse
         place = middle * along[2]
         np.subtract(along[axis], place, out=place)
-        place /= depth
-        place += middle
-        maps.append(corner_to_cell(place).reshape(-1, len(patch)))
+        place *= inverse
+        place += corner_to_cell(middle)
+        maps.append(place.reshape(-1, len(patch)))
     found = cv2.remap(grey, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.ascontiguousarray(found.reshape(place.shape).transpose(2, 0, 1))

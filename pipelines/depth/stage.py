@@ -36,6 +36,7 @@ from pipelines.depth.views import DepthView, make_view, without_contradiction
 from pipelines.regions.geometry import head_labels, make_head
 from pipelines.regions.things import face_views
 
+SHARE_OF_LEVEL = np.arange(256, dtype=np.float32) / 255
 ERROR_STEPS = 30.0  # 8-bit steps at the bright end of the error maps
 BLANK = 24  # grey of unknown pixels
 SHOWN = 4  # cameras in the contact sheet
@@ -118,7 +119,7 @@ def read_views(
         read = partial(read_matted_frame, dataset, item, camera)
         try:
             rgb, alpha = read()
-            views.append(make_view(camera, rgb, alpha.astype(np.float32) / 255, image_side))
+            views.append(make_view(camera, rgb, cv2.LUT(alpha, SHARE_OF_LEVEL), image_side))
             pictures.append(picture_of(camera, rgb, alpha, read))
         except (CaptureError, FormatError, StageError) as error:
             dropped.append(Note(camera_id, str(error)))

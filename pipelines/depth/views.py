@@ -124,9 +124,9 @@ def project_fast(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.nda
     """Project points (N, 3) into a pinhole camera: pixels (N, 2), depths (N,); float32, no NaN."""
     # Relative to the camera before the cast: a rig may be a kilometre from its world's origin.
     about = (points - camera.center).astype(np.float32)
-    p = about @ (camera.K @ camera.cam_from_world[:3, :3]).T.astype(np.float32)
-    depth = np.maximum(p[:, 2], 1e-6)
-    return p[:, :2] / depth[:, None], p[:, 2]
+    x, y, depth = (camera.K @ camera.cam_from_world[:3, :3]).astype(np.float32) @ about.T
+    divisor = np.maximum(depth, np.float32(1e-6))
+    return np.stack([x / divisor, y / divisor]).T, depth  # columns follow each other in memory
 
 
 def in_picture(
