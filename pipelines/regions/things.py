@@ -219,7 +219,7 @@ class _Sweep:
         places: (h, w, 3) on the head, about its centre, and unit `ways` (h, w, 3) towards them.
         on_face: (h, w) best agreement within NEAR_M of the head.
         before: (HEIGHTS_M, h, w) best agreement in front of the head.
-        free: (HEIGHTS_M, h, w) bool, where there may be a thing.
+        free: (HEIGHTS_M, h, w) bool, where there may be a thing in front of the face.
     """
 
     camera: Camera
@@ -234,7 +234,7 @@ class _Sweep:
 
     def face_view(self, center: np.ndarray) -> FaceView:
         """Tell the face from things; the head's `center` (3,) is in the world."""
-        asked = self.face & self.free.any(0)
+        asked = self.free.any(0)
         score = np.where(self.free, self.before, np.float32(-2))
         better = np.where(asked, score.max(0) - self.on_face, 0)
         size = (PATCH_PX, PATCH_PX)
@@ -342,10 +342,11 @@ def _sweep(head: TrackedHead, shots: Sequence[_Shot], own: int, face: np.ndarray
     ways = unit(places - camera.center)
     places, ways = (values.reshape(*shape, 3) for values in (places - head.center, ways))
     lines = [_line(shot.camera, head.center, places, ways) for shot in shots]
-    free = np.ones((len(HEIGHTS_M), *shape), bool)
+    free = np.repeat(face[None, *window], len(HEIGHTS_M), axis=0)
     for line, shot in zip(lines, shots, strict=True):
         for room, offset in zip(free, HEIGHTS_M, strict=True):
-            room &= _sampled(shot.alpha, _pixels_at(line, offset), 1.0) > 0.5
+            if room.any():
+                room &= _sampled(shot.alpha, _pixels_at(line, offset), 1.0) > 0.5
     mine = _patches(shots[own].grey[window])
     sights = unit(np.array([shot.camera.center - head.center for shot in shots]))
     cosine = sights @ sights[own]
@@ -357,7 +358,7 @@ def _sweep(head: TrackedHead, shots: Sequence[_Shot], own: int, face: np.ndarray
     on_face = np.max([_agreement(mine, near, offset) for offset in about], axis=0)
     before = np.full(free.shape, np.float32(-1))
     for k, offset in enumerate(HEIGHTS_M):
-        if (free[k] & face[window]).any():
+        if free[k].any():
             before[k] = np.max([_agreement(mine, near, offset + more) for more in STEPS_M], axis=0)
     return _Sweep(camera, depth, window, face[window], places, ways, on_face, before, free)
 
@@ -420,5 +421,6 @@ def _carve(head: TrackedHead, sweep: _Sweep, views: Sequence[FaceView]) -> None:
         line = _line(view.camera, head.center, sweep.places, sweep.ways)
         ends = np.where(view.bare, view.depth - np.float32(NEAR_M), 0)
         for room, offset in zip(sweep.free, HEIGHTS_M, strict=True):
-            point = _pixels_at(line, offset)
-            room &= point[2] >= _sampled(ends, point, 0.0)
+            if room.any():
+                point = _pixels_at(line, offset)
+                room &= point[2] >= _sampled(ends, point, 0.0)
