@@ -113,8 +113,14 @@ def check_quality(
     moves: dict[str, np.ndarray] = {}
     steps: dict[str, list[Step]] = {}
     unjudged: dict[str, str] = {}
+    warnings = {}
     if every > 1:
         unjudged = dict.fromkeys(sorted(measured), "not all frames were decoded (ingest.every)")
+        if sync_frames and len(measured) >= FEWEST_CAMERAS and max(clips) >= FEWEST_FRAMES:
+            warnings["sync"] = (
+                f"not checked, as one of {every} frames was decoded; if cameras may be out of step,"
+                " ingest with --set ingest.every=1"
+            )
     else:
         count = min(sum(clips), *(len(s.moves) for s in measured.values()))
         moves = {name: s.moves[:count] for name, s in measured.items()}
@@ -124,7 +130,6 @@ def check_quality(
     drifts = {n: measure_drift(s.cells.astype("float32"), s.frames) for n, s in measured.items()}
     widths, blurred = judge_focus({n: s.widths for n, s in measured.items()}, blur_ratio)
     first: dict[str, str] = {}
-    warnings = {}
     for name in sorted(measured):
         faults = []
         if (twin := first.setdefault(digests[name], name)) != name:

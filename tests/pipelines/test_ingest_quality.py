@@ -169,3 +169,14 @@ def test_ingest_warns_of_all_faults_and_writes_their_figures(footage, tmp_path):
     assert figures["light"]["cam00"]["exposure"] == pytest.approx(0.515, abs=0.06)
     lines = list(ingest.account(dataset, ["S001"]))
     assert lines[0] == "  S001 (express50): 5 cameras, 88 to 90 frames each, 0 expressions"
+
+
+def test_ingest_says_that_it_did_not_check_sync(footage, tmp_path):
+    for name, images in footage.items():
+        write_frames(tmp_path / "S001/cameras" / name / "frames", images)
+    (tmp_path / "S001/capture.toml").write_text('subject = "S001"\nfps = 24\n')
+    dataset = Dataset(tmp_path / "data")
+    ingest.add_captures(dataset, [tmp_path / "S001"])
+    for every, said in ((24, True), (1, False)):
+        lines = run_here(ingest.STAGE, dataset, every=every).lines()
+        assert any("sync: not checked, as one of 24 frames" in line for line in lines) is said
