@@ -118,7 +118,7 @@ def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> Result:
 
 ENCODE = Stage(
     name="encode",
-    version=2,
+    version=3,
     config=EncodeConfig,
     presets=ENCODE_PRESETS,
     items=included,
@@ -136,7 +136,7 @@ ENCODE = Stage(
 
 STAGE = Stage(
     name="pack",
-    version=14,
+    version=13,
     config=PackConfig,
     presets={"draft": {}, "standard": {}, "reference": {}},
     items=items,
