@@ -17,7 +17,14 @@ import numpy as np
 import tifffile
 
 from express50.capture.colour_correction import correct_srgb
-from express50.capture.index import CameraSource, Index, nearest_decoded, read_index, same_hash
+from express50.capture.index import (
+    UNKNOWN_HASH,
+    CameraSource,
+    Index,
+    nearest_decoded,
+    read_index,
+    same_hash,
+)
 from express50.capture.raw import RawCamera
 from express50.contract.layout import Dataset
 from express50.errors import CaptureError, FormatError, StageError, check_known
@@ -160,7 +167,7 @@ class FootageReader:
         """Make the picture (H, W, 3) uint8 sRGB of a frame, given by its decode index.
 
         Raises:
-            CaptureError: there is no such camera or frame, or the footage changed.
+            CaptureError: the camera or the frame does not exist, or the footage has changed.
             StageError: the camera is not calibrated.
         """
         if camera_id not in self._readers:
@@ -397,30 +404,31 @@ def read_proxy(dataset: Dataset, subject: str, camera_id: str, frame: int) -> np
 
     Raises:
         StageError: the subject is not ingested.
-        CaptureError: there is no such camera or frame, or the footage changed.
+        CaptureError: the camera or the frame does not exist, or the footage has changed.
     """
     folder = dataset.proxies_dir(subject)
     index = read_index(dataset, subject)
     if camera_id not in index.cameras or not 0 <= frame < index.cameras[camera_id].frames:
         raise CaptureError(f"{folder}: no frame {frame} of camera {camera_id!r}")
-    decoded = nearest_decoded(index.cameras[camera_id], frame)
-    proxy = decode_proxy(folder, camera_id, decoded)
-    if decoded == frame:
-        return proxy
-    several = 1 if index.cameras[camera_id].kind == "frames" else BLOCK
+    source = index.cameras[camera_id]
+    if source.dhash[frame] != UNKNOWN_HASH:
+        return decode_proxy(folder, camera_id, frame)
+    several = 1 if source.kind == "frames" else BLOCK
     block, number = divmod(frame, several)
     path, key = dataset.index_file(subject), (dataset, subject, camera_id, index.capture)
     with _READING:
-        copies = _block_of_proxies(path, key, block * several, several, max(proxy.shape))
-    return copies[number].copy()
+        return _block_of_proxies(path, key, block * several, several)[number].copy()
 
 
 @cached_by_file(BLOCKS)
 def _block_of_proxies(
-    path: Path, key: tuple[Dataset, str, str, Path], first: int, count: int, side: int
+    path: Path, key: tuple[Dataset, str, str, Path], first: int, count: int
 ) -> list[np.ndarray]:
     """Make the proxies of neighbouring frames: videos are decoded forward only."""
+    dataset, subject, camera_id, _ = key
     reader = _reader(path, *key)
+    made = nearest_decoded(reader.source, first)
+    side = max(decode_proxy(dataset.proxies_dir(subject), camera_id, made).shape)
     frames = range(first, min(first + count, reader.source.frames))
     return [shrink(reader.read(frame), side) for frame in frames]
 
