@@ -93,6 +93,7 @@ def test_each_peak_frame_is_decoded_once(dataset, reads):
             expected += [(str(index.capture / c.source), frame) for c in index.cameras.values()]
     assert sorted(reads["frames"]) == sorted(expected)
     assert len(expected) == 2 * 3 * 6
+    assert len({path for path, _ in reads["observe"]}) <= len(dataset.subjects())  # one camera
     others = reads.keys() - {"calibrate", "frames", "observe"}
     assert not [name for name in others if reads[name]]
 
