@@ -10,8 +10,9 @@ from scipy import stats
 
 from benchmarks.intervals_collect import Sample
 from express50.contract.stage import Unit
-from express50.error_model import NOMINAL, TINY, ErrorModel, error_bounds, item_error, scores_of
+from express50.error_model import NOMINAL, ErrorModel, error_bounds, item_error, scores_of
 
+TINY = 1e-6  # least ratio and figure whose logarithm is taken
 KNOTS = 20
 LEAST_ELEMENTS = 40  # per knot
 FLOORS = {"mm": 0.02, "px": 0.002, "alpha": 0.002, "frames": 0.3, "dB": 0.1}
