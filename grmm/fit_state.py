@@ -1,4 +1,4 @@
-"""Hold the state of a fit: start it, save and resume it, and write what it made."""
+"""Hold the state of a fit: start it, save it, resume it, and write the fitted model."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FIT = "fit"  # name of its state in a checkpoint's loop
 
 @dataclass(kw_only=True)
 class FitProgress:
-    """What is done of a fit: the stage it is in, and by stage iterations, seconds and scores."""
+    """How far a fit is: its stage, the iterations and seconds of each stage, and the scores."""
 
     stage: int = 1
     iterations: dict[int, int] = field(default_factory=lambda: {1: 0, 2: 0})
@@ -38,7 +38,7 @@ class FitProgress:
 
 @dataclass(kw_only=True)
 class FitState:
-    """Everything that a fit changes or reads: the tuned model and the codes sought."""
+    """Everything that a fit reads or changes, such as the tuned model and the fitted codes."""
 
     loaded: Checkpoint
     model: GRMM

@@ -201,12 +201,13 @@ def write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:
 
 
 def _encode_in_memory(path: Path, image: np.ndarray) -> bytes:
-    """Encode an image with OpenImageIO as its file's name says.
+    """Encode an image with OpenImageIO in the format that its file's name says.
 
-    To a full disk it writes files without their end and does not say so, or ends the process.
+    OpenImageIO must not write to disk itself: on a full one, it leaves out the end of a file
+    without an error, or ends the process. Needs Linux.
 
     Raises:
-        FormatError: it cannot.
+        FormatError: the format cannot hold such an image.
     """
     target = _make_output(path)
     channels = 1 if image.ndim == 2 else image.shape[2]

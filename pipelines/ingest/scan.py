@@ -145,12 +145,10 @@ def iterate_camera(
         for number, name in enumerate(camera.names):
             clip = int(np.searchsorted(ends, number, side="right"))
             stamp = camera.stamps[number] if camera.stamps else number
-            chosen = number % every == 0
-            yield (
-                clip,
-                stamp,
-                (read_picture(camera.path, name, camera.orientation) if chosen else None),
-            )
+            image = None
+            if number % every == 0:
+                image = read_picture(camera.path, name, camera.orientation)
+            yield clip, stamp, image
 
 
 def time_gaps(pts: tuple[int, ...], clips: tuple[int, ...] = ()) -> int:
