@@ -53,9 +53,11 @@ _ON_MESH = {
 
 # Bare scalps.
 COMPARED_PIXELS = 4000  # pixels of scalp and of face that a view compares
-FLOOR = 2.0  # steps of Lab under which a spread of colours is noise
-ALIKE = 4.0  # spreads of the face's own colours from their middle
-BARE = 0.7  # share of the scalp in the face's colours that makes it bare
+LEAST_SCALP = 0.1  # pixels of scalp per pixel of the face: temples alone are often bare
+# Most by which a bare scalp differs from the face's middle, in brightness and ratios of colours.
+# Spreads of the face's own do not help: they are wide in hard light, where hair then passes for it.
+UNLIKE = WITHIN * LEAST_SPREAD
+BARE = 0.7  # share of the scalp in the face's colours, over the same of the face, of bare scalps
 
 
 def face_colours(rgb: np.ndarray, alpha: np.ndarray, mesh: np.ndarray) -> np.ndarray | None:
@@ -68,20 +70,23 @@ def face_colours(rgb: np.ndarray, alpha: np.ndarray, mesh: np.ndarray) -> np.nda
 
 
 def colour_logs(rgb: np.ndarray) -> np.ndarray:
-    """Return what `like_skin` compares (..., 3) of pixels (..., 3) uint8."""
+    """Return logarithms of root light (..., 3) of pixels (..., 3) uint8."""
     return np.log(np.sqrt(LIGHT_OF_LEVEL[rgb].astype(np.float64)) + DARK)
+
+
+def _ratios(logs: np.ndarray) -> np.ndarray:
+    """Return brightness and two ratios of colours (N, 3), logarithms, of `colour_logs` (N, 3).
+
+    Shading changes brightness much, ratios of colours little.
+    """
+    r, g, b = logs.T
+    return np.stack([(r + g + b) / 3.0, r - g, g - b], axis=1)
 
 
 def like_skin(values: np.ndarray, face: np.ndarray) -> np.ndarray:
     """Mark the colours (N, 3) that are like most of the face's (M, 3); logarithms of root light."""
-
-    def ratios(logs: np.ndarray) -> np.ndarray:
-        # Shading changes brightness much, ratios of colours little.
-        r, g, b = logs.T
-        return np.stack([(r + g + b) / 3.0, r - g, g - b], axis=1)
-
-    usual, spread = robust_moments(ratios(face))
-    return (np.abs(ratios(values) - usual) < WITHIN * np.maximum(spread, LEAST_SPREAD)).all(1)
+    usual, spread = robust_moments(_ratios(face))
+    return (np.abs(_ratios(values) - usual) < WITHIN * np.maximum(spread, LEAST_SPREAD)).all(1)
 
 
 def bare_skin(rgb: np.ndarray, skin: np.ndarray) -> np.ndarray:
@@ -187,39 +192,42 @@ def _priors(labels: np.ndarray, geometry: HeadGeometry, beyond: float) -> np.nda
 
 @dataclass(frozen=True)
 class Scalp:
-    """Whether the scalp is skin, and the share of it in the face's colours; None: unknown."""
+    """Whether the scalp is skin, and how much of it has the face's colours; None: unknown.
+
+    The share of the scalp's pixels near the face's middle colour is divided by the share of the
+    face's own, which is less than 1 in noise and hard light.
+    """
 
     is_skin: bool
     skin_coloured: float | None
 
 
 def scalp_votes(rgb: np.ndarray, labels: np.ndarray, alpha: np.ndarray) -> tuple[int, int]:
-    """Count the pixels of scalp compared with the view's own face, and those of its colours.
+    """Count the pixels of a scalp that have the face's colours if it is bare, and those that do.
 
-    The view's own face is taken, because other cameras differ in gain and light. The frame
-    (H, W, 3) is uint8 sRGB; `labels` (H, W) are the mesh's, SCALP among them.
+    The view's own face is taken, because other cameras differ in gain and light. Views without a
+    face or with little of the scalp count none. The frame (H, W, 3) is uint8 sRGB; `labels` (H, W)
+    are the mesh's, SCALP among them; alpha (H, W) is in [0, 1].
     """
-
-    def evenly(rows: np.ndarray) -> np.ndarray:
-        chosen = np.linspace(0, len(rows) - 1, COMPARED_PIXELS).astype(int)
-        return rows[np.unique(chosen)] if len(rows) else rows
-
-    lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB)
-    skin, scalp = (
-        evenly(lab[(labels == label) & (alpha > SOLID)].astype(np.float32))
-        for label in (SKIN, SCALP)
-    )
-    if min(len(skin), len(scalp)) < LEAST:
+    skin, scalp = ((labels == label) & (alpha > SOLID) for label in (SKIN, SCALP))
+    least = max(LEAST, LEAST_SCALP * skin.sum())
+    if not _sees_face(labels) or skin.sum() < LEAST or scalp.sum() < least:
         return 0, 0
-    middle, spread = robust_moments(skin)
-    away = np.sqrt((((scalp - middle) / np.maximum(spread, FLOOR)) ** 2).sum(1))
-    return len(scalp), int((away < ALIKE).sum())
+    of_face, of_scalp = (_some_ratios(rgb[mask]) for mask in (skin, scalp))
+    middle = np.median(of_face, axis=0)
+    usual, found = ((np.abs(v - middle) < UNLIKE).all(1).mean() for v in (of_face, of_scalp))
+    return round(len(of_scalp) * usual), round(len(of_scalp) * found)
+
+
+def _some_ratios(pixels: np.ndarray) -> np.ndarray:
+    chosen = np.linspace(0, len(pixels) - 1, COMPARED_PIXELS).astype(int)
+    return _ratios(colour_logs(pixels[np.unique(chosen)]))
 
 
 def judge_scalp(votes: Sequence[tuple[int, int]]) -> Scalp:
-    """Call the scalp bare where most of the compared pixels have the face's colours."""
-    compared = sum(count for count, _ in votes)
-    if not compared:
+    """Call the scalp bare where it has the face's colours, by the votes of all views."""
+    expected = sum(count for count, _ in votes)
+    if not expected:
         return Scalp(False, None)
-    share = round(sum(alike for _, alike in votes) / compared, 4)
+    share = round(min(1.0, sum(alike for _, alike in votes) / expected), 4)
     return Scalp(share > BARE, share)

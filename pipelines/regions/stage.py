@@ -44,7 +44,7 @@ from pipelines.regions.geometry import (
 from pipelines.regions.things import Picture, find_glasses, shown_in_front
 
 STUDIED_SIDE = 512  # pixels of the pictures that are studied for a person's colours and glasses
-STUDIED_CAMERAS = 4  # in which skin colours and bare scalps are looked for
+STUDIED_CAMERAS = 4  # of the face, in which skin colours and bare scalps are looked for
 GLASSES_CAMERAS = 10  # in which glasses are looked for
 AGREEMENT = 0.85  # a camera with less of the tracked mesh inside its matte gets a warning
 SHOWN = 4  # cameras in the contact sheet
@@ -167,9 +167,10 @@ def judge_scalp_and_skin(
     dataset: Dataset, item: str, head: TrackedHead
 ) -> tuple[Scalp, np.ndarray | None, Frames]:
     """Judge the scalp and count the skin's colours in a few cameras; return their frames too."""
-    cameras = list(read_cameras_of(dataset, item.split("/")[0]).values())
+    cameras = read_cameras_of(dataset, item.split("/")[0]).values()
+    seeing = [camera for camera in cameras if head.faces_camera(camera)]
     votes, colours, frames = [], [], Frames()
-    for camera in evenly(cameras, STUDIED_CAMERAS):
+    for camera in evenly(seeing, STUDIED_CAMERAS):
         with contextlib.suppress(*UNREADABLE):  # the stage names them
             rgb, alpha = frames[camera.id] = read_frame_and_matte(dataset, item, camera)
             camera, rgb, alpha, _ = _shrunk(camera, rgb, alpha, None, STUDIED_SIDE)

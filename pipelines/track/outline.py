@@ -15,16 +15,14 @@ import open3d as o3d
 from express50.files.images import edge_distance
 from express50.geometry.cameras import (
     Camera,
-    inside_frame,
     project_pinhole,
     project_with_slope,
     resized,
 )
 from express50.geometry.raycast import mesh_scene
 from express50.geometry.sampling import bilinear_slope
-from express50.head.model import HeadModel, in_regions, normals_of
-from pipelines.regions.colour import like_skin
-from pipelines.track.surface import FEATURES, SignedDistance, Visibility, look_up, near_things
+from express50.head.model import HeadModel, in_regions
+from pipelines.track.surface import SignedDistance, near_things
 from pipelines.track.terms import MeshPlaces, Residuals, huber
 
 # A head's outline counts as about this many independent points per view.
@@ -35,8 +33,6 @@ EDGE_SIGMA_M = 0.0015
 # Where hair, cloth or shoulders may hide the skin: standard deviation of their thickness, and the
 # gap (metres) at which the pull on vertices inside the matte has faded.
 COVER_SIGMA_M, HAIR_GAP_M, BALD_GAP_M = 0.008, 0.004, 0.03
-BALD_SHARE = 0.6
-LEAST_SEEN = 0.06  # share of the scalp: temples alone are bare on most people
 COVERED = ("neck", "scalp", "forehead", "left_ear", "right_ear")
 BARE = ("face", "nose", "lips")
 
@@ -187,30 +183,3 @@ def outline_terms(
         if len(ids) >= 8:
             terms.append(OutlineTerm.of(distance, ids, mesh[ids], covered[ids], pictures, bald))
     return terms
-
-
-def bare_share(
-    model: HeadModel, images: list[tuple[np.ndarray, Camera]], mesh: np.ndarray
-) -> float:
-    """Return the share of the visible scalp that has the face's colour; 0 if too little is seen.
-
-    `images` are of `root_light`, the mesh (V, 3) is fitted roughly. A head with more than
-    BALD_SHARE is bald; under hair the skull can be anywhere within centimetres of the outline.
-    """
-    scalp, face = in_regions(model, ("scalp",)), in_regions(model, ("face",))
-    face &= ~in_regions(model, FEATURES)
-    normals = normals_of(mesh, model.faces)
-    visibility = Visibility(mesh, model.faces.numpy())
-    values = np.full((len(images), *mesh.shape), np.nan)
-    for value, (image, camera) in zip(values, images, strict=True):
-        seen = visibility.weights(camera, mesh, normals) > 0
-        seen &= inside_frame(camera, mesh)[1]
-        value[seen] = np.log(np.maximum(look_up(camera, image, mesh[seen]), 0.01))
-    known = np.isfinite(values).any((0, 2))
-    least = LEAST_SEEN * scalp.sum()
-    scalp, face = scalp & known, face & known
-    if face.sum() < 20 or scalp.sum() < least:
-        return 0.0
-    middle = np.full(mesh.shape, np.nan)
-    middle[known] = np.nanmedian(values[:, known], axis=0)
-    return float(like_skin(middle[scalp], middle[face]).mean())

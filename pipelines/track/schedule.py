@@ -14,14 +14,15 @@ from express50.contract.layout import Dataset
 from express50.files.images import shrink
 from express50.geometry.cameras import resized
 from express50.head.model import HeadModel
-from pipelines.regions.geometry import head_labels, make_head
+from pipelines.regions.colour import judge_scalp, scalp_votes
+from pipelines.regions.geometry import head_labels, make_head, render_head
 from pipelines.regions.things import Picture, face_views, find_glasses
 from pipelines.track.basis import ALONG, OFF, Basis, freeze_shape
 from pipelines.track.config import TrackConfig
 from pipelines.track.eyes_and_jaw import EyeOffsets, measure_eyes, with_irises_and_jaw
 from pipelines.track.face_uv import FaceUvMap, make_uv_map, reading_map, slide_term, with_slide
 from pipelines.track.fit import fit
-from pipelines.track.outline import BALD_SHARE, bare_share, outline_terms
+from pipelines.track.outline import outline_terms
 from pipelines.track.photo_consistency import SkinSamples, patch_terms, skin_samples, under_hair
 from pipelines.track.read_inputs import peak_pictures
 from pipelines.track.skin_flow import FINE, skin_flows
@@ -141,20 +142,32 @@ def read_evidence(
         peak_pictures(dataset, subject, config.photo_side, target.observation.expression, mesh)
         for target, mesh in zip(targets, meshes, strict=True)
     ]
-    bald = False
+    turns = rotations(state)
     first = next((k for k, one in enumerate(pictures) if one.crops), None)
-    if first is not None:
-        images = pictures[first].images()
-        # A single picture cannot distinguish fair hair from skin.
-        bald = len(images) > 1 and bare_share(model, images, meshes[first]) > BALD_SHARE
     return SubjectEvidence(
         pictures,
         skin_samples(model, config.samples),
         reading_map(model) if any(one.read_uv for one in schedule) else None,
         make_uv_map(model, FINE) if any(one.follow_skin for one in schedule) else None,
-        measure_eyes(model, targets, meshes, rotations(state)),
-        bald,
+        measure_eyes(model, targets, meshes, turns),
+        first is not None and is_bald(model, pictures[first], meshes[first], turns[first]),
     )
+
+
+def is_bald(
+    model: HeadModel, pictures: FrameSetCrops, mesh: np.ndarray, rotation: np.ndarray
+) -> bool:
+    """Return whether the skull is bare; under hair it can be centimetres inside the outline.
+
+    The mesh (V, 3) is fitted roughly; `rotation` is world from head.
+    """
+    head = make_head(mesh, rotation, head_labels(model))
+    votes = [
+        scalp_votes(rgb, render_head(head, camera)[0], alpha)
+        for camera, rgb, alpha in matted_pictures(pictures)
+    ]
+    # A single picture cannot distinguish fair hair from skin.
+    return sum(count > 0 for count, _ in votes) > 1 and judge_scalp(votes).is_skin
 
 
 @dataclass(frozen=True)

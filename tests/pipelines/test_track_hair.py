@@ -3,21 +3,27 @@
 A bare skull is recognised by what the pictures show of it, not by their rims.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 
-from express50.geometry.cameras import Camera, pinhole, project, unproject
+from express50.geometry.cameras import Camera, crop_camera, unproject
 from express50.geometry.transforms import look_at
 from express50.head.load import load_head
 from express50.head.model import pose
+from pipelines.regions.colour import SKIN as FACE_SKIN
 from pipelines.regions.colour import like_skin
+from pipelines.regions.geometry import SCALP, head_labels, make_head, render_head
 from pipelines.track.observe import LandmarkView, Observation
-from pipelines.track.outline import BALD_SHARE, bare_share
-from pipelines.track.schedule import HAIR_FACTOR, NEAR_THING_FACTOR, NEAR_THING_M, widened_sigma
+from pipelines.track.schedule import (
+    HAIR_FACTOR,
+    NEAR_THING_FACTOR,
+    NEAR_THING_M,
+    is_bald,
+    widened_sigma,
+)
 from pipelines.track.state import Target
+from pipelines.track.surface import FrameSetCrops, HeadCrop
 from pipelines.track.terms import landmark_anchors
 from tests.pipelines.textured_scenes import rig
 
@@ -67,42 +73,59 @@ def test_landmarks_on_a_thing_are_vague_where_it_is_seen_and_those_beside_it_les
 
 
 SIZE, FOCAL = 400, 900.0
-SKIN, HAIR = (0.8, 0.6, 0.5), (0.2, 0.15, 0.1)
+SKIN, HAIR = (200, 150, 125), (110, 80, 62)
 
 
 @pytest.fixture(scope="module")
 def scene():
-    """The head at rest, a camera before it, and the row where its face begins."""
+    """The head at rest, two cameras before it, and what each of their pixels shows."""
     head = load_head("procedural")
     still = torch.zeros(1, 1)
     mesh = pose(head, still, still)[0].double().numpy()
-    eye = mesh.mean(0) + [0.0, 0.25, 0.9]
-    camera_pose = look_at(eye, mesh.mean(0))
-    params = (FOCAL, FOCAL, SIZE / 2, SIZE / 2)
-    camera = Camera("cam", SIZE, SIZE, "PINHOLE", params, camera_pose)
-    pixels = project(camera, mesh)[0]
-    return head, mesh, camera, int(pixels[head.regions["face"].numpy(), 1].min())
+    views = []
+    for side in (-0.2, 0.2):
+        eye = mesh.mean(0) + [side, 0.25, 0.9]
+        params = (FOCAL, FOCAL, SIZE / 2, SIZE / 2)
+        camera = Camera("cam", SIZE, SIZE, "PINHOLE", params, look_at(eye, mesh.mean(0)))
+        labels, _ = render_head(make_head(mesh, np.eye(3), head_labels(head)), camera)
+        views.append((camera, labels))
+    return head, mesh, views
 
 
-def painted(row: int) -> np.ndarray:
-    """Hair above a row, skin below."""
-    image = np.empty((SIZE, SIZE, 3), np.float32)
-    image[:row], image[row:] = HAIR, SKIN
-    return image
+def bald(
+    scene, hair: bool, shade: float = 1.0, noise: float = 0.0, first_row: int = 0, count: int = 2
+) -> bool:
+    """Judge a head with hair or skin on its scalp, one half of it in shade, in sensor noise."""
+    head, mesh, views = scene
+    random = np.random.default_rng(0)
+    crops = []
+    for camera, labels in views[:count]:
+        grown = hair & ((labels == SCALP) | (labels == 0))
+        image = np.where(grown[..., None], HAIR, SKIN).astype(np.float32)
+        image[:, : SIZE // 2] *= shade
+        image += random.normal(0, noise, image.shape)
+        image = image.clip(0, 255).round().astype(np.uint8)[first_row:]
+        cut = crop_camera(camera, 0, first_row, SIZE, SIZE - first_row)
+        crops.append(HeadCrop(cut, image, np.full(image.shape[:2], 255, np.uint8)))
+    return is_bald(head, FrameSetCrops((), tuple(crops)), mesh, np.eye(3))
 
 
 def test_hair_above_the_face_is_no_bald_head(scene):
-    head, mesh, camera, row = scene
-    assert bare_share(head, [(painted(row), camera)], mesh) < BALD_SHARE
-    assert bare_share(head, [(painted(0), camera)], mesh) > BALD_SHARE
+    assert not bald(scene, hair=True)
+    assert bald(scene, hair=False)
+    assert not bald(scene, hair=False, count=1), "it may be fair hair"
+
+
+@pytest.mark.parametrize("shade", [0.2, 0.35, 0.6])
+def test_hair_is_no_bald_head_in_hard_light(scene, shade):
+    assert not bald(scene, hair=True, shade=shade)
+    assert bald(scene, hair=False, shade=0.8)
+
+
+def test_noise_is_not_taken_for_hair(scene):
+    assert bald(scene, hair=False, noise=25.0) and not bald(scene, hair=True, noise=25.0)
 
 
 def test_a_skull_outside_the_picture_is_not_seen(scene):
-    head, mesh, camera, row = scene
-    whole = bare_share(head, [(painted(row), camera)], mesh)
-    cut = pinhole(camera)
-    fx, fy, cx, cy = cut.params
-    cut = replace(cut, height=SIZE - row, params=(fx, fy, cx, cy - row))
-    share = bare_share(head, [(painted(row)[row:], cut)], mesh)
-    assert 0 < whole < 0.3
-    assert share < 0.5, "its rim is skin"
+    face = min(np.flatnonzero((labels == FACE_SKIN).any(1))[0] for _, labels in scene[2])
+    assert bald(scene, hair=False) and not bald(scene, hair=False, first_row=int(face))
