@@ -35,6 +35,9 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 # Windows reserves these names for devices, in any letter case.
 RESERVED = {"CON", "PRN", "AUX", "NUL"}
 RESERVED |= {f"{port}{n}" for port in ("COM", "LPT") for n in range(1, 10)}
+# Files beside the footage that are read, and suffixes of others that somebody may expect to be.
+FILES_READ = ("capture.toml", "cues.csv", "calibration.json")
+DATA_SUFFIXES = (".csv", ".json", ".npz", ".toml", ".xml", ".yaml", ".yml")
 CUE_COLUMNS = ("expression_id", "start_frame", "end_frame")
 
 
@@ -143,7 +146,7 @@ def read_capture(root: Path) -> RawCapture:
         plates=read_plates(root, cameras),
         board=read_board(root, cameras),
         cues=read_cues(root / "cues.csv"),
-        warnings=files_of_no_camera(root, [*cameras, *dropped]),
+        warnings=unused_files(root, [*cameras, *dropped]),
     )
 
 
@@ -327,8 +330,12 @@ def _board_files(folder: Path, camera: str) -> list[str]:
     return [f"board/{path.relative_to(folder).as_posix()}" for path in videos or images]
 
 
-def files_of_no_camera(root: Path, cameras: Iterable[str]) -> dict[str, str]:
-    """Return which files of ``plates`` and ``board`` belong to no camera, with what to do."""
+def unused_files(root: Path, cameras: Iterable[str]) -> dict[str, str]:
+    """Return what a capture holds that nothing reads, with what to do: a name may be misspelt.
+
+    These are files of ``plates`` and ``board`` that belong to no camera, and tables, settings and
+    calibrations beside those that are read.
+    """
     known, found = list(cameras), {}
     for part, suffixes in (("plates", IMAGE_SUFFIXES), ("board", VIDEO_SUFFIXES)):
         folder = root / part
@@ -342,6 +349,16 @@ def files_of_no_camera(root: Path, cameras: Iterable[str]) -> dict[str, str]:
             found[part] = (
                 f"holds {few(names)}, but cameras are {few(known, 8)}; rename it after its camera"
             )
+    names = [
+        path.name
+        for path in sorted(root.iterdir())
+        if is_shown(path, DATA_SUFFIXES) and path.name not in FILES_READ
+    ]
+    if names:
+        found["folder"] = (
+            f"holds {few(names)}, which nothing reads; cues come from cues.csv, cameras from"
+            " calibration.json (make it with 'express50 cameras import')"
+        )
     return found
 
 

@@ -21,12 +21,12 @@ from express50.capture.raw import (
     VIDEO_SUFFIXES,
     RawCamera,
     RawCapture,
-    files_of_no_camera,
     is_shown,
     read_board,
     read_calibration,
     read_cues,
     read_plates,
+    unused_files,
 )
 from express50.capture.readers.selection import (
     Moment,
@@ -278,5 +278,5 @@ def read_videos(path: Path, selection: Selection) -> RawCapture:
         cameras=cameras, dropped=dropped, calibration=calibration,
         plates=read_plates(path, cameras), board=read_board(path, cameras),
         clips=() if cues else (selection.expression(CLIP),),
-        warnings=files_of_no_camera(path, ids.values()),
+        warnings=unused_files(path, ids.values()),
     )  # fmt: skip

@@ -181,3 +181,10 @@ def test_cues_may_come_from_a_spreadsheet(tmp_path):
     )
     assert read_cues(path) == (Cue("smile", 0, 4),)
     assert read_cues(tmp_path / "absent.csv") == ()
+
+
+def test_tables_and_calibrations_that_nothing_reads_are_named(raw):
+    for name in ("cue.csv", "camera_array.toml", "notes.txt", ".hidden.json"):
+        (raw / name).touch()
+    what = "holds camera_array.toml, cue.csv, which nothing reads; cues come from cues.csv"
+    assert read_capture(raw).warnings["folder"].startswith(what)
