@@ -57,6 +57,9 @@ SPREADS = (0.05, 0.05, 0.2)
 COLOUR_LIMIT = 3.0  # standard deviations off skin's colour at which trust is halved
 # Confidences, as shares of bare skin's, that give no trust and full trust.
 CONFIDENCE_RANGE = (0.5, 1.0)
+# Bare skin's confidence where views agree is 0.7 to 0.85. Much less means that cameras, mattes or
+# synchronisation are wrong, and tracking is nearer to the head than the surface.
+AGREEING = 0.6
 # The rim of hair has colours of skin, so a vertex is trusted only as far as those around it.
 AROUND_M, NEIGHBOURS, EVERY = 0.008, 12, 14
 
@@ -218,6 +221,13 @@ def smoothed(
     return unit(splu(spread.tocsc()).solve(mass[:, None] * normals))
 
 
+def bare_skin(model: HeadModel, mesh: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """Return the indices of a surface's vertices (N, 3) near bare skin of a mesh (V, 3); metres."""
+    bare = in_regions(model, FACE) & ~in_regions(model, NOT_BARE)
+    distance, nearest = cKDTree(vertices).query(mesh[bare])
+    return np.unique(nearest[distance < NEAR_M])
+
+
 def skin_trust(
     model: HeadModel,
     mesh: np.ndarray,
@@ -230,9 +240,7 @@ def skin_trust(
     The reference is the surface near bare skin of the tracked mesh (V, 3): how much other colours
     (N, 3), uint8 sRGB, and confidence (N,), 0 to 1, differ from those there. Places are in metres.
     """
-    bare = in_regions(model, FACE) & ~in_regions(model, NOT_BARE)
-    distance, nearest = cKDTree(vertices).query(mesh[bare])
-    reference = np.unique(nearest[distance < NEAR_M])
+    reference = bare_skin(model, mesh, vertices)
     if len(reference) < LEAST_SKIN_VERTICES:
         return confidence.astype(np.float64)
     # Standard deviations that colours are off those of bare skin.
@@ -242,7 +250,7 @@ def skin_trust(
     odd = np.linalg.norm((axes - middle) / np.maximum(spread, SPREADS), axis=1)
     _, owner = cKDTree(mesh).query(vertices, distance_upper_bound=LIPS_M)
     odd[np.r_[in_regions(model, ("lips",)), False][owner]] = 0.0
-    sure = confidence / max(float(np.median(confidence[reference])), 1e-6)
+    sure = confidence / max(float(np.median(confidence[reference])), AGREEING)
     trust = np.clip(
         (sure - CONFIDENCE_RANGE[0]) / (CONFIDENCE_RANGE[1] - CONFIDENCE_RANGE[0]), 0.0, 1.0
     ) / (1.0 + (odd / COLOUR_LIMIT) ** 4)

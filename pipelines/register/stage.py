@@ -31,9 +31,11 @@ from express50.head.load import load_head
 from express50.head.model import HeadModel, joint_angles, joint_transforms
 from express50.head.preview import render_preview
 from pipelines.register.lay import (
+    AGREEING,
     SURFACE_M,
     GivenSurface,
     LaidMesh,
+    bare_skin,
     lay,
     mesh_normals,
     skin_trust,
@@ -75,9 +77,17 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
     shared = sigma_along_normals(laid, cameras, model)
     bounds = error_bounds("register", error_figures(laid, track, row), shared)
     metrics = write_registration(out, path, track, row, laid, bound=1e-3 * bounds.bound)
+    skin = surface.confidence[bare_skin(model, start, surface.vertices)]
+    metrics["skin_agreement"] = sure = round(float(np.median(skin)), 4) if len(skin) else None
     warnings = []
     if metrics["seen_share"] < LEAST_SEEN:
         why = f"the surface was found at only {metrics['seen_share']:.0%} of the face's vertices"
+        warnings.append(Note(expression, why))
+    elif sure is not None and sure < AGREEING:
+        why = (
+            f"cameras agree on bare skin by {sure:.2f}, expected {AGREEING} or more, so the mesh"
+            " stays near the track: check calibration and synchronisation"
+        )
         warnings.append(Note(expression, why))
     expected = bounds.expected
     if shape_spread(track.shape) > LARGEST_SPREAD:  # the error model knows people only

@@ -146,6 +146,7 @@ def test_hair_and_doubtful_places_get_no_trust(model):
     assert np.median(skin_trust(model, mesh, mesh, colors, confidence)[lips]) > 0.5
     nowhere = skin_trust(model, mesh, mesh + 1.0, colors, confidence)
     assert nowhere == pytest.approx(confidence)
+    assert skin_trust(model, mesh, mesh, colors, 0.35 * confidence).max() == 0, "views disagree"
 
 
 def test_lips_eyes_and_the_underside_of_the_nose_are_too_fine_for_depth(model):
