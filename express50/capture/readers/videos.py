@@ -13,6 +13,8 @@ Database of Emotional Speech and Song", PLoS ONE 13(5), 2018.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -93,7 +95,7 @@ def read_participant(path: Path, selection: Selection) -> RawCapture:
     return RawCapture(
         root=path,
         subject=folder_id(path),
-        fps=video_fps(path / next(iter(line.cameras.values())).names[0]),
+        fps=_first_fps([path / camera.names[0] for camera in line.cameras.values()]),
         meta={"licence": "research only, see the terms of NeRSemble"},
         cameras={
             serial: replace(camera, correction=colours.get(serial, ()))
@@ -250,6 +252,18 @@ def _one_video(camera: str, path: Path) -> RawCamera:
     )
 
 
+def _first_fps(videos: Sequence[Path]) -> float:
+    """Return the frame rate of the first video that states it.
+
+    Raises:
+        CaptureError: none does.
+    """
+    for video in videos[:-1]:
+        with suppress(CaptureError):
+            return video_fps(video)
+    return video_fps(videos[-1])
+
+
 def fits_videos(path: Path) -> bool:
     """Return whether a folder holds videos."""
     return path.is_dir() and any(map(fits_video, path.iterdir()))
@@ -258,11 +272,12 @@ def fits_videos(path: Path) -> bool:
 def read_videos(path: Path, selection: Selection) -> RawCapture:
     """Read each video of a folder as a camera; frame 17 of all shows the same moment.
 
+    A file that cannot be read as a video, such as a sound recording, is dropped.
     ``cues.csv``, ``calibration.json``, ``board`` and ``plates`` beside them are those of our own
     layout (docs/FORMAT.md); without cues, the whole footage is one clip.
 
     Raises:
-        CaptureError: one of them is not a video, two names become one camera id, or the cues or the
+        CaptureError: none of them is a video, two names become one camera id, or the cues or the
             board's files are malformed.
         CalibrationError: calibration.json is malformed.
     """
@@ -270,13 +285,33 @@ def read_videos(path: Path, selection: Selection) -> RawCapture:
     ids = unique_ids(path, (file.name for file in files), lambda name: Path(name).stem)
     check_selection(selection, [CLIP], sorted(ids.values()))
     wanted = {ids[f.name]: f for f in files if selection.has_camera(ids[f.name])}
-    cameras = {camera: _one_video(camera, file) for camera, file in wanted.items()}
-    dropped: dict[str, str] = {}
+    cameras, dropped = _videos_that_open(wanted)
+    fps = _first_fps([wanted[camera] for camera in cameras])
     calibration, cues = read_calibration(path, cameras, dropped), read_cues(path / "cues.csv")
     return RawCapture(
-        root=path, subject=folder_id(path), fps=video_fps(files[0]), meta={}, cues=cues,
+        root=path, subject=folder_id(path), fps=fps, meta={}, cues=cues,
         cameras=cameras, dropped=dropped, calibration=calibration,
         plates=read_plates(path, cameras), board=read_board(path, cameras),
         clips=() if cues else (selection.expression(CLIP),),
         warnings=unused_files(path, ids.values()),
     )  # fmt: skip
+
+
+def _videos_that_open(
+    files: Mapping[str, Path],
+) -> tuple[dict[str, RawCamera], dict[str, str]]:
+    """Return the cameras whose file is a video, and why the others are dropped.
+
+    Raises:
+        CaptureError: none is.
+    """
+    cameras: dict[str, RawCamera] = {}
+    dropped: dict[str, str] = {}
+    for camera, file in files.items():
+        try:
+            cameras[camera] = _one_video(camera, file)
+        except CaptureError as error:
+            dropped[camera] = str(error)
+    if not cameras:
+        raise CaptureError(next(iter(dropped.values())))
+    return cameras, dropped

@@ -272,6 +272,28 @@ def test_a_folder_of_videos_is_a_rig_with_what_lies_beside_them(tmp_path):
         read_any(folder)
 
 
+def test_a_file_that_is_no_video_costs_its_camera_alone(tmp_path):
+    folder = tmp_path / "rig"
+    folder.mkdir()
+    for name in ("left.mp4", "right.mp4"):
+        write_video(folder / name, noise_video_images(4))
+    (folder / "empty.mp4").touch()
+    found = read_any(folder)  # the frame rate is not that of the first file by name
+    assert (list(found.cameras), list(found.dropped)) == (["left", "right"], ["empty"])
+    assert "empty.mp4: cannot be opened as a video" in found.dropped["empty"]
+    for name in ("left.mp4", "right.mp4"):
+        (folder / name).write_bytes(b"")
+    with pytest.raises(CaptureError, match="empty.mp4: cannot be opened"):
+        read_any(folder)
+
+
+def test_a_participants_first_video_may_be_damaged(tmp_path):
+    path = layouts.write_nersemble(tmp_path, write_video)
+    (path / "sequences/EMO-1-shout+laugh/images/cam_222200036.mp4").write_bytes(b"")
+    dataset, subject = ingested(tmp_path, path)
+    assert sorted(read_index(dataset, subject).cameras) == ["222200037", "222200038"]
+
+
 def test_a_video_that_one_camera_lacks_costs_the_camera_or_the_video_whichever_is_less(tmp_path):
     names = [f"c{n:02d}" for n in range(16)]
     for count, cameras, kept in ((2, 15, 2), (20, 16, 19)):
