@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import os
 import re
 import shutil
 import time
@@ -23,7 +24,14 @@ from urllib.parse import quote, unquote
 
 from express50.contract.layout import Dataset
 from express50.errors import DiskFullError, Express50Error, FormatError, StageError
-from express50.files.atomic import FORMER, folder_in_one_step, put_back, sync_directory, write_json
+from express50.files.atomic import (
+    FORMER,
+    folder_in_one_step,
+    naming_full_disk,
+    put_back,
+    sync_directory,
+    write_json,
+)
 from express50.files.digests import file_sha256, files_of
 from express50.files.text import read_json_table
 from express50.runner.ledger import FileMark, Ledger, Made, Receipt
@@ -33,6 +41,7 @@ GLANCE_SECONDS = 0.05
 GENERATIONS = 2  # replaced outputs per item; more would keep mistakes rather than choices
 LEAST_ROOM = 2e9  # bytes; with less left on the disk the store is emptied
 RECEIPT = ".receipt.json"
+RESERVE_BYTES = 1_000_000  # for the receipt of an output that fills the disk
 Keep = Callable[[Path], None]
 
 
@@ -42,10 +51,14 @@ def run_folder(dataset: Dataset, stage: str) -> Iterator[Path]:
 
     A worker may outlive its run, or be given up as dead while it still works. Once the folder is
     gone, at the end of the run or when the next one begins, such a worker can no longer publish.
+
+    Meanwhile some space is held for the receipt of an output that fills the disk.
     """
     folder = dataset.staging_dir / f"{stage}-{uuid.uuid4().hex}"
     folder.mkdir(parents=True)
     try:
+        with naming_full_disk(dataset.root):
+            _reserve(dataset, stage).write_bytes(os.urandom(RESERVE_BYTES))  # zeros may be no space
         yield folder
     finally:
         clean_leftovers(dataset, stage)
@@ -92,12 +105,24 @@ def discard_stale(dataset: Dataset, stage: str, item: str) -> None:
 
 
 def record_published(dataset: Dataset, ledger: Ledger, receipt: Receipt) -> None:
-    """Store the receipt of a published item; what its earlier failures left is deleted."""
+    """Store the receipt of a published item; what its earlier failures left is deleted.
+
+    Without a receipt, the item would be made again. If the output has filled the disk, the receipt
+    takes the space that the run holds for it (`run_folder`).
+    """
     discard_stale(dataset, receipt.stage, receipt.item)
     dataset.log_file(receipt.stage, receipt.item).unlink(missing_ok=True)
-    ledger.write(receipt)
+    try:
+        ledger.write(receipt)
+    except DiskFullError:
+        _reserve(dataset, receipt.stage).unlink(missing_ok=True)
+        ledger.write(receipt)
     if receipt.made is not None:
         ledger.know(dataset.item_dir(receipt.stage, receipt.item), receipt.made.files)
+
+
+def _reserve(dataset: Dataset, stage: str) -> Path:
+    return dataset.staging_dir / f".{stage}.reserve"
 
 
 def leftovers(dataset: Dataset, stage: str) -> list[Path]:
@@ -112,6 +137,7 @@ def clean_leftovers(dataset: Dataset, stage: str) -> None:
     It is renamed first, so that no worker publishes what is being deleted. Published folders that a
     kill between two renames left beside their place are put back.
     """
+    _reserve(dataset, stage).unlink(missing_ok=True)
     left = leftovers(dataset, stage)
     if not left:
         return
@@ -252,6 +278,11 @@ def restore(
         pass  # it is made instead, which also says what is wrong with the disk
     shutil.rmtree(entry, ignore_errors=True)
     return None
+
+
+def is_kept(dataset: Dataset, stage: str, item: str, fingerprint: str) -> bool:
+    """Return whether the store has an output with this fingerprint."""
+    return _entry(dataset, stage, item, fingerprint).is_dir()
 
 
 def make_room(dataset: Dataset) -> bool:

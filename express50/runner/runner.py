@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from express50.console import count as count_of
+from express50.console import format_seconds
 from express50.console import log as write
 from express50.contract.config import config_toml
 from express50.contract.layout import Dataset
@@ -28,6 +29,7 @@ from express50.runner.preflight import expected_shortage
 from express50.runner.progress import RunLog, showing
 from express50.runner.publish import (
     clean_leftovers,
+    is_kept,
     keeping,
     make_room,
     record_published,
@@ -37,6 +39,7 @@ from express50.runner.publish import (
 )
 from express50.runner.worker import Task, failed_receipt, failure_reason, fingerprint, input_digests
 
+REASONS = 3  # for making items again, said before they are made
 WARNINGS = 12  # lines; more of them would hide the account
 ALIKE_FAILURES = 3  # if so many first items fail for the same reason, a setting is wrong
 KEPT = "imported; the stage does not make it"
@@ -201,10 +204,7 @@ def run_stage(
         if not path.is_file() or path.read_bytes() != data:
             write_bytes(path, data)
         if items is None:
-            gone = sorted(set(ledger.read(stage.name)) - set(chosen))
-            for item in gone:
-                _retire(dataset, ledger, stage.name, item)
-            ledger.forget(stage.name, gone)
+            _set_aside_gone(stage, dataset, chosen, ledger, progress)
         threads = workers_pool.threads
         with RunLog(dataset.ledger, stage.name, len(chosen)) as log:
             if shortage := expected_shortage(dataset, ledger, stage.name, chosen):
@@ -221,6 +221,18 @@ def run_stage(
         raise StageError(f"{stage.name}: the outcome of {names} is unknown; run it again")
     seconds = time.perf_counter() - started
     return Summary(stage.name, tuple(outcomes[item] for item in chosen), seconds)
+
+
+def _set_aside_gone(
+    stage: Stage, dataset: Dataset, chosen: list[str], ledger: Ledger, progress: bool
+) -> None:
+    """Set aside the outputs of items that no longer exist, and say so."""
+    gone = sorted(set(ledger.read(stage.name)) - set(chosen))
+    aside = [item for item in gone if _retire(dataset, ledger, stage.name, item)]
+    if aside and progress:
+        items = f"{count_of(len(aside), 'item')} ({few(aside)})"
+        write(f"{stage.name}: set aside {items}, which the dataset no longer has")
+    ledger.forget(stage.name, gone)
 
 
 @dataclass(frozen=True)
@@ -354,6 +366,8 @@ def _run_items(
         log.begin(task.item)
 
     total = len(work.tasks) + len(work.unreadable)
+    if progress:
+        _say_again(stage, dataset, work)
     with showing(stage.name, total, progress) as show:
 
         def settle(receipt: Receipt) -> None:
@@ -390,6 +404,21 @@ def _run_items(
     return outcomes
 
 
+def _say_again(stage: Stage, dataset: Dataset, work: _Work) -> None:
+    """Say, while it can still be stopped, which finished work a run does again, and why."""
+    lost = [
+        task
+        for task in work.tasks
+        if task.former is not None and not is_kept(dataset, stage.name, task.item, task.fingerprint)
+    ]
+    for why, count in Counter(work.again[task.item] for task in lost).most_common(REASONS):
+        spent = sum(work.former[t.item].seconds for t in lost if work.again[t.item] == why)
+        write(
+            f"{stage.name}: makes {count_of(count, 'finished item')} again, which took"
+            f" {format_seconds(spent)}: {why}"
+        )
+
+
 def _refuse_alike(stage: Stage, ended: list[Receipt], former: Mapping[str, Receipt]) -> None:
     """Stop if the first items all fail for one reason although earlier runs made them.
 
@@ -405,14 +434,18 @@ def _refuse_alike(stage: Stage, ended: list[Receipt], former: Mapping[str, Recei
         )
 
 
-def _retire(dataset: Dataset, ledger: Ledger, stage: str, item: str) -> None:
-    """Set an output aside that no later stage may read; kept in case it becomes valid again."""
+def _retire(dataset: Dataset, ledger: Ledger, stage: str, item: str) -> bool:
+    """Set an output aside that no later stage may read; return whether there was one.
+
+    It is kept in case it becomes valid again.
+    """
     if not dataset.item_dir(stage, item).exists():
-        return
+        return False
     former = ledger.read_whole(stage, item)
     if former is not None and former.imported:  # the store may be emptied, and no run makes it
         former = None
     set_aside(dataset, stage, item, keeping(dataset, former))
+    return True
 
 
 def _outcome(receipt: Receipt, status: str = "", again: str = "") -> Outcome:

@@ -97,6 +97,40 @@ def test_a_changed_input_setting_or_version_makes_an_item_again_and_is_said(tmp_
     assert again(stage=newer, word="c") == ["", "output missing"]
 
 
+def test_finished_work_that_is_made_again_is_said_before_it_is_made(tmp_path, capsys):
+    dataset = make_dataset(tmp_path / "data", ["a", "b"])
+
+    def said(items=None, **values):
+        capsys.readouterr()
+        run_stage(toy.STAGE, dataset, toy.ToyConfig(**values), items, workers=0)
+        return capsys.readouterr().err
+
+    assert "again" not in said() + said()
+    lines = said(word="c").splitlines()
+    assert lines[0].startswith("toy: makes 2 finished items again, which took 0.")
+    assert lines[0].endswith('settings changed: word was "a", is "c"') and lines[-1].startswith(
+        "toy 2/2 b"
+    )
+    assert "again" not in said()  # restored at no cost
+    (dataset.root / "in" / "b.txt").unlink()
+    assert "toy: set aside 1 item (b), which the dataset no longer has" in said()
+
+
+def test_the_receipt_of_an_output_that_fills_the_disk_is_kept(tmp_path, monkeypatch):
+    dataset = make_dataset(tmp_path / "data", ["a", "b"])
+    write, refused = Ledger.write, []
+
+    def full(ledger, receipt):
+        if list(dataset.staging_dir.glob(".toy.reserve")):
+            refused.append(receipt.item)
+            raise DiskFullError("the disk is full")
+        write(ledger, receipt)
+
+    monkeypatch.setattr(Ledger, "write", full)
+    assert run_toy(dataset).ok and refused == ["a"]
+    assert set(statuses(run_toy(dataset)).values()) == {"skipped"}
+
+
 class OneItem:
     """A monitor that lets one item through."""
 
