@@ -261,7 +261,9 @@ def target_of(name: str | None, sizes: Mapping[str, float], measured: Footage) -
     values |= TARGETS.get(name or "", {}) | dict(sizes)
     each = measured.frames / max(measured.expressions, 1)
     each = values.pop("frames_per_expression", each)
-    return Footage(**values, frames=each * values["expressions"], side=measured.side)
+    return Footage(
+        **values, frames=each * values["expressions"], side=measured.side, every=measured.every
+    )
 
 
 def estimate(

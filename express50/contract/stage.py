@@ -130,8 +130,8 @@ class Growth:
     """Sizes of the footage that a stage's cost is proportional to, for ``express50 plan``.
 
     The sizes are ``subjects``, ``expressions``, ``views`` (cameras), ``pixels`` (of a recorded
-    image), ``picture`` (pixels of a peak frame, which may be reduced) and ``frames`` (of a camera);
-    several are multiplied.
+    image), ``picture`` (pixels of a peak frame, which may be reduced), ``frames`` (of a camera) and
+    ``decoded`` (those that ingest decodes); several are multiplied.
 
     Attributes:
         items: number of items.
@@ -142,6 +142,7 @@ class Growth:
             standard settings, so that larger pictures take no longer; 0 if it does not.
         reduces: name of the stage's setting to whose pixels it reduces the longer side of pictures
             for all later stages; 0 pixels leave them as they are.
+        skips: name of the stage's setting that says of how many frames one is decoded.
     """
 
     items: tuple[str, ...] = ("subjects",)
@@ -150,6 +151,7 @@ class Growth:
     more: tuple[str, ...] = ()
     side: int = 0
     reduces: str = ""
+    skips: str = ""
 
 
 @dataclass(frozen=True)

@@ -103,7 +103,7 @@ def item_seconds(load: Workload, stage: Stage, label: str) -> tuple[int, float]:
     count = max(1, round(share * load.footage.items(stage.growth)))
     samples = sizes_of(load.measured, stage)
     # What reduced pictures save was measured, see `size_factor`.
-    recorded = replace(load.footage, side=trial.footage.side)
+    recorded = replace(load.footage, side=trial.footage.side, every=trial.footage.every)
     work = [footage.time(stage.growth) for footage in (recorded, trial.footage)]
     grown = typical_seconds(samples, work[0]) / typical_seconds(samples, work[1])
     return count, (cost.core_seconds if load.cores else cost.seconds) * grown

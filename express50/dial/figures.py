@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from express50.capture.index import read_index
+from express50.capture.index import UNKNOWN_HASH, read_index
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, stages
 from express50.errors import FormatError, StageError
@@ -22,7 +22,7 @@ class Footage:
     """Holds the size of a campaign; means over subjects where it was measured.
 
     ``side`` is the length, pixels, to which the longer side of peak frames is reduced; 0: not.
-    ``shape`` is their shorter side over the longer one.
+    ``shape`` is their shorter side over the longer one. Ingest decodes one of ``every`` frames.
     """
 
     subjects: float
@@ -32,6 +32,12 @@ class Footage:
     frames: float
     side: float = 0.0
     shape: float = SHORT_SIDE
+    every: float = 1.0
+
+    @property
+    def decoded(self) -> float:
+        """Return the number of a camera's frames that ingest decodes: at least the first."""
+        return max(1.0, self.frames / self.every)
 
     @property
     def picture(self) -> float:
@@ -60,21 +66,29 @@ def footage_of(dataset: Dataset) -> Footage:
         raise StageError(f"{dataset.root}: nothing is ingested, so nothing was measured")
     cameras = [camera for index in indices for camera in index.cameras.values()]
     sizes = [(camera.width, camera.height) for camera in cameras]
-    side = 0.0  # to which the settings of the last run reduced pictures
-    for name, stage in stages().items():
-        path = dataset.config_file(name)
-        if stage.growth.reduces and path.is_file():
-            table = read_toml(path, FormatError).get(name, {})
-            side = float(table.get(stage.growth.reduces, 0))
+    frames = sum(camera.frames for camera in cameras)
+    decoded = sum(camera.frames - camera.dhash.count(UNKNOWN_HASH) for camera in cameras)
     return Footage(
         subjects=len(indices),
         expressions=sum(len(index.cues) for index in indices) / len(indices),
         views=len(cameras) / len(indices),
         pixels=sum(width * height for width, height in sizes) / len(sizes),
-        frames=sum(camera.frames for camera in cameras) / len(cameras),
-        side=side,
+        frames=frames / len(cameras),
+        side=_last_setting(dataset, "reduces", 0.0),
         shape=sum(min(size) / max(size) for size in sizes) / len(sizes),
+        # Fewer are decoded in videos with few key frames, and a larger share of short ones.
+        every=max(frames / max(decoded, 1), _last_setting(dataset, "skips", 1.0)),
     )
+
+
+def _last_setting(dataset: Dataset, kind: str, default: float) -> float:
+    """Return the last run's value of the setting that stages name as ``kind`` in their `Growth`."""
+    value = default
+    for name, stage in stages().items():
+        path, key = dataset.config_file(name), getattr(stage.growth, kind)
+        if key and path.is_file():
+            value = float(read_toml(path, FormatError).get(name, {}).get(key, default))
+    return value
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -109,5 +109,7 @@ STAGE = Stage(
     prepare=add_captures,
     account=account,
     # Proxies have one size, whatever that of the footage.
-    growth=Growth(("subjects",), ("frames", "views", "pixels"), ("frames", "views")),
+    growth=Growth(
+        ("subjects",), ("decoded", "views", "pixels"), ("decoded", "views"), skips="every"
+    ),
 )

@@ -16,6 +16,7 @@ from express50.dial.measuring import tune
 from express50.runner.ledger import Ledger
 from pipelines import ingest
 from tests.express50.dial.toy_chain import captures_of, chain_of
+from tests.stages import ingest_captures
 from tests.synth import make_capture
 
 SMALL = Footage(subjects=2, expressions=6, views=8, pixels=1e5, frames=36)
@@ -58,6 +59,19 @@ def test_reduced_pictures_bound_the_stages_after_frames_and_no_other():
         assert row.seconds == pytest.approx(2.0 * pixels / 1e5)
 
 
+def test_frames_that_ingest_does_not_decode_cost_nothing(tmp_path):
+    short, long = (tmp_path / name for name in ("short", "long"))
+    found = []
+    for path, frames in ((short, 8), (long, 60)):
+        make_capture(path / "raw", cameras=2, frames=frames, expressions=("smile",))
+        found.append(footage_of(ingest_captures(path / "data", path / "raw", every=24)))
+    assert [footage.decoded for footage in found] == [1, pytest.approx(2.5, abs=0.5)]
+    target = target_of(None, {"frames_per_expression": 480}, found[0])
+    assert target.decoded == 20
+    (row,) = estimate([stages()["ingest"]], target, [(found[0], {"ingest": cost(2.0)})], 1)
+    assert row.seconds == pytest.approx(40.0)  # 480 / 8 times as much it would be with every=1
+
+
 def test_plates_are_an_item_per_subject_not_per_expression():
     (row,) = estimate([stages()["frames"]], SMALL, [(SMALL, {"frames": cost(2.0)})], workers=1)
     assert row.items == 2 * 6 + 2
@@ -96,7 +110,7 @@ def test_figures_are_those_of_the_receipts(tmp_path, capsys):
     assert found.memory == max(r.peak_memory for r in receipts) and found.preset == "draft"
     files = [p for p in dataset.stage_dir("ingest").rglob("*") if p.is_file()]
     assert found.bytes == sum(p.stat().st_size for p in files) / 2
-    size = {"pixels": 4096, "shape": 1.0}
+    size = {"pixels": 4096, "shape": 1.0, "every": 24}
     assert footage_of(dataset) == Footage(subjects=2, expressions=2, views=2, frames=4, **size)
     capsys.readouterr()
     assert main(["plan", str(root), "--size", "128x64", "--subjects", "10", "--json"]) == 0
