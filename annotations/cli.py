@@ -27,6 +27,7 @@ from annotations.labels import (
     make_event,
     make_flag,
     make_mark,
+    overruling,
     read_labels,
 )
 from annotations.suggestions import choose_reference, read_suggestions, reference_subject
@@ -36,6 +37,7 @@ from annotations.validate import (
     by_pair,
     describe,
     disagreements,
+    in_spite_of,
     marked_clips,
     problems,
     settlement,
@@ -308,10 +310,11 @@ def run_undo(args: argparse.Namespace) -> int:
 
 def _keep(args: argparse.Namespace, label: Label, said: str) -> int:
     append_label(args.dataset, label)
-    words = (
-        f"{label.subject} {label.expression}: {said} by {label.annotator};"
-        f" run 'express50 align {args.dataset.root}' to use it"
-    )
+    settled = overruling(read_labels(args.dataset, label.subject), label)
+    after = f"run 'express50 align {args.dataset.root}' to use it"
+    if settled is not None:
+        after = in_spite_of(settled)
+    words = f"{label.subject} {label.expression}: {said} by {label.annotator}; {after}"
     return answer(args, asdict(label), words)
 
 
@@ -371,7 +374,9 @@ def run_review(args: argparse.Namespace) -> int:
         said = ", ".join(f"{who} {what}" for who, what in row.said.items())
         settled = f" -> {row.settled}" if row.settled else ""
         lines.append(f"{row.subject} {row.expression}: {said}{settled}")
-    words = f"{len(queue)} to review (marks at most {count(args.beyond, 'frame')} apart agree)"
+    done = sum(row.settled is not None for row in queue)
+    words = f"{len(queue) - done} to review" + (f", {done} settled" if args.all else "")
+    words += f" (marks at most {count(args.beyond, 'frame')} apart agree)"
     return answer(args, [asdict(row) for row in queue], *lines, words)
 
 

@@ -132,7 +132,11 @@ def _label(row: object, where: str) -> Label:
     unknown = sorted(set(map(str, given)) - set(_FIELDS))
     missing = sorted(set(REQUIRED) - set(given))
     if unknown or missing:
-        raise AnnotationError(f"{where}: unknown columns {unknown}, missing {missing}")
+        said = [f"no {name}" for name in missing] + [f"unknown column {name!r}" for name in unknown]
+        raise AnnotationError(
+            f"{where}: {', '.join(said)}; expected columns as 'express50 annotate export' writes"
+            f" them, at least {', '.join(REQUIRED)}"
+        )
     if not NAME.fullmatch(str(given["subject"])):  # it becomes a file name
         raise AnnotationError(f"{where}: subject {given['subject']!r} is not an id")
     check_known(where, "action", [given["action"]], ACTIONS, AnnotationError)
@@ -140,7 +144,8 @@ def _label(row: object, where: str) -> Label:
     needed = {"frame", "camera", "dhash"} if framed else set()
     needed |= {"reason"} if given["action"] == "flag" else set()
     if lacking := sorted(needed - set(given)):
-        raise AnnotationError(f"{where}: a {given['action']} needs {', '.join(lacking)}")
+        fix = "; 'express50 annotate mark' labels a frame by its number" if framed else ""
+        raise AnnotationError(f"{where}: a {given['action']} needs {', '.join(lacking)}{fix}")
     try:
         return Label(**{k: _typed(k, v) for k, v in given.items()})
     except ValueError as error:

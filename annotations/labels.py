@@ -102,10 +102,15 @@ def make_mark(
             f"{index.subject} {expression}: frame {frame} is outside its cue window; "
             f"expected {cue.start_frame} to {end}"
         )
-    if not cue.start_frame <= low <= frame <= high <= end:
+    if not low <= frame <= high:
         raise AnnotationError(
-            f"{index.subject} {expression}: plateau {low} to {high} with peak frame {frame};"
-            f" expected first <= peak <= last, inside the cue window {cue.start_frame} to {end}"
+            f"{index.subject} {expression}: frame {frame} is outside its plateau, {low} to {high};"
+            " move the mark or the plateau's ends"
+        )
+    if not cue.start_frame <= low <= high <= end:
+        raise AnnotationError(
+            f"{index.subject} {expression}: plateau {low} to {high} leaves the cue window; expected"
+            f" {cue.start_frame} to {end} or less"
         )
     return replace(
         make_event(index, expression, "mark", annotator),
@@ -253,6 +258,12 @@ def current_labels(labels: Iterable[Label]) -> dict[str, Label]:
     events = [label for stack in _stacks(labels).values() for label in stack]
     events.sort(key=lambda label: (label.expression, _rank(label), label.time))
     return {label.expression: label for label in events}  # the last one wins
+
+
+def overruling(labels: Iterable[Label], label: Label) -> Label | None:
+    """Return the settlement that stays in force whatever a label says; None without one."""
+    force = current_labels(labels).get(label.expression)
+    return force if force is not None and _rank(force) > _rank(label) else None
 
 
 def latest_labels(labels: Iterable[Label]) -> list[Label]:

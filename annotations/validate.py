@@ -154,6 +154,11 @@ def describe(label: Label) -> str:
     return f"flag: {label.reason or 'no reason given'}"
 
 
+def in_spite_of(settled: Label) -> str:
+    """Say that a settlement outranks what an annotator has just decided."""
+    return f"{settled.annotator}'s settlement ({describe(settled)}) stays in force"
+
+
 def settlement(
     dataset: Dataset, index: Index, expression: str, verdict: str, annotator: str
 ) -> Label:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
+from typing import ClassVar
 
 from rich.text import Text
 from textual import events, work
 from textual.app import App, ComposeResult
-from textual.binding import Binding
 from textual.containers import Horizontal, Vertical
 from textual.filter import LineFilter
 from textual.geometry import Size
@@ -50,12 +51,12 @@ LEAST_COLUMNS = 90  # of a terminal that shows three pictures: in narrower ones 
 class Desk(Screen[None]):
     """Shows a scene, a view of it and a message; call ``draw`` after changing them."""
 
-    BINDINGS = [
-        Binding(name, key.action.format(key=name), key.words, show=False)
+    ACTIONS: ClassVar[dict[str, str]] = {
+        name: key.action.format(key=name)
         for group in theme.GROUPS
         for key in group
         for name in key.keys.split(",")
-    ]
+    }
 
     def __init__(
         self, session: Session, cache: FrameCache, faces: FaceFinder | None, sixel_cell: Size | None
@@ -104,6 +105,18 @@ class Desk(Screen[None]):
         faces.load()
         self.app.call_from_thread(self.draw)
 
+    async def on_key(self, event: events.Key) -> None:
+        """Act on a key; one that was typed before a dialog was drawn goes to the dialog.
+
+        Textual's bindings would act only after the next keys have been given to this screen.
+        """
+        dialog, late = self.app.screen, copy(event)  # a copy was counted already
+        event.stop()
+        if dialog is not self:
+            dialog.call_after_refresh(lambda: (dialog.focused or dialog).post_message(late))
+        elif event.key in self.ACTIONS:
+            await self.app.run_action(self.ACTIONS[event.key], self)
+
     def on_resize(self) -> None:
         """Give the strip what the height allows, then draw everything again."""
         height = self.app.size.height
@@ -119,9 +132,12 @@ class Desk(Screen[None]):
             return
         self._draw_status()
         scene, view = self.scene, self.view
-        there = reference_look(scene, self.aim)
+        # The reference's own frame of this clip is a suggestion or somebody's mark.
+        hidden = scene.is_reference and self.session.hidden(scene.task)
+        there = None if hidden else reference_look(scene, self.aim)
         picture = self.query_one("#reference", PicturePane)
-        picture.show(there, "the reference has no frame of this expression yet")
+        nothing = "the reference has no frame of this expression yet"
+        picture.show(there, "hidden until you decide" if hidden else nothing)
         title = words.reference_title(scene, there, picture.size.width)
         self._write("#reference-title", title)
         here = None if view is None else subject_look(scene, view, self.aim)
@@ -310,10 +326,11 @@ class Desk(Screen[None]):
         except (Express50Error, OSError) as error:
             self.say(f"not saved: {error}", theme.RED)
             return
+        before = None if self.scene is None else self.scene.in_force
         more = self.session.advance()
         self.open_task()
         done = "" if more else f"all {len(self.session.tasks)} done. q quits, p goes back. "
-        self.say(done + words.saved(label))
+        self.say(done + words.saved(label, before))
 
     def action_undo(self) -> None:
         """Undo the last decision and show its task."""

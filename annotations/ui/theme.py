@@ -1,7 +1,7 @@
 """Define the colours, layout and keys of the annotator.
 
-The colours hold on dark terminals with 256 colours too. Every key is listed once: the app binds the
-keys, and the help shows them.
+The colours hold on dark terminals with 256 colours too. Every key is listed once: the app acts on
+the keys, and the help shows them.
 """
 
 from __future__ import annotations

@@ -15,12 +15,13 @@ from textual.containers import Vertical, VerticalScroll
 from textual.screen import ModalScreen
 from textual.widgets import Input, Static
 
-from annotations.labels import FLAG_REASONS, Label
+from annotations.labels import FLAG_REASONS, Label, overruling
 from annotations.ui import theme
 from annotations.ui.picture import FrameLook
 from annotations.ui.session import Session
 from annotations.ui.task import CueView, TaskScene
 from annotations.ui.theme import GROUPS, HINTS
+from annotations.validate import in_spite_of
 
 LEAST_CELLS = 6  # fewer say nothing
 
@@ -117,11 +118,13 @@ def hint_line(width: int) -> Text:
     return text
 
 
-def saved(label: Label) -> str:
-    """Report that a decision is on disk."""
+def saved(label: Label, in_force: Label | None) -> str:
+    """Report that a decision is on disk, and whether a settlement outranks it."""
     what = f"frame {label.frame}" if label.action == "mark" else f"flagged {label.reason}"
     cost = f"{label.keys} key{'' if label.keys == 1 else 's'}, {label.seconds:.1f} s"
-    return f"saved: {label.subject} {label.expression} {what} ({cost}); u undoes it"
+    said = f"saved: {label.subject} {label.expression} {what} ({cost}); u undoes it"
+    settled = overruling([] if in_force is None else [in_force], label)
+    return said if settled is None else f"{said}; {in_spite_of(settled)}"
 
 
 SCROLLING = ("up", "down", "pageup", "pagedown", "home", "end")

@@ -81,6 +81,28 @@ def test_agree_measures_and_review_settles_without_losing_labels(annotate):
     assert force["smile"] == 18
 
 
+def test_a_mark_against_a_settlement_says_that_it_does_not_count(annotate, dataset, capsys):
+    for who, frame in (("ann", 12), ("bob", 18)):
+        mark(annotate, who, "smile", frame)
+    annotate("review", "--settle", "S001", "smile", "bob", "--annotator", "eve")
+    root = str(dataset.root)
+    assert main(["annotate", "mark", root, "S001", "smile", "13", "--annotator", "ann"]) == 0
+    said = capsys.readouterr().out
+    assert "eve's settlement (frame 18) stays in force" in said and "to use it" not in said
+    assert main(["annotate", "undo", root, "S001", "smile", "--annotator", "eve"]) == 0
+    assert "to use it" in capsys.readouterr().out
+
+
+def test_review_counts_settled_disagreements_apart(annotate, dataset, capsys):
+    for expression in ("smile", "wink_left"):
+        start = 10 * EXPRESSIONS.index(expression)
+        mark(annotate, "ann", expression, start)
+        mark(annotate, "bob", expression, start + 5)
+    annotate("review", "--settle", "S001", "smile", "bob", "--annotator", "eve")
+    assert main(["annotate", "review", str(dataset.root), "--all"]) == 0
+    assert "1 to review, 1 settled" in capsys.readouterr().out
+
+
 def test_alpha_is_krippendorffs_on_time_within_the_clip():
     # two annotators; the pairwise definition, written out
     values = [np.array([0.1, 0.2]), np.array([0.5, 0.5]), np.array([0.9, 0.6])]
@@ -273,7 +295,7 @@ def test_a_disagreement_is_settled_by_a_reason_in_words(annotate):
         ({"camera": "z"}, "'z'"),
         ({"dhash": "f" * 16}, "f" * 16),
         ({"pts": 3}, "pts 140"),
-        ({"expression": ""}, "missing ['expression']"),
+        ({"expression": ""}, "no expression; expected columns"),
         ({"frame": "1e9"}, "frame is '1e9', expected a whole number"),
     ],
 )

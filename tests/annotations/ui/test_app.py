@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 from rich.text import Text
+from textual import events
 from textual.widgets import Input
 
 from annotations import cli
@@ -107,7 +108,7 @@ def test_frame_outside_its_plateau_is_refused_with_a_message(suggested, make_app
     keys = ("]", "right", "enter")
     said = drive(make_app(suggested), *keys, check=lambda app: line(app, "message"))
     assert "not saved" in said
-    assert "plateau" in said
+    assert "frame 5 is outside its plateau, 0 to 4" in said
     assert labels(suggested) == []
 
 
@@ -117,6 +118,37 @@ def test_flag_by_digit_or_in_words(suggested, make_app):
     first, second = labels(suggested)
     assert (first.action, first.reason, first.keys) == ("flag", "occluded", 2)
     assert (second.expression, second.reason) == ("smile", "tongueless")
+
+
+async def type_ahead(pilot, keys, done):
+    """Deliver keys at once, as a slow line does; wait until they are done."""
+    for key in keys:
+        pilot.app.post_message(events.Key(key, key if len(key) == 1 else None))
+    for _ in range(500):
+        await pilot.pause(0.01)
+        if done():
+            return
+
+
+def test_a_flag_typed_before_its_dialog_is_drawn_is_saved(suggested, make_app):
+    piloted(make_app(suggested), lambda pilot: type_ahead(pilot, "f2", lambda: labels(suggested)))
+    (flag,) = labels(suggested)
+    assert (flag.reason, flag.keys) == ("occluded", 2)
+
+
+def test_a_frame_typed_before_its_dialog_is_drawn_is_opened(suggested, make_app):
+    app = make_app(suggested)
+    keys = ("g", "7", "enter")
+    piloted(app, lambda pilot: type_ahead(pilot, keys, lambda: app.desk.view.cursor == 7))
+    assert app.desk.view.cursor == 7
+    assert app.session.effort().keys == 3
+
+
+def test_a_mark_against_a_settlement_says_that_it_does_not_count(suggested, make_app):
+    mark = make_mark(read_index(suggested, "S001"), "neutral", 6, "cam01", "eve")
+    append_label(suggested, replace(mark, action="settle"))
+    said = drive(make_app(suggested), "enter", check=lambda app: line(app, "message"))
+    assert "eve's settlement (frame 6) stays in force" in said
 
 
 def test_undo_reopens_the_task_with_a_message(suggested, make_app):
@@ -145,6 +177,17 @@ def test_earlier_mark_is_shown_on_return(suggested, make_app):
     assert "frame 5" in title
     assert "● your mark" in title
     assert "●" in strip[-1]
+
+
+def test_blind_hides_the_references_own_frame_until_the_decision(suggested, make_app):
+    append_label(suggested, make_mark(read_index(suggested, "S001"), "neutral", 7, "cam00", "bob"))
+    app = make_app(suggested, blind=True, subjects=["S001"])
+    shown = lambda app: line(app, "reference-title")  # noqa: E731
+    before = drive(app, check=shown)
+    assert "frame" not in before and "bob" not in before
+    assert "frame" in drive(make_app(suggested, blind=True), "enter", "p", check=shown)
+    other = make_app(suggested, blind=True, subjects=["S002"])
+    assert "frame" in drive(other, check=shown)
 
 
 def test_blind_hides_suggestions_curves_and_marks_until_the_decision(suggested, make_app):
