@@ -19,7 +19,7 @@ STAGE_FLAGS = --preset $(PRESET) --workers $(WORKERS) $(foreach kv,$(SET),--set 
         ingest calibrate align frames matte track depth register regions pack run tune train
 
 help: ## list the targets
-	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
+	@grep -hE '^[a-z -]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
 
 setup: $(READY) ## make .venv with everything that is needed
 $(READY): pyproject.toml constraints.txt setup.py scripts/system_libs.sh $(wildcard express50/native/*.cpp express50/native/*.h)
@@ -30,46 +30,46 @@ $(READY): pyproject.toml constraints.txt setup.py scripts/system_libs.sh $(wildc
 	$(BIN)/python -m pip install --quiet -e '.[dev]' -c constraints.txt
 	touch $@
 
-demo: $(READY) ## the whole chain on a synthetic capture (or CAPTURES="dir ..."): build/demo/report/index.html
+demo: $(READY) ## run everything on a synthetic capture (or CAPTURES="dir ..."): build/demo/report/index.html
 	$(BIN)/python -m benchmarks.demo build/demo $(if $(CAPTURES),--captures $(CAPTURES)) --workers $(WORKERS)
 
 PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-test: check ## lint, types and every test
+test: check ## lint, check types, run every test
 	$(PYTEST)
 
-coverage: $(READY) ## every test, and the share of lines that they run; Python code takes 1.4 times as long
+coverage: $(READY) ## run every test and print the share of lines that they run; Python code takes 1.4 times as long
 	@mkdir -p build
 	$(PYTEST) --cov --cov-report=
 	@echo "coverage: $$($(BIN)/coverage report --format=total) % of the product's lines"
 
-check: $(READY) ## lint and types
+check: $(READY) ## lint and check types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: $(READY) ## the benchmarks that need no arguments, each ends in one JSON object
+bench: $(READY) ## run the benchmarks that need no arguments; each ends with one JSON object
 	$(BIN)/python -m benchmarks.all
 
-tradeoff: $(READY) ## sweep the speed-accuracy knobs into docs/TRADEOFFS.md
+tradeoff: $(READY) ## measure speed against accuracy and write docs/TRADEOFFS.md
 	$(BIN)/python -m benchmarks.tradeoff
 
 ingest: $(READY) ## index CAPTURES="dir ..." into DATASET
 	$(BIN)/express50 ingest "$(DATASET)" $(CAPTURES) $(STAGE_FLAGS)
 
-calibrate align frames matte track depth register regions pack: $(READY) ## one stage over DATASET
+calibrate align frames matte track depth register regions pack: $(READY) ## run one stage on DATASET
 	$(BIN)/express50 $@ "$(DATASET)" $(STAGE_FLAGS)
 
-run: $(READY) ## every stage within BUDGET=2h, with settings chosen for CAPTURES="dir ..." in DATASET
+run: $(READY) ## run every stage on CAPTURES="dir ..." in DATASET, with settings that fit BUDGET=2h
 	$(BIN)/express50 run "$(DATASET)" $(CAPTURES) --budget $(BUDGET) --workers $(WORKERS) $(foreach kv,$(SET),--set $(kv)) $(if $(SLURM),--slurm $(SLURM))
 
-tune: $(READY) ## measure what time buys on DATASET: error against time of the whole chain
+tune: $(READY) ## measure the error of the whole chain against its time on DATASET
 	$(BIN)/express50 tune "$(DATASET)" $(CAPTURES) --workers $(WORKERS)
 
-train: $(READY) ## train GRMM on DATASET's shards, or go on with it, sized for the machine and an hour
+train: $(READY) ## train GRMM on DATASET's shards for an hour, or continue; the preset suits the machine
 	$(BIN)/grmm train "$(DATASET)/pack/shards" "$(DATASET)/grmm" $(TRAIN)
 
-report: $(READY) ## gather DATASET's QC into one HTML page
+report: $(READY) ## write one HTML page of DATASET's results and pictures
 	$(BIN)/express50 report "$(DATASET)"
 
 clean: ## remove what was built, keep .venv

@@ -128,7 +128,7 @@ def _add_labelling_actions(add: Callable[..., Callable]) -> None:
     argument("--last", type=number(0), metavar="FRAME", help="last frame of the plateau")
     argument = add("flag", run_flag, "record that an expression has no peak", "clip", "annotator")
     argument("reason", metavar="REASON", help=", ".join(FLAG_REASONS) + ", ...")
-    add("undo", run_undo, "undo your last event on an expression", "clip", "annotator")
+    add("undo", run_undo, "undo your last label of an expression", "clip", "annotator")
     add("labels", run_labels, "list every label in force", "subjects")
 
 

@@ -60,7 +60,7 @@ STAGE = Stage(
     items=Dataset.subjects,
     inputs=inputs,
     run=run,
-    help="suggest, match to the reference and accept the peak frame of each expression",
+    help="suggest each expression's peak frame, matched to the reference, and accept it",
     purpose="The labelled frame of every expression, between its cue window's first and last.",
     runs_first=(OBSERVE.name,),
     growth=Growth(items=("subjects",), time=("frames",), disk=("frames",)),

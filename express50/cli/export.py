@@ -43,7 +43,7 @@ def add_commands(subparsers: Any) -> None:
     add("--even-colour", action="store_true", help=words)
     words = "expression to hold out for testing; may be repeated (default: the last three tenths)"
     add("--test-expression", action="append", metavar="ID", help=words)
-    words = "camera to hold out in training (default: the last)"
+    words = "camera to hold out for validation (default: the last)"
     add("--validation-camera", metavar="ID", help=words)
 
     words = "write one self-contained HTML page of results and pictures"
