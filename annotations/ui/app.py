@@ -335,15 +335,15 @@ class Desk(Screen[None]):
     def action_undo(self) -> None:
         """Undo the last decision and show its task."""
         try:
-            task = self.session.undo()
+            label = self.session.undo()
         except (Express50Error, OSError) as error:
             self.say(f"not undone: {error}", theme.RED)
             return
-        if task is None:
+        if label is None:
             self.say("you have nothing to undo here", theme.ACCENT)
             return
         self.open_task()
-        self.say(f"undone: {task.subject} {task.expression}")
+        self.say(words.undone(label))
 
     def action_task(self, by: int) -> None:
         """Open the next or previous task."""

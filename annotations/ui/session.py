@@ -15,6 +15,7 @@ from annotations.labels import (
     Label,
     append_label,
     labels_of,
+    last_event,
     make_event,
     make_flag,
     make_mark,
@@ -171,10 +172,11 @@ class Session:
         del self._efforts[self.position]
         return label
 
-    def undo(self) -> LabelTask | None:
+    def undo(self) -> Label | None:
         """Undo the annotator's last decision of this session, else that on the open task.
 
-        The task it was about becomes the open one; None when there is nothing to take back.
+        The task it was about becomes the open one. Return what was taken back, which is a
+        settlement where the annotator gave one since; None when there is nothing.
         """
         target = self._decided.pop() if self._decided else self.position
         if not self.tasks:
@@ -183,11 +185,12 @@ class Session:
         if task.expression not in self._said(task.subject):
             return None
         index = read_index(self.dataset, task.subject)
+        last = last_event(read_labels(self.dataset, task.subject), task.expression, self.annotator)
         append_label(self.dataset, make_event(index, task.expression, "undo", self.annotator))
         if task.expression not in self._said(task.subject):
             self._open.add(task.key)
         self._go(target)
-        return task
+        return last
 
     def _said(self, subject: str) -> dict[str, Label]:
         return labels_of(read_labels(self.dataset, subject), self.annotator)

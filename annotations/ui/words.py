@@ -21,7 +21,7 @@ from annotations.ui.picture import FrameLook
 from annotations.ui.session import Session
 from annotations.ui.task import CueView, TaskScene
 from annotations.ui.theme import GROUPS, HINTS
-from annotations.validate import in_spite_of
+from annotations.validate import describe, in_spite_of
 
 LEAST_CELLS = 6  # fewer say nothing
 
@@ -125,6 +125,12 @@ def saved(label: Label, in_force: Label | None) -> str:
     said = f"saved: {label.subject} {label.expression} {what} ({cost}); u undoes it"
     settled = overruling([] if in_force is None else [in_force], label)
     return said if settled is None else f"{said}; {in_spite_of(settled)}"
+
+
+def undone(label: Label) -> str:
+    """Report what was taken back."""
+    kind = "settlement, " if label.action == "settle" else ""
+    return f"undone: {label.subject} {label.expression} {kind}{describe(label)}"
 
 
 SCROLLING = ("up", "down", "pageup", "pagedown", "home", "end")

@@ -154,11 +154,20 @@ def test_a_mark_against_a_settlement_says_that_it_does_not_count(suggested, make
 def test_undo_reopens_the_task_with_a_message(suggested, make_app):
     app = make_app(suggested)
     said = drive(app, "enter", "u", check=lambda app: line(app, "message"))
-    assert "undone: S001 neutral" in said
+    assert "undone: S001 neutral frame 4" in said
     assert app.session.task.expression == "neutral"
     assert current_labels(labels(suggested)) == {}
     fresh = make_app(suggested, "bob")
     assert "nothing to undo" in drive(fresh, "u", check=lambda app: line(app, "message"))
+
+
+def test_undo_says_that_it_takes_back_a_settlement(suggested, make_app):
+    mark = make_mark(read_index(suggested, "S001"), "neutral", 6, "cam01", "ann")
+    for label in (mark, replace(mark, action="settle")):
+        append_label(suggested, label)
+    app = make_app(suggested, subjects=["S001"], expressions=["neutral"])
+    said = drive(app, "u", check=lambda app: line(app, "message"))
+    assert "undone: S001 neutral settlement, frame 6" in said
 
 
 def test_next_and_previous_leave_tasks_open(suggested, make_app):
