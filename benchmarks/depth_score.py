@@ -34,7 +34,7 @@ def score(
     none = np.zeros(0)
     rows = [
         compare(mesh, truth, subject, frame, camera, motion, alpha, (sure or {}).get(camera.id))
-        for camera, (_, alpha) in ((picture.camera, picture.read()) for picture in pictures)
+        for camera, alpha in ((picture.camera, picture.matte) for picture in pictures)
     ]
     found: dict = {
         key: np.concatenate([row.get(key, none) for row in rows])

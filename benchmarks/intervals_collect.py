@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -163,11 +162,8 @@ def _depth(peak: _Peak) -> Iterator[Sample]:
         track = read_track(peak.dataset.track_file(peak.subject))
         mesh = track.vertices[track.row(peak.expression)].astype(np.float64)
         solid = close_mesh(mesh, load_head(track.head).faces.numpy())
-    reads = {
-        n: partial(lambda n: (peak.frame_of(n), peak.alpha(n)), n)
-        for n in surface.figures["cameras"]
-    }
-    pictures = [picture_of(peak.cameras[n], *read(), read) for n, read in reads.items()]
+    names = surface.figures["cameras"]
+    pictures = [picture_of(peak.cameras[n], peak.frame_of(n), peak.alpha(n)) for n in names]
     parts, errors, shared, skin = [], [], [], []
     lone = HEAD_SIZE_SPREAD if len(pictures) == 1 else 0.0
     for name, view, _ in surface_maps(surface, pictures, solid):

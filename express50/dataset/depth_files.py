@@ -85,7 +85,7 @@ def encode_normals(normals: np.ndarray, valid: np.ndarray) -> np.ndarray:
         raise ValueError("valid normals must be finite and of unit length")
     # It rounds, cuts at 255 and converts in one pass.
     code = cv2.convertScaleAbs(normals, alpha=NORMAL_STEPS, beta=NORMAL_STEPS + 1)
-    return np.where(valid[..., None], code, np.uint8(0))
+    return cv2.bitwise_and(code, code, mask=valid.astype(np.uint8))
 
 
 def read_normals(path: Path) -> tuple[np.ndarray, np.ndarray]:

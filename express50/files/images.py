@@ -33,6 +33,7 @@ DEPTH_LIMIT_M = DEPTH_UNIT_M * 65535
 JPEG_ENDINGS = (".jpg", ".jpeg")
 JPEG_SIDE, PNG_SIDE = 65500, 1_000_000  # pixels; encoder and decoder refuse longer sides
 PNG_START = b"\x89PNG\r\n\x1a\n"
+PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 UP, PNG_LEVEL = 2, 3  # of PNG's filters the difference from the row above; libdeflate's level
 # Orientation -> quarter turns counter-clockwise after an optional left-right flip (EXIF 2.3).
 TURNS = {1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (1, True), 6: (3, False),
@@ -92,13 +93,46 @@ def _plain_png(path: Path) -> np.ndarray | None:
         width, height = image_size(head, str(path))
         if not 0 < width * height <= PIXEL_LIMIT or head[24] not in (8, 16):
             return None
-        channels = {0: (), 2: (3,), 4: (2,), 6: (4,)}.get(head[25])
+        channels, data = {0: (), 2: (3,), 4: (2,), 6: (4,)}.get(head[25]), head + file.read()
+        if channels is not None and (own := _own_png(data, (height, width, *channels))) is not None:
+            return own
         try:
-            pixels = imagecodecs.png_decode(head + file.read())
+            pixels = imagecodecs.png_decode(data)
         except imagecodecs.PngError as error:
             raise FormatError(f"{path}: {DAMAGED} ({error}); {REPAIR}") from error
         return pixels if channels is not None and pixels.shape[2:] == channels else None
     return None
+
+
+def _own_png(data: bytes, shape: tuple[int, ...]) -> np.ndarray | None:
+    """Decode a PNG as `encode_png` makes them, in a third of libpng's time.
+
+    None if it is another one, or damaged: libpng says how.
+    """
+    kind, end = np.dtype(f">u{data[24] // 8}"), len(data) - len(PNG_END)
+    length = math.prod(shape[1:]) * kind.itemsize + 1  # of a row, with its filter type
+    header, body = data[12:33], data[37:end]
+    if data[26:29] != bytes(3) or data[33:37] != struct.pack(">I", len(body) - 8):
+        return None
+    if body[:4] != b"IDAT" or data[end:] != PNG_END or not (_intact(header) and _intact(body)):
+        return None
+    rows = np.empty((shape[0], length), np.uint8)
+    try:
+        if len(imagecodecs.deflate_decode(body[4:-4], out=rows.reshape(-1).data)) != rows.size:
+            return None
+    except imagecodecs.DeflateError:
+        return None
+    if (rows[:, 0] != UP).any():
+        return None
+    for above, row in zip(rows[:-1, 1:], rows[1:, 1:], strict=True):
+        np.add(above, row, out=row)
+    pixels = np.ascontiguousarray(rows[:, 1:]).view(kind).reshape(shape)
+    return pixels.astype(kind.newbyteorder("="), copy=False)
+
+
+def _intact(chunk: bytes) -> bool:
+    """Return True if the kind and the data of a PNG's chunk have the checksum that follows them."""
+    return struct.unpack(">I", chunk[-4:])[0] == imagecodecs.deflate_crc32(chunk[:-4])
 
 
 def open_image(path: Path) -> oiio.ImageInput:

@@ -9,7 +9,7 @@ noise. On bare skin a small error proves little, but a large one always shows (S
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -41,33 +41,43 @@ GRAINS = 7  # every n-th pixel counts for the typical grain of all views
 
 @dataclass(frozen=True)
 class Picture:
-    """One camera's picture; full size is read when needed, as all cameras' would take a gigabyte.
+    """One camera's picture; of the full size only what counts, as all would take a gigabyte.
 
     Attributes:
         camera: pinhole, of the full size.
         small: camera, frame (h, w, 3) and matte (h, w), uint8, as they are compared.
+        box: rows and columns of the full size about the matte.
+        grey, alpha: frame and matte (h, w), uint8, in this box.
         grains: (N,) `grain` at some pixels of the matte.
         edge_px: width of its sharpest edges at the small size, NaN with too few: how blurred it is.
-        read: returns frame (H, W, 3) and matte (H, W), uint8.
     """
 
     camera: Camera
     small: tuple[Camera, np.ndarray, np.ndarray]
+    box: tuple[slice, slice]
+    grey: np.ndarray
+    alpha: np.ndarray
     grains: np.ndarray
     edge_px: float
-    read: Callable[[], tuple[np.ndarray, np.ndarray]]
+
+    @property
+    def matte(self) -> np.ndarray:
+        """Return the matte (H, W) uint8 in the full size."""
+        found = np.zeros((self.camera.height, self.camera.width), np.uint8)
+        found[self.box] = self.alpha
+        return found
 
 
-def picture_of(
-    camera: Camera, rgb: np.ndarray, alpha: np.ndarray,
-    read: Callable[[], tuple[np.ndarray, np.ndarray]],
-) -> Picture:  # fmt: skip
-    """Describe a frame (H, W, 3) and a matte (H, W), uint8, that `read` returns again."""
-    grains = grain(rgb, alpha > 255 * INSIDE)[::GRAINS]
+def picture_of(camera: Camera, rgb: np.ndarray, alpha: np.ndarray) -> Picture:
+    """Describe a frame (H, W, 3) and a matte (H, W), uint8."""
+    box = box_about(alpha, WINDOW)
+    grey = cv2.cvtColor(np.ascontiguousarray(rgb[box]), cv2.COLOR_RGB2GRAY)
+    grains = grain(grey, alpha[box] > 255 * INSIDE)[::GRAINS]
     small = reduced(camera, rgb, alpha, COMPARED_SIDE)
     part = np.ascontiguousarray(small[1][box_about(small[2] > 255 * INSIDE)])
     edge = edge_width(part) if part.size else None
-    return Picture(camera, small, grains, np.nan if edge is None else edge, read)
+    edge_px = np.nan if edge is None else edge
+    return Picture(camera, small, box, grey, alpha[box].copy(), grains, edge_px)
 
 
 @dataclass(frozen=True)
@@ -165,15 +175,15 @@ def surface_maps(
     photo = photo_errors(shots)
     common = common_figures(surface, pictures, photo)
     for picture, errors in zip(pictures, photo, strict=True):
-        camera, (rgb, alpha) = picture.camera, picture.read()
-        seen = cast_window(surface, scene, camera, alpha, apart)
+        camera = picture.camera
+        seen = cast_window(surface, scene, camera, picture.matte, apart)
         valid = seen.whole(seen.valid)
         figures = {
             **seen.figures,
             **common,
             "photo": smoothed_errors(errors, valid, WINDOW),
             "photo_wide": smoothed_errors(errors, valid, 3 * WINDOW),
-            "grain": grain(rgb, valid),
+            "grain": grain(picture.grey, valid[picture.box]),
         }
         shared = 1e3 * HEAD_SIZE_SPREAD * seen.depth[seen.valid] if len(pictures) == 1 else 0.0
         bounds = error_bounds("depth", figures, shared)
@@ -257,7 +267,7 @@ def cast_maps(
     coarse = resized(wide, width, height)
     depth, seen = cast(rays(coarse)[1])
     if step > 1:
-        known, steep = depth > 0, jumps(coarse, depth) > FLAT
+        known, steep = depth > 0, jumps(coarse, depth) > 2 * FLAT
         depth, seen = (_enlarged(values, wide, cv2.INTER_LINEAR) for values in (depth, seen))
         known, steep = (_enlarged(mask, wide, cv2.INTER_NEAREST) for mask in (known, steep))
         box = np.s_[: camera.height, : camera.width]
@@ -265,7 +275,8 @@ def cast_maps(
         y, x = np.nonzero(steep[box] & (alpha > INSIDE))
         pixels = cell_to_corner(np.stack([x, y], 1))
         depth[y, x], seen[y, x] = cast(unproject(camera, pixels, np.ones(len(x))) - camera.center)
-    seen = seen[_inside(depth, alpha)]
+    # By flat indices: in a fifth of a mask's time.
+    seen = seen.reshape(-1, seen.shape[2]).take(np.flatnonzero(_inside(depth, alpha)), axis=0)
     return make_maps(camera, alpha, depth, seen[:, :3], seen[:, 3], seen[:, 4])
 
 
@@ -303,7 +314,7 @@ def make_maps(
     cosine /= np.sqrt(1 + across * across + down * down)
     depth = np.where(valid, depth, 0).astype(np.float32)
     turned = np.zeros((*depth.shape, 3), np.float32)
-    turned[valid] = known
+    turned.reshape(-1, 3)[y * depth.shape[1] + x] = known
     return DepthMaps(
         depth=depth,
         valid=valid,
@@ -341,7 +352,7 @@ def roughness(normals: np.ndarray) -> np.ndarray:
 
 def has_normal(normals: np.ndarray) -> np.ndarray:
     """Mark the pixels (H, W) whose normal (H, W, 3) is not 0; `any` takes ten times as long."""
-    return np.einsum("hwi,hwi->hw", normals, normals) > 0
+    return cv2.inRange(normals, (0, 0, 0), (0, 0, 0)) == 0
 
 
 def jumps(camera: Camera, depth: np.ndarray) -> np.ndarray:
@@ -416,15 +427,15 @@ def _difference(colour: np.ndarray, points: np.ndarray, other: ComparedView) -> 
     return found
 
 
-def grain(rgb: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Measure how much a picture (H, W, 3) uint8 varies around the N pixels of a mask: (N,).
+def grain(grey: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Measure how much a picture (H, W) uint8 varies around the N pixels of a mask: (N,).
 
     It is the deviation within a window over the light. Hair varies, whose strands no surface
     follows.
     """
     box = box_about(mask, WINDOW)
-    grey = cv2.cvtColor(np.ascontiguousarray(rgb[box]), cv2.COLOR_RGB2GRAY).astype(np.float32)
-    mean, variance = (values[mask[box]] for values in local_moments(grey, WINDOW))
+    moments = local_moments(grey[box].astype(np.float32), WINDOW)
+    mean, variance = (values[mask[box]] for values in moments)
     return (1 + np.sqrt(variance)) / (DARK + mean)
 
 

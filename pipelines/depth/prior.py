@@ -11,8 +11,8 @@ import numpy as np
 import open3d as o3d
 from scipy.spatial import cKDTree
 
-from express50.files.images import disc
-from express50.geometry.cameras import inside_frame, rays
+from express50.files.images import disc, shrunk_size
+from express50.geometry.cameras import inside_frame, rays, resized
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.meshes import open_edges
 from express50.geometry.raycast import camera_rays, join_rays, mesh_scene
@@ -32,6 +32,7 @@ BORDER = 0.03  # metres from the mesh's open border, where collars are, over whi
 BODY = 0.5  # metres that the body continues below the neck, and widens; shoulders are nearer
 EYES_M = 0.03  # metres from glasses within which the head is trusted, whatever the hull
 WORN_M = 0.004  # radius about a place on glasses that shows glasses, or what is behind them
+OUTLINE_SIDE = 512  # longest side, pixels, of the body's outlines: they count at the first level
 NECK = 0.08  # metres; an open border larger than this is a neck, not an eye or a nostril
 # 26 directions to the neighbours of a cell, the axes first: a mesh hides most points along these.
 _CELL: np.ndarray = (
@@ -95,13 +96,16 @@ class TrackedSolid:
         return merged
 
     def outlines(self, views: Sequence[DepthView]) -> list[DepthView]:
-        """Replace the views' mattes by the body's own."""
-        masks = [self.body.test_occlusions(camera_rays(v.camera), nthreads=1) for v in views]
-        alphas = [mask.numpy().astype(np.float32) for mask in masks]
-        return [
-            replace(view, alpha=alpha, silhouette_px=silhouette_distance(alpha))
-            for view, alpha in zip(views, alphas, strict=True)
-        ]
+        """Replace the views by small ones without colours, whose mattes are the body's own."""
+        found = []
+        for view in views:
+            size = shrunk_size(view.camera.width, view.camera.height, OUTLINE_SIDE)
+            camera = resized(view.camera, *size)
+            mask = self.body.test_occlusions(camera_rays(camera), nthreads=1).numpy()
+            alpha = mask.astype(np.float32)
+            rgb = np.zeros((*alpha.shape, 3), np.uint8)
+            found.append(DepthView(camera, rgb, alpha, silhouette_distance(alpha)))
+        return found
 
     def without_glasses(self, views: Sequence[DepthView]) -> Sequence[DepthView]:
         """Clear the mattes where views show glasses; the silhouettes stay."""

@@ -287,16 +287,17 @@ def view_weights(views: Sequence[DepthView], mesh: HeadMesh, lift: float) -> np.
 
     A vertex counts as seen if the point ``lift`` metres above it is.
     """
-    vertices, normals, _ = mesh
+    vertices, normals = mesh.vertices, mesh.normals.astype(np.float32)
     scene = mesh_scene(vertices, mesh.faces)
     weights = np.zeros((len(views), len(vertices)), np.float32)
     for row, view in zip(weights, views, strict=True):
-        towards = unit(view.camera.center - vertices)
-        cosine = (normals * towards).sum(1)
+        towards = (view.camera.center - vertices).astype(np.float32)
+        towards /= np.sqrt(np.einsum("vi,vi->v", towards, towards))[:, None]
+        cosine = np.einsum("vi,vi->v", normals, towards)
         pixels, depth = project_fast(view.camera, vertices)
         seen = (cosine > GRAZING) & in_picture(view.camera, pixels, depth, inset=2)
         seen[seen] = bilinear(view.alpha, pixels[seen]) > 0.9
-        rays = join_rays((vertices + lift * (normals + towards))[seen], towards[seen])
+        rays = join_rays(vertices[seen] + lift * (normals + towards)[seen], towards[seen])
         seen[seen] = ~scene.test_occlusions(rays, nthreads=1).numpy()
         row[seen] = cosine[seen]
     return weights
@@ -318,12 +319,13 @@ def _correlate(
     count = patch.shape[1]
     total = np.zeros((*line.shape[:2], count), np.float32)
     own = np.zeros(line.shape[:2], np.float32)
+    mean = np.full(count, 1 / count, np.float32)
     for view, grey, weight in zip(views, greys, weights, strict=True):
         seen = weight > 0
         if not seen.any():
             continue
         z = _patch_values(view, grey, line[seen], patch[seen])
-        z -= z.mean(-1, keepdims=True)
+        z -= (z @ mean)[..., None]
         power = np.einsum("ndp,ndp->nd", z, z)
         share = weight[seen, None] / np.sqrt(power + count * noise * noise)
         total[seen] += z * share[..., None]
@@ -335,19 +337,20 @@ def _correlate(
 def _patch_values(
     view: DepthView, grey: np.ndarray, line: np.ndarray, patch: np.ndarray
 ) -> np.ndarray:
-    """Interpolate a view (H, W) at patches: (n, D, P). They are small: affine within one."""
+    """Interpolate a view (H, W) at patches: (n, D, P).
+
+    They are small: one is pictured alike, by an affine map, all along its line.
+    """
     M = (view.camera.K @ view.camera.cam_from_world[:3, :3]).astype(np.float32)
     # Vertices come last, for long inner loops.
     center = ((line - view.camera.center).astype(np.float32) @ M.T).T[:, :, None]  # (3, D, 1, n)
-    along = np.ascontiguousarray((patch @ M.T).T)[:, None]  # (3, 1, P, n)
+    along = np.ascontiguousarray((patch @ M.T).T)  # (3, P, n)
     inverse = 1 / np.maximum(center[2], np.float32(1e-6))
+    middle = len(inverse) // 2
     maps = []
     for axis in range(2):
-        middle = center[axis] * inverse
-        place = middle * along[2]
-        np.subtract(along[axis], place, out=place)
-        place *= inverse
-        place += corner_to_cell(middle)
-        maps.append(place.reshape(-1, len(patch)))
+        place = center[axis] * inverse
+        shape = (along[axis] - place[middle] * along[2]) * inverse[middle]  # (P, n)
+        maps.append((corner_to_cell(place) + shape).reshape(-1, len(patch)))
     found = cv2.remap(grey, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.ascontiguousarray(found.reshape(place.shape).transpose(2, 0, 1))
+    return np.ascontiguousarray(found.reshape(-1, *along.shape[1:]).transpose(2, 0, 1))

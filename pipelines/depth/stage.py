@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -116,11 +115,10 @@ def read_views(
     pictures: list[Picture] = []
     dropped = []
     for camera_id, camera in read_cameras_of(dataset, item.split("/")[0]).items():
-        read = partial(read_matted_frame, dataset, item, camera)
         try:
-            rgb, alpha = read()
+            rgb, alpha = read_matted_frame(dataset, item, camera)
             views.append(make_view(camera, rgb, cv2.LUT(alpha, SHARE_OF_LEVEL), image_side))
-            pictures.append(picture_of(camera, rgb, alpha, read))
+            pictures.append(picture_of(camera, rgb, alpha))
         except (CaptureError, FormatError, StageError) as error:
             dropped.append(Note(camera_id, str(error)))
     views, contradicting = without_contradiction(views)

@@ -136,7 +136,9 @@ def rim_targets(views: Sequence[DepthView], grid: LevelSet, depth_range: float) 
 
     The grid's distance there is the displacement that the surface lacks.
     """
-    steps = np.arange(-0.5, 0.5, 1.5 * grid.voxel / depth_range) * depth_range
+    step = 1.5 * grid.voxel
+    # The distance is smooth: every fourth step tells about which place to try all.
+    steps = np.arange(-0.5 * depth_range, 0.5 * depth_range, 4 * step), step * np.arange(-3, 4)
     middle = grid.points((np.array(grid.shape) - 1) / 2)
     found = []
     for view in views:
@@ -153,9 +155,13 @@ def rim_targets(views: Sequence[DepthView], grid: LevelSet, depth_range: float) 
         pixels = cell_to_corner(np.stack([x - dx * scale, y - dy * scale], axis=1))
         depths = (view.camera.cam_from_world[:3, :3] @ middle)[2] + view.camera.cam_from_world[2, 3]
         ray = unproject(view.camera, pixels, np.ones(len(x))) - view.camera.center
-        points = view.camera.center + ray[:, None] * (depths + steps)[None, :, None]
-        best = grid.sample(points.reshape(-1, 3)).reshape(len(x), -1).argmin(1)
-        found.append(points[np.arange(len(x)), best])
+        best = np.full(len(x), depths)
+        for about in steps:
+            tried = best[:, None] + about
+            points = view.camera.center + ray[:, None] * tried[..., None]
+            least = grid.sample(points.reshape(-1, 3)).reshape(tried.shape).argmin(1)
+            best = tried[np.arange(len(x)), least]
+        found.append(view.camera.center + ray * best[:, None])
     return np.concatenate(found) if found else np.zeros((0, 3))
 
 

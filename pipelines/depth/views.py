@@ -24,6 +24,7 @@ FULL = 0.98  # share above which a matte cuts nothing out
 SPECK = 0.01  # share of a matte's largest part below which other parts are dropped
 HOLE = 0.05  # share of the matte up to which a hole in it is filled
 UPSAMPLE = 3  # times that a matte is enlarged before distances to its outline are measured
+ENLARGED_PX = 16  # up to so far around it; further away, a pixel's error does not matter
 UNSEEN = 1.0  # metres; the distance given to space that too few cameras see
 BOX_CELLS = 40  # along the sides of the box in which the hull is looked for
 VOTERS = 5  # fewest views of which one can be outvoted
@@ -100,24 +101,27 @@ def repaired_matte(alpha: np.ndarray) -> np.ndarray:
 def silhouette_distance(alpha: np.ndarray) -> np.ndarray:
     """Measure the signed distance (H, W) float32, pixels, positive inside, to alpha's 0.5 contour.
 
-    The matte is enlarged first, so that the contour keeps the matte's subpixel position.
+    Near the contour, the matte is enlarged first, so that it keeps the matte's subpixel position.
     Pixels beyond the image are unknown, not empty: a head cut by the border stays inside there.
     """
-    height, width = alpha.shape
-    size = (width * UPSAMPLE, height * UPSAMPLE)
-    large = cv2.resize(alpha.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
-    mask = (large > INSIDE).astype(np.uint8)
-    # Distances are to pixel centres across the contour: half a pixel too long on either side.
-    signed = cv2.distanceTransform(1 - mask, cv2.DIST_L2, cv2.DIST_MASK_5)
-    np.subtract(0.5, signed, out=signed)
-    box = box_about(mask, 1)
-    part = np.ascontiguousarray(mask[box])
-    inside = cv2.distanceTransform(part, cv2.DIST_L2, cv2.DIST_MASK_5)
-    signed[box] = np.where(part > 0, inside - 0.5, signed[box])
-    signed /= UPSAMPLE
-    limit = float(width + height)  # a matte without a contour is infinitely far from one
-    np.clip(signed, -limit, limit, out=signed)
-    return cv2.resize(signed, (width, height), interpolation=cv2.INTER_AREA)
+    signed = _mask_distance(alpha > INSIDE)
+    box = box_about(alpha > INSIDE, ENLARGED_PX)
+    part = alpha[box].astype(np.float32)
+    large = cv2.resize(part, None, fx=UPSAMPLE, fy=UPSAMPLE, interpolation=cv2.INTER_LINEAR)
+    fine = _mask_distance(large > INSIDE) / UPSAMPLE
+    signed[box] = cv2.resize(fine, part.shape[::-1], interpolation=cv2.INTER_AREA)
+    limit = float(sum(alpha.shape))  # a matte without a contour is infinitely far from one
+    return np.clip(signed, -limit, limit)
+
+
+def _mask_distance(mask: np.ndarray) -> np.ndarray:
+    """Measure the signed distance (H, W) of each pixel to a mask's edge, positive inside."""
+    outside, inside = (
+        cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+        for part in (~mask, mask)
+    )
+    # Distances are to pixel centres across the edge: half a pixel too long on either side.
+    return np.where(mask, inside - np.float32(0.5), np.float32(0.5) - outside)
 
 
 def project_fast(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -273,7 +273,7 @@ def subject_region(difference: np.ndarray, size: int) -> np.ndarray:
         (smooth > 2.2).astype(np.uint8), connectivity=8
     )
     sure = np.zeros(count, bool)
-    sure[np.unique(labels[smooth > HIGH])] = True
+    sure[labels[smooth > HIGH]] = True
     sure[0] = False
     if not sure.any():
         return np.zeros(difference.shape, bool)

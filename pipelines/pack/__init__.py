@@ -118,7 +118,7 @@ def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> Result:
 
 ENCODE = Stage(
     name="encode",
-    version=3,
+    version=4,
     config=EncodeConfig,
     presets=ENCODE_PRESETS,
     items=included,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -232,7 +231,7 @@ def test_two_runs_give_the_same_surface(surface, views):
 def test_confidence_separates_good_depth_from_bad(surface, shots):
     mattes = [np.rint(alpha * 255).astype(np.uint8) for _, _, alpha, _ in shots]
     pictures = [
-        picture_of(camera, rgb, matte, partial(tuple, (rgb, matte)))
+        picture_of(camera, rgb, matte)
         for (camera, rgb, _, _), matte in zip(shots, mattes, strict=True)
     ]
     views = surface_maps(replace(surface, grid=None), pictures)  # as published, without the grid

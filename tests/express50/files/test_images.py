@@ -5,6 +5,7 @@ import struct
 import zlib
 
 import cv2
+import imagecodecs
 import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
@@ -75,6 +76,30 @@ def test_a_picture_below_our_limit_is_read_without_a_warning():
     png = small[:12] + head + struct.pack(">I", zlib.crc32(head)) + small[33:]
     with pytest.raises(CaptureError, match="damaged image"):
         decode_picture(png, "big")
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (7, 5), (9, 4, 3), (6, 3, 4)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_own_png_is_decoded_as_libpng_does(shape, dtype):
+    image = RNG.integers(0, np.iinfo(dtype).max, shape, dtype, endpoint=True)
+    data = images.encode_png(image)
+    found = images._own_png(data, shape)
+    assert found.dtype == dtype and found.flags.writeable
+    np.testing.assert_array_equal(found, image)
+    np.testing.assert_array_equal(found, imagecodecs.png_decode(data))
+
+
+def test_png_that_is_damaged_or_not_our_own_is_left_to_libpng(tmp_path):
+    image = (RNG.random((9, 8, 3)) * 255).astype(np.uint8)
+    data = images.encode_png(image)
+    for place in range(24, len(data)):
+        damaged = bytearray(data)
+        damaged[place] ^= 4
+        assert images._own_png(bytes(damaged), image.shape) is None
+    other = imagecodecs.png_encode(image, level=5)
+    assert images._own_png(other, image.shape) is None
+    (tmp_path / "a.png").write_bytes(other)
+    np.testing.assert_array_equal(images.read_image(tmp_path / "a.png"), image)
 
 
 def test_jpeg_keeps_colour_order_and_png_alpha():
