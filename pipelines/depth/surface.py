@@ -33,6 +33,7 @@ from pipelines.depth.views import DepthView
 OUTLIER_STEPS = 2.0  # steps of offsets from the neighbours at which a match counts as a quarter
 LEAST_VOXELS = 1e-3  # voxels; smaller distances are raised to this before meshing
 STIFFNESS_VOXELS = 2.2  # length below which a thin plate smooths displacements
+RIM_STEP_M = 0.01  # along a silhouette's ray; a nose is no narrower
 COUPLINGS = (1e3, 3e3, 1e4, 2e4)  # per square metre; a gap of 10 mm costs 0.1 at first, 2 at last
 
 
@@ -137,8 +138,10 @@ def rim_targets(views: Sequence[DepthView], grid: LevelSet, depth_range: float) 
     The grid's distance there is the displacement that the surface lacks.
     """
     step = 1.5 * grid.voxel
-    # The distance is smooth: every fourth step tells about which place to try all.
-    steps = np.arange(-0.5 * depth_range, 0.5 * depth_range, 4 * step), step * np.arange(-3, 4)
+    # The distance is smooth: some of the steps tell about which place to try all.
+    some = int(np.clip(RIM_STEP_M / step, 1, 4))
+    ends = 0.5 * depth_range
+    steps = np.arange(-ends, ends, some * step), step * np.arange(1 - some, some)
     middle = grid.points((np.array(grid.shape) - 1) / 2)
     found = []
     for view in views:
