@@ -51,7 +51,11 @@ class FormatError(Express50Error):
     """A file does not follow its format."""
 
 
-class DiskFullError(Express50Error):
+class DiskError(Express50Error):
+    """The dataset's disk cannot be written to; finished work is kept."""
+
+
+class DiskFullError(DiskError):
     """The disk is full, or a quota on it is used up; finished work is kept."""
 
 

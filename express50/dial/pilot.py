@@ -25,7 +25,7 @@ from express50.contract.stage import Stage, typical_error
 from express50.dial.budget import Clock
 from express50.dial.figures import Cost, PilotFigures, Trial, footage_of, trial_of
 from express50.dial.results import RESULTS, ResultKind, differences, whole_peaks
-from express50.errors import ConfigError, DiskFullError, Express50Error, FormatError, StageError
+from express50.errors import ConfigError, DiskError, Express50Error, FormatError, StageError
 from express50.files.atomic import link_file, write_json
 from express50.files.digests import files_of, value_digest
 from express50.files.text import read_json_table
@@ -126,7 +126,7 @@ class Pilot:
             self.clock.expect(0.0 if before is None else _item_seconds(self, before), until=until)
             try:
                 cost, why = self._run(stage, dataset, config, anew=source is not None)
-            except (ConfigError, DiskFullError):
+            except (ConfigError, DiskError):
                 raise
             except Express50Error as error:  # an earlier stage made nothing, perhaps
                 cost, why = None, str(error)

@@ -19,10 +19,19 @@ from typing import BinaryIO
 
 from rich.filesize import decimal
 
-from express50.errors import ConfigError, DiskFullError
+from express50.errors import ConfigError, DiskError, DiskFullError
 
 LEAST_FREE = 100e6  # bytes; a disk with less free space counts as full
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # Linux constants
+BROKEN = {
+    errno.EIO,
+    errno.EROFS,
+    errno.ESTALE,
+    errno.ENXIO,
+    errno.ENODEV,
+    errno.EACCES,
+    errno.EPERM,
+}
 FORMER = ".former"  # suffix of a folder that was moved out of the way
 
 
@@ -88,6 +97,27 @@ def check_folder_writable(folder: Path) -> None:
             pass
     except OSError as error:  # its own name is one that nobody has given
         raise OSError(error.errno, error.strerror, str(folder)) from None
+
+
+def check_disk(folder: Path, name: Path) -> None:
+    """Refuse a disk that broke, or became read-only, after a run began; nothing is left on it.
+
+    A folder that is gone is not the disk's fault. ``name`` is what the error names.
+
+    Raises:
+        DiskError: the disk of the folder refuses to be written to.
+    """
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(b"1")
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        if error.errno in BROKEN:
+            raise DiskError(
+                f"{name}: its disk cannot be written to ({error.strerror}); repair that and run the"
+                " same command again; finished work is kept"
+            ) from error
 
 
 def check_file_writable(path: Path) -> None:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-from express50.errors import DiskFullError, StageError
+from express50.errors import DiskError, StageError
 from express50.runner.clusters import GPU, LocalWorkers, RemoteWorkers, cuda_devices, no_gpu
 from express50.runner.ledger import Receipt
 from express50.runner.slurm import SlurmJob, SlurmWorkers, check_job_gpu
@@ -86,7 +86,7 @@ class Pool:
         Raises:
             StageError: the scheduler cannot be reached or went away, or offers no GPU that the
                 stage needs.
-            DiskFullError: there is no room for an item's outputs.
+            DiskError: the disk has no room for an item's outputs, or cannot be written to.
         """
         tasks = list(tasks)
         here = self.scheduler is None and self.slurm is None
@@ -131,7 +131,7 @@ class Pool:
         from distributed.scheduler import KilledWorker
 
         waiting, killed, size = deque(tasks), [], 1
-        full: DiskFullError | None = None
+        full: DiskError | None = None
         name, gpu = tasks[0].stage.name, tasks[0].stage.needs_gpu(tasks[0].config)
         resources = {GPU: 1} if gpu else None
         running: dict[Any, list[Task]] = {}
@@ -155,7 +155,7 @@ class Pool:
                 ended = _ended(workers.client, running)
             for future, receipts, failure in ended:
                 batch = running.pop(future)
-                if isinstance(failure, DiskFullError):
+                if isinstance(failure, DiskError):
                     full = failure
                 elif isinstance(failure, KilledWorker):
                     killed += batch

@@ -60,8 +60,11 @@ def run_folder(dataset: Dataset, stage: str) -> Iterator[Path]:
         with naming_full_disk(dataset.root):
             _reserve(dataset, stage).write_bytes(os.urandom(RESERVE_BYTES))  # zeros may be no space
         yield folder
-    finally:
-        clean_leftovers(dataset, stage)
+    except BaseException:
+        with suppress(OSError):  # of a full or broken disk: the first error says so
+            clean_leftovers(dataset, stage)
+        raise
+    clean_leftovers(dataset, stage)
 
 
 @contextmanager

@@ -188,7 +188,7 @@ def run_stage(
 
     Raises:
         StageError: the stage has no items, or another run holds it.
-        DiskFullError: the dataset's disk is nearly full.
+        DiskError: the dataset's disk is nearly full, or can no longer be written to.
         NotReadyError: it has no room for the items, as far as some were measured.
     """
     started = time.perf_counter()

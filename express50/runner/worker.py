@@ -22,8 +22,8 @@ from express50.console import system_error_line
 from express50.contract.config import config_texts
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
-from express50.errors import CaptureError, DiskFullError, Express50Error, StageError
-from express50.files.atomic import dump_json, naming_full_disk, write_bytes
+from express50.errors import CaptureError, DiskError, DiskFullError, Express50Error, StageError
+from express50.files.atomic import check_disk, dump_json, naming_full_disk, write_bytes
 from express50.files.digests import files_of, value_digest
 from express50.runner.ledger import FileMark, Made, Receipt, mark_file
 from express50.runner.publish import empty, keeping, publishing, restore
@@ -103,13 +103,13 @@ def failed_receipt(task: Task, reason: str, attempts: int) -> Receipt:
 def run_tasks(tasks: list[Task]) -> list[Receipt]:
     """Run items in turn for a while; returns the receipts of those begun, at least one.
 
-    If the disk is full, those made before are returned, and the next call says so.
+    If the disk is full or broken, those made before are returned, and the next call says so.
     """
     began, receipts = time.perf_counter(), []
     for task in tasks:
         try:
             receipts.append(run_task(task))
-        except DiskFullError:
+        except DiskError:
             if not receipts:
                 raise
             break
@@ -125,7 +125,7 @@ def run_task(task: Task) -> Receipt:
     instead. Only a receipt travels back to the driver, never data.
 
     Raises:
-        DiskFullError: the disk has no room for the outputs; other items would fail as well.
+        DiskError: the disk is full or cannot be written to; other items would fail as well.
     """
     where = task.folder, task.dataset, task.stage.name, task.item
     if (restored := restore(*where, task.fingerprint, task.former)) is not None:
@@ -146,6 +146,7 @@ def run_task(task: Task) -> Receipt:
             raise
         return run_task(task)  # with the space that deleting replaced outputs gave
     except Exception as error:  # noqa: BLE001 (a defect that one item shows must not stop others)
+        check_disk(task.dataset.staging_dir, task.dataset.root)
         reason = failure_reason(task.dataset, task.stage.name, task.item, error)
     return Receipt(
         stage=task.stage.name,

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import errno
 import functools
 import logging
 import os
@@ -21,7 +22,7 @@ import pytest
 from express50.cli.status import read_status
 from express50.contract.config import field_documents
 from express50.contract.stage import ExpectedError, Note
-from express50.errors import CaptureError, ConfigError, DiskFullError, StageError
+from express50.errors import CaptureError, ConfigError, DiskError, DiskFullError, StageError
 from express50.runner import publish
 from express50.runner.clusters import RemoteWorkers
 from express50.runner.executor import Pool
@@ -311,6 +312,30 @@ def test_a_full_disk_stops_the_stage(tmp_path, workers):
     # With two workers the item before is still being computed when the disk turns out to be full.
     assert again["full1"] == "done" and (workers or again["a"] == "skipped")
     assert set(again.values()) <= {"done", "skipped"}
+
+
+@pytest.mark.parametrize("trouble", [errno.EIO, errno.EROFS])
+def test_a_disk_that_breaks_stops_the_stage(tmp_path, monkeypatch, trouble):
+    dataset = make_dataset(tmp_path / "data", ["a", "b", "c"])
+    sync, broken, tried = os.fsync, [], []
+
+    def run(data, item, config, out):
+        tried.append(item)
+        broken.extend(["b"] * (item == "b"))
+        return toy.STAGE.run(data, item, config, out)
+
+    def fsync(descriptor):
+        if broken:
+            raise OSError(trouble, os.strerror(trouble))
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    stage = dataclasses.replace(toy.STAGE, run=run)
+    with pytest.raises(DiskError, match=f"cannot be written to .{os.strerror(trouble)}"):
+        run_toy(dataset, stage=stage)
+    assert tried == ["a", "b"] and receipts(dataset)["a"].status == "done"
+    broken.clear()
+    assert statuses(run_toy(dataset)) == {"a": "skipped", "b": "done", "c": "done"}
 
 
 def test_a_nearly_full_disk_stops_before_an_item_is_computed(tmp_path, monkeypatch):
