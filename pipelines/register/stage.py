@@ -86,7 +86,8 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
     elif sure is not None and sure < AGREEING:
         why = (
             f"cameras agree on bare skin by {sure:.2f}, expected {AGREEING} or more, so the mesh"
-            " stays near the track: check calibration and synchronisation"
+            " stays near the track: check calibration and synchronisation; cameras that stand far"
+            " apart or see a small head agree less, too"
         )
         warnings.append(Note(expression, why))
     expected = bounds.expected
