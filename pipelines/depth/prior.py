@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -33,6 +33,7 @@ BODY = 0.5  # metres that the body continues below the neck, and widens; shoulde
 EYES_M = 0.03  # metres from glasses within which the head is trusted, whatever the hull
 WORN_M = 0.004  # radius about a place on glasses that shows glasses, or what is behind them
 OUTLINE_SIDE = 512  # longest side, pixels, of the body's outlines: they count at the first level
+FACE = ("face", "nose", "lips", "left_eye_region", "right_eye_region")  # but for the forehead
 NECK = 0.08  # metres; an open border larger than this is a neck, not an eye or a nostril
 # 26 directions to the neighbours of a cell, the axes first: a mesh hides most points along these.
 _CELL: np.ndarray = (
@@ -47,7 +48,8 @@ class TrackedSolid:
 
     `body` continues below large holes, because silhouettes of a torso are not those of a head.
     `glasses` are places (n, 3) all over frames and lenses, `face_views` are those of a face with
-    things in front of it.
+    things in front of it. `bare` (F,) marks the triangles of a face without: it is trusted however
+    far above it the hull lies, as it does over cheeks if views are few or far apart.
     """
 
     scene: o3d.t.geometry.RaycastingScene
@@ -57,6 +59,7 @@ class TrackedSolid:
     high: np.ndarray
     glasses: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     face_views: tuple[FaceView, ...] = ()
+    bare: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
 
     @cached_property
     def bare_px(self) -> list[np.ndarray]:
@@ -135,9 +138,12 @@ class TrackedSolid:
         near = np.clip(2.0 - height / REACH, 0, 1)
         if len(self.glasses):
             near[cKDTree(self.glasses).query(points)[0] < EYES_M] = 1
+        query = o3d.core.Tensor(np.ascontiguousarray(points, np.float32))
+        if self.bare.any():
+            nearest = self.scene.compute_closest_points(query, nthreads=1)["primitive_ids"].numpy()
+            near[np.append(self.bare, False)[np.minimum(nearest, len(self.bare))]] = 1
         if self.border is None:
             return near
-        query = o3d.core.Tensor(np.ascontiguousarray(points, np.float32))
         edge = self.border.compute_distance(query, nthreads=1).numpy()
         return near * np.clip(edge / BORDER - 1.0, 0, 1)
 
@@ -181,6 +187,13 @@ def close_mesh(vertices: np.ndarray, faces: np.ndarray) -> TrackedSolid:
         solid += [wall[:, :3], wall[:, [0, 2, 3]], _fan(row, first + len(loop))]
     body = mesh_scene(np.concatenate(points), np.concatenate(solid))
     return TrackedSolid(scene, border, body, low, high)
+
+
+def bare_triangles(faces: np.ndarray, regions: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Mark the triangles (F, 3) of the face, (F,), by the vertices (V,) of a model's regions."""
+    none = np.zeros(faces.max() + 1, bool)
+    face = np.any([regions.get(name, none) for name in FACE], axis=0)
+    return (face & ~regions.get("forehead", none))[faces].all(1)
 
 
 def _fan(loop: np.ndarray, middle: int) -> np.ndarray:

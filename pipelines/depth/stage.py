@@ -28,7 +28,7 @@ from pipelines.depth.maps import (
     picture_of,
     surface_maps,
 )
-from pipelines.depth.prior import TrackedSolid, close_mesh, matte_agreement
+from pipelines.depth.prior import TrackedSolid, bare_triangles, close_mesh, matte_agreement
 from pipelines.depth.reconstruct import reconstruct, tracked_surface
 from pipelines.depth.surface import HeadSurface
 from pipelines.depth.views import DepthView, make_view, without_contradiction
@@ -147,7 +147,10 @@ def read_tracked(
     head = make_head(vertices, track.R[track.row(expression)], head_labels(model))
     found = face_views(head, [(view.camera, view.rgb, view.alpha) for view in views])
     solid, glasses = close_mesh(vertices, faces), track.glasses_in(expression)
-    solid = replace(solid, face_views=tuple(found))
+    if found:
+        solid = replace(solid, face_views=tuple(found))
+    else:
+        solid = replace(solid, bare=bare_triangles(faces, model.regions))
     if glasses is not None:
         solid = replace(solid, glasses=glasses)
     return solid, {

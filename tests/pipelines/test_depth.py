@@ -12,7 +12,7 @@ from express50.geometry.cameras import rays, unproject
 from express50.geometry.raycast import mesh_scene
 from pipelines.depth.blocks import build
 from pipelines.depth.maps import cast_maps, picture_of, surface_maps
-from pipelines.depth.prior import boundary_loops, close_mesh, matte_agreement
+from pipelines.depth.prior import bare_triangles, boundary_loops, close_mesh, matte_agreement
 from pipelines.depth.reconstruct import reconstruct
 from pipelines.depth.stage import write_meshes
 from pipelines.depth.surface import advance, extract_mesh
@@ -156,6 +156,21 @@ def test_what_glasses_hide_is_not_compared_and_the_head_is_believed_behind_them(
     points, height = np.array([[0, 0, 0.12], [0, 0.12, 0]]), np.full(2, 0.05)
     assert bare.trust(points, height).tolist() == [0, 0]
     assert worn.trust(points, height).tolist() == [1, 0]
+
+
+def test_a_bare_face_is_believed_however_far_above_it_the_hull_lies():
+    vertices, faces = mesh()
+    front, up = vertices[:, 2] > 0.05, vertices[:, 1] > 0.05
+    bare = bare_triangles(faces, {"face": front, "forehead": up})
+    assert 0 < bare.sum() < (front & ~up)[faces].any(1).sum()
+    assert not bare_triangles(faces, {}).any()
+    solid = replace(close_mesh(vertices, faces), bare=bare)
+    points, height = np.array([[0, 0, 0.2], [0, 0.2, 0.06], [0, 0, -0.2]]), np.full(3, 0.1)
+    assert solid.trust(points, height).tolist() == [1, 0, 0]
+    open_behind = faces[(vertices[faces][:, :, 2] > -0.05).all(1)]
+    solid = close_mesh(vertices, open_behind)  # its cap has triangles, which are not of the face
+    solid = replace(solid, bare=bare_triangles(open_behind, {"face": front}))
+    assert solid.trust(points, height).tolist() == [1, 0, 0]
 
 
 def test_room_before_the_face_is_carved_where_a_view_shows_it_bare(shots):
