@@ -112,7 +112,7 @@ def _own_png(data: bytes, shape: tuple[int, ...]) -> np.ndarray | None:
     kind, end = np.dtype(f">u{data[24] // 8}"), len(data) - len(PNG_END)
     length = math.prod(shape[1:]) * kind.itemsize + 1  # of a row, with its filter type
     header, body = data[12:33], data[37:end]
-    if data[26:29] != bytes(3) or data[33:37] != struct.pack(">I", len(body) - 8):
+    if data[26:29] != bytes(3) or int.from_bytes(data[33:37], "big") != len(body) - 8:
         return None
     if body[:4] != b"IDAT" or data[end:] != PNG_END or not (_intact(header) and _intact(body)):
         return None
@@ -132,7 +132,7 @@ def _own_png(data: bytes, shape: tuple[int, ...]) -> np.ndarray | None:
 
 def _intact(chunk: bytes) -> bool:
     """Return True if the kind and the data of a PNG's chunk have the checksum that follows them."""
-    return struct.unpack(">I", chunk[-4:])[0] == imagecodecs.deflate_crc32(chunk[:-4])
+    return int.from_bytes(chunk[-4:], "big") == imagecodecs.deflate_crc32(chunk[:-4])
 
 
 def open_image(path: Path) -> oiio.ImageInput:

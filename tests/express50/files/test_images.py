@@ -96,6 +96,8 @@ def test_png_that_is_damaged_or_not_our_own_is_left_to_libpng(tmp_path):
         damaged = bytearray(data)
         damaged[place] ^= 4
         assert images._own_png(bytes(damaged), image.shape) is None
+    for length in range(26, len(data)):
+        assert images._own_png(data[:length], image.shape) is None
     other = imagecodecs.png_encode(image, level=5)
     assert images._own_png(other, image.shape) is None
     (tmp_path / "a.png").write_bytes(other)
