@@ -1,13 +1,15 @@
 """Run the paper's ablations: rows trained and fitted under one budget, and one table.
 
 Finished rows are kept: a row is measured again only when its settings, the shards or the protocol
-differ from those it was measured with; a half-trained row continues from its checkpoint.
+differ from those it was measured with; a half-trained row continues from its checkpoint, and a
+half-measured one from its fits.
 """
 
 from __future__ import annotations
 
 import fnmatch
 import hashlib
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -36,7 +38,14 @@ from grmm.evaluate import (
     mean,
     training_render,
 )
-from grmm.fit import NOVEL_EXPRESSION, NOVEL_VIEW, FitProtocol, evaluate_unseen, given_views
+from grmm.fit import (
+    FITS,
+    NOVEL_EXPRESSION,
+    NOVEL_VIEW,
+    FitProtocol,
+    evaluate_unseen,
+    given_views,
+)
 from grmm.metrics import PerceptualMetrics
 from grmm.shard_source import open_shards
 from grmm.train import train
@@ -214,10 +223,12 @@ def _row(run: Ablation, name: str, variant: Variant, seed: int) -> dict:
         _train(used, folder, settings)
     loaded = load_checkpoint(folder / "checkpoint.pt", best_device())
     log(f"ablate: measuring {name}{ending}")
-    row = measure(run, replace(loaded, config=settings), used)
+    fits = path.parent / FITS
+    row = measure(run, replace(loaded, config=settings), used, fits)
     row |= {"digest": digest, "label": variant.label, "paper_db": variant.paper_db}
     row["against"] = variant.against
     write_json(path, row)
+    shutil.rmtree(fits, ignore_errors=True)  # only a stopped command needs them
     return row
 
 
@@ -242,8 +253,11 @@ def _train(used: Sequence[Path], folder: Path, settings: Config) -> None:
     train(source, load_head(source.head), folder, settings, resume=checkpoint.exists())
 
 
-def measure(run: Ablation, loaded: Checkpoint, used: Sequence[Path]) -> dict:
-    """Measure held-out views and expressions of training people, and unseen people."""
+def measure(run: Ablation, loaded: Checkpoint, used: Sequence[Path], fits: Path) -> dict:
+    """Measure held-out views and expressions of training people, and unseen people.
+
+    ``fits`` is the folder of `fit_unseen`.
+    """
     views, kind = loaded.views(open_shards(run.roots, "*")), partial(kind_of, loaded)
     judge, rows, efforts = PerceptualMetrics(loaded.config.metrics), [], []
     # Rows without a dataset train on other people, so their views cannot be compared.
@@ -257,7 +271,9 @@ def measure(run: Ablation, loaded: Checkpoint, used: Sequence[Path]) -> dict:
     source, people = run.unseen()
     strangers = loaded.views(source)
     for subject in people:
-        found, effort = evaluate_unseen(loaded, strangers, subject, run.protocol, judge)
+        found, effort = evaluate_unseen(
+            loaded, strangers, subject, run.protocol, judge, folder=fits
+        )
         rows += found
         efforts.append(effort)
     groups = {}

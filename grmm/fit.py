@@ -9,6 +9,7 @@ rates, cameras of the locality loss.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -23,10 +24,11 @@ from torch import Tensor
 
 from express50.console import figure_label, format_seconds, log
 from express50.errors import ConfigError, TrainError
-from express50.files.atomic import check_space, write_json
+from express50.files.atomic import check_space, dump_json, write_json
 from express50.geometry.sampling import evenly
 from grmm import losses
 from grmm.checkpoint import Checkpoint
+from grmm.config import as_tables
 from grmm.data import HeadView, HeadViews, Shuffle, with_codes
 from grmm.edit import HeadCodes, between, trained_head
 from grmm.evaluate import HELD_IDENTITY, Row, evaluate, mean
@@ -56,6 +58,7 @@ STAGE1_SHARE = 0.35  # of a time budget (G22)
 STAGE1_LR = 1e-2  # learning rate of the codes: they are few and start at a mean (G22)
 STAGE1_FINAL_LR = 0.1  # rate at the end of stage 1 over the rate at its start (G22)
 LOCALITY_T = 0.3  # weight of the fitted subject in the interpolation (paper, supplement)
+FITS = "unfinished_fits"  # folder that a stopped measurement continues from
 NOVEL_VIEW = f"{HELD_IDENTITY}, novel view"
 NOVEL_EXPRESSION = f"{HELD_IDENTITY}, other expression"
 
@@ -353,17 +356,18 @@ def evaluate_unseen(
     judge: PerceptualMetrics,
     keep: Callable[[int, Tensor], None] | None = None,
     among: Sequence[int] | None = None,
+    folder: Path | None = None,
 ) -> tuple[list[Row], dict[str, Any]]:
     """Fit a person from the protocol's views; rows of its other views and expressions, effort.
 
-    ``among`` are the indices to measure, by default all of the person's.
+    ``among`` are the indices to measure, by default all of the person's. ``folder`` is that of
+    `fit_unseen`.
 
     Raises:
         ConfigError: the shards hold no such views, or nothing is left to measure.
     """
     given, own = unseen_views(loaded, views, subject, protocol, among)
-    state = start(loaded, views, given)
-    effort = run_stages(state, dict)
+    state, effort = fit_unseen(loaded, views, given, folder)
     rows = []
     for kind, fitted in ((NOVEL_VIEW, True), (NOVEL_EXPRESSION, False)):
         chosen = [i for i in own if (views.keys[i].expression in state.z_exp) == fitted]
@@ -371,6 +375,30 @@ def evaluate_unseen(
         rows += evaluate(views, chosen, state.render, judge, lambda key, kind=kind: kind, keep)
     cameras = sorted({views.keys[i].camera for i in given})
     return rows, {"subject": subject, "cameras": cameras} | effort
+
+
+def fit_unseen(
+    loaded: Checkpoint, views: HeadViews, given: list[int], folder: Path | None = None
+) -> tuple[FitState, dict[str, Any]]:
+    """Fit a person to be measured at once; returns the fit and its effort.
+
+    The fit is saved in ``folder``, if one is given, and continues from there if it was stopped. It
+    is named after its inputs and settings, so another fit never continues from it.
+    """
+    state = start(loaded, views, given)
+    if folder is None:
+        return state, run_stages(state, dict)
+    made_from = inputs(state)
+    settings = as_tables(state.config)
+    settings.pop("metrics")  # a fit does not depend on how it is measured
+    name = hashlib.sha256(dump_json({"inputs": made_from, "settings": settings})).hexdigest()
+    path = folder / name[:16] / "checkpoint.pt"
+    if path.exists():
+        resume(state, path, made_from)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save = partial(save_unfinished, state, made_from=made_from)
+    keeping = partial(_kept, path, save, state.config.train.save_seconds)
+    return state, run_stages(state, dict, keeping)
 
 
 def unseen_views(

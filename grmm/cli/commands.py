@@ -6,6 +6,7 @@ Torch takes a second to import and --help must not wait for it, so handlers impo
 from __future__ import annotations
 
 import argparse
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -243,7 +244,7 @@ def evaluate(args: argparse.Namespace) -> int:
     """Measure a checkpoint on people it has codes for, and on people fitted first."""
     from express50.geometry.sampling import evenly
     from grmm.evaluate import SEEN, evaluate, kind_of, save_pictures, training_render
-    from grmm.fit import evaluate_unseen, unseen_views
+    from grmm.fit import FITS, evaluate_unseen, unseen_views
     from grmm.metrics import PerceptualMetrics
     from grmm.shard_source import ShardSource
 
@@ -270,11 +271,16 @@ def evaluate(args: argparse.Namespace) -> int:
     render = training_render(loaded.model, views)
     log(f"measuring {count(len(known), 'image')} of people with codes")
     rows = evaluate(views, known, render, judge, kind, keep)
+    fits = args.out / FITS
     for subject, chosen in unseen.items():
-        found, effort = evaluate_unseen(loaded, views, subject, protocol, judge, keep, chosen)
+        found, effort = evaluate_unseen(
+            loaded, views, subject, protocol, judge, keep, chosen, folder=fits
+        )
         log(f"{subject}: fitted from {', '.join(effort['cameras'])} in {effort['seconds']} s")
         rows += found
-    return _report(args, rows, judge)
+    code = _report(args, rows, judge)
+    shutil.rmtree(fits, ignore_errors=True)  # only a stopped command needs them
+    return code
 
 
 def _split(

@@ -82,6 +82,23 @@ def test_finished_rows_are_kept_and_changed_ones_measured_again(table, roots, mo
     assert trained == ["no_residuals"]
 
 
+def test_a_stopped_ablation_keeps_the_people_it_has_fitted(roots, tmp_path, monkeypatch):
+    def stop(*arguments):
+        raise KeyboardInterrupt
+
+    arguments = [*command(roots, tmp_path), "--rows=full"]
+    with monkeypatch.context() as patch:
+        patch.setattr("grmm.fit.evaluate", stop)
+        assert main(arguments) == 130
+    assert len(list(tmp_path.glob("full/unfinished_fits/*/checkpoint.pt"))) == 1
+    with monkeypatch.context() as patch:
+        patch.setattr("grmm.fit._finite", stop)  # no step is taken again
+        assert main(arguments) == 0
+    assert (tmp_path / "full" / "row.json").exists() and not (
+        tmp_path / "full" / "unfinished_fits"
+    ).exists()
+
+
 def test_rows_of_other_samples_are_not_replaced(tmp_path, monkeypatch):
     gone_on = []
     monkeypatch.setattr(ablate_module, "train", lambda *a, resume, **k: gone_on.append(resume))

@@ -303,6 +303,24 @@ def test_unseen_people_are_measured_in_the_views_that_are_named(checkpoint, shar
     }
 
 
+def test_a_stopped_evaluation_keeps_the_people_it_has_fitted(
+    checkpoint, shards, tmp_path, monkeypatch
+):
+    def stop(*arguments):
+        raise KeyboardInterrupt
+
+    arguments = ["evaluate", str(checkpoint), str(shards), str(tmp_path), "--subjects=S002"]
+    arguments += ["--fit-cameras=cam00", "--fit-expression=e0"]
+    with monkeypatch.context() as patch:
+        patch.setattr("grmm.fit.evaluate", stop)
+        assert main(arguments) == 130
+    assert len(list(tmp_path.glob("unfinished_fits/*/checkpoint.pt"))) == 1
+    with monkeypatch.context() as patch:
+        patch.setattr("grmm.fit._finite", stop)  # no step is taken again
+        assert main(arguments) == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["evaluation.csv", "evaluation.json"]
+
+
 def test_config_prints_settings_that_train_takes(tmp_path, capsys):
     assert main(["config", "train", "fit", "--preset=demo", "--set=train.lr=0.003"]) == 0
     printed = capsys.readouterr().out

@@ -229,6 +229,30 @@ def test_an_interrupted_fit_goes_on_and_gives_the_same_bytes(
     assert made == wanted
 
 
+def test_a_stopped_measurement_continues_its_fits(loaded, views, tmp_path, monkeypatch):
+    protocol, judge = (
+        FitProtocol(cameras=("cam00",), expression="e0"),
+        PerceptualMetrics(MetricsConfig()),
+    )
+
+    def measured(folder=None, loaded=loaded):
+        return evaluate_unseen(loaded, views, "S002", protocol, judge, folder=folder)
+
+    expected, _ = measured()
+    stop = interrupt_at(monkeypatch, 2, 1)
+    with pytest.raises(KeyboardInterrupt):
+        measured(tmp_path)
+    stop()
+    assert repr(measured(tmp_path)[0]) == repr(expected)
+    steps = []
+    at_step(monkeypatch, 1, 0, lambda: steps.append(1))
+    rows, effort = measured(tmp_path)  # finished: no step is taken again
+    assert repr(rows) == repr(expected) and effort["iterations"] > 0 and not steps
+    longer = replace(loaded.config.fit, stage1_iterations=5)
+    measured(tmp_path, replace(loaded, config=replace(loaded.config, fit=longer)))
+    assert steps == [1] and len(list(tmp_path.glob("*/checkpoint.pt"))) == 2
+
+
 def test_a_fit_stopped_while_it_is_measured_is_measured_later(loaded, views, tmp_path, monkeypatch):
     def stop(*arguments):
         raise KeyboardInterrupt
