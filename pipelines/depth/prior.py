@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -18,6 +18,7 @@ from express50.geometry.meshes import open_edges
 from express50.geometry.raycast import camera_rays, join_rays, mesh_scene
 from express50.geometry.sampling import bilinear
 from express50.geometry.transforms import unit
+from express50.head.load import HeadTopology
 from pipelines.depth.views import (
     DepthView,
     hull_distance,
@@ -189,11 +190,11 @@ def close_mesh(vertices: np.ndarray, faces: np.ndarray) -> TrackedSolid:
     return TrackedSolid(scene, border, body, low, high)
 
 
-def bare_triangles(faces: np.ndarray, regions: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Mark the triangles (F, 3) of the face, (F,), by the vertices (V,) of a model's regions."""
-    none = np.zeros(faces.max() + 1, bool)
-    face = np.any([regions.get(name, none) for name in FACE], axis=0)
-    return (face & ~regions.get("forehead", none))[faces].all(1)
+def bare_triangles(model: HeadTopology) -> np.ndarray:
+    """Mark the triangles (F,) of a head model's face, without the forehead, where hair hangs."""
+    none = np.zeros(len(model.template), bool)
+    face = np.any([model.regions.get(name, none) for name in FACE], axis=0)
+    return (face & ~model.regions.get("forehead", none))[model.faces].all(1)
 
 
 def _fan(loop: np.ndarray, middle: int) -> np.ndarray:

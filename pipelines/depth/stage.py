@@ -150,7 +150,7 @@ def read_tracked(
     if found:
         solid = replace(solid, face_views=tuple(found))
     else:
-        solid = replace(solid, bare=bare_triangles(faces, model.regions))
+        solid = replace(solid, bare=bare_triangles(model))
     if glasses is not None:
         solid = replace(solid, glasses=glasses)
     return solid, {

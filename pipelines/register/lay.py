@@ -234,11 +234,13 @@ def skin_trust(
     vertices: np.ndarray,
     colors: np.ndarray,
     confidence: np.ndarray,
+    agreeing: float = AGREEING,
 ) -> np.ndarray:
     """Return the trust (N,), 0 to 1, that a surface's vertices (N, 3) are skin and well placed.
 
     The reference is the surface near bare skin of the tracked mesh (V, 3): how much other colours
-    (N, 3), uint8 sRGB, and confidence (N,), 0 to 1, differ from those there. Places are in metres.
+    (N, 3), uint8 sRGB, and confidence (N,), 0 to 1, differ from those there. There, confidence
+    counts as at least `agreeing`. Places are in metres.
     """
     reference = bare_skin(model, mesh, vertices)
     if len(reference) < LEAST_SKIN_VERTICES:
@@ -250,7 +252,7 @@ def skin_trust(
     odd = np.linalg.norm((axes - middle) / np.maximum(spread, SPREADS), axis=1)
     _, owner = cKDTree(mesh).query(vertices, distance_upper_bound=LIPS_M)
     odd[np.r_[in_regions(model, ("lips",)), False][owner]] = 0.0
-    sure = confidence / max(float(np.median(confidence[reference])), AGREEING)
+    sure = confidence / max(float(np.median(confidence[reference])), agreeing, 1e-6)
     trust = np.clip(
         (sure - CONFIDENCE_RANGE[0]) / (CONFIDENCE_RANGE[1] - CONFIDENCE_RANGE[0]), 0.0, 1.0
     ) / (1.0 + (odd / COLOUR_LIMIT) ** 4)

@@ -21,9 +21,10 @@ from express50.dataset.tracks import (
     shape_spread,
 )
 from express50.error_model import error_bounds, single_camera_sigma
-from express50.errors import StageError
+from express50.errors import FormatError, StageError
 from express50.files.digests import file_sha256
 from express50.files.images import contact_sheet, write_image
+from express50.files.text import read_json_table
 from express50.geometry.cameras import Camera
 from express50.geometry.meshes import read_surface
 from express50.geometry.transforms_torch import axis_angle_to_matrix
@@ -66,7 +67,8 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
     track, surface = read_track(path), read_surface(file)
     row, model = track.row(expression), load_head(track.head)
     start = track.mesh(expression, len(model.template), path)
-    trust = skin_trust(model, start, surface.vertices, surface.colors, surface.confidence)
+    agreeing = AGREEING if views_were_compared(dataset, item) else 0.0
+    trust = skin_trust(model, start, surface.vertices, surface.colors, surface.confidence, agreeing)
     trust[too_fine(model, start, surface.vertices)] = 0.0
     laid = lay(model, start, GivenSurface(surface.vertices, surface.faces, trust), DETAIL_M)
     # Tracking sees lips, eyes and nostrils well: where it alone placed them, its deviations count.
@@ -80,15 +82,15 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
     skin = surface.confidence[bare_skin(model, start, surface.vertices)]
     metrics["skin_agreement"] = sure = round(float(np.median(skin)), 4) if len(skin) else None
     warnings = []
-    if metrics["seen_share"] < LEAST_SEEN:
-        why = f"the surface was found at only {metrics['seen_share']:.0%} of the face's vertices"
-        warnings.append(Note(expression, why))
-    elif sure is not None and sure < AGREEING:
+    if sure is not None and sure < agreeing:
         why = (
             f"cameras agree on bare skin by {sure:.2f}, expected {AGREEING} or more, so the mesh"
             " stays near the track: check calibration and synchronisation; cameras that stand far"
             " apart or see a small head agree less, too"
         )
+        warnings.append(Note(expression, why))
+    elif metrics["seen_share"] < LEAST_SEEN:
+        why = f"the surface was found at only {metrics['seen_share']:.0%} of the face's vertices"
         warnings.append(Note(expression, why))
     expected = bounds.expected
     if shape_spread(track.shape) > LARGEST_SPREAD:  # the error model knows people only
@@ -96,6 +98,13 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
         why = "the tracked head has an impossible shape, so no error is stated; see 'track'"
         warnings.append(Note("head shape", why))
     return Result(metrics, (), warnings, expected)
+
+
+def views_were_compared(dataset: Dataset, item: str) -> bool:
+    """Return whether depth compared views; it does not with one camera, nor if it is imported."""
+    path = dataset.item_dir("depth", item) / "metrics.json"
+    figures = read_json_table(path, FormatError) if path.is_file() else {}
+    return figures.get("views", 1) > 1
 
 
 def sigma_along_normals(laid: LaidMesh, cameras: Sequence[Camera], model: HeadModel) -> np.ndarray:

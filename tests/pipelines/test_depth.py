@@ -10,6 +10,7 @@ import pytest
 from express50.errors import StageError
 from express50.geometry.cameras import rays, unproject
 from express50.geometry.raycast import mesh_scene
+from express50.head.load import HeadTopology
 from pipelines.depth.blocks import build
 from pipelines.depth.maps import cast_maps, picture_of, surface_maps
 from pipelines.depth.prior import bare_triangles, boundary_loops, close_mesh, matte_agreement
@@ -161,15 +162,17 @@ def test_what_glasses_hide_is_not_compared_and_the_head_is_believed_behind_them(
 def test_a_bare_face_is_believed_however_far_above_it_the_hull_lies():
     vertices, faces = mesh()
     front, up = vertices[:, 2] > 0.05, vertices[:, 1] > 0.05
-    bare = bare_triangles(faces, {"face": front, "forehead": up})
+    model = HeadTopology(vertices, faces, {"face": front, "forehead": up})
+    bare = bare_triangles(model)
     assert 0 < bare.sum() < (front & ~up)[faces].any(1).sum()
-    assert not bare_triangles(faces, {}).any()
+    assert not bare_triangles(replace(model, regions={})).any()
     solid = replace(close_mesh(vertices, faces), bare=bare)
     points, height = np.array([[0, 0, 0.2], [0, 0.2, 0.06], [0, 0, -0.2]]), np.full(3, 0.1)
     assert solid.trust(points, height).tolist() == [1, 0, 0]
     open_behind = faces[(vertices[faces][:, :, 2] > -0.05).all(1)]
     solid = close_mesh(vertices, open_behind)  # its cap has triangles, which are not of the face
-    solid = replace(solid, bare=bare_triangles(open_behind, {"face": front}))
+    cut = HeadTopology(vertices, open_behind, {"face": front})  # some vertices have no triangle
+    solid = replace(solid, bare=bare_triangles(cut))
     assert solid.trust(points, height).tolist() == [1, 0, 0]
 
 

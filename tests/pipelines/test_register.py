@@ -242,12 +242,29 @@ def dataset(tmp_path, model) -> Dataset:
     return dataset
 
 
-def write_surface(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+def write_surface(
+    path: Path, vertices: np.ndarray, faces: np.ndarray, confidence: float = 0.8
+) -> None:
     """Write a skin-coloured surface as depth does."""
     colour = dict(zip(("red", "green", "blue"), (200, 150, 125), strict=True))
     columns = {k: np.full(len(vertices), v, np.uint8) for k, v in colour.items()}
-    columns["confidence"] = np.full(len(vertices), 0.8, np.float32)
+    columns["confidence"] = np.full(len(vertices), confidence, np.float32)
     write_ply(path, vertices, faces, columns)
+
+
+def test_a_surface_on_which_views_disagree_is_not_followed(dataset, tmp_path):
+    path = dataset.surface_file("S001", "smile")
+    surface = read_surface(path)
+    write_surface(path, surface.vertices, surface.faces, 0.4)
+    found = {}
+    for views in (1, 4):  # imported surfaces and those of one camera compare none
+        (path.parent / "metrics.json").write_text(f'{{"views": {views}}}')
+        (tmp_path / str(views)).mkdir()
+        found[views] = STAGE.run(dataset, "S001/smile", NoSettings(), tmp_path / str(views))
+    assert not found[1].warnings and found[1].metrics["seen_share"] > 0.4
+    assert found[1].metrics["skin_agreement"] == pytest.approx(0.4)
+    assert "cameras agree on bare skin by 0.40, expected 0.6" in found[4].warnings[0].why
+    assert found[4].metrics["moved_mm_p95"] < 0.7 * found[1].metrics["moved_mm_p95"]
 
 
 def test_the_stage_writes_a_mesh_that_later_stages_take(dataset, tmp_path):
