@@ -33,7 +33,7 @@ from pipelines.depth.views import DepthView
 OUTLIER_STEPS = 2.0  # steps of offsets from the neighbours at which a match counts as a quarter
 LEAST_VOXELS = 1e-3  # voxels; smaller distances are raised to this before meshing
 STIFFNESS_VOXELS = 2.2  # length below which a thin plate smooths displacements
-RIM_STEP_M = 0.01  # along a silhouette's ray; a nose is no narrower
+RIM_STEP_M = 0.01  # between the places that are tried first on a silhouette's ray: noses are wider
 COUPLINGS = (1e3, 3e3, 1e4, 2e4)  # per square metre; a gap of 10 mm costs 0.1 at first, 2 at last
 
 
@@ -138,7 +138,7 @@ def rim_targets(views: Sequence[DepthView], grid: LevelSet, depth_range: float) 
     The grid's distance there is the displacement that the surface lacks.
     """
     step = 1.5 * grid.voxel
-    # The distance is smooth: some of the steps tell about which place to try all.
+    # Distances are smooth: coarse steps find the region, and fine steps the place in it.
     some = int(np.clip(RIM_STEP_M / step, 1, 4))
     ends = 0.5 * depth_range
     steps = np.arange(-ends, ends, some * step), step * np.arange(1 - some, some)

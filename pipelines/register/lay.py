@@ -234,25 +234,25 @@ def skin_trust(
     vertices: np.ndarray,
     colors: np.ndarray,
     confidence: np.ndarray,
-    agreeing: float = AGREEING,
+    skin: np.ndarray,
+    agreeing: float = 0.0,
 ) -> np.ndarray:
     """Return the trust (N,), 0 to 1, that a surface's vertices (N, 3) are skin and well placed.
 
-    The reference is the surface near bare skin of the tracked mesh (V, 3): how much other colours
-    (N, 3), uint8 sRGB, and confidence (N,), 0 to 1, differ from those there. There, confidence
-    counts as at least `agreeing`. Places are in metres.
+    It depends on how much colours (N, 3), uint8 sRGB, and confidence (N,), 0 to 1, differ from
+    those of `skin`, the indices of `bare_skin`, whose confidence counts as at least `agreeing`.
+    The tracked mesh (V, 3) shows where the lips are. Places are in metres.
     """
-    reference = bare_skin(model, mesh, vertices)
-    if len(reference) < LEAST_SKIN_VERTICES:
+    if len(skin) < LEAST_SKIN_VERTICES:
         return confidence.astype(np.float64)
     # Standard deviations that colours are off those of bare skin.
     log = np.log(srgb_to_linear(colors / 255.0) + 0.01)
     axes = np.stack([log[:, 0] - log[:, 1], log[:, 2] - log[:, 1], log.mean(1)], axis=1)
-    middle, spread = robust_moments(axes[reference])
+    middle, spread = robust_moments(axes[skin])
     odd = np.linalg.norm((axes - middle) / np.maximum(spread, SPREADS), axis=1)
     _, owner = cKDTree(mesh).query(vertices, distance_upper_bound=LIPS_M)
     odd[np.r_[in_regions(model, ("lips",)), False][owner]] = 0.0
-    sure = confidence / max(float(np.median(confidence[reference])), agreeing, 1e-6)
+    sure = confidence / max(float(np.median(confidence[skin])), agreeing, 1e-6)
     trust = np.clip(
         (sure - CONFIDENCE_RANGE[0]) / (CONFIDENCE_RANGE[1] - CONFIDENCE_RANGE[0]), 0.0, 1.0
     ) / (1.0 + (odd / COLOUR_LIMIT) ** 4)

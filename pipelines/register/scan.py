@@ -26,6 +26,7 @@ from pipelines.register.lay import (
     GivenSurface,
     LaidMesh,
     SurfaceSearch,
+    bare_skin,
     folded,
     lay,
     mesh_normals,
@@ -97,7 +98,8 @@ def fit_scan(scan: Scan, head: str, given: np.ndarray | None = None) -> FittedSc
     start = all_vertices(model, state)[0]
     if scan.textured:
         shades = np.rint(255 * linear_to_srgb(scan.colors)).astype(np.uint8)
-        trust = skin_trust(model, start, scan.vertices, shades, trust)
+        skin = bare_skin(model, start, scan.vertices)
+        trust = skin_trust(model, start, scan.vertices, shades, trust, skin)
     laid = lay(model, start, replace(surface, trust=trust), DETAIL_M)
     return FittedScan(basis, targets, state, start, laid)
 

@@ -68,9 +68,11 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
     row, model = track.row(expression), load_head(track.head)
     start = track.mesh(expression, len(model.template), path)
     agreeing = AGREEING if views_were_compared(dataset, item) else 0.0
-    trust = skin_trust(model, start, surface.vertices, surface.colors, surface.confidence, agreeing)
-    trust[too_fine(model, start, surface.vertices)] = 0.0
-    laid = lay(model, start, GivenSurface(surface.vertices, surface.faces, trust), DETAIL_M)
+    places, sure = surface.vertices, surface.confidence
+    skin = bare_skin(model, start, places)
+    trust = skin_trust(model, start, places, surface.colors, sure, skin, agreeing)
+    trust[too_fine(model, start, places)] = 0.0
+    laid = lay(model, start, GivenSurface(places, surface.faces, trust), DETAIL_M)
     # Tracking sees lips, eyes and nostrils well: where it alone placed them, its deviations count.
     fine = too_fine(model, start, start) & ~laid.seen & np.isfinite(track.sigma[row])
     sigma = np.where(fine, np.hypot(track.sigma[row], SURFACE_M), laid.sigma)
@@ -79,14 +81,14 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
     shared = sigma_along_normals(laid, cameras, model)
     bounds = error_bounds("register", error_figures(laid, track, row), shared)
     metrics = write_registration(out, path, track, row, laid, bound=1e-3 * bounds.bound)
-    skin = surface.confidence[bare_skin(model, start, surface.vertices)]
-    metrics["skin_agreement"] = sure = round(float(np.median(skin)), 4) if len(skin) else None
+    agreement = round(float(np.median(sure[skin])), 4) if len(skin) else None
+    metrics["skin_agreement"] = agreement
     warnings = []
-    if sure is not None and sure < agreeing:
+    if agreement is not None and agreement < agreeing:
         why = (
-            f"cameras agree on bare skin by {sure:.2f}, expected {AGREEING} or more, so the mesh"
-            " stays near the track: check calibration and synchronisation; cameras that stand far"
-            " apart or see a small head agree less, too"
+            f"cameras agree on bare skin by {agreement:.2f}, expected {AGREEING} or more, so the"
+            " mesh stays near the track: check calibration and synchronisation; cameras that stand"
+            " far apart or see a small head agree less, too"
         )
         warnings.append(Note(expression, why))
     elif metrics["seen_share"] < LEAST_SEEN:

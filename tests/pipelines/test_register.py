@@ -22,10 +22,12 @@ from express50.head.load import load_head
 from express50.head.model import joint_angles, pose, rest_vertices, skin
 from pipelines.register import STAGE
 from pipelines.register.lay import (
+    AGREEING,
     SURFACE_M,
     GivenSurface,
     Plate,
     SurfaceSearch,
+    bare_skin,
     lay,
     mesh_normals,
     skin_trust,
@@ -137,16 +139,19 @@ def test_hair_and_doubtful_places_get_no_trust(model):
     confidence = np.full(count, 0.8)
     side = mesh[:, 0] < -0.055
     confidence[side] = 0.3
-    trust = skin_trust(model, mesh, mesh, colors, confidence)
+    skin = bare_skin(model, mesh, mesh)
+    trust = skin_trust(model, mesh, mesh, colors, confidence, skin)
     nose = model.regions["nose"].numpy()
     assert trust[hair].max() < 0.05 and trust[side].max() < 0.05
     assert np.median(trust[nose]) > 0.75
     lips = model.regions["lips"].numpy() & ~side
     colors[lips] = (190, 80, 90)
-    assert np.median(skin_trust(model, mesh, mesh, colors, confidence)[lips]) > 0.5
-    nowhere = skin_trust(model, mesh, mesh + 1.0, colors, confidence)
+    assert np.median(skin_trust(model, mesh, mesh, colors, confidence, skin)[lips]) > 0.5
+    nowhere = skin_trust(model, mesh, mesh + 1.0, colors, confidence, np.zeros(0, int))
     assert nowhere == pytest.approx(confidence)
-    assert skin_trust(model, mesh, mesh, colors, 0.35 * confidence).max() == 0, "views disagree"
+    assert not len(bare_skin(model, mesh, mesh + 1.0))
+    disagreeing = skin_trust(model, mesh, mesh, colors, 0.35 * confidence, skin, AGREEING)
+    assert disagreeing.max() == 0
 
 
 def test_lips_eyes_and_the_underside_of_the_nose_are_too_fine_for_depth(model):
