@@ -398,7 +398,10 @@ def fit_unseen(
     path.parent.mkdir(parents=True, exist_ok=True)
     save = partial(save_unfinished, state, made_from=made_from)
     keeping = partial(_kept, path, save, state.config.train.save_seconds)
-    return state, run_stages(state, dict, keeping)
+    effort = run_stages(state, dict, keeping)
+    state.optimizer = None  # a finished fit takes a third of the space without it
+    save(path)
+    return state, effort
 
 
 def unseen_views(

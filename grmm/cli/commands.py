@@ -19,6 +19,7 @@ from express50.errors import ConfigError, check_known
 from express50.files.atomic import (
     check_file_writable,
     check_folder_writable,
+    check_space,
     write_bytes,
     write_json,
 )
@@ -268,10 +269,13 @@ def evaluate(args: argparse.Namespace) -> int:
     protocol = _protocol(args)
     for subject, chosen in unseen.items():  # before anybody is fitted for nothing
         _, unseen[subject] = unseen_views(loaded, views, subject, protocol, chosen)
+    fits = args.out / FITS
+    if unseen:  # before anybody is measured for nothing
+        fits.mkdir(parents=True, exist_ok=True)
+        check_space(fits)
     render = training_render(loaded.model, views)
     log(f"measuring {count(len(known), 'image')} of people with codes")
     rows = evaluate(views, known, render, judge, kind, keep)
-    fits = args.out / FITS
     for subject, chosen in unseen.items():
         found, effort = evaluate_unseen(
             loaded, views, subject, protocol, judge, keep, chosen, folder=fits

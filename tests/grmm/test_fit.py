@@ -243,7 +243,10 @@ def test_a_stopped_measurement_continues_its_fits(loaded, views, tmp_path, monke
     with pytest.raises(KeyboardInterrupt):
         measured(tmp_path)
     stop()
+    [path] = tmp_path.glob("*/checkpoint.pt")
+    unfinished = path.stat().st_size
     assert repr(measured(tmp_path)[0]) == repr(expected)
+    assert path.stat().st_size < 0.6 * unfinished, "the optimiser's state is left out"
     steps = []
     at_step(monkeypatch, 1, 0, lambda: steps.append(1))
     rows, effort = measured(tmp_path)  # finished: no step is taken again
