@@ -485,4 +485,7 @@ def run_import(args: argparse.Namespace) -> int:
     """Append the new events."""
     new, known = import_labels(args.dataset, args.file)
     data = {"file": str(args.file), "new": new, "known": known}
-    return answer(args, data, f"{args.file}: {count(new, 'new event')}, {known} known already")
+    words = f"{count(new, 'new event')}, {known} known already"
+    if not new + known:
+        words = "has no rows of events; nothing was imported"
+    return answer(args, data, f"{args.file}: {words}")

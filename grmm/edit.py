@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from express50.console import count
-from express50.errors import ConfigError, check_known, nearest
+from express50.errors import ConfigError, check_known, few, nearest
 from express50.geometry.transforms import (
     axis_angle_to_matrix,
     matrix_to_axis_angle,
@@ -30,6 +30,7 @@ from grmm.model import HeadState
 
 ANGLES = {"neck": 3, "jaw": 3, "eyes": 6}  # axis-angles by name, radians
 CODES = ("z_id", "z_exp")
+LARGEST = 1000.0  # of a control; far beyond any head, and float32 still holds what it makes
 POSES = {  # sliders of joints: controls, range in radians
     "jaw open": (("jaw.0",), (-0.1, 0.6)),
     "jaw sideways": (("jaw.1",), (-0.2, 0.2)),
@@ -138,11 +139,14 @@ def controlled(
     deviations along a principal direction of the training codes.
 
     Raises:
-        ConfigError: no such parameter, a wrong count of numbers, or one that is not finite.
+        ConfigError: no such parameter, a wrong count of numbers, or one beyond `LARGEST`.
     """
     for name, values in controls.items():
-        if not np.isfinite(values).all():
-            raise ConfigError(f"control {name}: got {list(values)}, expected finite numbers")
+        for value in values:
+            if not abs(value) <= LARGEST:  # NaN too
+                raise ConfigError(
+                    f"control {name}: got {value:g}, expected {-LARGEST:g} to {LARGEST:g}"
+                )
         table, _, entry = name.partition(".")
         if table in CODES:
             (amount,), code = _numbers(values, 1, name), getattr(head, table)
@@ -266,8 +270,11 @@ def _entry(text: str, count: int, name: str, what: str, names: Sequence[str] = (
         return names.index(text)
     if text.isdecimal() and int(text) < count:
         return int(text)
-    named = nearest(text, names) if names else ""
-    raise ConfigError(f"control {name!r}: there are {count} {what}, 0 to {count - 1}{named}")
+    expected = f"expected 0 to {count - 1}"
+    if names:
+        alike = [known for known in names if text.casefold() in known.casefold()]
+        expected += f", or a name such as {few(alike or names)}{nearest(text, names)}"
+    raise ConfigError(f"control {name!r} is none of the {count} {what}; {expected}")
 
 
 def _lerp(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:

@@ -130,6 +130,8 @@ def read_capture(root: Path) -> RawCapture:
                 f" '-'; call it {identifier(path.name)[:120]!r} here, in plates/, board/ and"
                 " calibration.json"
             )
+        if path.name.startswith("@"):  # such as @eaDir, which Synology's disks add everywhere
+            continue
         try:
             cameras[path.name] = _read_camera(path)
         except CaptureError as error:

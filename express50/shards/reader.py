@@ -38,6 +38,7 @@ from express50.shards.codecs import AGAIN, ALPHA, DEPTH, PARTS, RGB, crc32, deco
 
 SCHEMA = "express50.shards/1"
 _COPY_AGAIN = f"copy the shards again or {AGAIN}"
+MADE_BY = {"parts": "regions", "depth": "depth"}  # stages without which `pack` lacks a member
 SUBJECT_FILES = ("offsets.npy", "registered.npz")  # beside the shards, if `track` in meta says so
 KEY = re.compile(rf"[A-Za-z0-9_-]{{1,{KEY_LENGTH}}}")
 SHARD_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*-[0-9]{6}\.tar")
@@ -148,8 +149,13 @@ class ShardReader:
     def _place(self, entry: Entry, name: str) -> tuple[int, int, int]:
         if name not in entry.members:
             where = f"{self.root / entry.shard}: {entry.key}"
-            has = ", ".join(entry.members)
-            raise FormatError(f"{where}: has no {name}, it has {has}; {AGAIN}")
+            has, stem = ", ".join(entry.members), name.partition(".")[0]
+            fix = AGAIN
+            if f"{stem}." in has:  # another profile names it so
+                fix = "ask for that"
+            elif stem in MADE_BY:
+                fix = f"run 'express50 {MADE_BY[stem]}', then 'express50 pack' again"
+            raise FormatError(f"{where}: has no {name}, it has {has}; {fix}")
         return entry.members[name]
 
     def meta(self, number: int) -> dict:

@@ -147,6 +147,13 @@ def test_export_and_import_round_trip_without_loss_or_duplicates(
     assert {s: dataset.labels_file(s).read_text() for s in before} == before
 
 
+@pytest.mark.parametrize("name", ["labels.csv", "labels.json"])
+def test_importing_a_table_without_rows_says_so(annotate, dataset, tmp_path, capsys, name):
+    annotate("export", str(tmp_path / name))
+    assert main(["annotate", "import", str(dataset.root), str(tmp_path / name)]) == 0
+    assert "has no rows of events; nothing was imported" in capsys.readouterr().out
+
+
 def test_import_of_another_datasets_frame_writes_nothing(annotate, dataset, tmp_path, capsys):
     mark(annotate, "ann", "smile", 14)
     file = tmp_path / "labels.json"

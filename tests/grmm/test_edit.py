@@ -100,11 +100,13 @@ def test_principal_directions_rebuild_the_covariance(loaded):
     [
         ({"jwa": (1.0,)}, "did you mean 'jaw'"),
         ({"jaw": (1.0,)}, "got 1 number, expected 3 with commas between, or jaw.0"),
-        ({"neck.3": (1.0,)}, "3 neck parameters, 0 to 2"),
-        ({"expression.e9": (1.0,)}, "4 expression parameters"),
+        ({"neck.3": (1.0,)}, "none of the 3 neck parameters; expected 0 to 2"),
+        ({"expression.nope": (1.0,)}, "0 to 3, or a name such as e0, e1, e2 and 1 more$"),
+        ({"expression.E3x": (1.0,)}, "did you mean 'e3'"),
         ({"expression": (1.0,)}, "expected one entry"),
         ({"z_id.2": (1.0,)}, "2 principal directions"),
-        ({"jaw.0": (float("nan"),)}, "expected finite"),
+        ({"jaw.0": (float("nan"),)}, "jaw.0: got nan, expected -1000 to 1000"),
+        ({"shape.0": (1e30,)}, r"shape.0: got 1e\+30, expected -1000 to 1000"),
     ],
 )
 def test_wrong_controls_are_named(loaded, controls, message):

@@ -74,7 +74,9 @@ def read_participant(path: Path, selection: Selection) -> RawCapture:
     calibration = read_nersemble(path / CAMERAS)
     check_links(*(path / "sequences").iterdir())
     sequences = sorted(
-        p.name for p in (path / "sequences").iterdir() if p.is_dir() and p.name != BACKGROUND
+        p.name
+        for p in (path / "sequences").iterdir()
+        if p.is_dir() and p.name != BACKGROUND and p.name[0] not in ".@"  # such as @eaDir
     )
     check_selection(selection, sequences, sorted(calibration))
     wanted = [name for name in sequences if selection.has_sequence(name)]

@@ -102,9 +102,11 @@ def test_cameras_whose_name_is_no_id_fail_the_capture(raw, name):
         read_capture(raw)
 
 
-def test_folders_without_footage_may_have_any_name(raw):
-    (raw / "cameras" / "@eaDir").mkdir()
-    assert set(read_capture(raw).dropped) == {"@eaDir"}
+def test_what_file_systems_add_is_no_camera(raw):
+    (raw / "cameras" / "@eaDir" / "cam00").mkdir(parents=True)
+    (raw / "cameras" / ".DS_Store").touch()
+    (raw / "cameras" / "empty one").mkdir()
+    assert set(read_capture(raw).dropped) == {"empty one"}
 
 
 def test_endings_may_be_upper_case_and_other_names_are_pointed_out(raw):

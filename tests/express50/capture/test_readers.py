@@ -102,6 +102,7 @@ def test_renderme_of_two_actors_annotations_alone_or_an_unknown_camera_is_refuse
 
 def test_nersemble_colours_are_corrected_and_sizes_fitted(tmp_path):
     path = layouts.write_nersemble(tmp_path, write_video)
+    (path / "sequences" / "@eaDir").mkdir()  # as some disks add
     assert (detect(path).name, subject_of(path)) == ("nersemble", "018")
     dataset, subject = ingested(tmp_path, path)
     index = read_index(dataset, subject)

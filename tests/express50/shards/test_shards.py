@@ -112,6 +112,19 @@ def test_sample_is_what_was_written(shards):
     assert sample["meta"]["subject"] == "S001"
 
 
+@pytest.mark.parametrize(
+    ("name", "fix"),
+    [
+        ("parts.png", "run 'express50 regions', then 'express50 pack' again"),
+        ("depth.lerc", "has no depth.lerc, it has .*depth.png.*; ask for that"),
+        ("mesh.ply", "rerun 'express50 pack'"),
+    ],
+)
+def test_a_missing_member_says_what_makes_it(shards, name, fix):
+    with pytest.raises(FormatError, match=fix):
+        ShardReader(shards).members(0, [name])
+
+
 def test_groups_stay_in_one_shard_with_members_adjacent(shards):
     reader = ShardReader(shards)
     assert len({entry.shard for entry in reader.entries}) >= 3
