@@ -38,7 +38,9 @@ MOVE_BANDS = ((0.1, 0.015), (0.02, 0.003))
 shift of a moved camera's picture, as shares of the diagonal."""
 LEAST_GAIN, GAIN_RATIO = 30.0, 4.0
 """Freeing a moved camera must lower the robust cost by this much (noise alone: half a chi-square
-of six, under 15), and by GAIN_RATIO times what the median other camera would."""
+of six, under 15) and that much more than freeing any other, and by GAIN_RATIO times what the median
+other camera would. With few points in common, freeing any of three cameras explains chance matches
+about as well."""
 MOVE_PRIORS = RigPriors(turn_rad=np.radians(1.0), move_m=0.01)
 MOVE_SCALES, ITERATIONS = (6.0, 3.0, 1.5), 4
 """Sigmas at which residuals flatten: a camera that is off by a few pixels must not be rejected
@@ -257,7 +259,8 @@ def _free_moved_cameras(
         found, camera = tried[name], cameras[name]
         shift = _picture_shift(camera, found.cameras[name], found, tracks)
         others = single_camera_gains(found, tracks, MOVE_PRIORS, MOVE_SCALES[-1], (*free, name))
-        needed = max(LEAST_GAIN, GAIN_RATIO * float(np.median(others)))
+        rival = max((fit.cost - tried[n].cost for n in tried if n != name), default=0.0)
+        needed = max(LEAST_GAIN + rival, GAIN_RATIO * float(np.median(others)))
         if shift < least_shift * np.hypot(camera.width, camera.height):
             break
         if fit.cost - found.cost < needed:

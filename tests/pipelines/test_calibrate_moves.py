@@ -128,6 +128,18 @@ def test_two_bumped_cameras_are_both_named(footage, seen):
     assert set(check_footage(wrong, seen).moved) == {"cam01", "cam05"}
 
 
+def test_no_camera_is_named_where_any_other_may_have_moved_instead():
+    """The outer ones of three cameras are off by as much, upwards and downwards."""
+    rig = make_rig(3)
+    points = np.random.default_rng(0).normal(size=(68, 3))
+    points *= 0.09 / np.linalg.norm(points, axis=1, keepdims=True)
+    views = [
+        (name, project(camera, points)[0] + (0, up), np.full(68, 0.5))
+        for (name, camera), up in zip(rig.items(), (-1, 0, 1), strict=True)
+    ]
+    assert check_footage(rig, {0: FrameSetPoints(views, {})}).moved == {}
+
+
 def test_a_camera_without_common_points_is_said_to_be_unchecked(footage):
     rig, images = footage
     blind = images | {"cam02": np.full_like(images["cam02"], 128)}
