@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +56,17 @@ NO_NETWORKS = PerceptualMetrics(MetricsConfig())
 NAMED = 5  # most files that an error names
 
 
+@dataclass(frozen=True)
+class Journal:
+    """A file of rows measured so far, from which a measurement that was stopped continues.
+
+    ``made_from`` stands for everything that the rows depend on, except the code.
+    """
+
+    path: Path
+    made_from: str
+
+
 def training_render(model: GRMM, views: HeadViews) -> Render:
     """Make a function that renders training subjects by their rows of the code tables."""
 
@@ -80,14 +93,19 @@ def evaluate(
     judge: PerceptualMetrics = NO_NETWORKS,
     kind: Callable[[SampleKey], str] = lambda key: "",
     keep: Callable[[int, Tensor], None] | None = None,
+    journal: Journal | None = None,
 ) -> list[Row]:
     """Measure samples, one row of numbers each; see `compare`.
 
     ``depth_mm`` is the median absolute error where both depths are known (NaN: nowhere). ``keep``
-    gets every index with its picture (3, H, W).
+    gets every index with its picture (3, H, W). What the ``journal`` holds is not measured again.
     """
-    rows = []
+    rows, known = [], journal_rows(journal)
     for index in indices:
+        key = views.keys[index]
+        if held := known.get((*vars(key).values(), kind(key))):
+            rows.append(held)
+            continue
         item = views.item(index)
         out = item.hide_behind_torso(render(item))
         both = item.depth_valid & (out.alpha > 0.5)
@@ -98,6 +116,25 @@ def evaluate(
         rows.append(row)
         if keep is not None:
             keep(index, out.image)
+        if journal is not None:
+            line = json.dumps({"made_from": journal.made_from, "row": row})
+            with journal.path.open("a", encoding="utf-8") as file:
+                file.write(f"\n{line}")  # the break first: it ends a line that was cut short
+    return rows
+
+
+def journal_rows(journal: Journal | None) -> dict[tuple[str | float, ...], Row]:
+    """Read the rows of a journal by their IDS; those made from something else do not count."""
+    rows: dict[tuple[str | float, ...], Row] = {}
+    if journal is None or not journal.path.exists():
+        return rows
+    for line in journal.path.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            entry = json.loads(line)
+            if entry["made_from"] == journal.made_from:
+                rows[tuple(entry["row"][name] for name in IDS)] = entry["row"]
+        except (ValueError, KeyError, TypeError):  # cut short when the measurement was stopped
+            continue
     return rows
 
 

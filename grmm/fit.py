@@ -31,7 +31,7 @@ from grmm.checkpoint import Checkpoint
 from grmm.config import as_tables
 from grmm.data import HeadView, HeadViews, Shuffle, with_codes
 from grmm.edit import HeadCodes, between, trained_head
-from grmm.evaluate import HELD_IDENTITY, Row, evaluate, mean
+from grmm.evaluate import HELD_IDENTITY, Journal, Row, evaluate, mean
 from grmm.fit_state import (
     FitState,
     Scores,
@@ -357,11 +357,12 @@ def evaluate_unseen(
     keep: Callable[[int, Tensor], None] | None = None,
     among: Sequence[int] | None = None,
     folder: Path | None = None,
+    journal: Journal | None = None,
 ) -> tuple[list[Row], dict[str, Any]]:
     """Fit a person from the protocol's views; rows of its other views and expressions, effort.
 
     ``among`` are the indices to measure, by default all of the person's. ``folder`` is that of
-    `fit_unseen`.
+    `fit_unseen`, ``journal`` that of `evaluate`.
 
     Raises:
         ConfigError: the shards hold no such views, or nothing is left to measure.
@@ -372,7 +373,8 @@ def evaluate_unseen(
     for kind, fitted in ((NOVEL_VIEW, True), (NOVEL_EXPRESSION, False)):
         chosen = [i for i in own if (views.keys[i].expression in state.z_exp) == fitted]
         chosen = evenly(chosen, protocol.images or len(chosen))
-        rows += evaluate(views, chosen, state.render, judge, lambda key, kind=kind: kind, keep)
+        named = lambda key, kind=kind: kind  # noqa: E731
+        rows += evaluate(views, chosen, state.render, judge, named, keep, journal)
     cameras = sorted({views.keys[i].camera for i in given})
     return rows, {"subject": subject, "cameras": cameras} | effort
 

@@ -6,9 +6,10 @@ Torch takes a second to import and --help must not wait for it, so handlers impo
 from __future__ import annotations
 
 import argparse
+import hashlib
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,9 +21,11 @@ from express50.files.atomic import (
     check_file_writable,
     check_folder_writable,
     check_space,
+    dump_json,
     write_bytes,
     write_json,
 )
+from express50.files.digests import file_sha256
 from grmm.config import TABLES, Config, as_tables, choose, from_tables, resolve
 from grmm.deviations import paper_diff
 
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
     from grmm.checkpoint import Checkpoint
     from grmm.data import HeadViews
     from grmm.edit import HeadCodes
+    from grmm.evaluate import Journal
     from grmm.fit import FitProtocol
     from grmm.metrics import PerceptualMetrics
 
@@ -270,21 +274,39 @@ def evaluate(args: argparse.Namespace) -> int:
     for subject, chosen in unseen.items():  # before anybody is fitted for nothing
         _, unseen[subject] = unseen_views(loaded, views, subject, protocol, chosen)
     fits = args.out / FITS
-    if unseen:  # before anybody is measured for nothing
-        fits.mkdir(parents=True, exist_ok=True)
-        check_space(fits)
+    fits.mkdir(parents=True, exist_ok=True)
+    check_space(fits)  # before anybody is measured for nothing
+    journal = _journal(args, loaded, source.digest, protocol, fits)
     render = training_render(loaded.model, views)
     log(f"measuring {count(len(known), 'image')} of people with codes")
-    rows = evaluate(views, known, render, judge, kind, keep)
+    rows = evaluate(views, known, render, judge, kind, keep, journal)
     for subject, chosen in unseen.items():
         found, effort = evaluate_unseen(
-            loaded, views, subject, protocol, judge, keep, chosen, folder=fits
+            loaded, views, subject, protocol, judge, keep, chosen, fits, journal
         )
         log(f"{subject}: fitted from {', '.join(effort['cameras'])} in {effort['seconds']} s")
         rows += found
     code = _report(args, rows, judge)
     shutil.rmtree(fits, ignore_errors=True)  # only a stopped command needs them
     return code
+
+
+def _journal(
+    args: argparse.Namespace, loaded: Checkpoint, samples: str, protocol: FitProtocol, folder: Path
+) -> Journal | None:
+    """Name the file from which a stopped evaluation continues; None if FID needs all pictures."""
+    from grmm.evaluate import Journal
+
+    if loaded.config.metrics.inception:
+        return None
+    made_from = {
+        "checkpoint": file_sha256(args.checkpoint),
+        "samples": samples,
+        "config": as_tables(loaded.config),
+        "protocol": asdict(protocol),
+        "pictures": str(args.save),
+    }
+    return Journal(folder / "rows.jsonl", hashlib.sha256(dump_json(made_from)).hexdigest())
 
 
 def _split(

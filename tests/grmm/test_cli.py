@@ -16,7 +16,7 @@ from express50.files.images import read_image
 from express50.shards.writer import PackedSample, ShardWriter
 from grmm.cli import build_parser, main
 from grmm.cli.commands import train_config
-from grmm.evaluate import IDS, NUMBERS, summarise, summary_lines
+from grmm.evaluate import IDS, NUMBERS, compare, summarise, summary_lines
 from grmm.render import write_video
 from grmm.shard_source import ShardSource, seen_window
 from tests.grmm.packed import TINY, packed, write_shards
@@ -253,8 +253,8 @@ def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
         (["render", "{checkpoint}", "{out}", "--samples=3000"], 2,
          "3000 x 2 pictures of 32 x 32 px is larger than 65000 px; lower --size, --samples"),
         (["render", "{checkpoint}", "{out}", "--to=S000/e9"], 2, "e9"),
-        (["render", "{checkpoint}", "{out}", "--control=z_id.0=1e30"], 1,
-         "values that are not finite or over 1e+30"),
+        (["render", "{checkpoint}", "{out}", "--control=z_id.0=1e30"], 2,
+         "control z_id.0: got 1e+30, expected -1000 to 1000"),
         (["export", "{checkpoint}", "{out}/head.obj"], 2, "expected one of .html, .ply, .spz"),
         (["export", "{checkpoint}", "{out}/head.html", "--format=splats"], 2,
          "--format splats needs a name that ends in .glb"),
@@ -319,6 +319,34 @@ def test_a_stopped_evaluation_keeps_the_people_it_has_fitted(
         patch.setattr("grmm.fit._finite", stop)  # no step is taken again
         assert main(arguments) == 0
     assert sorted(p.name for p in tmp_path.iterdir()) == ["evaluation.csv", "evaluation.json"]
+
+
+def test_a_stopped_evaluation_keeps_what_it_has_measured(checkpoint, shards, tmp_path, monkeypatch):
+    def evaluation(name: str) -> list[str]:
+        fitted = ["--fit-cameras=cam00", "--fit-expression=e0"]
+        return ["evaluate", str(checkpoint), str(shards), str(tmp_path / name), *fitted]
+
+    measured = []
+
+    def counted(image, item, *rest):
+        if len(measured) == stop_after:
+            raise KeyboardInterrupt
+        measured.append(item.key)
+        return compare(image, item, *rest)
+
+    monkeypatch.setattr("grmm.evaluate.compare", counted)
+    stop_after = 1000
+    assert main(evaluation("whole")) == 0
+    count, stop_after = len(measured), len(measured) + 14  # two of the fitted person's four
+    assert main(evaluation("stopped")) == 130
+    journal = next(tmp_path.glob("stopped/*/rows.jsonl"))
+    journal.write_text(journal.read_text()[:-9])  # the last line was cut short
+    stop_after = 1000
+    assert main(evaluation("stopped")) == 0
+    assert len(measured) == 2 * count + 1
+    files = [tmp_path / name / "evaluation.csv" for name in ("whole", "stopped")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+    assert not journal.exists()
 
 
 def test_config_prints_settings_that_train_takes(tmp_path, capsys):
