@@ -60,12 +60,11 @@ from express50.geometry.sampling import evenly
 from express50.twin import TwinConfig
 from express50.twin.truth import Truth
 from pipelines.matte import MatteConfig
-from pipelines.matte.consensus import compare_mattes
 from pipelines.matte.cutout import CutView, cut_out, make_cut_view, soft_alpha
 from pipelines.matte.key import key_alpha
 from pipelines.matte.plates import LEAST_SHARE, match_plate
 from pipelines.matte.stage import corrected, make_view
-from pipelines.matte.visual_hull import ball_of
+from pipelines.matte.visual_hull import ball_of, compare_mattes
 
 RIG = TwinConfig(
     subjects=1, first_subject=61, cameras=24, width=384, height=384, footage="jpg",

@@ -7,13 +7,13 @@ import sys
 from collections.abc import Sequence
 
 from express50 import __version__
-from express50.cli import check, dial, export, plan, shards, stages, status
+from express50.cli import dataset, export, plan, stages, status
 from express50.console import USAGE, Parser, run_handler
 from express50.contract.stage import commands
 from express50.errors import Express50Error
 from express50.twin import record as twin
 
-OWN = (stages, dial, status, shards, check, plan, export, twin)
+OWN = (stages, status, dataset, plan, export, twin)
 DESCRIPTION = "From raw multi-view head footage to packed, annotated shards."
 EPILOG = """example:
   express50 run DATASET CAPTURE... --budget 2h

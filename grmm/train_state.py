@@ -190,7 +190,11 @@ def saving(
         now = time.perf_counter()
         due = every > 0 and now - saved >= max(every, cost / SAVING_SHARE)
         if due or last:
-            _release(spare, path)
+            # Free the spare's space. A second name keeps the former file when the next checkpoint
+            # takes its place: no byte is copied.
+            spare.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # none yet, or a disk without second names
+                spare.hardlink_to(path)
             save(path)
             saved = time.perf_counter()
             cost = saved - now
@@ -201,16 +205,6 @@ def saving(
         yield after_step
     finally:
         spare.unlink(missing_ok=True)
-
-
-def _release(spare: Path, path: Path) -> None:
-    """Free the spare's space for the next checkpoint; the former one becomes the spare after it.
-
-    A second name keeps the former file when the next takes its place: no byte is copied.
-    """
-    spare.unlink(missing_ok=True)
-    with contextlib.suppress(OSError):  # none yet, or a disk without second names
-        spare.hardlink_to(path)
 
 
 def save(state: TrainState, path: Path, config: Config, head_spec: str, gallery: Gallery) -> None:

@@ -277,7 +277,7 @@ def estimate(
     Workers are processes of one core each. Only datasets of the first one's preset count.
     """
     # Imported here, because NumPy would slow every command.
-    from express50.dial.laws import MeasuredSize, forecast, typical_seconds
+    from express50.dial.choice import MeasuredSize, forecast, typical_seconds
 
     rows = []
     for stage in known:

@@ -1,59 +1,78 @@
-"""Run the stages (one command each, ``run`` for all), and ``config``, which prints settings."""
+"""Run the stages (one command each, ``run`` for all), ``tune`` and ``config`` their settings."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from express50.console import (
     FAILED,
     OK,
     USAGE,
     add_command,
+    answer,
     log,
     number,
     say,
     say_json,
     stdout_to_stderr,
 )
-from express50.contract.config import PRESETS, config_toml, resolve_config
+from express50.contract.config import PRESETS, config_toml, distinct_settings, resolve_config
 from express50.contract.layout import Dataset, check_folder
 from express50.contract.stage import Stage, stages, with_required
 from express50.errors import ConfigError, check_known
 
+if TYPE_CHECKING:
+    from express50.runner.executor import Pool
+
 
 def add_commands(subparsers: Any) -> None:
-    """Add ``run``, one command per stage, and ``config``."""
+    """Add ``run``, one command per stage, ``config`` and ``tune``."""
     names = list(stages())
     words = f"run all stages in order, from {names[0]} to {names[-1]}"
     parser = add_command(
-        subparsers, "run", run_all, words,
+        subparsers, "run", run_chain, words,
         description="Run all stages in order, and skip items that are up to date. With --budget "
         "or --error, first measure a few expressions, then choose the settings of every stage.",
         example="express50 run DATASET CAPTURE... --budget 2h\n"
         "settings of a stage: express50 config STAGE",
     )  # fmt: skip
-    add_run_options(parser, captures=True)
+    _add_run_options(parser, captures=True)
     parser.add_argument("--first", metavar="STAGE", choices=names, help="first stage to run")
     parser.add_argument("--last", metavar="STAGE", choices=names, help="last stage to run")
+    words = "choose the settings that fit this time: 45m, 2h, 1h30m, or 40ch (core hours); "
+    words += "not with --preset or --print-job"
+    parser.add_argument("--budget", metavar="TIME", help=words)
+    words = "choose the quickest settings that reach this expected error, such as 0.5mm; "
+    words += "not with --preset or --print-job"
+    parser.add_argument("--error", metavar="ERROR", help=words)
     for stage in stages().values():
         parser = add_command(
             subparsers, stage.name, run_one, stage.help,
             epilog=f"settings of the stage: express50 config {stage.name}",
         )  # fmt: skip
-        add_run_options(parser, captures=stage.prepare is not None)
+        _add_run_options(parser, captures=stage.prepare is not None)
         parser.add_argument("--items", metavar="GLOB", help="only items that match, such as 'S00*'")
         parser.set_defaults(stage=stage.name)
     words = "print the settings of stages as TOML"
     parser = add_command(subparsers, "config", show_config, words, dataset=False, json=False)
     parser.add_argument("stage", nargs="*", metavar="STAGE", help="stages to print (default: all)")
     add_config_options(parser)
+    words = "measure the error of the whole chain against its time on this dataset"
+    parser = add_command(
+        subparsers, "tune", run_tune, words,
+        description="Try every setting of every stage on a few expressions of one subject, print "
+        "the choices that no other choice beats in both time and error, and write them to "
+        "DATASET/dial/front.csv. Later, 'run --budget' and 'plan' use the measurements.",
+        example="express50 tune DATASET && express50 report DATASET",
+    )  # fmt: skip
+    _add_run_options(parser, captures=True, preset=False)
 
 
-def add_run_options(parser: argparse.ArgumentParser, captures: bool, preset: bool = True) -> None:
+def _add_run_options(parser: argparse.ArgumentParser, captures: bool, preset: bool = True) -> None:
     """Add the options that say on what, where and with which settings stages run.
 
     Without ``preset``, the command chooses the settings itself, so options that need them are
@@ -109,7 +128,7 @@ def run_one(args: argparse.Namespace) -> int:
     return _run(args, chosen, args.items)
 
 
-def run_all(args: argparse.Namespace) -> int:
+def _run_all(args: argparse.Namespace) -> int:
     """Run all stages in order; a stage that fails for some items continues with the others."""
     names = list(stages())
     first = names.index(args.first) if args.first else 0
@@ -127,15 +146,14 @@ def run_all(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None) -> int:
     from express50.runner.executor import Pool
-    from express50.runner.preflight import problems
     from express50.runner.runner import Summary, run_stage
     from express50.runner.worker import cap_threads
 
     # Set before a stage imports NumPy, whose BLAS reads the thread limit when it is loaded.
     cap_threads(args.threads)
     dataset = Dataset(args.dataset)
-    refuse_swapped(dataset, getattr(args, "captures", ()), args.command)
-    slurm = slurm_jobs(args)
+    _refuse_swapped(dataset, getattr(args, "captures", ()), args.command)
+    slurm = _slurm_jobs(args)
     if slurm is not None and args.print_job:
         jobs = dict.fromkeys(slurm[stage.name] for stage in chosen)
         return _say_scripts(jobs, args.threads, Dataset(dataset.root.resolve()).slurm_dir)
@@ -146,9 +164,7 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
     ):
         # Everything is checked before the first stage spends hours.
         work = [(stage, config_of(stage, args)) for stage in chosen]
-        if found := list(problems(dataset, work, pool, all_items=pattern is None)):
-            for line in found:
-                log(f"express50: {line}")
+        if not _is_ready(dataset, work, pool, all_items=pattern is None):
             return USAGE
         for stage, config in work:
             items = _items(stage, dataset, args, pattern)
@@ -159,15 +175,106 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
                 break
             summaries.append(run_stage(stage, dataset, config, items, pool=pool))
             if not args.json:
-                say_account(stage, dataset, summaries[-1])
+                _say_account(stage, dataset, summaries[-1])
     if args.json:
         accounts = [summary.to_json() for summary in summaries]
         before = {"before": accounts[:-1]} if len(accounts) > 1 else {}
         say_json(accounts if args.command == "run" else accounts[-1] | before)
-    return exit_code(summaries, args.strict)
+    return _exit_code(summaries, args.strict)
 
 
-def exit_code(summaries: Sequence[Any], strict: bool) -> int:
+def _is_ready(
+    dataset: Dataset, work: Sequence[tuple[Stage, Any]], pool: Pool, all_items: bool = True
+) -> bool:
+    """Say what would stop stages with these configurations; return whether nothing would."""
+    from express50.runner.preflight import problems
+
+    found = list(problems(dataset, work, pool, all_items))
+    for line in found:
+        log(f"express50: {line}")
+    return not found
+
+
+def run_chain(args: argparse.Namespace) -> int:
+    """Run all stages, with settings chosen for the budget or the goal if one is given."""
+    if args.budget is None and args.error is None:
+        return _run_all(args)
+    from express50.dial.budget import parse_budget, parse_goal
+    from express50.dial.run import closing_lines, run_within
+
+    if args.first or args.last:
+        raise ConfigError("--budget and --error run all stages; omit --first and --last")
+    budget = None if args.budget is None else parse_budget(args.budget)
+    goal = None if args.error is None else parse_goal(args.error)
+
+    def ended(stage: Stage, summary: Any) -> None:
+        if not args.json:
+            _say_account(stage, chain.dataset, summary)
+
+    with _chain(args) as chain:
+        if chain is None:
+            return USAGE
+        summaries, state = run_within(chain, budget, goal, ended)
+    if args.json:
+        say_json({"run": vars(state), "stages": [summary.to_json() for summary in summaries]})
+    else:
+        say(*closing_lines(state, summaries))
+    return _exit_code(summaries, args.strict) if state.finished else FAILED
+
+
+def run_tune(args: argparse.Namespace) -> int:
+    """Measure every setting of every stage on a few items, and write the Pareto front."""
+    from express50.dial.measuring import tune
+
+    with _chain(args) as chain:
+        if chain is None:
+            return USAGE
+        table, lines = tune(chain)
+    return answer(args, table, *lines)
+
+
+@contextmanager
+def _chain(args: argparse.Namespace) -> Iterator[Any]:
+    """Open a dataset's chain with all settings of its stages; yield None if it cannot run."""
+    from express50.dial.pilot import Chain
+    from express50.runner.executor import Pool
+    from express50.runner.worker import cap_threads
+
+    if args.preset is not None:
+        raise ConfigError(
+            "--preset: --budget and --error choose the settings; leave it out, or use --set"
+        )
+    if args.print_job:
+        raise ConfigError(
+            "--print-job: the settings are not chosen yet; give --preset instead of --budget"
+        )
+    cap_threads(args.threads)
+    known, dataset = list(stages().values()), Dataset(args.dataset.resolve())
+    _refuse_swapped(dataset, args.captures, args.command)
+    ladders = {
+        stage.name: distinct_settings(
+            stage, lambda s, preset: resolve_config(s, preset, args.config, args.set, stages())
+        )
+        for stage in known
+    }
+    slurm = _slurm_jobs(args)
+    with (
+        stdout_to_stderr() if args.json else nullcontext(),
+        Pool(args.workers, args.scheduler, args.threads, slurm) as pool,
+    ):
+        work = [(stage, config) for stage in known for config in ladders[stage.name].values()]
+        if not _is_ready(dataset, work, pool):
+            yield None
+            return
+        if not args.captures:
+            check_folder(dataset)
+        for stage in known:
+            if stage.prepare is not None and args.captures:
+                stage.prepare(dataset, args.captures, args.replace)
+        yield Chain(known, dataset, ladders, pool, log if args.json else say)
+
+
+def _exit_code(summaries: Sequence[Any], strict: bool) -> int:
     """Return whether no item failed or, with ``strict``, lost a part."""
     dropped = strict and any(o.dropped for summary in summaries for o in summary.outcomes)
     return OK if all(summary.ok for summary in summaries) and not dropped else FAILED
@@ -182,7 +289,7 @@ def _say_scripts(jobs: Iterable[Any], threads: int, logs: Path) -> int:
     return OK
 
 
-def refuse_swapped(dataset: Dataset, captures: Sequence[Path], command: str) -> None:
+def _refuse_swapped(dataset: Dataset, captures: Sequence[Path], command: str) -> None:
     """Raise ConfigError if a capture is in the place of the dataset, or the other way round."""
     from express50.capture.readers.read import is_capture
 
@@ -200,7 +307,7 @@ def refuse_swapped(dataset: Dataset, captures: Sequence[Path], command: str) -> 
             )
 
 
-def say_account(stage: Stage, dataset: Dataset, summary: Any) -> None:
+def _say_account(stage: Stage, dataset: Dataset, summary: Any) -> None:
     """Print the account of a stage."""
     say(*summary.lines())
     if stage.account is not None:
@@ -208,7 +315,7 @@ def say_account(stage: Stage, dataset: Dataset, summary: Any) -> None:
         say(*stage.account(dataset, done))
 
 
-def slurm_jobs(args: argparse.Namespace) -> Mapping[str, Any] | None:
+def _slurm_jobs(args: argparse.Namespace) -> Mapping[str, Any] | None:
     """Return the resources that SLURM jobs ask for, per stage; None if stages run elsewhere."""
     if args.slurm is None:
         if args.print_job:

@@ -62,7 +62,7 @@ def write_with(path: Path, write: Callable[[BinaryIO], object]) -> None:
                 os.fsync(file.fileno())
             aside.replace(path)
         except OSError as error:
-            if error.filename == str(aside):  # a name that nobody has given
+            if error.filename == str(aside):  # the user knows only the target
                 error.filename = str(path)
             raise
         finally:
@@ -95,7 +95,7 @@ def check_folder_writable(folder: Path) -> None:
     try:
         with tempfile.TemporaryFile(dir=place):
             pass
-    except OSError as error:  # its own name is one that nobody has given
+    except OSError as error:  # the user does not know its name
         raise OSError(error.errno, error.strerror, str(folder)) from None
 
 
@@ -144,7 +144,7 @@ def check_space(folder: Path) -> None:
 def naming_full_disk(path: Path, aside: Path | None = None) -> Iterator[None]:
     """Turn any error caused by a full disk, even in a library, into one that names the path.
 
-    ``aside`` is where the files lie until they are whole, which is nobody's name for them.
+    ``aside`` is where the files lie until they are complete; errors name ``path`` instead of it.
 
     Raises:
         DiskFullError: the body raised such an error.
@@ -174,10 +174,10 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
-def is_full(path: Path, needed: float = 1e6) -> bool:
-    """Say whether a disk has fewer free bytes than needed, for libraries that do not say why."""
+def is_full(path: Path) -> bool:
+    """Say whether a disk has less than a megabyte left, for libraries that do not say why."""
     usage = shutil.disk_usage(nearest_existing(path))
-    return bool(usage.total) and usage.free < needed
+    return bool(usage.total) and usage.free < 1e6
 
 
 def disk_full(path: Path, why: str) -> DiskFullError:

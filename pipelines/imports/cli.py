@@ -39,13 +39,16 @@ from pipelines.imports.footage_check import (
 )
 from pipelines.imports.pictures import (
     UNITS,
+    PeakFrame,
     check_depths,
     check_masks,
+    check_pattern,
+    fill,
+    peak_frames,
     read_foreign_depth,
     read_mask,
     write_fused,
 )
-from pipelines.imports.places import PeakFrame, check_pattern, fill, peak_frames
 from pipelines.imports.tracks import TrackSource, read_foreign_track
 from pipelines.track.sequence import write_npz
 

@@ -16,8 +16,7 @@ from express50.errors import CaptureError, StageError
 from express50.files.images import disc
 from express50.geometry.cameras import Camera, inside_frame, project_pinhole
 from express50.landmarks import EMBEDDED
-from pipelines.imports.pictures import pixels_showing
-from pipelines.imports.places import PeakFrame
+from pipelines.imports.pictures import PeakFrame, pixels_showing
 from pipelines.track.observe import Observation
 from pipelines.track.read_inputs import agreed, open_landmarks, search_views
 

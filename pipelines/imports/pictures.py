@@ -1,16 +1,23 @@
-"""Read the masks and depth maps of other tools, check them against cameras, and fuse depth."""
+"""Find and read the masks and depth maps of other tools, check them with cameras, fuse depth.
+
+Files are named by patterns with places for subject, expression, camera and frame.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 import open3d as o3d
 
+from express50.capture.index import read_index, read_peaks
+from express50.contract.layout import Dataset
 from express50.dataset.depth_files import FARTHEST_M as BACKGROUND_M
-from express50.errors import FormatError, StageError
+from express50.errors import ConfigError, FormatError, StageError
 from express50.files.arrays import read_npy
 from express50.files.images import read_image, resize_area
 from express50.geometry.cameras import (
@@ -24,6 +31,69 @@ from express50.geometry.cameras import (
 from express50.geometry.conventions import K_to_opencv, cell_centres, cell_to_corner
 from express50.geometry.meshes import write_surface
 from express50.geometry.sampling import undistort_image, undistort_maps
+
+PLACES = ("subject", "expression", "camera", "frame", "clip_frame")
+_PLACE = re.compile(r"\{([^{}:]*)(?::0?(\d+)d?)?\}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PeakFrame:
+    """Names the peak frame of an expression.
+
+    Attributes:
+        expression: its id.
+        frame: decode index in the footage.
+        clip_frame: the same, counted from the first frame of the expression's cue window.
+    """
+
+    expression: str
+    frame: int
+    clip_frame: int
+
+
+def peak_frames(dataset: Dataset, subject: str) -> list[PeakFrame]:
+    """List a subject's peak frames by expression, sorted."""
+    starts = {cue.expression_id: cue.start_frame for cue in read_index(dataset, subject).cues}
+    return [
+        PeakFrame(expression=name, frame=frame, clip_frame=frame - starts.get(name, 0))
+        for name, frame in sorted(read_peaks(dataset, subject).items())
+    ]
+
+
+def check_pattern(pattern: str, needed: tuple[str, ...]) -> set[str]:
+    """Return the names of a pattern's placeholders.
+
+    Raises:
+        ConfigError: a placeholder is unknown, or a needed one is missing.
+    """
+    found = {match[1] for match in _PLACE.finditer(pattern)}
+    known = ", ".join(f"{{{name}}}" for name in PLACES)
+    if unknown := sorted(found - set(PLACES)):
+        raise ConfigError(
+            f"{pattern}: unknown placeholder {{{unknown[0]}}}; expected some of {known}"
+        )
+    if "expression" in needed and found & {"frame", "clip_frame"}:
+        needed = tuple(name for name in needed if name != "expression")
+    if missing := [name for name in needed if name not in found]:
+        raise ConfigError(
+            f"{pattern}: has no {{{missing[0]}}}; expected a pattern with {known}, and widths such"
+            " as {frame:06d}"
+        )
+    return found
+
+
+def fill(pattern: str, subject: str, peak: PeakFrame | None = None, camera: str = "") -> Path:
+    """Return the path that a pattern names."""
+    values: dict[str, str | int] = {"subject": subject, "camera": camera}
+    if peak is not None:
+        values |= vars(peak)
+
+    def value(match: re.Match[str]) -> str:
+        found = values.get(match[1], match[0])
+        return f"{found:0{match[2] or 0}d}" if isinstance(found, int) else str(found)
+
+    return Path(_PLACE.sub(value, pattern)).expanduser()
+
 
 SAMPLES = 1500  # pixels per view that are compared to the other views
 NEAR_M = 0.01  # distance within which surface points of two views are the same
@@ -267,7 +337,13 @@ def write_fused(
         raise StageError(f"{path.name}: the depth maps hold no surface")
     mesh.compute_vertex_normals()
     vertices = mesh.vertex.positions.numpy().astype(np.float64) + centre
-    seen, colours = _seen(vertices, cameras, depths, pictures, TRUNCATION * voxel)
+    seen, total = np.zeros(len(vertices)), np.zeros((len(vertices), 3))  # views, and their colours
+    for name, depth in depths.items():
+        found, z = pixels_showing(cameras[name], depth, vertices)
+        shown = (found > 0) & (np.abs(found - z) < TRUNCATION * voxel)
+        seen += shown
+        total[shown] += pixels_showing(cameras[name], pictures[name], vertices[shown])[0]
+    colours = np.rint(total / np.maximum(seen, 1)[:, None]).astype(np.uint8)
     faces, normals = mesh.triangle.indices.numpy(), mesh.vertex.normals.numpy()
     confidence = np.minimum(seen / SURE, 1.0).astype(np.float32)
     write_surface(path, vertices, faces, normals, colours, confidence)
@@ -296,20 +372,3 @@ def fuse(
         blocks = volume.compute_unique_block_coordinates(image, *pose, 1.0, FARTHEST_M, TRUNCATION)
         volume.integrate(blocks, image, *pose, 1.0, FARTHEST_M, TRUNCATION)
     return volume.extract_triangle_mesh(weight_threshold=least_views)
-
-
-def _seen(
-    vertices: np.ndarray,
-    cameras: Mapping[str, Camera],
-    depths: Mapping[str, np.ndarray],
-    pictures: Mapping[str, np.ndarray],
-    near: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Count the views that show each vertex (N,), and average their colours (N, 3) uint8."""
-    count, total = np.zeros(len(vertices)), np.zeros((len(vertices), 3))
-    for name, depth in depths.items():
-        found, z = pixels_showing(cameras[name], depth, vertices)
-        shown = (found > 0) & (np.abs(found - z) < near)
-        count += shown
-        total[shown] += pixels_showing(cameras[name], pictures[name], vertices[shown])[0]
-    return count, np.rint(total / np.maximum(count, 1)[:, None]).astype(np.uint8)

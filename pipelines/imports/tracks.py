@@ -36,7 +36,7 @@ from express50.head.load import load_head
 from express50.head.model import HeadModel, pose, rest_vertices
 from express50.rigs.read import read_rig
 from express50.rigs.transforms_json import frame_camera
-from pipelines.imports.places import PeakFrame, fill
+from pipelines.imports.pictures import PeakFrame, fill
 
 WHAT = "FLAME parameters of a tracker"
 # Names and widths of the arrays with one row per time step.

@@ -19,7 +19,6 @@ from express50.errors import CaptureError, NoFaceError, StageError
 from express50.files.images import box_about, shrink, tile_sheet, write_image
 from express50.geometry.cameras import Camera, pinhole, resized
 from express50.geometry.sampling import local_moments, undistorted_mask
-from pipelines.matte.consensus import SIDE, Agreement, compare_mattes
 from pipelines.matte.cutout import CutView, cut_out, make_cut_view, soft_alpha
 from pipelines.matte.key import dilated, key_alpha
 from pipelines.matte.plates import (
@@ -30,7 +29,15 @@ from pipelines.matte.plates import (
     match_plate,
     white_share,
 )
-from pipelines.matte.visual_hull import INSIDE, Ball, MatteView, ball_of
+from pipelines.matte.visual_hull import (
+    INSIDE,
+    SIDE,
+    Agreement,
+    Ball,
+    MatteView,
+    ball_of,
+    compare_mattes,
+)
 
 COLUMNS = 6  # of the contact sheet
 TILE = 240

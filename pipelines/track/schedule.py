@@ -20,12 +20,19 @@ from pipelines.regions.things import Picture, face_views, find_glasses
 from pipelines.track.basis import ALONG, OFF, Basis, freeze_shape
 from pipelines.track.config import TrackConfig
 from pipelines.track.eyes_and_jaw import EyeOffsets, measure_eyes, with_irises_and_jaw
-from pipelines.track.face_uv import FaceUvMap, make_uv_map, reading_map, slide_term, with_slide
+from pipelines.track.face_uv import (
+    FINE,
+    FaceUvMap,
+    make_uv_map,
+    reading_map,
+    skin_flows,
+    slide_term,
+    with_slide,
+)
 from pipelines.track.fit import fit
 from pipelines.track.outline import outline_terms
 from pipelines.track.photo_consistency import SkinSamples, patch_terms, skin_samples, under_hair
 from pipelines.track.read_inputs import peak_pictures
-from pipelines.track.skin_flow import FINE, skin_flows
 from pipelines.track.state import State, Target, all_vertices, rotations
 from pipelines.track.surface import FrameSetCrops, mask_things, near_things
 from pipelines.track.terms import NormalTerm, SlideTerm, Term, landmark_anchors

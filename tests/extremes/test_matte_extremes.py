@@ -10,9 +10,8 @@ import pytest
 from express50.geometry.cameras import pinhole_camera, scale_camera, transform_camera
 from express50.geometry.transforms import look_at, make_transform
 from pipelines.matte import visual_hull
-from pipelines.matte.consensus import Agreement, compare_mattes
 from pipelines.matte.stage import corrected, make_view
-from pipelines.matte.visual_hull import MatteView, ball_of
+from pipelines.matte.visual_hull import Agreement, MatteView, ball_of, compare_mattes
 from tests.pipelines.bump_head import ring
 from tests.pipelines.matte_rig import SIZE, disc, make_views, shots, with_alpha
 

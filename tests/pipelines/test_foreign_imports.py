@@ -27,8 +27,7 @@ from express50.runner.ledger import Ledger
 from pipelines.depth import STAGE as DEPTH
 from pipelines.frames import STAGE as FRAMES
 from pipelines.imports.footage_check import check_landmarks, check_masks_show_face, edge_contrast
-from pipelines.imports.pictures import ray_lengths
-from pipelines.imports.places import PeakFrame, check_pattern, fill
+from pipelines.imports.pictures import PeakFrame, check_pattern, fill, ray_lengths
 from pipelines.matte import STAGE as MATTE
 from pipelines.track import STAGE as TRACK
 from pipelines.track.observe import LandmarkView, Observation

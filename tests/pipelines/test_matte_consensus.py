@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.matte.consensus import compare_mattes
 from pipelines.matte.stage import corrected
+from pipelines.matte.visual_hull import compare_mattes
 from tests.pipelines.matte_rig import SIZE, disc, make_views, with_alpha
 
 BACKDROP = np.array([77, 128, 102], np.uint8)

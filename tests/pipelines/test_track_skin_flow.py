@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from express50.head.model import pose
-from pipelines.track.face_uv import HEIGHT, WIDTH, make_uv_map
+from pipelines.track.face_uv import FINE, HEIGHT, WIDTH, SkinMap, flow_term, make_uv_map
 from pipelines.track.schedule import SKIN_ROUNDS, make_schedule
-from pipelines.track.skin_flow import FINE, SkinMap, flow_term
 
 SIZE = FINE * HEIGHT, FINE * WIDTH
 

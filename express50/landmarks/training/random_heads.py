@@ -9,14 +9,23 @@ at once; the others move random muscles, so that unscripted expressions occur to
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
+import open3d as o3d
 import torch
 
 from express50.capture.expressions import Expression, load_script
-from express50.head.model import HeadModel, landmarks, landmarks_of, pose, vertex_normals
+from express50.geometry.raycast import barycentrics, mesh_scene
+from express50.head.model import (
+    HeadModel,
+    in_regions,
+    landmarks,
+    landmarks_of,
+    pose,
+    vertex_normals,
+)
 from express50.landmarks.network import INNER_LIPS
-from express50.landmarks.training.places import Places, closest_places, place_points
 
 BROWS = slice(17, 27)
 SCRIPTED_SHARE = 0.6  # share of the heads that show entries of the script
@@ -344,3 +353,34 @@ def _draw_mouth(expression: np.ndarray, jaw: np.ndarray, model: HeadModel, rng: 
     showing = {"mouthUpperUp": 1.0, "mouthLowerDown": 1.0, "mouthSmile": 1.0, "mouthStretch": 0.6}
     for name, most in showing.items() if kind >= SHUT else ():
         expression[[k for k in moves if names[k].startswith(name)]] = rng.uniform(0.0, most)
+
+
+INSIDE = (
+    "teeth", "tongue", "mouth_interior", "left_eyeball", "right_eyeball", "left_iris", "right_iris",
+    "boundary",
+)  # fmt: skip
+Places = tuple[np.ndarray, np.ndarray]  # faces (N,), weights (N, 3)
+
+
+@lru_cache(maxsize=4)
+def _skin(model: HeadModel) -> tuple[o3d.t.geometry.RaycastingScene, np.ndarray]:
+    """Return the skin of a head model at rest as a scene, and the ids of its faces."""
+    faces = model.faces.numpy()
+    skin = np.flatnonzero(~in_regions(model, INSIDE)[faces].any(1))
+    return mesh_scene(model.template.numpy(), faces[skin]), skin
+
+
+def closest_places(model: HeadModel, points: np.ndarray) -> Places:
+    """Return the places on the skin of a head model at rest nearest to points (D, 3)."""
+    scene, skin = _skin(model)
+    found = scene.compute_closest_points(o3d.core.Tensor(points.astype(np.float32)))
+    weights = barycentrics(found).astype(np.float32)
+    return skin[found["primitive_ids"].numpy()], weights
+
+
+def place_points(
+    model: HeadModel, places: Places, vertices: np.ndarray | None = None
+) -> np.ndarray:
+    """Return the points (D, 3) at places of a head model with vertices (V, 3), or at rest."""
+    mesh = model.template.double().numpy() if vertices is None else vertices
+    return (mesh[model.faces.numpy()[places[0]]] * places[1][..., None]).sum(1)

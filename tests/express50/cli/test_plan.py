@@ -10,8 +10,8 @@ from express50.__main__ import main
 from express50.cli.plan import TARGETS, Measured, estimate, measure, measure_sizes, target_of
 from express50.contract.layout import Dataset
 from express50.contract.stage import stages
+from express50.dial.choice import MeasuredSize, forecast
 from express50.dial.figures import Footage, footage_of
-from express50.dial.laws import MeasuredSize, forecast
 from express50.dial.measuring import tune
 from express50.runner.ledger import Ledger
 from pipelines import ingest

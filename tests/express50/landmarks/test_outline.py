@@ -8,7 +8,7 @@ import pytest
 from express50.geometry.transforms import axis_angle_to_matrix
 from express50.head.load import load_head
 from express50.head.model import landmarks_of
-from express50.landmarks.training.places import face_front
+from express50.landmarks.training.scene import face_front
 
 FOCAL, DISTANCE, SIZE = 900.0, 0.8, 512
 HEAD = load_head("procedural")
