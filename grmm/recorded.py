@@ -51,8 +51,7 @@ class Recorded(Generic[Result]):
     def __call__(self, *values: Tensor | float, module: nn.Module | None = None) -> Result:
         """Call the function; the caller may keep and change what it returns."""
         function = self._function if module is None else partial(self._function, module)
-        on_gpu = all(v.is_cuda for v in values if isinstance(v, Tensor))
-        if torch.is_grad_enabled() or not on_gpu:  # a recording computes no gradient
+        if not _can_record(values):
             return function(*values)
         with self._lock:
             known = self._recordings.setdefault(self if module is None else module, {})
@@ -83,6 +82,11 @@ class Recorded(Generic[Result]):
                 return outputs.clone()
             copies = {name: value.clone() for name, value in vars(outputs).items()}
             return replace(outputs, **copies)
+
+
+def _can_record(values: Sequence[Tensor | float]) -> bool:
+    """Say whether the tensors are on a GPU and no gradient is wanted."""
+    return not torch.is_grad_enabled() and all(v.is_cuda for v in values if isinstance(v, Tensor))
 
 
 def _recording(
