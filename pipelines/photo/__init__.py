@@ -93,7 +93,8 @@ def run_photo(args: argparse.Namespace) -> int:
             for stage, config in zip(loaded, configs, strict=True):
                 chosen = [i for i in stage.items(dataset) if i.split("/")[0] == subject]
                 summaries.append(run_stage(stage, dataset, config, chosen, pool=pool))
-                if not summaries[-1].ok:
+                # Without a matte, `track` fits a frame to its landmarks alone.
+                if not summaries[-1].ok and not (stage.name == "matte" and picture.video):
                     break
         # Not in the capture: ingest would be outdated.
         panel = dataset.root / "panels" / subject / "panel.jpg"

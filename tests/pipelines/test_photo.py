@@ -215,6 +215,21 @@ def test_a_video_is_tracked_in_every_frame(tmp_path: Path, astronaut: np.ndarray
     assert moved[-1] - moved[0] == pytest.approx(4.0, abs=0.5)
 
 
+def test_a_video_is_tracked_where_a_face_half_hidden_gets_no_matte(
+    tmp_path: Path, astronaut: np.ndarray, monkeypatch, capsys
+) -> None:
+    shown = np.ascontiguousarray(astronaut[20:260, 90:350])
+    hidden = shown.copy()
+    hidden[140:] = 90
+    write_video(tmp_path / "clip.mp4", [shown, shown, hidden])
+    monkeypatch.setattr("pipelines.matte.cutout.FACE_SCORE", 0.78)  # between the two scores
+    command = ["photo", str(tmp_path / "clip.mp4"), str(tmp_path / "out"), "--matte"]
+    assert main([*command, "--preset", "draft", "--windows", "3"]) == 0
+    assert "failed clip/clip_02: StageError: clip/clip_02: no face" in "".join(capsys.readouterr())
+    assert (tmp_path / "out/matte/clip/clip_00/photo.png").is_file()
+    assert (tmp_path / "out/track/clip/sequence.npz").is_file()
+
+
 @pytest.mark.parametrize(
     "setting", ["head=flame.pkl", "landmarks=points.npz", "landmarks=fan:x.pt"]
 )
