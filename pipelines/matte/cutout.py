@@ -29,6 +29,7 @@ from express50.geometry.conventions import corner_to_cell
 from express50.geometry.transforms import transform_points
 from pipelines.matte.plates import local_colours, nearest_first, to_light
 from pipelines.matte.visual_hull import (
+    FEWEST,
     Ball,
     Evidence,
     MatteView,
@@ -44,9 +45,8 @@ SURE, LIKELY, HAIR = 0.7, 1.3, 1.6  # skull sizes: no wall inside the first, no 
 LEAST_DEPTH = 0.05  # metres in front of the camera
 HOLE_M2 = 1.5e-3  # larger gaps show the background
 CUTS = 6  # GrabCut's iterations
-FEWEST = 4  # cameras that can correct each other
 MANY = 7  # the hull of fewer cameras is so much larger than the person that it holds much wall
-SLACK_PX = (3.0, 1.5)  # distance from an outline within which it proves nothing, per round
+SLACK_PX = (3.0, 1.5)  # of `_corrected_labels`, per round
 COLOURS, RARE = 32, 1e-5  # colour cells along each axis of Lab; share of a cell that is never seen
 UNSEEN = 2 / COLOURS**3  # the person does not have colours of a smaller share
 CELLS = 96  # cells along each side of the cube in which cameras are compared
@@ -94,14 +94,6 @@ class CutView:
 
 
 @dataclass(frozen=True)
-class PersonGuess:
-    """A person's likely place: GrabCut labels (h, w) uint8, and pixels per metre of the head."""
-
-    labels: np.ndarray
-    density: float
-
-
-@dataclass(frozen=True)
 class HeadPlace:
     """The pose of a mean head: world = scale * rotation @ head + shift."""
 
@@ -143,17 +135,20 @@ def cut_out(views: Sequence[CutView], ball: Ball | None) -> dict[str, Cut]:
     place = _place_head(views)
     small = [_at_scale(view, PIXEL_M * place.density(view.camera)) for view in views]
     guesses = [_guess(view, place) for view in small]
-    masks = [
-        _cut(view, guess.labels, guess) if view.known is None else view.known
-        for view, guess in zip(small, guesses, strict=True)
-    ]
+    density = [place.density(view.camera) for view in small]
+
+    def cut(labels: Sequence[np.ndarray]) -> list[np.ndarray]:
+        return [
+            _cut(view, own, guess, scale) if view.known is None else view.known
+            for view, own, guess, scale in zip(small, labels, guesses, density, strict=True)
+        ]
+
+    masks = cut(guesses)
     if ball is not None and len(views) >= FEWEST:
         for slack in SLACK_PX:
-            masks = _corrected(small, guesses, masks, ball, slack)
-    return {
-        view.name: Cut(mask, guess.density)
-        for view, mask, guess in zip(small, masks, guesses, strict=True)
-    }
+            masks = cut(_corrected_labels(small, guesses, masks, ball, slack))
+    cuts = map(Cut, masks, density)
+    return {view.name: found for view, found in zip(small, cuts, strict=True)}
 
 
 def _place_head(views: Sequence[CutView]) -> HeadPlace:
@@ -165,7 +160,7 @@ def _place_head(views: Sequence[CutView]) -> HeadPlace:
 
     faces = detect_many(load_network(), [view.rgb for view in views], smallest=SMALL)
     place = place_head([
-        LandmarkView(view.name, view.camera, face.points, face.sigma, face.score)
+        LandmarkView(view.camera, face.points, face.sigma, face.score)
         for view, face in zip(views, faces, strict=True)
         if face.score >= FACE_SCORE
     ])  # fmt: skip
@@ -235,8 +230,8 @@ def _slab(
     ])  # fmt: skip
 
 
-def _guess(view: CutView, place: HeadPlace) -> PersonGuess:
-    """Project a person's parts into a view, to start GrabCut from."""
+def _guess(view: CutView, place: HeadPlace) -> np.ndarray:
+    """Project a person's parts into a view: GrabCut labels (h, w) uint8 to start from."""
     labels = np.full(view.valid.shape, cv2.GC_BGD, np.uint8)
     for value, parts in parts_of_a_person().items():
         for points in parts:
@@ -246,15 +241,16 @@ def _guess(view: CutView, place: HeadPlace) -> PersonGuess:
                 cells = corner_to_cell(np.clip(pixels, -far, far))
                 hull = cv2.convexHull(cells.astype(np.float32))
                 cv2.fillConvexPoly(labels, hull.round().astype(np.int32), value)
-    return PersonGuess(labels, place.density(view.camera))
+    return labels
 
 
-def _cut(view: CutView, labels: np.ndarray, guess: PersonGuess) -> np.ndarray:
+def _cut(view: CutView, labels: np.ndarray, guess: np.ndarray, density: float) -> np.ndarray:
     """Run GrabCut from labels (h, w); return the person's mask (h, w), with small holes filled.
 
-    Parts that are not connected to where the `guess` is certain are left out.
+    Parts that are not connected to where the `guess` (h, w) is certain are left out. `density` is
+    in pixels per metre of the head.
     """
-    sure = guess.labels == cv2.GC_FGD
+    sure = guess == cv2.GC_FGD
     if not sure.any():  # the person is out of view
         return np.zeros(labels.shape, bool)
     if not np.isin(labels, (cv2.GC_BGD, cv2.GC_PR_BGD)).any():
@@ -269,17 +265,20 @@ def _cut(view: CutView, labels: np.ndarray, guess: PersonGuess) -> np.ndarray:
     person = np.isin(parts, np.unique(parts[sure & inside])) & inside
     holes = binary_fill_holes(person) & ~person
     _, parts, stats, _ = cv2.connectedComponentsWithStats(holes.astype(np.uint8), connectivity=4)
-    return person | (holes & (stats[:, cv2.CC_STAT_AREA] < HOLE_M2 * guess.density**2)[parts])
+    return person | (holes & (stats[:, cv2.CC_STAT_AREA] < HOLE_M2 * density**2)[parts])
 
 
-def _corrected(
+def _corrected_labels(
     views: Sequence[CutView],
-    guesses: Sequence[PersonGuess],
+    guesses: Sequence[np.ndarray],
     masks: Sequence[np.ndarray],
     ball: Ball,
     slack: float,
 ) -> list[np.ndarray]:
-    """Cut all views again, within what the other views leave possible; `slack` is in pixels."""
+    """Limit each view's GrabCut labels to what the other views' masks leave possible.
+
+    `slack` is the distance from an outline, in pixels, within which it proves nothing.
+    """
     mattes = [
         MatteView.of(view.camera, ball, view.rgb, mask.astype(np.float32), view.valid)
         for view, mask in zip(views, masks, strict=True)
@@ -287,21 +286,10 @@ def _corrected(
     space = make_space(mattes, CELLS, slack)
     place = subject_place(space)
     seen = [evidence_of(matte, space, place) for matte in mattes]
-    foreign = _foreign(
-        mattes,
-        [
-            one.solid | (guess.labels == cv2.GC_FGD)
-            for one, guess in zip(seen, guesses, strict=True)
-        ],
-    )
-    return [
-        _cut(view, _labels(matte, evidence, guess.labels, odd, len(views) >= MANY), guess)
-        if view.known is None
-        else view.known
-        for view, matte, evidence, guess, odd in zip(
-            views, mattes, seen, guesses, foreign, strict=True
-        )
-    ]
+    sure = [one.solid | (guess == cv2.GC_FGD) for one, guess in zip(seen, guesses, strict=True)]
+    foreign = _foreign(mattes, sure)
+    rows = zip(mattes, seen, guesses, foreign, strict=True)
+    return [_labels(*row, many=len(views) >= MANY) for row in rows]
 
 
 def _labels(

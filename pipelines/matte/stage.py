@@ -30,6 +30,7 @@ from pipelines.matte.plates import (
     white_share,
 )
 from pipelines.matte.visual_hull import (
+    EMPTY,
     INSIDE,
     SIDE,
     Agreement,
@@ -43,7 +44,6 @@ COLUMNS = 6  # of the contact sheet
 TILE = 240
 SHOWN = 192  # longest side of the pictures in the contact sheet, pixels
 RED, GREEN = (235, 50, 40), (50, 220, 80)
-EMPTY = 0.003  # share of the image below which a matte counts as empty
 # Share of the image's top or of a side that the subject may cover before it counts as cut off.
 MOST_CONTACT = 0.02
 RIM = 0.008  # share of the longer side: distance from the outline in which errors are predicted

@@ -386,7 +386,7 @@ def _corner_height(view: MatteView, others: Sequence[MatteView]) -> float:
 # long and gain next to nothing (docs/LOG.md, "Mattes").
 SIDE, CELLS = 128, 64
 FEWEST = 4  # views; of three, two with the same error would overrule a correct one
-EMPTY, FULL = 0.003, 0.98  # shares of the image
+EMPTY, FULL = 0.003, 0.98  # shares of the image that a useful matte covers
 # The entire matte is wrong if over STRAY of it lies off the others' subject and it lacks over
 # LACKING of that subject, or if it lacks over MOST_LACKING.
 STRAY, LACKING, MOST_LACKING = 0.03, 0.07, 0.3

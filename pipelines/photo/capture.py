@@ -312,7 +312,7 @@ def _cost(basis: Basis, detections: list[Detection], size: tuple[int, int], foca
     template = landmarks_of(basis.model)
     targets, poses = [], []
     for number, seen in enumerate(detections):
-        view = LandmarkView(camera.id, camera, seen.points, seen.sigma, seen.score)
+        view = LandmarkView(camera, seen.points, seen.sigma, seen.score)
         observation, _ = triangulate_views(f"frame {number}", number, [view])
         try:
             poses.append(initial_pose(observation, template))

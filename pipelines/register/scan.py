@@ -202,7 +202,7 @@ def views_about_face(source: Source, painter: ScanPainter, pose: FacePose) -> li
             camera = place_camera(middle, way, up, SPAN_M, f"view{len(views):02d}")
             face = source(painter.picture(camera)[0], camera.id, 0).face
             if face.score >= LEAST_SCORE:
-                views.append(LandmarkView(camera.id, camera, face.points, face.sigma, face.score))
+                views.append(LandmarkView(camera, face.points, face.sigma, face.score))
     return views
 
 

@@ -40,7 +40,6 @@ class LandmarkView:
             fixed places of the skin.
     """
 
-    camera_id: str
     camera: Camera
     points: np.ndarray
     sigma: np.ndarray
@@ -48,6 +47,11 @@ class LandmarkView:
     irises: Irises | None = None
     redundancy: float = 1.0
     visible_contour: bool = False
+
+    @property
+    def camera_id(self) -> str:
+        """Return the camera's id."""
+        return self.camera.id
 
     @property
     def doubt(self) -> float:

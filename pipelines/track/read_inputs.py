@@ -210,7 +210,7 @@ def _facing_cameras(cameras: Mapping[str, Camera], marks: np.ndarray) -> list[st
 def _landmark_view(camera: Camera, seen: Marked) -> LandmarkView:
     face = seen.face
     return LandmarkView(
-        camera.id, camera, face.points, face.sigma, face.score, seen.irises,
+        camera, face.points, face.sigma, face.score, seen.irises,
         visible_contour=seen.visible_contour,
     )  # fmt: skip
 

@@ -44,7 +44,7 @@ def seen() -> Detection:
 
 def fit_one(basis: Basis, face: Detection, camera: Camera) -> tuple[np.ndarray, float]:
     """World landmarks (68, 3) of a single-view fit, and their error between brows and mouth, px."""
-    view = LandmarkView(camera.id, camera, face.points, face.sigma, face.score)
+    view = LandmarkView(camera, face.points, face.sigma, face.score)
     observation, _ = triangulate_views("photo", 0, [view])
     template = landmarks_of(basis.model)
     start = start_state(basis, [initial_pose(observation, template)])

@@ -512,7 +512,7 @@ def face(cameras: dict, points: np.ndarray) -> Observation:
     from express50.geometry.cameras import project_pinhole
 
     views = tuple(
-        LandmarkView(name, camera, project_pinhole(camera, points)[0], np.ones(68), 1.0)
+        LandmarkView(camera, project_pinhole(camera, points)[0], np.ones(68), 1.0)
         for name, camera in cameras.items()
     )
     covariance = np.full((68, 3, 3), 1e-6)

@@ -66,7 +66,7 @@ def observations(scene, noise: float, cameras=RIG, order: int = 1) -> list[Obser
         views = []
         for camera in cameras:
             pixels = project(camera, marks)[0] + noise * rng.normal(size=(68, 2))
-            views.append(LandmarkView(camera.id, camera, pixels, np.ones(68), 0.9))
+            views.append(LandmarkView(camera, pixels, np.ones(68), 0.9))
         found.append(triangulate_views("clip", frame, views)[0])
     return found if order > 0 else found[::-1]
 

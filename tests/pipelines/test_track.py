@@ -79,9 +79,7 @@ def make_views(
 ) -> list[LandmarkView]:
     rng = np.random.default_rng(7)
     return [
-        LandmarkView(
-            c.id, c, project(c, marks)[0] + noise * rng.normal(size=(68, 2)), np.ones(68), 0.9
-        )
+        LandmarkView(c, project(c, marks)[0] + noise * rng.normal(size=(68, 2)), np.ones(68), 0.9)
         for c in cameras
     ]
 

@@ -102,7 +102,7 @@ def observed(head: HeadModel, mesh: np.ndarray, shift: np.ndarray) -> Target:
         centres = project(camera, mesh[[left, right]] + shift)[0]
         irises = Irises(centres, np.full(2, 0.5), np.full(2, 0.9))
         points = project(camera, marks)[0]
-        views.append(LandmarkView(camera.id, camera, points, np.ones(68), 0.9, irises))
+        views.append(LandmarkView(camera, points, np.ones(68), 0.9, irises))
     observation, _ = triangulate_views("gaze", 0, views)
     return Target(observation, landmark_sigma(observation), False)
 
@@ -176,7 +176,10 @@ def test_a_camera_given_ten_times_counts_as_one() -> None:
     good = make_views(scene.marks, 0.2, [make_camera(angle) for angle in (-0.8, -0.3, 0.3, 0.8)])
     bad = make_camera(0.0)
     points = project(bad, scene.marks)[0] + [5.0, 0.0]
-    copies = [LandmarkView(f"copy{n}", bad, points, np.ones(68), 0.9) for n in range(9)]
+    copies = [
+        LandmarkView(dataclasses.replace(bad, id=f"copy{n}"), points, np.ones(68), 0.9)
+        for n in range(9)
+    ]
     observation, _ = triangulate_views("smile", 0, [*good, *copies])
     crowds = {view.camera_id: view.redundancy for view in observation.views}
     assert crowds[good[0].camera_id] == pytest.approx(1.0, abs=0.01)

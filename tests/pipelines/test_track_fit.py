@@ -46,7 +46,7 @@ def shifted_targets(count: int, relief: bool) -> tuple[Basis, list[Target], Stat
     for seed in range(count):
         scene = make_scene(seed)
         marks = scene.marks + ERROR @ scene.rotation.T
-        views = [LandmarkView(c.id, c, project(c, marks)[0], np.full(68, 0.3), 0.9) for c in RIG]
+        views = [LandmarkView(c, project(c, marks)[0], np.full(68, 0.3), 0.9) for c in RIG]
         observation, _ = triangulate_views("smile", 0, views)
         target = Target(observation, landmark_sigma(observation), False)
         if relief:

@@ -39,7 +39,7 @@ def test_shading_is_like_skin_and_hair_is_not():
 def target_of(cameras) -> Target:
     """Views that see all landmarks in a row, 20 pixels apart."""
     points = np.stack([20.0 * np.arange(68), np.full(68, 100.0)], axis=1)
-    views = tuple(LandmarkView(c.id, c, points, np.full(68, 2.0), 1.0) for c in cameras)
+    views = tuple(LandmarkView(c, points, np.full(68, 2.0), 1.0) for c in cameras)
     none = np.full((68, 3), np.nan)
     seen = Observation("neutral", 0, views, np.ones((len(views), 68), bool), none, none[:, None])
     return Target(seen, np.full((len(views), 68), 2.0), neutral=True)

@@ -54,7 +54,7 @@ def observe(found: np.ndarray, time: str, marks: np.ndarray | None = None) -> Ob
         sigma = np.where(sides, 1.0, np.inf)
         irises = Irises(np.zeros((2, 2)), sigma, np.where(sides, 0.5, 0.0))
         pixels = project(camera, marks)[0]
-        views.append(LandmarkView(camera.id, camera, pixels, np.ones(68), 0.9, irises))
+        views.append(LandmarkView(camera, pixels, np.ones(68), 0.9, irises))
     return triangulate_views(time, TIMES.index(time), views)[0]
 
 
