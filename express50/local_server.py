@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from socket import SHUT_RDWR, SOCK_STREAM, getaddrinfo, socket
+from socket import SHUT_RDWR, SO_REUSEADDR, SOCK_STREAM, SOL_SOCKET, getaddrinfo, socket
 from threading import BoundedSemaphore, Timer
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
@@ -69,17 +69,24 @@ class RequestGuard:
         return after if mine and slash else None
 
 
-def check_host(host: str) -> None:
-    """Check that a server can listen on this address; ConfigError if it is not this machine's."""
+def check_address(host: str, port: int) -> None:
+    """Check that a server can listen on this address and port.
+
+    Raises:
+        ConfigError: the address is not this machine's, or the port is taken or not allowed.
+    """
+    fix = "expected an address of this machine, such as 127.0.0.1, or 0.0.0.0 for all of its"
+    fix += " addresses"
+    where = host
     try:
-        family, kind, _, _, address = getaddrinfo(host, 0, type=SOCK_STREAM)[0]
-        with socket(family, kind) as probe:
-            probe.bind(address)
+        for number in (0, port):
+            family, kind, _, _, address = getaddrinfo(host, number, type=SOCK_STREAM)[0]
+            with socket(family, kind) as probe:
+                probe.setsockopt(SOL_SOCKET, SO_REUSEADDR, 1)  # as the server itself does
+                probe.bind(address)
+            where, fix = f"{host}:{port}", "choose another port"
     except OSError as error:
-        raise ConfigError(
-            f"{host}: {error.strerror or error}; expected an address of this machine, such as"
-            " 127.0.0.1, or 0.0.0.0 for all of its addresses"
-        ) from error
+        raise ConfigError(f"{where}: {error.strerror or error}; {fix}") from error
 
 
 class PageServer(ThreadingHTTPServer):
@@ -89,16 +96,17 @@ class PageServer(ThreadingHTTPServer):
 
     def __init__(self, get: Get, post: Post | None, host: str, port: int) -> None:
         """Bind the port without serving yet; ConfigError if address or port cannot be used."""
-        check_host(host)
         if not 0 <= port <= 65535:
             raise ConfigError(f"port {port}: expected 0 to 65535 (0: any free port)")
         self.guard, self.get, self.post = RequestGuard(host), get, post
         self._free = BoundedSemaphore(AT_ONCE)
-        try:
-            super().__init__((host, port), _Handler)
-        except OSError as error:
-            why = error.strerror or error
-            raise ConfigError(f"{host}:{port}: {why}; choose another port") from error
+        check_address(host, port)
+        super().__init__((host, port), _Handler)
+
+    def serve_forever(self, poll_interval: float = 0.5) -> None:
+        """Answer until Ctrl-C, which is the way to stop and no interruption of work."""
+        with suppress(KeyboardInterrupt):
+            super().serve_forever(poll_interval)
 
     @property
     def address(self) -> str:

@@ -7,10 +7,12 @@ The library's page asks Google's tag manager to count visitors if the browser is
 
 from __future__ import annotations
 
+import io
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from http import HTTPStatus
@@ -26,7 +28,7 @@ from websockets.http11 import Request, Response
 
 from express50.console import stdout_to_stderr
 from express50.geometry.transforms import invert_transform, make_transform, quat_to_matrix
-from express50.local_server import RequestGuard, check_host
+from express50.local_server import RequestGuard, check_address
 from grmm.checkpoint import Checkpoint
 from grmm.edit import POSES, HeadCodes, between, controlled, principal_directions, trained_head
 from grmm.head_crop import draw_window, without_neck_end
@@ -124,6 +126,13 @@ class _Server(viser.ViserServer):
         """Share nothing: hiding the button instead leaves the whole page blank (viser 0.2.23)."""
 
 
+@contextmanager
+def _silenced() -> Iterator[None]:
+    """Drop what the library prints."""
+    with stdout_to_stderr(), redirect_stdout(io.StringIO()):
+        yield
+
+
 def _serve_behind(
     guard: RequestGuard,
     listen: Callable[..., Any],
@@ -152,14 +161,15 @@ class Viewer:
 
     def __init__(self, loaded: Checkpoint, host: str, port: int, moving: int, still: int) -> None:
         """Start to listen; heights in pixels while things move and once they rest."""
-        check_host(host)  # the library would wait without a word
+        # The library would wait for an address, and take another port, without a word.
+        check_address(host, port)
         self.loaded, self.heights = loaded, {True: moving, False: still}
         self.preview = Preview(loaded)
         self._stop, self._wake = threading.Event(), threading.Event()
         self._watchers: dict[int, Watcher] = {}
         self._head_changed = time.perf_counter()
-        with stdout_to_stderr():
-            guard = RequestGuard(host)
+        guard = RequestGuard(host)
+        with _silenced():  # it prints an address without the token
             self.server = _Server(guard, port=port, label="GRMM", verbose=False)
         self.address = guard.address(int(self.server.get_port()))
         self.server.gui.configure_theme(dark_mode=True)
@@ -172,12 +182,13 @@ class Viewer:
     def run(self) -> None:
         """Draw until `stop` (or Ctrl-C)."""
         try:
-            while not self._stop.is_set():
-                if not self._draw_due():
-                    self._wake.wait(REST_SECONDS / 2)
-                    self._wake.clear()
+            with suppress(KeyboardInterrupt):
+                while not self._stop.is_set():
+                    if not self._draw_due():
+                        self._wake.wait(REST_SECONDS / 2)
+                        self._wake.clear()
         finally:
-            with stdout_to_stderr():
+            with _silenced():
                 self.server.stop()
 
     def stop(self) -> None:

@@ -1,4 +1,5 @@
 import shutil
+import socket
 import subprocess
 import threading
 import urllib.error
@@ -93,8 +94,14 @@ def served(viewer):
     assert not thread.is_alive()
 
 
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
 def test_a_slider_moved_in_a_browser_changes_the_picture(loaded):
-    with served(Viewer(loaded, "127.0.0.1", 18200, moving=48, still=64)) as viewer:
+    with served(Viewer(loaded, "127.0.0.1", free_port(), moving=48, still=64)) as viewer:
         browser = Browser(viewer.address)
         eye = np.array([0.0, 0.05, 0.7])
         browser.look(eye)
@@ -121,7 +128,7 @@ def test_a_browser_shows_the_controls(loaded, tmp_path):
         browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}",
         "--timeout=8000", "--virtual-time-budget=8000", "--dump-dom",
     ]  # fmt: skip
-    with served(Viewer(loaded, "127.0.0.1", 8330, moving=32, still=32)) as viewer:
+    with served(Viewer(loaded, "127.0.0.1", free_port(), moving=32, still=32)) as viewer:
         command.append(viewer.address)
         for _ in range(3):  # a busy machine may not answer in the browser's time
             page = subprocess.run(command, capture_output=True, text=True, timeout=90, check=False)
@@ -131,11 +138,11 @@ def test_a_browser_shows_the_controls(loaded, tmp_path):
 
 
 def test_other_sites_and_other_users_do_not_get_in(loaded):
-    with served(Viewer(loaded, "127.0.0.1", 8360, moving=32, still=32)) as viewer:
-        socket = viewer.address.replace("http://", "ws://").removesuffix("/")
-        root = socket.rsplit("/", 1)[0]
+    with served(Viewer(loaded, "127.0.0.1", free_port(), moving=32, still=32)) as viewer:
+        ours = viewer.address.replace("http://", "ws://").removesuffix("/")
+        root = ours.rsplit("/", 1)[0]
         for address, origin, status in [
-            (socket, "http://evil.example", 403),
+            (ours, "http://evil.example", 403),
             (root, None, 404),
             (root + "/guess", None, 404),
         ]:
@@ -152,3 +159,21 @@ def test_other_sites_and_other_users_do_not_get_in(loaded):
 def test_an_address_of_another_machine_is_one_error(loaded):
     with pytest.raises(ConfigError, match="expected an address of this machine"):
         Viewer(loaded, "192.0.2.1", 0, 64, 128)
+
+
+def test_a_port_that_is_taken_is_one_error(loaded):
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        with pytest.raises(ConfigError, match=f"127.0.0.1:{port}: .*; choose another port"):
+            Viewer(loaded, "127.0.0.1", port, 64, 128)
+
+
+def test_ctrl_c_stops_the_viewer_and_only_its_own_address_is_printed(loaded, monkeypatch, capfd):
+    viewer = Viewer(loaded, "127.0.0.1", free_port(), 64, 128)
+
+    def interrupted():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(viewer, "_draw_due", interrupted)
+    viewer.run()
+    assert capfd.readouterr() == ("", "")
