@@ -310,6 +310,14 @@ def odd_keys(raw: RawCapture) -> dict[str, str]:
     units = raw.meta.get("units", "m")
     if str(units).lower() not in METRES:
         found.append(f"units is {units!r}, but lengths are taken as metres: convert them")
+    colours = raw.meta.get("color_space", "sRGB")
+    names = [name for camera in raw.cameras.values() for name in camera.names[:1]]
+    may_be_float = any(name.lower().endswith((".exr", ".tif", ".tiff")) for name in names)
+    if str(colours).lower() not in ("srgb", "linear" if may_be_float else "srgb"):
+        found.append(
+            f"color_space is {colours!r}, but pictures are taken as sRGB (float pictures as linear"
+            " light): convert them"
+        )
     focals = raw.meta.get("focal_px")
     if isinstance(focals, dict) and (strange := sorted(focals.keys() - raw.cameras.keys())):
         known = few(list(raw.cameras), 8)

@@ -21,7 +21,7 @@ from express50.dataset.tracks import (
     shape_spread,
 )
 from express50.error_model import error_bounds, single_camera_sigma
-from express50.errors import FormatError, StageError
+from express50.errors import FormatError, StageError, rounded_down
 from express50.files.digests import file_sha256
 from express50.files.images import contact_sheet, write_image
 from express50.files.text import read_json_table
@@ -86,8 +86,8 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
     warnings = []
     if agreement is not None and agreement < agreeing:
         why = (
-            f"cameras agree on bare skin by {agreement:.2f}, expected {AGREEING} or more, so the"
-            " mesh stays near the track: check calibration and synchronisation; cameras that stand"
+            f"cameras agree on bare skin by {rounded_down(agreement)}, expected {AGREEING} or more,"
+            " so the mesh stays near the track: check calibration and synchronisation; cameras that stand"
             " far apart or see a small head agree less, too"
         )
         warnings.append(Note(expression, why))

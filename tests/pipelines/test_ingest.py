@@ -189,6 +189,7 @@ def test_a_capture_without_cues_is_ingested_with_a_warning(dataset):
         ("metres_per_unit = 0.001", "metres_per_unit: read for colmap and transforms only"),
         ('licens = "CC0"', "'licens' (did you mean 'license'?); keys are"),
         ('units = "mm"', "units is 'mm', but lengths are taken as metres"),
+        ('color_space = "ACEScg"', "color_space is 'ACEScg', but pictures are taken as sRGB"),
         ("focal_px = {cam09 = 900}", "focal_px names cam09, but cameras are cam00, cam01, cam02"),
     ],
 )

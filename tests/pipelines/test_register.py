@@ -270,6 +270,10 @@ def test_a_surface_on_which_views_disagree_is_not_followed(dataset, tmp_path):
     assert found[1].metrics["skin_agreement"] == pytest.approx(0.4)
     assert "cameras agree on bare skin by 0.40, expected 0.6" in found[4].warnings[0].why
     assert found[4].metrics["moved_mm_p95"] < 0.7 * found[1].metrics["moved_mm_p95"]
+    write_surface(path, surface.vertices, surface.faces, 0.599)
+    (tmp_path / "nearly").mkdir()
+    nearly = STAGE.run(dataset, "S001/smile", NoSettings(), tmp_path / "nearly")
+    assert "by 0.59, expected 0.6" in nearly.warnings[0].why  # 0.60 would read like the limit
 
 
 def test_the_stage_writes_a_mesh_that_later_stages_take(dataset, tmp_path):
