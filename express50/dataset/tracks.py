@@ -175,6 +175,8 @@ def _arrays_of(
 ) -> Iterator[dict[str, np.ndarray]]:
     """Yield a file's arrays, to be checked: a ValueError about them becomes a FormatError."""
     command = f"'express50 {stage}'"
+    if path.is_dir():
+        raise StageError(f"{path}: is a folder, expected the file of a {what} in it")
     if not path.is_file():
         raise StageError(f"{path}: the {what} is missing; run {make or command}")
     again = f"run {make or command}{'' if make else ' again'}"

@@ -82,10 +82,10 @@ class PlayerReport:
 
     def __str__(self) -> str:
         loss = f"loss against footage n/a: {self.footage or 'give --shards'}"
-        if self.loss_db is not None:
+        if self.full_db is not None and self.loss_db is not None:
             loss = (
-                f"{self.loss_db:.2f} dB lost of the {self.full_db:.2f} dB against {self.images} "
-                f"pictures of footage ({self.footage})"
+                f"{self.full_db - self.loss_db:.2f} dB against {self.images} pictures of footage"
+                f" ({self.footage}), the full model {self.full_db:.2f} dB"
             )
         return (
             f"{self.gaussians} Gaussians, {self.megabytes:.1f} MB; {self.agreement_db:.1f} dB from "

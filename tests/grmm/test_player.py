@@ -165,7 +165,9 @@ def test_the_report_measures_footage_and_foreign_clips_are_refused(loaded, tmp_p
     own = [index for index, key in enumerate(views.keys) if key.subject == "S000"]
     rows = evaluate(views, own, training_render(loaded.model, views))
     assert report.full_db == pytest.approx(mean(rows, "psnr_db"), abs=0.01)
-    assert "dB lost" in str(report)
+    page = report.full_db - report.loss_db
+    assert f" {page:.2f} dB against {report.images} pictures of footage" in str(report)
+    assert str(report).endswith(f"the full model {report.full_db:.2f} dB")
     assert "give --shards" in str(replace(report, loss_db=None, footage=None))
     nothing = _loss(person_of(loaded, head, "S000"), None, "S009", views)
     assert "n/a: --shards has no picture of S009" in str(replace(report, loss_db=None, **nothing))

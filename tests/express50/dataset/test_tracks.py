@@ -10,7 +10,7 @@ import pytest
 
 import express50.files.arrays as array_files
 from express50.contract.layout import Dataset
-from express50.dataset.tracks import existing_track, read_track
+from express50.dataset.tracks import existing_track, read_sequence, read_track
 from express50.errors import FormatError, StageError
 from tests.express50.dataset.tracked import track_arrays, write_track
 
@@ -142,3 +142,8 @@ def test_an_absent_track_says_what_to_run(tmp_path) -> None:
         read_track(tmp_path / "track.npz")
     with pytest.raises(StageError, match="subject 'S001' is not tracked; run 'express50 track'"):
         existing_track(Dataset(tmp_path), "S001")
+
+
+def test_a_folder_is_not_reported_as_missing(tmp_path) -> None:
+    with pytest.raises(StageError, match="is a folder, expected the file of a sequence in it"):
+        read_sequence(tmp_path)
