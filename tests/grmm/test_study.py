@@ -1,4 +1,7 @@
 import json
+import re
+import shutil
+import subprocess
 import threading
 import urllib.error
 import urllib.request
@@ -12,6 +15,7 @@ from express50.errors import ConfigError, FormatError
 from express50.files.images import write_image
 from grmm.cli import main
 from grmm.study import (
+    PAGE,
     append_answer,
     check_answer,
     make_server,
@@ -186,6 +190,39 @@ def test_page_shows_trials_and_takes_answers_and_nothing_else(study):
             server.shutdown()
             thread.join()
     assert read_answers(folder, made) == [answer]
+
+
+SHOWN = """<script>
+setTimeout(() => { find("participant").value = 1; find("start").requestSubmit(); }, 200);
+setTimeout(() => {
+  document.title = "widths " + ["reference", "A", "B"].map(name => find(name).naturalWidth);
+}, 4000);
+</script>"""
+
+
+def test_a_participant_sees_the_pictures(study, tmp_path, monkeypatch):
+    """The page asked for them without the address's token, and got none."""
+    browser = shutil.which("chromium") or shutil.which("chromium-browser")
+    if browser is None:
+        pytest.skip("chromium is not installed")
+    page = tmp_path / "page.html"
+    page.write_text(PAGE.read_text() + SHOWN)
+    monkeypatch.setattr("grmm.study.PAGE", page)
+    command = [
+        browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}",
+        "--timeout=8000", "--virtual-time-budget=8000", "--dump-dom",
+    ]  # fmt: skip
+    with make_server(study[0], port=0) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            command.append(server.address)
+            found = subprocess.run(command, capture_output=True, text=True, timeout=90, check=False)
+        finally:
+            server.shutdown()
+            thread.join()
+    widths = re.search(r"<title>widths (\d+),(\d+),(\d+)</title>", found.stdout)
+    assert widths and all(int(width) > 0 for width in widths.groups()), found.stdout[:500]
 
 
 @pytest.mark.parametrize(
