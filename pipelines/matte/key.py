@@ -93,10 +93,10 @@ def key_alpha(
     # The first support only says which colours the subject has nearby.
     support = find_support(difference > 2 * LOW, region, clear, length, eroded_about)
     if support.core.any():
-        own = subject_colour(image, support.core, length)
+        own = whitened(subject_colour(image, support.core, length) - part.plate, part)
         firm = firm_pixels(image, difference, own, support.core, part)
         # Where the plate has the subject's colours, what looks like it may be a shirt.
-        clear &= _length(whitened(own - part.plate, part)) > HIGH
+        clear &= _length(own) > HIGH
         support = find_support(firm, region, clear, length)
     alpha[whole][window] = _opacity(frame, difference, dark, support, part, length)
     alpha[~valid] = 0.0
@@ -336,17 +336,24 @@ def firm_pixels(
 ) -> np.ndarray:
     """Return the pixels (H, W) bool that look opaque, given a first core and the colours near it.
 
-    Thin hair differs less from the plate than dense hair. Skin under dark hair may differ little
-    too, but is not a mixture of hair and plate: colours off the line between these are subject.
+    `own` (H, W, 3) are these colours' whitened errors from the plate. Thin hair differs less from
+    the plate than dense hair. Skin under dark hair may differ little too, but is not a mixture of
+    hair and plate: colours off the line between these are subject.
     """
-    off, own = (whitened(colour - model.plate, model) for colour in (image, own))
     reach = _length(own)
     firm = difference > np.maximum(FIRM * reach, 2 * LOW)
+    left = core & ~firm
+    if not left.any():
+        return firm
+    pixels = PlateModel(model.plate[left][None], model.sigma[left][None], model.whiten)
+    own, reach = own[left][None], reach[left]
+    off = whitened(image[left][None] - pixels.plate, pixels)
     along = np.einsum("...i,...i->...", off, own)
     share = np.clip(along / (3 * np.maximum(reach, 1e-3) ** 2), 0, 1)
-    misfit = _length(off - share[..., None] * own)
+    misfit = _length(off - share[..., None] * own)[0]
     # At least half of the difference, because in 8-bit steps mixtures lie on a curve.
-    return firm | (core & (misfit > np.maximum(2 * LOW, 0.5 * difference)))
+    firm[left] = misfit > np.maximum(2 * LOW, 0.5 * difference[left])
+    return firm
 
 
 def subject_colour(image: np.ndarray, core: np.ndarray, length: int) -> np.ndarray:
