@@ -75,18 +75,18 @@ def check_address(host: str, port: int) -> None:
     Raises:
         ConfigError: the address is not this machine's, or the port is taken or not allowed.
     """
-    fix = "expected an address of this machine, such as 127.0.0.1, or 0.0.0.0 for all of its"
-    fix += " addresses"
-    where = host
-    try:
-        for number in (0, port):
+    if not 0 <= port <= 65535:
+        raise ConfigError(f"port {port}: expected 0 to 65535 (0: any free port)")
+    own = "expected an address of this machine, such as 127.0.0.1, or 0.0.0.0 for all of its"
+    checks = ((host, 0, f"{own} addresses"), (f"{host}:{port}", port, "choose another port"))
+    for where, number, fix in checks:
+        try:
             family, kind, _, _, address = getaddrinfo(host, number, type=SOCK_STREAM)[0]
             with socket(family, kind) as probe:
                 probe.setsockopt(SOL_SOCKET, SO_REUSEADDR, 1)  # as the server itself does
                 probe.bind(address)
-            where, fix = f"{host}:{port}", "choose another port"
-    except OSError as error:
-        raise ConfigError(f"{where}: {error.strerror or error}; {fix}") from error
+        except OSError as error:
+            raise ConfigError(f"{where}: {error.strerror or error}; {fix}") from error
 
 
 class PageServer(ThreadingHTTPServer):
@@ -96,15 +96,13 @@ class PageServer(ThreadingHTTPServer):
 
     def __init__(self, get: Get, post: Post | None, host: str, port: int) -> None:
         """Bind the port without serving yet; ConfigError if address or port cannot be used."""
-        if not 0 <= port <= 65535:
-            raise ConfigError(f"port {port}: expected 0 to 65535 (0: any free port)")
+        check_address(host, port)
         self.guard, self.get, self.post = RequestGuard(host), get, post
         self._free = BoundedSemaphore(AT_ONCE)
-        check_address(host, port)
         super().__init__((host, port), _Handler)
 
     def serve_forever(self, poll_interval: float = 0.5) -> None:
-        """Answer until Ctrl-C, which is the way to stop and no interruption of work."""
+        """Answer until Ctrl-C, the usual way to stop a server."""
         with suppress(KeyboardInterrupt):
             super().serve_forever(poll_interval)
 

@@ -30,6 +30,7 @@ from express50.errors import ConfigError
 DRAWS = 400
 LEAST_SPREAD = 0.05  # of a mean: machines vary as much from day to day
 ASSUMED_SPREAD = 0.15  # of an item's seconds, as a share, if no size has two items
+STATES = 400  # partial choices that are kept; far more than a front has points
 
 
 @dataclass(frozen=True)
@@ -106,9 +107,6 @@ def _law(
         elif found[1] < 0:  # more work took no longer
             constant, slope = float(np.average(seconds, weights=weights**2)), 0.0
     return float(constant + slope * at / works.max())
-
-
-STATES = 400  # partial choices that are kept; far more than a front has points
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,19 @@ from express50.geometry.sampling import undistort_image, undistort_maps
 
 PLACES = ("subject", "expression", "camera", "frame", "clip_frame")
 _PLACE = re.compile(r"\{([^{}:]*)(?::0?(\d+)d?)?\}")
+SAMPLES = 1500  # pixels per view that are compared to the other views
+NEAR_M = 0.01  # distance within which surface points of two views are the same
+MOST_OFF = 0.6  # of half a mask's extent: how far its middle may be off the one all masks show
+AGREE_SHARE = 0.4  # least share of the pixels known to two views that show the same surface
+LEAST_COSINE = 0.5  # between the directions of two views that are compared
+FINE_M, FINER_SHARE = 0.003, 0.1  # the other measure is right if so many more pixels agree so well
+FACTORS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
+LEAST_VOXEL_M, VOXEL_PX = 0.0015, 1.4  # as depth's own
+TRUNCATION = 4.0  # voxels
+FARTHEST_M = 1e3
+SLOPE = 3.0  # pixels of depth per half pixel across, of a surface seen at 80 degrees
+SURE = 3.0  # views of a point for full confidence
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,21 +106,6 @@ def fill(pattern: str, subject: str, peak: PeakFrame | None = None, camera: str 
         return f"{found:0{match[2] or 0}d}" if isinstance(found, int) else str(found)
 
     return Path(_PLACE.sub(value, pattern)).expanduser()
-
-
-SAMPLES = 1500  # pixels per view that are compared to the other views
-NEAR_M = 0.01  # distance within which surface points of two views are the same
-MOST_OFF = 0.6  # of half a mask's extent: how far its middle may be off the one all masks show
-AGREE_SHARE = 0.4  # least share of the pixels known to two views that show the same surface
-LEAST_COSINE = 0.5  # between the directions of two views that are compared
-FINE_M, FINER_SHARE = 0.003, 0.1  # the other measure is right if so many more pixels agree so well
-FACTORS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
-LEAST_VOXEL_M, VOXEL_PX = 0.0015, 1.4  # as depth's own
-TRUNCATION = 4.0  # voxels
-FARTHEST_M = 1e3
-SLOPE = 3.0  # pixels of depth per half pixel across, of a surface seen at 80 degrees
-SURE = 3.0  # views of a point for full confidence
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
 def read_mask(path: Path, recorded: Camera, seen: Camera, distorted: bool) -> np.ndarray:

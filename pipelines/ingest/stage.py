@@ -311,9 +311,11 @@ def odd_keys(raw: RawCapture) -> dict[str, str]:
     if str(units).lower() not in METRES:
         found.append(f"units is {units!r}, but lengths are taken as metres: convert them")
     colours = raw.meta.get("color_space", "sRGB")
-    names = [name for camera in raw.cameras.values() for name in camera.names[:1]]
-    may_be_float = any(name.lower().endswith((".exr", ".tif", ".tiff")) for name in names)
-    if str(colours).lower() not in ("srgb", "linear" if may_be_float else "srgb"):
+    names = [name.lower() for camera in raw.cameras.values() for name in camera.names[:1]]
+    usual = ["srgb"]
+    if any(name.endswith((".exr", ".tif", ".tiff")) for name in names):  # may hold floats
+        usual.append("linear")
+    if str(colours).lower() not in usual:
         found.append(
             f"color_space is {colours!r}, but pictures are taken as sRGB (float pictures as linear"
             " light): convert them"

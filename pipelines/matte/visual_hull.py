@@ -33,6 +33,16 @@ STRAND = 0.03  # share of the longer side that hair may extend beyond the other 
 INSIDE = 0.5  # alpha from which a pixel shows the subject
 OUT, CLEAR, RIM, SOLID = range(4)  # what a view says of a cell
 
+# The comparison of mattes.
+# Longest side of the pictures, and cells along each side of space: 192 and 96 take three times as
+# long and gain next to nothing (docs/LOG.md, "Mattes").
+SIDE, CELLS = 128, 64
+FEWEST = 4  # views; of three, two with the same error would overrule a correct one
+EMPTY, FULL = 0.003, 0.98  # shares of the image that a useful matte covers
+# The entire matte is wrong if over STRAY of it lies off the others' subject and it lacks over
+# LACKING of that subject, or if it lacks over MOST_LACKING.
+STRAY, LACKING, MOST_LACKING = 0.03, 0.07, 0.3
+
 
 @dataclass(frozen=True)
 class Ball:
@@ -380,16 +390,6 @@ def _corner_height(view: MatteView, others: Sequence[MatteView]) -> float:
     """
     cosines = sorted((_cosine(view, o) for o in others if o.name != view.name), reverse=True)
     return 1 / cosines[1] - 1 if len(cosines) > 1 and cosines[1] > WIDEST else 1.0
-
-
-# Longest side of the pictures, and cells along each side of space: 192 and 96 take three times as
-# long and gain next to nothing (docs/LOG.md, "Mattes").
-SIDE, CELLS = 128, 64
-FEWEST = 4  # views; of three, two with the same error would overrule a correct one
-EMPTY, FULL = 0.003, 0.98  # shares of the image that a useful matte covers
-# The entire matte is wrong if over STRAY of it lies off the others' subject and it lacks over
-# LACKING of that subject, or if it lacks over MOST_LACKING.
-STRAY, LACKING, MOST_LACKING = 0.03, 0.07, 0.3
 
 
 @dataclass(frozen=True)

@@ -89,6 +89,17 @@ FIRST = 17
 LEFT, UPPER, SIDE = 36, 34, 120
 TEXELS_PER_PIXEL = SIDE / CROP
 
+# Following the skin, on a finer map.
+FINE = 2  # texels of 0.65 mm on the cheeks
+LIGHT_TEXELS = 6.0  # texels over which light and shade are evened out
+NOISE = 0.01  # of root light: contrast must stand out from it
+SPACING_TEXELS = 4  # texels between places that are followed
+RETURN_TEXELS = 0.6  # texels by which the flow there and back may miss
+TEXTURED = 0.02  # least contrast, in every direction, of what is followed
+SIGMA = 0.5  # texels
+FLOW_REDUNDANCY = 30.0  # places that count as one, because neighbours err together
+RIM = 9  # texels: closer than this to what is not seen, flow is not trusted
+
 
 def with_slide(target: Target, slide: SlideTerm | None) -> Target:
     """Add a reading of the map; trust the detector less at landmarks that the map shows."""
@@ -297,17 +308,6 @@ def reading_map(model: HeadModel) -> FaceUvMap:
     some = np.all((off >= 0) & (off < SIDE), axis=1)
     samples, texels, skin = whole.samples.some(some), whole.texels[some], whole.skin[some]
     return replace(whole, samples=samples, texels=texels, skin=skin)
-
-
-FINE = 2  # texels of 0.65 mm on the cheeks
-LIGHT_TEXELS = 6.0  # texels over which light and shade are evened out
-NOISE = 0.01  # of root light: contrast must stand out from it
-SPACING_TEXELS = 4  # texels between places that are followed
-RETURN_TEXELS = 0.6  # texels by which the flow there and back may miss
-TEXTURED = 0.02  # least contrast, in every direction, of what is followed
-SIGMA = 0.5  # texels
-FLOW_REDUNDANCY = 30.0  # places that count as one, because neighbours err together
-RIM = 9  # texels: closer than this to what is not seen, flow is not trusted
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,11 @@ LASHES = "eyelashes"
 BLINKS = 0.22  # share of the heads that close one eye or both
 SHUT, TEETH = 0.3, 0.75  # of drawn mouths: share that is shut; share that is shut or shows teeth
 Rng = np.random.Generator
+INSIDE = (
+    "teeth", "tongue", "mouth_interior", "left_eyeball", "right_eyeball", "left_iris", "right_iris",
+    "boundary",
+)  # fmt: skip
+Places = tuple[np.ndarray, np.ndarray]  # faces (N,), weights (N, 3)
 
 
 @dataclass(frozen=True)
@@ -353,13 +358,6 @@ def _draw_mouth(expression: np.ndarray, jaw: np.ndarray, model: HeadModel, rng: 
     showing = {"mouthUpperUp": 1.0, "mouthLowerDown": 1.0, "mouthSmile": 1.0, "mouthStretch": 0.6}
     for name, most in showing.items() if kind >= SHUT else ():
         expression[[k for k in moves if names[k].startswith(name)]] = rng.uniform(0.0, most)
-
-
-INSIDE = (
-    "teeth", "tongue", "mouth_interior", "left_eyeball", "right_eyeball", "left_iris", "right_iris",
-    "boundary",
-)  # fmt: skip
-Places = tuple[np.ndarray, np.ndarray]  # faces (N,), weights (N, 3)
 
 
 @lru_cache(maxsize=4)

@@ -32,6 +32,11 @@ OPEN_RAYS, OPEN_M = 4, 0.08  # rays per vertex that measure the ambient light, a
 GLASSES_SHARE, NATURAL_SHARE = 0.25, 0.75
 LASHES_SHARE = 0.3  # of the heads with lashes that keep them: opaque lashes look too dense
 RING = 24  # corners of a lens
+# The outline of a face.
+EYE_BAND_M, CHIN_BAND_M = 0.005, 0.004  # around the height of the eye corners; around the middle
+MASK_SIDE, MASK_SHARE = 512, 0.9  # side of the face's mask, pixels, and the face's share of it
+SMOOTHING = 6  # pixels of the mask, because the face ends along triangles
+HALF = 8  # steps from an ear to the chin
 Rng = np.random.Generator
 
 
@@ -275,12 +280,6 @@ def _random_camera(
     cam_from_world = make_transform(rotation, -rotation @ (target + distance * forward))
     focal = side * distance / frame_m * rng.uniform(0.85, 1.15)
     return np.array([[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1.0]]), cam_from_world
-
-
-EYE_BAND_M, CHIN_BAND_M = 0.005, 0.004  # around the height of the eye corners; around the middle
-MASK_SIDE, MASK_SHARE = 512, 0.9  # side of the face's mask, pixels, and the face's share of it
-SMOOTHING = 6  # pixels of the mask, because the face ends along triangles
-HALF = 8  # steps from an ear to the chin
 
 
 class FaceFront:
