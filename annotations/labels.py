@@ -32,40 +32,27 @@ ACTIONS = ("mark", "flag", "undo", "settle", *EXCLUSION_ACTIONS)
 
 @dataclass(frozen=True, kw_only=True)
 class Label:
-    """One event of the store.
-
-    Attributes:
-        subject, expression: the labelled performance; no expression for a whole subject.
-        action: one of ``ACTIONS``; a settlement has a frame, or the reason for a flag.
-        annotator: the person's name; ``auto`` for accepted suggestions, ``rule:...`` for rules.
-        time: seconds since 1970.
-        tool: version of this toolkit.
-        frame, camera, pts, dhash: the frame's identity (absent for flag and undo).
-        first, last: the plateau around the frame, inclusive, if it was given.
-        suggested, confidence: the frame suggested at that moment, and its confidence, 0 to 1.
-        shown: whether the suggestion was visible before the decision.
-        seconds, keys: time and keystrokes that the label took.
-        reason: why it was flagged or excluded.
-    """
+    """One event of the store."""
 
     subject: str
-    expression: str
-    action: str
-    annotator: str
-    time: float
-    tool: str = __version__
+    expression: str  # empty for a whole subject
+    action: str  # one of ``ACTIONS``; a settlement has a frame, or the reason for a flag
+    annotator: str  # the person's name; ``auto`` for accepted suggestions, ``rule:...`` for rules
+    time: float  # seconds since 1970
+    tool: str = __version__  # version of this toolkit
+    # frame, camera, pts and dhash identify the frame; flag and undo have none
     frame: int | None = None
     camera: str | None = None
     pts: int | None = None
     dhash: str | None = None
-    first: int | None = None
-    last: int | None = None
-    suggested: int | None = None
-    confidence: float | None = None
-    shown: bool | None = None
-    seconds: float | None = None
-    keys: int | None = None
-    reason: str | None = None
+    first: int | None = None  # of the plateau around the frame, if it was given
+    last: int | None = None  # of the plateau, inclusive
+    suggested: int | None = None  # the frame suggested at that moment
+    confidence: float | None = None  # of the suggestion, 0 to 1
+    shown: bool | None = None  # whether the suggestion was visible before the decision
+    seconds: float | None = None  # that the label took
+    keys: int | None = None  # keystrokes that the label took
+    reason: str | None = None  # why it was flagged or excluded
 
 
 # Types of the fields; an integer is accepted where a float is expected.

@@ -27,34 +27,24 @@ STATES = ("person", "rule", "auto", "suggestion", "flagged", "missing")
 
 @dataclass(frozen=True, kw_only=True)
 class Tile:
-    """One expression of one subject.
+    """One expression of one subject."""
 
-    Attributes:
-        subject, expression: ids of the person shown and of the expression.
-        state: who chose the frame (``person``, ``rule``, ``auto``: a suggestion accepted by the
-            align stage, ``suggestion``: one not yet accepted), or ``flagged`` or ``missing``.
-        reference: whether this is the reference's canonical frame.
-        frame, camera: the picture to show; no frame if there is none. A flagged tile
-            shows what was suggested, so that the flag can be judged.
-        first, last: the cue window's frames.
-        by: who chose, in words.
-        confidence: of the suggestion where a suggestion was chosen, 0 to 1.
-        words: why it is flagged, missing or doubtful.
-        doubtful: whether somebody should look again.
-    """
-
-    subject: str
+    subject: str  # id of the person shown
     expression: str
+    # who chose the frame (``person``, ``rule``, ``auto``: a suggestion accepted by the align stage,
+    # ``suggestion``: one not yet accepted), or ``flagged`` or ``missing``
     state: str = "missing"
-    reference: bool = False
+    reference: bool = False  # whether this is the reference's canonical frame
+    # the picture to show; no frame if there is none. A flagged tile shows what was suggested, so
+    # that the flag can be judged.
     frame: int | None = None
-    camera: str = ""
-    first: int = 0
-    last: int = 0
-    by: str = ""
-    confidence: float | None = None
-    words: str = ""
-    doubtful: bool = False
+    camera: str = ""  # whose picture is shown
+    first: int = 0  # frame of the cue window
+    last: int = 0  # frame of the cue window
+    by: str = ""  # who chose, in words
+    confidence: float | None = None  # of the suggestion where a suggestion was chosen, 0 to 1
+    words: str = ""  # why it is flagged, missing or doubtful
+    doubtful: bool = False  # whether somebody should look again
 
 
 @dataclass(frozen=True)

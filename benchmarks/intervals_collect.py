@@ -46,21 +46,14 @@ Figures = dict[str, np.ndarray | float]
 
 @dataclass(frozen=True, kw_only=True)
 class Sample:
-    """Elements of one item.
-
-    Attributes:
-        stage, item: the names of its stage and item.
-        figures: by name (N,).
-        errors: (N,) true ones.
-        shared: (N,) deviations that all elements share, as `error_bounds` takes them.
-        skin: (N,) where the truth shows the head's own surface; for depth only.
-    """
+    """Elements of one item."""
 
     stage: str
     item: str
-    figures: dict[str, np.ndarray]
-    errors: np.ndarray
-    shared: np.ndarray
+    figures: dict[str, np.ndarray]  # by name (N,)
+    errors: np.ndarray  # (N,) true ones
+    shared: np.ndarray  # (N,) deviations that all elements share, as `error_bounds` takes them
+    # (N,) where the truth shows the head's own surface; for depth only
     skin: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
 
 

@@ -44,21 +44,15 @@ MEASURED_KEYS = ("left", "right", "pageup", "pagedown")
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayResult:
-    """What the labels cost.
+    """What the labels cost."""
 
-    Attributes:
-        labels: the labels that were given, in their order.
-        keystrokes: of each label.
-        seconds: of each label, as the app counted them; a machine's, not a person's.
-        steps: seconds from each key that moved the cursor to the picture, encoded for a terminal.
-        errors: frames between each mark and the truth.
-    """
-
-    labels: list[Label] = field(default_factory=list)
-    keystrokes: list[int] = field(default_factory=list)
+    labels: list[Label] = field(default_factory=list)  # the labels that were given, in their order
+    keystrokes: list[int] = field(default_factory=list)  # of each label
+    # of each label, as the app counted them; a machine's, not a person's
     seconds: list[float] = field(default_factory=list)
+    # seconds from each key that moved the cursor to the picture, encoded for a terminal
     steps: list[float] = field(default_factory=list)
-    errors: list[int] = field(default_factory=list)
+    errors: list[int] = field(default_factory=list)  # frames between each mark and the truth
 
     def summary(self) -> dict[str, float]:
         """Return medians and 95th percentiles; empty lists give no entry."""

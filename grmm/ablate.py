@@ -54,23 +54,16 @@ from grmm.train_state import best_device, with_map_size
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """One row of the ablation.
+    """One row of the ablation."""
 
-    Attributes:
-        label: its name in the table.
-        changes: table -> key -> value over the common configuration.
-        paper_db: the paper's PSNR minus that of its full model; None if the paper has no figure.
-        against: the row it is compared with.
-        trains_as: the row whose checkpoint it uses, if only the fit differs.
-        without: the folder of shards that it leaves out.
-    """
-
-    label: str
+    label: str  # its name in the table
+    # table -> key -> value over the common configuration
     changes: Mapping[str, Mapping[str, object]]
+    # the paper's PSNR minus that of its full model; None if the paper has no figure
     paper_db: float | None = None
-    against: str = "full"
-    trains_as: str = ""
-    without: Path | None = None
+    against: str = "full"  # the row it is compared with
+    trains_as: str = ""  # the row whose checkpoint it uses, if only the fit differs
+    without: Path | None = None  # the folder of shards that it leaves out
 
 
 VARIANTS = {
@@ -106,24 +99,15 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True, kw_only=True)
 class Ablation:
-    """The settings that all rows share.
+    """The settings that all rows share."""
 
-    Attributes:
-        roots: folders of shards; training mixes several.
-        out: the folder for the tables and one folder per row.
-        config: the full model's; every row has its budget.
-        protocol: how unseen people are fitted.
-        subjects: unseen people; empty: everyone who is not in the training split.
-        seeds: how often each row is trained; intervals need two or more.
-        test: folders of shards whose people are fitted, and nobody is trained on; empty: ``roots``.
-    """
-
-    roots: Sequence[Path]
-    out: Path
-    config: Config
-    protocol: FitProtocol
-    subjects: Sequence[str] = ()
-    seeds: int = 1
+    roots: Sequence[Path]  # folders of shards; training mixes several
+    out: Path  # the folder for the tables and one folder per row
+    config: Config  # the full model's; every row has its budget
+    protocol: FitProtocol  # how unseen people are fitted
+    subjects: Sequence[str] = ()  # unseen people; empty: everyone who is not in the training split
+    seeds: int = 1  # how often each row is trained; intervals need two or more
+    # folders of shards whose people are fitted, and nobody is trained on; empty: ``roots``
     test: Sequence[Path] = ()
 
     def unseen(self) -> tuple[Source, list[str]]:

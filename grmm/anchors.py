@@ -21,17 +21,11 @@ NEEDLE_AREA = 1e-14  # of a UV or 3D triangle; smaller ones have no reliable dir
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Anchors:
-    """N covered texels of an n_g x n_g map, in row-major order; row 0 is the top (v = 1).
+    """N covered texels of an n_g x n_g map, in row-major order; row 0 is the top (v = 1)."""
 
-    Attributes:
-        texels: (N,) flat index row * n_g + column.
-        faces: (N,) face under the texel's centre.
-        barycentrics: (N, 3) of the centre, non-negative, rows sum to 1.
-    """
-
-    texels: Tensor
-    faces: Tensor
-    barycentrics: Tensor
+    texels: Tensor  # (N,) flat index row * n_g + column
+    faces: Tensor  # (N,) face under the texel's centre
+    barycentrics: Tensor  # (N, 3) of the centre, non-negative, rows sum to 1
 
 
 def make_anchors(head: HeadModel, n_g: int, mouth: bool = True) -> Anchors:

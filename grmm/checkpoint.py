@@ -64,15 +64,10 @@ UNSAID: dict[str, dict[str, object]] = {
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Gallery:
-    """Tracked frames and cameras of the training set, so that a checkpoint renders on its own.
+    """Tracked frames and cameras of the training set, so that a checkpoint renders on its own."""
 
-    Attributes:
-        frames: (subject, expression) -> parameters.
-        cameras: camera id -> its view of the first frame it took.
-    """
-
-    frames: dict[tuple[str, str], Tracked]
-    cameras: dict[str, PinholeView]
+    frames: dict[tuple[str, str], Tracked]  # (subject, expression) -> parameters
+    cameras: dict[str, PinholeView]  # camera id -> its view of the first frame it took
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)

@@ -50,66 +50,41 @@ class SampleKey:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Tracked:
-    """Head-model parameters of one frame; world = R @ head + t.
+    """Head-model parameters of one frame; world = R @ head + t."""
 
-    Attributes:
-        shape: (S,).
-        expression: (X,).
-        neck: (3,) axis-angle, radians.
-        jaw: (3,) axis-angle, radians.
-        eyes: (6,) axis-angles, left then right, radians.
-        R: (3, 3).
-        t: (3,) metres.
-        offsets: (V, 3) float32 metres, added to the rest shape, one array for all frames of a
-            subject; (0, 3) where there are none.
-    """
-
-    shape: np.ndarray
-    expression: np.ndarray
-    neck: np.ndarray
-    jaw: np.ndarray
-    eyes: np.ndarray
-    R: np.ndarray
-    t: np.ndarray
+    shape: np.ndarray  # (S,)
+    expression: np.ndarray  # (X,)
+    neck: np.ndarray  # (3,) axis-angle, radians
+    jaw: np.ndarray  # (3,) axis-angle, radians
+    eyes: np.ndarray  # (6,) axis-angles, left then right, radians
+    R: np.ndarray  # (3, 3)
+    t: np.ndarray  # (3,) metres
+    # (V, 3) float32 metres, added to the rest shape, one array for all frames of a subject; (0, 3)
+    # where there are none
     offsets: np.ndarray = field(default_factory=lambda: NO_OFFSETS)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Place:
-    """The camera and head of one view: a sample without its pictures.
+    """The camera and head of one view: a sample without its pictures."""
 
-    Attributes:
-        K: (3, 3) pixels, corner origin.
-        cam_from_world: (4, 4).
-        tracked: head-model parameters.
-        size: (H, W) of the view.
-    """
-
-    K: np.ndarray
-    cam_from_world: np.ndarray
-    tracked: Tracked
-    size: tuple[int, int]
+    K: np.ndarray  # (3, 3) pixels, corner origin
+    cam_from_world: np.ndarray  # (4, 4)
+    tracked: Tracked  # head-model parameters
+    size: tuple[int, int]  # (H, W) of the view
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sample:
-    """One decoded view as the shards hold it.
+    """One decoded view as the shards hold it."""
 
-    Attributes:
-        image: (H, W, 3) uint8 sRGB.
-        alpha: (H, W) uint8.
-        depth: (H, W) float32 camera z, metres; 0 where unknown. None: no depth.
-        place: camera and head.
-        parts: (H, W) uint8 of segmentation_labels.LABELS. None: the shards have none.
-        bare: True if alpha leaves the torso out already.
-    """
-
-    image: np.ndarray
-    alpha: np.ndarray
-    depth: np.ndarray | None
-    place: Place
+    image: np.ndarray  # (H, W, 3) uint8 sRGB
+    alpha: np.ndarray  # (H, W) uint8
+    depth: np.ndarray | None  # (H, W) float32 camera z, metres; 0 where unknown. None: no depth.
+    place: Place  # camera and head
+    # (H, W) uint8 of segmentation_labels.LABELS. None: the shards have none.
     parts: np.ndarray | None = None
-    bare: bool = False
+    bare: bool = False  # True if alpha leaves the torso out already
 
     @property
     def nbytes(self) -> int:
@@ -137,34 +112,21 @@ class Source(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HeadView:
-    """One training view.
-
-    Attributes:
-        key: ids.
-        state: tracked head.
-        view: camera in head space.
-        target: (3, H, W) footage composited on the background.
-        mask: (H, W) bool, footage alpha over 0.5.
-        depth: (H, W) metres.
-        depth_valid: (H, W) bool.
-        parts: (H, W) uint8 of segmentation_labels.LABELS. None: the shards have none.
-        hidden: (H, W) bool, where the torso hides the neck (DataConfig.skip_hidden_neck).
-        torso: (H, W) metres, depth of the torso; 0 where unknown or DataConfig.hide_behind_torso is
-            off.
-        background: grey behind footage and renderings.
-    """
+    """One training view."""
 
     key: SampleKey
-    state: HeadState
-    view: PinholeView
-    target: Tensor
-    mask: Tensor
-    depth: Tensor
-    depth_valid: Tensor
+    state: HeadState  # tracked head
+    view: PinholeView  # camera in head space
+    target: Tensor  # (3, H, W) footage composited on the background
+    mask: Tensor  # (H, W) bool, footage alpha over 0.5
+    depth: Tensor  # (H, W) metres
+    depth_valid: Tensor  # (H, W) bool
+    # (H, W) uint8 of segmentation_labels.LABELS. None: the shards have none.
     parts: np.ndarray | None
-    hidden: Tensor
+    hidden: Tensor  # (H, W) bool, where the torso hides the neck (DataConfig.skip_hidden_neck)
+    # (H, W) metres, depth of the torso; 0 where unknown or DataConfig.hide_behind_torso is off
     torso: Tensor
-    background: float
+    background: float  # grey behind footage and renderings
 
     def hide_behind_torso(self, rendering: Rendering) -> Rendering:
         """Return a rendering that is background where the torso is in front of what was drawn."""

@@ -44,17 +44,11 @@ POSES = {  # sliders of joints: controls, range in radians
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HeadCodes:
-    """One head: residual codes and head-model parameters.
+    """One head: residual codes and head-model parameters."""
 
-    Attributes:
-        z_id: residual identity code.
-        z_exp: residual expression code.
-        tracked: head-model parameters; (R, t) has no effect on pictures in head space.
-    """
-
-    z_id: Tensor
-    z_exp: Tensor
-    tracked: Tracked
+    z_id: Tensor  # residual identity code
+    z_exp: Tensor  # residual expression code
+    tracked: Tracked  # head-model parameters; (R, t) has no effect on pictures in head space
 
     def state(self, loaded: Checkpoint) -> HeadState:
         """Return the posed mesh in head space."""

@@ -65,22 +65,15 @@ SPZ_COLOUR = 0.15  # share of a byte's range per unit of the constant harmonic's
 class GaussianCloud:
     """N Gaussians with one colour each, head space.
 
-    Attributes:
-        means: (N, 3) metres.
-        quats: (N, 4) wxyz, unit length.
-        scales: (N, 3) standard deviations, metres.
-        opacities: (N,).
-        colors: (N, 3) in [0, 1], sRGB, as the exported view sees them.
-
     Raises:
         ValueError: a value is not finite.
     """
 
-    means: np.ndarray
-    quats: np.ndarray
-    scales: np.ndarray
-    opacities: np.ndarray
-    colors: np.ndarray
+    means: np.ndarray  # (N, 3) metres
+    quats: np.ndarray  # (N, 4) wxyz, unit length
+    scales: np.ndarray  # (N, 3) standard deviations, metres
+    opacities: np.ndarray  # (N,)
+    colors: np.ndarray  # (N, 3) in [0, 1], sRGB, as the exported view sees them
 
     def __post_init__(self) -> None:
         for name, array in vars(self).items():

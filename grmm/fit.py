@@ -335,17 +335,12 @@ def _scores(state: FitState, held_out: Sequence[int]) -> Scores:
 
 @dataclass(frozen=True, kw_only=True)
 class FitProtocol:
-    """The views of an unseen person that a fit gets.
+    """The views of an unseen person that a fit gets."""
 
-    Attributes:
-        cameras: patterns of those to fit from; empty: the first by id.
-        expression: patterns of those to fit; others are rendered with the codes of training.
-        images: the most to measure per person and kind, 0 = all.
-    """
-
-    cameras: tuple[str, ...] = ()
+    cameras: tuple[str, ...] = ()  # patterns of those to fit from; empty: the first by id
+    # patterns of those to fit; others are rendered with the codes of training
     expression: str = "neutral"
-    images: int = 0
+    images: int = 0  # the most to measure per person and kind, 0 = all
 
 
 def evaluate_unseen(

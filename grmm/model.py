@@ -25,38 +25,23 @@ THICKNESS = 0.3  # of a Gaussian before training, along the normal over the tang
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HeadState:
-    """The tracked head of one frame, in head space: (R, t) belong to the camera (`PinholeView`).
+    """The tracked head of one frame, in head space: (R, t) belong to the camera (`PinholeView`)."""
 
-    Attributes:
-        vertices: (V, 3) tracked mesh v_rec, metres, eye pose included.
-        shape: (S,) identity coefficients alpha_id.
-        expression: (X,) expression coefficients alpha_exp.
-        neck: (3,) axis-angle.
-        jaw: (3,) axis-angle.
-    """
-
-    vertices: Tensor
-    shape: Tensor
-    expression: Tensor
-    neck: Tensor
-    jaw: Tensor
+    vertices: Tensor  # (V, 3) tracked mesh v_rec, metres, eye pose included
+    shape: Tensor  # (S,) identity coefficients alpha_id
+    expression: Tensor  # (X,) expression coefficients alpha_exp
+    neck: Tensor  # (3,) axis-angle
+    jaw: Tensor  # (3,) axis-angle
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PinholeView:
-    """A pinhole camera in canonical head space: pi' = K E [R t] (paper, equation 2).
+    """A pinhole camera in canonical head space: pi' = K E [R t] (paper, equation 2)."""
 
-    Attributes:
-        K: (3, 3) pixels, corner origin.
-        cam_from_head: (4, 4) rigid, metres, OpenCV axes.
-        width: pixels.
-        height: pixels.
-    """
-
-    K: Tensor
-    cam_from_head: Tensor
-    width: int
-    height: int
+    K: Tensor  # (3, 3) pixels, corner origin
+    cam_from_head: Tensor  # (4, 4) rigid, metres, OpenCV axes
+    width: int  # pixels
+    height: int  # pixels
 
     def direction(self) -> Tensor:
         """Return the unit vector (3,) from the head's origin to the camera (G7)."""
@@ -66,55 +51,33 @@ class PinholeView:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Gaussians:
-    """N Gaussians in head space, without colour.
+    """N Gaussians in head space, without colour."""
 
-    Attributes:
-        means: (N, 3) metres.
-        quats: (N, 4) wxyz.
-        scales_mm: (N, 3) unclamped standard deviations, which the regulariser sees.
-        opacities: (N,) in (0, 1).
-        displacement: (V, 3) metres, what the mesh decoder added.
-    """
-
-    means: Tensor
-    quats: Tensor
-    scales_mm: Tensor
-    opacities: Tensor
-    displacement: Tensor
+    means: Tensor  # (N, 3) metres
+    quats: Tensor  # (N, 4) wxyz
+    scales_mm: Tensor  # (N, 3) unclamped standard deviations, which the regulariser sees
+    opacities: Tensor  # (N,) in (0, 1)
+    displacement: Tensor  # (V, 3) metres, what the mesh decoder added
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Maps:
-    """The outputs of the transform and opacity decoders for N Gaussians.
+    """The outputs of the transform and opacity decoders for N Gaussians."""
 
-    Attributes:
-        offsets: (N, 7) raw position and quaternion offsets.
-        scales_mm: (N, 3) unclamped standard deviations.
-        opacities: (N,) in (0, 1).
-    """
-
-    offsets: Tensor
-    scales_mm: Tensor
-    opacities: Tensor
+    offsets: Tensor  # (N, 7) raw position and quaternion offsets
+    scales_mm: Tensor  # (N, 3) unclamped standard deviations
+    opacities: Tensor  # (N,) in (0, 1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rendering:
-    """One rendered view.
+    """One rendered view."""
 
-    Attributes:
-        image: (3, H, W) refined colours I; the same tensor as ``rgb`` without refinement.
-        rgb: (3, H, W) rasterised colours I_rgb.
-        depth: (H, W) camera z, metres; 0 where alpha is 0.
-        alpha: (H, W).
-        gaussians: what was drawn.
-    """
-
-    image: Tensor
-    rgb: Tensor
-    depth: Tensor
-    alpha: Tensor
-    gaussians: Gaussians
+    image: Tensor  # (3, H, W) refined colours I; the same tensor as ``rgb`` without refinement
+    rgb: Tensor  # (3, H, W) rasterised colours I_rgb
+    depth: Tensor  # (H, W) camera z, metres; 0 where alpha is 0
+    alpha: Tensor  # (H, W)
+    gaussians: Gaussians  # what was drawn
 
 
 class GRMM(Networks):

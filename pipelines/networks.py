@@ -28,19 +28,12 @@ Run = Callable[[Sequence[np.ndarray]], list[np.ndarray]]
 
 @dataclass(frozen=True, kw_only=True)
 class Role:
-    """The interface of a network: the pictures it takes, and the output that is the answer.
+    """The interface of a network: the pictures it takes, and the output that is the answer."""
 
-    Attributes:
-        setting: config key that names the file, such as matte.weights, for messages.
-        inputs: names of the pictures; an ONNX file may order them otherwise.
-        outputs: names that mark the answer in an ONNX file.
-        place: index of the answer where no name marks it.
-    """
-
-    setting: str
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...] = ()
-    place: int = 0
+    setting: str  # config key that names the file, such as matte.weights, for messages
+    inputs: tuple[str, ...]  # names of the pictures; an ONNX file may order them otherwise
+    outputs: tuple[str, ...] = ()  # names that mark the answer in an ONNX file
+    place: int = 0  # index of the answer where no name marks it
 
 
 @dataclass(frozen=True)

@@ -48,25 +48,18 @@ REST_DIRECTIONS = 20  # number of leading directions of unrest that are shrunk
 
 @dataclass(frozen=True)
 class Features:
-    """Features of a subject from C cameras in F observed frames, in units of each feature's noise.
+    """Features of a subject from C cameras in F observed frames, in units of their own noise."""
 
-    Attributes:
-        cameras: ids of the cameras, the one that sees the face best first.
-        frames: (F,) numbers of the frames.
-        windows: expression id -> rows of ``frames`` in its cue window, in order of time.
-        values: (F, N) zero at the subject's neutral; each camera has the same N / C features.
-        owner: (N,) landmark 0 to 67 that a feature belongs to or lies nearest to.
-        camera: (N,) which camera a feature is of, 0 to C - 1.
-        rest: (R,) rows of ``values`` in which the face should be at rest: the neutral clip and
-            both ends of every window. A few frames that are not at rest do no harm.
-    """
-
-    cameras: tuple[str, ...]
-    frames: np.ndarray
+    cameras: tuple[str, ...]  # ids of the cameras, the one that sees the face best first
+    frames: np.ndarray  # (F,) numbers of the frames
+    # expression id -> rows of ``frames`` in its cue window, in order of time
     windows: dict[str, np.ndarray]
+    # (F, N) zero at the subject's neutral; each camera has the same N / C features
     values: np.ndarray
-    owner: np.ndarray
-    camera: np.ndarray
+    owner: np.ndarray  # (N,) landmark 0 to 67 that a feature belongs to or lies nearest to
+    camera: np.ndarray  # (N,) which camera a feature is of, 0 to C - 1
+    # (R,) rows of ``values`` in which the face should be at rest: the neutral clip and both ends of
+    # every window. A few frames that are not at rest do no harm.
     rest: np.ndarray
 
 

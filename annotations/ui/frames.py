@@ -164,16 +164,12 @@ MIN_SCORE = 0.25
 
 @dataclass(frozen=True)
 class Face:
-    """A face in a picture, in shares of the picture's width.
+    """A face in a picture, in shares of the picture's width."""
 
-    Attributes:
-        x, y: middle of the eyes' corners.
-        unit: distance of the outer corners of the eyes as a frontal view would have it.
-    """
-
+    # x and y are the middle of the eyes' corners
     x: float
     y: float
-    unit: float
+    unit: float  # distance of the outer corners of the eyes as a frontal view would have it
 
 
 def zoom_box(face: Face | None, zoom: str, pane_aspect: float, image_aspect: float) -> Box:

@@ -25,39 +25,24 @@ from express50.errors import Express50Error
 
 @dataclass(frozen=True, kw_only=True)
 class TaskScene:
-    """One task, ready to be shown.
+    """One task, ready to be shown."""
 
-    Attributes:
-        task: subject, expression and doubt.
-        name, description: of the expression.
-        index: the subject's footage; None where it cannot be read.
-        first, last: the cue window, both inside.
-        cameras: ids from the suggestion's on, which sees the face best.
-        suggestion: what align suggested; None where it did not run.
-        reference: the reference's canonical frame of the expression, or None.
-        reference_index: the reference's footage; None where it cannot be read.
-        is_reference: whether this subject is the reference itself.
-        mine: this annotator's label, or None.
-        in_force: the label in force, whoever gave it.
-        problem: why the task cannot be labelled, in plain words.
-        notes: what the annotator should know, in plain words.
-    """
-
-    task: LabelTask
-    name: str
-    description: str
-    index: Index | None = None
-    first: int = 0
-    last: int = 0
-    cameras: tuple[str, ...] = ()
-    suggestion: Suggested | None = None
+    task: LabelTask  # subject, expression and doubt
+    name: str  # of the expression
+    description: str  # of the expression
+    index: Index | None = None  # the subject's footage; None where it cannot be read
+    first: int = 0  # frame of the cue window
+    last: int = 0  # frame of the cue window, inclusive
+    cameras: tuple[str, ...] = ()  # ids from the suggestion's on, which sees the face best
+    suggestion: Suggested | None = None  # what align suggested; None where it did not run
+    # the reference's canonical frame of the expression, or None
     reference: CanonicalFrame | None = None
-    reference_index: Index | None = None
-    is_reference: bool = False
-    mine: Label | None = None
-    in_force: Label | None = None
-    problem: str | None = None
-    notes: tuple[str, ...] = ()
+    reference_index: Index | None = None  # the reference's footage; None where it cannot be read
+    is_reference: bool = False  # whether this subject is the reference itself
+    mine: Label | None = None  # this annotator's label, or None
+    in_force: Label | None = None  # the label in force, whoever gave it
+    problem: str | None = None  # why the task cannot be labelled, in plain words
+    notes: tuple[str, ...] = ()  # what the annotator should know, in plain words
 
 
 def load_scene(dataset: Dataset, task: LabelTask, annotator: str) -> TaskScene:
@@ -142,23 +127,16 @@ def _reference(
 
 @dataclass(frozen=True, kw_only=True)
 class CueView:
-    """Position within one task.
+    """Position within one task."""
 
-    Attributes:
-        first, last: the cue window, both inside.
-        cursor: the frame that is shown.
-        candidates: suggested frames, best first; empty where none is known or shown.
-        candidate: which of them was visited last.
-        plateau_first, plateau_last: ends of the plateau where they were set.
-    """
-
-    first: int
-    last: int
-    cursor: int
+    first: int  # frame of the cue window
+    last: int  # frame of the cue window, inclusive
+    cursor: int  # the frame that is shown
+    # suggested frames, best first; empty where none is known or shown
     candidates: tuple[int, ...] = ()
-    candidate: int = 0
-    plateau_first: int | None = None
-    plateau_last: int | None = None
+    candidate: int = 0  # which of them was visited last
+    plateau_first: int | None = None  # start of the plateau, if it was set
+    plateau_last: int | None = None  # end of the plateau, if it was set
 
 
 def open_view(

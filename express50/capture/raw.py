@@ -43,65 +43,47 @@ CUE_COLUMNS = ("expression_id", "start_frame", "end_frame")
 
 @dataclass(frozen=True, kw_only=True)
 class RawCamera:
-    """Footage of one camera, as consecutive clips.
-
-    Attributes:
-        id: camera id.
-        kind: ``video`` (``path`` is the file), ``videos`` (a file per clip) or ``frames`` (images).
-        path: the video, or the folder that ``names`` are relative to.
-        names: videos or images in order; an image may lie in a container (`files.containers`).
-        counts: number of images of each clip; if empty, there is one clip.
-        stamps: the layout's own number for each image; if empty, its position.
-        correction: rows of a polynomial colour correction (`colour_correction`), or none.
-        orientation: how images are rotated when they are read (`files.images`).
-    """
+    """Footage of one camera, as consecutive clips."""
 
     id: str
+    # ``video`` (``path`` is the file), ``videos`` (a file per clip) or ``frames`` (images)
     kind: str
-    path: Path
+    path: Path  # the video, or the folder that ``names`` are relative to
+    # videos or images in order; an image may lie in a container (`files.containers`)
     names: tuple[str, ...] = ()
-    counts: tuple[int, ...] = ()
-    stamps: tuple[int, ...] = ()
+    counts: tuple[int, ...] = ()  # number of images of each clip; if empty, there is one clip
+    stamps: tuple[int, ...] = ()  # the layout's own number for each image; if empty, its position
+    # rows of a polynomial colour correction (`colour_correction`), or none
     correction: tuple[tuple[float, ...], ...] = ()
-    orientation: int = 1
+    orientation: int = 1  # how images are rotated when they are read (`files.images`)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RawCapture:
-    """A capture in any layout, checked without decoding footage.
+    """A capture in any layout, checked without decoding footage."""
 
-    Attributes:
-        root: the folder that footage and plates are relative to.
-        subject: subject id.
-        fps: frames per second.
-        meta: content of capture.toml.
-        cameras: footage by camera id.
-        dropped: cameras that cannot be used, with the reason.
-        calibration: given cameras, or None if they are to be calibrated.
-        plates: background plates by camera id, relative to the root.
-        board: content of board.toml and files by camera, images or one video, or None.
-        cues: scripted expressions in file order.
-        layout: name of the layout in `express50.capture.readers.read`; ours is ``express50``.
-        clips: expression of each clip, if the footage comes in clips; the cues follow from them.
-        skipped: parts of a layout that were left out (sequences, frames), with the reason.
-        found: facts about the layout, for metrics.
-        warnings: oddities that may be intentional, with the reason.
-    """
-
-    root: Path
+    root: Path  # the folder that footage and plates are relative to
     subject: str
-    fps: float
-    meta: dict
-    cameras: dict[str, RawCamera]
+    fps: float  # frames per second
+    meta: dict  # content of capture.toml
+    cameras: dict[str, RawCamera]  # footage by camera id
+    # cameras that cannot be used, with the reason
     dropped: dict[str, str] = field(default_factory=dict)
+    # given cameras, or None if they are to be calibrated
     calibration: dict[str, Camera] | None = None
+    # background plates by camera id, relative to the root
     plates: dict[str, str] = field(default_factory=dict)
+    # content of board.toml and files by camera, images or one video, or None
     board: dict | None = None
-    cues: tuple[Cue, ...] = ()
+    cues: tuple[Cue, ...] = ()  # scripted expressions in file order
+    # name of the layout in `express50.capture.readers.read`; ours is ``express50``
     layout: str = "express50"
+    # expression of each clip, if the footage comes in clips; the cues follow from them
     clips: tuple[str, ...] = ()
+    # parts of a layout that were left out (sequences, frames), with the reason
     skipped: dict[str, str] = field(default_factory=dict)
-    found: dict = field(default_factory=dict)
+    found: dict = field(default_factory=dict)  # facts about the layout, for metrics
+    # oddities that may be intentional, with the reason
     warnings: dict[str, str] = field(default_factory=dict)
 
 

@@ -89,18 +89,13 @@ def typical_error(metrics: Iterable[Mapping[str, Any]]) -> ExpectedError | None:
 
 @dataclass(frozen=True)
 class Result:
-    """The outcome of one item, besides the files it wrote.
+    """The outcome of one item, besides the files it wrote."""
 
-    Attributes:
-        metrics: deterministic figures that JSON can hold.
-        dropped: parts of the item that were left out.
-        warnings: parts that were kept although something about them is doubtful.
-        expected_error: how wrong the item probably is; None where the stage cannot say.
-    """
-
+    # deterministic figures that JSON can hold
     metrics: Mapping[str, Any] = field(default_factory=dict)
-    dropped: Sequence[Note] = ()
-    warnings: Sequence[Note] = ()
+    dropped: Sequence[Note] = ()  # parts of the item that were left out
+    warnings: Sequence[Note] = ()  # parts that were kept although something about them is doubtful
+    # how wrong the item probably is; None where the stage cannot say
     expected_error: ExpectedError | None = None
 
     def to_json(self) -> dict[str, Any]:
@@ -132,71 +127,55 @@ class Growth:
     The sizes are ``subjects``, ``expressions``, ``views`` (cameras), ``pixels`` (of a recorded
     image), ``picture`` (pixels of a peak frame, which may be reduced), ``frames`` (of a camera) and
     ``decoded`` (those that ingest decodes); several are multiplied.
-
-    Attributes:
-        items: number of items.
-        time: seconds per item.
-        disk: bytes per item.
-        more: number of further items, such as one of plates per subject; none by default.
-        side: longer side, pixels, to which the stage reduces pictures for most of its work at
-            standard settings, so that larger pictures take no longer; 0 if it does not.
-        reduces: name of the stage's setting to whose pixels it reduces the longer side of pictures
-            for all later stages; 0 pixels leave them as they are.
-        skips: name of the stage's setting that says of how many frames one is decoded.
     """
 
-    items: tuple[str, ...] = ("subjects",)
-    time: tuple[str, ...] = ()
-    disk: tuple[str, ...] = ()
+    items: tuple[str, ...] = ("subjects",)  # number of items
+    time: tuple[str, ...] = ()  # seconds per item
+    disk: tuple[str, ...] = ()  # bytes per item
+    # number of further items, such as one of plates per subject; none by default
     more: tuple[str, ...] = ()
+    # longer side, pixels, to which the stage reduces pictures for most of its work at standard
+    # settings, so that larger pictures take no longer; 0 if it does not
     side: int = 0
+    # name of the stage's setting to whose pixels it reduces the longer side of pictures for all
+    # later stages; 0 pixels leave them as they are
     reduces: str = ""
-    skips: str = ""
+    skips: str = ""  # name of the stage's setting that says of how many frames one is decoded
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One processing step; the runner owns files, retries, receipts and progress.
+    """One processing step; the runner owns files, retries, receipts and progress."""
 
-    Attributes:
-        name: command, table in TOML and folder of the outputs.
-        version: raise it when the same inputs and config give other outputs.
-        config: frozen keyword-only dataclass; a string under each field documents it.
-        items: ids of the work items of a dataset; ``S001`` or nested ``S001/cam03``.
-        inputs: what one item reads: paths are digested by content, strings are literal digests.
-        run: ``run(dataset, item, config, out_dir)`` writes every file into ``out_dir`` and
-            returns a ``Result`` (the runner writes it to ``metrics.json``). Raises Express50Error
-            when the data of this item are bad.
-        presets: values of ``draft`` and ``reference`` that differ from the defaults, which are
-            ``standard``; none if the stage offers no trade between time and error.
-        try_files: opens the files that settings name; commands call it before any stage runs.
-            Raises Express50Error where one cannot be used.
-        needs_gpu: whether items of this config need a GPU; one item at a time runs on each.
-        help: one line for the command line, in the imperative.
-        purpose: one or two sentences for the report.
-        runs_first: stages that the command of this one runs before it.
-        prepare: registers captures that the command names, and returns the ids of their items; if
-            its last argument is true, they may replace other captures of their subjects. Only a
-            stage that has it accepts captures.
-        account: lines for people about items that were made, printed after the stage's account.
-        growth: what its cost is proportional to.
-    """
-
-    name: str
-    version: int
-    config: type
+    name: str  # command, table in TOML and folder of the outputs
+    version: int  # raise it when the same inputs and config give other outputs
+    config: type  # frozen keyword-only dataclass; a string under each field documents it
+    # ids of the work items of a dataset; ``S001`` or nested ``S001/cam03``
     items: Callable[[Dataset], list[str]]
+    # what one item reads: paths are digested by content, strings are literal digests
     inputs: Callable[[Dataset, str, Any], dict[str, Path | str]]
+    # ``run(dataset, item, config, out_dir)`` writes every file into ``out_dir`` and returns a
+    # ``Result`` (the runner writes it to ``metrics.json``). Raises Express50Error when the data of
+    # this item are bad.
     run: Callable[[Dataset, str, Any, Path], Result]
+    # values of ``draft`` and ``reference`` that differ from the defaults, which are ``standard``;
+    # none if the stage offers no trade between time and error
     presets: dict[str, dict[str, object]] = field(default_factory=dict)
+    # opens the files that settings name; commands call it before any stage runs. Raises
+    # Express50Error where one cannot be used.
     try_files: Callable[[Any], None] = no_files
+    # whether items of this config need a GPU; one item at a time runs on each
     needs_gpu: Callable[[Any], bool] = no_gpu
-    help: str = ""
-    purpose: str = ""
-    runs_first: tuple[str, ...] = ()
+    help: str = ""  # one line for the command line, in the imperative
+    purpose: str = ""  # one or two sentences for the report
+    runs_first: tuple[str, ...] = ()  # stages that the command of this one runs before it
+    # registers captures that the command names, and returns the ids of their items; if its last
+    # argument is true, they may replace other captures of their subjects. Only a stage that has it
+    # accepts captures.
     prepare: Callable[[Dataset, Sequence[Path], bool], list[str]] | None = None
+    # lines for people about items that were made, printed after the stage's account
     account: Callable[[Dataset, Sequence[str]], Iterable[str]] | None = None
-    growth: Growth = Growth()
+    growth: Growth = Growth()  # what its cost is proportional to
 
 
 OWN = "toolkit"  # the entry point of this project's own stages, which come first

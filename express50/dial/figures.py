@@ -121,18 +121,14 @@ class Trial:
 
 @dataclass(frozen=True, kw_only=True)
 class PilotFigures:
-    """What was measured of a dataset.
+    """What was measured of a dataset."""
 
-    Attributes:
-        key: digest of stages, settings and machine; figures of another key say nothing.
-        trials: the first at the cheapest settings, the second of one peak, then one step each.
-        losses: difference from the most expensive setting tried, by stage, setting and result.
-        untried: settings that there was no time to try, by stage.
-    """
-
-    key: str
+    key: str  # digest of stages, settings and machine; figures of another key say nothing
+    # the first at the cheapest settings, the second of one peak, then one step each
     trials: list[Trial]
+    # difference from the most expensive setting tried, by stage, setting and result
     losses: dict[str, dict[str, dict[str, float]]]
+    # settings that there was no time to try, by stage
     untried: dict[str, list[str]] = field(default_factory=dict)
 
 

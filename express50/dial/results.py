@@ -33,18 +33,13 @@ COMPARED = 4  # cameras of an expression; more change the mean by less than expr
 
 @dataclass(frozen=True)
 class ResultKind:
-    """A result of the chain.
+    """A result of the chain."""
 
-    Attributes:
-        name: for people.
-        unit: of its error.
-        places: paths of it; of a subject's expression and camera. Of several, the last one counts.
-        apart: how far the results of a subject in two datasets differ, of each of the expressions.
-    """
-
-    name: str
-    unit: str
+    name: str  # for people
+    unit: str  # of its error
+    # paths of it; of a subject's expression and camera. Of several, the last one counts.
     places: Sequence[Callable[[Dataset, str, str, str], Path]]
+    # how far the results of a subject in two datasets differ, of each of the expressions
     apart: Callable[[Dataset, Dataset, str, Sequence[str]], Iterable[float]]
 
     def made_by(self, names: Iterable[str]) -> list[str]:

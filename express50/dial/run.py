@@ -80,23 +80,15 @@ def run_file(dataset: Dataset) -> Path:
 
 @dataclass
 class _Run:
-    """A run as it goes on.
-
-    Attributes:
-        chain, clock: as given.
-        state: as stored.
-        measured: of the pilot.
-        wanted: name of the result that has a goal, and the goal.
-        real, expected: seconds that stages took so far, and that were expected of them.
-    """
+    """A run as it goes on."""
 
     chain: Chain
     clock: Clock
-    state: RunState
-    measured: PilotFigures = field(init=False)
-    wanted: tuple[str, float] | None = None
-    real: float = 0.0
-    expected: float = 0.0
+    state: RunState  # as stored
+    measured: PilotFigures = field(init=False)  # of the pilot
+    wanted: tuple[str, float] | None = None  # name of the result that has a goal, and the goal
+    real: float = 0.0  # seconds that stages took so far
+    expected: float = 0.0  # seconds that were expected of them
 
     def keep(self, **changes: Any) -> None:
         """Change the state, and store it with what is spent."""

@@ -237,18 +237,12 @@ class VideoTags:
 
     They are read as stored, also if a phone stored upright footage lying on its side: a calibration
     refers to stored pixels.
-
-    Attributes:
-        turn: quarter turns counter-clockwise, 0 to 3, that it asks players for.
-        hdr: name of its transfer curve if that is one for high dynamic range, else empty.
-        interlaced: whether a picture holds two half pictures of different moments.
-        aspect: width over height of a pixel.
     """
 
-    turn: int
-    hdr: str
-    interlaced: bool
-    aspect: float
+    turn: int  # quarter turns counter-clockwise, 0 to 3, that it asks players for
+    hdr: str  # name of its transfer curve if that is one for high dynamic range, else empty
+    interlaced: bool  # whether a picture holds two half pictures of different moments
+    aspect: float  # width over height of a pixel
 
 
 def video_tags(path: Path) -> VideoTags:

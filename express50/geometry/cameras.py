@@ -35,22 +35,15 @@ _DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 @dataclass(frozen=True)
 class Camera:
-    """One calibrated camera.
+    """One calibrated camera."""
 
-    Attributes:
-        id: the camera's name in the capture.
-        width, height: image size, pixels.
-        model: COLMAP's name of the model.
-        params: the model's parameters in COLMAP's order, in pixels or dimensionless.
-        cam_from_world: (4, 4) rigid transform, OpenCV axes, metres.
-    """
-
-    id: str
-    width: int
-    height: int
-    model: str
+    id: str  # the camera's name in the capture
+    width: int  # pixels
+    height: int  # pixels
+    model: str  # COLMAP's name of the model
+    # the model's parameters in COLMAP's order, in pixels or dimensionless
     params: tuple[float, ...]
-    cam_from_world: np.ndarray
+    cam_from_world: np.ndarray  # (4, 4) rigid transform, OpenCV axes, metres
 
     def _named(self) -> dict[str, float]:
         return dict(zip(MODELS[self.model], self.params, strict=True))

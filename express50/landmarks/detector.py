@@ -54,22 +54,17 @@ MOUTH_SEEN = 0.75  # least median visibility of a mouth that is looked at closel
 
 @dataclass(frozen=True)
 class Detection:
-    """Landmarks of one image.
+    """Landmarks of one image."""
 
-    Attributes:
-        points: (68, 2) pixels, corner origin, iBUG-68 order.
-        sigma: (68,) expected error in pixels (the scale of a Laplace distribution).
-        confidence: (68,) in 0..1: score times the point's visibility, lowered if sigma is large.
-        score: in 0..1, how likely a face looks towards the camera: the network's probability,
-            lowered if the points are vague or other crops give other points. Low for backs of
-            heads and if no head is visible.
-        outline: (17, 2) pixels, the edge of the face from ear to ear; None if it is unknown.
-    """
-
-    points: np.ndarray
-    sigma: np.ndarray
+    points: np.ndarray  # (68, 2) pixels, corner origin, iBUG-68 order
+    sigma: np.ndarray  # (68,) expected error in pixels (the scale of a Laplace distribution)
+    # (68,) in 0..1: score times the point's visibility, lowered if sigma is large
     confidence: np.ndarray
+    # in 0..1, how likely a face looks towards the camera: the network's probability, lowered if the
+    # points are vague or other crops give other points. Low for backs of heads and if no head is
+    # visible.
     score: float
+    # (17, 2) pixels, the edge of the face from ear to ear; None if it is unknown
     outline: np.ndarray | None = None
 
     def marks(self) -> np.ndarray:

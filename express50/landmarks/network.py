@@ -63,26 +63,17 @@ def face_box(points: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 class Output(NamedTuple):
-    """The network's answer for B crops.
+    """The network's answer for B crops."""
 
-    Attributes:
-        points: (B, 68, 2) crop pixels.
-        log_scale: (B, 68) natural logarithm of the Laplace scale in crop pixels.
-        seen: (B, 68) logit of whether the point is visible.
-        logit: (B,) logit of whether a face looks towards the camera.
-        heat: (B, 68, H / 4, W / 4) heat maps before the softmax.
-        outline: (B, 17, 2) crop pixels; landmarks 0 to 16 if the network does not find it.
-        outline_log_scale, outline_heat: as for the landmarks.
-    """
-
-    points: torch.Tensor
-    log_scale: torch.Tensor
-    seen: torch.Tensor
-    logit: torch.Tensor
-    heat: torch.Tensor
+    points: torch.Tensor  # (B, 68, 2) crop pixels
+    log_scale: torch.Tensor  # (B, 68) natural logarithm of the Laplace scale in crop pixels
+    seen: torch.Tensor  # (B, 68) logit of whether the point is visible
+    logit: torch.Tensor  # (B,) logit of whether a face looks towards the camera
+    heat: torch.Tensor  # (B, 68, H / 4, W / 4) heat maps before the softmax
+    # (B, 17, 2) crop pixels; landmarks 0 to 16 if the network does not find it
     outline: torch.Tensor
-    outline_log_scale: torch.Tensor
-    outline_heat: torch.Tensor
+    outline_log_scale: torch.Tensor  # as for the landmarks
+    outline_heat: torch.Tensor  # as for the landmarks
 
 
 class Residual(nn.Module):

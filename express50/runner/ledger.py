@@ -46,35 +46,24 @@ IMPORTED = "imported "  # begins the fingerprint of imported items
 
 @dataclass(frozen=True, kw_only=True)
 class Receipt:
-    """The state of one item: what is published, and how its last attempt ended.
+    """The state of one item: what is published, and how its last attempt ended."""
 
-    Attributes:
-        stage, item: name and id.
-        fingerprint: digest of stage version, config and inputs.
-        status: ``done``, or ``failed`` where nothing is published.
-        reason: one line if the last attempt failed, else empty. The output of an earlier attempt
-            may still be valid: then the status stays ``done``, and all fields but this and the time
-            describe that attempt.
-        metrics: what the stage returned.
-        seconds: wall time of the attempt.
-        core_seconds: processor time of the attempt; 0 in receipts of older versions.
-        peak_memory: largest resident memory while it ran, bytes.
-        attempts: number of tries in that run.
-        time: when the last attempt ended, seconds since 1970.
-        made: inputs and files of what was published; read by `Ledger.made`, not by `Ledger.read`.
-    """
-
-    stage: str
-    item: str
-    fingerprint: str
-    status: str
+    stage: str  # its name
+    item: str  # its id
+    fingerprint: str  # digest of stage version, config and inputs
+    status: str  # ``done``, or ``failed`` where nothing is published
+    # one line if the last attempt failed, else empty. The output of an earlier attempt may still be
+    # valid: then the status stays ``done``, and all fields but this and the time describe that
+    # attempt.
     reason: str = ""
-    metrics: dict = field(default_factory=dict)
-    seconds: float = 0.0
-    core_seconds: float = 0.0
-    peak_memory: int = 0
-    attempts: int = 1
+    metrics: dict = field(default_factory=dict)  # what the stage returned
+    seconds: float = 0.0  # wall time of the attempt
+    core_seconds: float = 0.0  # processor time of the attempt; 0 in receipts of older versions
+    peak_memory: int = 0  # largest resident memory while it ran, bytes
+    attempts: int = 1  # number of tries in that run
+    # when the last attempt ended, seconds since 1970
     time: float = field(default_factory=time.time)
+    # inputs and files of what was published; read by `Ledger.made`, not by `Ledger.read`
     made: Made | None = None
 
     @property

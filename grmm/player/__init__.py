@@ -60,25 +60,17 @@ PICTURES, FOOTAGE = 12, 24  # that agreement and loss are measured on
 
 @dataclass(frozen=True, kw_only=True)
 class PlayerReport:
-    """What an exported page is like.
+    """What an exported page is like."""
 
-    Attributes:
-        gaussians: drawn.
-        megabytes: of the page.
-        agreement_db: PSNR between its pictures and the full model's, in poses not fitted to.
-        full_db: PSNR of the full model's pictures against footage; None without footage.
-        loss_db: how much lower the page's PSNR is.
-        footage: which samples: ``held out``, or ``seen`` where training saw all; or why none.
-        images: how many.
-    """
-
-    gaussians: int
-    megabytes: float
-    agreement_db: float
+    gaussians: int  # drawn
+    megabytes: float  # of the page
+    agreement_db: float  # PSNR between its pictures and the full model's, in poses not fitted to
+    # PSNR of the full model's pictures against footage; None without footage
     full_db: float | None = None
-    loss_db: float | None = None
+    loss_db: float | None = None  # how much lower the page's PSNR is
+    # which samples: ``held out``, or ``seen`` where training saw all; or why none
     footage: str | None = None
-    images: int = 0
+    images: int = 0  # how many
 
     def __str__(self) -> str:
         loss = f"loss against footage n/a: {self.footage or 'give --shards'}"

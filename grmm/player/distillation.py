@@ -46,37 +46,24 @@ class Avatar:
     The features of a pose are its coefficients, the entries of R - I of neck, jaw, left and right
     eye, and its codes: F = X + 36 + K. They shape the mesh at rest, which is then skinned as the
     head model's is.
-
-    Attributes:
-        rest: (V, 3) metres; every feature zero.
-        shapes: (F, V, 3) metres per unit of a feature.
-        skinning: (V, 5).
-        joints: (1 + X, 5, 3) metres: at rest, then per unit of a coefficient.
-        own: (X + 12,) the head's coefficients, then neck, jaw and both eyes, radians.
-        changes: (E, X + 12) what a training expression adds to them.
-        codes: (E, K) and what it adds to the codes, which are zero for the head itself.
-        corners: (N, 3) vertices of each Gaussian's face.
-        weights: (N, 3) barycentrics.
-        gradient: (N, 2) of the face: its tangent is [P1 - P0, P2 - P0] @ gradient.
-        maps: (1 + K, N, 10) the head's, then per unit of a code: shift in the tangent frame,
-            metres; quaternion, wxyz, of any length; standard deviations, metres.
-        opacities: (N,).
-        colours: (9, N, 3) sRGB: per unit of 1, x, y, z, xy, yz, zx, xx - zz, yy of the direction
-            from the head to the camera.
     """
 
-    rest: Tensor
-    shapes: Tensor
-    skinning: Tensor
-    joints: Tensor
-    own: Tensor
-    changes: Tensor
-    codes: Tensor
-    corners: Tensor
-    weights: Tensor
-    gradient: Tensor
+    rest: Tensor  # (V, 3) metres; every feature zero
+    shapes: Tensor  # (F, V, 3) metres per unit of a feature
+    skinning: Tensor  # (V, 5)
+    joints: Tensor  # (1 + X, 5, 3) metres: at rest, then per unit of a coefficient
+    own: Tensor  # (X + 12,) the head's coefficients, then neck, jaw and both eyes, radians
+    changes: Tensor  # (E, X + 12) what a training expression adds to them
+    codes: Tensor  # (E, K) and what it adds to the codes, which are zero for the head itself
+    corners: Tensor  # (N, 3) vertices of each Gaussian's face
+    weights: Tensor  # (N, 3) barycentrics
+    gradient: Tensor  # (N, 2) of the face: its tangent is [P1 - P0, P2 - P0] @ gradient
+    # (1 + K, N, 10) the head's, then per unit of a code: shift in the tangent frame, metres;
+    # quaternion, wxyz, of any length; standard deviations, metres
     maps: Tensor
-    opacities: Tensor
+    opacities: Tensor  # (N,)
+    # (9, N, 3) sRGB: per unit of 1, x, y, z, xy, yz, zx, xx - zz, yy of the direction from the head
+    # to the camera
     colours: Tensor
 
     def kept(self, which: Tensor) -> Avatar:
@@ -99,23 +86,14 @@ class AvatarPose:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Person:
-    """The full model of a head, which decodes any pose.
-
-    Attributes:
-        loaded: the checkpoint.
-        head: at rest.
-        expressions: E names of training expressions that differ from the head.
-        own: (X + 12,) as `Avatar.own`.
-        changes: (E, X + 12) as `Avatar.changes`.
-        z_changes: (E, Z) what an expression adds to z_exp.
-    """
+    """The full model of a head, which decodes any pose."""
 
     loaded: Checkpoint
-    head: HeadCodes
-    expressions: tuple[str, ...]
-    own: Tensor
-    changes: Tensor
-    z_changes: Tensor
+    head: HeadCodes  # at rest
+    expressions: tuple[str, ...]  # E names of training expressions that differ from the head
+    own: Tensor  # (X + 12,) as `Avatar.own`
+    changes: Tensor  # (E, X + 12) as `Avatar.changes`
+    z_changes: Tensor  # (E, Z) what an expression adds to z_exp
 
     def at(self, pose: AvatarPose) -> HeadCodes:
         """Return the head in a pose, for the full model."""

@@ -68,49 +68,33 @@ class RenderOptions:
 
 @dataclass(frozen=True)
 class RenderOutput:
-    """The images that ``rasterize`` returns.
+    """The images that ``rasterize`` returns."""
 
-    Attributes:
-        colors: (H, W, C) blended colours (any channels), background included.
-        depth: (H, W) RaDe expected depth, camera z in metres; 0 where alpha is 0.
-        alpha: (H, W) in [0, 1).
-        median_depth: (H, W) camera z in metres of the plane of the Gaussian at which the
-            transmittance falls to one half or less; 0 where it never does. None unless asked for.
-        normals: (H, W, 3) blended unit normals of those planes, camera axes, towards the camera,
-            without background; divide by their length for a direction. None unless asked for.
-    """
-
-    colors: Tensor
-    depth: Tensor
-    alpha: Tensor
+    colors: Tensor  # (H, W, C) blended colours (any channels), background included
+    depth: Tensor  # (H, W) RaDe expected depth, camera z in metres; 0 where alpha is 0
+    alpha: Tensor  # (H, W) in [0, 1)
+    # (H, W) camera z in metres of the plane of the Gaussian at which the transmittance falls to one
+    # half or less; 0 where it never does. None unless asked for.
     median_depth: Tensor | None = None
+    # (H, W, 3) blended unit normals of those planes, camera axes, towards the camera, without
+    # background; divide by their length for a direction. None unless asked for.
     normals: Tensor | None = None
 
 
 @dataclass(frozen=True)
 class Projection:
-    """Gaussians in one image; rows of Gaussians that are not ``visible`` are finite but arbitrary.
+    """Gaussians in one image; rows of those that are not ``visible`` are finite but arbitrary."""
 
-    Attributes:
-        means2d: (N, 2) pixels, corner origin.
-        conics: (N, 3) entries xx, xy, yy of the inverse of the dilated 2D covariance, 1/px^2.
-        depths: (N,) camera z of the means, metres.
-        planes: (N, 3) ray length l at the mean (m) and its slope (s_u, s_v) in m/px, so that the
-            Gaussian lies at ray length ``l + s . (pixel - mean2d)``.
-        normals: (N, 3) unit normals of those planes, camera axes, towards the camera.
-        opacities: (N,) after the antialiasing compensation, if any.
-        extents: (N, 2) half width and height of the box in which alpha reaches 1/255, pixels.
-        visible: (N,) bool, in front of the near plane and touching the image.
-    """
-
-    means2d: Tensor
-    conics: Tensor
-    depths: Tensor
+    means2d: Tensor  # (N, 2) pixels, corner origin
+    conics: Tensor  # (N, 3) entries xx, xy, yy of the inverse of the dilated 2D covariance, 1/px^2
+    depths: Tensor  # (N,) camera z of the means, metres
+    # (N, 3) ray length l at the mean (m) and its slope (s_u, s_v) in m/px, so that the Gaussian
+    # lies at ray length ``l + s . (pixel - mean2d)``
     planes: Tensor
-    normals: Tensor
-    opacities: Tensor
-    extents: Tensor
-    visible: Tensor
+    normals: Tensor  # (N, 3) unit normals of those planes, camera axes, towards the camera
+    opacities: Tensor  # (N,) after the antialiasing compensation, if any
+    extents: Tensor  # (N, 2) half width and height of the box in which alpha reaches 1/255, pixels
+    visible: Tensor  # (N,) bool, in front of the near plane and touching the image
 
 
 def project(scene: Splats, camera: Pinhole, antialiased: bool = False) -> Projection:

@@ -31,21 +31,14 @@ Values = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class LevelSet:
-    """Signed distances, metres, negative inside, at origin + voxel * i in a box of voxels.
+    """Signed distances, metres, negative inside, at origin + voxel * i in a box of voxels."""
 
-    Attributes:
-        origin: (3,) world, metres.
-        voxel: metres.
-        shape: voxels (X, Y, Z) of the box.
-        table: (A, B, C) int32, the row of each block of the box.
-        blocks: (2 + N, BLOCK, BLOCK, BLOCK) float32, within BAND voxels of the surface; the rows
-            after the constant two are in the order of their places in the table.
-    """
-
-    origin: np.ndarray
-    voxel: float
-    shape: tuple[int, int, int]
-    table: np.ndarray
+    origin: np.ndarray  # (3,) world, metres
+    voxel: float  # metres
+    shape: tuple[int, int, int]  # voxels (X, Y, Z) of the box
+    table: np.ndarray  # (A, B, C) int32, the row of each block of the box
+    # (2 + N, BLOCK, BLOCK, BLOCK) float32, within BAND voxels of the surface; the rows after the
+    # constant two are in the order of their places in the table
     blocks: np.ndarray
 
     def points(self, index: np.ndarray) -> np.ndarray:

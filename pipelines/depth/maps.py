@@ -41,23 +41,16 @@ GRAINS = 7  # every n-th pixel counts for the typical grain of all views
 
 @dataclass(frozen=True)
 class Picture:
-    """One camera's picture; of the full size only what counts, as all would take a gigabyte.
+    """One camera's picture; of the full size only what counts, as all would take a gigabyte."""
 
-    Attributes:
-        camera: pinhole, of the full size.
-        small: camera, frame (h, w, 3) and matte (h, w), uint8, as they are compared.
-        box: rows and columns of the full size about the matte.
-        grey, alpha: frame and matte (h, w), uint8, in this box.
-        grains: (N,) `grain` at some pixels of the matte.
-        edge_px: width of its sharpest edges at the small size, NaN with too few: how blurred it is.
-    """
-
-    camera: Camera
+    camera: Camera  # pinhole, of the full size
+    # camera, frame (h, w, 3) and matte (h, w), uint8, as they are compared
     small: tuple[Camera, np.ndarray, np.ndarray]
-    box: tuple[slice, slice]
-    grey: np.ndarray
-    alpha: np.ndarray
-    grains: np.ndarray
+    box: tuple[slice, slice]  # rows and columns of the full size about the matte
+    grey: np.ndarray  # frame (h, w), uint8, in this box
+    alpha: np.ndarray  # matte (h, w), uint8, in this box
+    grains: np.ndarray  # (N,) `grain` at some pixels of the matte
+    # width of its sharpest edges at the small size, NaN with too few: how blurred it is
     edge_px: float
 
     @property

@@ -51,17 +51,11 @@ UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 @dataclass(frozen=True, kw_only=True)
 class PeakFrame:
-    """Names the peak frame of an expression.
+    """Names the peak frame of an expression."""
 
-    Attributes:
-        expression: its id.
-        frame: decode index in the footage.
-        clip_frame: the same, counted from the first frame of the expression's cue window.
-    """
-
-    expression: str
-    frame: int
-    clip_frame: int
+    expression: str  # its id
+    frame: int  # decode index in the footage
+    clip_frame: int  # the same, counted from the first frame of the expression's cue window
 
 
 def peak_frames(dataset: Dataset, subject: str) -> list[PeakFrame]:

@@ -62,38 +62,24 @@ _MISREADINGS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class FlameStep:
-    """Holds the parameters of one time step, in the dataset's world.
+    """Holds the parameters of one time step, in the dataset's world."""
 
-    Attributes:
-        where: its file, for messages.
-        arrays: by name, one row each.
-        shared: ``shape`` and ``static_offset``, which all time steps have in common.
-        motion: (4, 4) rigid, from the other tool's world.
-        dynamic_mm: largest displacement that this step alone has.
-    """
-
-    where: str
-    arrays: Mapping[str, np.ndarray]
+    where: str  # its file, for messages
+    arrays: Mapping[str, np.ndarray]  # by name, one row each
+    # ``shape`` and ``static_offset``, which all time steps have in common
     shared: Mapping[str, np.ndarray]
-    motion: np.ndarray
-    dynamic_mm: float
+    motion: np.ndarray  # (4, 4) rigid, from the other tool's world
+    dynamic_mm: float  # largest displacement that this step alone has
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackSource:
-    """Says where a subject's tracks are.
+    """Says where a subject's tracks are."""
 
-    Attributes:
-        pattern: path of a folder or file; with an expression in it, of each expression's own.
-        head: the head model, as ``load_head`` takes it.
-        axes: of the camera matrices, ``opengl`` or ``opencv``.
-        cameras: the other tool's rig, where the tracks do not bring it.
-    """
-
-    pattern: str
-    head: str
-    axes: str = "opengl"
-    cameras: Path | None = None
+    pattern: str  # path of a folder or file; with an expression in it, of each expression's own
+    head: str  # the head model, as ``load_head`` takes it
+    axes: str = "opengl"  # of the camera matrices, ``opengl`` or ``opencv``
+    cameras: Path | None = None  # the other tool's rig, where the tracks do not bring it
 
     @property
     def in_clip(self) -> bool:

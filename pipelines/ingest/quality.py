@@ -45,21 +45,14 @@ _CURVE = srgb_to_linear(np.arange(256, dtype=np.float32) / 255.0).astype(np.floa
 
 @dataclass(frozen=True)
 class CameraMeasurements:
-    """Measurements of one camera's frames.
+    """Measurements of one camera's frames."""
 
-    Attributes:
-        frames: (N,) the frames that were decoded.
-        moves: (N,) movement since the one before, grey levels.
-        cells: (N, 16, 16, 3) linear light.
-        widths: frame and width of its sharpest edges, pixels, of some frames.
-        tags: what its first video says of its pictures; None if it has none.
-    """
-
-    frames: np.ndarray
-    moves: np.ndarray
-    cells: np.ndarray
+    frames: np.ndarray  # (N,) the frames that were decoded
+    moves: np.ndarray  # (N,) movement since the one before, grey levels
+    cells: np.ndarray  # (N, 16, 16, 3) linear light
+    # frame and width of its sharpest edges, pixels, of some frames
     widths: tuple[tuple[int, float], ...]
-    tags: VideoTags | None = None
+    tags: VideoTags | None = None  # what its first video says of its pictures; None if it has none
 
 
 @dataclass
@@ -341,19 +334,13 @@ def find_repeats(moves: Mapping[str, np.ndarray]) -> dict[str, list[int]]:
 
 @dataclass(frozen=True)
 class Drift:
-    """Range of a camera's light over the capture, in stops.
+    """Range of a camera's light over the capture, in stops."""
 
-    Attributes:
-        exposure: mean over red, green and blue.
-        red, blue: against green.
-        brightest, darkest: frames of the largest and the smallest exposure.
-    """
-
-    exposure: float
-    red: float
-    blue: float
-    brightest: int
-    darkest: int
+    exposure: float  # mean over red, green and blue
+    red: float  # against green
+    blue: float  # against green
+    brightest: int  # frame of the largest exposure
+    darkest: int  # frame of the smallest exposure
 
 
 def light_cells(image: np.ndarray) -> np.ndarray:

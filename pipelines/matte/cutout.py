@@ -73,18 +73,12 @@ class Cut:
 
 @dataclass(frozen=True)
 class CutView:
-    """One camera's reduced picture.
+    """One camera's reduced picture."""
 
-    Attributes:
-        camera: pinhole, of the reduced picture.
-        rgb: (h, w, 3) uint8.
-        valid: (h, w) bool, pixels with footage.
-        known: (h, w) bool, the person's mask if it is known, as from a plate.
-    """
-
-    camera: Camera
-    rgb: np.ndarray
-    valid: np.ndarray
+    camera: Camera  # pinhole, of the reduced picture
+    rgb: np.ndarray  # (h, w, 3) uint8
+    valid: np.ndarray  # (h, w) bool, pixels with footage
+    # (h, w) bool, the person's mask if it is known, as from a plate
     known: np.ndarray | None = None
 
     @property

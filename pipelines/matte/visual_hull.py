@@ -54,23 +54,14 @@ class Ball:
 
 @dataclass(frozen=True)
 class MatteView:
-    """One camera's reduced picture and matte.
+    """One camera's reduced picture and matte."""
 
-    Attributes:
-        name: camera id.
-        projection: (3, 4) float32 from the unit ball's coordinates to (x, y, 1) z, pixels.
-        center: (3,) camera centre in the ball's coordinates.
-        rgb: (h, w, 3) uint8.
-        alpha: (h, w) float32 in [0, 1].
-        valid: (h, w) bool, pixels with footage.
-    """
-
-    name: str
-    projection: np.ndarray
-    center: np.ndarray
-    rgb: np.ndarray
-    alpha: np.ndarray
-    valid: np.ndarray
+    name: str  # camera id
+    projection: np.ndarray  # (3, 4) float32 from the unit ball's coordinates to (x, y, 1) z, pixels
+    center: np.ndarray  # (3,) camera centre in the ball's coordinates
+    rgb: np.ndarray  # (h, w, 3) uint8
+    alpha: np.ndarray  # (h, w) float32 in [0, 1]
+    valid: np.ndarray  # (h, w) bool, pixels with footage
 
     @classmethod
     def of(
@@ -87,19 +78,13 @@ class MatteView:
 
 @dataclass(frozen=True)
 class Space:
-    """What all views say of each cell of space.
+    """What all views say of each cell of space."""
 
-    Attributes:
-        axis: (n,) float32 coordinates of the cells, the same along x, y and z.
-        seen, clear, solid: (n, n, n) uint16 counts of the views that see the cell, see clear
-            background there, see the subject there.
-        labels: each view's pixel labels (h * w + 1,) uint8, the last for cells out of view.
-    """
-
-    axis: np.ndarray
-    seen: np.ndarray
-    clear: np.ndarray
-    solid: np.ndarray
+    axis: np.ndarray  # (n,) float32 coordinates of the cells, the same along x, y and z
+    seen: np.ndarray  # (n, n, n) uint16 count of the views that see the cell
+    clear: np.ndarray  # (n, n, n) uint16 count of those that see clear background there
+    solid: np.ndarray  # (n, n, n) uint16 count of those that see the subject there
+    # each view's pixel labels (h * w + 1,) uint8, the last for cells out of view
     labels: dict[str, np.ndarray]
 
 
@@ -204,21 +189,14 @@ LARGEST = 0.4  # share of the subject: if more lacks, the matte is wrong rather 
 
 @dataclass(frozen=True)
 class Evidence:
-    """The evidence of other views about a view's pixels, each (h, w).
+    """The evidence of other views about a view's pixels, each (h, w)."""
 
-    Attributes:
-        known: pixels whose rays cross the space.
-        possible: those whose rays pass a place that the others do not rule out.
-        likely: those whose rays pass a place that none of the others rules out.
-        solid: those whose rays pass a place where nearly all others that see it see the subject.
-        front: depth of the nearest such place, in radii; infinite without one.
-    """
-
-    known: np.ndarray
-    possible: np.ndarray
-    likely: np.ndarray
+    known: np.ndarray  # pixels whose rays cross the space
+    possible: np.ndarray  # those whose rays pass a place that the others do not rule out
+    likely: np.ndarray  # those whose rays pass a place that none of the others rules out
+    # those whose rays pass a place where nearly all others that see it see the subject
     solid: np.ndarray
-    front: np.ndarray
+    front: np.ndarray  # depth of the nearest such place, in radii; infinite without one
 
 
 def evidence_of(view: MatteView, space: Space, place: np.ndarray) -> Evidence:
@@ -417,18 +395,14 @@ class Misfit:
 
 @dataclass(frozen=True)
 class Agreement:
-    """The corrections that the views of one frame set make to each other.
+    """The corrections that the views of one frame set make to each other."""
 
-    Attributes:
-        removed, filled: (h, w) bool for each camera whose matte is corrected.
-        warnings: cameras whose mattes were not changed, and why.
-        unchanged: why nothing was compared; empty if mattes were compared.
-    """
-
+    # removed and filled pixels (h, w) bool of each camera whose matte is corrected
     removed: dict[str, np.ndarray] = field(default_factory=dict)
     filled: dict[str, np.ndarray] = field(default_factory=dict)
+    # cameras whose mattes were not changed, and why
     warnings: list[Note] = field(default_factory=list)
-    unchanged: str = ""
+    unchanged: str = ""  # why nothing was compared; empty if mattes were compared
 
 
 def compare_mattes(views: Sequence[MatteView], cells: int = CELLS) -> Agreement:

@@ -71,31 +71,18 @@ SOLID = 0.98  # alpha from which a pixel has the subject's colour alone
 
 @dataclass(frozen=True)
 class PackedSubject:
-    """The part of a subject's data that its samples share.
+    """The part of a subject's data that its samples share."""
 
-    Attributes:
-        name: subject id.
-        cameras: pinhole cameras of the pictures by id.
-        recorded: width and height of the footage by camera.
-        gains: linear light (3,) by camera, if measured.
-        peaks: decode index by expression.
-        labels: label without the annotator's name, by expression.
-        track: the tracked head.
-        registered: registrations of this track by expression, if any.
-        notes: why a registration is left out.
-        meta: the fields of meta.json that all samples share.
-    """
-
-    name: str
-    cameras: dict[str, Camera]
-    recorded: dict[str, list[int]]
-    gains: dict[str, np.ndarray]
-    peaks: dict[str, int]
-    labels: dict[str, dict]
-    track: Track
-    registered: dict[str, Registration]
-    notes: list[Note]
-    meta: dict
+    name: str  # subject id
+    cameras: dict[str, Camera]  # pinhole cameras of the pictures by id
+    recorded: dict[str, list[int]]  # width and height of the footage by camera
+    gains: dict[str, np.ndarray]  # linear light (3,) by camera, if measured
+    peaks: dict[str, int]  # decode index by expression
+    labels: dict[str, dict]  # label without the annotator's name, by expression
+    track: Track  # the tracked head
+    registered: dict[str, Registration]  # registrations of this track by expression, if any
+    notes: list[Note]  # why a registration is left out
+    meta: dict  # the fields of meta.json that all samples share
 
 
 def read_subject(dataset: Dataset, name: str) -> PackedSubject:
@@ -149,27 +136,16 @@ def nameless(label: dict) -> dict:
 
 @dataclass(frozen=True)
 class LoadedSample:
-    """The full-size images (H, W) of one view.
+    """The full-size images (H, W) of one view."""
 
-    Attributes:
-        rgb: (H, W, 3) uint8 sRGB frame.
-        plate: (H, W, 3) uint8 sRGB clean plate, or None.
-        matte: uint8 opacity of the subject, torso included.
-        alpha: uint8 opacity to pack.
-        depth: metres.
-        valid: bool, the depth is known.
-        parts: uint8 labels, or None.
-        torso: `removed` from alpha, or `kept`.
-    """
-
-    rgb: np.ndarray
-    plate: np.ndarray | None
-    matte: np.ndarray
-    alpha: np.ndarray
-    depth: np.ndarray
-    valid: np.ndarray
-    parts: np.ndarray | None
-    torso: str
+    rgb: np.ndarray  # (H, W, 3) uint8 sRGB frame
+    plate: np.ndarray | None  # (H, W, 3) uint8 sRGB clean plate, or None
+    matte: np.ndarray  # uint8 opacity of the subject, torso included
+    alpha: np.ndarray  # uint8 opacity to pack
+    depth: np.ndarray  # metres
+    valid: np.ndarray  # bool, the depth is known
+    parts: np.ndarray | None  # uint8 labels, or None
+    torso: str  # `removed` from alpha, or `kept`
 
 
 def load_sample(

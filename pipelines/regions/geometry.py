@@ -45,19 +45,13 @@ _REGIONS = (
 
 @dataclass(frozen=True)
 class HeadLabels:
-    """The labels of a head model.
+    """The labels of a head model."""
 
-    Attributes:
-        faces: (F, 3) that can be seen; sheets without any region (lash cards) are left out.
-        vertices: (V,) uint8 indices into LABELS, or SCALP.
-        end: (n,) indices of the vertices around the neck's lower end; empty if unknown.
-        missing: names of LABELS that the model cannot give.
-    """
-
+    # (F, 3) that can be seen; sheets without any region (lash cards) are left out
     faces: np.ndarray
-    vertices: np.ndarray
-    end: np.ndarray
-    missing: tuple[str, ...]
+    vertices: np.ndarray  # (V,) uint8 indices into LABELS, or SCALP
+    end: np.ndarray  # (n,) indices of the vertices around the neck's lower end; empty if unknown
+    missing: tuple[str, ...]  # names of LABELS that the model cannot give
 
 
 def head_labels(model: HeadModel | HeadTopology) -> HeadLabels:
@@ -83,17 +77,11 @@ def head_labels(model: HeadModel | HeadTopology) -> HeadLabels:
 
 @dataclass(frozen=True)
 class NeckEnd:
-    """The neck's lower end: a height by bearing, in axes of the head, level beyond the neck.
+    """The neck's lower end: a height by bearing, in axes of the head, level beyond the neck."""
 
-    Attributes:
-        center: (3,) middle of the end, world.
-        R: (3, 3) world from head axes; y up.
-        heights: (BEARINGS,) metres above the middle.
-    """
-
-    center: np.ndarray
-    R: np.ndarray
-    heights: np.ndarray
+    center: np.ndarray  # (3,) middle of the end, world
+    R: np.ndarray  # (3, 3) world from head axes; y up
+    heights: np.ndarray  # (BEARINGS,) metres above the middle
 
     def height(self, points: np.ndarray) -> np.ndarray:
         """Measure metres (N,) of points (N, 3), world, above the end; negative below."""
@@ -104,23 +92,14 @@ class NeckEnd:
 
 @dataclass(frozen=True)
 class TrackedHead:
-    """One expression's mesh, ready to be seen.
+    """One expression's mesh, ready to be seen."""
 
-    Attributes:
-        vertices: (V, 3) world, metres.
-        R: (3, 3) world from head axes; y up, z along the gaze.
-        labels: the head model's.
-        end: the neck's lower end; None if the model does not mark it.
-        center: (3,) origin of the scene, which keeps digits far from the world's origin.
-        scene: for casting rays.
-    """
-
-    vertices: np.ndarray
-    R: np.ndarray
-    labels: HeadLabels
-    end: NeckEnd | None
-    center: np.ndarray
-    scene: o3d.t.geometry.RaycastingScene
+    vertices: np.ndarray  # (V, 3) world, metres
+    R: np.ndarray  # (3, 3) world from head axes; y up, z along the gaze
+    labels: HeadLabels  # the head model's
+    end: NeckEnd | None  # the neck's lower end; None if the model does not mark it
+    center: np.ndarray  # (3,) origin of the scene, which keeps digits far from the world's origin
+    scene: o3d.t.geometry.RaycastingScene  # for casting rays
 
     def faces_camera(self, camera: Camera) -> bool:
         """Return whether a camera stands in front of the face, not behind the head."""
@@ -177,23 +156,16 @@ def render_head(head: TrackedHead, camera: Camera) -> tuple[np.ndarray, np.ndarr
 
 @dataclass(frozen=True)
 class HeadGeometry:
-    """Every pixel of one camera relative to the tracked head.
+    """Every pixel of one camera relative to the tracked head."""
 
-    Attributes:
-        mesh: (H, W) uint8 label of the mesh, SCALP among them, 0 beside it.
-        depth: (H, W) float32 camera z of the mesh, metres, 0 beside it.
-        near: (H, W) uint8 label at the nearest pixel of the mesh; 0 if no pixel shows it.
-        rim: (H, W) bool, just beyond the mesh.
-        height: (H, W) float32 metres above the neck's end; inf if the model does not mark it.
-        off: (H, W) float32 metres from the mesh to what is in front of its face; 0 where nothing
-            is CLEAR_M in front of it.
-    """
-
-    mesh: np.ndarray
-    depth: np.ndarray
-    near: np.ndarray
-    rim: np.ndarray
+    mesh: np.ndarray  # (H, W) uint8 label of the mesh, SCALP among them, 0 beside it
+    depth: np.ndarray  # (H, W) float32 camera z of the mesh, metres, 0 beside it
+    near: np.ndarray  # (H, W) uint8 label at the nearest pixel of the mesh; 0 if no pixel shows it
+    rim: np.ndarray  # (H, W) bool, just beyond the mesh
+    # (H, W) float32 metres above the neck's end; inf if the model does not mark it
     height: np.ndarray
+    # (H, W) float32 metres from the mesh to what is in front of its face; 0 where nothing is
+    # CLEAR_M in front of it
     off: np.ndarray
 
     def labels(self) -> np.ndarray:

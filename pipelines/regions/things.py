@@ -178,21 +178,13 @@ def shown_in_front(places: np.ndarray, camera: Camera, depth: np.ndarray) -> np.
 
 @dataclass(frozen=True)
 class FaceView:
-    """What one view shows where it would see the tracked face if nothing were in front of it.
+    """What one view shows where it would see the tracked face if nothing were in front of it."""
 
-    Attributes:
-        camera: pinhole.
-        depth: (H, W) of the head, camera z in metres, 0 beside it.
-        bare: (H, W) bool, surely the face.
-        covered: (H, W) bool, surely something in front of the face.
-        things: (n, 3) places, world, on what covers it.
-    """
-
-    camera: Camera
-    depth: np.ndarray
-    bare: np.ndarray
-    covered: np.ndarray
-    things: np.ndarray
+    camera: Camera  # pinhole
+    depth: np.ndarray  # (H, W) of the head, camera z in metres, 0 beside it
+    bare: np.ndarray  # (H, W) bool, surely the face
+    covered: np.ndarray  # (H, W) bool, surely something in front of the face
+    things: np.ndarray  # (n, 3) places, world, on what covers it
 
 
 @dataclass(frozen=True)
@@ -212,25 +204,17 @@ class _Shot:
 
 @dataclass(frozen=True)
 class _Sweep:
-    """How well a view agrees with others on the face and in front of it, in a window (h, w).
-
-    Attributes:
-        face: (h, w) bool.
-        places: (h, w, 3) on the head, about its centre, and unit `ways` (h, w, 3) towards them.
-        on_face: (h, w) best agreement within NEAR_M of the head.
-        before: (HEIGHTS_M, h, w) best agreement in front of the head.
-        free: (HEIGHTS_M, h, w) bool, where there may be a thing in front of the face.
-    """
+    """How well a view agrees with others on the face and in front of it, in a window (h, w)."""
 
     camera: Camera
     depth: np.ndarray
     window: tuple[slice, slice]
-    face: np.ndarray
-    places: np.ndarray
-    ways: np.ndarray
-    on_face: np.ndarray
-    before: np.ndarray
-    free: np.ndarray
+    face: np.ndarray  # (h, w) bool
+    places: np.ndarray  # (h, w, 3) on the head, about its centre
+    ways: np.ndarray  # (h, w, 3) unit, towards them
+    on_face: np.ndarray  # (h, w) best agreement within NEAR_M of the head
+    before: np.ndarray  # (HEIGHTS_M, h, w) best agreement in front of the head
+    free: np.ndarray  # (HEIGHTS_M, h, w) bool, where there may be a thing in front of the face
 
     def face_view(self, center: np.ndarray) -> FaceView:
         """Tell the face from things; the head's `center` (3,) is in the world."""

@@ -75,19 +75,12 @@ class GivenSurface:
 
 @dataclass(frozen=True)
 class LaidMesh:
-    """A mesh that was laid onto a surface.
+    """A mesh that was laid onto a surface."""
 
-    Attributes:
-        vertices: (V, 3), world, metres.
-        seen: (V,) bool, where the surface was found and trusted.
-        residual: (V,) height of the surface above the mesh there, metres; 0 elsewhere.
-        sigma: (V,) standard deviation of the vertices along their normals, metres.
-    """
-
-    vertices: np.ndarray
-    seen: np.ndarray
-    residual: np.ndarray
-    sigma: np.ndarray
+    vertices: np.ndarray  # (V, 3), world, metres
+    seen: np.ndarray  # (V,) bool, where the surface was found and trusted
+    residual: np.ndarray  # (V,) height of the surface above the mesh there, metres; 0 elsewhere
+    sigma: np.ndarray  # (V,) standard deviation of the vertices along their normals, metres
 
 
 def lay(model: HeadModel, start: np.ndarray, surface: GivenSurface, detail: float) -> LaidMesh:

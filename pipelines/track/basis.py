@@ -37,20 +37,13 @@ OFFSET_SIGMA_M, OFFSET_LENGTH_M = 0.001, 0.02  # standard deviation, correlation
 
 @dataclass(frozen=True)
 class Basis:
-    """Joints of a head model as a linear function of its coefficients, float64.
+    """Joints of a head model as a linear function of its coefficients, float64."""
 
-    Attributes:
-        model: the head model in float64.
-        directions: (V, 3, S + X).
-        joints: (J, 3) of the template.
-        joint_directions: (J, 3, S + X).
-        bias: (68, 3) the known error of the landmark detector on this face, head space.
-    """
-
-    model: HeadModel
-    directions: torch.Tensor
-    joints: torch.Tensor
-    joint_directions: torch.Tensor
+    model: HeadModel  # the head model in float64
+    directions: torch.Tensor  # (V, 3, S + X)
+    joints: torch.Tensor  # (J, 3) of the template
+    joint_directions: torch.Tensor  # (J, 3, S + X)
+    # (68, 3) the known error of the landmark detector on this face, head space
     bias: np.ndarray = field(default_factory=lambda: np.zeros((68, 3)))
 
     @property

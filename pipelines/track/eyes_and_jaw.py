@@ -272,17 +272,11 @@ def _is_shut(
 
 @dataclass(frozen=True)
 class JawLine:
-    """The jaw line in one view.
+    """The jaw line in one view."""
 
-    Attributes:
-        places: 17 points.
-        moved: (17,) bool, points that left the embedding for the rim.
-        usable: (17,) bool, points that the camera sees.
-    """
-
-    places: MeshPlaces
-    moved: np.ndarray
-    usable: np.ndarray
+    places: MeshPlaces  # 17 points
+    moved: np.ndarray  # (17,) bool, points that left the embedding for the rim
+    usable: np.ndarray  # (17,) bool, points that the camera sees
 
 
 def contour_points(model: HeadModel, vertices: np.ndarray, camera: Camera) -> JawLine:

@@ -181,23 +181,15 @@ def between(places: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class FaceUvMap:
-    """The UV map of a head model's face.
+    """The UV map of a head model's face."""
 
-    Attributes:
-        samples: T places on the mesh, one per texel that shows the head.
-        texels: (T, 2) their rows and columns.
-        places: (V, 2) column and row of every vertex, corner origin; far off where it has none.
-        front: (F,) bool, faces of skin that the map shows, however small.
-        skin: (T,) bool, texels of skin: not of eyes, teeth or tongue.
-        fine: texels per side of a texel of the map that the network reads.
-    """
-
-    samples: MeshPlaces
-    texels: np.ndarray
+    samples: MeshPlaces  # T places on the mesh, one per texel that shows the head
+    texels: np.ndarray  # (T, 2) their rows and columns
+    # (V, 2) column and row of every vertex, corner origin; far off where it has none
     places: np.ndarray
-    front: np.ndarray
-    skin: np.ndarray
-    fine: int = 1
+    front: np.ndarray  # (F,) bool, faces of skin that the map shows, however small
+    skin: np.ndarray  # (T,) bool, texels of skin: not of eyes, teeth or tongue
+    fine: int = 1  # texels per side of a texel of the map that the network reads
 
     def image(self, values: np.ndarray) -> np.ndarray:
         """Spread values (T, C) over the map (HEIGHT, WIDTH, C), finer by `fine`; 0 off the head."""

@@ -27,25 +27,18 @@ SAME_DIRECTION = np.radians(2.0)
 
 @dataclass(frozen=True)
 class LandmarkView:
-    """Landmarks seen by one pinhole camera.
-
-    Attributes:
-        points: (68, 2) pixels.
-        sigma: (68,) pixels; infinite where a point is not known.
-        score: of the face, 0 to 1.
-        irises: iris centres, where they were looked for.
-        redundancy: number of cameras, itself included, that look at the face from the same
-            direction. They err alike and count together as one.
-        visible_contour: points 0..16 mark the visible edge of the jaw, as people's marks do, not
-            fixed places of the skin.
-    """
+    """Landmarks seen by one pinhole camera."""
 
     camera: Camera
-    points: np.ndarray
-    sigma: np.ndarray
-    score: float
-    irises: Irises | None = None
+    points: np.ndarray  # (68, 2) pixels
+    sigma: np.ndarray  # (68,) pixels; infinite where a point is not known
+    score: float  # of the face, 0 to 1
+    irises: Irises | None = None  # iris centres, where they were looked for
+    # number of cameras, itself included, that look at the face from the same direction. They err
+    # alike and count together as one.
     redundancy: float = 1.0
+    # points 0..16 mark the visible edge of the jaw, as people's marks do, not fixed places of the
+    # skin
     visible_contour: bool = False
 
     @property
@@ -61,25 +54,15 @@ class LandmarkView:
 
 @dataclass(frozen=True)
 class Observation:
-    """Views of one expression at one frame.
-
-    Attributes:
-        expression: expression id.
-        frame: decode index.
-        views: views that are used.
-        inliers: (views, 68) bool, landmarks that agree with the other views.
-        points: (68, 3) triangulated, metres in the world; NaN where under two views agree.
-        covariance: (68, 3, 3) of the points, square metres; NaN with them.
-        shut: eyes that are known to be shut, as indices of `iris.EYES`.
-    """
+    """Views of one expression at one frame."""
 
     expression: str
-    frame: int
-    views: tuple[LandmarkView, ...]
-    inliers: np.ndarray
-    points: np.ndarray
-    covariance: np.ndarray
-    shut: tuple[int, ...] = ()
+    frame: int  # decode index
+    views: tuple[LandmarkView, ...]  # views that are used
+    inliers: np.ndarray  # (views, 68) bool, landmarks that agree with the other views
+    points: np.ndarray  # (68, 3) triangulated, metres in the world; NaN where under two views agree
+    covariance: np.ndarray  # (68, 3, 3) of the points, square metres; NaN with them
+    shut: tuple[int, ...] = ()  # eyes that are known to be shut, as indices of `iris.EYES`
 
 
 def triangulate_views(

@@ -74,19 +74,13 @@ class PatchSearch:
 
 @dataclass(frozen=True)
 class PatchViews:
-    """How C views see S places on a mesh (V, 3) with faces (F, 3).
+    """How C views see S places on a mesh (V, 3) with faces (F, 3)."""
 
-    Attributes:
-        images: grey pictures (H, W) float32, root of light, with their pinhole cameras.
-        weights: (C, S), 0 where a place is not seen.
-        places: (S, 3) in the world.
-        normals: (S, 3) of unit length.
-    """
-
+    # grey pictures (H, W) float32, root of light, with their pinhole cameras
     images: list[tuple[np.ndarray, Camera]]
-    weights: np.ndarray
-    places: np.ndarray
-    normals: np.ndarray
+    weights: np.ndarray  # (C, S), 0 where a place is not seen
+    places: np.ndarray  # (S, 3) in the world
+    normals: np.ndarray  # (S, 3) of unit length
     mesh: np.ndarray
     faces: np.ndarray
 

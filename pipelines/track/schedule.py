@@ -55,21 +55,14 @@ TRUST_GROWTH = 1 / 0.3
 
 @dataclass(frozen=True)
 class Round:
-    """The evidence of one round; landmarks, irises and the jaw line are always in.
+    """The evidence of one round; landmarks, irises and the jaw line are always in."""
 
-    Attributes:
-        outlines: fit the outlines of the mattes.
-        patch_reach_m: how far along the normals the surface is searched for; 0 for no search.
-        patch_weight: trust in what the search finds.
-        read_uv: find landmarks on the face UV map again; otherwise the last reading stays.
-        follow_skin: follow the skin's texture from the resting face to the other expressions. The
-            shape is held: the texture shows how a face moves, not what it is.
-    """
-
-    outlines: bool
-    patch_reach_m: float
-    patch_weight: float
-    read_uv: bool
+    outlines: bool  # fit the outlines of the mattes
+    patch_reach_m: float  # how far along the normals the surface is searched for; 0 for no search
+    patch_weight: float  # trust in what the search finds
+    read_uv: bool  # find landmarks on the face UV map again; otherwise the last reading stays
+    # follow the skin's texture from the resting face to the other expressions. The shape is held:
+    # the texture shows how a face moves, not what it is.
     follow_skin: bool = False
 
 
@@ -110,23 +103,14 @@ def schedule_table(schedule: Schedule) -> list[dict[str, object]]:
 
 @dataclass(frozen=True)
 class SubjectEvidence:
-    """Inputs that all rounds of a subject share.
+    """Inputs that all rounds of a subject share."""
 
-    Attributes:
-        pictures: of every expression's frame set.
-        skin: where the surface is searched for.
-        uv_map: of the face; None if no round reads it.
-        fine_map: of the face, to follow the skin on; None if no round does.
-        eyes: from `measure_eyes`.
-        bald: the skull is bare.
-    """
-
-    pictures: list[FrameSetCrops]
-    skin: SkinSamples
-    uv_map: FaceUvMap | None
-    fine_map: FaceUvMap | None
-    eyes: EyeOffsets | None
-    bald: bool
+    pictures: list[FrameSetCrops]  # of every expression's frame set
+    skin: SkinSamples  # where the surface is searched for
+    uv_map: FaceUvMap | None  # of the face; None if no round reads it
+    fine_map: FaceUvMap | None  # of the face, to follow the skin on; None if no round does
+    eyes: EyeOffsets | None  # from `measure_eyes`
+    bald: bool  # the skull is bare
 
     @property
     def outlines(self) -> int:
@@ -179,17 +163,12 @@ def is_bald(
 
 @dataclass(frozen=True)
 class FoundInRounds:
-    """What the rounds keep of one expression.
+    """What the rounds keep of one expression."""
 
-    Attributes:
-        things: places (n, 3) on things in front of the face, mostly hands.
-        glasses: places (n, 3) on glasses, which are found once; None before.
-        slide: the last reading of the face UV map.
-    """
-
+    # places (n, 3) on things in front of the face, mostly hands
     things: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    glasses: np.ndarray | None = None
-    slide: SlideTerm | None = None
+    glasses: np.ndarray | None = None  # places (n, 3) on glasses, which are found once; None before
+    slide: SlideTerm | None = None  # the last reading of the face UV map
 
     @property
     def hiding(self) -> np.ndarray:

@@ -87,21 +87,13 @@ class Quadratic:
 
 @dataclass(frozen=True)
 class Target:
-    """The evidence that one expression is fitted to.
+    """The evidence that one expression is fitted to."""
 
-    Attributes:
-        observation: landmarks in all cameras.
-        sigma: (views, 68) pixels, infinite where a landmark is not used.
-        neutral: the expression is the resting face.
-        terms: residuals beside the landmarks'.
-        known: evidence that was condensed to a quadratic.
-    """
-
-    observation: Observation
-    sigma: np.ndarray
-    neutral: bool
-    terms: tuple[Term, ...] = ()
-    known: Quadratic | None = None
+    observation: Observation  # landmarks in all cameras
+    sigma: np.ndarray  # (views, 68) pixels, infinite where a landmark is not used
+    neutral: bool  # the expression is the resting face
+    terms: tuple[Term, ...] = ()  # residuals beside the landmarks'
+    known: Quadratic | None = None  # evidence that was condensed to a quadratic
 
 
 def rounded(state: State, decimals: int) -> State:

@@ -32,18 +32,13 @@ Moment = tuple[str, int]  # sequence, the layout's own frame number
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """Parts of a layout to read; the names are the layout's own.
+    """Parts of a layout to read; the names are the layout's own."""
 
-    Attributes:
-        sequences: shell patterns of sequences to take; none takes the layout's usual ones.
-        cameras: shell patterns of cameras to take; none takes all.
-        expressions: our expression id by sequence.
-        metres_per_unit: length of one unit of the calibration's world; None where it is not given.
-    """
-
+    # shell patterns of sequences to take; none takes the layout's usual ones
     sequences: tuple[str, ...] = ()
-    cameras: tuple[str, ...] = ()
-    expressions: Mapping[str, str] = field(default_factory=dict)
+    cameras: tuple[str, ...] = ()  # shell patterns of cameras to take; none takes all
+    expressions: Mapping[str, str] = field(default_factory=dict)  # our expression id by sequence
+    # length of one unit of the calibration's world; None where it is not given
     metres_per_unit: float | None = None
 
     def has_sequence(self, name: str, usual: str = "*") -> bool:

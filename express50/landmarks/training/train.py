@@ -74,29 +74,18 @@ SMALL_EVERY = 4  # after the small steps, one in this many stays small, for blur
 
 @dataclass(frozen=True)
 class Part:
-    """A part of the face for which there are close-ups.
+    """A part of the face for which there are close-ups."""
 
-    Attributes:
-        name: used in file names.
-        make: returns its untrained network.
-        sides: the landmarks of each close-up; the second close-up is mirrored.
-        frame_m: width of a rendered view, metres.
-        blinks, mouths: arguments of `random_head`.
-        views: number per close-up of a head.
-        files: number per head model, of `FILE_HEADS` heads each.
-        steps, batch: number of batches, and their size.
-    """
-
-    name: str
-    make: Callable[[], CloseNet]
-    sides: tuple[np.ndarray, ...]
-    frame_m: float
-    blinks: float
-    mouths: float
-    views: int
-    files: int
-    steps: int
-    batch: int
+    name: str  # used in file names
+    make: Callable[[], CloseNet]  # returns its untrained network
+    sides: tuple[np.ndarray, ...]  # the landmarks of each close-up; the second close-up is mirrored
+    frame_m: float  # width of a rendered view, metres
+    blinks: float  # argument of `random_head`
+    mouths: float  # argument of `random_head`
+    views: int  # number per close-up of a head
+    files: int  # number per head model, of `FILE_HEADS` heads each
+    steps: int  # number of batches
+    batch: int  # their size
 
 
 # Most eyes blink. Most mouths are shut, slightly open, or show their teeth.

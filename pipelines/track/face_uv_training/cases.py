@@ -66,22 +66,14 @@ class Case:
 
 @dataclass(frozen=True)
 class Lamps:
-    """Light of a room.
+    """Light of a room."""
 
-    Attributes:
-        even: (3,) from everywhere.
-        sky: (3,) unit, where the even light is brightest.
-        directions, colors: (L, 3) unit, to the lamps, and their light.
-        sizes: (L,) radians, how far from the directions their light still comes.
-        shine: exponent of highlights.
-    """
-
-    even: np.ndarray
-    sky: np.ndarray
-    directions: np.ndarray
-    colors: np.ndarray
-    sizes: np.ndarray
-    shine: float
+    even: np.ndarray  # (3,) from everywhere
+    sky: np.ndarray  # (3,) unit, where the even light is brightest
+    directions: np.ndarray  # (L, 3) unit, to the lamps
+    colors: np.ndarray  # (L, 3) their light
+    sizes: np.ndarray  # (L,) radians, how far from the directions their light still comes
+    shine: float  # exponent of highlights
 
     def lit(
         self,
