@@ -200,9 +200,8 @@ def _finished(
     part = mesh_parts(mesh.faces, len(mesh.vertices))[mesh.faces[:, 0]]
     # Smaller parts are not the head.
     mesh = mesh._replace(faces=mesh.faces[part == np.bincount(part).argmax()])
-    offsets = np.array([-1.0, 0.0, 1.0]) * grid.voxel
     weights = view_weights(clear, mesh, grid.voxel)
-    agreement = patch_scores(clear, weights, grid, mesh, offsets, noise)[:, 1]
+    agreement = patch_scores(clear, weights, grid, mesh, np.zeros(1), noise)[:, 0]
     confidence = averaged(np.clip(agreement, 0, 1), mesh.faces, rounds=6)
     used, faces = np.unique(mesh.faces, return_inverse=True)
     vertices, agreement, confidence = mesh.vertices[used], agreement[used], confidence[used]
