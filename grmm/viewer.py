@@ -172,7 +172,7 @@ class Viewer:
         with _silenced():  # it prints an address without the token
             self.server = _Server(guard, port=port, label="GRMM", verbose=False)
         self.address = guard.address(int(self.server.get_port()))
-        self.server.gui.configure_theme(dark_mode=True)
+        self.server.gui.configure_theme(dark_mode=True, show_logo=False)
         self.server.scene.set_up_direction("+y")
         self._add_controls()
         self.head = self._described()
@@ -251,11 +251,11 @@ class Viewer:
         self._sliders: list[tuple[Any, float, tuple[str, ...]]] = []
         with gui.add_folder("who and what"):
             self._subject = self._choice("subject", model.subjects)
-            self._expression = self._choice("FLAME expression of", model.expressions)
+            self._expression = self._choice("expression of", model.expressions)
             self._code = self._choice("residual code of", (SAME, *model.expressions))
             self._goal = self._choice("blend towards", model.subjects)
             self._blend = self._slider("blend", (0.0, 1.0), 0.0)
-        with gui.add_folder("FLAME"):
+        with gui.add_folder("pose"):
             for name, (controls, reach) in POSES.items():
                 self._slider(name, reach, 0.0, *controls)
         with gui.add_folder("expression coefficients, added", expand_by_default=False):
