@@ -86,13 +86,8 @@ def make_sheet(
 ) -> Sheet:
     """Make the sheet of some subjects and expressions; excluded subjects are left out.
 
-    Args:
-        dataset: to read from.
-        subjects: only these; the reference is always shown with them.
-        expressions: only these.
-        camera: show this camera wherever a subject has it; by default the one in which the
-            reference's frame was chosen.
-        sure: suggestions less sure than this are doubtful.
+    The reference is always shown. `camera` is shown wherever a subject has it; by default it is the
+    one in which the reference's frame was chosen. Suggestions less sure than `sure` are doubtful.
 
     Raises:
         AnnotationError: an unknown subject, expression or camera; StageError where nothing is

@@ -257,16 +257,13 @@ def clip_times(clip: MarkedClip) -> np.ndarray:
 
 
 def interval_alpha(units: Sequence[np.ndarray]) -> float | None:
-    """Compute Krippendorff's alpha with the interval metric.
+    """Compute Krippendorff's alpha with the interval metric from two or more values of each unit.
 
-    None where it is undefined: all values are the same, or there is one unit alone, whose spread
-    is also the expected one.
+    None where it is undefined: all values are the same, or there is one unit alone, whose spread is
+    also the expected one.
 
     The mean squared difference of all pairs of values is twice their variance, which gives a closed
     form without the coincidence matrix (K. Krippendorff, Content Analysis, 2004, chapter 11).
-
-    Args:
-        units: the values of each unit, at least two per unit.
     """
     values = np.concatenate(units)
     expected = 2.0 * values.var(ddof=1)

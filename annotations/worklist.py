@@ -50,14 +50,10 @@ def worklist(
 ) -> list[LabelTask]:
     """List the tasks of an annotator, the reference's first in every order.
 
-    Args:
-        dataset: the dataset; excluded subjects have no tasks.
-        annotator: the person whose labels count as done; the labels of others do not.
-        subjects: only these; all by default.
-        expressions: only these; all by default.
-        order: ``doubt`` (least sure first), ``expression`` (one across all subjects, then the
-            next, in the order of the cues) or ``subject``.
-        everything: also what the annotator has labelled.
+    Excluded subjects have no tasks. What this annotator has labelled is done, and is listed only
+    with `everything`; the labels of others do not count. The `order` is ``doubt`` (least sure
+    first), ``expression`` (one across all subjects, then the next, in the order of the cues) or
+    ``subject``.
 
     Raises:
         AnnotationError: a subject is not in the dataset, or is excluded.

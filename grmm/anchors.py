@@ -97,19 +97,16 @@ def uv_gradients(head: HeadModel) -> Tensor:
 
 
 def tangent_frames(vertices: Tensor, faces: Tensor, gradients: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute right-handed frames of triangles, and metres per unit of UV along them.
+    """Compute right-handed frames of triangles (F, 3), and metres per unit of UV along them.
 
-    Args:
-        vertices: (V, 3) metres.
-        faces: (F, 3).
-        gradients: (F, 2, 2) from `uv_gradients`.
+    `gradients` (F, 2, 2) are those of `uv_gradients`.
 
     Returns:
         (F, 3, 3) rotations, columns = tangent (along dP/du), bitangent, normal; (F, 2) metres per
         unit of UV along tangent and bitangent. A triangle without area gets the identity and 0.
 
-    Source: the tangent basis of TexAvatars and GaussianAvatars; the bitangent's reach is the
-    area a unit of UV area covers over the tangent's, so that sheared charts keep their area.
+    Source: the tangent basis of TexAvatars and GaussianAvatars; the bitangent's reach is the area a
+    unit of UV area covers over the tangent's, so that sheared charts keep their area.
     """
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     edges = torch.stack([b - a, c - a], -1)  # (F, 3, 2)

@@ -78,12 +78,10 @@ def measure_features(index: Index, observations: FaceObservations) -> Features:
 
 
 def measure(observations: FaceObservations, windows: dict[str, np.ndarray]) -> Features:
-    """Measure the features of all observed frames.
+    """Measure the features of all frames in which one subject was observed.
 
-    Args:
-        observations: of one subject.
-        windows: rows of ``observations`` by expression, see `Features`; none is empty. Without
-            the neutral expression the windows' first frames are taken for rest.
+    `windows` are rows of the observations by expression, see `Features`; none is empty. Without the
+    neutral expression, the windows' first frames are taken for rest.
 
     Raises:
         ValueError: no window is given, a window is empty, or a landmark is not finite.

@@ -74,10 +74,8 @@ def suggest_all(
 ) -> tuple[dict[str, Suggestion], dict[str, int]]:
     """Suggest a frame of every expression; name the canonical frame it was matched to.
 
-    Args:
-        features: of the subject to suggest for.
-        script: the known expressions; for others all of the face counts.
-        reference: None where the subject is the reference, or it is not observed.
+    For expressions that `script` does not know, all of the face counts. `reference` is None where
+    the subject is the reference, or where that is not observed.
     """
     groups = features.owner + 68 * features.camera
     found, canonical = {}, {}
@@ -117,10 +115,8 @@ def _target(
 def suggest(values: np.ndarray, groups: np.ndarray, canonical: Canonical | None) -> Suggestion:
     """Suggest the frame of a clip that matches the canonical one, or else its apex.
 
-    Args:
-        values: (T, N) features, 0 at rest, of ``expression_values``.
-        groups: (N,) features of one group go to the same half when halves are drawn.
-        canonical: of the reference; None for the reference itself.
+    `values` (T, N) are those of ``expression_values``, 0 at rest. Features of one of the `groups`
+    (N,) go to the same half when halves are drawn. `canonical` is None for the reference itself.
 
     Raises:
         ValueError: the clip is empty or not finite.
@@ -149,10 +145,8 @@ def suggest(values: np.ndarray, groups: np.ndarray, canonical: Canonical | None)
 def suggest_rest(values: np.ndarray, groups: np.ndarray, typical: float) -> Suggestion:
     """Suggest the calmest frame of a clip at rest; any frame that is as calm is as good.
 
-    Args:
-        values: (T, N) features, 0 at the middle of the clip.
-        groups: as for :func:`suggest`.
-        typical: activity of other expressions at their apex, in the same units.
+    `values` (T, N) are 0 at the middle of the clip; `groups` are as for :func:`suggest`. `typical`
+    is the activity of other expressions at their apex, in the same units.
 
     Raises:
         ValueError: the clip is empty or not finite.
@@ -254,13 +248,10 @@ def _slope(share: np.ndarray, apex: int, side: int) -> np.ndarray:
 
 
 def canonical_of(values: np.ndarray, row: int, shared: np.ndarray, count: int) -> Canonical:
-    """Express a row of the reference's clip as the canonical frame.
+    """Express a row of the reference's clip, values (T, M), as the canonical frame.
 
-    Args:
-        values: (T, M) features of the reference's clip.
-        row: the canonical frame.
-        shared: (2, K) columns of the subject's features and those of the reference's, in pairs.
-        count: how many features the subject has.
+    `shared` (2, K) are columns of the subject's features and those of the reference's, in pairs;
+    the subject has `count` features.
     """
     event = strongest_event(values)
     share = share_of_apex(event)

@@ -251,10 +251,7 @@ def preset_of(dataset: Dataset, stage: Stage) -> str:
 def target_of(name: str | None, sizes: Mapping[str, float], measured: Footage) -> Footage:
     """Return the campaign to estimate: given sizes first, then the named campaign's, then measured.
 
-    Args:
-        name: a key of `TARGETS`, or None.
-        sizes: given sizes by their names in `Footage`, and ``frames_per_expression``.
-        measured: footage of the measured dataset.
+    `name` is a key of `TARGETS`. Sizes have their names in `Footage`, or ``frames_per_expression``.
     """
     kept = ("subjects", "expressions", "views", "pixels", "shape")
     values = {key: getattr(measured, key) for key in kept}

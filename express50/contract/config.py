@@ -30,17 +30,10 @@ def resolve_config(
     assignments: Sequence[str] = (),
     known_stages: Iterable[str] = (),
 ) -> Any:
-    """Build the configuration of one stage.
+    """Build the configuration of one stage, an instance of ``stage.config``.
 
-    Args:
-        stage: the stage.
-        preset: ``draft``, ``standard`` or ``reference``.
-        file: TOML file with one table per stage; tables of other stages are left alone.
-        assignments: ``stage.key=value`` strings; those of other known stages are left alone.
-        known_stages: names that a table may carry beside this stage's own.
-
-    Returns:
-        An instance of ``stage.config``.
+    `preset` is ``draft``, ``standard`` or ``reference``. The TOML `file` has one table per stage;
+    `assignments` are ``stage.key=value`` strings. Those of other `known_stages` are left alone.
 
     Raises:
         ConfigError: unknown preset, table or key (the nearest known one is named), wrong type,

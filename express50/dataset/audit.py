@@ -99,15 +99,11 @@ def audit(
 ) -> Audit:
     """Check everything that the ledger records, and set aside what can be made again.
 
-    Args:
-        dataset: the dataset.
-        stages: its stages in order.
-        deep: hash every output file; otherwise only those whose modification time has changed.
-        fix: set wrong outputs aside and forget their receipts; only what a stage can make again
-            is deleted.
-        label_problems: checks the labels of subjects against their footage; returns records with
-            ``kind``, ``expression`` and ``what``.
-        checkpoints: files outside the dataset that must not name a withdrawn person.
+    With `deep`, every output file is hashed, not only those whose modification time has changed.
+    With `fix`, wrong outputs are set aside and their receipts forgotten; only what a stage can make
+    again is deleted. `label_problems` checks the labels of subjects against their footage, and
+    returns records with ``kind``, ``expression`` and ``what``. `checkpoints` are files outside the
+    dataset that must not name a withdrawn person.
 
     Raises:
         StageError: ``fix`` is set and a stage is running.

@@ -98,12 +98,8 @@ class Pilot:
     ) -> Trial:
         """Run one trial, or read it if it ran before.
 
-        Args:
-            settings: name of the setting of each stage.
-            peaks: number of expressions.
-            source: trial to start from, or None.
-            words: what to tell people before it runs.
-            limit: seconds after which none of its items begins.
+        `settings` are named by stage; `source` is the trial to start from. `words` tell people what
+        is measured before it runs. After `limit` seconds none of its items begins.
         """
         chain, record = self.chain, self.record(settings, peaks)
         self.cut = False

@@ -120,11 +120,8 @@ def run_within(
 ) -> tuple[list[Summary], RunState]:
     """Run the chain within a budget, or to a goal.
 
-    Args:
-        chain: stages, dataset and workers.
-        budget: time, or None for as long as the goal takes.
-        goal: error of a result, or None for the least in the time.
-        ended: called with each stage's account.
+    Without a budget, the run takes as long as the goal takes; without a goal, it looks for the
+    least error in the time. `ended` is called with each stage's account.
 
     Raises:
         ConfigError: the budget does not cover the cheapest settings, or no setting reaches the

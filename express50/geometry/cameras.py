@@ -284,15 +284,10 @@ def rays(camera: Camera, stride: int = 1) -> tuple[np.ndarray, np.ndarray]:
 def triangulate(
     cameras: Sequence[Camera], pixels: np.ndarray, weights: np.ndarray | None = None
 ) -> np.ndarray:
-    """Triangulate points seen by several cameras.
+    """Triangulate points (N, 3), world, seen by C cameras at distorted pixels (C, N, 2).
 
-    Args:
-        cameras: C cameras.
-        pixels: (C, N, 2) distorted pixels; NaN if a camera does not see a point.
-        weights: (C, N) non-negative; all ones by default.
-
-    Returns:
-        (N, 3) world points; NaN if fewer than two cameras see a point, or it lies behind all.
+    A pixel is NaN where a camera does not see a point; `weights` (C, N) are ones by default. A
+    point is NaN if fewer than two cameras see it, or it lies behind all.
 
     Source: linear triangulation (Hartley and Zisserman, 12.2), then Gauss-Newton on pixels.
     """

@@ -33,9 +33,8 @@ _REQUIRED = ("v_template", "f", "shapedirs", "posedirs", "J_regressor", "weights
 def load_flame(path: str | Path) -> HeadModel:
     """Load FLAME; add teeth and the inside of the mouth if it has FLAME's number of vertices.
 
-    Args:
-        path: The model pickle (generic_model.pkl, flame2023.pkl, ...); landmark embedding, masks
-            and template must be beside it.
+    `path` is the model pickle (generic_model.pkl, flame2023.pkl, ...); landmark embedding, masks
+    and template must be beside it.
 
     Raises:
         HeadModelError: a file is missing, damaged, unsafe or has another layout.

@@ -65,10 +65,9 @@ def load_topology(spec: str | Path) -> HeadTopology:
 def load_head(spec: str | Path) -> HeadModel:
     """Load a head model by name or path.
 
-    Args:
-        spec: "procedural" for the built-in head, else a path: `*.pkl` is the user's FLAME model
-            (with its other files beside it), a folder is a checkout of ICT-FaceKit, `*.npz` holds
-            ICT-FaceKit's arrays or a head model of your own (docs/RECIPES.md).
+    "procedural" is the built-in head. Of paths, `*.pkl` is the user's FLAME model (with its other
+    files beside it), a folder is a checkout of ICT-FaceKit, and `*.npz` holds ICT-FaceKit's arrays
+    or a head model of your own (docs/RECIPES.md).
 
     Raises:
         HeadModelError: the name is unknown, or a file is missing or damaged.
@@ -101,14 +100,11 @@ def load_builtin() -> HeadModel:
 
 
 def load_stored(path: Path, name: str) -> HeadModel:
-    """Load a head model from its arrays; docs/RECIPES.md shows how to write them.
+    """Load a head model of this name from an .npz; docs/RECIPES.md shows how to write one.
 
-    Args:
-        path: .npz with the arrays of `FIELDS`. Optional are `regions` (R, V) bool with
-            `region_names` (R,); the 17 lists of jaw line candidates, concatenated in `contour`,
-            with their lengths in `contour_counts`; and `unit_expressions`, False if coefficients
-            are standard deviations.
-        name: of the model.
+    It holds the arrays of `FIELDS`. Optional are `regions` (R, V) bool with `region_names` (R,);
+    the 17 lists of jaw line candidates, concatenated in `contour`, with their lengths in
+    `contour_counts`; and `unit_expressions`, False if coefficients are standard deviations.
 
     Raises:
         HeadModelError: the file is damaged, lacks an array, or its arrays do not fit each other.

@@ -95,16 +95,12 @@ class _Place:
 def detect(
     net: LandmarkNet, image: np.ndarray, refinements: int = 2, smallest: float = SMALLEST
 ) -> Detection:
-    """Detect the landmarks of the most face-like place in an image.
+    """Detect the landmarks of the most face-like place in an image (H, W, 3) uint8 RGB.
 
-    Args:
-        net: From `load_network`.
-        image: (H, W, 3) uint8 RGB; any size.
-        refinements: Looks after the coarse pass; the last is taken in several crops, some of
-            them mirrored.
-        smallest: Side of the smallest windows searched, as a share of the image's longer side. A
-            face is found in windows of up to three times its width. If there is no face, each
-            smaller size costs about three times as much as the one before.
+    `refinements` are the looks after the coarse pass; the last is taken in several crops, some of
+    them mirrored. `smallest` is the side of the smallest windows searched, as a share of the
+    image's longer side. A face is found in windows of up to three times its width. If there is no
+    face, each smaller size costs about three times as much as the one before.
 
     Raises:
         ValueError: another shape or type.
@@ -242,15 +238,10 @@ def place_window(centre: np.ndarray, side: float, angle: float) -> np.ndarray:
 
 
 def place_crop(centre: np.ndarray, turn: np.ndarray, size: int) -> np.ndarray:
-    """Place a square crop around a point of an image.
+    """Return the affine (2, 3) from the pixels of a square crop to those of the image around it.
 
-    Args:
-        centre: (2,) pixels of the image, corner origin.
-        turn: (2, 2) from steps in the crop to steps in the image.
-        size: side of the crop, pixels.
-
-    Returns:
-        affine (2, 3) from crop pixels to image pixels.
+    Its middle is at `centre` (2,), its side is `size` pixels; `turn` (2, 2) leads from steps in the
+    crop to steps in the image.
     """
     return np.concatenate([turn, (centre - turn @ [size / 2, size / 2])[:, None]], axis=1)
 
@@ -380,14 +371,10 @@ def _run(net: LandmarkNet, looks: Sequence[Look]) -> list[_Place]:
 def follow(net: LandmarkNet, image: np.ndarray, window: np.ndarray) -> Detection:
     """Find a face near where it is expected, as in a video's next frame, with one look.
 
-    Args:
-        net: From `load_network`.
-        image: (H, W, 3) uint8 RGB; only the window and some pixels around are read.
-        window: Affine (2, 3) from crop pixels to image pixels, from `window_about`; the face may
-            be up to a quarter of its side off the middle.
-
-    Returns:
-        The face, with a low score if there is none. `detect` takes several looks, so it is surer.
+    Only the window of the image (H, W, 3) uint8 RGB and some pixels around are read. `window` is an
+    affine (2, 3) from crop to image pixels, from `window_about`; the face may be up to a quarter of
+    its side off the middle. Without a face, the score is low; `detect` takes several looks, so it
+    is surer.
     """
     corners = window @ np.array([[0, CROP, 0, CROP], [0, 0, CROP, CROP], [1, 1, 1, 1]])
     size = np.array([image.shape[1], image.shape[0]])

@@ -76,13 +76,10 @@ def open_source(
 ) -> Source:
     """Return a source that is ready to be called.
 
-    Args:
-        landmarks: `embedded`, `fan:PATH` (TorchScript weights) or the path of a file of points
-            (.npz or .json, see docs/FORMAT.md).
-        cameras: as recorded, by id; points of a file are undistorted with them.
-        refinements: looks of the embedded network.
-        smallest: smallest windows that it searches, see `detect`.
-        pictures: pinhole cameras of the images, by id; by default of the recorded size.
+    `landmarks` are `embedded`, `fan:PATH` (TorchScript weights) or the path of a file of points
+    (.npz or .json, see docs/FORMAT.md), which are undistorted with the `cameras`, as recorded.
+    `refinements` and `smallest` are those of `detect`. `pictures` are the pinhole cameras of the
+    images; by default they have the recorded size.
 
     Raises:
         ConfigError: the file is missing, or is not of the expected kind.
@@ -149,16 +146,11 @@ Table = dict[tuple[str, int], np.ndarray]
 def read_points(
     path: Path, cameras: Mapping[str, Camera], pictures: Mapping[str, Camera] | None = None
 ) -> Table:
-    """Read points by camera and frame, undistorted.
+    """Read points from an .npz or .json by camera and frame, undistorted.
 
-    Args:
-        path: .npz or .json.
-        cameras: as recorded, by id; other cameras of the file are left out.
-        pictures: pinhole cameras of the undistorted images; by default of the recorded size.
-
-    Returns:
-        Rows (68 or 70, 3) of x, y in pixels of the undistorted image, NaN where a point is unknown,
-        and confidence 0..1.
+    `cameras` are as recorded; others of the file are left out. `pictures` are the pinhole cameras
+    of the undistorted images; by default they have the recorded size. Rows (68 or 70, 3) are x, y
+    in pixels of the undistorted image, NaN where a point is unknown, and confidence 0..1.
 
     Raises:
         FormatError: another format, shape, an infinite number, a confidence out of range, or points

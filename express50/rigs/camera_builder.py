@@ -23,12 +23,8 @@ def camera_from_K(
 ) -> Camera:
     """Return a camera of the smallest COLMAP model that holds the distortion.
 
-    Args:
-        camera_id: camera name.
-        K: (3, 3) pixels, corner origin.
-        dist: distortion in OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6; missing terms are 0.
-        size: width and height, pixels.
-        cam_from_world: (4, 4), OpenCV axes.
+    `K` (3, 3) has pixels with a corner origin; `dist` has OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6,
+    and missing terms are 0; `size` is width and height; `cam_from_world` (4, 4) has OpenCV axes.
 
     Raises:
         CalibrationError: K has skew, or no model holds the distortion (thin prism, tilt).

@@ -169,22 +169,13 @@ def run_stage(
     pool: Pool | None = None,
     monitor: RunMonitor | None = None,
 ) -> Summary:
-    """Bring a stage's outputs up to date.
+    """Bring a stage's outputs up to date; return the account of all items.
 
-    Args:
-        stage: the stage.
-        dataset: the dataset.
-        config: instance of ``stage.config``.
-        items: ids to run. By default all are run, and outputs of items that no longer exist are set
-            aside.
-        workers: local processes; 0 runs in this one.
-        scheduler: address of a dask scheduler to use in place of local processes.
-        progress: show progress on standard error.
-        pool: workers shared with other stages, in place of the two arguments above.
-        monitor: sees every receipt, and says when no further item may begin.
-
-    Returns:
-        The account of all items. A bad item is in it; it does not raise.
+    A bad item is in the account; it does not raise. By default all items are run, and outputs of
+    items that no longer exist are set aside. `workers` are local processes, and with 0 all runs in
+    this one; `scheduler` is the address of a dask scheduler to use instead; `pool` replaces both
+    with workers shared with other stages. `progress` is shown on standard error. `monitor` sees
+    every receipt, and says when no further item may begin.
 
     Raises:
         StageError: the stage has no items, or another run holds it.

@@ -33,12 +33,8 @@ def encode_pictures(
 ) -> dict[str, bytes]:
     """Encode the pictures of a sample; return the members by name.
 
-    Args:
-        rgb: (H, W, 3) uint8 sRGB.
-        alpha: (H, W) uint8.
-        depth: (H, W) uint16 steps, 0 = unknown.
-        parts: (H, W) uint8 labels, or None.
-        profile: one of `PROFILES`.
+    Colours (H, W, 3) are uint8 sRGB, alpha (H, W) is uint8, depth (H, W) is in uint16 steps, 0
+    where unknown, and parts (H, W) are uint8 labels, or None. `profile` is one of `PROFILES`.
     """
     if profile == "lossless":
         members = {"rgb.png": encode_png(rgb)}

@@ -80,17 +80,11 @@ def grow_hair(
     detail: float,
     on_skull: bool = True,
 ) -> HairMesh:
-    """Grow a subject's hair.
+    """Grow the hair of a neutral head with vertices (V, 3) and faces (F, 3), rest head space.
 
-    Args:
-        rng: random generator.
-        vertices: (V, 3) the subject's neutral head, rest head space.
-        faces: (F, 3).
-        scalp: (V,) density of roots, 0 to 1.
-        star: outer surface of the head.
-        look: colour, style and length.
-        detail: over 1 more and thinner strands, under 1 fewer and thicker ones, at 0 none.
-        on_skull: strands move with the skull; if False, with the skin at their roots.
+    `scalp` (V,) is the density of roots, 0 to 1; `star` is the outer surface of the head. A
+    `detail` over 1 gives more and thinner strands, under 1 fewer and thicker ones, 0 none. Strands
+    move with the skull if `on_skull`, else with the skin at their roots.
     """
     style = _STYLES[look.hair_style]
     # Roots are spread evenly over the scalp's area.

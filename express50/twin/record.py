@@ -121,18 +121,10 @@ def record(
     workers: int = 2,
     report: Callable[[int, int], None] | None = None,
 ) -> list[str]:
-    """Record the subjects that do not exist yet; others are kept.
+    """Record the subjects that do not exist yet, and return their ids; others are kept.
 
-    Writes ``out/captures/<subject>`` (raw capture layout) and ``out/truth/<subject>``.
-
-    Args:
-        config: what to record.
-        out: the folder.
-        workers: processes.
-        report: called regularly with the number of pictures done and of all pictures.
-
-    Returns:
-        Ids of the subjects recorded now.
+    Writes ``out/captures/<subject>`` (raw capture layout) and ``out/truth/<subject>``. `report` is
+    called regularly with the number of pictures done and of all pictures.
 
     Raises:
         CaptureError: ``out`` holds a recording with other settings.

@@ -39,11 +39,9 @@ class Caster:
     def cast(
         self, origin: np.ndarray, directions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find the first hits of rays.
+        """Find the first hits of rays from an origin (3,) that they share, or from origins (N, 3).
 
-        Args:
-            origin: (3,) shared, or (N, 3).
-            directions: (N, 3) of any length, in units of which distances are measured.
+        Directions (N, 3) may have any length; distances are measured in it.
 
         Returns:
             distance (N,) float32, inf where nothing is hit; face (N,) uint32, ``MISS`` likewise;
