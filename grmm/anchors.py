@@ -51,7 +51,9 @@ def make_anchors(head: HeadModel, n_g: int, mouth: bool = True) -> Anchors:
     weights = _barycentrics(grid[face], centre)
     inside = (weights >= 0).all(1)
     if not mouth:
-        inside &= ~mouth_faces(head)[face]
+        solid = (head.regions["teeth"] | head.regions["tongue"])[head.faces].any(1)
+        hollow = head.regions["mouth_interior"][head.faces].all(1)
+        inside &= ~(solid | hollow).cpu()[face]
     # Candidates come in ascending order of faces: where charts overlap, the lowest index wins.
     texels, first = np.unique((row * n_g + column)[inside].numpy(), return_index=True)
     if not len(texels):
@@ -64,12 +66,6 @@ def make_anchors(head: HeadModel, n_g: int, mouth: bool = True) -> Anchors:
         faces=face[inside][first],
         barycentrics=weights[inside][first].float(),
     )
-
-
-def mouth_faces(head: HeadModel) -> Tensor:
-    """Mark faces (F,) bool with a corner on teeth or tongue, or inside the mouth."""
-    solid = (head.regions["teeth"] | head.regions["tongue"])[head.faces].any(1)
-    return (solid | head.regions["mouth_interior"][head.faces].all(1)).cpu()
 
 
 def _barycentrics(corners: Tensor, points: Tensor) -> Tensor:

@@ -157,13 +157,9 @@ def paper_diff(config: Config) -> list[str]:
     lines = ["All settings are the paper's."]
     if rows:
         lines = markdown_table(["setting", "paper", "here", "reason", "measured effect"], rows)
-    return [*lines, "", "With all settings:", "", *always_table()]
-
-
-def always_table() -> list[str]:
-    """Return the table of the deviations that all settings have, as Markdown lines."""
-    rows = [[row.paper, row.ours, row.reason, row.effect] for row in ALWAYS]
-    return markdown_table(["paper", "here", "reason", "measured effect"], rows)
+    common = [[row.paper, row.ours, row.reason, row.effect] for row in ALWAYS]
+    always = markdown_table(["paper", "here", "reason", "measured effect"], common)
+    return [*lines, "", "With all settings:", "", *always]
 
 
 def _shown(value: object) -> str:

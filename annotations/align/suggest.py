@@ -188,7 +188,13 @@ def distance_from_rest(values: np.ndarray) -> np.ndarray:
 def strongest_event(values: np.ndarray) -> Event:
     """Find the strongest movement of a clip (T, N): power iteration from the frames' energies."""
     curve, direction = _iterate_direction(values, (values**2).sum(1), np.ones(len(values)), 8)
-    return Event(apex_of(curve), curve, direction)
+    even = steady(curve)
+    top = int(np.argmax(even))
+    lower = np.flatnonzero(even < PLATEAU_SHARE * even[top])
+    low = lower[lower < top].max(initial=-1) + 1
+    high = lower[lower > top].min(initial=len(even)) - 1
+    # The apex is the middle of the frames that equal the top within noise.
+    return Event(round(float(low + high) / 2), curve, direction)
 
 
 def most_similar_event(values: np.ndarray, direction: np.ndarray) -> tuple[Event, np.ndarray]:
@@ -276,16 +282,6 @@ def _event_about(values: np.ndarray, weights: np.ndarray, row: int) -> Event:
         if even[best] <= even[row]:
             return Event(row, curve, direction)
         row = best
-
-
-def apex_of(curve: np.ndarray) -> int:
-    """Find the row of a curve's (T,) apex: the middle of the frames that equal it within noise."""
-    even = steady(curve)
-    top = int(np.argmax(even))
-    lower = np.flatnonzero(even < PLATEAU_SHARE * even[top])
-    low = lower[lower < top].max(initial=-1) + 1
-    high = lower[lower > top].min(initial=len(even)) - 1
-    return round(float(low + high) / 2)
 
 
 def candidate_rows(row: int, others: list[int], curve: np.ndarray) -> list[int]:

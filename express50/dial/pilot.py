@@ -279,14 +279,6 @@ def stated_errors(chain: Chain, dataset: Dataset) -> dict[str, list[float]]:
     return found
 
 
-def tradable(chain: Chain) -> list[str]:
-    """List the stages that have a choice and stand before the last measured result.
-
-    What a later stage's settings do cannot be measured here, so it keeps its standard one.
-    """
-    return [name for name in chain.measurable() if len(chain.ladders[name]) > 1]
-
-
 def broken_stage(chain: Chain, trial: Trial) -> str:
     """Return the first stage that made nothing, if a measured result needs it; else nothing."""
     return next((name for name in chain.measurable() if name in trial.failed), "")
@@ -326,7 +318,8 @@ def measure(pilot: Pilot, allowance: Allowance) -> PilotFigures:
     if a stage makes nothing at any setting.
     """
     chain, names = pilot.chain, pilot.chain.names
-    choices = tradable(chain)
+    # Later stages keep their standard settings, because nothing measures what those do.
+    choices = [name for name in chain.measurable() if len(chain.ladders[name]) > 1]
     cheapest = {n: next(iter(chain.ladders[n])) if n in choices else standard_of(chain.ladders[n])
                 for n in names}  # fmt: skip
     base = _base(pilot, cheapest, choices)

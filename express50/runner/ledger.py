@@ -174,7 +174,10 @@ class Ledger:
         try:
             yield
         except (sqlite3.DatabaseError, ValueError, TypeError, OverflowError) as error:
-            if _of_full_disk(error, self._path):
+            code = getattr(error, "sqlite_errorcode", 0) & 0xFF  # the rest says where
+            # On a full disk SQLite often says only "disk I/O error".
+            hidden = code == sqlite3.SQLITE_IOERR and is_full(self._path)
+            if hidden or code == sqlite3.SQLITE_FULL:
                 raise disk_full(self._path, str(error)) from error
             if self._read_only:  # a reader must not be advised to delete
                 check = f"run 'express50 check {self._path.parent}'"
@@ -399,12 +402,6 @@ def _of(table: str, stage: str, item: str | None) -> tuple[str, ...]:
     if item is None:
         return f"{table} WHERE stage = ? ORDER BY item", stage
     return f"{table} WHERE stage = ? AND item = ?", stage, item
-
-
-def _of_full_disk(error: Exception, path: Path) -> bool:
-    """Say whether an error of SQLite's comes from a full disk; it often says "disk I/O error"."""
-    code = getattr(error, "sqlite_errorcode", 0) & 0xFF  # the rest says where
-    return code == sqlite3.SQLITE_FULL or (code == sqlite3.SQLITE_IOERR and is_full(path))
 
 
 def _open_to_read(path: Path) -> sqlite3.Connection:

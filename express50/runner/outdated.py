@@ -29,18 +29,13 @@ def why_outdated(stage: Stage, config: Any, made: Made, inputs: Mapping[str, str
     words = []
     if changed := differing(made.inputs, inputs):
         words.append(f"inputs changed: {few(changed, NAMED)}")
-    if settings := other_settings(made, config):
-        words.append(f"settings changed: {few(settings, NAMED)}")
+    then, now = made.settings, config_texts(config)
+    if then and (names := differing(then, now)):
+        changes = [f"{n} was {then.get(n, 'unknown')}, is {now.get(n, 'gone')}" for n in names]
+        words.append(f"settings changed: {few(changes, NAMED)}")
     if made.version not in (0, stage.version):
         words.append(f"stage version changed: it was {made.version}, is {stage.version}")
     return "; ".join(words) or "settings or stage version changed"
-
-
-def other_settings(made: Made, config: Any) -> list[str]:
-    """List the settings that an output was made with and that differ from the given ones."""
-    then, now = made.settings, config_texts(config)
-    names = differing(then, now) if then else []
-    return [f"{n} was {then.get(n, 'unknown')}, is {now.get(n, 'gone')}" for n in names]
 
 
 def differing(one: Mapping[str, str], other: Mapping[str, str]) -> list[str]:

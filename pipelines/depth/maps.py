@@ -296,7 +296,8 @@ def make_maps(
     valid = _inside(depth, alpha)
     inside, hit = alpha > INSIDE, depth > 0
     turn = camera.cam_from_world[:3, :3].T.astype(np.float32)
-    known = (normals / np.maximum(_lengths(normals), 1e-9)[:, None]) @ turn
+    lengths = np.sqrt(np.einsum("ni,ni->n", normals, normals))  # faster than np.linalg.norm
+    known = (normals / np.maximum(lengths, 1e-9)[:, None]) @ turn
     y, x = np.nonzero(valid)
     K = camera.K
     across, down = (
@@ -328,11 +329,6 @@ def make_maps(
 def _inside(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     """Mark the pixels (H, W) whose ray hits the surface and that lie inside the matte."""
     return (depth > 0) & (alpha > INSIDE)
-
-
-def _lengths(vectors: np.ndarray) -> np.ndarray:
-    """Return the lengths (N,) of vectors (N, 3); faster than `np.linalg.norm`."""
-    return np.sqrt(np.einsum("ni,ni->n", vectors, vectors))
 
 
 def roughness(normals: np.ndarray) -> np.ndarray:

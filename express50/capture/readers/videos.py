@@ -13,7 +13,7 @@ Database of Emotional Speech and Song", PLoS ONE 13(5), 2018.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -287,7 +287,15 @@ def read_videos(path: Path, selection: Selection) -> RawCapture:
     ids = unique_ids(path, (file.name for file in files), lambda name: Path(name).stem)
     check_selection(selection, [CLIP], sorted(ids.values()))
     wanted = {ids[f.name]: f for f in files if selection.has_camera(ids[f.name])}
-    cameras, dropped = _videos_that_open(wanted)
+    cameras: dict[str, RawCamera] = {}
+    dropped: dict[str, str] = {}
+    for camera, file in wanted.items():
+        try:
+            cameras[camera] = _one_video(camera, file)
+        except CaptureError as error:
+            dropped[camera] = str(error)
+    if not cameras:
+        raise CaptureError(next(iter(dropped.values())))
     fps = _first_fps([wanted[camera] for camera in cameras])
     calibration, cues = read_calibration(path, cameras, dropped), read_cues(path / "cues.csv")
     return RawCapture(
@@ -297,23 +305,3 @@ def read_videos(path: Path, selection: Selection) -> RawCapture:
         clips=() if cues else (selection.expression(CLIP),),
         warnings=unused_files(path, ids.values()),
     )  # fmt: skip
-
-
-def _videos_that_open(
-    files: Mapping[str, Path],
-) -> tuple[dict[str, RawCamera], dict[str, str]]:
-    """Return the cameras whose file is a video, and why the others are dropped.
-
-    Raises:
-        CaptureError: none is.
-    """
-    cameras: dict[str, RawCamera] = {}
-    dropped: dict[str, str] = {}
-    for camera, file in files.items():
-        try:
-            cameras[camera] = _one_video(camera, file)
-        except CaptureError as error:
-            dropped[camera] = str(error)
-    if not cameras:
-        raise CaptureError(next(iter(dropped.values())))
-    return cameras, dropped

@@ -205,7 +205,7 @@ def expression_directions(
     for name, pulls in PAIRED.items():
         result |= _both_sides(mesh, name, moved(pulls))
     for name, (upper, lower, aside) in _LIDS.items():
-        motion = lid_motion(mean, "left", upper, lower)
+        motion = lid_motion(mean, upper, lower)
         # The cornea carries the lids a little sideways.
         shares = {f"lid{k}": (1 - k / 7) ** 2 for k in range(8)} | {"lid_edge": 1, "lid_hidden": 1}
         for tag, share in shares.items():

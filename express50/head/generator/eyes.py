@@ -101,16 +101,17 @@ def ball_centre(mesh: WholeMesh, side: str) -> Array:
 _STILL = 5  # the lid loop that does not move; loops inside it share the margin's motion
 
 
-def lid_motion(mesh: WholeMesh, side: str, upper: float, lower: float) -> Array:
-    """Return the displacement (V,3), mm, that moves lid margins by shares of the opening.
+def lid_motion(mesh: WholeMesh, upper: float, lower: float) -> Array:
+    """Return the displacement (V,3), mm, that moves the left lid margins by shares of the opening.
 
     Loops between the margin and the still loop are spread evenly over the stretched lid, as they
     turn about the eyeball's centre, and the upper lid's fold is smoothed onto the lid's sphere.
     `upper` is the share of the opening that the upper margin moves down, `lower` the share that the
     lower one moves up.
     """
-    center = ball_centre(mesh, side)
-    loops = np.stack([mesh.vertices[mesh.tag(f"lid{k}", side)] for k in range(_STILL + 1)]) - center
+    center = ball_centre(mesh, "left")
+    rings = [mesh.tag(f"lid{k}", "left") for k in range(_STILL + 1)]
+    loops = mesh.vertices[np.stack(rings)] - center
     margin = loops[0]
     count = len(margin)
     opposite = margin[(-np.arange(count)) % count]
@@ -133,9 +134,9 @@ def lid_motion(mesh: WholeMesh, side: str, upper: float, lower: float) -> Array:
     for k in range(_STILL):
         y, z = new_radius[k] * np.sin(new_angle[k]), new_radius[k] * np.cos(new_angle[k])
         new = np.stack([loops[k, :, 0], y, z], 1)
-        motion[mesh.tag(f"lid{k}", side)] = new - loops[k]
+        motion[rings[k]] = new - loops[k]
     for tag in ("lid_edge", "lid_hidden"):
-        ring = mesh.tag(tag, side)
+        ring = mesh.tag(tag, "left")
         motion[ring] = turned(mesh.vertices[ring] - center, new_margin - angle[0])
     return motion
 

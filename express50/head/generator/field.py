@@ -228,8 +228,3 @@ def sphere(azimuth: Array, latitude: Array) -> Array:
 def window(points: Array, at: ArrayLike, radius: ArrayLike) -> Array:
     """Return a Gaussian (N,) of points (N,D): 1 at `at` and exp(-1) at one radius."""
     return np.exp(-(((points - np.array(at)) / np.array(radius)) ** 2).sum(-1))
-
-
-def eye_center(side: str) -> Array:
-    """Return the eyeball's centre (3,), mm."""
-    return EYE_CENTER * [1.0 if side == "left" else -1.0, 1.0, 1.0]

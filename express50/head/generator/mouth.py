@@ -85,7 +85,9 @@ def _add_cavity(half: HalfMesh, slit: Array, contact: Array, sign: Array, thick:
         y = -50 + np.where(up > 0, (y_up + 50) * up, (y_down + 50) * -up)
         shapes.append(np.stack([width * out, y, z_mid + (z_side - z_mid) * out**2], 1))
     for k, shape in enumerate(shapes):
-        shape = _inside(shape, 1.5 if k == 0 else 3.0)
+        for _ in range(4):  # push in what is too close to the skin, mm
+            excess = np.maximum(skin_field(shape) + (1.5 if k == 0 else 3.0), 0.0)
+            shape = shape - excess[:, None] * gradient(shape)
         shape[[0, -1], 0] = 0.0
         rows.append(half.add(shape, "cavity"))
         half.tags[f"cavity{k}"] = rows[-1]
@@ -94,15 +96,6 @@ def _add_cavity(half: HalfMesh, slit: Array, contact: Array, sign: Array, thick:
     throat = half.tags["throat"] = half.add(np.array([[0.0, -51.0, 37.0]]), "cavity")
     half.set_uv("mouth", throat, np.array([[0.0, 0.0]]))
     half.fan("mouth", throat, rows[-1], closed=False)
-
-
-def _inside(points: Array, depth: float) -> Array:
-    """Return points, pushed in where they are less than `depth` mm under the skin."""
-    p = points.copy()
-    for _ in range(4):
-        excess = np.maximum(skin_field(p) + depth, 0.0)
-        p = p - excess[:, None] * gradient(p)
-    return p
 
 
 # Widths (mm) of the crowns from the mid plane outwards: incisors, canine, premolars, molar.

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from express50.geometry.meshes import edge_graph
 from express50.geometry.raycast import mesh_scene
 from express50.head.generator.expressions import LID_SHARE
-from express50.head.generator.field import EYE_CENTER, EYE_RADIUS, eye_center
+from express50.head.generator.field import EYE_CENTER, EYE_RADIUS
 from express50.head.generator.ict_registration import (
     FLAT,
     FLIP,
@@ -202,7 +202,7 @@ def _seat_eyes(
     for side, mirror in (("left", 1.0), ("right", -1.0)):
         middle = centre * [mirror, 1, 1]
         eyeball = mesh.tag("eyeball", side)
-        points[eyeball] = mesh.vertices[eyeball] - eye_center(side) + middle
+        points[eyeball] = mesh.vertices[eyeball] - EYE_CENTER * [mirror, 1, 1] + middle
         rigid = 10.0 * arrays.shape_dirs[slice(*RANGES[f"{side}_eyeball"])].mean(0)
         moves[eyeball] = rigid
         for k, share in enumerate(LID_SHARE):
