@@ -43,11 +43,7 @@ _FIELDS = tuple(field.name for field in fields(Label))
 
 
 def export_labels(labels: Iterable[Label], path: Path) -> None:
-    """Write events as CSV or JSON, by the file's ending.
-
-    Raises:
-        AnnotationError: another ending.
-    """
+    """Write events as CSV or JSON, by the file's ending; AnnotationError for another one."""
     _check_format(path)
     rows = [asdict(label) for label in labels]
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -217,11 +217,7 @@ def _row(run: Ablation, name: str, variant: Variant, seed: int) -> dict:
 
 
 def _train(used: Sequence[Path], folder: Path, settings: Config) -> None:
-    """Train or resume a row.
-
-    Raises:
-        ConfigError: it was trained with other settings or samples.
-    """
+    """Train or resume a row; ConfigError if it was trained with other settings or samples."""
     source = open_shards(used, "train")
     tables = {k: v for k, v in as_tables(settings).items() if k not in ("fit", "metrics")}
     wanted = dump_json({"tables": tables, "samples": source.digest})

@@ -152,11 +152,7 @@ def train(
 
 
 def step(state: TrainState, parallel: torch.nn.Module, config: Config) -> None:
-    """Take one optimiser step over ``accumulate`` views.
-
-    Raises:
-        TrainError: Gaussians or objective are not finite.
-    """
+    """Take one optimiser step over ``accumulate`` views; TrainError if something is not finite."""
     state.optimizer.zero_grad(set_to_none=True)
     for left in reversed(range(config.train.accumulate)):
         item = state.views.item(state.shuffle.next(), crop=True)

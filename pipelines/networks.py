@@ -80,11 +80,7 @@ def load_network(path: str | Path, role: Role) -> Network:
 
 
 def weights_file(path: str | Path, setting: str) -> Path:
-    """Return the path of the file of weights that a setting names.
-
-    Raises:
-        ConfigError: the file is missing.
-    """
+    """Return the path of the weights that a setting names; ConfigError if the file is missing."""
     path = Path(path).expanduser()
     if not path.is_file():
         raise ConfigError(f"{setting} {path}: no such file; expected TorchScript or .onnx")

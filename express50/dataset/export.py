@@ -166,11 +166,7 @@ def clip_vertices(model: HeadModel, track: Track, clips: HeadPoses) -> Iterator[
 
 
 def read_albedo(folder: Path) -> np.ndarray | None:
-    """Read the texture beside a track, if there is one.
-
-    Raises:
-        FormatError: it is not an 8-bit colour image.
-    """
+    """Read the texture beside a track, if any; FormatError if it is not an 8-bit colour image."""
     path = folder / TEXTURE
     if not path.is_file():
         return None

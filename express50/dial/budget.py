@@ -63,11 +63,7 @@ def budget_text(seconds: float, cores: bool) -> str:
 
 
 def parse_goal(text: str) -> Goal:
-    """Read a goal: ``0.5mm``, ``0.004alpha``.
-
-    Raises:
-        ConfigError: the text is not a number with a unit.
-    """
+    """Read a goal: ``0.5mm``, ``0.004alpha``; ConfigError unless it is a number with a unit."""
     found = re.fullmatch(r"(\d*\.?\d+)\s*([A-Za-z]+)", text)
     if found is None or found[2] not in get_args(Unit) or not float(found[1]) > 0:
         units = ", ".join(get_args(Unit))

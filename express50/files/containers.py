@@ -95,11 +95,7 @@ def read_picture(root: Path, name: str, orientation: int = 1) -> np.ndarray:
 
 
 def read_srgb(path: Path) -> np.ndarray:
-    """Read an image file as (H, W, 3) uint8 sRGB.
-
-    Raises:
-        CaptureError: it is missing, damaged or too large.
-    """
+    """Read an image (H, W, 3) uint8 sRGB; CaptureError if it is missing, damaged or too large."""
     try:
         return to_srgb(read_image(path))
     except FormatError as error:
@@ -225,11 +221,7 @@ def members(group: h5py.Group) -> list[str]:
 
 
 def attribute(group: h5py.Group, name: str, default: object) -> np.ndarray:
-    """Read an attribute of a group, or its default, as a flat array.
-
-    Raises:
-        CaptureError: the file is damaged.
-    """
+    """Read a group's attribute, or its default, as a flat array; CaptureError if damaged."""
     with _damage_is_one_error(DAMAGE, f"{group.file.filename}: attribute {name} is damaged"):
         return np.ravel(np.asarray(group.attrs.get(name, default)))
 

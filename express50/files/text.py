@@ -117,11 +117,7 @@ def read_text(path: Path, kind: Kind, limit: int = TEXT_LIMIT, fix: str = AGAIN)
 
 
 def read_json(path: Path, kind: Kind, fix: str = AGAIN) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        Express50Error: as for `read_text` and `parse_json`.
-    """
+    """Read a JSON file; errors are those of `read_text` and `parse_json`."""
     return parse_json(read_text(path, kind, fix=fix), str(path), kind, fix)
 
 

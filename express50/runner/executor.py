@@ -193,11 +193,7 @@ class Pool:
         self._workers = None
 
     def width(self) -> int:
-        """Return how many items can be worked on at once.
-
-        Raises:
-            StageError: the scheduler cannot be reached.
-        """
+        """Return how many items can be worked on at once; StageError without the scheduler."""
         if self.slurm:
             return min(job.jobs * job.processes(self.threads) for job in self.slurm.values())
         if self.scheduler is None:

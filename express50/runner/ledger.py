@@ -235,11 +235,7 @@ class Ledger:
             )
 
     def read(self, stage: str, item: str | None = None) -> dict[str, Receipt]:
-        """Read the receipts of a stage by item, sorted, or that of one item.
-
-        Raises:
-            FormatError: a row is damaged.
-        """
+        """Read a stage's receipts by item, sorted, or that of one; FormatError if a row is damaged."""
         found = {}
         older = self._columns() or COLUMNS  # no table, where nothing was made yet
         columns = tuple(name for name in COLUMNS if name in older)
@@ -285,11 +281,7 @@ class Ledger:
             self._replace("runs", dict(vars(run)) | {"running": json.dumps(run.running)})
 
     def runs(self) -> dict[str, Run]:
-        """Read the last run of each stage.
-
-        Raises:
-            FormatError: a row is damaged.
-        """
+        """Read the last run of each stage; FormatError if a row is damaged."""
         rows = self._rows(tuple(one.name for one in fields(Run)), "runs")
         return {
             row["stage"]: Run(**row | {"running": self._parsed(row["running"], "runs")})

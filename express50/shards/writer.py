@@ -285,11 +285,7 @@ def verify(root: Path) -> list[str]:
 
 
 def _manifest_digests(root: Path) -> dict[str, str]:
-    """Read the SHA-256 by file name from a folder's manifest.
-
-    Raises:
-        FormatError: it is missing or malformed.
-    """
+    """Read a folder's manifest: SHA-256 by file name; FormatError if it is missing or malformed."""
     path = root / "manifest.json"
     if not path.exists():
         raise FormatError(

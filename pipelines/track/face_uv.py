@@ -200,11 +200,7 @@ class FaceUvMap:
 
 
 def make_uv_map(model: HeadModel, fine: int = 1) -> FaceUvMap:
-    """Lay a head model's template flat.
-
-    Raises:
-        HeadModelError: the outer corners of the eyes coincide.
-    """
+    """Lay a head model's template flat; HeadModelError if the eyes' outer corners coincide."""
     vertices = model.template.double().numpy()
     marks = landmarks(model, model.template[None].double())[0].double().numpy()
     if np.linalg.norm(marks[45] - marks[36]) < 1e-6:

@@ -221,11 +221,7 @@ def _expected(
 
 
 def write_npz(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Write arrays without pickled objects.
-
-    Raises:
-        StageError: one of them is not finite.
-    """
+    """Write arrays without pickled objects; StageError if one of them is not finite."""
     for name, array in arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise StageError(f"{path.name}: {name} holds NaN or infinity; the fit diverged")

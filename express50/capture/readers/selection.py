@@ -59,11 +59,7 @@ class Selection:
 
 
 def unique_ids(root: Path, names: Iterable[str], stem: Callable[[str], str]) -> dict[str, str]:
-    """Return the camera id of each name's stem.
-
-    Raises:
-        CaptureError: two names become one id.
-    """
+    """Return the camera id of each name's stem; CaptureError if two names become one id."""
     owners: dict[str, str] = {}
     for name in names:
         camera = identifier(stem(name))

@@ -255,11 +255,7 @@ def _one_video(camera: str, path: Path) -> RawCamera:
 
 
 def _first_fps(videos: Sequence[Path]) -> float:
-    """Return the frame rate of the first video that states it.
-
-    Raises:
-        CaptureError: none does.
-    """
+    """Return the frame rate of the first video that states it; CaptureError if none does."""
     for video in videos[:-1]:
         with suppress(CaptureError):
             return video_fps(video)
