@@ -120,10 +120,9 @@ def decoded(
 ) -> tuple[GaussianCloud, np.ndarray, np.ndarray]:
     """Decode a head; colours are those that ``view`` sees, before refinement.
 
-    Returns:
-        The Gaussians; the vertices (V, 3), metres, of the deformed mesh v_rec + v_id +
-        M_face v_exp; its texture (n_g, n_g, 3) uint8 sRGB, which holds the Gaussians' colours and
-        the mean colour where no face covers a texel.
+    Beside the Gaussians come the vertices (V, 3), metres, of the deformed mesh v_rec + v_id +
+    M_face v_exp, and its texture (n_g, n_g, 3) uint8 sRGB, which holds the Gaussians' colours and
+    the mean colour where no face covers a texel.
     """
     model, state = loaded.model, head.state(loaded)
     gaussians = model.geometry(head.z_id, head.z_exp, state)

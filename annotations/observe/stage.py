@@ -146,10 +146,7 @@ def choose_cameras(
     """Find the first attempt that shows a face, and rank the cameras that see it best.
 
     An attempt is the size of the smallest windows to search, and a frame; `score` rates the face
-    that a camera shows.
-
-    Returns:
-        The size of the windows that were enough, the frame and the cameras.
+    that a camera shows. Returns the size that was enough, the frame and the cameras.
 
     Raises:
         StageError: no camera sees a face in any attempt.
@@ -181,9 +178,8 @@ def _observe_camera(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Watch windows of frames with one camera.
 
-    Returns:
-        Points (F, 68, 2), scores (F,) and aligned faces (F, FACE, FACE) of all frames of the
-        windows, in order. In overlapping windows, the last one counts.
+    Points (F, 68, 2), scores (F,) and aligned faces (F, FACE, FACE) are those of all frames of the
+    windows, in order. In overlapping windows, the last one counts.
     """
 
     @lru_cache(maxsize=CACHED_FRAMES)

@@ -137,8 +137,7 @@ class SixelPainter(Painter):
 def cell_colours(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Choose the block character and two colours of each cell, of a picture (2 h, 2 w, 3) uint8.
 
-    Returns:
-        Glyphs (h, w) as strings of one character, foreground and background (h, w, 3) uint8.
+    Glyphs (h, w) are strings of one character; foreground and background (h, w, 3) are uint8.
     """
     rows, columns = picture.shape[0] // 2, picture.shape[1] // 2
     cells = picture.reshape(rows, 2, columns, 2, 3).transpose(0, 2, 1, 3, 4)

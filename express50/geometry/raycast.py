@@ -42,9 +42,8 @@ def visible_faces(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the face of a mesh (V, 3), (F, 3), metres, that each pixel of a pinhole camera sees.
 
-    Returns:
-        Face ids (H, W) int64, -1 if there is none, and depth (H, W) float64, camera z in metres,
-        infinite if there is none.
+    Face ids (H, W) are int64, -1 if there is none; depth (H, W) float64 is camera z in metres,
+    infinite if there is none.
     """
     # Far from the origin float32 rays are too coarse, so rays are cast relative to the mesh centre.
     centre = vertices.mean(0)

@@ -111,12 +111,10 @@ def bilinear(image: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def bilinear_slope(image: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate an image (H, W, C) at points (N, 2) exactly, with slopes per pixel.
+    """Interpolate an image (H, W, C) at points (N, 2) exactly: values (N, C), slopes (N, C, 2).
 
-    Outside the image its edge pixels repeat; the slope is that of the nearest cell.
-
-    Returns:
-        float64 values (N, C), and their derivatives (N, C, 2) with respect to x and y.
+    Both are float64; slopes are per pixel. Outside the image its edge pixels repeat; the slope is
+    that of the nearest cell.
     """
     height, width, channels = image.shape
     x, y = np.clip(corner_to_cell(points), 0.0, [width - 1.001, height - 1.001]).T

@@ -235,7 +235,7 @@ class Ledger:
             )
 
     def read(self, stage: str, item: str | None = None) -> dict[str, Receipt]:
-        """Read a stage's receipts by item, sorted, or that of one; FormatError if a row is damaged."""
+        """Read a stage's receipts by item, sorted, or one; FormatError if a row is damaged."""
         found = {}
         older = self._columns() or COLUMNS  # no table, where nothing was made yet
         columns = tuple(name for name in COLUMNS if name in older)

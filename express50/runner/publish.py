@@ -253,11 +253,8 @@ def restore(
     """Publish an output of the store again, if it has this fingerprint and all of its bytes.
 
     It is published through the run's ``folder``. The published output, whose receipt is ``former``,
-    goes into the store in exchange.
-
-    Returns:
-        The receipt, with 0 attempts as nothing was made; None if the store has no such output.
-        A damaged one is deleted.
+    goes into the store in exchange. The receipt has 0 attempts, as nothing was made; it is None if
+    the store has no such output. A damaged one is deleted.
     """
     entry = _entry(dataset, stage, item, fingerprint)
     if not entry.is_dir():

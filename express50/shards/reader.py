@@ -221,10 +221,9 @@ class ShardReader:
     def registered(self, subject: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Read a subject's registered meshes by expression; only those whose meta says so exist.
 
-        Returns:
-            offsets (V, 3) float32, metres, to add to the rest shape of the track, whose joints
-            stay; and the standard deviation (V,) float32, metres, of the vertices along their
-            normals.
+        A mesh is offsets (V, 3) float32, metres, to add to the rest shape of the track, whose
+        joints stay; and the standard deviation (V,) float32, metres, of the vertices along their
+        normals.
 
         Raises:
             FormatError: the file is missing, damaged, or holds something else.

@@ -78,12 +78,9 @@ def render_band(
 ) -> tuple[np.ndarray, np.ndarray, tuple[slice, slice]] | None:
     """Render premultiplied colour and alpha of the part of a band where the subject may be.
 
-    That is inside ``window``: columns and rows x0, y0, x1, y1 of the image. Without ``shade``,
-    colours are 0.
-
-    Returns:
-        colour (h, w, 3), alpha (h, w) float32, and their rows and columns in the image; None if
-        the band does not meet the window.
+    That is inside ``window``: columns and rows x0, y0, x1, y1 of the image. Returns colour (h, w,
+    3), alpha (h, w) float32, and their rows and columns in the image; None if the band does not
+    meet the window. Without ``shade``, colours are 0.
     """
     x0, x1 = window[0], window[2]
     y0, y1 = max(band.top, window[1]), min(band.bottom, window[3])

@@ -41,11 +41,9 @@ class Caster:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Find the first hits of rays from an origin (3,) that they share, or from origins (N, 3).
 
-        Directions (N, 3) may have any length; distances are measured in it.
-
-        Returns:
-            distance (N,) float32, inf where nothing is hit; face (N,) uint32, ``MISS`` likewise;
-            barycentric weights (N, 2) of the face's second and third vertex.
+        Directions (N, 3) may have any length; the distance (N,) float32 is measured in it, and inf
+        where nothing is hit. The face (N,) is uint32, ``MISS`` likewise, with barycentric weights
+        (N, 2) of its second and third vertex.
         """
         hits = self._scene.cast_rays(join_rays(origin, directions), nthreads=1)
         return (

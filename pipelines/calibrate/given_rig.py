@@ -187,9 +187,8 @@ def _find_exchanged(
 def _judge_size(cameras: dict[str, Camera], tracks: PointTracks) -> tuple[dict[str, Camera], str]:
     """Compare the distance between the eyes with that of people.
 
-    Returns:
-        The cameras, with other focal lengths if these alone explain the distance, and a warning,
-        empty if the distance is usual.
+    The cameras get other focal lengths if these alone explain the distance. The warning is empty if
+    the distance is usual.
     """
     error, eyes_mm = _fit_faces(cameras, tracks)
     nowhere = not 1e-3 < eyes_mm < np.inf  # cameras of one place do not triangulate

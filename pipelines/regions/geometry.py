@@ -122,10 +122,9 @@ def make_head(vertices: np.ndarray, R: np.ndarray, labels: HeadLabels) -> Tracke
 
 
 def render_head(head: TrackedHead, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Cast a pinhole camera's rays at a head alone.
+    """Cast a pinhole camera's rays at a head alone: labels (H, W) uint8 and depth (H, W) float32.
 
-    Returns:
-        labels (H, W) uint8 and depth (H, W) float32, camera z, metres; both 0 beside the head.
+    Depth is camera z, metres; both are 0 beside the head.
     """
     labels = np.zeros((camera.height, camera.width), np.uint8)
     depth = np.zeros(labels.shape, np.float32)

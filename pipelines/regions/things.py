@@ -352,8 +352,8 @@ def _agreement(
 ) -> np.ndarray:
     """Correlate `_patches` of a view with those of neighbours `offset` metres in front of the head.
 
-    Returns:
-        The best correlation (h, w), averaged over a patch; -1 where no neighbour sees the place.
+    The best correlation (h, w) is averaged over a patch; it is -1 where no neighbour sees the
+    place.
     """
     best, size = np.full(mine[0].shape, np.float32(-1)), (PATCH_PX, PATCH_PX)
     for shot, line in near:

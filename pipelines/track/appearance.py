@@ -249,11 +249,8 @@ def bake_albedo(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Bake the head's colours freed of light and gains, from frame sets with meshes (E, V, 3).
 
-    The first frame set, best the neutral one, counts most.
-
-    Returns:
-        (side, side, 3) uint8 sRGB, first row at v = 1, continued over what was not seen; and
-        (side, side) bool, where it was seen.
+    The first frame set, best the neutral one, counts most. The colours (side, side, 3) are uint8
+    sRGB, first row at v = 1, continued over what was not seen; a mask (side, side) says what was.
     """
     texels, texture = texel_samples(model, side)
     scenes = [_scene(model, *pair) for pair in zip(pictures, meshes, strict=True)]

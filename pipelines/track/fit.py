@@ -37,13 +37,10 @@ REJECT_SIGMA, REJECT_SHARE = 4.0, 0.12
 def fit(
     basis: Basis, targets: list[Target], state: State, steps: int, free: tuple[str, ...] = ()
 ) -> tuple[State, float]:
-    """Minimise the targets' cost plus priors from a start, in at most `steps` steps.
+    """Minimise the targets' cost plus priors in at most `steps` steps; return state and cost.
 
     `free` are the offset modes that the terms can determine (`basis.OFF`, `basis.ALONG`). With any
     of them the detector's bias is free too: the surface then shows how landmarks err.
-
-    Returns:
-        The fitted state and its cost.
 
     Raises:
         StageError: the cost is not a finite number.

@@ -68,11 +68,7 @@ class Observation:
 def triangulate_views(
     expression: str, frame: int, views: list[LandmarkView]
 ) -> tuple[Observation, list[str]]:
-    """Triangulate robustly and leave out whole views that disagree with the rest.
-
-    Returns:
-        The observation and the ids of the cameras left out.
-    """
+    """Triangulate robustly; leave out whole views that disagree, and return their ids too."""
     refused: list[str] = []
     views = with_redundancy(views)
     while True:
@@ -101,14 +97,12 @@ def with_redundancy(views: list[LandmarkView]) -> list[LandmarkView]:
 
 
 def robust_triangulate(views: list[LandmarkView]) -> tuple[np.ndarray, np.ndarray]:
-    """Triangulate each landmark by consensus over pairs of views.
+    """Triangulate landmarks by consensus over pairs of views: points (68, 3), inliers (views, 68).
 
     Every pair gives a candidate point; the one with the lowest truncated squared error over all
-    views wins, its inliers are triangulated again, weighted by 1 / sigma^2.
-
-    Returns:
-        points (68, 3), NaN where under two views agree; inliers (views, 68) bool. With fewer than
-        two views all landmarks count as inliers and no point is triangulated.
+    views wins, its inliers are triangulated again, weighted by 1 / sigma^2. Points are NaN where
+    under two views agree. With fewer than two views all landmarks count as inliers and no point is
+    triangulated.
     """
     count = len(views)
     if count < 2:
@@ -134,8 +128,7 @@ def robust_triangulate(views: list[LandmarkView]) -> tuple[np.ndarray, np.ndarra
 def place_head(views: list[LandmarkView]) -> tuple[float, np.ndarray, np.ndarray] | None:
     """Place the mean head by all views of a face, or by the best one; None if that fails.
 
-    Returns:
-        scale, rotation (3, 3) and shift (3,): world = scale * rotation @ head + shift.
+    The scale, rotation (3, 3) and shift (3,) mean: world = scale * rotation @ head + shift.
     """
     points, _ = robust_triangulate(views)
     head, known = mean_landmarks(), np.isfinite(points[INNER]).all(1)

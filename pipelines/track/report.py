@@ -44,9 +44,7 @@ def draw_overlays(
     """Write overlay_<expression>.jpg: frame above, mesh and landmarks below, in four views.
 
     Yellow: detected; green: fitted. Vertices (E, V, 3) world, rotations (E, 3, 3) from head to it.
-
-    Returns:
-        Expression to the overlay (TILE, TILE, 3) uint8 in the view that the face looks at.
+    Returns by expression the overlay (TILE, TILE, 3) uint8 in the view that the face looks at.
     """
     folder.mkdir(parents=True, exist_ok=True)
     cameras = read_cameras_of(dataset, subject)

@@ -197,10 +197,8 @@ def fit_landmarks(
 ) -> tuple[list[Target], State, list[Note]]:
     """Fit to landmarks alone and leave out those that contradict the fit.
 
-    `further` terms are added to those of every expression.
-
-    Returns:
-        Targets, the fitted state, and the expressions without a start.
+    `further` terms are added to those of every expression. The third value are the expressions
+    without a start.
 
     Raises:
         RigScaleError: the rig's unit is not the metre.
