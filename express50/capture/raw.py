@@ -31,7 +31,7 @@ from express50.files.text import (
 from express50.geometry.cameras import Camera
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr")
-VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mxf", ".mts", ".m2ts")
 # Windows reserves these names for devices, in any letter case.
 RESERVED = {"CON", "PRN", "AUX", "NUL"}
 RESERVED |= {f"{port}{n}" for port in ("COM", "LPT") for n in range(1, 10)}

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from express50.capture.raw import (
+    VIDEO_SUFFIXES,
     RawCapture,
     check_identity,
     read_capture,
@@ -76,7 +77,7 @@ LAYOUTS = (
         "photos", "a folder of images", pictures.fits_photos, folder_id, pictures.read_photos
     ),
     Layout(
-        "videos", "a folder of videos, one per camera",
+        "videos", f"a folder of videos ({' '.join(VIDEO_SUFFIXES)}), one per camera",
         videos.fits_videos, folder_id, videos.read_videos,
     ),
     Layout("video", "a video file", videos.fits_video, videos.video_id, videos.read_video),

@@ -28,12 +28,15 @@ FRAMES = 61
         {"gop": 16, "b_frames": 4, "options": {"x264-params": "open-gop=1:bframes=4:b-pyramid=2"}},
         {"gop": 1, "b_frames": 0},
         {"gop": 24, "codec": "libx265", "options": {"x265-params": "log-level=none:bframes=6"}},
+        {"gop": 12, "b_frames": 3, "name": "camcorder.mts"},
+        {"gop": 12, "b_frames": 0, "name": "cinema.mxf"},
     ],
-    ids=["closed", "long", "open", "intra", "h265"],
+    ids=["closed", "long", "open", "intra", "h265", "camcorder", "cinema"],
 )
 def video(request, tmp_path_factory):
-    path = tmp_path_factory.mktemp("video") / "video.mp4"
-    write_video(path, noise_video_images(FRAMES), **request.param)
+    options = dict(request.param)
+    path = tmp_path_factory.mktemp("video") / options.pop("name", "video.mp4")
+    write_video(path, noise_video_images(FRAMES), **options)
     return path
 
 
@@ -95,7 +98,8 @@ def test_a_key_frame_before_a_frame_is_found_and_reads_go_on(video):
     for wanted in (0, 5, 30, FRAMES - 1):
         found = reader.key_frame(wanted)
         earlier = [k for k in range(wanted + 1) if frames[k].key_frame]
-        assert found == earlier[-1]
+        indexed = video.suffix != ".mts"  # without an index, the frame itself is returned
+        assert found == (earlier[-1] if indexed else wanted)
         assert np.array_equal(reader.read(found), frames[found].to_ndarray(format="rgb24"))
 
 
@@ -109,7 +113,10 @@ def test_forward_reads_do_not_seek(video, monkeypatch):
 
 @pytest.mark.parametrize(
     ("shift", "frame", "message"),
-    [(0, FRAMES, "frame 61 does not exist, expected 0 to 60"), (1, 5, "no frame with time stamp")],
+    [
+        (0, FRAMES, "frame 61 does not exist, expected 0 to 60"),
+        (1000, FRAMES - 1, "no frame with time stamp"),
+    ],
 )
 def test_frames_outside_and_foreign_time_stamps_are_refused(video, shift, frame, message):
     pts = tuple(stamp + shift for stamp, _ in iterate_video(video))
@@ -220,6 +227,12 @@ def test_an_avi_file_whose_time_stamps_are_out_of_order_is_refused(tmp_path):
     for read in (iterate_video, lambda path: iterate_sparsely(path, 5, lambda tags: None)):
         with pytest.raises(CaptureError, match="video.avi: time stamps of frames are not in order"):
             list(read(tmp_path / "video.avi"))
+
+
+def test_an_mxf_file_whose_time_stamps_are_out_of_order_is_refused(tmp_path):
+    encode(tmp_path / "video.mxf", bf="3", g="12")
+    with pytest.raises(CaptureError, match="video.mxf: time stamps of frames are not in order"):
+        list(iterate_video(tmp_path / "video.mxf"))
 
 
 def test_frames_that_only_claim_to_stand_alone_are_not_decoded_sparsely(tmp_path):
