@@ -156,9 +156,11 @@ def controlled(
             head = replace(head, tracked=tracked)
         else:
             known = (*ANGLES, "shape", "expression", *CODES)
+            entries = [f"expression.{one}" for one in loaded.head.expression_names]
+            hint = nearest(table, known) or nearest(name, entries) or _joint_hint(name)
             raise ConfigError(
-                f"control {name!r} is unknown{nearest(table, known)}; expected {', '.join(known)}, "
-                "with .NUMBER or .NAME for one entry"
+                f"control {name!r} is unknown{hint}; expected {', '.join(known)}, with .NUMBER or"
+                " .NAME for one entry"
             )
     return head
 
@@ -267,8 +269,16 @@ def _entry(text: str, count: int, name: str, what: str, names: Sequence[str] = (
     expected = f"expected 0 to {count - 1}"
     if names:
         alike = [known for known in names if text.casefold() in known.casefold()]
-        expected += f", or a name such as {few(alike or names)}{nearest(text, names)}"
+        expected += f", or a name such as {few(alike or names)}"
+        expected += nearest(text, names) or _joint_hint(text)
     raise ConfigError(f"control {name!r} is none of the {count} {what}; {expected}")
+
+
+def _joint_hint(text: str) -> str:
+    """Return a hint at the joint that does what jawOpen or the like names, else nothing."""
+    found = (controls for name, (controls, _) in POSES.items() if nearest(text, [name]))
+    names = " and ".join(map(repr, next(found, ())))
+    return f" (did you mean {names}?)" if names else ""
 
 
 def _lerp(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:

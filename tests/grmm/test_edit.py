@@ -99,6 +99,9 @@ def test_principal_directions_rebuild_the_covariance(loaded):
     ("controls", "message"),
     [
         ({"jwa": (1.0,)}, "did you mean 'jaw'"),
+        ({"e3": (1.0,)}, "did you mean 'expression.e3'"),
+        ({"jawOpen": (1.0,)}, "did you mean 'jaw.0'"),
+        ({"expression.jawOpen": (1.0,)}, "did you mean 'jaw.0'"),
         ({"jaw": (1.0,)}, "got 1 number, expected 3 with commas between, or jaw.0"),
         ({"neck.3": (1.0,)}, "none of the 3 neck parameters; expected 0 to 2"),
         ({"expression.nope": (1.0,)}, "0 to 3, or a name such as e0, e1, e2 and 1 more$"),
