@@ -11,11 +11,12 @@ import math
 import re
 import shutil
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 
@@ -36,7 +37,7 @@ from express50.geometry.sampling import evenly
 from express50.head.load import load_head
 from express50.head.model import landmarks_of
 from express50.head.preview import render_preview
-from express50.landmarks.detector import Detection, detect
+from express50.landmarks.detector import FOUND_SCORE, SMALLEST, Detection, detect, detect_many
 from express50.landmarks.network import load_network
 from pipelines.calibrate.footage import focal_of_film
 from pipelines.track.basis import Basis, make_basis
@@ -52,6 +53,10 @@ CAMERA = "photo"
 PANEL_TILE, PANEL_YAW = 512, 60.0  # pixels; degrees
 FACE_SCORE = 0.2
 PROBES, FOCAL_FACES = 8, 3
+# Images of a video that are searched for small faces, which takes seconds each. Images are alike if
+# no cell of `CELLS` along the longer side, half as wide as the least face, differs by `ALIKE` grey
+# levels.
+THOROUGH, CELLS, ALIKE = 3, 64, 10.0
 PHOTO_FPS = 25.0  # a photograph has no rate, but a capture must state one
 # Range of possible focal lengths, in longer sides of the picture.
 FOCAL_LIMITS = (0.1, 100.0)
@@ -224,9 +229,16 @@ def _cues(frames: int, windows: int) -> str:
 
 
 def find_faces(path: Path, images: list[np.ndarray], config: TrackConfig) -> list[Detection]:
-    """Find the faces, at least one, that are surely visible in images of one person."""
-    net = load_network()
-    seen = [detect(net, image, DETECTOR_PASSES, config.search) for image in images]
+    """Find the faces, at least one, that are surely visible in images of one person.
+
+    Small faces are searched for only if no large one was surely found, in images that differ.
+    """
+    net, seen, chosen = load_network(), list[Detection](), images
+    if len(images) > 1:
+        seen = detect_many(net, images, DETECTOR_PASSES, max(SMALLEST, config.search))
+        found = max(face.score for face in seen) >= FOUND_SCORE
+        chosen = [] if found else different(images, THOROUGH)
+    seen += [detect(net, image, DETECTOR_PASSES, config.search) for image in chosen]
     faces = [face for face in seen if face.score >= FACE_SCORE]
     if not faces:
         best = rounded_down(max(face.score for face in seen))
@@ -236,6 +248,21 @@ def find_faces(path: Path, images: list[np.ndarray], config: TrackConfig) -> lis
             f"least {config.search / 3:.0%} of the picture wide, or lower track.search"
         )
     return faces
+
+
+def different(images: Sequence[np.ndarray], count: int) -> list[np.ndarray]:
+    """Choose at most `count` images that are not alike, as different as possible."""
+    size = np.array(images[0].shape[1::-1])
+    width, height = np.maximum(1, np.round(size * CELLS / size.max()).astype(int)).tolist()
+    cells = [cv2.resize(i, (width, height), interpolation=cv2.INTER_AREA) for i in images]
+    small = np.stack(cells).astype(np.float32)
+    chosen = [len(images) // 2]
+    apart = np.full(len(images), np.inf)
+    while True:
+        apart = np.minimum(apart, np.abs(small - small[chosen[-1]]).max((1, 2, 3)))
+        if len(chosen) == count or apart.max() < ALIKE:
+            return [images[one] for one in sorted(chosen)]
+        chosen.append(int(apart.argmax()))
 
 
 def subject_id(path: Path) -> str:

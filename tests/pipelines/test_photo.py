@@ -20,7 +20,8 @@ from express50.files.images import write_image
 from express50.files.video import iterate_video
 from express50.head.load import load_head
 from express50.head.model import landmarks, pose
-from pipelines.photo.capture import make_photo_capture, open_picture, subject_id
+from pipelines.photo import capture
+from pipelines.photo.capture import find_faces, make_photo_capture, open_picture, subject_id
 from pipelines.track.config import TrackConfig
 from tests.synth import turn_video, write_video
 
@@ -87,6 +88,28 @@ def test_a_picture_without_a_face_is_one_clear_error(
     said = capsys.readouterr().err.strip()
     assert "no face found" in said and "\n" not in said
     assert not (tmp_path / "out").exists()
+
+
+def test_a_video_without_a_face_is_refused_after_few_searches(monkeypatch) -> None:
+    """A small face that appears late is found all the same."""
+    searched, detect = [], capture.detect
+    config = TrackConfig(search=0.08)
+    rng = np.random.default_rng(0)
+    wall = np.repeat(data.brick()[:360, :480, None], 3, axis=2)
+    noise = rng.normal(0, 5, (6, *wall.shape))
+    still = list(np.clip(wall + noise, 0, 255).astype(np.uint8))
+    pan = [np.roll(wall, 60 * n, axis=1) for n in range(6)]
+    with monkeypatch.context() as patch:
+        blind = lambda *inputs: searched.append(inputs) or detect(*inputs[:3], 1.0)  # noqa: E731
+        patch.setattr(capture, "detect", blind)
+        for images, searches in ((still, 1), (pan, capture.THOROUGH)):
+            searched.clear()
+            with pytest.raises(CaptureError, match="no face found"):
+                find_faces(Path("wall.mp4"), images, config)
+            assert [inputs[3] for inputs in searched] == [config.search] * searches
+    still[-1][40:150, 300:410] = cv2.resize(data.astronaut()[:220, 110:330], (110, 110))
+    (face,) = find_faces(Path("late.mp4"), still, config)
+    np.testing.assert_allclose(face.points.mean(0), (357, 100), atol=8)
 
 
 def test_wrong_options_and_files_are_refused(tmp_path: Path) -> None:
