@@ -16,9 +16,10 @@ import numpy as np
 from express50.contract.layout import Dataset
 from express50.errors import FormatError, StageError
 from express50.files.arrays import read_arrays
-from express50.files.digests import file_sha256
+from express50.files.digests import cached_by_file, file_sha256
 from express50.files.text import ID
 from express50.geometry.shapes import check_finite, check_shape
+from express50.head.files import head_files
 
 SCHEMA = "express50.track/2"
 SEQUENCE_SCHEMA = "express50.sequence/1"
@@ -134,6 +135,24 @@ def existing_track(dataset: Dataset, subject: str) -> Path:
     if not path.is_file():
         raise StageError(f"subject {subject!r} is not tracked; run 'express50 track'")
     return path
+
+
+def track_inputs(dataset: Dataset, subject: str) -> dict[str, Path]:
+    """Return what reading a subject's track opens: its file, and its head model's files.
+
+    Raises:
+        StageError: the subject is not tracked.
+        FormatError: the file is not a track.
+    """
+    path = existing_track(dataset, subject)
+    return {"track": path, **_head_files_of(path)}
+
+
+@cached_by_file(64)
+def _head_files_of(path: Path) -> dict[str, Path]:
+    fix = "run 'express50 track' again"
+    arrays = read_arrays(path, FormatError, "a track", ("head",), fix, only=True)
+    return {name: file for name, file in head_files(str(arrays["head"])).items() if file.exists()}
 
 
 def read_track(path: Path) -> Track:

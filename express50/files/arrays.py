@@ -44,11 +44,17 @@ DAMAGE = (
 
 
 def read_arrays(
-    path: Path, kind: Kind, what: str, wanted: Collection[str] = (), fix: str = AGAIN
+    path: Path,
+    kind: Kind,
+    what: str,
+    wanted: Collection[str] = (),
+    fix: str = AGAIN,
+    only: bool = False,
 ) -> dict[str, np.ndarray]:
     """Read the arrays of an ``.npz`` file by name; refuse arrays of objects.
 
-    Messages say ``what`` the file should be, such as "a track", and how to ``fix`` it.
+    Messages say ``what`` the file should be, such as "a track", and how to ``fix`` it. With
+    ``only``, no other arrays than the ``wanted`` ones are read.
 
     Raises:
         Express50Error: of the given kind: the file is missing, damaged, lacks a wanted array, or
@@ -62,9 +68,12 @@ def read_arrays(
                 raise ValueError(f"{size} bytes unpacked, expected at most {SIZE_LIMIT}")
             found = {}
             for member in members:
+                name = member.filename.removesuffix(".npy")
+                if only and name not in wanted:
+                    continue
                 with archive.open(member) as file:
                     data = io.BytesIO(file.read(member.file_size))
-                found[member.filename.removesuffix(".npy")] = _array(data, member.file_size)
+                found[name] = _array(data, member.file_size)
     except DAMAGE as error:
         raise kind(f"{path}: not {what} ({reason(error)}); {fix}") from None
     missing = [name for name in wanted if name not in found]

@@ -17,16 +17,11 @@ import torch
 
 from express50.errors import HeadModelError
 from express50.files.arrays import read_object_array, read_pickle, to_array
+from express50.head.files import COMPANIONS, companions
 from express50.head.ict import read_obj, tensor
 from express50.head.model import PARENTS, REGIONS, HeadModel, check_head
 from express50.head.mouth import FLAME_VERTICES, add_mouth
 
-COMPANIONS = {
-    "embedding": ("landmark_embedding.npy", "landmark_embedding_with_eyes.npy",
-                  "flame_static_embedding_68.pkl"),
-    "masks": ("FLAME_masks.pkl",),
-    "template": ("head_template_mesh.obj", "head_template.obj"),
-}  # fmt: skip
 _REQUIRED = ("v_template", "f", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table")
 
 
@@ -185,13 +180,8 @@ def _read_dict(path: Path) -> dict[str, Any]:
 
 def _find_companions(path: Path) -> dict[str, Path]:
     """Find the model's other files; one HeadModelError lists all that are missing."""
-    found, missing = {}, []
-    for kind, names in COMPANIONS.items():
-        file = next((path.parent / name for name in names if (path.parent / name).is_file()), None)
-        if file is None:
-            missing.append(" or ".join(names))
-        else:
-            found[kind] = file
+    found = companions(path)
+    missing = [" or ".join(names) for kind, names in COMPANIONS.items() if kind not in found]
     if missing:
         raise HeadModelError(
             f"{path}: missing beside the model: {'; '.join(missing)}; download them from the FLAME"

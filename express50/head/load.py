@@ -82,6 +82,11 @@ def load_head(spec: str | Path) -> HeadModel:
         )
     if path.suffix == ".npz" and is_stored(path):
         return load_stored(path, path.stem)
+    if path.suffix == ".npz" and _holds(path, "kintree_table"):
+        raise HeadModelError(
+            f"{path}: holds FLAME's arrays, expected FLAME's .pkl as downloaded, with its other"
+            " files beside it; name that file"
+        )
     if path.is_dir() or path.suffix == ".npz":
         from express50.head.ict import load_ict
 
@@ -145,6 +150,10 @@ def _region_masks(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def is_stored(path: Path) -> bool:
     """Return whether a file holds a head model's arrays by the names of `FIELDS`."""
+    return _holds(path, "skinning")
+
+
+def _holds(path: Path, array: str) -> bool:
     with suppress(zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
-        return "skinning.npy" in archive.namelist()
+        return f"{array}.npy" in archive.namelist()
     return False

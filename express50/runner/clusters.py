@@ -5,11 +5,14 @@ from __future__ import annotations
 import logging
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from typing import Any
 from urllib.parse import urlsplit
@@ -42,7 +45,6 @@ class LocalWorkers:
             gpu = {"env": {"CUDA_VISIBLE_DEVICES": device}, "resources": {GPU: 1}}
             workers[number]["options"] |= gpu
         self.client, self._cluster = start_cluster(workers, threads, host="127.0.0.1")
-        self.client.register_plugin(_ignore_interrupts())
 
     def keep(self, tasks: int) -> None:
         """Do nothing: nannies replace workers that died."""
@@ -131,6 +133,28 @@ class RemoteWorkers:
         close_within(5, self.client)
 
 
+@contextmanager
+def holding_interrupts() -> Iterator[None]:
+    """Hold Ctrl-C and SIGTERM back until the end; processes begun meanwhile never see Ctrl-C.
+
+    Stopped while workers start, dask would print tracebacks. Processes inherit that Ctrl-C is
+    blocked; here it could still reach another thread, so handlers note it.
+    """
+    received: list[int] = []
+    main = threading.current_thread() is threading.main_thread()  # only it may set handlers
+    held = (signal.SIGINT, signal.SIGTERM) if main else ()
+    former = {number: signal.signal(number, lambda n, _: received.append(n)) for number in held}
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)  # hands over what is pending
+        for number, handler in former.items():
+            signal.signal(number, handler)
+        for one in received:
+            signal.raise_signal(one)
+
+
 def close_within(seconds: float, part: Any) -> None:
     """Close a client or cluster; one that a busy machine closes more slowly ends with the run."""
     with suppress(TimeoutError):
@@ -156,8 +180,9 @@ def start_cluster(workers: dict[int, dict], threads: int, **scheduler: object) -
         "distributed.nanny.pre-spawn-environ": thread_environment(threads),
     }
     options = {"dashboard": False, "dashboard_address": ":0", "port": 0, "protocol": "tcp://"}
-    _start_tracker()
-    with dask.config.set(settings):
+    _start_tracker()  # before: its start lets interrupts through again
+    # A terminal sends Ctrl-C to workers, too; the driver stops them in order.
+    with holding_interrupts(), dask.config.set(settings):
         cluster = SpecCluster(
             workers=workers,
             scheduler={"cls": Scheduler, "options": options | scheduler},
@@ -197,20 +222,3 @@ def cuda_devices() -> list[str]:
     except (OSError, subprocess.SubprocessError):  # a driver that does not answer has no device
         return []
     return [str(n) for n, _ in enumerate(x for x in listing.splitlines() if x.startswith("GPU "))]
-
-
-def _ignore_interrupts() -> Any:
-    """Make the plug-in by which workers leave Ctrl-C to the driver, which stops them in order."""
-    from distributed import WorkerPlugin
-
-    class IgnoreInterrupts(WorkerPlugin):
-        name = "ignore-interrupts"
-
-        def setup(self, worker: object) -> None:
-            import signal
-            import threading
-
-            if threading.current_thread() is threading.main_thread():
-                signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    return IgnoreInterrupts()

@@ -19,6 +19,7 @@ from express50.files.arrays import read_arrays
 from express50.files.calibration import read_cameras, write_cameras
 from express50.geometry.cameras import Camera, rays
 from express50.geometry.transforms import make_transform, rigid_fit
+from express50.head.files import absolute_head
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.twin import render
@@ -42,7 +43,7 @@ def write_truth(
     folder.mkdir(parents=True, exist_ok=True)
     write_cameras(folder / "cameras.json", cameras)
     subject = body.subject
-    about = {"id": subject.id, "number": subject.number, "head": head,
+    about = {"id": subject.id, "number": subject.number, "head": absolute_head(head),
              "look": asdict(subject.look), "cues": play.cues}  # fmt: skip
     words = json.dumps(about, indent=1, default=np.ndarray.tolist)
     (folder / "subject.json").write_text(words + "\n")

@@ -41,6 +41,7 @@ PRESETS: dict[str, dict[str, object]] = {
 def inputs(dataset: Dataset, item: str, config: DepthConfig) -> dict[str, Path | str]:
     """List cameras, frames and mattes of the expression, and the track if there is one."""
     from express50.capture.frames import frame_inputs, read_cameras_of
+    from express50.dataset.tracks import track_inputs
 
     subject, expression = item.split("/")
     found: dict[str, Path | str] = {
@@ -51,9 +52,8 @@ def inputs(dataset: Dataset, item: str, config: DepthConfig) -> dict[str, Path |
         path = dataset.matte_file(subject, expression, camera)
         if path.is_file():
             found[f"matte {camera}"] = path
-    track = dataset.track_file(subject)
-    if track.is_file():
-        found["track"] = track
+    if dataset.track_file(subject).is_file():
+        found |= track_inputs(dataset, subject)
     return found
 
 

@@ -37,13 +37,13 @@ def inputs(dataset: Dataset, item: str, config: RegionsConfig) -> dict[str, Path
     """List cameras, frames, track, mattes and depth maps of the expression, and the weights."""
     from express50.capture.frames import frame_inputs, read_cameras_of
     from express50.dataset.depth_files import depth_file
-    from express50.dataset.tracks import existing_track
+    from express50.dataset.tracks import track_inputs
 
     subject, expression = item.split("/")
     found: dict[str, Path | str] = {
         "cameras": dataset.cameras_file(subject),
         **frame_inputs(dataset, subject, expression),
-        "track": existing_track(dataset, subject),
+        **track_inputs(dataset, subject),
     }
     for camera in read_cameras_of(dataset, subject):
         matte = dataset.matte_file(subject, expression, camera)

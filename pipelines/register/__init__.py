@@ -11,12 +11,12 @@ from express50.contract.stage import Growth, NoSettings, Result, Stage
 
 def inputs(dataset: Dataset, item: str, config: NoSettings) -> dict[str, Path | str]:
     """Name the cameras, the track and the expression's surface."""
-    from express50.dataset.tracks import existing_track
+    from express50.dataset.tracks import track_inputs
 
     subject, expression = item.split("/")
     return {
         "cameras": dataset.cameras_file(subject),
-        "track": existing_track(dataset, subject),
+        **track_inputs(dataset, subject),
         "surface": dataset.surface_file(subject, expression),
     }
 

@@ -18,6 +18,7 @@ from express50.files.atomic import dump_json, folder_in_one_step, write_bytes
 from express50.files.digests import file_sha256, value_digest
 from express50.files.text import ID, read_json_table, read_text
 from express50.geometry.raycast import mesh_scene
+from express50.head.files import absolute_head, head_files
 from express50.head.load import load_head
 from express50.head.model import landmarks_of
 from pipelines.register.scan import PITCHES, YAWS, FittedScan, fit_scan
@@ -148,7 +149,7 @@ def register_scan(path: Path, head: str, folder: Path) -> dict:
         Express50Error: scan or landmarks cannot be read, or the scan shows no face.
     """
     points = landmarks_beside(path)
-    files = [path, Path(head).expanduser(), points]
+    files = [path, *(head_files(head).values() or [Path(head)]), points]
     digests = [file_sha256(file) if file and file.is_file() else str(file) for file in files]
     identity = value_digest([VERSION, *digests])
     if folder.exists():
@@ -164,7 +165,7 @@ def register_scan(path: Path, head: str, folder: Path) -> dict:
     with folder_in_one_step(folder.with_name(f".{folder.name}.part"), folder) as out:
         file = out / "track.npz"
         vertices = fitted.start[None]
-        write_track(file, head, fitted.basis, fitted.targets, fitted.state, vertices)
+        write_track(file, absolute_head(head), fitted.basis, fitted.targets, fitted.state, vertices)
         metrics = write_registration(out, file, read_track(file), 0, fitted.laid, "parameters")
         write_head_obj(out / "head.obj", fitted.laid.vertices / UNITS[scan.unit], load_head(head))
         metrics |= distances(scan, fitted) | {"unit": scan.unit, "textured": scan.textured}

@@ -8,13 +8,14 @@ from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
 from express50.errors import ConfigError
 from express50.head import BUILTIN_NAME
+from express50.head.files import head_files
 from pipelines.track.config import PRESETS, UV_WEIGHTS, VERSION, TrackConfig
 
 __all__ = ["STAGE"]
 
 
 def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path | str]:
-    """Name index, cameras, peaks, mattes, network weights and the head model's file."""
+    """Name index, cameras, peaks, mattes, network weights and the head model's files."""
     from express50.capture.frames import frame_inputs
     from express50.capture.index import read_peaks
 
@@ -37,9 +38,7 @@ def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path |
 def _setting_files(config: TrackConfig) -> dict[str, Path]:
     from express50.landmarks import source_files
 
-    found = source_files(config.landmarks)
-    if config.head != BUILTIN_NAME:
-        found["head"] = Path(config.head).expanduser()
+    found = {**source_files(config.landmarks), **head_files(config.head)}
     for name, setting in (("head", "head"), ("landmarks", "landmarks"), ("fan", "landmarks")):
         if name in found and not found[name].exists():
             raise ConfigError(

@@ -8,6 +8,7 @@ from typing import Literal
 
 from express50.contract.config import check_ranges
 from express50.head import BUILTIN_NAME
+from express50.head.files import absolute_head
 
 VERSION = 27
 UV_WEIGHTS = Path(__file__).with_name("face_uv_weights.npz")
@@ -54,7 +55,11 @@ class TrackConfig:
     """Rounds in which a frame of a clip is fitted to its pictures; 0 uses landmarks alone."""
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot work."""
+        """Refuse values that cannot work; make the head model's path absolute.
+
+        Track and shards name the model by this path, and other commands read it from there.
+        """
+        object.__setattr__(self, "head", absolute_head(self.head))
         check_ranges(
             "track", self, stride=(1, 10_000), cameras=(0, 10_000), search=(0.02, 1),
             photo_side=(32, 8192), samples=(100, 30_000), outline_rounds=(0, 100),

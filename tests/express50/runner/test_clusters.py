@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -10,7 +11,7 @@ import pytest
 
 from express50.errors import StageError
 from express50.runner import clusters
-from express50.runner.clusters import LocalWorkers, RemoteWorkers, cuda_devices
+from express50.runner.clusters import LocalWorkers, RemoteWorkers, cuda_devices, holding_interrupts
 from express50.runner.executor import Pool
 from express50.runner.runner import run_stage
 from express50.runner.slurm import SlurmJob
@@ -64,6 +65,35 @@ def test_workers_that_a_busy_machine_stops_slowly_do_not_fail_the_run():
     workers = object.__new__(LocalWorkers)
     workers.client = workers._cluster = Slow()
     workers.close()
+
+
+def blocked_signals():
+    return signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
+def test_workers_never_see_the_interrupt_that_a_terminal_sends_to_all():
+    """Not even while they start: each would print a traceback."""
+    workers = LocalWorkers(2, threads=1)
+    try:
+        assert all(
+            signal.SIGINT in blocked for blocked in workers.client.run(blocked_signals).values()
+        )
+    finally:
+        workers.close()
+    assert signal.SIGINT not in blocked_signals()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_while_workers_start_comes_after_their_start(number):
+    started = False
+    former = signal.signal(number, signal.default_int_handler)  # others may have changed it
+    try:
+        with pytest.raises(KeyboardInterrupt), holding_interrupts():
+            os.kill(os.getpid(), number)
+            started = True
+    finally:
+        signal.signal(number, former)
+    assert started
 
 
 def test_one_item_at_a_time_on_each_device(devices):
