@@ -84,7 +84,7 @@ def people_lines(people: Sequence[Mapping]) -> list[str]:
         lines += [f"Age: {mean[0]:g} years in the mean of {mean[1]} people.", ""]
     if ages := shown_counts(age_counts(people)):
         lines += _count_table("age", ages)
-    few = f"Gender and age are not stated, or of fewer than {LEAST_PEOPLE} of {len(people)} people."
+    few = f"No figures: gender and age are shown only for groups of {LEAST_PEOPLE} people or more."
     return lines[:-1] or [few]
 
 

@@ -187,7 +187,7 @@ def test_every_view_is_packed_and_the_account_balances(packed):
 
 def test_gender_and_age_of_a_few_people_stay_out_of_card_and_shards(packed):
     root, _ = packed
-    assert "fewer than 5 of 2 people" in (root / "card.md").read_text()
+    assert "only for groups of 5 people or more" in (root / "card.md").read_text()
     for path in (p for p in root.rglob("*") if p.is_file()):
         words = (b"feminine", b"47.11", b'gender"', b"tester")
         assert not {word for word in words if word in path.read_bytes()}, path
@@ -224,6 +224,8 @@ def test_gender_and_age_of_many_people_are_counted_on_the_card():
     ]
     ages_only = people_lines([{"age": n} for n in (20, 30, 40, 50, 60, -1, True, "x")])
     assert ages_only == ["Age: 40 years in the mean of 5 people."]
+    (few,) = people_lines([{"age": 30, "gender": "male"}] * 4)
+    assert "5 people or more" in few and "30" not in few and "male" not in few
     hundred = people_lines([{"gender": "a|b\nc"}] * 100)
     assert hundred == ["| gender | subjects | |", "|---|---|---|", f"| a/b c | 100 | {'█' * 40} |"]
 
