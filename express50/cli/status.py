@@ -38,6 +38,7 @@ from express50.runner.publish import is_running
 PAGE_SECONDS = 3.0  # between two writes of the page during a run
 SILENT_SECONDS = 15.0  # a run that has not updated the ledger for this long was killed
 UNLOCKED_SECONDS = 5.0  # the same where nobody holds the stage's lock, as far as this machine sees
+AHEAD_SECONDS = 600.0  # another machine's clock may be this far ahead; more: one was set back
 RECENT = 50  # the time left is estimated from the rate of this many last items
 FAILED_SHOWN = 200
 SLOWEST_SHOWN = 10
@@ -226,7 +227,7 @@ def _stage(
     alive, open_items, former, missing, rate = False, 0, 0, 0, 0.0
     running: dict[str, float] = {}
     if run is not None:
-        alive = not run.ended and now - run.seen < silence
+        alive = not run.ended and -AHEAD_SECONDS < now - run.seen < silence
         settled = [r.time for r in receipts if r.time >= run.begun]
         # An item's receipt may be written before the run's next update says that it has ended.
         began = run.running if alive else {}

@@ -201,6 +201,19 @@ def _reconstruct_array(kind: object, shape: object, code: object) -> np.ndarray:
     return np.ndarray((0,), np.dtype("b"))
 
 
+def _array_of_bytes(
+    data: object, dtype: object, shape: Any, order: object = "C", *_: object
+) -> np.ndarray:
+    """Do what numpy's _frombuffer does, with which protocol 5 stores arrays."""
+    if isinstance(data, (bytes, bytearray)) and isinstance(dtype, np.dtype):
+        flat = np.frombuffer(data, dtype)  # refuses a type of Python objects
+        if order == "C":
+            return flat.reshape(shape)
+        if order == "F":
+            return flat.reshape(shape, order="F")
+    raise pickle.UnpicklingError("numpy array without bytes")
+
+
 def _dtype(code: object, *flags: object) -> np.dtype:
     """Make a numpy.dtype from a type code string."""
     if not isinstance(code, (str, bytes)):
@@ -262,6 +275,8 @@ _ALLOWED = MappingProxyType(
     {
         **{(module, "_reconstruct"): _reconstruct_array for module in _NUMPY},
         **{(module, "scalar"): _scalar for module in _NUMPY},
+        ("numpy.core.numeric", "_frombuffer"): _array_of_bytes,
+        ("numpy._core.numeric", "_frombuffer"): _array_of_bytes,
         ("numpy", "ndarray"): ArrayType,
         ("numpy", "dtype"): _dtype,
         ("_codecs", "encode"): _encode,

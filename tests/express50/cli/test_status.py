@@ -234,6 +234,8 @@ def test_a_killed_run_counts_as_stopped(tmp_path):
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert status_of_toy(dataset, time.time() + SILENT_SECONDS).state == "stopped"
+    clock_set_back = time.time() - 1e6
+    assert status_of_toy(dataset, clock_set_back).state == "stopped"
     with Ledger(dataset.ledger, read_only=True) as ledger:  # its lock is free, so it is sooner sure
         soon, locked = time.time() + UNLOCKED_SECONDS, partial(is_running, dataset)
         (row,) = read_status(ledger, ["toy"], soon, locked)

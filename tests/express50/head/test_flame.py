@@ -149,6 +149,19 @@ def test_a_hostile_storage_inside_a_tensor_executes_nothing(flame: Path, tmp_pat
     assert not marker.exists()
 
 
+@pytest.mark.parametrize("protocol", [2, pickle.HIGHEST_PROTOCOL])
+def test_a_model_that_the_user_saved_again_loads(
+    flame: Path, tmp_path: Path, protocol: int
+) -> None:
+    """With any protocol, of which the newest store arrays in another way."""
+    shutil.copytree(flame.parent, tmp_path / "copy")
+    path, arrays = tmp_path / "copy" / "flame.pkl", flame_dict()
+    arrays["weights"] = np.asfortranarray(arrays["weights"])
+    path.write_bytes(pickle.dumps(arrays, protocol=protocol))
+    model = load_flame(path)
+    np.testing.assert_array_equal(model.skinning.numpy(), arrays["weights"].astype(np.float32))
+
+
 def test_a_cut_file_is_refused_in_one_line(flame: Path, tmp_path: Path) -> None:
     shutil.copytree(flame.parent, tmp_path / "copy")
     path = tmp_path / "copy" / "flame.pkl"
