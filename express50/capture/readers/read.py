@@ -20,7 +20,7 @@ from express50.capture.raw import (
     read_capture_toml,
     read_meta,
 )
-from express50.capture.readers import codec_avatars, pictures, renderme, videos
+from express50.capture.readers import codec_avatars, folders, pictures, renderme, videos
 from express50.capture.readers.selection import Selection, folder_id, parse_selection
 from express50.contract.layout import Dataset, footage_source
 from express50.errors import CalibrationError, CaptureError, Express50Error, check_known
@@ -41,6 +41,7 @@ class Layout:
     fits: Callable[[Path], bool]  # whether a file or folder is one
     subject_of: Callable[[Path], str]  # the subject's id
     read: Callable[[Path, Selection], RawCapture]  # the selected parts of the capture
+    named: bool = False  # whether it needs no test where capture.toml names it
 
 
 # The order matters: a layout that could be mistaken for another comes after it.
@@ -81,6 +82,18 @@ LAYOUTS = (
         videos.fits_videos, folder_id, videos.read_videos,
     ),
     Layout("video", "a video file", videos.fits_video, videos.video_id, videos.read_video),
+    Layout(
+        "camera_folders", "a folder per camera, such as cam_01/, of videos or numbered pictures",
+        folders.fits_camera_folders, folder_id, folders.read_camera_folders, named=True,
+    ),
+    Layout(
+        "expression_folders", "a folder per expression, of videos such as cam_01.mp4",
+        folders.fits_expression_folders, folder_id, folders.read_folders_of_cameras, named=True,
+    ),
+    Layout(
+        "frame_folders", "a folder per frame, of pictures such as cam_01.png",
+        folders.fits_frame_folders, folder_id, folders.read_folders_of_cameras, named=True,
+    ),
 )  # fmt: skip
 
 
@@ -96,7 +109,7 @@ def detect(path: Path, name: object = None) -> Layout:
         names = [OURS, *(layout.name for layout in LAYOUTS)]
         check_known(str(path), "layout", [str(name)], names, CaptureError)
     for layout in LAYOUTS:
-        if name in (None, layout.name) and layout.fits(path):
+        if name in (None, layout.name) and ((name and layout.named) or layout.fits(path)):
             return layout
     check_links(*(path.iterdir() if path.is_dir() else ()))
     looks = "; ".join(f"{x.name}: {x.looks}" for x in LAYOUTS if name in (None, x.name))
@@ -112,9 +125,15 @@ def detect(path: Path, name: object = None) -> Layout:
         )
     if (path.parent / "capture.toml").is_file():
         raise CaptureError(f"{path}: part of the capture {path.parent}; give that folder instead")
+    unclear = ""
+    if folders.holds_folders(path):
+        unclear = (
+            ". Its folders hold footage: write 'layout' into a capture.toml beside them, or give"
+            " each folder by itself if it is a person"
+        )
     raise CaptureError(
         f"{path}: no known layout; got {', '.join(held[:5]) or 'an empty folder'}, expected one "
-        f"of: {looks}; {OURS}: capture.toml and cameras/"
+        f"of: {looks}; {OURS}: capture.toml and cameras/{unclear}"
     )
 
 

@@ -97,7 +97,7 @@ def read_participant(path: Path, selection: Selection) -> RawCapture:
     return RawCapture(
         root=path,
         subject=folder_id(path),
-        fps=_first_fps([path / camera.names[0] for camera in line.cameras.values()]),
+        fps=first_fps([path / camera.names[0] for camera in line.cameras.values()]),
         meta={"licence": "research only, see the terms of NeRSemble"},
         cameras={
             serial: replace(camera, correction=colours.get(serial, ()))
@@ -254,7 +254,7 @@ def _one_video(camera: str, path: Path) -> RawCamera:
     )
 
 
-def _first_fps(videos: Sequence[Path]) -> float:
+def first_fps(videos: Sequence[Path]) -> float:
     """Return the frame rate of the first video that states it; CaptureError if none does."""
     for video in videos[:-1]:
         with suppress(CaptureError):
@@ -292,7 +292,7 @@ def read_videos(path: Path, selection: Selection) -> RawCapture:
             dropped[camera] = str(error)
     if not cameras:
         raise CaptureError(next(iter(dropped.values())))
-    fps = _first_fps([wanted[camera] for camera in cameras])
+    fps = first_fps([wanted[camera] for camera in cameras])
     calibration, cues = read_calibration(path, cameras, dropped), read_cues(path / "cues.csv")
     return RawCapture(
         root=path, subject=folder_id(path), fps=fps, meta={}, cues=cues,

@@ -1,0 +1,116 @@
+"""Rigs whose footage lies in folders by camera, by expression or by frame."""
+
+import numpy as np
+import pytest
+
+from express50.capture.index import Cue, read_index
+from express50.capture.readers.read import detect, read_any, subject_of
+from express50.errors import CaptureError
+from express50.files.calibration import write_cameras
+from express50.files.images import write_image
+from tests.express50.capture.layouts import picture, rig
+from tests.stages import ingest_captures
+from tests.synth import noise_video_images, read_frame, write_video
+
+FRAMES = 3
+
+
+def write(root, names):
+    """Write a video, or a blank picture, of each of these names."""
+    for name in names:
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.suffix == ".mp4":
+            write_video(path, noise_video_images(FRAMES))
+        else:
+            write_image(path, picture(0, 0))
+    return root
+
+
+@pytest.mark.parametrize(
+    ("layout", "names"),
+    [
+        ("camera_folders", "cam{c}/{f:06d}.png"),
+        ("camera_folders", "cam{c}/shot_{f}.png"),
+        ("camera_folders", "2219{c}0/{f:06d}.png"),
+        ("frame_folders", "{f:04d}/cam{c}.png"),
+        ("frame_folders", "frame_{f:05d}/{c}.png"),
+        ("frame_folders", "{f:06d}/2219{c}0.png"),
+    ],
+)
+def test_folders_of_pictures_are_a_rig(tmp_path, layout, names):
+    root, order = tmp_path / "rig", [(c, f) for c in (0, 1) for f in range(8, 11)]
+    for c, f in order:
+        write(root, [names.format(c=c, f=f)])
+        write_image(root / names.format(c=c, f=f), picture(c, f))
+    assert (detect(root).name, subject_of(root)) == (layout, "rig")
+    dataset = ingest_captures(tmp_path / "data", root)
+    index = read_index(dataset, "rig")
+    assert len(index.cameras) == 2 and index.cues == (Cue("clip", 0, 2),)
+    for c, camera in enumerate(sorted(index.cameras)):  # the tenth frame comes after the ninth
+        assert index.cameras[camera].pts == (8, 9, 10)
+        np.testing.assert_array_equal(read_frame(dataset, "rig", camera, 2, False), picture(c, 10))
+
+
+@pytest.mark.parametrize(
+    ("layout", "names"),
+    [
+        ("camera_folders", "GoPro {c}/{e}.mp4"),
+        ("camera_folders", "GoPro {c}/GoPro {c}_{e}.mp4"),
+        ("camera_folders", "22190{c}/{e}.mp4"),
+        ("expression_folders", "{e}/22190{c}_cam.mp4"),
+    ],
+)
+def test_folders_of_videos_hold_expressions(tmp_path, layout, names):
+    expressions = ("look left", "smile")
+    names = [names.format(c=c, e=e) for c in (0, 1) for e in expressions]
+    root = write(tmp_path / "rig", names)
+    (root / "cues.csv").write_text("expression_id,start_frame,end_frame\nsmile,1,2\n")
+    found = read_any(root)
+    assert detect(root).name == layout and found.clips == ("look_left", "smile")
+    assert len(found.cameras) == 2 and "cues.csv" in found.warnings
+    index = read_index(ingest_captures(tmp_path / "data", root), "rig")
+    assert index.cues == (Cue("look_left", 0, 2), Cue("smile", 3, 5))
+
+
+def test_a_video_per_camera_folder_is_one_clip_whatever_its_name(tmp_path):
+    root = write(tmp_path / "rig", ["cam_a/GX010023.mp4", "cam_b/GX010456.mp4"])
+    (root / "cam_a/GX010023.THM").touch()
+    (root / "cues.csv").write_text("expression_id,start_frame,end_frame\nsmile,1,2\n")
+    found = read_any(root)
+    assert list(found.cameras) == ["cam_a", "cam_b"] and found.cues == (Cue("smile", 1, 2),)
+
+
+def test_a_calibration_says_which_names_are_cameras(tmp_path):
+    root = write(tmp_path / "rig", ["left/01.mp4", "left/02.mp4", "right/01.mp4", "right/02.mp4"])
+    for cameras, layout in ((["left", "right"], "camera"), (["01", "02"], "expression")):
+        write_cameras(root / "calibration.json", rig(cameras))
+        assert detect(root).name == f"{layout}_folders"
+        found = read_any(root)
+        assert list(found.cameras) == list(found.calibration) == cameras
+
+
+def test_names_that_do_not_tell_are_not_guessed_at(tmp_path):
+    """Folders of people would be read as expressions of one."""
+    pairs = [(s, c) for s in (1, 2) for c in (0, 1)]
+    for kind in ("png", "mp4"):
+        root = write(tmp_path / kind, [f"S00{s}/cam{c}.{kind}" for s, c in pairs])
+        with pytest.raises(
+            CaptureError, match="write 'layout' into a capture.toml beside them, or"
+        ):
+            read_any(root)
+    (root / "capture.toml").write_text('layout = "expression_folders"\nsequences = ["S001"]')
+    found = read_any(root)
+    assert found.clips == ("S001",) and list(found.cameras) == ["cam0", "cam1"]
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    (empty / "capture.toml").write_text('layout = "frame_folders"')
+    with pytest.raises(CaptureError, match="its cameras share no frames .it has no cameras"):
+        read_any(empty)
+
+
+def test_a_picture_without_a_number_is_named(tmp_path):
+    root = write(tmp_path / "rig", ["cam0/1.png", "cam1/1.png"])
+    write_image(root / "cam1/dark.png", picture(0, 0))
+    with pytest.raises(CaptureError, match="dark.png: has no number in its name"):
+        read_any(root)
