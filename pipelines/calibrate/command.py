@@ -145,7 +145,7 @@ def _report(
         size = f"{camera.width}x{camera.height}"
         say(f"{name:16} {size:>11} {camera.model:14} {fx:9.1f} {view:9.1f}")
     if verdict.meeting is not None:
-        place = ", ".join(f"{x:.3f}" for x in verdict.meeting)
+        place = ", ".join(f"{round(x, 3) + 0.0:.3f}" for x in verdict.meeting)  # no "-0.000"
         say(f"they look at ({place}) m from {verdict.distance_m:.3f} m;"
             f" axes miss it by {verdict.miss_mm:.0f} mm (median)")  # fmt: skip
     say(*(f"warning: {warning}" for warning in verdict.warnings))

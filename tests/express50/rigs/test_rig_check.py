@@ -99,6 +99,13 @@ def test_check_of_an_inverted_rig_fails_and_import_writes_nothing(tmp_path, caps
     assert not (tmp_path / "o.json").exists()
 
 
+def test_check_prints_the_common_point_without_negative_zeros(tmp_path, capsys):
+    write_cameras(tmp_path / "c.json", rig_around_the_origin())
+    assert main(["cameras", "check", str(tmp_path / "c.json")]) == 0
+    printed = capsys.readouterr().out
+    assert "they look at (" in printed and "-0.000" not in printed
+
+
 def test_wrong_size_is_one_line(tmp_path, capsys):
     write_cameras(tmp_path / "c.json", make_rig())
     assert main(["cameras", "check", str(tmp_path / "c.json"), "--size", "big"]) == 2
