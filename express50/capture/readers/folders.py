@@ -8,7 +8,7 @@ capture.toml has to say it: to guess could take people for one person's expressi
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -39,14 +39,15 @@ from express50.files.video import video_tags
 FPS = 24.0  # of pictures, which do not state it
 # The last is a serial number; people's numbers are shorter.
 CAMERA = re.compile(r".*(cam|gopro|kinect|view).*|c[-_]?\d+|\d{5,}", re.IGNORECASE)
-FRAME = re.compile(r"(frame|timestep|time|step|f|t)[-_]?\d+", re.IGNORECASE)
+NUMBER = re.compile(r"\d+")
+FRAME = re.compile(r"(frame|timestep|time|step|f|t)?[-_]?\d+", re.IGNORECASE)
 PERSON = re.compile(r"(s|sub|subj|subject|p|participant|person|id|actor)[-_]?\d+", re.IGNORECASE)
 
 
 def fits_camera_folders(path: Path) -> bool:
     """Return whether a folder holds a folder per camera, of videos or of numbered pictures."""
     kind, files = _files_by_folder(path)
-    if kind == "frames" and all(map(str.isdecimal, files)):
+    if kind == "frames" and _all(NUMBER, files):
         numbers = sorted(map(int, files))
         if numbers and numbers[-1] - numbers[0] < len(numbers):  # they count frames
             return False
@@ -54,17 +55,17 @@ def fits_camera_folders(path: Path) -> bool:
 
 
 def fits_expression_folders(path: Path) -> bool:
-    """Return whether a folder holds a folder per expression, of a video per camera."""
+    """Return whether a folder holds a folder per expression, of a video or picture per camera."""
     kind, files = _files_by_folder(path)
-    return kind == "videos" and not _are_people(files) and _are_cameras(path, _stems(files))
+    other = _all(PERSON, files) or (kind == "frames" and _all(FRAME, files))
+    return not other and _are_cameras(path, _stems(files))
 
 
 def fits_frame_folders(path: Path) -> bool:
     """Return whether a folder holds a folder per frame, of a picture per camera."""
     kind, files = _files_by_folder(path)
-    named = bool(files) and all(map(FRAME.fullmatch, files))
-    cameras = not _are_people(files) and _are_cameras(path, _stems(files))
-    return kind == "frames" and (named or cameras)
+    named = not _all(NUMBER, files) or _are_cameras(path, _stems(files))
+    return kind == "frames" and bool(files) and _all(FRAME, files) and named
 
 
 def holds_folders(path: Path) -> bool:
@@ -94,17 +95,29 @@ def read_camera_folders(path: Path, selection: Selection) -> RawCapture:
     return _read(path, kind, rows, selection)
 
 
-def read_folders_of_cameras(path: Path, selection: Selection) -> RawCapture:
-    """Read a folder per expression or frame, which has a video or picture of each camera.
+def read_expression_folders(path: Path, selection: Selection) -> RawCapture:
+    """Read a folder per expression, which has a video or a picture of each camera.
 
     Raises as `read_camera_folders` does.
     """
+    return _read_inner(path, selection, lambda folder: (folder, 0))
+
+
+def read_frame_folders(path: Path, selection: Selection) -> RawCapture:
+    """Read a folder per frame, which has a picture of each camera.
+
+    Raises as `read_camera_folders` does.
+    """
+    return _read_inner(path, selection, lambda folder: (CLIP, _number(folder)))
+
+
+def _read_inner(path: Path, selection: Selection, moment_of: Callable[[str], Moment]) -> RawCapture:
+    """Read folders that hold all cameras' files of one moment each."""
     kind, files = _files_by_folder(path)
     rows: dict[str, dict[Moment, str]] = {stem: {} for stem in sorted(_stems(files))}
     for folder, names in files.items():
-        moment = (CLIP, _number(folder)) if kind == "frames" else (folder, 0)
         for name in names:
-            _add(rows[Path(name).stem], moment, f"{folder}/{name}")
+            _add(rows[Path(name).stem], moment_of(folder), f"{folder}/{name}")
     return _read(path, kind, rows, selection)
 
 
@@ -135,12 +148,11 @@ def _are_cameras(path: Path, names: Collection[str]) -> bool:
     """Return whether all names are cameras', by the calibration beside them or by their words."""
     file, ids = path / "calibration.json", {identifier(name) for name in names}
     known = set(read_cameras(file)) if names and file.is_file() else set()
-    return ids <= known if known & ids else bool(names) and all(map(CAMERA.fullmatch, names))
+    return ids <= known if known & ids else bool(names) and _all(CAMERA, names)
 
 
-def _are_people(names: Collection[str]) -> bool:
-    """Return whether each folder is a capture of its own, to judge by its name."""
-    return all(map(PERSON.fullmatch, names))
+def _all(pattern: re.Pattern[str], names: Collection[str]) -> bool:
+    return all(map(pattern.fullmatch, names))
 
 
 def _number(name: str) -> int:

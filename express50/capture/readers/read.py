@@ -87,12 +87,12 @@ LAYOUTS = (
         folders.fits_camera_folders, folder_id, folders.read_camera_folders, named=True,
     ),
     Layout(
-        "expression_folders", "a folder per expression, of videos such as cam_01.mp4",
-        folders.fits_expression_folders, folder_id, folders.read_folders_of_cameras, named=True,
+        "expression_folders", "a folder per expression, of videos or pictures such as cam_01.mp4",
+        folders.fits_expression_folders, folder_id, folders.read_expression_folders, named=True,
     ),
     Layout(
         "frame_folders", "a folder per frame, of pictures such as cam_01.png",
-        folders.fits_frame_folders, folder_id, folders.read_folders_of_cameras, named=True,
+        folders.fits_frame_folders, folder_id, folders.read_frame_folders, named=True,
     ),
 )  # fmt: skip
 

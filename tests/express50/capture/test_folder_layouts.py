@@ -59,9 +59,10 @@ def test_folders_of_pictures_are_a_rig(tmp_path, layout, names):
         ("camera_folders", "GoPro {c}/GoPro {c}_{e}.mp4"),
         ("camera_folders", "22190{c}/{e}.mp4"),
         ("expression_folders", "{e}/22190{c}_cam.mp4"),
+        ("expression_folders", "{e}/view {c}.png"),
     ],
 )
-def test_folders_of_videos_hold_expressions(tmp_path, layout, names):
+def test_names_of_files_or_folders_are_expressions(tmp_path, layout, names):
     expressions = ("look left", "smile")
     names = [names.format(c=c, e=e) for c in (0, 1) for e in expressions]
     root = write(tmp_path / "rig", names)
@@ -70,7 +71,8 @@ def test_folders_of_videos_hold_expressions(tmp_path, layout, names):
     assert detect(root).name == layout and found.clips == ("look_left", "smile")
     assert len(found.cameras) == 2 and "cues.csv" in found.warnings
     index = read_index(ingest_captures(tmp_path / "data", root), "rig")
-    assert index.cues == (Cue("look_left", 0, 2), Cue("smile", 3, 5))
+    length = FRAMES if names[0].endswith("mp4") else 1
+    assert index.cues == (Cue("look_left", 0, length - 1), Cue("smile", length, 2 * length - 1))
 
 
 def test_a_video_per_camera_folder_is_one_clip_whatever_its_name(tmp_path):
