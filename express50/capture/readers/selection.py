@@ -115,7 +115,8 @@ def check_selection(selection: Selection, sequences: Sequence[str], cameras: Seq
         CaptureError: a pattern matches nothing of the layout.
     """
     for what, patterns, known in (
-        ("sequences", (*selection.sequences, *selection.expressions), sequences),
+        ("sequences", selection.sequences, sequences),
+        ("[expressions]", tuple(selection.expressions), sequences),
         ("cameras", selection.cameras, cameras),
     ):
         for pattern in patterns:

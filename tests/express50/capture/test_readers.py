@@ -95,6 +95,11 @@ def test_renderme_of_two_actors_annotations_alone_or_an_unknown_camera_is_refuse
         CaptureError, match="'cam99', which matches nothing; expected some of cam00"
     ):
         read_any(tmp_path / "wishes")
+    (tmp_path / "wishes/capture.toml").write_text(
+        'source = "../raw/0026"\n[expressions]\ne99 = "a"\n'
+    )
+    with pytest.raises(CaptureError, match=r"\[expressions\] names 'e99'"):
+        read_any(tmp_path / "wishes")
     (tmp_path / "raw/0026/0027_e0_raw.smc").write_bytes(b"")
     with pytest.raises(CaptureError, match="0026, 0027"):
         subject_of(tmp_path / "raw" / "0026")
