@@ -185,10 +185,10 @@ def refine(
     rest = next((k for k, target in enumerate(targets) if target.neutral), None)
     for number, current in enumerate(schedule):
         meshes, turns = all_vertices(model, state), rotations(state)
-        pairs = zip(evidence.pictures, found, strict=True)
-        clear = [mask_things(pictures, own.hiding) for pictures, own in pairs]
         flows = {}
         if current.follow_skin and evidence.fine_map is not None:
+            pairs = zip(evidence.pictures, found, strict=True)
+            clear = [mask_things(pictures, own.hiding) for pictures, own in pairs]
             flows = skin_flows(model, evidence.fine_map, clear, meshes, rest)
         if current.patch_reach_m and number in THING_ROUNDS:
             rows = zip(found, evidence.pictures, meshes, turns, strict=True)

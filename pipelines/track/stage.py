@@ -57,7 +57,6 @@ from pipelines.track.state import (
 from pipelines.track.terms import Term
 
 SCHEMA = "express50.track/2"
-DECIMALS = 7
 # Number of modes along the skin (for each of three axes) per mode along the normals: texture
 # locates the skin less finely than patches do.
 ALONG_SHARE = 4 / 15
@@ -87,7 +86,7 @@ def run(
         raise StageError(f"{item}: no expression could be tracked ({reasons})")
     evidence = read_evidence(dataset, item, config, model, targets, state, schedule)
     state, targets, glasses = refine(basis, targets, state, evidence, schedule)
-    state = rounded(state, DECIMALS)
+    state = rounded(state)
     meshes = all_vertices(model, state)
     metrics = track_metrics(model, targets, meshes)
     sigma = vertex_sigma(basis, targets, state, free_modes(targets))

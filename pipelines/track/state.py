@@ -96,12 +96,10 @@ class Target:
     known: Quadratic | None = None  # evidence that was condensed to a quadratic
 
 
-def rounded(state: State, decimals: int) -> State:
-    """Drop the last digits, which may differ with another BLAS or machine."""
-    poses = tuple(
-        Pose(pose.own.round(decimals), pose.rotation.round(decimals)) for pose in state.poses
-    )
-    return State(state.shape.round(decimals), poses, state.bias.round(decimals))
+def rounded(state: State) -> State:
+    """Drop digits after the seventh decimal, which may differ with another BLAS or machine."""
+    poses = tuple(Pose(pose.own.round(7), pose.rotation.round(7)) for pose in state.poses)
+    return State(state.shape.round(7), poses, state.bias.round(7))
 
 
 def start_state(basis: Basis, poses: list[tuple[np.ndarray, np.ndarray]]) -> State:

@@ -281,9 +281,9 @@ class SkinSample:
     weights: Array  # (N, 3)
 
 
-def sample_skin(skin: IctSkin, count: int = 300_000) -> SkinSample:
+def sample_skin(skin: IctSkin) -> SkinSample:
     """Draw places evenly over ICT's skin."""
-    rng = np.random.default_rng(0)
+    rng, count = np.random.default_rng(0), 300_000
     a, b, c = (skin.points[skin.faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     corners = skin.faces[rng.choice(len(area), count, p=area / area.sum())]
