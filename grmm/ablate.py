@@ -57,10 +57,8 @@ class Variant:
     """One row of the ablation."""
 
     label: str  # its name in the table
-    # table -> key -> value over the common configuration
-    changes: Mapping[str, Mapping[str, object]]
-    # the paper's PSNR minus that of its full model; None if the paper has no figure
-    paper_db: float | None = None
+    changes: Mapping[str, Mapping[str, object]]  # table -> key -> value, over the common one
+    paper_db: float | None = None  # the paper's PSNR minus its full model's, if it has a figure
     against: str = "full"  # the row it is compared with
     trains_as: str = ""  # the row whose checkpoint it uses, if only the fit differs
     without: Path | None = None  # the folder of shards that it leaves out

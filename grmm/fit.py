@@ -338,8 +338,7 @@ class FitProtocol:
     """The views of an unseen person that a fit gets."""
 
     cameras: tuple[str, ...] = ()  # patterns of those to fit from; empty: the first by id
-    # patterns of those to fit; others are rendered with the codes of training
-    expression: str = "neutral"
+    expression: str = "neutral"  # patterns of those to fit; others get the codes of training
     images: int = 0  # the most to measure per person and kind, 0 = all
 
 

@@ -52,10 +52,8 @@ class Features:
 
     cameras: tuple[str, ...]  # ids of the cameras, the one that sees the face best first
     frames: np.ndarray  # (F,) numbers of the frames
-    # expression id -> rows of ``frames`` in its cue window, in order of time
-    windows: dict[str, np.ndarray]
-    # (F, N) zero at the subject's neutral; each camera has the same N / C features
-    values: np.ndarray
+    windows: dict[str, np.ndarray]  # expression id -> rows of ``frames`` of its cue, by time
+    values: np.ndarray  # (F, N) zero at the subject's neutral; the same N / C of each camera
     owner: np.ndarray  # (N,) landmark 0 to 67 that a feature belongs to or lies nearest to
     camera: np.ndarray  # (N,) which camera a feature is of, 0 to C - 1
     # (R,) rows of ``values`` in which the face should be at rest: the neutral clip and both ends of

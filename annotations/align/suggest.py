@@ -42,8 +42,7 @@ class Event:
 class Canonical:
     """The reference's canonical frame, in the subject's features."""
 
-    # (N,) unit vector of the movement; 0 in features the reference does not have
-    direction: np.ndarray
+    direction: np.ndarray  # (N,) unit vector of the movement; 0 where the reference lacks a feature
     level: float  # how far the movement was done in that frame, as a share of its apex
     side: int  # -1 before the apex, 1 after it, 0 at it
 

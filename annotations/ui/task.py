@@ -35,8 +35,7 @@ class TaskScene:
     last: int = 0  # frame of the cue window, inclusive
     cameras: tuple[str, ...] = ()  # ids from the suggestion's on, which sees the face best
     suggestion: Suggested | None = None  # what align suggested; None where it did not run
-    # the reference's canonical frame of the expression, or None
-    reference: CanonicalFrame | None = None
+    reference: CanonicalFrame | None = None  # the reference's frame of the expression
     reference_index: Index | None = None  # the reference's footage; None where it cannot be read
     is_reference: bool = False  # whether this subject is the reference itself
     mine: Label | None = None  # this annotator's label, or None
@@ -132,8 +131,7 @@ class CueView:
     first: int  # frame of the cue window
     last: int  # frame of the cue window, inclusive
     cursor: int  # the frame that is shown
-    # suggested frames, best first; empty where none is known or shown
-    candidates: tuple[int, ...] = ()
+    candidates: tuple[int, ...] = ()  # suggested frames, best first, where they are known and shown
     candidate: int = 0  # which of them was visited last
     plateau_first: int | None = None  # start of the plateau, if it was set
     plateau_last: int | None = None  # end of the plateau, if it was set

@@ -36,10 +36,8 @@ class CameraSource:
     width: int  # width of the footage, pixels
     height: int  # height of the footage, pixels
     frames: int  # number of frames that decode
-    # presentation time stamp of each frame (the frame's number for image files)
-    pts: tuple[int, ...]
-    # 64-bit difference hash of each frame, 16 hexadecimal digits, or UNKNOWN_HASH
-    dhash: tuple[str, ...]
+    pts: tuple[int, ...]  # presentation time stamps; the frame's number for image files
+    dhash: tuple[str, ...]  # 64-bit difference hashes, 16 hexadecimal digits, or UNKNOWN_HASH
     sha256: str  # digest of the video file, or of the image files' names and digests
     # images or videos in order, relative to the source; empty for a single video. An image may lie
     # in a container (`express50.files.containers`).
@@ -70,8 +68,7 @@ class Index:
     cameras: dict[str, CameraSource]  # usable cameras by id
     plates: dict[str, str]  # clean background plates by camera id, relative to the capture
     board: dict | None  # ``{"config": board.toml's content, "cameras": {id: [files]}}`` or None
-    # calibration file relative to the capture, or None; see `calibration_file`
-    calibration: str | None
+    calibration: str | None  # file relative to the capture, or None; see `calibration_file`
     cues: tuple[Cue, ...]  # scripted expressions, in file order
     # content of capture.toml without what describes the person (`demographics`)
     meta: dict = field(default_factory=dict)

@@ -46,11 +46,9 @@ class RawCamera:
     """Footage of one camera, as consecutive clips."""
 
     id: str
-    # ``video`` (``path`` is the file), ``videos`` (a file per clip) or ``frames`` (images)
-    kind: str
+    kind: str  # ``video`` (the file is ``path``), ``videos`` (a file per clip) or ``frames``
     path: Path  # the video, or the folder that ``names`` are relative to
-    # videos or images in order; an image may lie in a container (`files.containers`)
-    names: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()  # in order; an image may lie in a container (`files.containers`)
     counts: tuple[int, ...] = ()  # number of images of each clip; if empty, there is one clip
     stamps: tuple[int, ...] = ()  # the layout's own number for each image; if empty, its position
     # rows of a polynomial colour correction (`colour_correction`), or none
@@ -67,14 +65,10 @@ class RawCapture:
     fps: float  # frames per second
     meta: dict  # content of capture.toml
     cameras: dict[str, RawCamera]  # footage by camera id
-    # cameras that cannot be used, with the reason
-    dropped: dict[str, str] = field(default_factory=dict)
-    # given cameras, or None if they are to be calibrated
-    calibration: dict[str, Camera] | None = None
-    # background plates by camera id, relative to the root
-    plates: dict[str, str] = field(default_factory=dict)
-    # content of board.toml and files by camera, images or one video, or None
-    board: dict | None = None
+    dropped: dict[str, str] = field(default_factory=dict)  # unusable cameras, with the reason
+    calibration: dict[str, Camera] | None = None  # None if cameras are to be calibrated
+    plates: dict[str, str] = field(default_factory=dict)  # by camera id, relative to the root
+    board: dict | None = None  # content of board.toml, and each camera's images or one video
     cues: tuple[Cue, ...] = ()  # scripted expressions in file order
     # name of the layout in `express50.capture.readers.read`; ours is ``express50``
     layout: str = "express50"
@@ -83,8 +77,7 @@ class RawCapture:
     # parts of a layout that were left out (sequences, frames), with the reason
     skipped: dict[str, str] = field(default_factory=dict)
     found: dict = field(default_factory=dict)  # facts about the layout, for metrics
-    # oddities that may be intentional, with the reason
-    warnings: dict[str, str] = field(default_factory=dict)
+    warnings: dict[str, str] = field(default_factory=dict)  # oddities that may be intentional
 
 
 def read_capture(root: Path) -> RawCapture:

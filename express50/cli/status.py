@@ -54,8 +54,7 @@ class StageStatus:
     # ``not run``
     state: str
     done: int  # number of finished items
-    # receipts of items whose last attempt failed, unless they are running again
-    failed: tuple[Receipt, ...]
+    failed: tuple[Receipt, ...]  # items whose last attempt failed, unless they are running again
     running: dict[str, float]  # start of each item in progress, seconds since 1970
     # number of items of the last run that are waiting, or were not reached, and had not failed
     missing: int

@@ -91,12 +91,10 @@ def typical_error(metrics: Iterable[Mapping[str, Any]]) -> ExpectedError | None:
 class Result:
     """The outcome of one item, besides the files it wrote."""
 
-    # deterministic figures that JSON can hold
-    metrics: Mapping[str, Any] = field(default_factory=dict)
+    metrics: Mapping[str, Any] = field(default_factory=dict)  # deterministic, for JSON
     dropped: Sequence[Note] = ()  # parts of the item that were left out
     warnings: Sequence[Note] = ()  # parts that were kept although something about them is doubtful
-    # how wrong the item probably is; None where the stage cannot say
-    expected_error: ExpectedError | None = None
+    expected_error: ExpectedError | None = None  # None where the stage cannot say
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of ``metrics.json``."""
@@ -132,8 +130,7 @@ class Growth:
     items: tuple[str, ...] = ("subjects",)  # number of items
     time: tuple[str, ...] = ()  # seconds per item
     disk: tuple[str, ...] = ()  # bytes per item
-    # number of further items, such as one of plates per subject; none by default
-    more: tuple[str, ...] = ()
+    more: tuple[str, ...] = ()  # number of further items, such as one of plates per subject
     # longer side, pixels, to which the stage reduces pictures for most of its work at standard
     # settings, so that larger pictures take no longer; 0 if it does not
     side: int = 0
@@ -150,8 +147,7 @@ class Stage:
     name: str  # command, table in TOML and folder of the outputs
     version: int  # raise it when the same inputs and config give other outputs
     config: type  # frozen keyword-only dataclass; a string under each field documents it
-    # ids of the work items of a dataset; ``S001`` or nested ``S001/cam03``
-    items: Callable[[Dataset], list[str]]
+    items: Callable[[Dataset], list[str]]  # ids of work items; ``S001`` or nested ``S001/cam03``
     # what one item reads: paths are digested by content, strings are literal digests
     inputs: Callable[[Dataset, str, Any], dict[str, Path | str]]
     # ``run(dataset, item, config, out_dir)`` writes every file into ``out_dir`` and returns a

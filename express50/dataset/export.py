@@ -45,8 +45,7 @@ class Head:
     subject: str
     track: Track  # the chosen rows of the subject's track
     model: HeadModel  # the head model it was tracked with
-    # (H, W, 3) uint8 sRGB texture, first row at v = 1; None if there is no texture
-    albedo: np.ndarray | None
+    albedo: np.ndarray | None  # (H, W, 3) uint8 sRGB texture, if any, first row at v = 1
 
     def meta(self, kind: str) -> dict:
         """Make the part of ``export.json`` that all formats share."""

@@ -51,8 +51,7 @@ class AvatarOptions:
     background: str = "alpha"  # ``alpha`` (keep the alpha channel), or the colour behind the head
     head_only: bool = False  # use the regions stage's alpha of the head without the torso
     downscale: int = 1  # integer factor by which images are smaller than the footage
-    # divide each camera's images by its colour gain, as measured by calibrate
-    even_colour: bool = False
+    even_colour: bool = False  # divide images by the colour gains that calibrate measured
     # expressions held out for testing; None for the last three tenths
     test_expressions: tuple[str, ...] | None = None
     validation_camera: str | None = None  # camera held out of training; None for the last one

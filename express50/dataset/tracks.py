@@ -121,8 +121,7 @@ class Registration:
     vertices: np.ndarray  # (V, 3) float32 metres, world
     offsets: np.ndarray  # (V, 3) float32 metres, added to the rest shape of the tracked parameters
     seen: np.ndarray  # (V,) bool, True where the surface was found and trusted
-    # (V,) float32 metres, height of the surface above the mesh if seen, otherwise 0
-    residual: np.ndarray
+    residual: np.ndarray  # (V,) float32 metres, height of the surface above the mesh; 0 if unseen
     sigma: np.ndarray  # (V,) float32 metres, standard deviation of the vertices along their normals
     # (V,) float32 metres: along their normals nine vertices in ten are nearer than this to the true
     # ones; NaN if the file has none, as for a scan

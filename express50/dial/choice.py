@@ -131,8 +131,7 @@ class Point:
     settings: dict[str, str]  # name of each stage's setting
     seconds: float  # clock or core seconds for all items that are not made yet
     each: dict[str, float]  # the same per stage
-    # sum over the results of the error, relative to that at the most expensive settings
-    worse: float
+    worse: float  # sum of the results' errors, relative to those at the most expensive settings
     errors: dict[str, Expected]  # expected error of each result
 
 

@@ -124,12 +124,10 @@ class PilotFigures:
     """What was measured of a dataset."""
 
     key: str  # digest of stages, settings and machine; figures of another key say nothing
-    # the first at the cheapest settings, the second of one peak, then one step each
-    trials: list[Trial]
+    trials: list[Trial]  # first at the cheapest settings, then of one peak, then one step each
     # difference from the most expensive setting tried, by stage, setting and result
     losses: dict[str, dict[str, dict[str, float]]]
-    # settings that there was no time to try, by stage
-    untried: dict[str, list[str]] = field(default_factory=dict)
+    untried: dict[str, list[str]] = field(default_factory=dict)  # by stage, for lack of time
 
 
 def dial_dir(dataset: Dataset) -> Path:

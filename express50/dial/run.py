@@ -61,8 +61,7 @@ class RunState:
     goal: str  # as it was written, or empty
     spent: float = 0.0  # seconds, of the clock or of all cores
     settings: dict[str, str] = field(default_factory=dict)  # name of the setting of each stage
-    # stages that have begun, which keep their setting
-    begun: list[str] = field(default_factory=list)
+    begun: list[str] = field(default_factory=list)  # begun stages, which keep their setting
     # expected error of each result, as said before the start
     promised: dict[str, dict[str, Any]] = field(default_factory=dict)
     seconds: float = 0.0  # expected before the start

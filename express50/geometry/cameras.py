@@ -41,8 +41,7 @@ class Camera:
     width: int  # pixels
     height: int  # pixels
     model: str  # COLMAP's name of the model
-    # the model's parameters in COLMAP's order, in pixels or dimensionless
-    params: tuple[float, ...]
+    params: tuple[float, ...]  # the model's, in COLMAP's order, in pixels or dimensionless
     cam_from_world: np.ndarray  # (4, 4) rigid transform, OpenCV axes, metres
 
     def _named(self) -> dict[str, float]:

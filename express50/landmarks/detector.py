@@ -58,14 +58,12 @@ class Detection:
 
     points: np.ndarray  # (68, 2) pixels, corner origin, iBUG-68 order
     sigma: np.ndarray  # (68,) expected error in pixels (the scale of a Laplace distribution)
-    # (68,) in 0..1: score times the point's visibility, lowered if sigma is large
-    confidence: np.ndarray
+    confidence: np.ndarray  # (68,) in 0..1: score times visibility, lowered if sigma is large
     # in 0..1, how likely a face looks towards the camera: the network's probability, lowered if the
     # points are vague or other crops give other points. Low for backs of heads and if no head is
     # visible.
     score: float
-    # (17, 2) pixels, the edge of the face from ear to ear; None if it is unknown
-    outline: np.ndarray | None = None
+    outline: np.ndarray | None = None  # (17, 2) pixels, the edge of the face from ear to ear
 
     def marks(self) -> np.ndarray:
         """Return points (68, 2) as in published marks, where 0 to 16 lie on the outline."""

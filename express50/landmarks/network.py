@@ -70,8 +70,7 @@ class Output(NamedTuple):
     seen: torch.Tensor  # (B, 68) logit of whether the point is visible
     logit: torch.Tensor  # (B,) logit of whether a face looks towards the camera
     heat: torch.Tensor  # (B, 68, H / 4, W / 4) heat maps before the softmax
-    # (B, 17, 2) crop pixels; landmarks 0 to 16 if the network does not find it
-    outline: torch.Tensor
+    outline: torch.Tensor  # (B, 17, 2) crop pixels; landmarks 0 to 16 if the network lacks it
     outline_log_scale: torch.Tensor  # as for the landmarks
     outline_heat: torch.Tensor  # as for the landmarks
 

@@ -83,8 +83,7 @@ class RigVerdict:
     """Figures and warnings about a rig."""
 
     cameras: int  # number of cameras
-    # (3,) world point nearest to all axes, None if they are parallel
-    meeting: tuple[float, float, float] | None
+    meeting: tuple[float, float, float] | None  # nearest to all axes; None if parallel
     distance_m: float | None  # median distance of the cameras from it
     miss_mm: float | None  # median distance of the axes from it
     problem: str  # what is wrong, empty if nothing is

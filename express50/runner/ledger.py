@@ -61,8 +61,7 @@ class Receipt:
     core_seconds: float = 0.0  # processor time of the attempt; 0 in receipts of older versions
     peak_memory: int = 0  # largest resident memory while it ran, bytes
     attempts: int = 1  # number of tries in that run
-    # when the last attempt ended, seconds since 1970
-    time: float = field(default_factory=time.time)
+    time: float = field(default_factory=time.time)  # end of the last attempt, seconds since 1970
     # inputs and files of what was published; read by `Ledger.made`, not by `Ledger.read`
     made: Made | None = None
 

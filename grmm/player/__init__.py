@@ -65,11 +65,9 @@ class PlayerReport:
     gaussians: int  # drawn
     megabytes: float  # of the page
     agreement_db: float  # PSNR between its pictures and the full model's, in poses not fitted to
-    # PSNR of the full model's pictures against footage; None without footage
-    full_db: float | None = None
+    full_db: float | None = None  # PSNR of the full model's pictures against footage
     loss_db: float | None = None  # how much lower the page's PSNR is
-    # which samples: ``held out``, or ``seen`` where training saw all; or why none
-    footage: str | None = None
+    footage: str | None = None  # ``held out``, or ``seen`` where training saw all; or why none
     images: int = 0  # how many
 
     def __str__(self) -> str:

@@ -50,8 +50,7 @@ class Picture:
     grey: np.ndarray  # frame (h, w), uint8, in this box
     alpha: np.ndarray  # matte (h, w), uint8, in this box
     grains: np.ndarray  # (N,) `grain` at some pixels of the matte
-    # width of its sharpest edges at the small size, NaN with too few: how blurred it is
-    edge_px: float
+    edge_px: float  # how blurred it is: width of its sharpest edges at the small size, or NaN
 
     @property
     def matte(self) -> np.ndarray:

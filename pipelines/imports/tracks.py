@@ -66,8 +66,7 @@ class FlameStep:
 
     where: str  # its file, for messages
     arrays: Mapping[str, np.ndarray]  # by name, one row each
-    # ``shape`` and ``static_offset``, which all time steps have in common
-    shared: Mapping[str, np.ndarray]
+    shared: Mapping[str, np.ndarray]  # ``shape`` and ``static_offset`` of all time steps
     motion: np.ndarray  # (4, 4) rigid, from the other tool's world
     dynamic_mm: float  # largest displacement that this step alone has
 

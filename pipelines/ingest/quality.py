@@ -50,8 +50,7 @@ class CameraMeasurements:
     frames: np.ndarray  # (N,) the frames that were decoded
     moves: np.ndarray  # (N,) movement since the one before, grey levels
     cells: np.ndarray  # (N, 16, 16, 3) linear light
-    # frame and width of its sharpest edges, pixels, of some frames
-    widths: tuple[tuple[int, float], ...]
+    widths: tuple[tuple[int, float], ...]  # some frames, and the width of their sharpest edges
     tags: VideoTags | None = None  # what its first video says of its pictures; None if it has none
 
 

@@ -78,8 +78,7 @@ class CutView:
     camera: Camera  # pinhole, of the reduced picture
     rgb: np.ndarray  # (h, w, 3) uint8
     valid: np.ndarray  # (h, w) bool, pixels with footage
-    # (h, w) bool, the person's mask if it is known, as from a plate
-    known: np.ndarray | None = None
+    known: np.ndarray | None = None  # (h, w) bool, the person's mask if known, as from a plate
 
     @property
     def name(self) -> str:

@@ -400,8 +400,7 @@ class Agreement:
     # removed and filled pixels (h, w) bool of each camera whose matte is corrected
     removed: dict[str, np.ndarray] = field(default_factory=dict)
     filled: dict[str, np.ndarray] = field(default_factory=dict)
-    # cameras whose mattes were not changed, and why
-    warnings: list[Note] = field(default_factory=list)
+    warnings: list[Note] = field(default_factory=list)  # cameras with unchanged mattes, and why
     unchanged: str = ""  # why nothing was compared; empty if mattes were compared
 
 

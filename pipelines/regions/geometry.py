@@ -47,8 +47,7 @@ _REGIONS = (
 class HeadLabels:
     """The labels of a head model."""
 
-    # (F, 3) that can be seen; sheets without any region (lash cards) are left out
-    faces: np.ndarray
+    faces: np.ndarray  # (F, 3) that can be seen; sheets without a region (lash cards) are left out
     vertices: np.ndarray  # (V,) uint8 indices into LABELS, or SCALP
     end: np.ndarray  # (n,) indices of the vertices around the neck's lower end; empty if unknown
     missing: tuple[str, ...]  # names of LABELS that the model cannot give
@@ -161,8 +160,7 @@ class HeadGeometry:
     depth: np.ndarray  # (H, W) float32 camera z of the mesh, metres, 0 beside it
     near: np.ndarray  # (H, W) uint8 label at the nearest pixel of the mesh; 0 if no pixel shows it
     rim: np.ndarray  # (H, W) bool, just beyond the mesh
-    # (H, W) float32 metres above the neck's end; inf if the model does not mark it
-    height: np.ndarray
+    height: np.ndarray  # (H, W) float32 metres above the neck's end; inf if that is unknown
     # (H, W) float32 metres from the mesh to what is in front of its face; 0 where nothing is
     # CLEAR_M in front of it
     off: np.ndarray

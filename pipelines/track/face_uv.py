@@ -185,8 +185,7 @@ class FaceUvMap:
 
     samples: MeshPlaces  # T places on the mesh, one per texel that shows the head
     texels: np.ndarray  # (T, 2) their rows and columns
-    # (V, 2) column and row of every vertex, corner origin; far off where it has none
-    places: np.ndarray
+    places: np.ndarray  # (V, 2) vertices' columns and rows, corner origin; far off if without
     front: np.ndarray  # (F,) bool, faces of skin that the map shows, however small
     skin: np.ndarray  # (T,) bool, texels of skin: not of eyes, teeth or tongue
     fine: int = 1  # texels per side of a texel of the map that the network reads

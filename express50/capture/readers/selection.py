@@ -34,8 +34,7 @@ Moment = tuple[str, int]  # sequence, the layout's own frame number
 class Selection:
     """Parts of a layout to read; the names are the layout's own."""
 
-    # shell patterns of sequences to take; none takes the layout's usual ones
-    sequences: tuple[str, ...] = ()
+    sequences: tuple[str, ...] = ()  # shell patterns; none takes the layout's usual ones
     cameras: tuple[str, ...] = ()  # shell patterns of cameras to take; none takes all
     expressions: Mapping[str, str] = field(default_factory=dict)  # our expression id by sequence
     # length of one unit of the calibration's world; None where it is not given
