@@ -38,9 +38,8 @@ class ErrorModel:
     weights: np.ndarray  # (F,) weights of their logarithms; positive if a larger figure is worse
     limits: np.ndarray  # (F, 2) smallest and largest logarithm in the data
     scores: np.ndarray  # (K,) ascending knots of the table
-    # typical, bound: (K,) logarithms of the median error and of the bound, non-decreasing
-    typical: np.ndarray
-    bound: np.ndarray
+    typical: np.ndarray  # (K,) logarithms of the median error, non-decreasing
+    bound: np.ndarray  # (K,) logarithms of the bound, non-decreasing
     # 5th, 50th and 95th percentile of an item's error divided by the median of its elements'
     # typical errors
     item: tuple[float, float, float]

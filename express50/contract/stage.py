@@ -47,9 +47,8 @@ class ExpectedError:
     """How wrong a result probably is, judged without ground truth."""
 
     value: float  # expected error, in the stage's own measure (docs/FORMAT.md)
-    # low, high: bounds of the 90 % interval of the true error
-    low: float
-    high: float
+    low: float  # lower end of the 90 % interval of the true error
+    high: float  # upper end of it
     unit: Unit  # unit of all three
 
     def __post_init__(self) -> None:
