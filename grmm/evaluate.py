@@ -58,13 +58,10 @@ NAMED = 5  # most files that an error names
 
 @dataclass(frozen=True)
 class Journal:
-    """A file of rows measured so far, from which a measurement that was stopped continues.
-
-    ``made_from`` stands for everything that the rows depend on, except the code.
-    """
+    """A file of rows measured so far, from which a measurement that was stopped continues."""
 
     path: Path
-    made_from: str
+    made_from: str  # stands for everything that the rows depend on, except the code
 
 
 def training_render(model: GRMM, views: HeadViews) -> Render:

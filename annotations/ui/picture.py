@@ -105,16 +105,13 @@ AHEAD = 64  # frames about the cursor that are decoded before they are asked for
 
 
 class Aim(NamedTuple):
-    """The view of the pictures: camera (counted from the best), zoom, finder of faces.
+    """The view of the pictures."""
 
-    ``two`` asks for a second camera, of which ``second`` is the id that was chosen last.
-    """
-
-    camera: int
+    camera: int  # counted from the best
     zoom: str
     faces: FaceFinder | None
-    two: bool = False
-    second: str = ""
+    two: bool = False  # asks for a second camera
+    second: str = ""  # id of the second camera that was chosen last
 
 
 def camera_name(scene: TaskScene, number: int) -> str:

@@ -87,15 +87,12 @@ FAR = 10**9  # frames: beyond any window, whose ends stop the cursor
 
 
 class KeyAction(NamedTuple):
-    """Keys (Textual's names) of one action, how they are written for people, and what it does.
+    """The keys of one action."""
 
-    ``{key}`` in the action is replaced by the key's name.
-    """
-
-    keys: str
-    shown: str
-    action: str
-    words: str
+    keys: str  # Textual's names
+    shown: str  # how they are written for people
+    action: str  # ``{key}`` is replaced by the key's name
+    words: str  # what it does
 
 
 MOVE = (

@@ -51,14 +51,11 @@ TARGETS: dict[str, dict[str, float]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Measured:
-    """Holds what one stage cost in a dataset: per item, peak over items, and the preset.
+    """What one stage cost in a dataset."""
 
-    Seconds are processor time if the receipts hold it, else clock time.
-    """
-
-    seconds: tuple[float, ...]
-    bytes: float
-    memory: float
+    seconds: tuple[float, ...]  # per item, of processors if receipts hold them, else of the clock
+    bytes: float  # per item
+    memory: float  # most of all items
     preset: str
 
 

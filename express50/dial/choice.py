@@ -113,15 +113,15 @@ def _law(
 class Expected:
     """A result's expected error: value and interval.
 
-    Where no stage states this error (``stated`` is false), all three are the difference from the
-    result of the most expensive settings tried.
+    Where no stage states this error, all three are the difference from the result of the most
+    expensive settings tried.
     """
 
     value: float
     low: float
     high: float
     unit: str
-    stated: bool
+    stated: bool  # whether a stage states this error
 
 
 @dataclass(frozen=True)
@@ -301,15 +301,12 @@ def expected_errors(load: Workload, lost: Mapping[str, float]) -> dict[str, Expe
 
 
 class _State(NamedTuple):
-    """Settings of the first stages, seconds by stage, squares by result.
+    """What settings of the first stages take and lose."""
 
-    ``kept`` numbers those of `Workload.done` that were made with the same settings up to here.
-    """
-
-    settings: dict[str, str]
-    each: dict[str, float]
-    lost: dict[str, float]
-    kept: frozenset[int]
+    settings: dict[str, str]  # of these stages
+    each: dict[str, float]  # seconds by stage
+    lost: dict[str, float]  # squares by result
+    kept: frozenset[int]  # those of `Workload.done` made with the same settings up to here
 
 
 def front(load: Workload) -> list[Point]:

@@ -19,20 +19,16 @@ SHORT_SIDE = 0.75  # of a picture over its long side if its shape is not known
 
 @dataclass(frozen=True, kw_only=True)
 class Footage:
-    """Holds the size of a campaign; means over subjects where it was measured.
-
-    ``side`` is the length, pixels, to which the longer side of peak frames is reduced; 0: not.
-    ``shape`` is their shorter side over the longer one. Ingest decodes one of ``every`` frames.
-    """
+    """The size of a campaign; means over subjects where it was measured."""
 
     subjects: float
     expressions: float
     views: float
     pixels: float
     frames: float
-    side: float = 0.0
-    shape: float = SHORT_SIDE
-    every: float = 1.0
+    side: float = 0.0  # pixels, to which the longer side of peak frames is reduced; 0: not
+    shape: float = SHORT_SIDE  # their shorter side over the longer one
+    every: float = 1.0  # ingest decodes one of so many frames
 
     @property
     def decoded(self) -> float:
@@ -93,17 +89,14 @@ def _last_setting(dataset: Dataset, kind: str, default: float) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Cost:
-    """What an item of a stage costs: typical seconds, and bytes; the most memory.
-
-    ``extra`` are seconds of the clock that the stage took beside its items.
-    """
+    """What an item of a stage costs: typical seconds, and bytes; the most memory."""
 
     seconds: float
     core_seconds: float
     bytes: float
     memory: float
     items: int
-    extra: float = 0.0
+    extra: float = 0.0  # seconds of the clock that the stage took beside its items
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -39,16 +39,12 @@ def write_ply(
 
 @dataclass(frozen=True)
 class Surface:
-    """A reconstructed surface, as ``surface.ply`` holds it.
+    """A reconstructed surface, as ``surface.ply`` holds it."""
 
-    Vertices (N, 3) are in metres, faces (F, 3) are indices, colors (N, 3) are uint8 sRGB and
-    confidence (N,) is from 0 to 1.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    colors: np.ndarray
-    confidence: np.ndarray
+    vertices: np.ndarray  # (N, 3) metres
+    faces: np.ndarray  # (F, 3) indices
+    colors: np.ndarray  # (N, 3) uint8 sRGB
+    confidence: np.ndarray  # (N,) from 0 to 1
 
 
 def write_surface(

@@ -35,14 +35,11 @@ class Lens(NamedTuple):
 
 
 class Shot(NamedTuple):
-    """A posed image: its file name, its camera's number, and its world-to-camera pose.
+    """A posed image."""
 
-    ``pose`` is a quaternion (wxyz) followed by a translation.
-    """
-
-    name: str
-    camera: int
-    pose: tuple[float, ...]
+    name: str  # of its file
+    camera: int  # its camera's number
+    pose: tuple[float, ...]  # world to camera: quaternion (wxyz), then translation
 
 
 def is_colmap(path: Path) -> bool:

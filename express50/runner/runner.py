@@ -57,20 +57,16 @@ class RunMonitor(Protocol):
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of one item: ``done``, ``skipped`` (was current), ``failed`` or ``left``.
-
-    ``again`` says why an item was run that a former run had made already; it was ``restored``
-    where the same output had been made before and was replaced since.
-    """
+    """The result of one item."""
 
     item: str
-    status: str
+    status: str  # ``done``, ``skipped`` (was current), ``failed`` or ``left``
     reason: str = ""
     seconds: float = 0.0
     dropped: tuple[Note, ...] = ()
     warnings: tuple[Note, ...] = ()
-    again: str = ""
-    restored: bool = False
+    again: str = ""  # why it was run although a former run had made it
+    restored: bool = False  # the same output had been made before, and was replaced since
 
 
 @dataclass(frozen=True)

@@ -33,10 +33,7 @@ BATCH_SECONDS = 0.2  # after this time a batch begins no further item
 
 @dataclass(frozen=True)
 class Task:
-    """An item to run, with all that a worker needs.
-
-    ``former`` is the receipt of its output, ``folder`` the run's (`run_folder`).
-    """
+    """An item to run, with all that a worker needs."""
 
     stage: Stage
     dataset: Dataset
@@ -45,8 +42,8 @@ class Task:
     fingerprint: str
     inputs: dict[str, str]
     threads: int = 1
-    former: Receipt | None = None
-    folder: Path = Path()
+    former: Receipt | None = None  # of its output
+    folder: Path = Path()  # the run's (`run_folder`)
 
 
 def input_digests(

@@ -48,17 +48,14 @@ _STYLES = {
 
 @dataclass(frozen=True, kw_only=True)
 class HairMesh:
-    """Ribbons in rest head space: vertices, faces, unit tangents, outward normals, colours.
-
-    ``moves`` (N,) is the head vertex that each vertex moves with, or -1 for the skull.
-    """
+    """Ribbons in rest head space."""
 
     vertices: np.ndarray
     faces: np.ndarray
-    tangents: np.ndarray
-    normals: np.ndarray
+    tangents: np.ndarray  # unit
+    normals: np.ndarray  # outward
     colours: np.ndarray
-    moves: np.ndarray
+    moves: np.ndarray  # (N,) the head vertex that each vertex moves with, or -1 for the skull
 
 
 def join_hair(meshes: list[HairMesh]) -> HairMesh:

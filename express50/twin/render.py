@@ -26,14 +26,11 @@ _DEPTH_STEP = 0.004  # metres between neighbours that count as an edge inside th
 
 @dataclass(frozen=True, kw_only=True)
 class Sampling:
-    """Rays per pixel: at silhouettes and loose hair, and at detail inside the silhouette.
+    """Rays per pixel."""
 
-    If `sparing`, silhouette pixels whose first third of rays agree get no more.
-    """
-
-    edge: int = 9
-    inside: int = 2
-    sparing: bool = True
+    edge: int = 9  # at silhouettes and loose hair
+    inside: int = 2  # at detail inside the silhouette
+    sparing: bool = True  # silhouette pixels whose first third of rays agree get no more
 
 
 @dataclass(frozen=True, kw_only=True)

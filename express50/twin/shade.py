@@ -94,18 +94,14 @@ def find_eyes(model: HeadModel) -> TwinEyes:
 
 @dataclass(frozen=True, kw_only=True)
 class LitScene:
-    """One frame ready for rays: compiled geometry and per-vertex attributes.
-
-    ``attributes`` (N, 9 + L) are normal, place or colour, incoming diffuse light (RGB), and the
-    visible share of each soft box.
-    """
+    """One frame ready for rays: compiled geometry and per-vertex attributes."""
 
     caster: Caster
     body: Body
     texture: SkinTexture
     eyes: TwinEyes
     lighting: Lighting
-    attributes: np.ndarray
+    attributes: np.ndarray  # (N, 9 + L) normal, place or colour, diffuse light, share of soft boxes
     posed: Posed
     iris_lattice: np.ndarray
     living: LivingSkin | None

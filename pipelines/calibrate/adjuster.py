@@ -28,19 +28,14 @@ BEHIND = 1e4  # residual of a point behind its camera, in sigmas
 
 @dataclass(frozen=True, kw_only=True)
 class RigPriors:
-    """Standard deviations of the unknowns about their expected values: 0 holds, inf frees them.
-
-    `focal` and `focal_spread` (against the mean of pictures of the same size) are shares of the
-    focal length, `centre` is a share of the image's diagonal. `bend` is the first radial term's
-    effect at the image's corner, as a share of half the diagonal.
-    """
+    """Standard deviations of the unknowns about their expected values: 0 holds, inf frees them."""
 
     turn_rad: float = np.inf
     move_m: float = np.inf
-    focal: float = 0.0
-    focal_spread: float = np.inf
-    centre: float = 0.0
-    bend: float = 0.0
+    focal: float = 0.0  # share of the focal length
+    focal_spread: float = np.inf  # the same, against the mean of pictures of the same size
+    centre: float = 0.0  # share of the image's diagonal
+    bend: float = 0.0  # the first radial term's effect at the corner, over half the diagonal
 
 
 @dataclass(frozen=True)
@@ -304,14 +299,13 @@ def _linearise(rig: list[Camera], tracks: PointTracks, points: np.ndarray) -> _L
 class Normal(NamedTuple):
     """Normal equations of C cameras with K unknowns, from which G groups with M are eliminated.
 
-    `diagonal` (C K,) is the full system's, the rest the reduced one's. `follow` gives the groups'
-    steps (G, M) after a step (C K,) of the cameras. Source: Triggs et al., section 6.1.
+    Source: Triggs et al., section 6.1.
     """
 
     cameras: np.ndarray
     right: np.ndarray
-    diagonal: np.ndarray
-    follow: Callable[[np.ndarray], np.ndarray]
+    diagonal: np.ndarray  # (C K,) the full system's, the rest the reduced one's
+    follow: Callable[[np.ndarray], np.ndarray]  # the groups' steps (G, M) after a step (C K,)
 
 
 def _eliminate_points(

@@ -45,16 +45,13 @@ class Board:
 
 @dataclass(frozen=True)
 class BoardCorners:
-    """Board corners found in images, one row each.
-
-    `camera` and `frame` (N,) index `cameras` and `frames`; `corner` (N,) is the id on the board.
-    """
+    """Board corners found in images, one row each."""
 
     cameras: tuple[str, ...]
     frames: tuple[str, ...]
-    camera: np.ndarray
-    frame: np.ndarray
-    corner: np.ndarray
+    camera: np.ndarray  # (N,) index of `cameras`
+    frame: np.ndarray  # (N,) index of `frames`
+    corner: np.ndarray  # (N,) id on the board
     pixels: np.ndarray
 
     def select(self, keep: np.ndarray) -> BoardCorners:
@@ -260,14 +257,11 @@ def gather(
 
 @dataclass(frozen=True)
 class BoardFootage:
-    """One camera's pictures of the board: image files, or the frames of a video, by name.
-
-    `times` are the video's time stamps, none for images; `orientation` is how its frames lie.
-    """
+    """One camera's pictures of the board: image files, or the frames of a video, by name."""
 
     pictures: Mapping[str, Path]
-    times: tuple[int, ...] = ()
-    orientation: int = 1
+    times: tuple[int, ...] = ()  # the video's time stamps, none for images
+    orientation: int = 1  # how its frames lie
 
     def read(self, names: Sequence[str]) -> Iterator[tuple[str, Path, np.ndarray]]:
         """Yield name, file and image (H, W, 3) uint8 of the pictures that there are, in order."""

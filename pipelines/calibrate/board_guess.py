@@ -34,14 +34,12 @@ poses come from one view each with rough intrinsics."""
 
 @dataclass(frozen=True)
 class BoardView:
-    """Corners of one board image: points (N, 3) metres, pixels (N, 2), and these normalised.
-
-    `ideal` (N, 2) is without distortion; empty until the camera is known.
-    """
+    """Corners of one board image."""
 
     frame: int
-    points: np.ndarray
-    pixels: np.ndarray
+    points: np.ndarray  # (N, 3) metres
+    pixels: np.ndarray  # (N, 2)
+    # (N, 2) normalised, without distortion; empty until the camera is known
     ideal: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
 
 

@@ -23,16 +23,11 @@ LEAST_SHARED = 12  # squares that two cameras must see together to be compared
 
 @dataclass(frozen=True)
 class ColourGains:
-    """The responses of cameras to the same light.
+    """The responses of cameras to the same light."""
 
-    `gain` is linear light (3,) over the cameras' geometric mean, of the cameras that could be
-    measured. `before` and `after` the gains are divided out: median departure of a square's light
-    from its mean over cameras, percent; None if no two cameras could be compared.
-    """
-
-    gain: dict[str, np.ndarray]
-    before: float | None
-    after: float | None
+    gain: dict[str, np.ndarray]  # linear light (3,) over the cameras' geometric mean
+    before: float | None  # median departure of a square's light from its mean over cameras, percent
+    after: float | None  # the same with the gains divided out; None if no two compare
     squares: int
 
 

@@ -80,31 +80,23 @@ BLIND = (
 
 @dataclass(frozen=True)
 class EyeScale:
-    """How many metres a unit is by the distance between the eyes.
-
-    It was measured in `frame_sets` frame sets; `spread` is its robust standard deviation, as a
-    share.
-    """
+    """How many metres a unit is by the distance between the eyes."""
 
     metres: float
-    frame_sets: int
-    spread: float
+    frame_sets: int  # in which it was measured
+    spread: float  # its robust standard deviation, as a share
 
 
 @dataclass(frozen=True)
 class FootageSolution:
-    """A rig solved from footage, in metres and in the canonical world.
-
-    `errors` (N, 2), pixels, are those of `tracks`; `inliers` (N,) marks the features that are not
-    mismatches. `dropped` and `weak` (held by the face alone) give a reason per camera.
-    """
+    """A rig solved from footage, in metres and in the canonical world."""
 
     cameras: dict[str, Camera]
     tracks: PointTracks
-    errors: np.ndarray
-    inliers: np.ndarray
-    dropped: dict[str, str]
-    weak: dict[str, str]
+    errors: np.ndarray  # (N, 2) pixels, of the tracks
+    inliers: np.ndarray  # (N,) marks the features that are not mismatches
+    dropped: dict[str, str]  # a reason per camera
+    weak: dict[str, str]  # a reason per camera held by the face alone
     uncertainty: dict[str, HeadError]
     eyes: EyeScale
 

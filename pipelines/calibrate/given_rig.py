@@ -72,22 +72,16 @@ class CameraMove:
 
 @dataclass(frozen=True)
 class FootageCheck:
-    """The result of checking cameras against `points` that two or more of them see.
-
-    `error_px` is the median reprojection error, None without points. `moved` lists the surest
-    first; `cameras` have the corrected poses. `unchecked` gives a reason per camera, and `mirrored`
-    the reason to believe that a camera's pictures are. `exchanged` are pairs of cameras that fit
-    each other's footage, `size` says what is odd about the size of heads, and is empty otherwise.
-    """
+    """The result of checking cameras against points that two or more of them see."""
 
     points: int
-    error_px: float | None
-    moved: dict[str, CameraMove]
-    unchecked: dict[str, str]
-    mirrored: dict[str, str]
-    exchanged: tuple[tuple[str, str], ...]
-    size: str
-    cameras: dict[str, Camera]
+    error_px: float | None  # median reprojection error, None without points
+    moved: dict[str, CameraMove]  # the surest first
+    unchecked: dict[str, str]  # a reason per camera
+    mirrored: dict[str, str]  # the reason to believe that a camera's pictures are
+    exchanged: tuple[tuple[str, str], ...]  # pairs of cameras that fit each other's footage
+    size: str  # what is odd about the size of heads, or empty
+    cameras: dict[str, Camera]  # with the corrected poses
 
 
 def check_footage(
@@ -292,15 +286,12 @@ def _turn_and_move(before: Camera, after: Camera) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class RefinedRig:
-    """Cameras after refinement, and median errors of held-out points before and after.
-
-    `kept` is the reason why the given cameras stayed, empty if they were replaced.
-    """
+    """Cameras after refinement, and median errors of held-out points before and after."""
 
     cameras: dict[str, Camera]
     before_px: float
     after_px: float
-    kept: str
+    kept: str  # why the given cameras stayed, empty if they were replaced
 
     def figures(self, given: Mapping[str, Camera]) -> dict[str, object]:
         """Return metrics, including how far each camera was turned and moved."""

@@ -54,17 +54,13 @@ COLOUR_FRAMES = 12  # board images read per camera if only its colours are neede
 
 @dataclass(frozen=True)
 class CalibratedRig:
-    """The cameras of one subject in the canonical world, and what is reported about them.
+    """The cameras of one subject in the canonical world, and what is reported about them."""
 
-    `source` is given, board or footage, `figures` are metrics that only this source has. Errors
-    are rms over all observations; None for given cameras.
-    """
-
-    source: str
+    source: str  # given, board or footage
     cameras: dict[str, Camera]
-    reprojection_px: float | None = None
+    reprojection_px: float | None = None  # rms over all observations; None for given cameras
     per_camera_px: Mapping[str, float | None] = field(default_factory=dict)
-    figures: Mapping[str, object] = field(default_factory=dict)
+    figures: Mapping[str, object] = field(default_factory=dict)  # of this source only
     gains: ColourGains | None = None
     solution: BoardSolution | None = None
     dropped: tuple[Note, ...] = ()

@@ -28,12 +28,11 @@ LEAST_IMAGES = 6  # in which a board moves, for an estimate
 class CameraTiming:
     """The delay of a camera, in frames of the board's recording, with standard deviations.
 
-    `late` is against the median camera; `readout` is how much later its last row is than its first.
     Values that are not surely different from zero are zero.
     """
 
-    late: float
-    readout: float
+    late: float  # against the median camera
+    readout: float  # how much later its last row is than its first
     late_sigma: float
     readout_sigma: float
 

@@ -35,17 +35,13 @@ LEAST_POINTS = 20  # that a camera must share with two others to be judged by th
 
 @dataclass(frozen=True)
 class PointTracks:
-    """Observations of points, one row per camera and point; no camera sees a point twice.
-
-    `camera` (N,) indexes `names`; rows with one number in `point` (N,) show the same point.
-    `pixels` (N, 2) are as recorded, `sigma` (N,) are their expected errors.
-    """
+    """Observations of points, one row per camera and point; no camera sees a point twice."""
 
     names: tuple[str, ...]
-    camera: np.ndarray
-    point: np.ndarray
-    pixels: np.ndarray
-    sigma: np.ndarray
+    camera: np.ndarray  # (N,) index of `names`
+    point: np.ndarray  # (N,) rows with the same number show the same point
+    pixels: np.ndarray  # (N, 2) as recorded
+    sigma: np.ndarray  # (N,) their expected errors
 
     def select(self, keep: np.ndarray) -> PointTracks:
         """Keep the rows where `keep` (N,) is true, of points that two cameras still see."""
@@ -75,12 +71,9 @@ class PointTracks:
 
 @dataclass(frozen=True)
 class FrameSetPoints:
-    """The points that the cameras of one frame set saw, in recorded pixels.
+    """The points that the cameras of one frame set saw, in recorded pixels."""
 
-    `landmarks` are camera, points (68, 2) and sigma (68,) of each view of the face.
-    """
-
-    landmarks: list[tuple[str, np.ndarray, np.ndarray]]
+    landmarks: list[tuple[str, np.ndarray, np.ndarray]]  # camera, (68, 2), sigma (68,)
     features: dict[str, Features]
 
     def without(self, names: Container[str]) -> FrameSetPoints:

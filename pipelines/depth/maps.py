@@ -74,23 +74,17 @@ def picture_of(camera: Camera, rgb: np.ndarray, alpha: np.ndarray) -> Picture:
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """The maps (h, w) of the surface in a window of one camera, `valid` where inside the matte.
+    """The maps (h, w) of the surface in a window of one camera."""
 
-    Depth is in metres, normals (h, w, 3) in camera axes, both 0 where not valid. `covered` is the
-    share of the matte with depth, `spill` that of the surface outside. `figures` describe how well
-    each of the N valid pixels is known; `bounds` follow from them. `window` are the rows and
-    columns of a picture of `size` (H, W), None if the maps cover it.
-    """
-
-    depth: np.ndarray
-    valid: np.ndarray
-    normals: np.ndarray
-    covered: float
-    spill: float
-    figures: Mapping[str, np.ndarray | float]
-    bounds: Bounds | None = None
-    window: tuple[slice, slice] | None = None
-    size: tuple[int, int] = (0, 0)
+    depth: np.ndarray  # metres, 0 where not valid
+    valid: np.ndarray  # inside the matte
+    normals: np.ndarray  # (h, w, 3) camera axes, 0 where not valid
+    covered: float  # share of the matte with depth
+    spill: float  # share of the surface outside
+    figures: Mapping[str, np.ndarray | float]  # how well each of N valid pixels is known
+    bounds: Bounds | None = None  # that follow from the figures
+    window: tuple[slice, slice] | None = None  # rows and columns; None if the maps cover all
+    size: tuple[int, int] = (0, 0)  # (H, W) of the picture
 
     def whole(self, values: np.ndarray) -> np.ndarray:
         """Return values (h, w[, C]) of the window as those of the picture (H, W[, C]), else 0."""
@@ -111,27 +105,20 @@ class DepthMaps:
 
 @dataclass(frozen=True)
 class ComparedView:
-    """One camera's colours (H, W, 3) float32, 8-bit steps, at the size of the comparison.
-
-    `depth` (H, W) is in metres, 0 where there is none; `plain` (H, W) pixels lie off every edge and
-    see the surface at no flat angle.
-    """
+    """One camera's colours at the size of the comparison."""
 
     camera: Camera
-    colour: np.ndarray
-    depth: np.ndarray
-    plain: np.ndarray
+    colour: np.ndarray  # (H, W, 3) float32, 8-bit steps
+    depth: np.ndarray  # (H, W) metres, 0 where there is none
+    plain: np.ndarray  # (H, W) pixels off every edge that see the surface at no flat angle
 
 
 @dataclass(frozen=True)
 class PhotoErrors:
-    """Photometric errors (H, W), 8-bit steps, of one view; NaN where no neighbour sees the point.
+    """Photometric errors of one view."""
 
-    ``compared`` is the share that they see.
-    """
-
-    errors: np.ndarray
-    compared: float
+    errors: np.ndarray  # (H, W) 8-bit steps; NaN where no neighbour sees the point
+    compared: float  # share of pixels that neighbours see
 
     def figures(self) -> dict[str, float]:
         """Summarise the errors and the shares compared and consistent for the metrics."""

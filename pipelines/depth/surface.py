@@ -47,19 +47,15 @@ class HeadMesh(NamedTuple):
 
 @dataclass(frozen=True)
 class HeadSurface:
-    """The reconstructed head: a mesh as HeadMesh, and the signed distances it was taken from.
-
-    Confidence (V,) is in [0, 1], 0.3 where only silhouettes are evidence; colors (V, 3) are uint8
-    sRGB; `figures` are for the metrics.
-    """
+    """The reconstructed head: a mesh as HeadMesh, and the signed distances it was taken from."""
 
     vertices: np.ndarray
     normals: np.ndarray
     faces: np.ndarray
-    confidence: np.ndarray
-    colors: np.ndarray
+    confidence: np.ndarray  # (V,) in [0, 1], 0.3 where only silhouettes are evidence
+    colors: np.ndarray  # (V, 3) uint8 sRGB
     grid: LevelSet
-    figures: dict = field(default_factory=dict)
+    figures: dict = field(default_factory=dict)  # for the metrics
 
 
 def extract_mesh(grid: LevelSet) -> HeadMesh:

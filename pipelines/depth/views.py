@@ -35,15 +35,12 @@ CELLS = 64  # along the sides of the box in which views are compared
 
 @dataclass(frozen=True)
 class DepthView:
-    """One usable pinhole camera with its frame (H, W, 3) uint8 sRGB and matte (H, W) in [0, 1].
-
-    `silhouette_px` (H, W) is the signed distance to the matte's outline, positive inside.
-    """
+    """One usable pinhole camera."""
 
     camera: Camera
-    rgb: np.ndarray
-    alpha: np.ndarray
-    silhouette_px: np.ndarray
+    rgb: np.ndarray  # frame (H, W, 3) uint8 sRGB
+    alpha: np.ndarray  # matte (H, W) in [0, 1]
+    silhouette_px: np.ndarray  # (H, W) signed distance to the matte's outline, positive inside
 
 
 def make_view(camera: Camera, rgb: np.ndarray, alpha: np.ndarray, side: int) -> DepthView:
@@ -262,14 +259,11 @@ def without_contradiction(views: Sequence[DepthView]) -> tuple[list[DepthView], 
 
 
 class _Vote(NamedTuple):
-    """One view's evidence about P cells of space: which ones its matte allows, and their pixels.
+    """One view's evidence about P cells of space."""
 
-    ``pixel`` (P,) is a flat index of ``matte`` (h, w), about one pixel per cell, -1 where unseen.
-    """
-
-    allows: np.ndarray
-    pixel: np.ndarray
-    matte: np.ndarray
+    allows: np.ndarray  # (P,) which ones its matte allows
+    pixel: np.ndarray  # (P,) flat index of the matte, about one pixel per cell; -1 where unseen
+    matte: np.ndarray  # (h, w)
 
 
 def _vote(view: DepthView, points: np.ndarray, cell: float) -> _Vote:

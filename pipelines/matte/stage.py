@@ -57,14 +57,11 @@ MatteFunction = Callable[[np.ndarray, Any, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class CameraMatte:
-    """The matte of one camera alone: alpha (H, W) uint8, and the frame reduced to `SHOWN`.
+    """The matte of one camera alone."""
 
-    `noise` is the `wall_noise` of the full frame.
-    """
-
-    alpha: np.ndarray
-    rgb: np.ndarray
-    noise: float
+    alpha: np.ndarray  # (H, W) uint8
+    rgb: np.ndarray  # the frame reduced to `SHOWN`
+    noise: float  # `wall_noise` of the full frame
     plated: bool = True
 
 

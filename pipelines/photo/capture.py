@@ -77,15 +77,12 @@ CAM_FROM_WORLD = FLIP_YZ
 
 @dataclass(frozen=True)
 class PhotoSource:
-    """A photograph or video, with EXIF's orientation (1 is upright) and focal length.
-
-    `film_mm` is that on 35 mm film with the same diagonal angle of view; 0 if unknown.
-    """
+    """A photograph or video."""
 
     path: Path
     video: bool
-    orientation: int = 1
-    film_mm: float = 0.0
+    orientation: int = 1  # EXIF's, 1 is upright
+    film_mm: float = 0.0  # focal length on 35 mm film of the same diagonal angle; 0 if unknown
 
 
 def open_picture(path: Path) -> PhotoSource:
@@ -138,12 +135,11 @@ def guess_focal(picture: PhotoSource, width: int, height: int, film_mm: float) -
 class Focal:
     """A focal length, pixels, and its evidence.
 
-    `source` is `given`, `exif`, `guess`, or `fit` where the face moved the guess. The face is
-    explained as well by any focal length from `low` to `high`, within the ladder.
+    The face is explained as well by any from `low` to `high`, within the ladder.
     """
 
     pixels: float
-    source: str
+    source: str  # `given`, `exif`, `guess`, or `fit` where the face moved the guess
     low: float
     high: float
 

@@ -189,17 +189,14 @@ class FaceView:
 
 @dataclass(frozen=True)
 class _Shot:
-    """A crop about the head: picture (H, W, 3), matte (H, W), grey root of light (H, W).
-
-    `mesh` and `depth` (H, W) are what `render_head` says of the head.
-    """
+    """A crop about the head."""
 
     camera: Camera
-    rgb: np.ndarray
-    alpha: np.ndarray
-    grey: np.ndarray
-    mesh: np.ndarray
-    depth: np.ndarray
+    rgb: np.ndarray  # (H, W, 3)
+    alpha: np.ndarray  # (H, W) matte
+    grey: np.ndarray  # (H, W) root of light
+    mesh: np.ndarray  # (H, W) labels of `render_head`
+    depth: np.ndarray  # (H, W) depth of `render_head`
 
 
 @dataclass(frozen=True)

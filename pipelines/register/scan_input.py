@@ -46,16 +46,13 @@ _FIX = "docs/FORMAT.md, section Scans, has the layouts"
 
 @dataclass(frozen=True)
 class Scan:
-    """A scan in metres: vertices (N, 3), faces (F, 3), colors (N, 3) in linear light.
+    """A scan in metres."""
 
-    `unit` is the one of the file, a key of UNITS; `textured` says whether the file has colours.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    colors: np.ndarray
-    unit: str
-    textured: bool
+    vertices: np.ndarray  # (N, 3)
+    faces: np.ndarray  # (F, 3)
+    colors: np.ndarray  # (N, 3) in linear light
+    unit: str  # the file's, a key of UNITS
+    textured: bool  # whether the file has colours
 
 
 def read_scan(path: Path) -> Scan:

@@ -53,15 +53,12 @@ EVEN_LIGHT = np.repeat(np.eye(9)[:, :1], 3, axis=1)
 
 @dataclass(frozen=True)
 class SampleColours:
-    """The colours (C, S, 3), root of linear light, that C cameras show at S samples of a frame set.
-
-    Weights (C, S) are 0 where a sample is not seen; normals (S, 3) are of the world.
-    """
+    """The colours that C cameras show at S samples of a frame set."""
 
     cameras: tuple[str, ...]
-    values: np.ndarray
-    weights: np.ndarray
-    normals: np.ndarray
+    values: np.ndarray  # (C, S, 3) root of linear light
+    weights: np.ndarray  # (C, S) 0 where a sample is not seen
+    normals: np.ndarray  # (S, 3) world
 
 
 @dataclass(frozen=True)

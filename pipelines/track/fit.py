@@ -141,13 +141,10 @@ def consistent_sigma(target: Target, marks: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Expression:
-    """One expression's terms, the landmarks' first, on the vertices that they are about.
-
-    `anchors` are the terms' anchors with vertices counted among those of `points`.
-    """
+    """One expression's terms, the landmarks' first, on the vertices that they are about."""
 
     terms: tuple[Term, ...]
-    anchors: tuple[MeshPlaces, ...]
+    anchors: tuple[MeshPlaces, ...]  # the terms', of vertices counted among those of `points`
     points: Points
     neutral: bool
     single_view: bool

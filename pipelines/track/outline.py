@@ -39,16 +39,12 @@ BARE = ("face", "nose", "lips")
 
 @dataclass(frozen=True)
 class OutlineTerm:
-    """Vertices on the mesh's outline should lie on the outline of one view's matte.
-
-    `sigma` (n, 2) are standard deviations in pixels, inside and outside the matte; inside it the
-    pull fades at `gap` (n,) pixels.
-    """
+    """Vertices on the mesh's outline should lie on the outline of one view's matte."""
 
     distance: SignedDistance
     anchors: MeshPlaces
-    sigma: np.ndarray
-    gap: np.ndarray
+    sigma: np.ndarray  # (n, 2) standard deviations, pixels, inside and outside the matte
+    gap: np.ndarray  # (n,) pixels at which the pull fades inside the matte
 
     @classmethod
     def of(

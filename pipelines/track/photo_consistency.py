@@ -60,16 +60,12 @@ SkinSamples = list[tuple[MeshPlaces, float]]
 
 @dataclass(frozen=True)
 class PatchSearch:
-    """The heights (S,) that a search found, metres along the normals.
+    """The heights that a search found at S samples."""
 
-    `score` (S,) is the views' mean correlation there, 0 where nothing was found, `sharpness` (S,)
-    its margin over any other height; `pixel` is the width of a pixel at the samples, metres.
-    """
-
-    height: np.ndarray
-    score: np.ndarray
-    sharpness: np.ndarray
-    pixel: float
+    height: np.ndarray  # (S,) metres along the normals
+    score: np.ndarray  # (S,) the views' mean correlation there, 0 where nothing was found
+    sharpness: np.ndarray  # (S,) the score's margin over any other height
+    pixel: float  # width of a pixel at the samples, metres
 
 
 @dataclass(frozen=True)

@@ -37,26 +37,20 @@ MARGIN = 0.15  # around the head in its crop, as a share of the head's size
 
 @dataclass(frozen=True)
 class HeadCrop:
-    """One camera's picture (H, W, 3) uint8 sRGB of a frame set, cropped to the head.
+    """One camera's picture of a frame set, cropped to the head."""
 
-    `camera` is the crop's; `alpha` (H, W) uint8 is 255 where the subject is, None without a matte.
-    """
-
-    camera: Camera
-    image: np.ndarray
-    alpha: np.ndarray | None
+    camera: Camera  # the crop's
+    image: np.ndarray  # (H, W, 3) uint8 sRGB
+    alpha: np.ndarray | None  # (H, W) uint8, 255 where the subject is
 
 
 @dataclass(frozen=True)
 class SignedDistance:
-    """Signed distance (H, W) to a matte's edge in pixels of its camera, positive outside.
+    """Signed distance to a matte's edge."""
 
-    A cell is `step` (2,) pixels of the camera wide and high.
-    """
-
-    values: np.ndarray
+    values: np.ndarray  # (H, W) pixels of the camera, positive outside
     camera: Camera
-    step: np.ndarray
+    step: np.ndarray  # (2,) pixels of the camera that a cell is wide and high
 
 
 @dataclass(frozen=True)

@@ -158,17 +158,13 @@ class PointTerm:
 
 @dataclass(frozen=True)
 class NormalTerm:
-    """Places should lie on the surface: only the distance along a normal counts.
-
-    Goals (n, 3) and unit normals (n, 3) are of the world, sigma (n,) is in metres; a point further
-    off than `outlier` metres is more likely wrong than the mesh.
-    """
+    """Places should lie on the surface: only the distance along a normal counts."""
 
     anchors: MeshPlaces
-    goals: np.ndarray
-    normals: np.ndarray
-    sigma: np.ndarray
-    outlier: float
+    goals: np.ndarray  # (n, 3) world
+    normals: np.ndarray  # (n, 3) unit, world
+    sigma: np.ndarray  # (n,) metres
+    outlier: float  # metres off, beyond which a point is more likely wrong than the mesh
 
     def residuals(self, places: np.ndarray) -> Residuals:
         """Return the distance along the normal, over sigma."""
@@ -185,12 +181,11 @@ class NormalTerm:
 class SlideTerm:
     """Places should slide along the skin to where it belongs; the distance off it does not count.
 
-    `marks` are the landmarks of the 68 among them, none where the skin's texture is followed; the
-    rest is as in NormalTerm.
+    The rest is as in NormalTerm.
     """
 
     anchors: MeshPlaces
-    marks: np.ndarray
+    marks: np.ndarray  # landmarks of the 68 among them; none where the skin's texture is followed
     goals: np.ndarray
     normals: np.ndarray
     sigma: np.ndarray

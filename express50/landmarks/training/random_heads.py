@@ -42,17 +42,14 @@ Places = tuple[np.ndarray, np.ndarray]  # faces (N,), weights (N, 3)
 
 @dataclass(frozen=True)
 class RandomHead:
-    """One random head: vertices, normals, vertices without hair `skin` (V, 3 each), landmarks.
+    """One random head."""
 
-    `look` is the seed of its colours, which are painted on the canvas where a view sees it.
-    """
-
-    vertices: np.ndarray
-    normals: np.ndarray
-    skin: np.ndarray
+    vertices: np.ndarray  # (V, 3)
+    normals: np.ndarray  # (V, 3)
+    skin: np.ndarray  # (V, 3) vertices without hair
     landmarks: np.ndarray
     canvas: Canvas
-    look: int
+    look: int  # seed of its colours, painted on the canvas where a view sees it
     gloss: float
 
 

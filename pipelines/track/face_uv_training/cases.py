@@ -53,15 +53,11 @@ FAR_TEXELS = 12.0
 
 @dataclass(frozen=True)
 class Case:
-    """One reading of a map: `colors` (HEIGHT, WIDTH, 3) uint8, root of light.
+    """One reading of a map (HEIGHT, WIDTH)."""
 
-    A texel shows what belongs `flow` (HEIGHT, WIDTH, 2) float16 texels to its right and below it,
-    where `valid` (HEIGHT, WIDTH) says that this is known.
-    """
-
-    colors: np.ndarray
-    flow: np.ndarray
-    valid: np.ndarray
+    colors: np.ndarray  # (..., 3) uint8, root of light
+    flow: np.ndarray  # (..., 2) float16, texels to the right and down to where it belongs
+    valid: np.ndarray  # whether the flow is known
 
 
 @dataclass(frozen=True)
