@@ -88,11 +88,7 @@ def import_labels(dataset: Dataset, path: Path) -> tuple[int, int]:
 
 
 def read_table(path: Path) -> list[Label]:
-    """Read the events of a CSV or JSON file.
-
-    Raises:
-        AnnotationError: the file cannot be read, or a row is not an event.
-    """
+    """Read the events of a CSV or JSON file; AnnotationError if it cannot be read as events."""
     _check_format(path)
     text = read_text(path, AnnotationError)
     if path.suffix == ".json":

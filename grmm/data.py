@@ -289,11 +289,7 @@ class HeadViews:
         return sample
 
     def check_mattes(self, indices: Sequence[int]) -> None:
-        """Look at the mattes of some views, evenly spread, and log which are empty.
-
-        Raises:
-            TrainError: all of them are empty.
-        """
+        """Look at some views' mattes, evenly spread, and log empty ones; TrainError if all are."""
         looked = evenly(indices, CHECKED_MATTES)
         empty = [self._where(i) for i in looked if not bool(self.item(i).mask.any())]
         if not empty:

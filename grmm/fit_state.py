@@ -125,11 +125,7 @@ def save_unfinished(state: FitState, path: Path, made_from: dict[str, object]) -
 
 
 def resume(state: FitState, path: Path, made_from: dict[str, object]) -> None:
-    """Put a fit where `save_unfinished` left it.
-
-    Raises:
-        ConfigError: the fit is finished, or settings or inputs differ.
-    """
+    """Put a fit where `save_unfinished` left it; ConfigError if it is finished or another one."""
     saved = load_checkpoint(path, state.z_id.device)
     if FIT not in saved.loop:
         raise ConfigError(f"{path} exists; name another folder, or overwrite it with --overwrite")

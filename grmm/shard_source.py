@@ -29,11 +29,7 @@ class ShardSource:
     """Samples of one split (``*``: of all) of a folder of shards."""
 
     def __init__(self, root: Path, split: str = "train") -> None:
-        """Open the shards; all samples must be tracked with one head model.
-
-        Raises:
-            FormatError: no shards, unknown split, no samples.
-        """
+        """Open the shards; FormatError unless they hold samples of one head model."""
         reader = ShardReader(root)
         self.reader = reader if split == "*" else reader.select(split=split)
         if not len(self.reader):
@@ -61,11 +57,7 @@ class ShardSource:
         self._offsets: dict[str, np.ndarray] = {}
 
     def read(self, index: int) -> Sample:
-        """Decode one sample.
-
-        Raises:
-            FormatError: it is damaged, or was tracked with another head model than the first.
-        """
+        """Decode one sample; FormatError if it is damaged or tracked with another head model."""
         sample = self.reader.sample(index)
         rows, columns, _ = seen_window(sample["meta"], sample["key"])
         return Sample(
@@ -140,11 +132,7 @@ class MixedSource:
     """
 
     def __init__(self, sources: Sequence[ShardSource]) -> None:
-        """Join sources that were tracked with one head model.
-
-        Raises:
-            FormatError: head models differ, or a subject is in two folders.
-        """
+        """Join sources; FormatError if head models differ, or a subject is in two folders."""
         self.head = sources[0].head
         owners: dict[str, ShardSource] = {}
         for source in sources:

@@ -59,11 +59,7 @@ class PaneShape(NamedTuple):
 
 
 def cell_size() -> Size:
-    """Ask the terminal's driver for the pixels of a character cell.
-
-    Raises:
-        AnnotationError: it does not know them.
-    """
+    """Ask the terminal's driver for a cell's pixels; AnnotationError if it does not know them."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
         terminal = sys.__stdout__.fileno()  # type: ignore[union-attr]
         answer = fcntl.ioctl(terminal, termios.TIOCGWINSZ, bytes(8))

@@ -153,11 +153,7 @@ class FootageReader:
     """Reads pictures of all cameras of a subject; videos stay open, so reading forward is quick."""
 
     def __init__(self, dataset: Dataset, subject: str) -> None:
-        """Read index and cameras, but open no video.
-
-        Raises:
-            StageError: ingest or calibrate has not run.
-        """
+        """Read index and cameras, open no video; StageError before ingest and calibrate."""
         self._index = read_index(dataset, subject)
         self._cameras = read_recorded_cameras(dataset, subject)
         self._sizes = picture_sizes(dataset, subject)
@@ -315,11 +311,7 @@ def read_cameras_of(dataset: Dataset, subject: str, undistorted: bool = True) ->
 
 
 def read_recorded_cameras(dataset: Dataset, subject: str) -> dict[str, Camera]:
-    """Read the calibrated cameras of a subject's footage as recorded, sorted by id.
-
-    Raises:
-        StageError: the subject is not calibrated.
-    """
+    """Read a subject's calibrated cameras as recorded, sorted by id; StageError without any."""
     path = dataset.cameras_file(subject)
     try:
         return dict(sorted(_read_cameras(path).items()))

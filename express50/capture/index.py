@@ -151,11 +151,7 @@ def index_to_json(index: Index) -> dict[str, Any]:
 
 
 def index_from_json(content: Mapping[str, Any], capture: Path) -> Index:
-    """Convert JSON to an index.
-
-    Raises:
-        ValueError: the schema is wrong, or a sequence's length differs from the frame count.
-    """
+    """Convert JSON to an index; ValueError if the schema or a sequence's length is wrong."""
     if content.get("schema") != SCHEMA:
         raise ValueError(f"schema is {content.get('schema')!r}, expected {SCHEMA!r}")
     for name in (*content["cameras"], *(row[0] for row in content["cues"])):
@@ -249,11 +245,7 @@ def same_hash(one: str, other: str | None) -> bool:
 
 
 def check_peak(index: Index, expression: str, peak: Peak) -> None:
-    """Check that a label's frame matches the index.
-
-    Raises:
-        CaptureError: time stamp or hash differ, so footage or label have changed.
-    """
+    """Raise CaptureError unless a label's frame has the time stamp and hash of the index."""
     source = index.cameras.get(peak.camera)
     there = source is not None and 0 <= peak.frame < source.frames
     found = (source.pts[peak.frame], source.dhash[peak.frame]) if source and there else None

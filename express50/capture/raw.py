@@ -149,11 +149,7 @@ def read_calibration(
 
 
 def read_meta(root: Path) -> dict:
-    """Read capture.toml and check subject and fps.
-
-    Raises:
-        CaptureError: no such folder or file, not TOML, or a field is missing or out of range.
-    """
+    """Read capture.toml; CaptureError if it is missing, or subject or fps are invalid."""
     path = root / "capture.toml"
     if not path.is_file():
         what = "has no capture.toml" if root.is_dir() else no_folder(root)
@@ -178,11 +174,7 @@ def read_capture_toml(root: Path) -> dict:
 
 
 def check_identity(path: Path, subject: object, fps: object) -> None:
-    """Refuse an invalid subject id or frame rate.
-
-    Raises:
-        CaptureError: a value is missing, of the wrong type or out of range.
-    """
+    """Raise CaptureError unless subject id and frame rate are of the right type and in range."""
     if not isinstance(subject, str) or not ID.fullmatch(subject):
         raise CaptureError(
             f"{path}: subject is {subject!r:.130}, expected at most 120 letters, digits, '_'"

@@ -214,11 +214,7 @@ def measure_sizes(
 
 
 def measure(dataset: Dataset, known: Sequence[Stage]) -> dict[str, Measured]:
-    """Return what each stage that has run cost, from its receipts and files.
-
-    Raises:
-        StageError: the ledger is missing.
-    """
+    """Return what each stage that ran cost, by receipts and files; StageError without a ledger."""
     if not dataset.ledger.is_file():
         raise StageError(f"{dataset.root}: not a dataset (no ledger.sqlite)")
     found = {}

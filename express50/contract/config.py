@@ -65,11 +65,7 @@ def distinct_settings(stage: Stage, resolve: Callable[[Stage, str], Any]) -> dic
 
 
 def read_tables(file: Path, known: Sequence[str]) -> dict[str, dict[str, object]]:
-    """Return the tables of a TOML file.
-
-    Raises:
-        ConfigError: no such file, an unknown table, or a value outside a table.
-    """
+    """Return a TOML file's tables; ConfigError for unknown ones, and for values outside of them."""
     if not Path(file).exists():
         raise ConfigError(f"--config {file}: no such file")
     content = read_toml(file, ConfigError)
@@ -83,11 +79,7 @@ def read_tables(file: Path, known: Sequence[str]) -> dict[str, dict[str, object]
 def known_assignments(
     texts: Iterable[str], known: Sequence[str], kind: str = "table"
 ) -> list[tuple[str, str, object]]:
-    """Split ``table.key=value`` strings as `parse_assignment` does.
-
-    Raises:
-        ConfigError: a table is unknown, or a text does not have that form.
-    """
+    """Split ``table.key=value`` as `parse_assignment` does; ConfigError if a table is unknown."""
     found = [(text, *parse_assignment(text)) for text in texts]
     for text, table, _, _ in found:
         _check_table(table, known, f"--set {text!r}: no {kind} {table!r} in this command")

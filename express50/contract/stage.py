@@ -52,11 +52,7 @@ class ExpectedError:
     unit: Unit  # unit of all three
 
     def __post_init__(self) -> None:
-        """Check that low and high are an interval around the value.
-
-        Raises:
-            StageError: a figure is not finite, they are not in order, or the unit is unknown.
-        """
+        """Raise StageError unless the figures are finite and in order, and the unit is known."""
         figures = (self.low, self.value, self.high)
         if not all(map(math.isfinite, figures)) or list(figures) != sorted(figures):
             raise StageError(

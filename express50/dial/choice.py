@@ -399,11 +399,7 @@ def check_unit(kinds: Sequence[ResultKind], goal: Goal) -> None:
 
 
 def goal_result(load: Workload, goal: Goal) -> str:
-    """Return the name of the first result whose error is stated in a goal's unit.
-
-    Raises:
-        ConfigError: no stage states an error in it.
-    """
+    """Return the first result whose error has a goal's unit; ConfigError if no stage states it."""
     for kind in load.kinds:
         if kind.unit == goal.unit and remaining_error(load, kind.name) is not None:
             return kind.name

@@ -36,11 +36,7 @@ FORMER = ".former"  # suffix of a folder that was moved out of the way
 
 
 def dump_json(value: object) -> bytes:
-    """Encode as deterministic JSON: sorted keys, no NaN or infinity.
-
-    Raises:
-        ValueError: the value holds a number that is not finite.
-    """
+    """Encode as deterministic JSON with sorted keys; ValueError if a number is not finite."""
     text = json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False)
     return (text + "\n").encode()
 

@@ -30,11 +30,7 @@ def read_cameras(path: Path) -> dict[str, Camera]:
 
 
 def parse_cameras(table: object, where: str) -> dict[str, Camera]:
-    """Make cameras of a calibration file's content.
-
-    Raises:
-        CalibrationError: there are no cameras, or a field has the wrong shape or value.
-    """
+    """Make cameras of a calibration file's content; CalibrationError if it is malformed."""
     if not isinstance(table, dict) or not table:
         got = "an empty one" if isinstance(table, dict) else type(table).__name__
         raise CalibrationError(f"{where}: expected a table of cameras, got {got}")

@@ -167,11 +167,7 @@ def _damage_is_one_error(kinds: tuple[type[BaseException], ...], words: str) -> 
 
 
 def open_zip(path: Path) -> zipfile.ZipFile:
-    """Open a zip for reading; the last few stay open.
-
-    Raises:
-        CaptureError: it is missing or not a zip.
-    """
+    """Open a zip, the last few stay open; CaptureError if it is missing or not a zip."""
     with _damage_is_one_error(ARRAY_DAMAGE, f"{path}: not a zip archive"):
         return _open_zip(path)
 
@@ -180,11 +176,7 @@ _open_zip = cached_by_file(OPEN_FILES)(zipfile.ZipFile)
 
 
 def open_hdf5(path: Path) -> h5py.File:
-    """Open an HDF5 file for reading; the last few stay open.
-
-    Raises:
-        CaptureError: it is missing, truncated or not an HDF5 file.
-    """
+    """Open an HDF5 file, the last few stay open; CaptureError if it is missing or damaged."""
     with _damage_is_one_error(DAMAGE, f"{path}: cannot be opened as HDF5"):
         return _hdf5_of(path, "r")
 

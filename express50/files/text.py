@@ -93,11 +93,7 @@ def not_fetched(path: Path) -> str:
 
 
 def check_links(*paths: Path) -> None:
-    """Refuse broken links: they would be treated as optional files that do not exist.
-
-    Raises:
-        CaptureError: a link's target does not exist.
-    """
+    """Raise CaptureError for broken links, which would pass for optional files that are absent."""
     for path in paths:
         if path.is_symlink() and not path.exists():
             raise CaptureError(f"{path}: {not_fetched(path)}")
@@ -122,11 +118,7 @@ def read_json(path: Path, kind: Kind, fix: str = AGAIN) -> Any:
 
 
 def read_json_table(path: Path, kind: Kind, fix: str = AGAIN) -> dict[str, Any]:
-    """Read a JSON file that holds a table.
-
-    Raises:
-        Express50Error: as for `read_json`, or the file holds no table.
-    """
+    """Read a JSON file that must hold a table; other errors are those of `read_json`."""
     table = read_json(path, kind, fix)
     if not isinstance(table, dict):
         raise kind(f"{path}: expected a JSON table, got {type(table).__name__}; {fix}")

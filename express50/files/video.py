@@ -188,11 +188,7 @@ def _in_order(path: Path, frames: Iterable[av.VideoFrame]) -> Iterator[av.VideoF
 
 
 def video_fps(path: Path) -> float:
-    """Read the frames per second from a video's container.
-
-    Raises:
-        CaptureError: the file is not a video, or has no frame rate.
-    """
+    """Read the frames per second from a video's container; CaptureError if it has none."""
     container, stream = _open(path)
     with container:
         rate = float(stream.average_rate or 0)
@@ -246,11 +242,7 @@ class VideoTags:
 
 
 def video_tags(path: Path) -> VideoTags:
-    """Read what a video says of its pictures.
-
-    Raises:
-        CaptureError: the file is not a video, is damaged, or holds no frame.
-    """
+    """Read what a video says of its pictures; CaptureError unless it holds a frame."""
     for alone in (True, False):
         container, stream = _open(path)
         end = av.Packet()  # without it, the decoder waits for frames to be displayed earlier

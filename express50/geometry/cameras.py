@@ -91,11 +91,7 @@ def pinhole(camera: Camera) -> Camera:
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:
-    """Return the camera of the image resized to (width, height).
-
-    Raises:
-        ValueError: the image is empty before or after resizing.
-    """
+    """Return the camera of the image resized to (width, height); ValueError if either is empty."""
     if min(camera.width, camera.height) < 1:
         raise ValueError(
             f"{camera.id}: image is {camera.width}x{camera.height}, expected at least 1x1"

@@ -62,11 +62,7 @@ def write_surface(
 
 
 def read_surface(path: Path) -> Surface:
-    """Read a surface that the depth stage wrote.
-
-    Raises:
-        FormatError: it is not such a file, has no faces, or holds NaN.
-    """
+    """Read a surface that depth wrote; FormatError unless it has faces and no NaN."""
     import open3d as o3d
     import trimesh
 

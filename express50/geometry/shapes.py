@@ -28,11 +28,7 @@ def check_shape(
 
 
 def check_finite(name: str, array: np.ndarray) -> None:
-    """Raise if ``array`` holds NaN or Inf.
-
-    Raises:
-        ValueError: a value is not finite; the message says how many, and the index of the first.
-    """
+    """Raise ValueError if ``array`` holds NaN or Inf; it says how many, and the first's index."""
     bad = ~np.isfinite(array)
     if bad.any():
         first = tuple(int(i) for i in np.argwhere(bad)[0])

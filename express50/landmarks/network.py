@@ -302,11 +302,7 @@ def load_network(path: Path = WEIGHTS) -> LandmarkNet:
 
 
 def trainable_network(path: Path = WEIGHTS) -> LandmarkNet:
-    """Read weights written by `save_network`, to continue training.
-
-    Raises:
-        FormatError: the file is missing, damaged or holds something else.
-    """
+    """Read weights of `save_network` to train on; FormatError if the file is missing or damaged."""
     names = [key for key in LandmarkNet().state_dict() if not key.endswith(COUNTERS)]
     arrays = read_arrays(path, FormatError, "landmark weights", names)
     net = LandmarkNet("outline.spread" in arrays)

@@ -251,11 +251,7 @@ REACH = 3  # cells around a heat map's peak that give its place
 
 
 def load_fan(path: Path) -> torch.jit.ScriptModule:
-    """Read TorchScript weights.
-
-    Raises:
-        ConfigError: the file is not TorchScript, or does not map crops to heat maps.
-    """
+    """Read TorchScript weights; ConfigError unless they map crops to heat maps."""
     wanted = f"expected FAN's TorchScript weights, (1, 3, {FAN_CROP}, {FAN_CROP}) to 68 heat maps"
     try:
         fan = torch.jit.load(str(path), map_location="cpu").eval()

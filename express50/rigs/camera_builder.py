@@ -95,11 +95,7 @@ def at_size(camera: Camera, size: tuple[int, int]) -> Camera:
 
 
 def in_metres(cameras: dict[str, Camera], metres_per_unit: float) -> dict[str, Camera]:
-    """Return the cameras with positions scaled to metres.
-
-    Raises:
-        CalibrationError: the factor is not a positive finite number.
-    """
+    """Return cameras with positions in metres; CalibrationError unless the factor is positive."""
     if not (np.isfinite(metres_per_unit) and metres_per_unit > 0):
         raise CalibrationError(f"scale {metres_per_unit} m per unit; expected a positive number")
     found = {}
@@ -136,9 +132,5 @@ def checked(cameras: dict[str, Camera], path: Path) -> dict[str, Camera]:
 
 
 def holds(path: Path, word: str) -> bool:
-    """Return whether a file contains a word.
-
-    Raises:
-        CalibrationError: it cannot be read, or is too large to be a calibration.
-    """
+    """Return whether a file contains a word; CalibrationError if it cannot be read."""
     return word.encode() in read_bytes(path, CalibrationError)

@@ -110,11 +110,7 @@ FORMATS = {
 
 
 def guess_format(path: Path) -> str:
-    """Return the format of a file or folder.
-
-    Raises:
-        CalibrationError: the path does not exist, is a .json that is not JSON, or fits no format.
-    """
+    """Return the format of a file or folder; CalibrationError if none fits."""
     if not path.exists():
         raise CalibrationError(f"{path}: no such file or folder; expected a calibration")
     found = next((name for name, known in FORMATS.items() if known.fits(path)), None)

@@ -50,11 +50,7 @@ class LocalWorkers:
         """Do nothing: nannies replace workers that died."""
 
     def slots(self, stage: str, gpu: bool) -> int:
-        """Return the number of tasks that may run at once.
-
-        Raises:
-            StageError: the stage needs a GPU and there is none.
-        """
+        """Return how many tasks may run at once; StageError if the stage lacks the GPU it needs."""
         if gpu and not self.gpus:
             raise no_gpu(stage, "nvidia-smi lists none on this machine")
         return self.gpus if gpu else self.count

@@ -407,11 +407,7 @@ def _say_again(stage: Stage, dataset: Dataset, work: _Work) -> None:
 
 
 def _refuse_alike(stage: Stage, ended: list[Receipt], former: Mapping[str, Receipt]) -> None:
-    """Stop if the first items all fail for one reason although earlier runs made them.
-
-    Raises:
-        StageError: they do, so that a setting is probably wrong.
-    """
+    """Raise StageError if the first items fail for one reason although earlier runs made them."""
     made = all(r.item in former and not former[r.item].reason for r in ended)
     if made and all(r.status == "failed" and r.reason == ended[0].reason for r in ended):
         raise StageError(

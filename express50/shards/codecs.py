@@ -94,11 +94,7 @@ def decode_picture(name: str, data: bytes, width: int, height: int, where: str) 
 
 
 def lerc_size(data: bytes, where: str) -> tuple[int, int]:
-    """Read width and height from the header of a LERC blob.
-
-    Raises:
-        FormatError: the bytes are not one LERC blob of one channel.
-    """
+    """Read a LERC blob's width and height; FormatError unless it is one blob of one channel."""
     if len(data) >= LERC_HEADER.size:
         name, version, _, rows, columns, depth, _, _, size = LERC_HEADER.unpack_from(data)
         # A second blob after the first would decode as a second channel of the same size.

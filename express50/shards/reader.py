@@ -159,11 +159,7 @@ class ShardReader:
         return entry.members[name]
 
     def meta(self, number: int) -> dict:
-        """Return the sample's meta.json.
-
-        Raises:
-            FormatError: it is missing, damaged, or lacks ``depth_scale_m``.
-        """
+        """Return the sample's meta.json; FormatError if damaged or without ``depth_scale_m``."""
         return self._meta(number, self.members(number, ["meta.json"])["meta.json"])
 
     def _meta(self, number: int, data: bytes) -> dict:

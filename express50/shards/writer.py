@@ -355,11 +355,7 @@ def copy_samples(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> in
 
 
 def _checked_splits(readers: Sequence[ShardReader]) -> dict[str, str]:
-    """Return the split of every subject.
-
-    Raises:
-        FormatError: two folders hold the same group, or a subject is in two splits.
-    """
+    """Return the split of every subject; FormatError if folders contradict each other."""
     owners: dict[tuple[str, str], ShardReader] = {}
     for reader in readers:
         for group in reader.groups():
@@ -380,11 +376,7 @@ def _checked_splits(readers: Sequence[ShardReader]) -> dict[str, str]:
 
 
 def _copy_subject_files(reader: ShardReader, subject: str, out: Path) -> None:
-    """Copy a subject's files beside the shards.
-
-    Raises:
-        FormatError: a file that its samples need is missing, or `out` has a different one.
-    """
+    """Copy a subject's files; FormatError if one that samples need is missing, or they differ."""
     for name in SUBJECT_FILES:
         source, target = subject_file(reader.root, subject, name), subject_file(out, subject, name)
         if not source.is_file():

@@ -31,11 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def parse_seconds(text: str) -> float:
-    """Parse the seconds of a budget: ``90``, ``60s``, ``5m`` or ``1.5h``.
-
-    Raises:
-        argparse.ArgumentTypeError: not a positive time.
-    """
+    """Parse a budget in seconds: ``90``, ``60s``, ``5m``, ``1.5h``; ArgumentTypeError otherwise."""
     unit = {"s": 1.0, "m": 60.0, "h": 3600.0}.get(text[-1:], 0.0)
     try:
         seconds = float(text[:-1]) * unit if unit else float(text)

@@ -181,11 +181,7 @@ def solve_footage(
 
 
 def eye_scale(shapes: Sequence[np.ndarray], eye_distance_m: float, where: str) -> EyeScale:
-    """Measure the unit of triangulated landmarks (68, 3) by the distance between the eyes.
-
-    Raises:
-        CalibrationError: the eyes are nowhere known.
-    """
+    """Measure the landmarks' (68, 3) unit by the eyes' distance; CalibrationError without eyes."""
     gaps = np.array([np.linalg.norm(p[EYES[0]].mean(0) - p[EYES[1]].mean(0)) for p in shapes])
     gaps = gaps[gaps > 0]
     if len(gaps) == 0:

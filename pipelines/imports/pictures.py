@@ -68,11 +68,7 @@ def peak_frames(dataset: Dataset, subject: str) -> list[PeakFrame]:
 
 
 def check_pattern(pattern: str, needed: tuple[str, ...]) -> set[str]:
-    """Return the names of a pattern's placeholders.
-
-    Raises:
-        ConfigError: a placeholder is unknown, or a needed one is missing.
-    """
+    """Return a pattern's placeholders; ConfigError if one is unknown or a needed one is missing."""
     found = {match[1] for match in _PLACE.finditer(pattern)}
     known = ", ".join(f"{{{name}}}" for name in PLACES)
     if unknown := sorted(found - set(PLACES)):

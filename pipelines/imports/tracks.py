@@ -199,11 +199,7 @@ def _camera_of(where: str, name: str, row: dict, axes: str) -> Camera:
 
 
 def _choose(keys: list[str], peaks: list[PeakFrame], in_clip: bool, where: str) -> dict[str, str]:
-    """Find each peak's time step: by the expression's id, else by the frame's number.
-
-    Raises:
-        StageError: some are missing.
-    """
+    """Find each peak's time step by expression, else by frame; StageError if some are missing."""
     numbers: dict[int, str] = {}
     if not any(peak.expression in keys for peak in peaks):  # ids may end in numbers too
         numbers = {int(match[1]): key for key in keys if (match := NUMBER.search(key))}

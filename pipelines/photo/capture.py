@@ -86,11 +86,7 @@ class PhotoSource:
 
 
 def open_picture(path: Path) -> PhotoSource:
-    """Read a file's kind from its name, and its EXIF.
-
-    Raises:
-        CaptureError: no such file, or neither an image nor a video.
-    """
+    """Read a file's kind from its name, and its EXIF; CaptureError unless image or video."""
     path = Path(path)
     if path.is_dir():
         raise CaptureError(

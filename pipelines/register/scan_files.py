@@ -92,11 +92,7 @@ def run_scans(args: argparse.Namespace) -> int:
 
 
 def read_index(path: Path) -> dict[str, dict[str, str]]:
-    """Read the rows of an index by scan name; without the file there are none.
-
-    Raises:
-        FormatError: the file is not an index.
-    """
+    """Read an index's rows by scan name, none without the file; FormatError if it is not one."""
     if not path.exists():
         return {}
     table = csv.DictReader(read_text(path, FormatError).splitlines())

@@ -76,11 +76,7 @@ def folder_id(path: Path) -> str:
 
 
 def parse_selection(meta: Mapping[str, Any], where: Path) -> Selection:
-    """Return the selection that a capture.toml makes.
-
-    Raises:
-        CaptureError: a value is of another type, or an expression id cannot be one.
-    """
+    """Return the selection that a capture.toml makes; CaptureError if a value has a wrong type."""
     scale = meta.get("metres_per_unit")
     if scale is not None and not (is_number(scale) and 0 < scale < math.inf):
         raise CaptureError(f"{where}: metres_per_unit is {scale!r}, expected a number above 0")

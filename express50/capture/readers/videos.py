@@ -167,11 +167,7 @@ def fits_ravdess(path: Path) -> bool:
 
 
 def actor_of(path: Path) -> str:
-    """Return the actor's folder name in RAVDESS, such as ``Actor_01``.
-
-    Raises:
-        CaptureError: the folder holds several actors.
-    """
+    """Return the actor's folder name in RAVDESS, ``Actor_01``; CaptureError if it has several."""
     actors = sorted({clip.actor for clip in _clips(path).values() if clip})
     if len(actors) != 1:
         raise CaptureError(
