@@ -19,7 +19,7 @@ from express50.files.arrays import read_arrays
 from express50.files.digests import cached_by_file, file_sha256
 from express50.files.text import ID
 from express50.geometry.shapes import check_finite, check_shape
-from express50.head.files import head_files
+from express50.head import head_files
 
 SCHEMA = "express50.track/2"
 SEQUENCE_SCHEMA = "express50.sequence/1"

@@ -1,3 +1,46 @@
-"""Load head models: one type for FLAME, ICT-FaceKit and the built-in head."""
+"""Head models: one type for FLAME, ICT-FaceKit and the built-in head.
+
+This file is light: it names models and their files, without reading them.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
 
 BUILTIN_NAME = "procedural"  # as commands and tracks name it; other head models are named by path
+# FLAME's other files, which lie beside its pickle: the first name that is there counts.
+COMPANIONS = {
+    "embedding": ("landmark_embedding.npy", "landmark_embedding_with_eyes.npy",
+                  "flame_static_embedding_68.pkl"),
+    "masks": ("FLAME_masks.pkl",),
+    "template": ("head_template_mesh.obj", "head_template.obj"),
+}  # fmt: skip
+
+
+def absolute_head(spec: str) -> str:
+    """Return a head model's name or path such that it means the same in every folder."""
+    # Links stay: a pickle may be one whose companions lie beside the link.
+    return spec if spec == BUILTIN_NAME else os.path.normpath(Path(spec).expanduser().absolute())
+
+
+def head_files(spec: str) -> dict[str, Path]:
+    """Return the files and folders that a head model is read from; none of the built-in head.
+
+    The model's own path may not exist, its companions do.
+    """
+    if spec == BUILTIN_NAME:
+        return {}
+    path = Path(spec).expanduser()
+    beside = companions(path) if path.suffix == ".pkl" else {}
+    return {"head": path, **{f"head {kind}": file for kind, file in beside.items()}}
+
+
+def companions(path: Path) -> dict[str, Path]:
+    """Return those of a FLAME pickle's other files that are there."""
+    found = {}
+    for kind, names in COMPANIONS.items():
+        file = next((path.parent / name for name in names if (path.parent / name).is_file()), None)
+        if file is not None:
+            found[kind] = file
+    return found

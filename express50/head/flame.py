@@ -17,7 +17,7 @@ import torch
 
 from express50.errors import HeadModelError
 from express50.files.arrays import read_object_array, read_pickle, to_array
-from express50.head.files import COMPANIONS, companions
+from express50.head import COMPANIONS, companions
 from express50.head.ict import read_obj, tensor
 from express50.head.model import PARENTS, REGIONS, HeadModel, check_head
 from express50.head.mouth import FLAME_VERTICES, add_mouth

@@ -19,7 +19,7 @@ from express50.files.arrays import read_arrays
 from express50.files.calibration import read_cameras, write_cameras
 from express50.geometry.cameras import Camera, rays
 from express50.geometry.transforms import make_transform, rigid_fit
-from express50.head.files import absolute_head
+from express50.head import absolute_head
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.twin import render

@@ -22,7 +22,7 @@ from express50.dataset.depth_files import encode_depth, write_depth
 from express50.errors import ConfigError, Express50Error, StageError, few
 from express50.files.images import read_alpha, write_image
 from express50.geometry.cameras import Camera
-from express50.head.files import absolute_head
+from express50.head import absolute_head
 from express50.head.load import load_head
 from express50.head.model import landmarks
 from express50.runner.imported import publish_import, remove_imports

@@ -18,7 +18,7 @@ from express50.files.atomic import dump_json, folder_in_one_step, write_bytes
 from express50.files.digests import file_sha256, value_digest
 from express50.files.text import ID, read_json_table, read_text
 from express50.geometry.raycast import mesh_scene
-from express50.head.files import absolute_head, head_files
+from express50.head import absolute_head, head_files
 from express50.head.load import load_head
 from express50.head.model import landmarks_of
 from pipelines.register.scan import PITCHES, YAWS, FittedScan, fit_scan

@@ -7,8 +7,7 @@ from pathlib import Path
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
 from express50.errors import ConfigError
-from express50.head import BUILTIN_NAME
-from express50.head.files import head_files
+from express50.head import BUILTIN_NAME, head_files
 from pipelines.track.config import PRESETS, UV_WEIGHTS, VERSION, TrackConfig
 
 __all__ = ["STAGE"]

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from express50.contract.config import check_ranges
-from express50.head import BUILTIN_NAME
-from express50.head.files import absolute_head
+from express50.head import BUILTIN_NAME, absolute_head
 
 VERSION = 27
 UV_WEIGHTS = Path(__file__).with_name("face_uv_weights.npz")

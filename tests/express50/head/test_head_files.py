@@ -9,7 +9,7 @@ import pytest
 
 from express50.contract.layout import Dataset
 from express50.dataset.tracks import track_inputs
-from express50.head.files import absolute_head, head_files
+from express50.head import absolute_head, head_files
 from pipelines.register.scan_files import register_scan
 from pipelines.track import STAGE
 from pipelines.track.config import TrackConfig
