@@ -372,18 +372,14 @@ class Desk(Screen[None]):
 
 
 class Player:
-    """Plays the window or blinks the pictures of a desk, one at a time.
-
-    Attributes:
-        plays: whether the window is played.
-        blinks: whether frame and reference take turns.
-        swapped: whether the reference is shown in place of the frame.
-    """
+    """Plays the window or blinks the pictures of a desk, one at a time."""
 
     def __init__(self, desk: Desk) -> None:
         self._desk = desk
         self._timer: Timer | None = None
-        self.plays = self.blinks = self.swapped = False
+        self.plays = False
+        self.blinks = False  # frame and reference take turns
+        self.swapped = False  # the reference is shown in place of the frame
 
     def play(self) -> None:
         """Play from the cursor, or from the start if the cursor is at the end; or stop."""

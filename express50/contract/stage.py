@@ -244,10 +244,9 @@ def _raise(error: ConfigError, subparsers: Any) -> None:
 def hook(name: str) -> Callable[..., Any]:
     """Return an installed hook.
 
-    Args:
-        name: ``label_problems(dataset, subjects)`` checks labels against their footage;
-            ``read_checkpoint(path)`` reads a trained model or refuses it;
-            ``redact_checkpoint(path, subject)`` takes a person out of one.
+    ``label_problems(dataset, subjects)`` checks labels against their footage;
+    ``read_checkpoint(path)`` reads a trained model or refuses it; ``redact_checkpoint(path,
+    subject)`` takes a person out of one.
 
     Raises:
         StageError: no package brings it.

@@ -143,16 +143,12 @@ class OutlinePart(nn.Module):
 
 
 class CloseNet(nn.Module):
-    """Finds points in close-ups (B, 3, crop, crop) in [0, 1].
-
-    Attributes:
-        crop: side of the close-ups, a multiple of 8.
-        zoom: size of a pixel of the close-ups, in pixels of the face's crop.
-    """
+    """Finds points in close-ups (B, 3, crop, crop) in [0, 1]."""
 
     def __init__(self, count: int, crop: int, zoom: float) -> None:
         super().__init__()
-        self.crop, self.zoom = crop, zoom
+        self.crop = crop  # side of the close-ups, a multiple of 8
+        self.zoom = zoom  # size of their pixels, in pixels of the face's crop
         self.stem, self.block24 = _conv(3, 16, 5, 2), Residual(16)
         self.down12, self.block12 = _conv(16, 32, 3, 2), Residual(32)
         self.down6, self.block6 = _conv(32, 48, 3, 2), Residual(48)
