@@ -1,7 +1,7 @@
 """Read a rig in any known format, at the footage's size, in metres.
 
-Most formats have modules of their own. OpenCV's YAML, one file per camera, is read here; its pixel
-origin is the first pixel's centre, so K is shifted.
+Most formats have modules of their own. OpenCV's YAML is read here, a file per camera or EasyMocap's
+two files; its pixel origin is the first pixel's centre, so K is shifted.
 """
 
 from __future__ import annotations
@@ -146,48 +146,74 @@ def read_rig(
 
 
 def read_opencv_yaml(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
-    """Read the cameras of a folder of ``<camera>.yml`` files, or one such file.
+    """Read the cameras of a folder of ``<camera>.yml`` files, of one such file, or of EasyMocap.
 
     ``size`` is the width and height of the images, used if the files do not give them.
 
     Raises:
         CalibrationError: a matrix is missing or has the wrong shape, or no size is known.
     """
-    files = sorted(p for p in path.iterdir() if p.suffix in YAML) if path.is_dir() else [path]
     found = {}
-    for file in files:
-        table = read_yaml(file, CalibrationError)
-        K, dist = _matrix(table, _K, file), _matrix(table, _DIST, file)
-        R, t = _matrix(table, _ROTATION, file), _matrix(table, _TRANSLATION, file)
+    for name, where, table in _easymocap(path) or _opencv_files(path):
+        K, dist = _matrix(table, _K, where), _matrix(table, _DIST, where)
+        R, t = _matrix(table, _ROTATION, where), _matrix(table, _TRANSLATION, where)
         if K.shape != (3, 3):
-            raise CalibrationError(f"{file}: expected a 3 x 3 matrix called {' or '.join(_K)}")
+            raise CalibrationError(f"{where}: expected a 3 x 3 matrix called {' or '.join(_K)}")
         if R.size == 3:
             R = axis_angle_to_matrix(R.ravel())
         if R.shape != (3, 3) or t.size != 3:
             raise CalibrationError(
-                f"{file}: no pose; expected {' or '.join(_ROTATION)} (3 x 3 or a Rodrigues vector)"
+                f"{where}: no pose; expected {' or '.join(_ROTATION)} (3 x 3 or a Rodrigues vector)"
                 f" and {' or '.join(_TRANSLATION)} (3), world to camera"
             )
         pair = next((pair for pair in _SIZES if table.keys() >= {*pair}), None)
         shape = size
         if pair is not None:
-            shape = size_from([table[side] for side in pair], f"{file} has {' and '.join(pair)}")
+            shape = size_from([table[side] for side in pair], f"{where} has {' and '.join(pair)}")
         if shape is None:
             raise CalibrationError(
-                f"{file}: does not give the images' size; pass --size WIDTHxHEIGHT"
+                f"{where}: does not give the images' size; pass --size WIDTHxHEIGHT"
             )
         pose = make_transform(R, t.ravel())
-        name = identifier(file.stem)
         if name in found:
-            raise CalibrationError(f"{path}: two files become camera {name}; rename one")
+            raise CalibrationError(f"{path}: two cameras are called {name}; rename one")
         found[name] = camera_from_K(name, K_from_opencv(K), dist, shape, pose)
     return checked(found, path)
 
 
-def _matrix(table: object, keys: tuple[str, ...], path: Path) -> np.ndarray:
-    """Read the first matrix found, as rows of numbers or in OpenCV's form; empty if none is."""
+def _opencv_files(path: Path) -> list[tuple[str, Path | str, dict]]:
+    """Return name, place and values of each camera's file."""
+    files = sorted(p for p in path.iterdir() if p.suffix in YAML) if path.is_dir() else [path]
+    return [(identifier(file.stem), file, _named_values(file)) for file in files]
+
+
+def _easymocap(path: Path) -> list[tuple[str, Path | str, dict]]:
+    """Return the same from ``intri.yml`` and ``extri.yml``, which hold all cameras; else nothing.
+
+    Values are named ``K_01``, ``dist_01``, ``R_01``, ``Rot_01``, ``T_01``, after the camera.
+    """
+    folder = path if path.is_dir() else path.parent
+    files = [folder / "intri.yml", folder / "extri.yml"]
+    if not (path in (folder, *files) and all(file.is_file() for file in files)):
+        return []
+    values = {key: value for file in files for key, value in _named_values(file).items()}
+    found: list[tuple[str, Path | str, dict]] = []
+    for camera in (key.removeprefix("K_") for key in values if key.startswith("K_")):
+        end = f"_{camera}"
+        own = {key.removesuffix(end): value for key, value in values.items() if key.endswith(end)}
+        found.append((identifier(camera), f"{folder}: camera {camera}", own))
+    return found
+
+
+def _named_values(path: Path) -> dict:
+    table = read_yaml(path, CalibrationError)
     if not isinstance(table, dict):
         raise CalibrationError(f"{path}: holds no named values, expected OpenCV's matrices")
+    return table
+
+
+def _matrix(table: dict, keys: tuple[str, ...], path: Path | str) -> np.ndarray:
+    """Read the first matrix found, as rows of numbers or in OpenCV's form; empty if none is."""
     name = next((key for key in keys if key in table), "")
     value = table.get(name, [])
     try:

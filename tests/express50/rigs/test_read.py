@@ -88,6 +88,30 @@ def write_yaml(folder, rig, rodrigues=False):
         storage.release()
 
 
+def write_easymocap(folder, rig):
+    """Both files name all cameras; sizes are not always given."""
+    folder.mkdir()
+    names = [name.removeprefix("cam") for name in rig]
+    storages = [
+        cv2.FileStorage(str(folder / f"{part}.yml"), cv2.FILE_STORAGE_WRITE)
+        for part in ("intri", "extri")
+    ]
+    for storage in storages:
+        storage.startWriteStruct("names", cv2.FileNode_SEQ)
+        for name in names:
+            storage.write("", name)
+        storage.endWriteStruct()
+    for name, camera in zip(names, rig.values(), strict=True):
+        R = camera.cam_from_world[:3, :3]
+        storages[0].write(f"K_{name}", K_to_opencv(camera.K))
+        storages[0].write(f"dist_{name}", camera.dist[:5, None])
+        storages[1].write(f"R_{name}", matrix_to_axis_angle(R)[:, None])
+        storages[1].write(f"Rot_{name}", R)
+        storages[1].write(f"T_{name}", camera.cam_from_world[:3, 3:])
+    for storage in storages:
+        storage.release()
+
+
 ROUND_TRIPS = {
     "colmap": ("colmap", write_colmap),
     "transforms": ("transforms", write_transforms),
@@ -102,6 +126,20 @@ def test_cameras_come_back_as_they_were_written(tmp_path, kind, write):
     write(path, rig)
     assert guess_format(path) == kind
     assert_same(read_rig(path), rig)
+
+
+def test_easymocaps_two_files_hold_all_cameras(tmp_path):
+    path, rig = tmp_path / "calibration", make_rig()
+    write_easymocap(path, rig)
+    expected = {name.removeprefix("cam"): camera for name, camera in rig.items()}
+    for given in (path, path / "intri.yml", path / "extri.yml"):
+        assert guess_format(given) == "opencv"
+        assert_same(read_rig(given, size=(640, 480)), expected)
+    with pytest.raises(CalibrationError, match="camera 00: does not give the images' size; pass"):
+        read_rig(path)
+    (path / "extri.yml").unlink()
+    with pytest.raises(CalibrationError, match=r"intri.yml: expected a 3 x 3 matrix called"):
+        read_rig(path)
 
 
 def test_colmap_fisheye_is_refused_by_name(tmp_path):
