@@ -41,6 +41,7 @@ QUALITY = {True: 80, False: 95}  # JPEG, while moving and at rest
 SAME = "the same"  # residual code as the expression's
 SLOW_SECONDS = 0.04  # slower colours are not decoded while the camera moves
 TURN_DEGREES = 1.5  # smaller camera turns change the colours invisibly
+STOP_SECONDS = 5.0  # to wait for the server's thread, which a busy browser may hold up
 
 
 class Preview:
@@ -115,12 +116,19 @@ class _Server(viser.ViserServer):
 
     def __init__(self, guard: RequestGuard, **options: Any) -> None:
         """Start to listen; the library has no setting for what a request must hold."""
-        listen = websockets.asyncio.server.serve
+        listen, others = websockets.asyncio.server.serve, set(threading.enumerate())
         websockets.asyncio.server.serve = partial(_serve_behind, guard, listen)
         try:
             super().__init__(host=guard.host, **options)
         finally:
             websockets.asyncio.server.serve = listen
+        self._own_threads = [t for t in threading.enumerate() if t.daemon and t not in others]
+
+    def stop(self) -> None:
+        """Stop, and wait until the library's thread, which prints at its end, has ended."""
+        super().stop()
+        for thread in self._own_threads:
+            thread.join(STOP_SECONDS)
 
     def request_share_url(self, verbose: bool = True) -> None:
         """Share nothing: hiding the button instead leaves the whole page blank (viser 0.2.23)."""
