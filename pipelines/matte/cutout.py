@@ -117,15 +117,18 @@ def make_cut_view(
     return CutView(resized(camera, rgb.shape[1], rgb.shape[0]), rgb, small, known)
 
 
-def cut_out(views: Sequence[CutView], ball: Ball | None) -> dict[str, Cut]:
+def cut_out(
+    views: Sequence[CutView], ball: Ball | None, place: HeadPlace | None = None
+) -> dict[str, Cut]:
     """Find the person's outline in all cameras of a frame set.
 
-    `ball` is the volume that the cameras look at; None if they share none.
+    `ball` is the volume that the cameras look at; None if they share none. `place` is from
+    `find_head`, which is called if it is not given.
 
     Raises:
         NoFaceError: no camera shows a face.
     """
-    place = _place_head(views)
+    place = place or find_head(views)
     small = [_at_scale(view, PIXEL_M * place.density(view.camera)) for view in views]
     guesses = [_guess(view, place) for view in small]
     density = [place.density(view.camera) for view in small]
@@ -144,9 +147,13 @@ def cut_out(views: Sequence[CutView], ball: Ball | None) -> dict[str, Cut]:
     return {view.name: found for view, found in zip(small, cuts, strict=True)}
 
 
-def _place_head(views: Sequence[CutView]) -> HeadPlace:
-    """Place the mean head by all faces that are found, or by the best one."""
-    # Imported here, because cameras with plates need no network and torch takes seconds to import.
+def find_head(views: Sequence[CutView]) -> HeadPlace:
+    """Place the mean head by all faces that are found, or by the best one.
+
+    Raises:
+        NoFaceError: no camera shows a face.
+    """
+    # Imported here, because fitting plates need no network, and torch takes seconds to import.
     from express50.landmarks.detector import SMALL, detect_many
     from express50.landmarks.network import load_network
     from pipelines.track.observe import LandmarkView, place_head
@@ -221,6 +228,11 @@ def _slab(
         for side in (-1, 1)
         for face in (-1, 1)
     ])  # fmt: skip
+
+
+def region_of(view: CutView, place: HeadPlace) -> np.ndarray:
+    """Return where a person may be (h, w) bool in a view, their hair and shoulders included."""
+    return _guess(view, place) != cv2.GC_BGD
 
 
 def _guess(view: CutView, place: HeadPlace) -> np.ndarray:

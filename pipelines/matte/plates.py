@@ -14,7 +14,7 @@ grey hair in front of a grey wall differs from it in every strand, although not 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -39,6 +39,7 @@ RIM, ODD_STEPS, GOOD_SHARE, LEAST_GAIN = 0.06, 12.0, 0.97, 0.01
 WIDE_RIM = 0.15  # width of the rim by which a plate is aligned
 MOST_MOVED = 0.03  # share of the longer side; alignments that move the plate further are rejected
 LEAST_SHARE = 0.9  # a plate that explains less shows another set
+LEAST_OPEN = 0.2  # of a frame's border that the person leaves open, so that a plate can be compared
 WHITE, MOST_WHITE = 250, 0.3  # level, and share of a rim, from which the exposure is unknown
 ALIGN_SIDE = 960  # pixels of the pictures that are aligned
 ROUNDS = 3  # of solving, since a pixel's covariance depends on its alpha; 0.01 off after two
@@ -107,38 +108,57 @@ def exposed(plate: np.ndarray, gain: np.ndarray) -> np.ndarray:
 class MatchedPlate:
     """A plate (H, W, 3) uint8, aligned with a frame and its light evened where that helps.
 
-    `share` is how much of the frame's top and sides it explains.
+    `share` is how much of the frame's border beside the person it explains; it is `sure` if the
+    plate explains that as it was.
     """
 
     plate: np.ndarray
     share: float
+    sure: bool = False
 
 
-def match_plate(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> MatchedPlate:
+def match_plate(
+    plate: np.ndarray, frame: np.ndarray, valid: np.ndarray, person: np.ndarray | None = None
+) -> MatchedPlate:
     """Match a plate to a frame that the camera took after it moved a little, or in other light.
 
-    Both are (H, W, 3) uint8, ``valid`` (H, W) bool marks the pixels with footage. The person
-    usually fills the middle of a frame, so its top and sides are compared.
+    Both are (H, W, 3) uint8, ``valid`` (H, W) bool marks the pixels with footage. If it is not
+    known where a `person` (H, W) bool may be, their body leaves the frame below, so its top and
+    upper sides are compared.
     """
-    rim = valid & _rim(valid.shape, RIM)
+    rim = valid & _rim(valid.shape, RIM, person)
     best = MatchedPlate(plate, _explained(plate, frame, rim))
     if best.share > GOOD_SHARE:
-        return best
+        return replace(best, sure=True)
+    wide = _rim(valid.shape, WIDE_RIM, person)
     for light in (plate, _evened(plate, frame, rim)):
-        for image in (light, _aligned(light, frame, valid)):
+        for image in (light, _aligned(light, frame, valid & wide)):
             found = MatchedPlate(image, _explained(image, frame, rim))
             best = found if found.share > best.share + LEAST_GAIN else best
     return best
 
 
-def _rim(shape: tuple[int, ...], share: float) -> np.ndarray:
-    """Mark the top and the upper sides (H, W) of an image; `share` of the longer side wide."""
+def _rim(shape: tuple[int, ...], share: float, person: np.ndarray | None = None) -> np.ndarray:
+    """Mark the top and the upper sides (H, W) of an image; `share` of the longer side wide.
+
+    Where a person may be (H, W) bool, if known, is left out instead of the lower part.
+    """
     height, width = shape
     edge = max(2, round(share * max(shape)))
+    low = round(0.6 * height) if person is None else height
     rim = np.zeros(shape, bool)
     rim[:edge] = True
-    rim[: round(0.6 * height), :edge] = rim[: round(0.6 * height), width - edge :] = True
+    rim[:low, :edge] = rim[:low, width - edge :] = True
+    if person is not None:
+        rim[height - edge :] = True
+        rim &= ~person
     return rim
+
+
+def open_share(person: np.ndarray) -> float:
+    """Return the share of an image's border that a person (H, W) bool leaves open."""
+    border = _rim(person.shape, RIM, np.zeros_like(person))
+    return float((~person[border]).mean())
 
 
 def white_share(image: np.ndarray, valid: np.ndarray) -> float:
@@ -157,17 +177,16 @@ def _explained(plate: np.ndarray, frame: np.ndarray, rim: np.ndarray) -> float:
     return float((_largest(cv2.blur(off, (3, 3))[rim]) < ODD_STEPS).mean())
 
 
-def _aligned(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Return a plate aligned with a frame by an affine motion; unchanged if none fits."""
-    scale = min(1.0, ALIGN_SIDE / max(valid.shape))
+def _aligned(plate: np.ndarray, frame: np.ndarray, rim: np.ndarray) -> np.ndarray:
+    """Return a plate aligned with a frame's rim by an affine motion; unchanged if none fits."""
+    scale = min(1.0, ALIGN_SIDE / max(rim.shape))
     grey = [
         cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None, fx=scale, fy=scale,
                    interpolation=cv2.INTER_AREA)
         for image in (frame, plate)
     ]  # fmt: skip
     height, width = grey[0].shape
-    mask = (valid & _rim(valid.shape, WIDE_RIM)).astype(np.uint8)
-    mask = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST)
+    mask = cv2.resize(rim.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
     motion = np.eye(2, 3, dtype=np.float32)
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
     try:
@@ -179,7 +198,7 @@ def _aligned(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> np.ndar
         return plate
     motion = affine_from_opencv(motion)
     motion[:, 2] /= scale
-    height, width = valid.shape
+    height, width = rim.shape
     corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]])
     moved = np.linalg.norm(corners @ motion.T - corners[:, :2], axis=1)
     if moved.max() > MOST_MOVED * max(width, height):

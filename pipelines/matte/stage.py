@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
-from functools import partial
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +18,24 @@ from express50.errors import CaptureError, NoFaceError, StageError
 from express50.files.images import box_about, shrink, tile_sheet, write_image
 from express50.geometry.cameras import Camera, pinhole, resized
 from express50.geometry.sampling import local_moments, undistorted_mask
-from pipelines.matte.cutout import CutView, cut_out, make_cut_view, soft_alpha
+from pipelines.matte.cutout import (
+    CutView,
+    cut_out,
+    find_head,
+    make_cut_view,
+    region_of,
+    soft_alpha,
+)
 from pipelines.matte.key import dilated, key_alpha
 from pipelines.matte.plates import (
+    LEAST_OPEN,
     LEAST_SHARE,
     MOST_WHITE,
+    MatchedPlate,
     exposed,
     exposure_gain,
     match_plate,
+    open_share,
     white_share,
 )
 from pipelines.matte.visual_hull import (
@@ -63,6 +72,7 @@ class CameraMatte:
     rgb: np.ndarray  # the frame reduced to `SHOWN`
     noise: float  # `wall_noise` of the full frame
     plated: bool = True
+    sure: bool = True  # unless a plate had to be changed
 
 
 def run(
@@ -127,48 +137,109 @@ def camera_mattes(
     Only one camera's full images are in memory at a time. `ball` is the volume that the cameras
     look at, None if they share none. Also returns the cameras without a matte, and warnings.
     """
-    subject, expression = item.split("/")
-    read = partial(read_peak_frame, dataset, subject, expression)
-
+    shots = _Shots(dataset, item, method, matte_one, cameras)
     found: dict[str, CameraMatte] = {}
     seen: dict[str, CutView] = {}
     dropped: list[Note] = []
-    warnings: list[Note] = []
-    for name, camera in cameras.items():
+    odd: dict[str, str] = {}
+    for name in cameras:
         try:
-            frame, valid, alpha = read(name), valid_pixels(camera), None
-            plate, why = _plate(dataset, subject, name, frame, valid, method)
-            if plate is not None or method == "salient":
-                alpha = eight_bit(matte_one(frame, plate, valid), valid)
-                noise = wall_noise(alpha, frame)
-                found[name] = CameraMatte(alpha, shrink(frame, SHOWN), noise)
+            frame, valid = shots.read(name)
+            own, why = shots.matte(name, frame, valid)
         except (CaptureError, StageError) as error:
             dropped.append(Note(name, str(error)))
             continue
-        warnings += [Note(name, why)] if why else []
-        if alpha is None:
-            seen[name] = make_cut_view(pinhole(camera), frame, valid)
-    unplated = list(seen)
-    for name in found if unplated else ():  # read again, as most captures have all plates
-        frame, valid = read(name), valid_pixels(cameras[name])
-        seen[name] = make_cut_view(pinhole(cameras[name]), frame, valid, found[name].alpha)
+        if why or (own is not None and not own.sure):
+            odd[name] = why
+        if own is None:
+            seen[name] = make_cut_view(pinhole(cameras[name]), frame, valid)
+        else:
+            found[name] = own
     try:
-        cuts = cut_out([seen[name] for name in cameras if name in seen], ball) if unplated else {}
+        found |= _with_other_views(shots, found, seen, odd, ball) if seen or odd else {}
     except NoFaceError as error:
-        dropped += [Note(name, str(error)) for name in unplated]
-        return found, sorted(dropped, key=lambda note: note.what), warnings
-    for name in unplated:
-        frame, valid = read(name), valid_pixels(cameras[name])
-        alpha = eight_bit(soft_alpha(frame, valid, cuts[name]), valid)
-        noise = wall_noise(alpha, frame)
-        found[name] = CameraMatte(alpha, shrink(frame, SHOWN), noise, plated=False)
+        dropped = sorted(
+            [*dropped, *(Note(name, str(error)) for name in seen)], key=lambda n: n.what
+        )
+    warnings = [Note(name, why) for name, why in odd.items() if why]
     return {name: found[name] for name in cameras if name in found}, dropped, warnings
 
 
+@dataclass(frozen=True)
+class _Shots:
+    """The frames of a peak, and how each is matted."""
+
+    dataset: Dataset
+    item: str
+    method: str
+    matte_one: MatteFunction
+    cameras: Mapping[str, Camera]
+
+    def read(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Read a frame (H, W, 3) uint8 and its valid pixels (H, W) bool."""
+        subject, expression = self.item.split("/")
+        frame = read_peak_frame(self.dataset, subject, expression, name)
+        return frame, valid_pixels(self.cameras[name])
+
+    def matte(
+        self, name: str, frame: np.ndarray, valid: np.ndarray, person: np.ndarray | None = None
+    ) -> tuple[CameraMatte | None, str]:
+        """Matte a frame alone, None without a plate that fits; see `_plate`."""
+        subject = self.item.split("/")[0]
+        found, why = _plate(self.dataset, subject, name, frame, valid, self.method, person)
+        if found is None and self.method != "salient":
+            return None, why
+        alpha = self.matte_one(frame, None if found is None else found.plate, valid)
+        own = _camera_matte(alpha, frame, valid)
+        return replace(own, sure=found is None or found.sure), why
+
+
+def _camera_matte(alpha: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> CameraMatte:
+    found = eight_bit(alpha, valid)
+    return CameraMatte(found, shrink(frame, SHOWN), wall_noise(found, frame))
+
+
+def _with_other_views(
+    shots: _Shots, found: dict[str, CameraMatte], seen: dict[str, CutView], odd: dict[str, str],
+    ball: Ball | None,
+) -> dict[str, CameraMatte]:  # fmt: skip
+    """Matte the cameras that were only `seen`, knowing where the faces say that the person is.
+
+    Plates that did not fit as they were (`odd`) are compared anew, beside the person: their body
+    may leave a turned camera's picture at the top. The reasons in `odd` are updated.
+
+    Raises:
+        NoFaceError: no camera shows a face.
+    """
+    cameras, views = shots.cameras, dict(seen)
+    for name, own in found.items():  # read again, as most captures have all plates
+        views[name] = make_cut_view(pinhole(cameras[name]), *shots.read(name), own.alpha)
+    place = find_head([views[name] for name in cameras if name in views])
+    rest: dict[str, CameraMatte] = {}
+    for name in odd:
+        frame, valid = shots.read(name)
+        keyed, odd[name] = shots.matte(name, frame, valid, region_of(views[name], place))
+        rest |= {} if keyed is None else {name: keyed}
+        known = None if keyed is None else keyed.alpha
+        views[name] = make_cut_view(pinhole(cameras[name]), frame, valid, known)
+    unplated = [name for name in {**seen, **odd} if name not in rest]
+    ordered = [views[name] for name in cameras if name in views]
+    cuts = cut_out(ordered, ball, place) if unplated else {}
+    for name in unplated:
+        frame, valid = shots.read(name)
+        cut = _camera_matte(soft_alpha(frame, valid, cuts[name]), frame, valid)
+        rest[name] = replace(cut, plated=False)
+    return rest
+
+
 def _plate(
-    dataset: Dataset, subject: str, camera: str, frame: np.ndarray, valid: np.ndarray, method: str
-) -> tuple[np.ndarray | None, str]:  # fmt: skip
-    """Read a plate and match it to the frame; also returns a warning, empty if all is well."""
+    dataset: Dataset, subject: str, camera: str, frame: np.ndarray, valid: np.ndarray, method: str,
+    person: np.ndarray | None = None,
+) -> tuple[MatchedPlate | None, str]:  # fmt: skip
+    """Read a plate and match it to the frame; also returns a warning, empty if all is well.
+
+    `person` (h, w) bool, of any size, is where the person may be, if that is known.
+    """
     if method not in ("key", "bgmv2"):
         return None, ""
     plate = read_plate_image(dataset, subject, camera)
@@ -179,10 +250,15 @@ def _plate(
             " or salient"
         )
     if plate is None or method == "bgmv2":
-        return plate, ""
-    matched = match_plate(plate, frame, valid)
+        return plate if plate is None else MatchedPlate(plate, 1.0, sure=True), ""
+    compared, outside = "top and sides", None
+    if person is not None and open_share(person) >= LEAST_OPEN:
+        compared = "border beside the person"
+        size = valid.shape[::-1]
+        outside = cv2.resize(person.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    matched = match_plate(plate, frame, valid, outside)
     if matched.share >= LEAST_SHARE:
-        return matched.plate, ""
+        return matched, ""
     white = {"frame": white_share(frame, valid), "plate": white_share(plate, valid)}
     which = max(white, key=lambda name: white[name])
     if white[which] > MOST_WHITE:
@@ -192,7 +268,7 @@ def _plate(
             " exposure, below white"
         )
     return None, (
-        f"its plate explains {matched.share:.0%} of the frame's top and sides, expected"
+        f"its plate explains {matched.share:.0%} of the frame's {compared}, expected"
         f" {LEAST_SHARE:.0%}: it shows another set or place, so the camera was matted without it;"
         " photograph the plate again"
     )

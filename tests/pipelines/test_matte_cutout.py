@@ -15,16 +15,17 @@ from express50.capture.frames import read_cameras_of
 from express50.contract.layout import Dataset
 from express50.errors import ConfigError, StageError
 from express50.files.images import read_alpha, write_image
-from express50.geometry.cameras import pinhole
+from express50.geometry.cameras import Camera, pinhole, pinhole_camera
 from express50.head.load import load_head
 from express50.shards.reader import ShardReader
 from express50.twin import TwinConfig
 from express50.twin.truth import Truth
 from pipelines import calibrate, frames, ingest
 from pipelines.matte import STAGE as MATTE
-from pipelines.matte import MatteConfig
+from pipelines.matte import MatteConfig, stage
 from pipelines.matte.cutout import cut_out, make_cut_view, parts_of_a_person, soft_alpha
-from pipelines.matte.stage import valid_pixels
+from pipelines.matte.key import key_alpha
+from pipelines.matte.stage import CameraMatte, camera_mattes, valid_pixels
 from pipelines.photo.capture import make_photo_capture, open_picture, single_camera
 from pipelines.track.config import TrackConfig
 from tests.stages import metrics_of, run_here
@@ -120,8 +121,8 @@ def test_a_photograph_becomes_a_sample_of_shards_without_plate_or_weights(tmp_pa
     matte = read_alpha(dataset.matte_file("eva", "photo", "photo"))
     assert all(matte[y, x] > 240 for x, y in HEAD) and all(matte[y, x] < 12 for x, y in BEHIND)
 
-    for stage in ("depth", "regions", "pack"):
-        assert main([stage, str(dataset.root), "--preset", "draft"]) == 0
+    for step in ("depth", "regions", "pack"):
+        assert main([step, str(dataset.root), "--preset", "draft"]) == 0
     reader = ShardReader(dataset.stage_dir("pack") / "shards")
     assert [entry.key for entry in reader.entries] == ["eva_photo_photo"]
     sample = reader.sample(0)
@@ -139,8 +140,8 @@ def test_a_frame_without_a_face_fails_alone(tmp_path: Path) -> None:
     folder = dataset.root / "photos" / "eva"
     make_photo_capture(open_picture(tmp_path / "eva.mp4"), folder, "eva", config, windows=2)
     ingest.add_captures(dataset, [folder])
-    for stage in (ingest.STAGE, calibrate.STAGE):
-        assert run_here(stage, dataset).ok
+    for step in (ingest.STAGE, calibrate.STAGE):
+        assert run_here(step, dataset).ok
     write_peaks(dataset, "eva", {"clip_00": 1, "clip_01": 6})
     assert run_here(frames.STAGE, dataset).ok
     run = run_here(MATTE, dataset, method="grabcut")
@@ -177,6 +178,42 @@ def mean_errors(dataset: Dataset, truth: Truth) -> dict[str, float]:
         ).mean())
         for name, camera in used.items()
     }  # fmt: skip
+
+
+def turned(camera: Camera) -> Camera:
+    """A pinhole camera whose picture `np.rot90` turns."""
+    turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, camera.width], [0.0, 0.0, 1.0]])
+    axes = np.eye(4)
+    axes[:2, :2] = turn[:2, :2]
+    K = turn @ camera.K @ axes[:3, :3].T
+    pose = axes @ camera.cam_from_world
+    return pinhole_camera(camera.id, K, camera.height, camera.width, pose)
+
+
+def test_plates_of_cameras_on_their_side_are_used(rig, monkeypatch) -> None:
+    """The person's body leaves their pictures at a side, where plates are compared first."""
+    dataset, _ = rig
+    subject = dataset.subjects()[0]
+    upright = {name: pinhole(c) for name, c in read_cameras_of(dataset, subject).items()}
+    keyed = lambda frame, plate, valid: key_alpha(frame, plate, valid, 0.25)  # noqa: E731
+
+    def mattes(cameras: dict[str, Camera]) -> dict[str, CameraMatte]:
+        item = f"{subject}/neutral"
+        found, dropped, warnings = camera_mattes(dataset, item, "key", keyed, cameras, None)
+        assert not dropped and not warnings
+        return found
+
+    right = mattes(upright)
+    for reader in ("read_peak_frame", "read_plate_image"):
+        read = getattr(stage, reader)
+        monkeypatch.setattr(
+            stage, reader, lambda *a, read=read: np.ascontiguousarray(np.rot90(read(*a)))
+        )
+    lying = mattes({name: turned(camera) for name, camera in upright.items()})
+    for name, matte in lying.items():
+        assert matte.plated, name
+        difference = cv2.absdiff(np.ascontiguousarray(np.rot90(matte.alpha, -1)), right[name].alpha)
+        assert difference.mean() / 255 < 0.01, name
 
 
 def test_a_rig_without_plates_is_matted_from_all_sides(rig) -> None:

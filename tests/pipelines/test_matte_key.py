@@ -29,6 +29,7 @@ from pipelines.matte.plates import (
     fit_plate,
     local_colours,
     match_plate,
+    open_share,
     shrunk,
     solve_opacity,
 )
@@ -311,6 +312,22 @@ def test_a_plate_of_another_room_explains_nothing() -> None:
     )
     valid = np.ones((256, 256), bool)
     assert match_plate(other.plate, scene.frame, valid).share < 0.5 < LEAST_SHARE
+
+
+def test_a_plate_is_compared_beside_a_person_whose_place_is_known() -> None:
+    """Upside down, a body leaves the picture at the top."""
+    scene = hair_before("dark", "cluttered", 256, np.random.default_rng(0))
+    valid, body = np.ones((256, 256), bool), np.s_[:20, 60:200]
+    frame = scene.frame.copy()
+    frame[body] = 90
+    assert match_plate(scene.plate, frame, valid).share < LEAST_SHARE
+    person = cv2.dilate(scene.true, np.ones((9, 9))) > 0
+    person[body] = True
+    found = match_plate(scene.plate, frame, valid, person)
+    assert found.sure and found.plate is scene.plate
+    assert open_share(person) > 0.4 > open_share(valid)
+    other = hair_before("dark", "cluttered", 256, np.random.default_rng(1))
+    assert match_plate(other.plate, frame, valid, person).share < 0.5
 
 
 @pytest.mark.parametrize("shape", [(2, 2), (8, 300), (64, 64)])
