@@ -98,7 +98,7 @@ def account(dataset: Dataset, subjects: Sequence[str]) -> Iterator[str]:
 
 STAGE = Stage(
     name="ingest",
-    version=8,
+    version=9,
     config=IngestConfig,
     presets=PRESETS,
     items=items,

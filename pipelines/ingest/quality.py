@@ -39,6 +39,7 @@ DRIFT_SPAN = 9  # frames of the running median: a passing hand is not a drift
 FEWEST_CELLS = 12
 FEWEST_DRIFT_FRAMES = 12  # with fewer, a movement looks like a drift
 DIM = 0.05  # linear light, level 63 of 255, below which nothing in a picture is well exposed
+COLOURLESS = 0.03  # share by which red, green and blue differ at most in pictures without colours
 EXPOSURE_DRIFT, COLOUR_DRIFT = 0.15, 0.06  # stops over the capture from which on it is a warning
 _CURVE = srgb_to_linear(np.arange(256, dtype=np.float32) / 255.0).astype(np.float32)
 
@@ -121,6 +122,7 @@ def check_quality(
     stuck = find_repeats(moves)
     drifts = {n: measure_drift(s.cells.astype("float32"), s.frames) for n, s in measured.items()}
     widths, blurred = judge_focus({n: s.widths for n, s in measured.items()}, blur_ratio)
+    grey = [name for name, s in measured.items() if is_colourless(s.cells)]
     first: dict[str, str] = {}
     for name in sorted(measured):
         faults = []
@@ -134,6 +136,11 @@ def check_quality(
                 f"repeats the frame before in {len(frames)} frames ({shown}) while others move"
             )
         faults += describe_dark(measured[name].cells)
+        if name in grey and len(grey) < len(measured):
+            faults.append(
+                "shows no colours, unlike other cameras: people are told from walls by their"
+                " colours, so check its mattes, or leave the camera out"
+            )
         faults += describe_drift(drifts[name])
         faults += [blurred[name]] if name in blurred else []
         if faults:
@@ -360,6 +367,12 @@ def describe_dark(cells: np.ndarray) -> list[str]:
         f"is very dark: its brightest parts have level {level:.0f} of 255; correct its exposure, or"
         " if its files hold 10 to 14 bits in 16, multiply the values to fill all 16"
     ]
+
+
+def is_colourless(cells: np.ndarray) -> bool:
+    """Return whether no cell (F, 16, 16, 3) of a camera that is not dark has a colour."""
+    seen = cells[cells.max(-1) >= DIM].astype(np.float32)
+    return bool(len(seen)) and bool((np.ptp(seen, axis=-1) < COLOURLESS * seen.max(-1)).all())
 
 
 def measure_drift(cells: np.ndarray, frames: np.ndarray) -> Drift | None:

@@ -350,6 +350,20 @@ def test_videos_whose_pictures_are_not_what_they_seem_are_warned_of(tmp_path):
     assert "camera cam02" not in said
 
 
+def test_a_camera_without_colours_among_others_is_warned_of(dataset):
+    for grey in ("cam01", "cam00", "cam02"):
+        video = camera_folder(dataset, grey) / "video.mp4"
+        images = [image.mean(-1, keepdims=True).repeat(3, -1) for _, image in iterate_video(video)]
+        video.unlink()
+        write_video(video, [image.astype(np.uint8) for image in images])
+        if grey == "cam01":
+            assert run(dataset).ok
+            said = notes(dataset)
+            assert "shows no colours" in said["camera cam01"] and list(said) == ["camera cam01"]
+    assert run(dataset).ok
+    assert not notes(dataset), "a rig of grey cameras knows that it is"
+
+
 def test_pictures_of_twelve_bits_in_sixteen_are_warned_of(dataset):
     source = camera_folder(dataset, "cam01") / "video.mp4"
     images = [image.astype(np.uint16) * 16 for _, image in iterate_video(source)]
