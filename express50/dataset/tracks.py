@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from express50.contract.layout import Dataset
-from express50.errors import FormatError, StageError
+from express50.errors import FormatError, HeadModelError, StageError
 from express50.files.arrays import read_arrays
 from express50.files.digests import cached_by_file, file_sha256
 from express50.files.text import ID
@@ -142,16 +142,22 @@ def track_inputs(dataset: Dataset, subject: str) -> dict[str, Path]:
     Raises:
         StageError: the subject is not tracked.
         FormatError: the file is not a track.
+        HeadModelError: its head model is missing.
     """
     path = existing_track(dataset, subject)
-    return {"track": path, **_head_files_of(path)}
+    files = head_files(head := _head_of(path))
+    if "head" in files and not files["head"].exists():
+        raise HeadModelError(
+            f"{path}: its head model {head} is missing; put it back there, or run 'express50 track'"
+            " or 'express50 import track' with its new path"
+        )
+    return {"track": path, **files}
 
 
 @cached_by_file(64)
-def _head_files_of(path: Path) -> dict[str, Path]:
+def _head_of(path: Path) -> str:
     fix = "run 'express50 track' again"
-    arrays = read_arrays(path, FormatError, "a track", ("head",), fix, only=True)
-    return {name: file for name, file in head_files(str(arrays["head"])).items() if file.exists()}
+    return str(read_arrays(path, FormatError, "a track", ("head",), fix, only=True)["head"])
 
 
 def read_track(path: Path) -> Track:

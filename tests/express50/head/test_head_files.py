@@ -9,6 +9,7 @@ import pytest
 
 from express50.contract.layout import Dataset
 from express50.dataset.tracks import track_inputs
+from express50.errors import HeadModelError
 from express50.head import absolute_head, head_files
 from pipelines.register.scan_files import register_scan
 from pipelines.track import STAGE
@@ -48,6 +49,10 @@ def test_stages_count_the_files_beside_a_flame_pickle(tmp_path: Path) -> None:
     dataset, flame = Dataset(tmp_path / "data"), write_flame(tmp_path)
     write_track(dataset.track_file("S001"), track_arrays(flame))
     assert set(track_inputs(dataset, "S001")) == KINDS | {"track"}
+    flame.rename(tmp_path / "away.pkl")
+    with pytest.raises(HeadModelError, match=r"head model .*flame\.pkl is missing; put it back"):
+        track_inputs(dataset, "S001")
+    (tmp_path / "away.pkl").rename(flame)
     dataset.peaks_file("S001").parent.mkdir(parents=True)
     dataset.peaks_file("S001").write_text("{}")
     assert STAGE.inputs(dataset, "S001", TrackConfig(head=str(flame))).keys() >= KINDS
