@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -261,5 +262,7 @@ def test_a_missing_file_is_reported_with_the_setting_that_names_it(
 ) -> None:
     shutil.copytree(tracked[0], tmp_path / "out")
     assert main(["track", str(tmp_path / "out"), "--set", f"track.{setting}"]) == 2
-    assert f"track.{setting.replace('=', ' is ')}: no such file" in "".join(capsys.readouterr())
+    name, value = setting.split("=")  # a head model's path is made absolute
+    words = rf"track.{name} is (/.*/)?{value}: no such file"
+    assert re.search(words, "".join(capsys.readouterr()))
     assert (tmp_path / "out/track/eva_1/track.npz").is_file()
