@@ -117,11 +117,9 @@ def main() -> int:
                     bare.setdefault((len(shots[::step]), scene), []).append(
                         without_plates(shots[::step], sheet)
                     )
-            for scene, shots in {"recorded": clean, "cluttered": walls(clean)["cluttered"]}.items():
-                for wrong, plated in other_plates(shots[::4]).items():
-                    plates.setdefault(f"{scene}_{wrong}", []).append(
-                        with_plates(plated, shots[::4])
-                    )
+        for scene, shots in {"recorded": clean, "cluttered": walls(clean)["cluttered"]}.items():
+            for wrong, plated in other_plates(shots[::4]).items():
+                plates.setdefault(f"{scene}_{wrong}", []).append(with_plates(plated, shots[::4]))
     unplated = by_scene(bare, "plate")
     result = {
         "benchmark": "matte_views",
