@@ -219,7 +219,8 @@ def _with_other_views(
     for name in odd:
         frame, valid = shots.read(name)
         keyed, odd[name] = shots.matte(name, frame, valid, region_of(views[name], place))
-        rest |= {} if keyed is None else {name: keyed}
+        if keyed is not None:
+            rest[name] = keyed
         known = None if keyed is None else keyed.alpha
         views[name] = make_cut_view(pinhole(cameras[name]), frame, valid, known)
     unplated = [name for name in {**seen, **odd} if name not in rest]
@@ -250,7 +251,7 @@ def _plate(
             " or salient"
         )
     if plate is None or method == "bgmv2":
-        return plate if plate is None else MatchedPlate(plate, 1.0, sure=True), ""
+        return None if plate is None else MatchedPlate(plate, 1.0, sure=True), ""
     compared, outside = "top and sides", None
     if person is not None and open_share(person) >= LEAST_OPEN:
         compared = "border beside the person"
