@@ -214,6 +214,11 @@ def is_shown(path: Path, suffixes: Container[str]) -> bool:
     return path.suffix.lower() in suffixes and not path.name.startswith(".")
 
 
+def is_data_folder(path: Path) -> bool:
+    """Return whether a path is a folder that is neither hidden nor a disk's own, as @eaDir is."""
+    return path.is_dir() and path.name[0] not in ".@"
+
+
 def _videos(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if is_shown(path, VIDEO_SUFFIXES))
 

@@ -1,8 +1,12 @@
-"""Read rigs whose footage lies in folders by camera, by expression or by frame.
+"""Read rigs: a folder of videos, one per camera, or folders by camera, by expression or by frame.
 
-Nothing marks which side of such a tree is the cameras. ``calibration.json`` names them; otherwise
+Nothing marks which side of a tree is the cameras. ``calibration.json`` names them; otherwise
 names such as ``cam_01``, ``GoPro 2`` or a serial number tell. Where neither does, ``layout`` in
 capture.toml has to say it: to guess could take people for one person's expressions.
+
+What may lie beside the footage is that of our own layout (docs/FORMAT.md): ``calibration.json``,
+``board``, ``plates``, and ``cues.csv`` if the footage is one clip. Pictures and videos that were
+stored on their side are read upright.
 """
 
 from __future__ import annotations
@@ -15,6 +19,7 @@ from pathlib import Path
 from express50.capture.raw import (
     RawCapture,
     image_names,
+    is_data_folder,
     read_board,
     read_calibration,
     read_cues,
@@ -42,6 +47,11 @@ CAMERA = re.compile(r".*(cam|gopro|kinect|view).*|c[-_]?\d+|\d{5,}", re.IGNORECA
 NUMBER = re.compile(r"\d+")
 FRAME = re.compile(r"(frame|timestep|time|step|f|t)?[-_]?\d+", re.IGNORECASE)
 PERSON = re.compile(r"(s|sub|subj|subject|p|participant|person|id|actor)[-_]?\d+", re.IGNORECASE)
+
+
+def fits_videos(path: Path) -> bool:
+    """Return whether a folder holds videos."""
+    return path.is_dir() and any(map(fits_video, path.iterdir()))
 
 
 def fits_camera_folders(path: Path) -> bool:
@@ -73,16 +83,28 @@ def holds_folders(path: Path) -> bool:
     return bool(_files_by_folder(path)[1])
 
 
+def read_videos(path: Path, selection: Selection) -> RawCapture:
+    """Read each video of a folder as a camera; frame 17 of all shows the same moment.
+
+    A file that cannot be read as a video, such as a sound recording, is dropped. Without cues, the
+    whole footage is one clip.
+
+    Raises:
+        CaptureError: the cameras share no footage, two names become one camera id, a picture lacks
+            its number, or cues or the board's files are malformed.
+        CalibrationError: calibration.json is malformed.
+    """
+    names = sorted(file.name for file in path.iterdir() if fits_video(file))
+    ids = unique_ids(path, names, lambda name: Path(name).stem)
+    return _read(path, "videos", {ids[name]: {(CLIP, 0): name} for name in names}, selection)
+
+
 def read_camera_folders(path: Path, selection: Selection) -> RawCapture:
     """Read a folder per camera: its pictures, its only video, or a video per expression.
 
-    A camera's name before that of an expression is left out. What may lie beside the folders is
-    that of our own layout (docs/FORMAT.md), with cues only for footage that is one clip.
+    A camera's name before that of an expression is left out.
 
-    Raises:
-        CaptureError: the cameras share no footage, a name is ambiguous or lacks its number, or
-            cues or the board's files are malformed.
-        CalibrationError: calibration.json is malformed.
+    Raises as `read_videos` does.
     """
     kind, files = _files_by_folder(path)
     one_clip = kind == "frames" or all(len(names) == 1 for names in files.values())
@@ -98,7 +120,7 @@ def read_camera_folders(path: Path, selection: Selection) -> RawCapture:
 def read_expression_folders(path: Path, selection: Selection) -> RawCapture:
     """Read a folder per expression, which has a video or a picture of each camera.
 
-    Raises as `read_camera_folders` does.
+    Raises as `read_videos` does.
     """
     return _read_inner(path, selection, lambda folder: (folder, 0))
 
@@ -106,7 +128,7 @@ def read_expression_folders(path: Path, selection: Selection) -> RawCapture:
 def read_frame_folders(path: Path, selection: Selection) -> RawCapture:
     """Read a folder per frame, which has a picture of each camera.
 
-    Raises as `read_camera_folders` does.
+    Raises as `read_videos` does.
     """
     return _read_inner(path, selection, lambda folder: (CLIP, _number(folder)))
 
@@ -131,7 +153,7 @@ def _files_by_folder(path: Path) -> tuple[str, dict[str, list[str]]]:
     folders = [
         inner
         for inner in sorted(path.iterdir())
-        if inner.is_dir() and inner.name[0] not in ".@" and inner.name not in ("plates", "board")
+        if is_data_folder(inner) and inner.name not in ("plates", "board")
     ]
     videos = {f.name: [v.name for v in sorted(f.iterdir()) if fits_video(v)] for f in folders}
     kind = "videos" if any(videos.values()) else "frames"

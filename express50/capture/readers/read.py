@@ -79,7 +79,7 @@ LAYOUTS = (
     ),
     Layout(
         "videos", f"a folder of videos ({' '.join(VIDEO_SUFFIXES)}), one per camera",
-        videos.fits_videos, folder_id, videos.read_videos,
+        folders.fits_videos, folder_id, folders.read_videos,
     ),
     Layout("video", "a video file", videos.fits_video, videos.video_id, videos.read_video),
     Layout(

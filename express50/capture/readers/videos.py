@@ -1,4 +1,4 @@
-"""Read footage stored as videos: NeRSemble v2, RAVDESS, a video, or one per camera in a folder.
+"""Read footage stored as videos: NeRSemble v2, RAVDESS, or a single video.
 
 NeRSemble v2: a participant's folder, ``018/``, one video per sequence and camera. Footage is
 colour-corrected when it is read (``color_calibration.json``: a polynomial per camera, in linear
@@ -23,12 +23,8 @@ from express50.capture.raw import (
     VIDEO_SUFFIXES,
     RawCamera,
     RawCapture,
+    is_data_folder,
     is_shown,
-    read_board,
-    read_calibration,
-    read_cues,
-    read_plates,
-    unused_files,
 )
 from express50.capture.readers.selection import (
     Moment,
@@ -36,7 +32,6 @@ from express50.capture.readers.selection import (
     check_selection,
     common_timeline,
     folder_id,
-    unique_ids,
 )
 from express50.errors import CalibrationError, CaptureError
 from express50.files.images import ORIENTATION
@@ -74,9 +69,7 @@ def read_participant(path: Path, selection: Selection) -> RawCapture:
     calibration = read_nersemble(path / CAMERAS)
     check_links(*(path / "sequences").iterdir())
     sequences = sorted(
-        p.name
-        for p in (path / "sequences").iterdir()
-        if p.is_dir() and p.name != BACKGROUND and p.name[0] not in ".@"  # such as @eaDir
+        p.name for p in (path / "sequences").iterdir() if is_data_folder(p) and p.name != BACKGROUND
     )
     check_selection(selection, sequences, sorted(calibration))
     wanted = [name for name in sequences if selection.has_sequence(name)]
@@ -237,17 +230,14 @@ def read_video(path: Path, selection: Selection) -> RawCapture:
         CaptureError: it is not a video.
     """
     check_selection(selection, [CLIP], ["video"])
+    turn = ORIENTATION[video_tags(path).turn]
+    camera = RawCamera(
+        id="video", kind="videos", path=path.parent, names=(path.name,), orientation=turn
+    )
     return RawCapture(
         root=path.parent, subject=video_id(path), fps=video_fps(path), meta={},
-        cameras={"video": _one_video("video", path)}, clips=(selection.expression(CLIP),),
+        cameras={"video": camera}, clips=(selection.expression(CLIP),),
     )  # fmt: skip
-
-
-def _one_video(camera: str, path: Path) -> RawCamera:
-    turn = ORIENTATION[video_tags(path).turn]
-    return RawCamera(
-        id=camera, kind="videos", path=path.parent, names=(path.name,), orientation=turn
-    )
 
 
 def first_fps(videos: Sequence[Path]) -> float:
@@ -256,44 +246,3 @@ def first_fps(videos: Sequence[Path]) -> float:
         with suppress(CaptureError):
             return video_fps(video)
     return video_fps(videos[-1])
-
-
-def fits_videos(path: Path) -> bool:
-    """Return whether a folder holds videos."""
-    return path.is_dir() and any(map(fits_video, path.iterdir()))
-
-
-def read_videos(path: Path, selection: Selection) -> RawCapture:
-    """Read each video of a folder as a camera; frame 17 of all shows the same moment.
-
-    A file that cannot be read as a video, such as a sound recording, is dropped.
-    ``cues.csv``, ``calibration.json``, ``board`` and ``plates`` beside them are those of our own
-    layout (docs/FORMAT.md); without cues, the whole footage is one clip.
-
-    Raises:
-        CaptureError: none of them is a video, two names become one camera id, or the cues or the
-            board's files are malformed.
-        CalibrationError: calibration.json is malformed.
-    """
-    files = sorted(filter(fits_video, path.iterdir()))
-    ids = unique_ids(path, (file.name for file in files), lambda name: Path(name).stem)
-    check_selection(selection, [CLIP], sorted(ids.values()))
-    wanted = {ids[f.name]: f for f in files if selection.has_camera(ids[f.name])}
-    cameras: dict[str, RawCamera] = {}
-    dropped: dict[str, str] = {}
-    for camera, file in wanted.items():
-        try:
-            cameras[camera] = _one_video(camera, file)
-        except CaptureError as error:
-            dropped[camera] = str(error)
-    if not cameras:
-        raise CaptureError(next(iter(dropped.values())))
-    fps = first_fps([wanted[camera] for camera in cameras])
-    calibration, cues = read_calibration(path, cameras, dropped), read_cues(path / "cues.csv")
-    return RawCapture(
-        root=path, subject=folder_id(path), fps=fps, meta={}, cues=cues,
-        cameras=cameras, dropped=dropped, calibration=calibration,
-        plates=read_plates(path, cameras), board=read_board(path, cameras),
-        clips=() if cues else (selection.expression(CLIP),),
-        warnings=unused_files(path, ids.values()),
-    )  # fmt: skip
