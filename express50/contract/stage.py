@@ -118,8 +118,9 @@ class Growth:
     """Sizes of the footage that a stage's cost is proportional to, for ``express50 plan``.
 
     The sizes are ``subjects``, ``expressions``, ``views`` (cameras), ``pixels`` (of a recorded
-    image), ``picture`` (pixels of a peak frame, which may be reduced), ``frames`` (of a camera) and
-    ``decoded`` (those that ingest decodes); several are multiplied.
+    image), ``picture`` (pixels of a peak frame, which may be reduced), ``converted`` (the mean of
+    these two), ``frames`` (of a camera) and ``decoded`` (those that ingest decodes); several are
+    multiplied.
     """
 
     items: tuple[str, ...] = ("subjects",)  # number of items

@@ -7,7 +7,7 @@ are known.
 
 The law of an item's seconds is a constant (libraries, the head model) plus a part proportional to
 the sizes that the stage names in its `Growth`. Two sizes determine both; one leaves only the
-proportional part.
+proportional part. Of more, those near the size in question count most.
 """
 
 from __future__ import annotations
@@ -95,8 +95,11 @@ def _weighed(samples: Sequence[MeasuredSize]) -> tuple[np.ndarray, np.ndarray, n
 def _law(
     works: np.ndarray, seconds: np.ndarray, errors: np.ndarray, at: float, bounded: bool = True
 ) -> float:
-    """Fit constant and slope, neither below 0 if bounded, by weighted least squares."""
-    weights = 1 / errors
+    """Fit constant and slope, neither below 0 if bounded, by weighted least squares.
+
+    Errors count as larger with the distance from `at`, because few stages follow the law exactly.
+    """
+    weights = 1 / (errors * (1 + np.log(works / at) ** 2))
     rows = np.stack([np.ones_like(works), works / works.max()], 1)
     constant, slope = 0.0, float((weights**2 * rows[:, 1] * seconds).sum())
     slope /= float((weights**2 * rows[:, 1] ** 2).sum())

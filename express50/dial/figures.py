@@ -38,7 +38,16 @@ class Footage:
     @property
     def picture(self) -> float:
         """Return the pixels of a peak frame."""
-        return min(self.pixels, self.shape * self.side**2) if self.side else self.pixels
+        return self._at_most(self.side)
+
+    @property
+    def converted(self) -> float:
+        """Return the mean of the pixels that are decoded and written where pictures are reduced."""
+        return (self.pixels + self.picture) / 2
+
+    def _at_most(self, side: float) -> float:
+        """Return the pixels of an image whose longer side is reduced to `side`, unless it is 0."""
+        return min(self.pixels, self.shape * side**2) if side else self.pixels
 
     def work(self, factors: Sequence[str]) -> float:
         """Return the product of the named sizes."""
@@ -46,9 +55,7 @@ class Footage:
 
     def time(self, growth: Growth) -> float:
         """Return the size that the seconds of a stage's item are proportional to."""
-        sides = [side for side in (self.side * ("picture" in growth.time), growth.side) if side]
-        seen = replace(self, side=float(min(sides, default=0)))
-        return replace(seen, pixels=seen.picture).work(growth.time)
+        return replace(self, pixels=self._at_most(growth.side)).work(growth.time)
 
     def items(self, growth: Growth) -> float:
         """Return the number of items of a stage."""

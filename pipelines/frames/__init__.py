@@ -84,7 +84,7 @@ STAGE = Stage(
     " calibrated pinhole camera, colour-corrected, lossless, and reduced if the settings say so.",
     growth=Growth(
         items=("subjects", "expressions"),
-        time=("views", "pixels"),
+        time=("views", "converted"),
         disk=("views", "picture"),
         more=("subjects",),
         reduces="image_side",

@@ -55,7 +55,8 @@ def test_reduced_pictures_bound_the_stages_after_frames_and_no_other():
     chosen = [stages()[name] for name in names]
     costs = {name: cost(2.0) for name in names}
     bounded = estimate(chosen, replace(target, side=1280), [(replace(SMALL, side=1280), costs)], 1)
-    for row, pixels in zip(bounded, (8e6, 8e6, 0.75 * 1280**2), strict=True):
+    small = 0.75 * 1280**2
+    for row, pixels in zip(bounded, (8e6, (8e6 + small) / 2, small), strict=True):
         assert row.seconds == pytest.approx(2.0 * pixels / 1e5)
 
 
@@ -150,6 +151,12 @@ def test_two_sizes_tell_what_does_not_grow_and_the_interval_holds_a_third():
     (alone,) = estimate([stage], unseen, measured[:1], 1)
     assert alone.sizes == 1 and alone.seconds == pytest.approx(20 * 5.0)
     assert alone.core_hours_low < row.core_hours < alone.core_hours_high
+
+
+def test_sizes_near_the_one_in_question_count_most():
+    samples = [MeasuredSize(w, [t]) for w, t in ((1.0, 1.4), (14.0, 5.1), (240.0, 35.0))]
+    for work, seconds in ((240.0, 35.0), (480.0, 66.0), (1.0, 1.4)):
+        assert forecast(samples, work).value == pytest.approx(seconds, rel=0.06)
 
 
 def test_intervals_hold_nine_times_in_ten():
