@@ -35,7 +35,7 @@ OUT, CLEAR, RIM, SOLID = range(4)  # what a view says of a cell
 
 # The comparison of mattes.
 # Longest side of the pictures, and cells along each side of space: 192 and 96 take three times as
-# long and gain next to nothing (docs/LOG.md, "Mattes").
+# long and gain next to nothing (docs/LOG.md, "What was removed").
 SIDE, CELLS = 128, 64
 FEWEST = 4  # views; of three, two with the same error would overrule a correct one
 EMPTY, FULL = 0.003, 0.98  # shares of the image that a useful matte covers
