@@ -14,6 +14,7 @@ from express50.console import log
 from express50.errors import ConfigError, FormatError
 from express50.files.digests import text_digest
 from express50.geometry.transforms import is_rigid, make_transform
+from express50.head import head_path
 from express50.shards.reader import ShardReader
 from grmm.data import Place, Sample, SampleKey, Tracked
 
@@ -76,7 +77,7 @@ class ShardSource:
     def _place(self, index: int, meta: dict) -> Place:
         entry = self.reader.entries[index]
         where = f"{self.reader.root / entry.shard}: {entry.key}"
-        if meta.get("head") != self.head:
+        if not _is_one_head(meta.get("head"), self.head):
             raise FormatError(
                 f"{where}: tracked with head model {meta.get('head')!r}, the first sample with "
                 f"{self.head!r}; train on one of them: pack them into different folders"
@@ -136,7 +137,7 @@ class MixedSource:
         self.head = sources[0].head
         owners: dict[str, ShardSource] = {}
         for source in sources:
-            if source.head != self.head:
+            if not _is_one_head(source.head, self.head):
                 raise FormatError(
                     f"{source.reader.root}: tracked with head model {source.head!r}, "
                     f"{sources[0].reader.root} with {self.head!r}; track both with one"
@@ -161,6 +162,11 @@ class MixedSource:
         """Read one sample's place, as `ShardSource.place` does."""
         source, number = self._sources[index]
         return source.place(number)
+
+
+def _is_one_head(named: object, other: str) -> bool:
+    """Return whether two names mean one head model; two machines may name it by different paths."""
+    return named == other or (isinstance(named, str) and head_path(named) == head_path(other))
 
 
 def open_shards(roots: Sequence[Path], split: str) -> ShardSource | MixedSource:

@@ -19,7 +19,7 @@ from express50.files.arrays import read_arrays
 from express50.files.digests import cached_by_file, file_sha256
 from express50.files.text import ID
 from express50.geometry.shapes import check_finite, check_shape
-from express50.head import head_files
+from express50.head import HEADS, head_files
 
 SCHEMA = "express50.track/2"
 SEQUENCE_SCHEMA = "express50.sequence/1"
@@ -148,8 +148,8 @@ def track_inputs(dataset: Dataset, subject: str) -> dict[str, Path]:
     files = head_files(head := _head_of(path))
     if "head" in files and not files["head"].exists():
         raise HeadModelError(
-            f"{path}: its head model {head} is missing; put it back there, or run 'express50 track'"
-            " or 'express50 import track' with its new path"
+            f"{path}: its head model {head} is missing; put it back there, or set {HEADS} to"
+            f" the folder that holds {files['head'].name}"
         )
     return {"track": path, **files}
 

@@ -9,6 +9,7 @@ import os
 from pathlib import Path
 
 BUILTIN_NAME = "procedural"  # as commands and tracks name it; other head models are named by path
+HEADS = "EXPRESS50_HEADS"  # environment variable: folders of head models, listed as in PATH
 # FLAME's other files, which lie beside its pickle: the first name that is there counts.
 COMPANIONS = {
     "embedding": ("landmark_embedding.npy", "landmark_embedding_with_eyes.npy",
@@ -24,6 +25,18 @@ def absolute_head(spec: str) -> str:
     return spec if spec == BUILTIN_NAME else os.path.normpath(Path(spec).expanduser().absolute())
 
 
+def head_path(spec: str | Path) -> Path:
+    """Return where a head model lies: at its path, or under the same name in ``EXPRESS50_HEADS``.
+
+    Tracks, shards and checkpoints name a model by its path on the machine that made them. Where
+    neither place has it, the path is returned.
+    """
+    path = Path(spec).expanduser()
+    folders = [path.parent, *map(Path, filter(None, os.environ.get(HEADS, "").split(os.pathsep)))]
+    places = (folder.expanduser() / path.name for folder in folders)
+    return next((place for place in places if place.exists()), path)
+
+
 def head_files(spec: str) -> dict[str, Path]:
     """Return the files and folders that a head model is read from; none of the built-in head.
 
@@ -31,7 +44,7 @@ def head_files(spec: str) -> dict[str, Path]:
     """
     if spec == BUILTIN_NAME:
         return {}
-    path = Path(spec).expanduser()
+    path = head_path(spec)
     beside = companions(path) if path.suffix == ".pkl" else {}
     return {"head": path, **{f"head {kind}": file for kind, file in beside.items()}}
 

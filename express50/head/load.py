@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from express50.console import log
 from express50.errors import HeadModelError
 from express50.files.arrays import read_arrays
-from express50.head import BUILTIN_NAME
+from express50.head import BUILTIN_NAME, HEADS, head_path
 
 if TYPE_CHECKING:
     from express50.head.model import HeadModel
@@ -52,7 +53,7 @@ def load_topology(spec: str | Path) -> HeadTopology:
     Raises:
         HeadModelError: as `load_head`.
     """
-    path = BUILTIN if str(spec) == BUILTIN_NAME else Path(spec).expanduser()
+    path = BUILTIN if str(spec) == BUILTIN_NAME else head_path(spec)
     if path.suffix == ".npz" and path.is_file() and is_stored(path):
         arrays = read_arrays(path, HeadModelError, "a stored head model", FIELDS)
         faces = arrays["faces"].astype(np.int64)
@@ -65,7 +66,8 @@ def load_topology(spec: str | Path) -> HeadTopology:
 def load_head(spec: str | Path) -> HeadModel:
     """Load a head model by name or path.
 
-    "procedural" is the built-in head. Of paths, `*.pkl` is the user's FLAME model (with its other
+    "procedural" is the built-in head. A path that is not there is looked for by its name in the
+    folders of ``EXPRESS50_HEADS``. Of paths, `*.pkl` is the user's FLAME model (with its other
     files beside it), a folder is a checkout of ICT-FaceKit, and `*.npz` holds ICT-FaceKit's arrays
     or a head model of your own (docs/RECIPES.md).
 
@@ -74,12 +76,15 @@ def load_head(spec: str | Path) -> HeadModel:
     """
     if str(spec) == BUILTIN_NAME:
         return load_builtin()
-    path = Path(spec).expanduser()
+    path = head_path(spec)
     if not path.exists():
         raise HeadModelError(
-            f"head model {str(spec)!r}: no such file or folder; expected {_KINDS}. Tracks and"
-            " shards name their model by its path, so keep the file there"
+            f"head model {str(spec)!r}: no such file or folder; expected {_KINDS}. Tracks, shards"
+            " and checkpoints name their model by its path: put it back there, or set the variable"
+            f" {HEADS} to the folder that holds {path.name}"
         )
+    if path != Path(spec).expanduser():
+        _say_found(str(spec), path)
     if path.suffix == ".npz" and is_stored(path):
         return load_stored(path, path.stem)
     if path.suffix == ".npz" and _holds(path, "kintree_table"):
@@ -96,6 +101,12 @@ def load_head(spec: str | Path) -> HeadModel:
 
         return load_flame(path)
     raise HeadModelError(f"head model {str(spec)!r}: unknown kind of file; expected {_KINDS}")
+
+
+@cache
+def _say_found(spec: str, path: Path) -> None:
+    """Say once which file is used, because only its name is known to be the right one."""
+    log(f"head model {spec} is not there, using {path}")
 
 
 @cache

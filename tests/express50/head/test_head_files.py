@@ -11,6 +11,7 @@ from express50.contract.layout import Dataset
 from express50.dataset.tracks import track_inputs
 from express50.errors import HeadModelError
 from express50.head import absolute_head, head_files
+from express50.head.load import load_head, load_topology
 from pipelines.register.scan_files import register_scan
 from pipelines.track import STAGE
 from pipelines.track.config import TrackConfig
@@ -56,6 +57,24 @@ def test_stages_count_the_files_beside_a_flame_pickle(tmp_path: Path) -> None:
     dataset.peaks_file("S001").parent.mkdir(parents=True)
     dataset.peaks_file("S001").write_text("{}")
     assert STAGE.inputs(dataset, "S001", TrackConfig(head=str(flame))).keys() >= KINDS
+
+
+def test_a_model_that_another_machine_has_elsewhere_is_found_by_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    here, there = tmp_path / "here", tmp_path / "there"
+    there.mkdir()
+    named, dataset = str(write_flame(there)), Dataset(tmp_path / "data")
+    write_track(dataset.track_file("S001"), track_arrays(Path(named)))
+    there.rename(here)
+    with pytest.raises(HeadModelError, match=r"EXPRESS50_HEADS to the folder that holds fl"):
+        load_head(named)
+    monkeypatch.setenv("EXPRESS50_HEADS", os.pathsep.join(["", str(tmp_path), str(here)]))
+    assert load_head(named).name == load_head(str(here / "flame.pkl")).name
+    assert capsys.readouterr().err.count(f"{named} is not there, using {here / 'flame.pkl'}") == 1
+    assert load_topology(named).faces.size
+    inputs = track_inputs(dataset, "S001")
+    assert inputs.keys() == KINDS | {"track"} and inputs["head"] == here / "flame.pkl"
 
 
 def test_a_scan_is_registered_again_if_flames_masks_change(
