@@ -17,7 +17,8 @@ recorded, bland and cluttered walls, and walls of the skin's and the shirt's col
 per scene and of all scenes together.
 
 ``plates`` has the same figures for plates that were shifted, or taken in other light or elsewhere,
-in front of the recorded and the cluttered set: ``sad`` as `match_plate` brings them to the frame,
+in front of the recorded and the cluttered set: ``sad`` as `match_plate` brings them to the frame
+(those that do not fit as they are a second time, beside where the faces say that the person is),
 ``sad_untouched`` as they are, ``sad_right`` with the right plate, and the share that is
 ``refused``.
 
@@ -60,7 +61,14 @@ from express50.geometry.sampling import evenly
 from express50.twin import TwinConfig
 from express50.twin.truth import Truth
 from pipelines.matte import MatteConfig
-from pipelines.matte.cutout import CutView, cut_out, make_cut_view, soft_alpha
+from pipelines.matte.cutout import (
+    CutView,
+    cut_out,
+    find_head,
+    make_cut_view,
+    region_of,
+    soft_alpha,
+)
 from pipelines.matte.key import key_alpha
 from pipelines.matte.plates import LEAST_SHARE, match_plate
 from pipelines.matte.stage import corrected, make_view
@@ -220,8 +228,12 @@ def _alone(shot: Shot, view: CutView) -> np.ndarray:
 def with_plates(wrong: list[Shot], right: list[Shot]) -> Figures:
     """Return errors of shots with wrong plates; those that are refused count for nothing else."""
     kept: list[Figures] = []
-    for shot, good in zip(wrong, right, strict=True):
+    views = [make_cut_view(pinhole(shot.camera), shot.frame, shot.valid) for shot in right]
+    place = find_head(views)
+    for shot, good, view in zip(wrong, right, views, strict=True):
         matched = match_plate(shot.plate, shot.frame, shot.valid)
+        if not matched.sure:  # as `pipelines.matte.stage.camera_mattes` does
+            matched = match_plate(shot.plate, shot.frame, shot.valid, region_of(view, place))
         if matched.share >= LEAST_SHARE:
             plates = {"sad": matched.plate, "sad_untouched": shot.plate, "sad_right": good.plate}
             kept.append(

@@ -108,12 +108,13 @@ def exposed(plate: np.ndarray, gain: np.ndarray) -> np.ndarray:
 class MatchedPlate:
     """A plate (H, W, 3) uint8, aligned with a frame and its light evened where that helps.
 
-    `share` is how much of the frame's border beside the person it explains; it is `sure` if the
-    plate explains that as it was.
+    `share` is how much it explains of the frame's top and upper sides, or of its whole border
+    `beside` the person; it is `sure` if the plate explains that as it was.
     """
 
     plate: np.ndarray
     share: float
+    beside: bool = False
     sure: bool = False
 
 
@@ -122,18 +123,20 @@ def match_plate(
 ) -> MatchedPlate:
     """Match a plate to a frame that the camera took after it moved a little, or in other light.
 
-    Both are (H, W, 3) uint8, ``valid`` (H, W) bool marks the pixels with footage. If it is not
-    known where a `person` (H, W) bool may be, their body leaves the frame below, so its top and
-    upper sides are compared.
+    Both are (H, W, 3) uint8, ``valid`` (H, W) bool marks the pixels with footage. `person` (h, w)
+    bool, of any size, is where a person may be. If that is not known, or leaves too little of the
+    border open, their body leaves the frame below, so its top and upper sides are compared. What
+    is not `sure` then is better matched again with the person.
     """
+    person = _where_open(person, valid.shape)
     rim = valid & _rim(valid.shape, RIM, person)
-    best = MatchedPlate(plate, _explained(plate, frame, rim))
+    best = MatchedPlate(plate, _explained(plate, frame, rim), beside=person is not None)
     if best.share > GOOD_SHARE:
         return replace(best, sure=True)
     wide = _rim(valid.shape, WIDE_RIM, person)
     for light in (plate, _evened(plate, frame, rim)):
         for image in (light, _aligned(light, frame, valid & wide)):
-            found = MatchedPlate(image, _explained(image, frame, rim))
+            found = replace(best, plate=image, share=_explained(image, frame, rim))
             best = found if found.share > best.share + LEAST_GAIN else best
     return best
 
@@ -155,10 +158,15 @@ def _rim(shape: tuple[int, ...], share: float, person: np.ndarray | None = None)
     return rim
 
 
-def open_share(person: np.ndarray) -> float:
-    """Return the share of an image's border that a person (H, W) bool leaves open."""
+def _where_open(person: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray | None:
+    """Return a person (h, w) bool at a shape; None if they leave too little of the border open."""
+    if person is None:
+        return None
     border = _rim(person.shape, RIM, np.zeros_like(person))
-    return float((~person[border]).mean())
+    if (~person[border]).mean() < LEAST_OPEN:
+        return None
+    size = shape[::-1]
+    return cv2.resize(person.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
 
 
 def white_share(image: np.ndarray, valid: np.ndarray) -> float:

@@ -28,14 +28,12 @@ from pipelines.matte.cutout import (
 )
 from pipelines.matte.key import dilated, key_alpha
 from pipelines.matte.plates import (
-    LEAST_OPEN,
     LEAST_SHARE,
     MOST_WHITE,
     MatchedPlate,
     exposed,
     exposure_gain,
     match_plate,
-    open_share,
     white_share,
 )
 from pipelines.matte.visual_hull import (
@@ -252,12 +250,7 @@ def _plate(
         )
     if plate is None or method == "bgmv2":
         return None if plate is None else MatchedPlate(plate, 1.0, sure=True), ""
-    compared, outside = "top and sides", None
-    if person is not None and open_share(person) >= LEAST_OPEN:
-        compared = "border beside the person"
-        size = valid.shape[::-1]
-        outside = cv2.resize(person.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-    matched = match_plate(plate, frame, valid, outside)
+    matched = match_plate(plate, frame, valid, person)
     if matched.share >= LEAST_SHARE:
         return matched, ""
     white = {"frame": white_share(frame, valid), "plate": white_share(plate, valid)}
@@ -268,6 +261,7 @@ def _plate(
             " overexposed, so the camera was matted without the plate; record both with the same"
             " exposure, below white"
         )
+    compared = "border beside the person" if matched.beside else "top and sides"
     return None, (
         f"its plate explains {matched.share:.0%} of the frame's {compared}, expected"
         f" {LEAST_SHARE:.0%}: it shows another set or place, so the camera was matted without it;"

@@ -29,7 +29,6 @@ from pipelines.matte.plates import (
     fit_plate,
     local_colours,
     match_plate,
-    open_share,
     shrunk,
     solve_opacity,
 )
@@ -324,8 +323,9 @@ def test_a_plate_is_compared_beside_a_person_whose_place_is_known() -> None:
     person = cv2.dilate(scene.true, np.ones((9, 9))) > 0
     person[body] = True
     found = match_plate(scene.plate, frame, valid, person)
-    assert found.sure and found.plate is scene.plate
-    assert open_share(person) > 0.4 > open_share(valid)
+    assert found.sure and found.beside and found.plate is scene.plate
+    anywhere = match_plate(scene.plate, frame, valid, person=np.ones((256, 256), bool))
+    assert not anywhere.beside and anywhere.share < LEAST_SHARE
     other = hair_before("dark", "cluttered", 256, np.random.default_rng(1))
     assert match_plate(other.plate, frame, valid, person).share < 0.5
 
