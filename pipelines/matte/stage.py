@@ -51,8 +51,11 @@ COLUMNS = 6  # of the contact sheet
 TILE = 240
 SHOWN = 192  # longest side of the pictures in the contact sheet, pixels
 RED, GREEN = (235, 50, 40), (50, 220, 80)
-# Share of the image's top or of a side that the subject may cover before it counts as cut off.
+# Share of a side of the image that the subject may cover before it counts as cut off there.
 MOST_CONTACT = 0.02
+SIDES = ("top", "right", "bottom", "left")  # of an image
+OUTWARD = np.array([[0, -1, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0]])  # of the camera, by side
+UPRIGHT = np.array([0, 0, 0.2, 0])  # share of a side that is as strong a sign as a camera's bottom
 RIM = 0.008  # share of the longer side: distance from the outline in which errors are predicted
 RIM_ROWS = 8  # rows of pixels that are judged within that distance, at least
 WINDOW = 5  # pixels, odd: side of the window in which alpha's spread is measured
@@ -116,7 +119,8 @@ def run(
         **({"unchanged": found.unchanged} if found.unchanged else {}),
     }
     named = {note.what for note in found.warnings}
-    odd = [note for note in matte_warnings(final) if note.what not in named]
+    body = body_sides({name: cameras[name] for name in final}, final)
+    odd = [note for note in matte_warnings(final, body) if note.what not in named]
     bounds = {
         name: error_bounds("matte", rim_figures(alpha, own.rgb, own.noise, own.plated, len(mattes)))
         for (name, alpha), own in zip(final.items(), mattes.values(), strict=True)
@@ -330,8 +334,8 @@ def _excess(more: np.ndarray, less: np.ndarray) -> float:
 
 def border_contact(alpha: np.ndarray) -> dict[str, float]:
     """Return the share of each side of the image that an alpha (H, W) uint8 covers."""
-    sides = {"top": alpha[0], "right": alpha[:, -1], "bottom": alpha[-1], "left": alpha[:, 0]}
-    return {side: round(float((line > 127).mean()), 4) for side, line in sides.items()}
+    lines = alpha[0], alpha[:, -1], alpha[-1], alpha[:, 0]
+    return {s: round(float((line > 127).mean()), 4) for s, line in zip(SIDES, lines, strict=True)}
 
 
 def rim_of(alpha: np.ndarray) -> np.ndarray:
@@ -412,8 +416,25 @@ def _nearby(values: np.ndarray) -> np.ndarray:
     return cv2.blur(values, (_nearby_side(values), _nearby_side(values)))
 
 
-def matte_warnings(alphas: dict[str, np.ndarray]) -> list[Note]:
-    """Warn of cameras whose matte is empty or whose subject is cut off at the top or a side."""
+def body_sides(cameras: Mapping[str, Camera], alphas: dict[str, np.ndarray]) -> dict[str, str]:
+    """Return the side of each camera's image at which the body leaves it.
+
+    That is the bottom, unless cameras lie on their side: from all around, a subject leaves the
+    images mostly downwards. A single camera does not show which way that is.
+    """
+    if len(cameras) < 2:
+        return dict.fromkeys(cameras, "bottom")
+    ways = {name: OUTWARD @ camera.cam_from_world[:3, :3] for name, camera in cameras.items()}
+    weights = [[*border_contact(alphas[name]).values()] + UPRIGHT for name in cameras]
+    down = np.einsum("cs,csd->d", weights, [*ways.values()])
+    return {name: SIDES[int(np.argmax(outward @ down))] for name, outward in ways.items()}
+
+
+def matte_warnings(alphas: dict[str, np.ndarray], body: Mapping[str, str]) -> list[Note]:
+    """Warn of cameras whose matte is empty, or whose subject is cut off.
+
+    `body` names the side at which the body may leave a camera's image.
+    """
     notes = []
     for name, alpha in alphas.items():
         share = float(alpha.mean()) / 255
@@ -421,7 +442,7 @@ def matte_warnings(alphas: dict[str, np.ndarray]) -> list[Note]:
             notes.append(Note(name, f"its matte is empty ({share:.2%} of the image)"))
             continue
         contact = border_contact(alpha)
-        cut = [side for side in ("top", "right", "left") if contact[side] > MOST_CONTACT]
+        cut = [s for s in SIDES if s != body[name] and contact[s] > MOST_CONTACT]
         if cut:
             most = max(contact[side] for side in cut)
             sides = " and ".join(cut)

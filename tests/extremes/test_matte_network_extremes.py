@@ -56,8 +56,9 @@ def test_an_odd_4k_frame_is_seen_small_and_refined_in_tiles(tmp_path) -> None:
 
 def test_warnings_of_empty_and_cut_off_mattes() -> None:
     alpha = np.zeros((40, 60), np.uint8)
-    alpha[10:, 20:40] = 255  # at the bottom every subject is cut off
+    alpha[10:, 20:40] = 255  # at the bottom the body leaves the image
     full = np.full((4, 6), 255, np.uint8)
     assert border_contact(full) == dict.fromkeys(("top", "right", "bottom", "left"), 1.0)
-    notes = matte_warnings({"a": alpha, "b": np.zeros((40, 60), np.uint8), "c": full})
+    alphas = {"a": alpha, "b": np.zeros((40, 60), np.uint8), "c": full}
+    notes = matte_warnings(alphas, dict.fromkeys(alphas, "bottom"))
     assert [note.what for note in notes] == ["b", "c"]

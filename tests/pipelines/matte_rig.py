@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from express50.geometry.cameras import Camera
+from express50.geometry.cameras import Camera, pinhole_camera
 from pipelines.matte.stage import make_view
 from pipelines.matte.visual_hull import MatteView, ball_of
 from tests.pipelines.bump_head import render, ring
@@ -44,3 +44,13 @@ def with_alpha(views: list[MatteView], changes: dict[int, np.ndarray]) -> list[M
         replace(v, alpha=changes[k].astype(np.float32)) if k in changes else v
         for k, v in enumerate(views)
     ]
+
+
+def turned(camera: Camera) -> Camera:
+    """A pinhole camera whose picture `np.rot90` turns."""
+    turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, camera.width], [0.0, 0.0, 1.0]])
+    axes = np.eye(4)
+    axes[:2, :2] = turn[:2, :2]
+    K = turn @ camera.K @ axes[:3, :3].T
+    pose = axes @ camera.cam_from_world
+    return pinhole_camera(camera.id, K, camera.height, camera.width, pose)

@@ -15,7 +15,7 @@ from express50.capture.frames import read_cameras_of
 from express50.contract.layout import Dataset
 from express50.errors import ConfigError, StageError
 from express50.files.images import read_alpha, write_image
-from express50.geometry.cameras import Camera, pinhole, pinhole_camera
+from express50.geometry.cameras import Camera, pinhole
 from express50.head.load import load_head
 from express50.shards.reader import ShardReader
 from express50.twin import TwinConfig
@@ -28,6 +28,7 @@ from pipelines.matte.key import key_alpha
 from pipelines.matte.stage import CameraMatte, camera_mattes, valid_pixels
 from pipelines.photo.capture import make_photo_capture, open_picture, single_camera
 from pipelines.track.config import TrackConfig
+from tests.pipelines.matte_rig import turned
 from tests.stages import metrics_of, run_here
 from tests.synth import write_video
 
@@ -178,16 +179,6 @@ def mean_errors(dataset: Dataset, truth: Truth) -> dict[str, float]:
         ).mean())
         for name, camera in used.items()
     }  # fmt: skip
-
-
-def turned(camera: Camera) -> Camera:
-    """A pinhole camera whose picture `np.rot90` turns."""
-    turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, camera.width], [0.0, 0.0, 1.0]])
-    axes = np.eye(4)
-    axes[:2, :2] = turn[:2, :2]
-    K = turn @ camera.K @ axes[:3, :3].T
-    pose = axes @ camera.cam_from_world
-    return pinhole_camera(camera.id, K, camera.height, camera.width, pose)
 
 
 def test_plates_of_cameras_on_their_side_are_used(rig, monkeypatch) -> None:

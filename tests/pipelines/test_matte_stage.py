@@ -15,12 +15,14 @@ from express50.contract.layout import Dataset
 from express50.error_model import error_bounds
 from express50.errors import ConfigError
 from express50.files.images import read_image, write_image
+from express50.geometry.cameras import pinhole
 from express50.runner.runner import Summary
+from express50.twin.rig import make_rig
 from pipelines import calibrate, frames
 from pipelines.matte import STAGE
-from pipelines.matte.stage import rim_figures, wall_noise
+from pipelines.matte.stage import body_sides, matte_warnings, rim_figures, wall_noise
 from tests.pipelines.bump_dataset import make_dataset as bump_dataset
-from tests.pipelines.matte_rig import disc
+from tests.pipelines.matte_rig import disc, turned
 from tests.pipelines.matte_scenes import make_scene
 from tests.pipelines.stand_ins import Bad, Difference, onnx_bright, torchscript
 from tests.stages import ingest_captures, metrics_of, notes_of, run_here
@@ -213,3 +215,29 @@ def test_noise_of_the_wall_is_not_that_of_its_edges_or_of_the_subject():
     frame[:, 110:] = 180
     assert wall_noise(alpha, frame) < 0.2
     assert wall_noise(np.full_like(alpha, 255), frame) == np.inf
+
+
+@pytest.mark.parametrize("lying", [(0,), (1, 4), range(8)])
+def test_a_body_may_leave_a_camera_on_its_side_where_the_others_say(lying) -> None:
+    body = np.zeros((40, 40), np.uint8)
+    body[25:, 5:35] = body[10:, 15:25] = 255
+    high = np.roll(body, -12, axis=0)  # whose head is cut off
+    high[-12:] = body[-1]
+    cameras = {name: pinhole(camera) for name, camera in make_rig(8, 40, 40, 0).items()}
+    alphas = dict.fromkeys(cameras, body) | {"cam04": high, "cam05": high}
+    for k in lying:
+        name = f"cam{k:02d}"
+        cameras[name], alphas[name] = turned(cameras[name]), np.rot90(alphas[name])
+    notes = matte_warnings(alphas, body_sides(cameras, alphas))
+    said = {note.what: note.why for note in notes}
+    sides = {name: "left" if int(name[3:]) in lying else "top" for name in ("cam04", "cam05")}
+    assert said.keys() == sides.keys()
+    assert all(f"at the {side} (" in said[name] for name, side in sides.items())
+
+
+def test_a_single_camera_is_taken_to_be_upright() -> None:
+    alpha = np.zeros((40, 40), np.uint8)
+    alpha[10:, :30] = 255
+    camera = pinhole(make_rig(1, 40, 40, 0)["cam00"])
+    notes = matte_warnings({"cam00": alpha}, body_sides({"cam00": camera}, {"cam00": alpha}))
+    assert ["at the left (75%)" in note.why for note in notes] == [True]
