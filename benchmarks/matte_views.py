@@ -18,9 +18,8 @@ per scene and of all scenes together.
 
 ``plates`` has the same figures for plates that were shifted, or taken in other light or elsewhere,
 in front of the recorded and the cluttered set: ``sad`` as `match_plate` brings them to the frame
-(those that do not fit as they are a second time, beside where the faces say that the person is),
-``sad_untouched`` as they are, ``sad_right`` with the right plate, and the share that is
-``refused``.
+when it knows where the faces place the person, ``sad_untouched`` as they are, ``sad_right`` with
+the right plate, and the share that is ``refused``.
 
 Disturbances are laid on the recorded frames in linear light with the true alpha, and keyed again.
 ``sad`` is the summed absolute error in thousands, ``mae`` its mean, both means over cameras and
@@ -231,9 +230,7 @@ def with_plates(wrong: list[Shot], right: list[Shot]) -> Figures:
     views = [make_cut_view(pinhole(shot.camera), shot.frame, shot.valid) for shot in right]
     place = find_head(views)
     for shot, good, view in zip(wrong, right, views, strict=True):
-        matched = match_plate(shot.plate, shot.frame, shot.valid)
-        if not matched.sure:  # as `pipelines.matte.stage.camera_mattes` does
-            matched = match_plate(shot.plate, shot.frame, shot.valid, region_of(view, place))
+        matched = match_plate(shot.plate, shot.frame, shot.valid, region_of(view, place))
         if matched.share >= LEAST_SHARE:
             plates = {"sad": matched.plate, "sad_untouched": shot.plate, "sad_right": good.plate}
             kept.append(

@@ -123,12 +123,24 @@ def match_plate(
 ) -> MatchedPlate:
     """Match a plate to a frame that the camera took after it moved a little, or in other light.
 
-    Both are (H, W, 3) uint8, ``valid`` (H, W) bool marks the pixels with footage. `person` (h, w)
-    bool, of any size, is where a person may be. If that is not known, or leaves too little of the
-    border open, their body leaves the frame below, so its top and upper sides are compared. What
-    is not `sure` then is better matched again with the person.
+    Both are (H, W, 3) uint8, ``valid`` (H, W) bool marks the pixels with footage. A body leaves
+    most frames below, so their top and upper sides are compared. If the plate does not fit there as
+    it is, it is compared beside the `person` as well: where one may be, (h, w) bool of any size.
     """
+    first = _matched(plate, frame, valid)
     person = _where_open(person, valid.shape)
+    if first.sure or person is None:
+        return first
+    second = _matched(plate, frame, valid, person)
+    # The fewer pixels are compared, the sooner a plate in other light seems to fit.
+    border = valid & _rim(valid.shape, RIM, person)
+    return first if _explained(first.plate, frame, border) > second.share else second
+
+
+def _matched(
+    plate: np.ndarray, frame: np.ndarray, valid: np.ndarray, person: np.ndarray | None = None
+) -> MatchedPlate:
+    """Match a plate by the frame's top and upper sides, or by its border beside a person (H, W)."""
     rim = valid & _rim(valid.shape, RIM, person)
     best = MatchedPlate(plate, _explained(plate, frame, rim), beside=person is not None)
     if best.share > GOOD_SHARE:
