@@ -2,9 +2,9 @@
 
 The faces that the cameras see place a head in the world, and so show roughly where skull, hair and
 shoulders are in every picture, even from behind. GrabCut (Rother, Kolmogorov and Blake 2004) finds
-their outlines by colours. Then the cameras correct each other: the person is nowhere that others
-see past them, and, if they are many, everywhere that all others see them; GrabCut runs again
-within these limits. A single camera has its colours only.
+their outlines by colours; heads of other people close by count as wall. Then the cameras correct
+each other: the person is nowhere that others see past them, and, if they are many, everywhere that
+all others see them; GrabCut runs again within these limits. A single camera has its colours only.
 
 Around an outline, alpha is the posterior mean of a mixture (Bayesian matting, Chuang et al. 2001)
 of two colours, the person's nearby and the wall's. The wall behind the person is interpolated from
@@ -14,7 +14,7 @@ plain wall this is as good as a plate; in front of a cluttered one the outline d
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -23,7 +23,7 @@ import numpy as np
 from scipy.ndimage import binary_fill_holes, gaussian_filter
 
 from express50.errors import NoFaceError
-from express50.files.images import edge_distance, shrink
+from express50.files.images import box_about, edge_distance, shrink
 from express50.geometry.cameras import Camera, resized
 from express50.geometry.conventions import corner_to_cell
 from express50.geometry.transforms import transform_points
@@ -39,6 +39,8 @@ from pipelines.matte.visual_hull import (
 )
 
 FACE_SCORE = 0.3  # heads from behind score up to 0.2, profiles from 0.33 on
+NEIGHBOUR_SCORE = 0.5  # other people's faces beside the person score 0.74 or more, walls up to 0.41
+NEIGHBOUR_M, MOST_NEIGHBOURS = 0.2, 4  # how far beside the person's region they are searched
 SIDE = 512  # pixels of the pictures in which faces are searched
 PIXEL_M = 0.0015  # size on the head of a pixel of the pictures that GrabCut sees
 SURE, LIKELY, HAIR = 0.7, 1.3, 1.6  # skull sizes: no wall inside the first, no hair past the last
@@ -131,6 +133,9 @@ def cut_out(
     place = place or find_head(views)
     small = [_at_scale(view, PIXEL_M * place.density(view.camera)) for view in views]
     guesses = [_guess(view, place) for view in small]
+    for view, reduced, guess in zip(views, small, guesses, strict=True):
+        if view.known is None:
+            _leave_out(guess, reduced, find_neighbours(view, place))
     density = [place.density(view.camera) for view in small]
 
     def cut(labels: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -172,6 +177,47 @@ def find_head(views: Sequence[CutView]) -> HeadPlace:
         " person is found by the face; record plates, or set matte.method=salient and"
         " matte.weights"
     )
+
+
+def find_neighbours(view: CutView, place: HeadPlace) -> list[HeadPlace]:
+    """Place the heads of other people that a view shows where the person may be, or close by."""
+    from express50.landmarks.detector import detect
+    from express50.landmarks.network import load_network
+    from pipelines.track.observe import LandmarkView, place_head
+
+    region = region_of(view, place)
+    if not region.any():
+        return []
+    box = box_about(region, round(NEIGHBOUR_M * place.density(view.camera)))
+    image, heads = view.rgb.copy(), [place]
+    blank = image[box].mean((0, 1))
+    while len(heads) <= MOST_NEIGHBOURS:
+        image[_head_of(view, heads[-1])] = blank  # a face is found once
+        face = detect(load_network(), np.ascontiguousarray(image[box]))
+        points = face.points + [box[1].start, box[0].start]
+        found = place_head([LandmarkView(view.camera, points, face.sigma, face.score)])
+        if face.score < NEIGHBOUR_SCORE or found is None:
+            break
+        heads.append(HeadPlace(*found))
+    return heads[1:]
+
+
+def _leave_out(guess: np.ndarray, view: CutView, neighbours: Sequence[HeadPlace]) -> None:
+    """Label neighbours' heads and necks in a guess (h, w) as wall, and their hair where it is free.
+
+    Where the person surely is, they are in front; hair is free where the person hardly is.
+    """
+    sure = guess == cv2.GC_FGD
+    for place in neighbours:
+        guess[(_guess(view, place) == cv2.GC_FGD) & ~sure] = cv2.GC_BGD
+        guess[_head_of(view, place) & (guess == cv2.GC_PR_BGD)] = cv2.GC_BGD
+
+
+def _head_of(view: CutView, place: HeadPlace) -> np.ndarray:
+    """Return where a head and most of its hair are in a view, (h, w) bool."""
+    parts = parts_of_a_person()
+    head = (parts[cv2.GC_PR_FGD][0], parts[cv2.GC_FGD][-1])
+    return _guess(view, place, {cv2.GC_FGD: head}) == cv2.GC_FGD
 
 
 def _at_scale(view: CutView, factor: float) -> CutView:
@@ -235,11 +281,13 @@ def region_of(view: CutView, place: HeadPlace) -> np.ndarray:
     return _guess(view, place) != cv2.GC_BGD
 
 
-def _guess(view: CutView, place: HeadPlace) -> np.ndarray:
-    """Project a person's parts into a view: GrabCut labels (h, w) uint8 to start from."""
+def _guess(
+    view: CutView, place: HeadPlace, parts: Mapping[int, Sequence[np.ndarray]] | None = None
+) -> np.ndarray:
+    """Project a person's parts, or some, into a view: GrabCut labels (h, w) uint8 to start from."""
     labels = np.full(view.valid.shape, cv2.GC_BGD, np.uint8)
-    for value, parts in parts_of_a_person().items():
-        for points in parts:
+    for value, hulls in (parts or parts_of_a_person()).items():
+        for points in hulls:
             pixels = place.pixels(points, view.camera)
             if len(pixels) > 2:
                 far = 4 * max(labels.shape)  # OpenCV stores polygons as 16-bit integers

@@ -23,7 +23,15 @@ from express50.twin.truth import Truth
 from pipelines import calibrate, frames, ingest
 from pipelines.matte import STAGE as MATTE
 from pipelines.matte import MatteConfig, stage
-from pipelines.matte.cutout import cut_out, make_cut_view, parts_of_a_person, soft_alpha
+from pipelines.matte.cutout import (
+    CutView,
+    cut_out,
+    find_head,
+    find_neighbours,
+    make_cut_view,
+    parts_of_a_person,
+    soft_alpha,
+)
 from pipelines.matte.key import key_alpha
 from pipelines.matte.stage import CameraMatte, camera_mattes, valid_pixels
 from pipelines.photo.capture import make_photo_capture, open_picture, single_camera
@@ -39,12 +47,15 @@ BEHIND = [(350, 40), (100, 60), (480, 60), (310, 130), (130, 120), (225, 5)]
 ABOVE_THE_SUIT = np.s_[:150, 120:330]
 
 
-def alpha_of(image: np.ndarray) -> np.ndarray:
+def view_of(image: np.ndarray) -> CutView:
     height, width = image.shape[:2]
     camera = single_camera("photo", width, height, 1.6 * max(width, height))
-    valid = np.ones((height, width), bool)
-    cuts = cut_out([make_cut_view(camera, image, valid)], None)
-    alpha = soft_alpha(image, valid, cuts["photo"])
+    return make_cut_view(camera, image, np.ones((height, width), bool))
+
+
+def alpha_of(image: np.ndarray) -> np.ndarray:
+    cuts = cut_out([view_of(image)], None)
+    alpha = soft_alpha(image, np.ones(image.shape[:2], bool), cuts["photo"])
     assert alpha.shape == image.shape[:2] and alpha.dtype == np.float32
     assert np.isfinite(alpha).all() and alpha.min() >= 0 and alpha.max() <= 1
     return alpha
@@ -94,6 +105,22 @@ def test_small_and_large_pictures_are_cut_alike(alpha: np.ndarray, scale: float)
     )
     found = cv2.resize(alpha_of(image), (512, 256), interpolation=cv2.INTER_AREA)
     assert np.abs(found - alpha[:256])[ABOVE_THE_SUIT].mean() < 0.02
+
+
+def test_a_neighbour_is_wall() -> None:
+    one = data.astronaut()[:200, 145:305]
+    alone, pair = view_of(one), view_of(np.hstack([one, one]))
+    assert not find_neighbours(alone, find_head([alone]))
+    place = find_head([pair])
+    (other,) = find_neighbours(pair, place)
+    mine, theirs = (
+        int(p.pixels(np.zeros((1, 3)), pair.camera)[0, 0] > 160) for p in (place, other)
+    )
+    assert theirs == 1 - mine
+    alpha = alpha_of(np.hstack([one, one]))
+    for x, y in HEAD:
+        assert alpha[y, x - 145 + 160 * mine] > 0.95
+        assert alpha[y, x - 145 + 160 * theirs] < 0.05
 
 
 def test_what_counts_as_certain_lies_inside_the_head_model() -> None:
