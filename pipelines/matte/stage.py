@@ -15,7 +15,7 @@ from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
 from express50.error_model import error_bounds, error_models, expect
 from express50.errors import CaptureError, NoFaceError, StageError
-from express50.files.images import box_about, shrink, tile_sheet, write_image
+from express50.files.images import box_about, resize_area, shrink, tile_sheet, write_image
 from express50.geometry.cameras import Camera, pinhole, resized
 from express50.geometry.sampling import local_moments, undistorted_mask
 from pipelines.matte.cutout import (
@@ -301,10 +301,11 @@ def _matte_function(method: str, weights: str, tile: int, shadow: float) -> Matt
 def make_view(
     camera: Camera, ball: Ball, image: np.ndarray, alpha: np.ndarray, side: int = SIDE
 ) -> MatteView:
-    """Reduce a recorded camera with its undistorted image (H, W, 3) and alpha (H, W), uint8."""
+    """Reduce a recorded camera with its undistorted image and alpha, uint8, of any two sizes."""
     rgb = shrink(image, side)
-    small = resized(camera, rgb.shape[1], rgb.shape[0])
-    share = shrink(alpha, side).astype(np.float32) / 255
+    size = rgb.shape[1], rgb.shape[0]
+    small = resized(camera, *size)
+    share = resize_area(alpha, *size).astype(np.float32) / 255
     return MatteView.of(pinhole(small), ball, rgb, share, undistorted_mask(small))
 
 

@@ -10,8 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.matte.stage import corrected
-from pipelines.matte.visual_hull import compare_mattes
+from express50.files.images import shrink
+from express50.geometry.cameras import Camera
+from pipelines.matte.stage import SHOWN, corrected, make_view
+from pipelines.matte.visual_hull import Ball, compare_mattes
 from tests.pipelines.matte_rig import SIZE, disc, make_views, with_alpha
 
 BACKDROP = np.array([77, 128, 102], np.uint8)
@@ -147,3 +149,15 @@ def test_corrections_are_soft_and_spare_the_rest_to_the_bit():
     ramp = corrected(np.full((200, 160), 255, np.uint8), removed, None)[40, 50:70]
     assert len(set(ramp.tolist())) >= 4 and (np.diff(ramp.astype(int)) >= 0).all()
     assert (corrected(alpha, None, None) == alpha).all()
+
+
+@pytest.mark.parametrize("size", [(1936, 1216), (160, 200), (1504, 2056)])
+def test_pictures_of_the_contact_sheet_and_mattes_are_reduced_to_one_size(size):
+    # Reduced in two steps, 160x200 is 103x128, in one step 102x128.
+    width, height = size
+    params = (2.0 * width, 2.0 * width, width / 2, height / 2)
+    camera = Camera("cam00", width, height, "PINHOLE", params, np.eye(4))
+    shown = shrink(np.zeros((height, width, 3), np.uint8), SHOWN)
+    ball = Ball(np.array([0, 0, 2.0]), 0.3)
+    view = make_view(camera, ball, shown, np.full((height, width), 255, np.uint8))
+    assert view.alpha.shape == view.valid.shape and view.alpha[view.valid].min() == 1
