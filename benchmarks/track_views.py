@@ -24,6 +24,7 @@ from express50.files.images import LIGHT_OF_LEVEL, linear_to_srgb
 from express50.geometry.cameras import Camera, pinhole, unproject
 from express50.geometry.raycast import visible_faces
 from express50.geometry.sampling import undistort_image
+from express50.geometry.transforms import unit
 from express50.head.model import HeadModel
 from express50.twin.truth import Truth
 from pipelines.track.surface import Visibility, look_up
@@ -115,7 +116,8 @@ def psnr_db(
         return None
     pixels = np.stack([columns, rows], axis=1) + 0.5
     places = unproject(view.camera, pixels, depth[rows, columns])
-    normals = face_normals(vertices, model.faces.numpy()[face_id[rows, columns]])
+    a, b, c = np.moveaxis(vertices[model.faces.numpy()[face_id[rows, columns]]], 1, 0)
+    normals = unit(np.cross(b - a, c - a))
     colours = median_colours(dataset, subject, frame, model, vertices, cameras, places, normals)
     known = np.isfinite(colours).all(1)
     if known.sum() < LEAST_PIXELS:
@@ -123,13 +125,6 @@ def psnr_db(
     shown = view.image[rows, columns][known] / 255.0
     error = linear_to_srgb(colours[known] ** 2) - shown
     return float(-10.0 * np.log10(np.mean(error**2)))
-
-
-def face_normals(vertices: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return unit normals (N, 3) of triangles (N, 3) of vertices."""
-    a, b, c = (vertices[corners[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
 
 
 def median_colours(

@@ -298,8 +298,9 @@ def write_tables(out: Path, rows: Mapping[str, list[dict]], config: Config) -> d
         row: dict[str, Any] = runs[-1] | {"seeds": len(runs), "difference_db": {}}
         row |= {"groups": {}, "interval_db": {}, "regions_db": {}}
         for group, numbers in runs[0]["groups"].items():
+            measured = [run["groups"][group] for run in runs]
             row["groups"][group] = {
-                key: _average([run["groups"][group][key] for run in runs]) for key in numbers
+                key: mean([m for m in measured if m[key] is not None], key) for key in numbers
             }
             pairs = [
                 (run["groups"][group], other["groups"].get(group, {}))
@@ -331,11 +332,6 @@ def compared(pairs: Sequence[tuple[dict, dict]], key: str) -> tuple[float, float
     spread_db = float(np.std(gains, ddof=1)) / len(gains) ** 0.5
     half = float(student_t.ppf(0.5 + CONFIDENCE / 2, len(gains) - 1)) * spread_db
     return round(float(np.mean(gains)), 3), round(half, 3)
-
-
-def _average(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return round(sum(known) / len(known), 4) if known else None
 
 
 def markdown(table: Mapping[str, dict], missing: Mapping[str, str]) -> str:

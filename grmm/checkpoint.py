@@ -24,42 +24,12 @@ from express50.head import BUILTIN_NAME
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from grmm.config import Config, ModelConfig, as_tables, from_tables
-from grmm.data import NO_OFFSETS, HeadViews, Source, Tracked, check_tracked, stacked
+from grmm.data import HeadViews, Source, Tracked, check_tracked, stacked
 from grmm.model import GRMM, PinholeView
 from grmm.networks import Networks
 
 FORMAT = "grmm.checkpoint/1"
 PARAMETERS = ("shape", "expression", "neck", "jaw", "eyes", "R", "t")  # of a frame
-ANY = object()
-# Settings of older checkpoints and the value that this version computes with; no result depends
-# on those with ANY.
-GONE: dict[str, dict[str, object]] = {
-    "model": {
-        "displacement_scale": 1e-2, "view_channels": 8, "code_spread": 1.0,
-        "opacity_from_expression": False, "thickness_init": 0.3, "scale_min_mm": 0.1,
-        "scale_max_mm": 10.0, "depth_normalisation": "minmax", "precision": "float32",
-        "backend": ANY,
-    },
-    "loss": {
-        "l1": 0.8, "perceptual": 0.04, "depth_erode_px": 2, "perceptual_crop_px": 0,
-        "perceptual_every": 1,
-    },
-    "data": {"crop_margin_px": 16, "split": ANY, "cache_mb": ANY, "torso": ANY},
-    "train": {
-        "ema": 0.0, "clip_norm": 0.0, "overfit": 0, "shuffle_directions": 0.0, "betas": ANY,
-        "tensorboard": ANY, "warm_start_images": ANY, "save_every": ANY,
-        "log_every": ANY, "threads": ANY,
-    },
-    "fit": {
-        "stage1_share": ANY, "stage1_lr": ANY, "stage1_final_lr": ANY,
-        "stage2_texel_lr_scale": ANY, "tune_refinement": ANY, "locality_t": ANY, "codes": ANY,
-        "seed": ANY,
-    },
-}  # fmt: skip
-# Values that older checkpoints were trained with, before these were settings.
-UNSAID: dict[str, dict[str, object]] = {
-    "model": {"refine_alpha": True}, "train": {"warm_start": True},
-}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -159,8 +129,8 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Checkpoin
     content = read_content(path)
     try:
         for part in ("model", "frames", "parameters", "offsets", "cameras"):
-            _check_finite(path, part, content.get(part, {}))
-        config = from_tables(_current_settings(path, content["config"]))
+            _check_finite(path, part, content[part])
+        config = from_tables(content["config"])
         head = load_head(content["head"]).to(device)
         return Checkpoint(
             config=config,
@@ -172,7 +142,10 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Checkpoin
             loop=content["loop"],
         )
     except ConfigError as error:
-        raise FormatError(f"{path}: its configuration: {error}; copy it again") from None
+        raise FormatError(
+            f"{path}: its configuration: {error}; use the version that the model was trained with,"
+            " or train it again"
+        ) from None
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
         words = f"{type(error).__name__}: {error}"
         raise FormatError(f"{path}: not a whole checkpoint ({words}); copy it again") from error
@@ -218,22 +191,6 @@ def _check_finite(path: Path, name: str, value: object) -> None:
             _check_finite(path, f"{name}.{key}", part)
 
 
-def _current_settings(path: Path, tables: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Drop settings of older versions; refuse values that would change results."""
-    current = {}
-    for table, values in tables.items():
-        gone = GONE.get(table, {})
-        for key in values.keys() & gone.keys():
-            if gone[key] not in (ANY, values[key]):
-                raise FormatError(
-                    f"{path}: was trained with {table}.{key} = {values[key]!r}, expected "
-                    f"{gone[key]!r}: this setting was removed. Train again, or use commit c44aa77"
-                )
-        kept = {key: value for key, value in values.items() if key not in gone}
-        current[table] = UNSAID.get(table, {}) | kept
-    return current
-
-
 def _build(path: Path, config: ModelConfig, head: HeadModel, content: dict[str, Any]) -> GRMM:
     """Build the model of a file's content, in the memory that its weights take there.
 
@@ -268,15 +225,13 @@ def _gallery(
     path: Path, content: dict[str, Any], head: HeadModel, device: torch.device | str
 ) -> Gallery:
     """Return the frames and cameras of a file's content; refuse cameras with impossible sizes."""
-    offsets = {name: tensor.numpy() for name, tensor in content.get("offsets", {}).items()}
+    offsets = {name: tensor.numpy() for name, tensor in content["offsets"].items()}
     frames = {}
-    stacks = {name: tensor.numpy() for name, tensor in content.get("parameters", {}).items()}
+    stacks = {name: tensor.numpy() for name, tensor in content["parameters"].items()}
     for number, row in enumerate(content["frames"]):
         subject, expression = row["subject"], row["expression_id"]
         arrays = {name: stack[number] for name, stack in stacks.items()}
-        if "parameters" in row:  # as it was stored before
-            arrays = {name: tensor.numpy() for name, tensor in row["parameters"].items()}
-        tracked = Tracked(**arrays, offsets=offsets.get(subject, NO_OFFSETS))
+        tracked = Tracked(**arrays, offsets=offsets[subject])
         check_tracked(f"{path}: {subject}/{expression}", tracked, head)
         frames[subject, expression] = tracked
     cameras = {}

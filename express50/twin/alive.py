@@ -15,7 +15,7 @@ import numpy as np
 
 from express50.geometry.sampling import smoothstep
 from express50.head.model import HeadModel, landmarks_of
-from express50.twin.surface import fractal, make_lattice, noise
+from express50.twin.surface import fractal, make_lattice, noise, spot
 
 # Standard deviation of a matrix entry if the amount is 1: the person adds two fifths of a motion.
 OWN_SHARE = 0.25
@@ -55,8 +55,7 @@ class LivingSkin:
                  (marks[27] + [0, 0.04, 0], 0.04, 0.5)]  # fmt: skip
         total = np.zeros(len(places), np.float32)
         for centre, radius, weight in spots:
-            away = ((places - centre) ** 2).sum(1)
-            total += weight * np.exp(-away / (2 * radius**2)).astype(np.float32)
+            total += weight * spot(places, centre, radius).astype(np.float32)
         red = self.flush * np.minimum(total, 1.0)
         tint = np.stack([0.15 * red, -red, -0.85 * red], 1)
         return (light[:, None] * (1 + FLUSH * tint)).astype(np.float32)
@@ -74,7 +73,7 @@ class LivingSkin:
             return front * area * smoothstep(x, -0.012, 0.006) * _ripple(up / 0.009 + 0.35 * wander)
         if kind == "glabella":
             middle = 0.5 * (marks[21] + marks[22])
-            area = _round(places[:, :2] - middle[:2], 0.011) * smoothstep(x, -0.002, 0.001)
+            area = spot(places[:, :2], middle[:2], 0.011) * smoothstep(x, -0.002, 0.001)
             return front * area * _ripple(x / 0.008 + 0.2 + 0.2 * wander)
         if kind == "crow":
             dx, dy = x - eye[0], y - eye[1]
@@ -89,17 +88,13 @@ class LivingSkin:
         line = start[:2] + np.clip(share, 0, 1)[:, None] * along
         off = np.stack([x, y], 1) - line
         across = off @ np.array([along[1], -along[0]]) / np.linalg.norm(along)
-        faded = _round(off, 0.006) * smoothstep(share, -0.15, 0.1) * smoothstep(share, 1.3, 0.9)
+        faded = spot(off, 0.0, 0.006) * smoothstep(share, -0.15, 0.1) * smoothstep(share, 1.3, 0.9)
         return 1.3 * front * faded * np.cos(np.clip(across / 0.004, -np.pi, np.pi))
 
 
 def _ripple(phase: np.ndarray) -> np.ndarray:
     """Return 1 in valleys, one per period, and slightly under 0 on the ridges between."""
     return 1.2 * np.exp(-((((phase % 1.0) - 0.5) / 0.16) ** 2)) - 0.2
-
-
-def _round(off: np.ndarray, radius: float) -> np.ndarray:
-    return np.exp(-(off**2).sum(1) / (2 * radius**2))
 
 
 def own_motion(model: HeadModel, number: int, seed: int, amount: float) -> np.ndarray:

@@ -247,7 +247,6 @@ def _check_settings(config: TwinConfig, out: Path) -> None:
     now = json.loads(dump_json(settings))
     begun = any((out / "captures").glob("*"))  # else nothing was recorded with the stored settings
     former = json.loads(path.read_bytes()) if begun and path.is_file() else now
-    former = {"personal": 0.0} | former  # recordings from before that setting
     changed = sorted(k for k in now | former if former.get(k) != now.get(k))
     if changed:
         raise CaptureError(

@@ -25,6 +25,7 @@ from express50.twin.surface import (
     sample_panorama,
     smooth_over_mesh,
     spherical_to_unit,
+    spot,
     unit_to_spherical,
 )
 
@@ -89,7 +90,7 @@ def _paint_rows(body: Body, seed: int, width: int, rows: range) -> np.ndarray:
         inside = smoothstep(np.linalg.norm(points - mole, axis=1), 1.25 * radius, 0.75 * radius)
         albedo = albedo * (1.0 - inside[:, None] * np.array([0.55, 0.65, 0.7]))
     brow = 0.5 * (marks[21] + marks[22]) + np.array([0.0, 0.03, 0.0])
-    oily = _bump(points, brow, 0.03) + _bump(points, 0.5 * (marks[28] + marks[30]), 0.014)
+    oily = spot(points, brow, 0.03) + spot(points, 0.5 * (marks[28] + marks[30]), 0.014)
     gloss = look.gloss * (1.0 + 0.25 * pores) * (0.8 + 0.5 * oily)
     lips = smoothstep(masks["lips"] + 0.10 * noise(points / 0.004, lattices[5]), 0.35, 0.65)
     creases = fractal(points * (1.0, 0.25, 1.0), lattices[1], 0.0025, 2)
@@ -128,10 +129,6 @@ def _surface_at(body: Body, width: int, rows: range) -> tuple[np.ndarray, dict[s
     return points.astype(np.float32), masks
 
 
-def _bump(points: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
-    return np.exp(-((points - centre) ** 2).sum(1) / (2 * radius**2))
-
-
 def _flush(model: HeadModel, marks: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return the redness (N,) of cheeks, tip of the nose, chin and ears."""
     left = 0.35 * marks[46] + 0.35 * marks[14] + 0.3 * marks[54]
@@ -144,7 +141,7 @@ def _flush(model: HeadModel, marks: np.ndarray, points: np.ndarray) -> np.ndarra
         spots.append((template[ears & (template[:, 0] * side > 0)].mean(0), 0.02, 0.8))
     total = np.zeros(len(points), np.float32)
     for centre, radius, weight in spots:
-        total += weight * _bump(points, centre, radius)
+        total += weight * spot(points, centre, radius)
     return total
 
 

@@ -140,6 +140,11 @@ class StarMap:
         return sample_panorama(self._radius, x, y)[:, 0]
 
 
+def spot(points: np.ndarray, centre: np.ndarray | float, radius: float) -> np.ndarray:
+    """Return a round Gaussian spot (N,) at points (N, D): 1 at its centre."""
+    return np.exp(-((points - centre) ** 2).sum(1) / (2 * radius**2))
+
+
 def make_lattice(rng: np.random.Generator) -> np.ndarray:
     """Return random values (32, 32, 32) in [-1, 1], float32, that `noise` interpolates."""
     return rng.uniform(-1.0, 1.0, (LATTICE,) * 3).astype(np.float32)
