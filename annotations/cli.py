@@ -351,7 +351,7 @@ def run_agree(args: argparse.Namespace) -> int:
     groups = {"all": overall} | pairs | expressions
     lines = table(("of", *_FIGURES), [{"of": name} | row for name, row in groups.items()])
     if any(row["alpha"] is None for row in groups.values()):
-        lines.append("alpha is n/a (-) for one clip alone, and where all marks are at one time")
+        lines.append("alpha is n/a (-) for a single clip, and where all marks are at the same time")
     interval = overall["alpha_interval"] or "n/a (too few clips)"
     return answer(args, data, *lines, f"Krippendorff's alpha of all, 95 % interval: {interval}")
 

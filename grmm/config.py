@@ -117,7 +117,7 @@ class LossConfig:
     """Weight of the squared Laplacian of the deformed mesh, mm^2. G12."""
     displacement: float = 0.0
     """Weight of the mean squared displacement of vertices, mm^2: the mesh stays as tracked where
-    the footage has no say. G12."""
+    the footage gives no evidence. G12."""
     codes: float = 0.001
     """Weight of the sum of squares of both codes. G13."""
 

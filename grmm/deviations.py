@@ -56,7 +56,7 @@ ALWAYS = (
         paper="tracking by VHAP, 68 FAN landmarks",
         ours="our own tracker; users may bring FAN's weights",
         reason="VHAP's licence (CONTRIBUTING.md)",
-        effect="face 1.31 mm from the truth on the twin (docs/LOG.md); VHAP was not run",
+        effect="face 1.34 mm from the truth on the twin (docs/LOG.md); VHAP was not run",
     ),
     Deviation(
         paper="depth by ProbeSDF",
@@ -81,12 +81,12 @@ ALWAYS = (
     ),
     Deviation(
         paper="losses over the picture",
-        ours="over the window around head and matte, with 16 px beside it",
-        reason="the rest is background in both; a constant factor, as heads fill their samples",
+        ours="over the window around head and matte, 16 px wider on each side",
+        reason="the rest is background in both, so this only scales the losses",
     ),
     Deviation(
         paper="locality: neck and jaw by SLERP",
-        ours="eyes by SLERP too, offsets linearly; I and I_rgb, seen by a random training camera",
+        ours="eyes by SLERP too, offsets linearly; I and I_rgb, in a random training camera",
         reason="the paper names no camera, and our meshes have eyes and offsets (G22)",
     ),
 )
@@ -94,13 +94,13 @@ ALWAYS = (
 # By setting: why a preset has another value than ``paper``, and its effect.
 REASONS: dict[str, tuple[str, str]] = {
     "data.skip_hidden_neck": (
-        "the collar hides another part of the neck in every view; as background, these views"
-        " contradict each other",
+        "the collar hides a different part of the neck in every view; as background, these"
+        " views contradict each other",
         "neck of held-out views 20.6 to 25.2 dB, within 3 px of the collar 14.3 to 19.8, skin +0.05"
         " (120 steps of demo, 96 texels)",
     ),
     "data.hide_behind_torso": (
-        "each camera looks behind the collar from another side, so no end of the neck suits all",
+        "each camera looks behind the collar from a different side; no single end of the neck fits",
         "28.25 to 28.75 dB, with every pixel counted 22.1 to 28.5 (held-out views of six people,"
         " two and three seeds)",
     ),

@@ -1,7 +1,7 @@
 """The align stage finds, for every expression, the frame that matches the reference's.
 
 Item: a subject. Its observations are compared with the reference identity's labels or peaks. A
-suggestion that is sure enough is accepted automatically, in the label store that annotators
+suggestion of enough confidence is accepted automatically, in the label store that annotators
 write to, under the name ``auto``; a person's label always ranks above it.
 """
 
@@ -61,7 +61,7 @@ STAGE = Stage(
     inputs=inputs,
     run=run,
     help="suggest each expression's peak frame, matched to the reference, and accept it",
-    purpose="The labelled frame of every expression, between its cue window's first and last.",
+    purpose="The peak frame of every expression, with the first and last frame of its cue window.",
     runs_first=(OBSERVE.name,),
     growth=Growth(items=("subjects",), time=("frames",), disk=("frames",)),
 )

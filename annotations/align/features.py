@@ -1,6 +1,6 @@
 """Describe an expression by numbers that can be compared over time: motion and local contrast.
 
-Every feature is counted in its own noise, which is measured from the footage itself. What a face
+Every feature is in units of its own noise, which is measured from the footage itself. What a face
 does at rest (fidgets, sway, the detector's drift) is shrunk, so that the curve of an expression
 rises only with the expression.
 """

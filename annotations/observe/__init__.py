@@ -23,7 +23,7 @@ class ObserveConfig:
     cameras: int = 3
     """Number of cameras to use: those that see the face best at rest."""
     stride: int = 1
-    """Use every stride-th frame of a cue window, at least 1."""
+    """Use every n-th frame of a cue window, 1 or more."""
     min_score: float = 0.3
     """Leave out cameras whose face score at rest is lower, 0 to 1."""
     search: float = 0.25

@@ -294,8 +294,8 @@ def iterate_sparsely(
 ) -> Iterator[tuple[int, np.ndarray | None]]:
     """List a video's frames in display order, and decode a few that need no other frame.
 
-    Of the frames that are coded alone, one is decoded in `every` frames, or all if they are further
-    apart. Arguments and errors are those of `iterate_video`.
+    One key frame is decoded in `every` frames, or all key frames if they are further apart.
+    Arguments and errors are those of `iterate_video`.
 
     Yields:
         Time stamp and (H, W, 3) uint8 sRGB image; None for a frame that is not decoded.
@@ -329,7 +329,7 @@ def iterate_sparsely(
             done = number + 1
     if not done:
         raise CaptureError(
-            f"{path}: video has no frame that is coded alone; encode it again, or ingest it with"
+            f"{path}: video has no key frame; encode it again, or ingest it with"
             " --set ingest.every=1"
         )
     yield from ((stamp, None) for stamp in stamps[done:])

@@ -93,9 +93,9 @@ class RemoteWorkers:
             sys.stderr.write(f"scheduler {address} has no workers yet; waiting\n")
         elif max(threads) > 1:
             sys.stderr.write(
-                f"scheduler {address}: a worker has {max(threads)} threads, so that items share a"
-                " process, and receipts count the time and memory of all of them for each; start"
-                " workers with --nthreads 1\n"
+                f"scheduler {address}: a worker has {max(threads)} threads, so items share a"
+                " process and each receipt counts the time and memory of all of them; start workers"
+                " with --nthreads 1\n"
             )
         return cls(client)
 

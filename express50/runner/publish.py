@@ -1,4 +1,4 @@
-"""Publish outputs safely: items appear complete, in one rename; a stage has one run at a time.
+"""Publish outputs safely: items appear complete, in one rename, and each stage runs once at a time.
 
 Outputs that were replaced are kept in a store, so that going back to their settings or inputs is a
 rename. An entry of this store is an output's folder with its receipt, named by its fingerprint.
@@ -189,7 +189,8 @@ def stage_lock(dataset: Dataset, stage: str) -> Iterator[None]:
             time.sleep(GLANCE_SECONDS)  # perhaps `is_running` has just looked
             if not _locked(file):
                 raise StageError(
-                    f"{dataset.root}: another '{stage}' runs on this dataset; wait until it ends"
+                    f"{dataset.root}: another '{stage}' is running on this dataset; wait until it"
+                    " ends"
                 )
         yield
 

@@ -41,7 +41,7 @@ from express50.runner.worker import Task, failed_receipt, failure_reason, finger
 
 REASONS = 3  # for making items again, said before they are made
 WARNINGS = 12  # lines; more of them would hide the account
-ALIKE_FAILURES = 3  # if so many first items fail for the same reason, a setting is wrong
+ALIKE_FAILURES = 3  # if this many first items fail for the same reason, a setting is wrong
 KEPT = "imported; the stage does not make it"
 
 

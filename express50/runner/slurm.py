@@ -1,7 +1,7 @@
 """Start workers as SLURM jobs: their requests, their script, and the jobs of a run.
 
-dask-jobqueue writes the script. Jobs are submitted and watched here, because its own cluster takes
-no notice of an ``sbatch`` that refuses, nor of jobs of several workers that have ended.
+dask-jobqueue writes the script. Jobs are submitted and watched here, because its own cluster
+ignores an ``sbatch`` that refuses, and jobs of several workers that have ended.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class SlurmJob:
     time: str
     """Time limit in SLURM's forms, such as 4:00:00 or 1-12:00:00."""
     memory: str
-    """Memory of a job, such as 16G (units of 1024, as SLURM has them)."""
+    """Memory of a job, such as 16G (units of 1024, as in SLURM)."""
     cores: int = 1
-    """Cores of a job. It works at cores / --threads items at a time, or at one with a GPU."""
+    """Cores of a job. It works on cores / --threads items at a time, or on one with a GPU."""
     jobs: int = 4
     """Most jobs at a time."""
     gpus: int = 0

@@ -118,7 +118,7 @@ def _write(rig: CalibratedRig, check: FootageCheck | None, out: Path) -> Result:
     moved |= check.mirrored if check else {}
     for a, b in check.exchanged if check else ():
         moved[f"{a} and {b}"] = (
-            "look exchanged: faces agree if each has the other's calibration; exchange their names"
+            "look swapped: faces agree if each has the other's calibration; swap their names"
             " in the calibration, or their folders in cameras/, plates/ and board/"
         )
     if check and check.size:
@@ -262,7 +262,7 @@ def _out_of_step(timing: Mapping[str, CameraTiming]) -> dict[str, str]:
             side = "late" if camera.late > 0 else "early"
             ways.append(f"its pictures are {abs(camera.late):.2f} frames {side}")
         if camera.readout:
-            rows = f"its last row {abs(camera.readout):.2f} of a frame from its first"
+            rows = f"its last row is {abs(camera.readout):.2f} of a frame apart from its first"
             ways.append(f"{rows} (rolling shutter)")
         if ways:
             found[name] = (
@@ -416,7 +416,7 @@ def draw_residuals(
     colours = ["tab:red" if n in solution.weak else "tab:blue" for n in names]
     bars.bar(range(len(names)), [per_camera_px[name] for name in names], color=colours)
     bars.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
-    bars.set_title("rms per camera [px]; red: weakly tied in", fontsize=10)
+    bars.set_title("rms per camera [px]; red: weakly constrained", fontsize=10)
     _save(figure, path)
 
 

@@ -24,9 +24,8 @@ class IngestConfig:
     proxy_quality: int = 85
     """JPEG quality of proxies, 1 to 100."""
     every: int = 1
-    """Decode one of so many frames, 1 or more: in videos, frames that are coded alone. With more
-    than 1, sync is not checked, and the proxies of other frames are made when they are asked for.
-    """
+    """Decode one of this many frames, 1 or more; in videos, key frames only. With more than 1, sync
+    is not checked, and the proxies of other frames are made on request."""
     sync_frames: int = 8
     """Largest offset searched for in a camera out of step, frames, 1 to 100; 0: no check."""
     focus_every: int = 24

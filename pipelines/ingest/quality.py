@@ -138,8 +138,8 @@ def check_quality(
         faults += describe_dark(measured[name].cells)
         if name in grey and len(grey) < len(measured):
             faults.append(
-                "shows no colours, unlike other cameras: people are told from walls by their"
-                " colours, so check its mattes, or leave the camera out"
+                "shows no colours, unlike other cameras: mattes separate people from walls"
+                " by colour, so check them, or leave the camera out"
             )
         faults += describe_drift(drifts[name])
         faults += [blurred[name]] if name in blurred else []

@@ -6,8 +6,8 @@ indexed tar, because a random seek in 4K H.264 costs half a second. The same pas
 and light: faults are warnings, and the figures go to checks.json.
 
 Decoding is most of the work for long clips, and later stages need few frames. With `every` above 1
-only some are decoded; the others have a time stamp but no hash, and their proxies are made when
-somebody asks for them (`express50.capture.frames.read_proxy`).
+only some are decoded; the others have a time stamp but no hash, and their proxies are made on
+request (`express50.capture.frames.read_proxy`).
 """
 
 from __future__ import annotations
@@ -284,8 +284,8 @@ def check_sample_names(raw: RawCapture) -> None:
     if len(name) > KEY_LENGTH:
         lengths = ", ".join(f"{what} {len(text)}" for what, text in ids.items())
         raise CaptureError(
-            f"{raw.root}: samples would be called like {name!r} ({lengths} characters), expected"
-            f" at most {KEY_LENGTH} together; shorten an id"
+            f"{raw.root}: samples would have names such as {name!r} ({lengths} characters),"
+            f" expected at most {KEY_LENGTH} together; shorten an id"
         )
 
 
@@ -295,7 +295,7 @@ def odd_keys(raw: RawCapture) -> dict[str, str]:
     misplaced = sorted(CHOICES & raw.meta.keys()) if raw.layout == OURS else []
     if misplaced:
         found.append(
-            f"{', '.join(misplaced)}: read for other layouts only; in our own, leave out folders of"
+            f"{', '.join(misplaced)}: only read for other layouts; in our own, leave out folders of"
             " cameras/ and rows of cues.csv instead"
         )
     if "metres_per_unit" in raw.meta and raw.layout not in UNITLESS:
@@ -306,7 +306,7 @@ def odd_keys(raw: RawCapture) -> dict[str, str]:
     valid = sorted(KNOWN_KEYS - (CHOICES if raw.layout == OURS else set()))
     if unknown := sorted(raw.meta.keys() - KNOWN_KEYS):
         words = ", ".join(f"{key!r}{nearest(key, valid)}" for key in unknown)
-        found.append(f"nothing reads {words}; keys are {', '.join(valid)}")
+        found.append(f"unknown {words}; keys are {', '.join(valid)}")
     units = raw.meta.get("units", "m")
     if str(units).lower() not in METRES:
         found.append(f"units is {units!r}, but lengths are taken as metres: convert them")

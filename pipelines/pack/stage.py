@@ -86,7 +86,7 @@ def encode(
     }
     warnings = warn_of_gaps(metas) + subject.notes
     if without_depth:
-        why = f"{without_depth} of {count(len(metas), 'sample')} know no depth"
+        why = f"{without_depth} of {count(len(metas), 'sample')} have no depth"
         if min_confidence > 0:
             why += f"; lower encode.min_confidence, which is {min_confidence:g}"
         warnings.append(Note("depth", why))

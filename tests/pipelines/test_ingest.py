@@ -185,7 +185,7 @@ def test_a_capture_without_cues_is_ingested_with_a_warning(dataset):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ('cameras = ["cam00"]', "cameras: read for other layouts only"),
+        ('cameras = ["cam00"]', "cameras: only read for other layouts"),
         ("metres_per_unit = 0.001", "metres_per_unit: read for colmap and transforms only"),
         ('licens = "CC0"', "'licens' (did you mean 'license'?); keys are"),
         ('units = "mm"', "units is 'mm', but lengths are taken as metres"),

@@ -313,7 +313,7 @@ def test_unsure_depth_can_be_left_out(dataset, packed, tmp_path):
 def test_samples_without_any_depth_are_named(dataset, tmp_path):
     encoded, _ = pack_into(dataset, tmp_path, EncodeConfig(size=64, min_confidence=1.0))
     why = {row["what"]: row["why"] for row in encoded["S001"]["warnings"]}
-    words = "know no depth; lower encode.min_confidence, which is 1"
+    words = "have no depth; lower encode.min_confidence, which is 1"
     assert why["depth"].endswith(words)
 
 
