@@ -180,7 +180,7 @@ def test_leftovers_are_swept_and_a_running_stage_is_left_alone(dataset):
     with stage_lock(dataset, "toy"):
         found, result = look(dataset)
         assert found == {} and result.notes == ["toy: is running; its items were not checked"]
-        with pytest.raises(StageError, match="another 'toy' runs"):
+        with pytest.raises(StageError, match="another 'toy' is running"):
             look(dataset, fix=True)
         assert leftover.is_dir()
     assert set(look(dataset)[0]) == {("leftover", ".staging toy"), ("missing", "toy S001")}

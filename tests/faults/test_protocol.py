@@ -222,7 +222,7 @@ def test_a_run_killed_at_any_call_and_the_next_one_are_a_path(
 
 def test_failures_and_a_second_run_are_paths(tmp_path, monkeypatch, outputs):
     dataset, rules = dataset_of(tmp_path, True), Rules(crashes=0, late=0, at_once=2)
-    with stage_lock(dataset, "toy"), pytest.raises(StageError, match="another 'toy' runs"):
+    with stage_lock(dataset, "toy"), pytest.raises(StageError, match="another 'toy' is running"):
         record(dataset, monkeypatch)
     recorded = record(dataset, monkeypatch, files=-1)  # a wrong setting: the output stands
     states = follow(recorded, [first_states(rules)[True]], rules)
