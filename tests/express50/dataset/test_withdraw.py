@@ -251,7 +251,7 @@ def test_the_record_says_when_and_how_much_but_not_who(dataset):
 
 def test_no_subject_is_withdrawn_while_a_stage_runs(dataset):
     before = tree(dataset.root)
-    with stage_lock(dataset, "ingest"), pytest.raises(StageError, match="another 'ingest' is running"):
+    with stage_lock(dataset, "ingest"), pytest.raises(StageError, match="'ingest' is running"):
         withdraw(dataset, "S001")
     after, before = (
         {k: v for k, v in files.items() if not k.endswith(".lock")}
