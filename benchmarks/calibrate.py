@@ -28,7 +28,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from benchmarks.calibrate_footage import refine_figures, see_capture, sfm_figures
+from benchmarks.calibrate_footage import (
+    BUMP_DEG,
+    refine_figures,
+    rig_errors,
+    see_capture,
+    sfm_figures,
+)
 from benchmarks.common import (
     add_twin_options,
     check_twin_options,
@@ -42,17 +48,13 @@ from express50.capture.index import Index, read_index
 from express50.contract.config import resolve_config
 from express50.files.calibration import read_cameras
 from express50.geometry.cameras import Camera, transform_camera
-from express50.geometry.transforms import (
-    axis_angle_to_matrix,
-    invert_transform,
-    make_transform,
-    matrix_to_axis_angle,
-)
+from express50.geometry.transforms import invert_transform
 from express50.rigs.world_frame import meeting_point
 from express50.twin import TwinConfig
 from express50.twin.rig import make_rig, make_sensor
 from express50.twin.truth import align_worlds
 from pipelines.calibrate import STAGE
+from pipelines.calibrate.adjuster import move_pose
 from pipelines.calibrate.board import (
     BoardCorners,
     board_from_table,
@@ -78,7 +80,6 @@ from pipelines.calibrate.footage import find_points, read_footage
 from pipelines.calibrate.given_rig import check_footage
 from pipelines.calibrate.uncertainty import camera_errors, head_points, state_uncertainty
 
-BUMP_DEG = 0.3
 RIG = TwinConfig(
     subjects=1, cameras=24, width=540, height=540, expressions=("neutral",),
     frames_per_expression=4, footage="jpg", board_frames=60, plates=False,
@@ -192,8 +193,8 @@ def bump_figures(cameras: Mapping[str, Camera], index: Index, bumps: int) -> dic
     for place in np.linspace(0, len(names) - 1, bumps + 2).round().astype(int)[1:-1]:
         name, axis = names[place], rng.normal(size=3)
         turn = np.radians(BUMP_DEG) * axis / np.linalg.norm(axis)
-        moved = make_transform(axis_angle_to_matrix(turn), np.zeros(3))
-        bumped = replace(cameras[name], cam_from_world=moved @ cameras[name].cam_from_world)
+        pose = move_pose(cameras[name].cam_from_world, np.concatenate([turn, np.zeros(3)]))
+        bumped = replace(cameras[name], cam_from_world=pose)
         accused[name] = sorted(check_footage({**cameras, name: bumped}, seen).moved)
     return {
         "bump_deg": BUMP_DEG,
@@ -209,17 +210,7 @@ def figures(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> dict
     """Return errors of a rig after a rigid motion onto the true one."""
     motion = align_worlds(estimated, true)
     moved = {name: transform_camera(camera, motion) for name, camera in estimated.items()}
-    turns = [c.cam_from_world[:3, :3] @ true[n].cam_from_world[:3, :3].T for n, c in moved.items()]
-    degrees = np.degrees(np.linalg.norm(matrix_to_axis_angle(np.stack(turns)), axis=1))
-    focals = [100 * abs(c.K[0, 0] / true[n].K[0, 0] - 1) for n, c in moved.items()]
-    shifts = [1e3 * np.linalg.norm(c.center - true[n].center) for n, c in moved.items()]
-    return {
-        "rotation_error_deg": float(degrees.mean()),
-        "rotation_error_deg_max": float(degrees.max()),
-        "translation_error_mm": float(np.mean(shifts)),
-        "translation_error_mm_max": float(np.max(shifts)),
-        "focal_error_percent": float(np.mean(focals)),
-        "focal_error_percent_max": float(np.max(focals)),
+    return rig_errors(moved, true) | {
         "head_px": head_error(estimated, true),
         "cameras": len(moved),
     }

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from express50.errors import CalibrationError
-from express50.geometry.cameras import Camera, project, triangulate
-from express50.geometry.transforms import matrix_to_axis_angle, similarity_fit
+from express50.geometry.cameras import Camera, project, transform_camera, triangulate
+from express50.geometry.transforms import make_transform, matrix_to_axis_angle, similarity_fit
 from express50.rigs.camera_builder import in_metres
 from express50.rigs.world_frame import meeting_point
 from pipelines.calibrate.adjuster import move_pose
@@ -28,6 +28,7 @@ from pipelines.calibrate.tracks import FrameSetPoints
 from pipelines.calibrate.uncertainty import camera_errors, head_points
 
 BUMP_DEG, BUMP_MM = 0.3, 5.0
+ERRORS = ("rotation_error_deg", "translation_error_mm", "focal_error_percent")
 RigJudge = Callable[[Mapping[str, Camera], Mapping[str, Camera]], dict[str, float]]
 
 
@@ -93,21 +94,27 @@ def similar(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> dict
         return count
     centers = [np.stack([rig[n].center for n in names]) for rig in (estimated, true)]
     scale, R, t = similarity_fit(*centers)
-    turns = [
-        estimated[n].cam_from_world[:3, :3] @ R.T @ true[n].cam_from_world[:3, :3].T for n in names
-    ]
-    degrees = np.degrees(np.linalg.norm(matrix_to_axis_angle(np.stack(turns)), axis=1))
-    shifts = 1e3 * np.linalg.norm(scale * centers[0] @ R.T + t - centers[1], axis=1)
-    focals = [100 * abs(estimated[n].K[0, 0] / true[n].K[0, 0] - 1) for n in names]
-    errors = {
-        "rotation_error_deg": float(degrees.mean()),
-        "rotation_error_deg_max": float(degrees.max()),
-        "translation_error_mm": float(shifts.mean()),
-        "translation_error_mm_max": float(shifts.max()),
-        "scale_error_percent": float(100 * abs(1 / scale - 1)),
-        "focal_error_percent": float(np.mean(focals)),
+    laid = {
+        name: transform_camera(camera, make_transform(R, t))
+        for name, camera in in_metres(dict(estimated), scale).items()
     }
-    return count | errors
+    count["scale_error_percent"] = float(100 * abs(1 / scale - 1))
+    return count | rig_errors(laid, true)
+
+
+def rig_errors(laid: Mapping[str, Camera], true: Mapping[str, Camera]) -> dict[str, float]:
+    """Return errors of a rig's cameras that was laid on the true one, means and worst."""
+    rows = []
+    for name, camera in laid.items():
+        goal = true[name]
+        turn = camera.cam_from_world[:3, :3] @ goal.cam_from_world[:3, :3].T
+        degrees = np.degrees(np.linalg.norm(matrix_to_axis_angle(turn)))
+        shift_mm = 1e3 * np.linalg.norm(camera.center - goal.center)
+        rows.append((degrees, shift_mm, 100 * abs(camera.K[0, 0] / goal.K[0, 0] - 1)))
+    found: dict[str, float] = {}
+    for name, off in zip(ERRORS, np.transpose(rows), strict=True):
+        found |= {name: float(off.mean()), f"{name}_max": float(off.max())}
+    return found
 
 
 def refine_figures(
