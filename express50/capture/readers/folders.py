@@ -6,7 +6,7 @@ capture.toml has to say it: to guess could take people for one person's expressi
 
 What may lie beside the footage is that of our own layout (docs/FORMAT.md): ``calibration.json``,
 ``board``, ``plates``, and ``cues.csv`` if the footage is one clip. Pictures and videos that were
-stored on their side are read upright.
+stored on their side are read upright. The footage may lie one folder deeper, as in ``rig/images``.
 """
 
 from __future__ import annotations
@@ -17,9 +17,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from express50.capture.raw import (
+    IMAGE_SUFFIXES,
     RawCapture,
     image_names,
     is_data_folder,
+    is_shown,
     read_board,
     read_calibration,
     read_cues,
@@ -47,11 +49,37 @@ CAMERA = re.compile(r".*(cam|gopro|kinect|view).*|c[-_]?\d+|\d{5,}", re.IGNORECA
 NUMBER = re.compile(r"\d+")
 FRAME = re.compile(r"(frame|timestep|time|step|f|t)?[-_]?\d+", re.IGNORECASE)
 PERSON = re.compile(r"(s|sub|subj|subject|p|participant|person|id|actor)[-_]?\d+", re.IGNORECASE)
+# Folders that only hold the footage, of a rig or of one of its moments, and folders beside these.
+WRAPPER = re.compile(
+    r"(image|img|picture|photo|video|frame|timestep|recording|footage|rgb|raw|data)s?"
+    r"([-_]\d*[a-z].*)?|hd(videos|imgs)",
+    re.IGNORECASE,
+)
+BESIDE = re.compile(
+    r"plates|board|(fg_?)?masks?([-_].*)?|mattes?|alphas?|depths?|annotations?", re.IGNORECASE
+)
+
+
+def footage_folder(path: Path) -> Path:
+    """Return the folder that holds a rig's footage: the path, or such as ``images`` in it.
+
+    It is the path where footage lies beside that folder, as one cannot tell which is meant.
+    """
+    if not path.is_dir() or _holds_footage(path):
+        return path
+    folders = [inner for inner in path.iterdir() if is_data_folder(inner)]
+    wrappers = [inner for inner in folders if WRAPPER.fullmatch(inner.name)]
+    others = {f for f in folders if not BESIDE.fullmatch(f.name)} - set(wrappers)
+    return wrappers[0] if len(wrappers) == 1 and not any(map(_holds_footage, others)) else path
+
+
+def _holds_footage(path: Path) -> bool:
+    return any(is_shown(file, IMAGE_SUFFIXES) or fits_video(file) for file in path.iterdir())
 
 
 def fits_videos(path: Path) -> bool:
     """Return whether a folder holds videos."""
-    return path.is_dir() and any(map(fits_video, path.iterdir()))
+    return path.is_dir() and any(map(fits_video, footage_folder(path).iterdir()))
 
 
 def fits_camera_folders(path: Path) -> bool:
@@ -94,7 +122,7 @@ def read_videos(path: Path, selection: Selection) -> RawCapture:
             its number, or cues or the board's files are malformed.
         CalibrationError: calibration.json is malformed.
     """
-    names = sorted(file.name for file in path.iterdir() if fits_video(file))
+    names = _videos(path, footage_folder(path))
     ids = unique_ids(path, names, lambda name: Path(name).stem)
     return _read(path, "videos", {ids[name]: {(CLIP, 0): name} for name in names}, selection)
 
@@ -113,7 +141,7 @@ def read_camera_folders(path: Path, selection: Selection) -> RawCapture:
         for name in files[folder]:
             stem = Path(name).stem
             sequence = CLIP if one_clip else stem.removeprefix(folder).strip("_- ") or stem
-            _add(row, (sequence, _number(name) if kind == "frames" else 0), f"{folder}/{name}")
+            _add(row, (sequence, _number(name) if kind == "frames" else 0), name)
     return _read(path, kind, rows, selection)
 
 
@@ -139,27 +167,38 @@ def _read_inner(path: Path, selection: Selection, moment_of: Callable[[str], Mom
     rows: dict[str, dict[Moment, str]] = {stem: {} for stem in sorted(_stems(files))}
     for folder, names in files.items():
         for name in names:
-            _add(rows[Path(name).stem], moment_of(folder), f"{folder}/{name}")
+            _add(rows[Path(name).stem], moment_of(folder), name)
     return _read(path, kind, rows, selection)
 
 
 def _files_by_folder(path: Path) -> tuple[str, dict[str, list[str]]]:
     """List the ``videos``, or else the pictures (``frames``), of each folder in a folder.
 
-    Under two folders with footage are none: a folder of folders was meant.
+    Their names are relative to the path. Under two folders with footage are none: a folder of
+    folders was meant.
     """
     if not path.is_dir() or (path.parent / "capture.toml").is_file():  # a part of our own layout
         return "videos", {}
     folders = [
         inner
-        for inner in sorted(path.iterdir())
+        for inner in sorted(footage_folder(path).iterdir())
         if is_data_folder(inner) and inner.name not in ("plates", "board")
     ]
-    videos = {f.name: [v.name for v in sorted(f.iterdir()) if fits_video(v)] for f in folders}
+    places = {folder.name: footage_folder(folder) for folder in folders}
+    videos = {name: _videos(path, place) for name, place in places.items()}
     kind = "videos" if any(videos.values()) else "frames"
-    files = videos if kind == "videos" else {f.name: image_names(f) for f in folders}
+    files = videos if kind == "videos" else {n: _pictures(path, p) for n, p in places.items()}
     files = {folder: names for folder, names in files.items() if names}
     return kind, files if len(files) > 1 else {}
+
+
+def _videos(root: Path, folder: Path) -> list[str]:
+    found = sorted(folder.iterdir())
+    return [file.relative_to(root).as_posix() for file in found if fits_video(file)]
+
+
+def _pictures(root: Path, folder: Path) -> list[str]:
+    return [(folder / name).relative_to(root).as_posix() for name in image_names(folder)]
 
 
 def _stems(files: Mapping[str, Collection[str]]) -> set[str]:

@@ -10,7 +10,16 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from express50.capture.raw import IMAGE_SUFFIXES, RawCamera, RawCapture, image_names
+from express50.capture.raw import (
+    IMAGE_SUFFIXES,
+    RawCamera,
+    RawCapture,
+    image_names,
+    read_calibration,
+    read_plates,
+    unused_files,
+)
+from express50.capture.readers.folders import footage_folder
 from express50.capture.readers.selection import (
     Moment,
     Selection,
@@ -35,18 +44,22 @@ MOMENT = "photo"
 
 def fits_photos(path: Path) -> bool:
     """Return whether a folder holds photographs."""
-    return bool(image_names(path))
+    return bool(image_names(footage_folder(path)))
 
 
 def read_photos(path: Path, selection: Selection) -> RawCapture:
-    """Read each photograph as a camera of one moment; calibrate solves the cameras.
+    """Read each photograph as a camera of one moment.
 
-    A photograph whose EXIF says that it lies on its side is read upright.
+    Cameras are those of calibration.json; without it, calibrate solves them. A photograph whose
+    EXIF says that it lies on its side is read upright.
 
     Raises:
         CaptureError: two names become one camera id, or no photograph can be used.
+        CalibrationError: calibration.json is malformed.
     """
-    ids = unique_ids(path, image_names(path), lambda name: Path(name).stem)
+    folder = footage_folder(path)
+    names = [(folder / name).relative_to(path).as_posix() for name in image_names(folder)]
+    ids = unique_ids(path, names, lambda name: Path(name).stem)
     check_selection(selection, [MOMENT], sorted(ids.values()))
     dropped: dict[str, str] = {}
     cameras: dict[str, RawCamera] = {}
@@ -64,9 +77,11 @@ def read_photos(path: Path, selection: Selection) -> RawCapture:
     if not cameras:
         reasons = "; ".join(f"{k}: {v}" for k, v in dropped.items())
         raise CaptureError(f"{path}: no photograph can be used: {reasons}")
+    calibration = read_calibration(path, cameras, dropped)
     return RawCapture(
         root=path, subject=folder_id(path), fps=FPS, meta={}, cameras=cameras, dropped=dropped,
-        clips=(selection.expression(MOMENT),),
+        calibration=calibration, plates=read_plates(path, cameras),
+        clips=(selection.expression(MOMENT),), warnings=unused_files(path, ids.values()),
     )  # fmt: skip
 
 

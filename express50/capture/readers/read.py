@@ -16,6 +16,7 @@ from express50.capture.raw import (
     VIDEO_SUFFIXES,
     RawCapture,
     check_identity,
+    is_data_folder,
     read_capture,
     read_capture_toml,
     read_meta,
@@ -75,7 +76,8 @@ LAYOUTS = (
         pictures.fits_colmap, folder_id, pictures.read_colmap_folder,
     ),
     Layout(
-        "photos", "a folder of images", pictures.fits_photos, folder_id, pictures.read_photos
+        "photos", "a folder of images, or images/ in it",
+        pictures.fits_photos, folder_id, pictures.read_photos,
     ),
     Layout(
         "videos", f"a folder of videos ({' '.join(VIDEO_SUFFIXES)}), one per camera",
@@ -131,10 +133,26 @@ def detect(path: Path, name: object = None) -> Layout:
             ". Its folders hold footage: write 'layout' into a capture.toml beside them, or give"
             " each folder by itself if it is a person"
         )
+    elif found := _deeper(path):
+        raise CaptureError(
+            f"{path}: no known layout, but {found[0]} has one ({found[1].looks}); give that folder,"
+            " and others like it"
+        )
     raise CaptureError(
         f"{path}: no known layout; got {', '.join(held[:5]) or 'an empty folder'}, expected one "
         f"of: {looks}; {OURS}: capture.toml and cameras/{unclear}"
     )
+
+
+def _deeper(path: Path) -> tuple[Path, Layout] | None:
+    """Find the first folder below, up to two deep, that is a rig by itself."""
+    rigs = [layout for layout in LAYOUTS if layout.name not in ("photos", "video")]
+    for depth in ("*", "*/*"):
+        for below in sorted(filter(is_data_folder, path.glob(depth))):
+            for layout in rigs:
+                if layout.fits(below):
+                    return below, layout
+    return None
 
 
 def is_capture(path: Path) -> bool:

@@ -83,6 +83,13 @@ def read_participant(path: Path, selection: Selection) -> RawCapture:
         except CaptureError as error:
             dropped[serial] = str(error)
             del videos[serial]
+    if not any(map(len, videos.values())) and list(path.glob("sequences/*/timesteps")):
+        raise CaptureError(
+            f"{path}: holds pictures, as NeRSemble's first release, expected videos; give a"
+            " sequence such as sequences/EXP-1-head, with a calibration.json beside its timesteps"
+            " ('express50 cameras import'; its cameras must be called cam_<serial>, as the pictures"
+            " are)"
+        )
     listed = [(name, 0) for name in wanted]
     line = common_timeline(path, videos, wanted, "videos", listed=listed, dropped=dropped)
     colours, warnings = _colours(path, set(line.cameras))

@@ -75,6 +75,43 @@ def test_names_of_files_or_folders_are_expressions(tmp_path, layout, names):
     assert index.cues == (Cue("look_left", 0, length - 1), Cue("smile", length, 2 * length - 1))
 
 
+@pytest.mark.parametrize(
+    ("layout", "footage"),
+    [
+        ("videos", "videos/cam{c}.mp4"),
+        ("camera_folders", "images/cam{c}/{f:06d}.png"),
+        ("camera_folders", "cam{c}/frames/{f:06d}.png"),
+        ("expression_folders", "smile{f}/videos/cam{c}.mp4"),
+        ("frame_folders", "timesteps/frame_{f:05d}/images-2fps/cam{c}.png"),
+        ("photos", "image/00{c}.png"),
+    ],
+)
+def test_footage_may_lie_one_folder_deeper(tmp_path, layout, footage):
+    names = [footage.format(c=c, f=f) for c in (0, 1) for f in range(FRAMES)]
+    root = write(tmp_path / "rig", [*dict.fromkeys(names)])
+    write(root, ["masks/cam0/0.png", "plates/cam0.png"])
+    cameras = ["000", "001"] if layout == "photos" else ["cam0", "cam1"]
+    write_cameras(root / "calibration.json", rig(cameras))
+    found = read_any(root)
+    assert (found.layout, found.subject, list(found.cameras)) == (layout, "rig", cameras)
+    assert list(found.calibration) == cameras and not found.dropped
+    assert bool(found.plates) == (layout != "photos")
+    if footage.endswith("png"):
+        ingest_captures(tmp_path / "data", root)
+
+
+def test_a_rig_further_below_is_named(tmp_path):
+    write(tmp_path / "day/take", ["video/cam0.mp4", "video/cam1.mp4"])
+    with pytest.raises(CaptureError, match=r"no known layout, but .*/day/take has one .* give th"):
+        read_any(tmp_path)
+
+
+def test_folders_beside_each_other_are_not_chosen_from(tmp_path):
+    root = write(tmp_path / "rig", ["images/left.png", "other/left.png"])
+    with pytest.raises(CaptureError, match="no known layout"):
+        read_any(root)
+
+
 def test_a_video_per_camera_folder_is_one_clip_whatever_its_name(tmp_path):
     root = write(tmp_path / "rig", ["cam_a/GX010023.mp4", "cam_b/GX010456.mp4"])
     (root / "cam_a/GX010023.THM").touch()
