@@ -17,14 +17,19 @@
   the centre) are fractions of the longer side; the last two distortion terms are OpenCV's p2, p1.
 - VGGT: ``extrinsic`` is world to camera, OpenCV's axes. ``intrinsic`` is for the network's input,
   whose centre is the principal point.
+- IDR and NeuS: ``world_mat_<i>`` is K [R|t], world to pixels from the first pixel's centre;
+  ``scale_mat_<i>`` only tells where the object is. FaceScape: ``<i>_K``, ``<i>_Rt`` and so on,
+  world to camera; OpenCV's axes, pixels and distortion.
 """
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
+import cv2
 import h5py
 import numpy as np
 
@@ -308,6 +313,53 @@ def read_vggt(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
         return found
     off = {n: abs(size[1] * c.width / size[0] - c.height) for n, c in found.items()}
     return {n: resized(c, *size) if off[n] <= PATCH / 2 else c for n, c in found.items()}
+
+
+def read_idr(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
+    """Read the projections of a ``cameras.npz``, named ``000`` and so on, as its pictures are.
+
+    The unit is the file's own; ``size`` is the width and height of the pictures.
+
+    Raises:
+        CalibrationError: no size is given, or a matrix is no projection of a camera.
+    """
+    if size is None:
+        raise CalibrationError(f"{path}: does not give the images' size; pass --size WIDTHxHEIGHT")
+    arrays = read_arrays(path, CalibrationError, "the cameras of IDR or NeuS")
+    found = []
+    for key in sorted(key for key in arrays if re.fullmatch(r"world_mat_\d{1,4}", key)):
+        what = f"{path} has {key}"
+        rows = 4 if arrays[key].shape == (4, 4) else 3
+        P = finite_array(arrays[key], (rows, 4), what)[:3]
+        sign = np.sign(np.linalg.det(P[:, :3]))  # P is known up to a factor
+        if not sign:
+            raise CalibrationError(f"{what} {P.tolist()}, expected K [R|t]; write the file again")
+        K, R = cv2.decomposeProjectionMatrix(sign * P)[:2]
+        pose = make_transform(R, np.linalg.solve(K, sign * P[:, 3]))
+        name = f"{int(key.rpartition('_')[2]):03d}"
+        found.append(camera_from_K(name, K_from_opencv(K / K[2, 2]), [], size, pose))
+    return as_rig(found, path)
+
+
+def read_facescape(path: Path) -> dict[str, Camera]:
+    """Read the valid cameras of an expression's ``params.json``, named as its pictures.
+
+    Raises:
+        CalibrationError: no camera is valid, or one lacks a value.
+    """
+    table = read_json_table(path, CalibrationError)
+    found = []
+    for name in sorted(key.removesuffix("_valid") for key in table if key.endswith("_valid")):
+        if not table[f"{name}_valid"]:
+            continue
+        what, K = f"{path}: camera {name} has an array", table.get(f"{name}_K")
+        side = 4 if isinstance(K, list) and len(K) == 4 else 3
+        lens = K_from_opencv(finite_array(K, (side, side), what)[:3, :3])
+        pose = np.vstack([finite_array(table.get(f"{name}_Rt"), (3, 4), what), [0, 0, 0, 1]])
+        size = size_from([table.get(f"{name}_{side}") for side in ("width", "height")], what)
+        dist = finite_array(table.get(f"{name}_distortion"), (5,), what)
+        found.append(camera_from_K(identifier(name), lens, dist, size, pose))
+    return as_rig(found, path)
 
 
 NERSEMBLE_SIZE = (2200, 3208)

@@ -29,6 +29,8 @@ from express50.rigs.camera_builder import (
 from express50.rigs.colmap import is_colmap, read_colmap_images
 from express50.rigs.other_tools import (
     read_calibration_toml,
+    read_facescape,
+    read_idr,
     read_kalibr,
     read_metashape,
     read_nersemble,
@@ -96,6 +98,12 @@ FORMATS = {
     ),
     "realitycapture": RigFormat(
         "RealityCapture's .xmp files", _files(".xmp"), read_reality_capture
+    ),
+    "idr": RigFormat("IDR's or NeuS' .npz", _file(".npz", word="world_mat_0"), read_idr),
+    "facescape": RigFormat(
+        "FaceScape's params.json",
+        _file(".json", word='"0_Rt"'),
+        lambda path, _: read_facescape(path),
     ),
     "vggt": RigFormat("VGGT's .npz", _file(".npz"), read_vggt),
     "opencv": RigFormat(

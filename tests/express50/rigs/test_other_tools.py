@@ -3,6 +3,7 @@
 Each layout is written out here, and so is the tool's own projection.
 """
 
+import json
 import re
 
 import cv2
@@ -199,7 +200,30 @@ def write_vggt(folder):
     return folder / "predictions.npz", pixels
 
 
+def write_idr(folder):
+    """Write projections, one of them negated: they are known up to a factor."""
+    arrays = {f"scale_mat_{n}": np.eye(4) for n in range(len(RIG))}
+    for n, pose in enumerate(RIG.values()):
+        arrays[f"world_mat_{n}"] = np.vstack([(-1) ** n * K @ pose[:3], [0, 0, 0, 1]])
+    np.savez(folder / "cameras_sphere.npz", **arrays)
+    pixels = [opencv_pixels(pose, dist=()) + 0.5 for pose in RIG.values()]
+    return folder / "cameras_sphere.npz", {f"{n:03d}": p for n, p in enumerate(pixels)}
+
+
+def write_facescape(folder):
+    """Write cameras of which the last is not valid."""
+    table = {}
+    for n, pose in enumerate([*RIG.values(), np.zeros((4, 4))]):
+        table |= {f"{n}_K": listed(K), f"{n}_Rt": listed(pose[:3]), f"{n}_distortion": DIST}
+        table |= {f"{n}_width": SIZE[0], f"{n}_height": SIZE[1], f"{n}_valid": n < len(RIG)}
+    (folder / "params.json").write_text(json.dumps(table))
+    pixels = [opencv_pixels(pose) + 0.5 for pose in RIG.values()]
+    return folder / "params.json", {str(n): p for n, p in enumerate(pixels)}
+
+
 WRITERS = {
+    "idr": ("idr", write_idr),
+    "facescape": ("facescape", write_facescape),
     "caliscope": ("toml", write_caliscope),
     "aniposelib": ("toml", write_aniposelib),
     "kalibr": ("kalibr", write_kalibr),
@@ -258,6 +282,13 @@ def test_a_metashape_chunk_without_a_world_is_its_own(tmp_path):
         ("metashape", 'jpg"><transform>', 'jpg"><transform>1 ', r"shape \(17,\)"),
         ("metashape", 'component_id="0"', 'component_id="1"', "2 components"),
         ("metashape", 'sensor_id="0"', 'sensor_id="5"', "has no frame lens"),
+        (
+            "facescape",
+            '"0_K": [',
+            '"0_K": [[1, 0, 0], ',
+            "camera 0 has an array: got nothing|shape",
+        ),
+        ("facescape", '"1_distortion"', '"1_d"', "camera 1 has an array: got nothing"),
         ("realitycapture", "brown3t2", "division", "cam00.xmp: lens division"),
         ("realitycapture", 'Skew="0"', 'Skew="0.1"', "no skew"),
         ("realitycapture", "Position>", "Position>1 ", "cam00.xmp has xcr:Position"),
@@ -285,6 +316,12 @@ def test_arrays_of_another_shape_and_missing_sizes_are_named(tmp_path):
     write_realitycapture(tmp_path)
     with pytest.raises(CalibrationError, match="--size"):
         read_rig(tmp_path, "realitycapture")
+    path, _ = write_idr(tmp_path)
+    with pytest.raises(CalibrationError, match="--size"):
+        read_rig(path)
+    np.savez(path, world_mat_0=np.zeros((3, 4)))
+    with pytest.raises(CalibrationError, match=r"has world_mat_0 .* expected K \[R|t\]"):
+        read_rig(path, size=SIZE)
 
 
 def test_footage_of_another_shape_than_the_network_saw_is_refused(tmp_path):
