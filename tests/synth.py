@@ -123,12 +123,13 @@ def write_video(
     container_options: dict[str, str] | None = None,
     ticks: list[int] | None = None,
     rate: int = 24,
+    pix_fmt: str = "yuv420p",
 ) -> None:
     """H.264 with B-frames, as cameras write it; ``ticks`` are time stamps in 96ths of a second."""
     with av.open(str(path), "w", options=container_options or {}) as container:
         stream = container.add_stream(codec, rate=rate)
         stream.height, stream.width = images[0].shape[:2]
-        stream.pix_fmt = "yuv420p"
+        stream.pix_fmt = pix_fmt
         stream.codec_context.gop_size = gop
         stream.codec_context.max_b_frames = b_frames
         stream.codec_context.thread_count = 1

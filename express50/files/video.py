@@ -38,6 +38,7 @@ HDR_CURVES = {16: "PQ", 18: "HLG"}
 # Weights of red and blue in luma by H.273's matrix coefficients: BT.709, BT.601 (two), BT.2020.
 LUMA = {1: (0.2126, 0.0722), 5: (0.299, 0.114), 6: (0.299, 0.114), 9: (0.2627, 0.0593)}
 LIMITED = 1  # colour range of 16 to 235 and 16 to 240, as cameras record
+LIMITS = 8, 247  # luma of 16 to 235 that noise and sharp edges hardly reach
 UNTIMED = "frames have no time stamps; remux it, for example with 'ffmpeg -i IN -c copy OUT.mp4'"
 UNORDERED = (
     "time stamps of frames are not in order, as in AVI and MXF files with B-frames; encode it"
@@ -239,6 +240,7 @@ class VideoTags:
     hdr: str  # name of its transfer curve if that is one for high dynamic range, else empty
     interlaced: bool  # whether a picture holds two half pictures of different moments
     aspect: float  # width over height of a pixel
+    beyond: float  # share of the first picture that the range hardly has, if none is stated
 
 
 def video_tags(path: Path) -> VideoTags:
@@ -260,7 +262,21 @@ def _tags(frame: av.VideoFrame, stream: av.VideoStream) -> VideoTags:
         HDR_CURVES.get(int(frame.color_trc), ""),
         bool(frame.interlaced_frame),
         float(stream.codec_context.sample_aspect_ratio or 1),
+        _beyond(frame),
     )
+
+
+def _beyond(frame: av.VideoFrame) -> float:
+    """Return the share of luma far outside of 16 to 235 where no range is stated.
+
+    Without a flag, H.264 means 16 to 235 (ITU-T H.264, E.2.1), and every player reads it so. Some
+    recorders of grey cameras store 0 to 255 and set no flag; darks and lights are then lost.
+    """
+    if frame.color_range or frame.format.name not in ("yuv420p", "yuv422p", "yuv444p"):
+        return 0.0
+    luma = np.frombuffer(frame.planes[0], np.uint8).reshape(-1, frame.planes[0].line_size)
+    luma = luma[: frame.height, : frame.width]
+    return float(((luma < LIMITS[0]) | (luma > LIMITS[1])).mean())
 
 
 def iterate_video(

@@ -24,6 +24,7 @@ from express50.files.video import VideoTags, iterate_sparsely, iterate_video, vi
 from pipelines.ingest.quality import CameraMeasurements, FrameMeasures
 
 FPS_SLACK = 0.02  # of the rate: less than from 24 to 25 frames per second
+BEYOND = 0.01  # share of the first picture outside of a range that no flag states
 UNEVEN = 0.1  # share of the steps that differ; a lost frame now and then is counted as a gap
 
 
@@ -214,6 +215,12 @@ def _odd_pictures(tags: VideoTags) -> list[str]:
         )
     if tags.interlaced:
         oddities.append("is interlaced: a picture mixes two moments; record progressive frames")
+    if tags.beyond > BEYOND:
+        oddities.append(
+            f"states no range and is read as 16 to 235, but {tags.beyond:.0%} of its first picture"
+            " lies outside; if it was recorded as 0 to 255, mark it so, for example with 'ffmpeg -i"
+            " IN -c copy -bsf:v h264_metadata=video_full_range_flag=1 OUT.mp4'"
+        )
     if tags.aspect != 1:
         oddities.append(
             f"has pixels {tags.aspect:.3g} times as wide as high, but is used as stored; the"

@@ -335,15 +335,18 @@ def test_footage_unlike_what_is_said_of_it_is_a_warning(tmp_path):
 
 def test_videos_whose_pictures_are_not_what_they_seem_are_warned_of(tmp_path):
     root = tmp_path / "S001"
-    make_capture(root, cameras=3, frames=6, video=True)
-    hdr, interlaced, plain = (root / f"cameras/cam0{n}/video.mp4" for n in range(3))
+    make_capture(root, cameras=4, frames=6, video=True)
+    hdr, interlaced, plain, grey = (root / f"cameras/cam0{n}/video.mp4" for n in range(4))
     images = [image for _, image in iterate_video(plain)]
     write_video(hdr, images, options={"x264-params": "transfer=arib-std-b67"})
     write_video(interlaced, images, options={"x264-params": "interlaced=1:sar=16/15"})
+    # FFmpeg encodes grey as 0 to 255, and sets no flag.
+    write_video(grey, [np.uint8(255) * (image > 120) for image in images], pix_fmt="gray")
     dataset = Dataset(tmp_path / "data")
     ingest.add_captures(dataset, [root])
     assert run(dataset).ok
     said = notes(dataset)
+    assert "states no range and is read as 16 to 235" in said["camera cam03"]
     assert "is HDR (HLG)" in said["camera cam00"]
     assert "is interlaced" in said["camera cam01"]
     assert "pixels 1.07 times as wide as high" in said["camera cam01"]
