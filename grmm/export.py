@@ -90,19 +90,16 @@ def write_export(
     morph targets; ``npz`` holds all Gaussians' arrays, mesh, codes and parameters.
     """
     gaussians, vertices, texture = decoded(loaded, head, view)
-    if form in ("ply", "spz", "splats"):
-        gaussians = with_neck_cut(loaded.head, vertices, gaussians)
-    if form == "ply":
-        content = ply_bytes(gaussians)
-    elif form in ("spz", "splats"):
-        content = spz_bytes(gaussians) if form == "spz" else splats_glb(gaussians)
-    elif form == "npz":
-        content = arrays_npz(loaded, head, gaussians, vertices)
-    else:
+    if form in ("glb", "arkit"):
         targets = arkit_targets(loaded, head) if form == "arkit" else {}
         write_bytes(path, mesh_glb(loaded.head, vertices, texture, targets))
         return f"mesh of {len(vertices)} vertices, texture {len(texture)} px"
-    write_bytes(path, content)
+    if form == "npz":
+        write_bytes(path, arrays_npz(loaded, head, gaussians, vertices))
+    else:
+        gaussians = with_neck_cut(loaded.head, vertices, gaussians)
+        encode = {"ply": ply_bytes, "spz": spz_bytes, "splats": splats_glb}[form]
+        write_bytes(path, encode(gaussians))
     return f"{len(gaussians.means)} Gaussians"
 
 

@@ -79,8 +79,7 @@ def render_preview(
     corner = faces[hits["primitive_ids"].numpy()[seen]]
     weights = barycentrics(hits, seen)[:, :, None]
     normals = normals_of(points, model.faces.cpu())
-    n = (normals[corner] * weights).sum(1)
-    n /= np.linalg.norm(n, axis=1, keepdims=True) + 1e-9
+    n = unit((normals[corner] * weights).sum(1))
     colors = np.tile(np.array(_SKIN), (len(points), 1))
     for region, color in _COLORS.items():
         if region in model.regions:
@@ -117,7 +116,7 @@ def _shade(
         (-0.55 * right + 0.65 * up + 0.75 * back, 0.88),
         (0.8 * right + 0.15 * up + 0.5 * back, 0.24),
     ):
-        light = light / np.linalg.norm(light)
+        light = unit(light)
         dark = scene.test_occlusions(join_rays(place + 8e-4 * n, light)).numpy()
         half = unit(light + view)
         lit = power * np.where(dark, 0.0, 1.0)

@@ -59,11 +59,7 @@ def source_digest() -> str:
 
 
 def compiler() -> str:
-    """Return the path of the C++ compiler: $CXX, g++, c++ or clang++.
-
-    Raises:
-        BuildError: there is none.
-    """
+    """Return the path of the C++ compiler: $CXX, g++, c++ or clang++; BuildError without any."""
     for name in (os.environ.get("CXX", ""), "g++", "c++", "clang++"):
         found = shutil.which(name) if name else None
         if found:

@@ -208,7 +208,6 @@ def cast_window(
     window = np.s_[low[1] : high[1], low[0] : high[0]]
     part = crop_camera(camera, *low.tolist(), *(high - low).tolist())
     seen = cast_maps(surface, scene, part, alpha[window].astype(np.float32) / 255, apart_mm)
-
     covered = float(seen.valid.sum() / max(int((alpha > 255 * INSIDE).sum()), 1))
     return replace(seen, covered=covered, window=window, size=alpha.shape)
 

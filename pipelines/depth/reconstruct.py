@@ -89,7 +89,6 @@ def reconstruct(
     _check_size(low, high, fine)
     coarser = np.log(COARSE_M / fine) / np.log(LEVEL_RATIO)
     voxels = [fine * LEVEL_RATIO**k for k in reversed(range(1 + max(0, round(coarser))))]
-
     outlines = [] if solid is None else solid.outlines(views)
     clear = views if solid is None else solid.without_glasses(views)
 

@@ -113,7 +113,6 @@ class Points:
         values, about = torch.from_numpy(parameters), torch.from_numpy(rotation)
         linear, pose = values[:-POSE_SIZE], values[-POSE_SIZE:]
         rest, joints = self._at_rest(linear)
-
         turns = _joint_rotations(pose)
         turn, shift = joint_transforms(joints[None], turns[None])
         world = axis_angle_to_matrix(pose[12:15]) @ about
