@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from express50.geometry.cameras import Camera
+from express50.files.images import box_about
+from express50.geometry.cameras import Camera, depth_in
 from express50.geometry.conventions import K_to_opencv
 from pipelines.depth.views import INSIDE, DepthView, head_box
 from pipelines.imports.pictures import fuse
@@ -31,17 +32,16 @@ def sweep(
 ) -> np.ndarray:
     """Choose the best of PLANES planes through a box: depth (H, W), 0 where views disagree."""
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), -1).reshape(-1, 3)
-    z = corners @ view.camera.cam_from_world[2, :3] + view.camera.cam_from_world[2, 3]
+    z = depth_in(view.camera, corners)
     planes = 1.0 / np.linspace(1.0 / max(z.min(), 1e-3), 1.0 / z.max(), PLANES)
-    rows, columns = (np.flatnonzero((view.alpha > INSIDE).any(k)) for k in (1, 0))
-    top, left = int(rows[0]), int(columns[0])
-    box = slice(top, int(rows[-1]) + 1), slice(left, int(columns[-1]) + 1)
+    box = box_about(view.alpha > INSIDE)
+    corner = box[1].start, box[0].start
     here = _moments(_grey(view)[box])
     greys = [(_grey(other), _rays_to(view.camera, other.camera)) for other in others]
     best = np.full(here[0].shape, AGREE, np.float32)
     depth = np.zeros_like(best)
     for plane in planes:
-        scores = [_correlation(here, _warped(grey, moved, plane, (left, top), best.shape))
+        scores = [_correlation(here, _warped(grey, moved, plane, corner, best.shape))
                   for grey, moved in greys]  # fmt: skip
         score = np.sort(scores, axis=0)[-2:].mean(0)  # two of four: the others may be hidden
         better = score > best

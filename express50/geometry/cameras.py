@@ -119,6 +119,21 @@ def crop_camera(camera: Camera, x0: float, y0: float, width: int, height: int) -
     return replace(_with_K(camera, K), width=int(width), height=int(height))
 
 
+def cut_about(
+    camera: Camera, pixels: np.ndarray, margin: float = 0
+) -> tuple[Camera, tuple[slice, slice]]:
+    """Return the camera of the part of a picture about pixels (N, 2), and its rows and columns.
+
+    It reaches a `margin` further, and has a pixel at least.
+    """
+    size = np.array([camera.width, camera.height])
+    pixels = pixels.astype(np.float64)
+    low = np.clip(np.floor(pixels.min(0) - margin), 0, size - 1).astype(int)
+    high = np.clip(np.ceil(pixels.max(0) + margin), low + 1, size).astype(int)
+    part = crop_camera(camera, *low.tolist(), *(high - low).tolist())
+    return part, np.s_[low[1] : high[1], low[0] : high[0]]
+
+
 def _with_K(camera: Camera, K: np.ndarray) -> Camera:
     """Return the camera with other intrinsics; a model with one focal length gets one with two."""
     p = camera._named() | {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
@@ -350,6 +365,11 @@ def project_pinhole(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.
     """Return pixels (..., 2) and depth (...) of world points (..., 3) in an undistorted camera."""
     ray, depth, _ = _rays(camera, points)
     return ray * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2], depth
+
+
+def depth_in(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Return the depth (...), camera z in metres, of world points (..., 3)."""
+    return points @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
 
 
 def inside_frame(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

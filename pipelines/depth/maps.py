@@ -18,7 +18,7 @@ import open3d as o3d
 
 from express50.error_model import HEAD_SIZE_SPREAD, Bounds, error_bounds
 from express50.files.images import box_about
-from express50.geometry.cameras import Camera, crop_camera, rays, resized, unproject
+from express50.geometry.cameras import Camera, crop_camera, cut_about, rays, resized, unproject
 from express50.geometry.conventions import cell_centres, cell_to_corner
 from express50.geometry.raycast import barycentrics, camera_rays, join_rays, mesh_scene
 from express50.geometry.sampling import bilinear, edge_width, local_moments
@@ -201,12 +201,9 @@ def cast_window(
     A head fills a third of a picture.
     """
     pixels, depth = project_fast(camera, surface.vertices)
-    low, high = np.zeros(2, int), np.array([camera.width, camera.height])
+    part, window = camera, np.s_[:, :]
     if (depth > 0).all():  # two pixels more for what looks at neighbours
-        low = np.clip(np.floor(pixels.min(0)).astype(int) - 2, low, high - 1)
-        high = np.clip(np.ceil(pixels.max(0)).astype(int) + 2, low + 1, high)
-    window = np.s_[low[1] : high[1], low[0] : high[0]]
-    part = crop_camera(camera, *low.tolist(), *(high - low).tolist())
+        part, window = cut_about(camera, pixels, 2)
     seen = cast_maps(surface, scene, part, alpha[window].astype(np.float32) / 255, apart_mm)
     covered = float(seen.valid.sum() / max(int((alpha > 255 * INSIDE).sum()), 1))
     return replace(seen, covered=covered, window=window, size=alpha.shape)

@@ -11,7 +11,7 @@ import open3d as o3d
 
 from express50.contract.segmentation_labels import HEAD, LABELS, label_mask
 from express50.files.images import disc, edge_distance
-from express50.geometry.cameras import Camera, crop_camera, project, rays, unproject
+from express50.geometry.cameras import Camera, cut_about, project, rays, unproject
 from express50.geometry.conventions import opencv_pixels_to_corner
 from express50.geometry.meshes import mesh_parts
 from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
@@ -130,14 +130,10 @@ def render_head(head: TrackedHead, camera: Camera) -> tuple[np.ndarray, np.ndarr
     pixels, ahead = project(camera, head.vertices)
     if not (ahead > 0).any():
         return labels, depth
-    size = np.array([camera.width, camera.height])
-    low, high = np.zeros(2, int), size  # of the window outside of which no ray meets the head
-    if (ahead > 0).all():
-        ends = np.clip([np.floor(pixels.min(0)), np.ceil(pixels.max(0))], 0, size)
-        low, high = ends.astype(int)
-        if (high <= low).any():
-            return labels, depth
-    origin, directions = rays(crop_camera(camera, *low.tolist(), *(high - low).tolist()))
+    part, window = camera, np.s_[:, :]
+    if (ahead > 0).all():  # elsewhere no ray meets the head
+        part, window = cut_about(camera, pixels)
+    origin, directions = rays(part)
     hits = head.scene.cast_rays(join_rays(origin - head.center, directions), nthreads=1)
     distance = hits["t_hit"].numpy()
     hit = np.isfinite(distance) & (distance > 0)
@@ -146,7 +142,6 @@ def render_head(head: TrackedHead, camera: Camera) -> tuple[np.ndarray, np.ndarr
     found = head.labels.vertices[vertex]
     away = (hits["primitive_normals"].numpy()[hit] * directions[hit]).sum(1) > 0
     found = np.where(away & np.isin(found, _OUTER), np.uint8(0), found)
-    window = np.s_[low[1] : high[1], low[0] : high[0]]
     labels[window][hit] = found
     depth[window][hit] = np.where(found > 0, distance[hit], 0)
     return labels, depth

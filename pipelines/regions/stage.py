@@ -17,7 +17,7 @@ from express50.dataset.depth_files import depth_file, read_depth
 from express50.dataset.tracks import existing_track, read_track
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.images import box_about, contact_sheet, fit_into, shrink, write_image
-from express50.geometry.cameras import Camera, crop_camera, project, resized
+from express50.geometry.cameras import Camera, cut_about, project, resized
 from express50.geometry.sampling import evenly
 from express50.head.load import load_topology
 from pipelines.regions.colour import (
@@ -209,10 +209,7 @@ def label_view(
     """
     camera, rgb, alpha, depth = _shrunk(camera, rgb, alpha, depth, side)
     whole = ViewLabels(np.zeros(alpha.shape, np.uint8), np.zeros(alpha.shape, bool))
-    rows, columns = window = _window(head, camera, alpha)
-    camera = crop_camera(
-        camera, columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start
-    )
+    camera, window = _part(head, camera, alpha)
     rgb, alpha = rgb[window], alpha[window]
     depth = None if depth is None else depth[window]
     geometry = head_geometry(head, camera, alpha, depth)
@@ -232,18 +229,17 @@ def label_view(
     return whole
 
 
-def _window(head: TrackedHead, camera: Camera, alpha: np.ndarray) -> tuple[slice, slice]:
-    """Find the rows and columns that hold the matte (H, W) and the head, with a margin."""
-    size = np.array([camera.width, camera.height])
+def _part(
+    head: TrackedHead, camera: Camera, alpha: np.ndarray
+) -> tuple[Camera, tuple[slice, slice]]:
+    """Cut a picture to the matte (H, W) and the head, with a margin: see `cut_about`."""
     x, y, width, height = cv2.boundingRect((alpha > 0).astype(np.uint8))
     pixels, ahead = project(camera, head.vertices)
     if not (ahead > 0).all():
-        return slice(0, camera.height), slice(0, camera.width)
+        return camera, np.s_[:, :]
     matte = np.array([(x, y), (x + width, y + height)])
     ends = np.concatenate([pixels, matte]) if width else pixels
-    low = np.clip(np.floor(ends.min(0)) - MARGIN, 0, size - 1).astype(int).tolist()
-    high = np.clip(np.ceil(ends.max(0)) + MARGIN, 1, size).astype(int).tolist()
-    return slice(low[1], high[1]), slice(low[0], high[0])
+    return cut_about(camera, ends, MARGIN)
 
 
 def _shrunk(

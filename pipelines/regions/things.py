@@ -26,6 +26,8 @@ from express50.files.images import LIGHT_OF_LEVEL, box_about, disc, shrink
 from express50.geometry.cameras import (
     Camera,
     crop_camera,
+    cut_about,
+    depth_in,
     inside_frame,
     project_pinhole,
     resized,
@@ -164,7 +166,7 @@ def shown_in_front(places: np.ndarray, camera: Camera, depth: np.ndarray) -> np.
     """
     found = np.zeros(depth.shape, np.uint8)
     pixels, inside = inside_frame(camera, places)
-    ahead = places[inside] @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
+    ahead = depth_in(camera, places[inside])
     column, row = pixels[inside].astype(np.int64).T
     clear = (depth[row, column] == 0) | (ahead < depth[row, column])
     found[row[clear], column[clear]] = 1
@@ -263,8 +265,7 @@ def _not_before_bare_face(things: np.ndarray, views: Sequence[FaceView]) -> np.n
     for view in views:
         pixels, inside = inside_frame(view.camera, things)
         column, row = pixels[inside].astype(np.int64).T
-        axis = view.camera.cam_from_world[2]
-        ahead = things[inside] @ axis[:3] + axis[3]
+        ahead = depth_in(view.camera, things[inside])
         kept = np.ones(len(things), bool)
         kept[inside] = ~(view.bare[row, column] & (ahead < view.depth[row, column] - NEAR_M))
         things = things[kept]
@@ -299,14 +300,11 @@ def _shot(head: TrackedHead, picture: Picture) -> _Shot | None:
     if (ahead <= 1e-3).any():
         return None
     margin = AROUND_M * camera.K[0, 0] / float(np.median(ahead))
-    x0, y0 = np.maximum(np.floor(pixels.min(0) - margin), 0).astype(int).tolist()
-    ends = np.minimum(np.ceil(pixels.max(0) + margin), (camera.width, camera.height))
-    width, height = (ends.astype(int) - (x0, y0)).tolist()
-    if min(width, height) < PATCH_PX:
+    part, window = cut_about(camera, pixels, margin)
+    if min(part.width, part.height) < PATCH_PX:
         return None
-    window = np.s_[y0 : y0 + height, x0 : x0 + width]
     rgb, alpha = (shrink(np.ascontiguousarray(image[window]), SIDE) for image in (rgb, alpha))
-    camera = resized(crop_camera(camera, x0, y0, width, height), rgb.shape[1], rgb.shape[0])
+    camera = resized(part, rgb.shape[1], rgb.shape[0])
     grey = np.sqrt(cv2.GaussianBlur(LIGHT_OF_LEVEL[rgb], (0, 0), 0.7)).mean(2)
     return _Shot(camera, rgb, alpha, grey, *render_head(head, camera))
 

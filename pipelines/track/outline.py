@@ -15,6 +15,7 @@ import open3d as o3d
 from express50.files.images import edge_distance
 from express50.geometry.cameras import (
     Camera,
+    depth_in,
     project_pinhole,
     project_with_slope,
     resized,
@@ -64,8 +65,8 @@ class OutlineTerm:
         near outline, because hair hides skull, temples and jaw.
         """
         camera, count = distance.camera, len(positions)
-        depth = (positions @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]).mean()
-        scale = camera.K[0, 0] / max(float(depth), 1e-6)
+        depth = float(depth_in(camera, positions).mean())
+        scale = camera.K[0, 0] / max(depth, 1e-6)
         redundancy = max(1.0, count / EFFECTIVE_POINTS) ** 0.5
         edge = np.hypot(0.5 * distance.step.max(), EDGE_SIGMA_M * scale)
         cover = np.hypot(edge, COVER_SIGMA_M * scale) * max(1, pictures) ** 0.5
@@ -124,8 +125,7 @@ def outline_vertices(
     projects to within a pixel and a half of the edge of the mesh's own mask, so that inner folds do
     not.
     """
-    depth = vertices @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
-    if (depth <= 1e-3).any():
+    if (depth_in(camera, vertices) <= 1e-3).any():
         return np.zeros(0, dtype=np.int64)
     shrink = OUTLINE_SIDE / max(camera.width, camera.height)
     window = resized(

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from express50.files.images import LIGHT_OF_LEVEL, disc, resize_area
-from express50.geometry.cameras import Camera, crop_camera, inside_frame, project_pinhole, resized
+from express50.geometry.cameras import Camera, cut_about, inside_frame, project_pinhole, resized
 from express50.geometry.raycast import join_rays, mesh_scene
 from express50.geometry.sampling import bilinear_slope
 from express50.geometry.transforms import unit
@@ -88,15 +88,11 @@ def cut_crop(
     pixels, depth = project_pinhole(camera, mesh)
     if (depth <= 1e-3).any():
         return None
-    low, high = pixels.min(0), pixels.max(0)
-    grow = MARGIN * (high - low).max()
-    x0, y0 = np.maximum(np.floor(low - grow), 0).astype(int).tolist()
-    x1, y1 = np.minimum(np.ceil(high + grow), (camera.width, camera.height)).astype(int).tolist()
-    if min(x1 - x0, y1 - y0) < 8:
+    seen, window = cut_about(camera, pixels, MARGIN * np.ptp(pixels, axis=0).max())
+    if min(seen.width, seen.height) < 8:
         return None
-    seen = crop_camera(camera, x0, y0, x1 - x0, y1 - y0)
-    image = np.ascontiguousarray(image[y0:y1, x0:x1])
-    alpha = None if alpha is None else np.ascontiguousarray(alpha[y0:y1, x0:x1])
+    image = np.ascontiguousarray(image[window])
+    alpha = None if alpha is None else np.ascontiguousarray(alpha[window])
     step = max(seen.width, seen.height) / side
     if step > 1.0:
         width, height = max(8, round(seen.width / step)), max(8, round(seen.height / step))

@@ -79,6 +79,27 @@ def test_crop_and_scale_commute_with_projection(x0, y0, scale, seed):
     )
 
 
+@pytest.mark.parametrize(
+    ("ends", "window"),
+    [
+        ([(3.2, 5.0), (9.0, 7.5)], np.s_[3:10, 1:11]),
+        ([(-9.0, 40.0), (70.0, 60.0)], np.s_[38:48, 0:64]),
+        ([(90.0, -9.0), (95.0, -5.0)], np.s_[0:1, 63:64]),  # beside the picture
+    ],
+)
+def test_a_part_of_a_picture_has_its_margin_and_a_pixel_at_least(ends, window):
+    picture = np.arange(48 * 64).reshape(48, 64)
+    camera, found = cameras.cut_about(OPENCV, np.array(ends), 2)
+    assert picture[found].shape == (camera.height, camera.width)
+    np.testing.assert_array_equal(picture[found], picture[window])
+    shift = (window[1].start, window[0].start)
+    pixels = cameras.project(OPENCV, POINTS)[0]
+    np.testing.assert_allclose(cameras.project(camera, POINTS)[0], pixels - shift, atol=1e-9)
+    np.testing.assert_allclose(
+        cameras.depth_in(OPENCV, POINTS), cameras.project(OPENCV, POINTS)[1], atol=1e-12
+    )
+
+
 def test_scaling_a_one_focal_model_keeps_it_right():
     camera = Camera("a", 64, 48, "SIMPLE_RADIAL", (80, 31, 25, 0.1), POSE)
     moved = cameras.resized(camera, 32, 24)
