@@ -25,7 +25,7 @@ from benchmarks.common import make_parser
 from express50.geometry.raycast import mesh_scene
 from express50.geometry.transforms import axis_angle_to_matrix, rigid_fit
 from express50.head.load import load_builtin, load_head
-from express50.head.model import HeadModel, landmarks, landmarks_of, pose
+from express50.head.model import HeadModel, in_regions, landmarks, landmarks_of, pose
 from express50.head.preview import render_preview
 from pipelines.register.scan import fit_scan
 from pipelines.register.scan_input import GREY, Scan
@@ -107,7 +107,7 @@ def laid(model: HeadModel, fitted: np.ndarray) -> np.ndarray:
 def region(model: HeadModel, name: str) -> np.ndarray:
     """Mark the vertices (V,) of the face, or of the face, scalp, ears and neck for "head"."""
     names = ("face", "scalp", "left_ear", "right_ear", "neck") if name == "head" else ("face",)
-    return np.any([model.regions[part].numpy() for part in names], axis=0)
+    return in_regions(model, names)
 
 
 def spread(rows: list[np.ndarray]) -> dict[str, float]:

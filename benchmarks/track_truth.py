@@ -23,7 +23,7 @@ from express50.errors import Express50Error
 from express50.geometry.cameras import Camera, pinhole, project, transform_camera
 from express50.geometry.transforms import axis_angle_to_matrix, rigid_fit, transform_points
 from express50.head.load import load_head
-from express50.head.model import HeadModel, landmarks
+from express50.head.model import HeadModel, in_regions, landmarks
 from express50.twin.truth import Truth, align_worlds
 
 NO_SKIN = ("mouth_interior", "teeth", "neck", "boundary")
@@ -133,9 +133,8 @@ def region_errors(model: HeadModel, vertices: np.ndarray, true: np.ndarray) -> d
 
 def regions_of(model: HeadModel) -> dict[str, np.ndarray]:
     """Return vertices (V,) bool of face, head and neck."""
-    away = np.any([model.regions[name].numpy() for name in NO_SKIN], axis=0)
-    face, neck = face_of(model), model.regions["neck"].numpy()
-    return {"face": face, "head": ~away, "neck": neck}
+    skin, neck = ~in_regions(model, NO_SKIN), model.regions["neck"].numpy()
+    return {"face": face_of(model), "head": skin, "neck": neck}
 
 
 def face_motion(model: HeadModel, expression: np.ndarray) -> np.ndarray:

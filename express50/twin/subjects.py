@@ -15,7 +15,7 @@ from express50.capture.expressions import Expression
 from express50.errors import HeadModelError
 from express50.geometry.sampling import smoothstep
 from express50.geometry.transforms import axis_angle_to_matrix, matrix_to_axis_angle
-from express50.head.model import HeadModel
+from express50.head.model import HeadModel, in_regions
 from express50.twin.alive import own_motion
 from express50.twin.rig import TARGET
 from express50.twin.surface import fractal, make_lattice
@@ -108,7 +108,7 @@ def soft_mask(model: HeadModel) -> np.ndarray:
     """Return weights (V,): 1 on skin, 0 on eyes and inside the mouth, soft at the lids."""
     template = model.template.double().numpy()
     inner = ("left_eyeball", "right_eyeball", "teeth", "tongue", "mouth_interior")
-    weight = np.where(np.any([model.regions[name].numpy() for name in inner], axis=0), 0.0, 1.0)
+    weight = np.where(in_regions(model, inner), 0.0, 1.0)
     for region in ("left_eyeball", "right_eyeball"):
         ball = template[model.regions[region].numpy()]
         centre = 0.5 * (ball.min(0) + ball.max(0))
