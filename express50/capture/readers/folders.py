@@ -69,6 +69,8 @@ def footage_folder(path: Path) -> Path:
         return path
     folders = [inner for inner in path.iterdir() if is_data_folder(inner)]
     wrappers = [inner for inner in folders if WRAPPER.fullmatch(inner.name)]
+    # In our own layout, ``cameras`` holds folders.
+    wrappers += [inner for inner in folders if inner.name == "cameras" and _holds_footage(inner)]
     others = {f for f in folders if not BESIDE.fullmatch(f.name)} - set(wrappers)
     return wrappers[0] if len(wrappers) == 1 and not any(map(_holds_footage, others)) else path
 

@@ -165,7 +165,8 @@ def is_ours(path: Path) -> bool:
     meta = read_capture_toml(path)
     if "source" in meta:
         return False
-    if "layout" in meta or (path / "cameras").is_dir():
+    cameras = path / "cameras"
+    if "layout" in meta or (cameras.is_dir() and folders.footage_folder(path) != cameras):
         return meta.get("layout", OURS) == OURS
     # A capture.toml alone marks it as ours; the error then names the missing file.
     return bool(meta) and not any(layout.fits(path) for layout in LAYOUTS)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from express50.capture.index import Cue, read_index
-from express50.capture.readers.read import detect, read_any, subject_of
+from express50.capture.readers.read import detect, is_ours, read_any, subject_of
 from express50.errors import CaptureError
 from express50.files.calibration import write_cameras
 from express50.files.images import write_image
@@ -79,6 +79,7 @@ def test_names_of_files_or_folders_are_expressions(tmp_path, layout, names):
     ("layout", "footage"),
     [
         ("videos", "videos/cam{c}.mp4"),
+        ("videos", "cameras/cam{c}.mp4"),
         ("camera_folders", "images/cam{c}/{f:06d}.png"),
         ("camera_folders", "cam{c}/frames/{f:06d}.png"),
         ("expression_folders", "smile{f}/videos/cam{c}.mp4"),
@@ -98,6 +99,13 @@ def test_footage_may_lie_one_folder_deeper(tmp_path, layout, footage):
     assert bool(found.plates) == (layout != "photos")
     if footage.endswith("png"):
         ingest_captures(tmp_path / "data", root)
+
+
+def test_pictures_beside_our_own_layout_change_nothing(tmp_path):
+    root = write(tmp_path / "rig", ["cameras/cam0/frames/000000.png", "images/overview.png"])
+    assert is_ours(root)
+    write(root, ["videos/turntable.mp4"])
+    assert is_ours(root)
 
 
 def test_a_rig_further_below_is_named(tmp_path):
