@@ -12,7 +12,7 @@ sparsification error of depth (0 is ideal, Ilg et al. 2018) over all pixels, ``_
 bare skin.
 What is made is kept in DIR and taken up again; ``--made`` takes only that. ``--fit`` makes the same
 of other subjects, and writes ``express50/error_models.json`` from it; raise the versions of the
-stages then. The last line is one JSON object.
+stages then. ``--fit items`` fits the intervals of items alone. The last line is one JSON object.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from benchmarks.intervals_collect import (
     sampled,
     with_tracked,
 )
-from benchmarks.intervals_fit import ause, fit_model
+from benchmarks.intervals_fit import ause, fit_items, fit_model
 from benchmarks.intervals_rows import ALIGN_NOISE, CONDITIONS, make_peaks, make_row
 from express50.contract.layout import Dataset
 from express50.contract.stage import Unit
@@ -82,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     began = time.process_time()
     rows = list(samples(options))
     if options.fit:
-        write_models(rows)
+        write_models(rows, options.fit)
         return 0
     figures = measure(rows)
     figures["cpu_seconds"] = round(time.process_time() - began)
@@ -101,7 +101,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--subjects", nargs="*", type=int, help="numbers; default: those not fitted"
     )
     parser.add_argument("--made", action="store_true", help="only rows that are made already")
-    parser.add_argument("--fit", action="store_true", help="fit the constants, on other subjects")
+    parser.add_argument("--fit", nargs="?", const="all", choices=("all", "items"),
+                        help="fit the constants, on other subjects")  # fmt: skip
     options = parser.parse_args(arguments)
     mine, others = (FIT, TEST) if options.fit else (TEST, FIT)
     options.subjects = options.subjects or list(mine)
@@ -243,33 +244,37 @@ def sparsification(depth: Sequence[Sample]) -> dict:
     return {k: round(float(v), 3) for k, v in zip(keys, np.nanmean(rows, axis=0), strict=True)}
 
 
-def write_models(rows: Sequence[Row]) -> None:
-    """Fit every stage's constants and write them; stages without samples keep theirs."""
+def write_models(rows: Sequence[Row], what: str) -> None:
+    """Fit and write every stage's constants, ``all`` or those of ``items``.
+
+    Stages without samples keep theirs.
+    """
     former = json.loads(FILE.read_text())
+    shipped = error_models()
     models: dict[str, ErrorModel] = {}
     for stage, unit in UNITS.items():
-        mine = [(name, sample) for name, sample in rows if sample.stage == stage]
+        mine = [sample for _, sample in rows if sample.stage == stage]
         if stage == "register" and "track" in models:
-            mine = [(name, with_tracked(sample, models["track"])) for name, sample in mine]
-        if mine:
+            mine = [with_tracked(sample, models["track"]) for sample in mine]
+        if mine and what == "items":
+            models[stage] = fit_items(shipped[stage], mine)
+        elif mine:
             models[stage] = fit_model(mine, unit)
-    fitted = {stage: _rounded(asdict(model)) for stage, model in models.items()}
-    content = {
-        "made_by": "python -m benchmarks.intervals --fit",
-        "nominal": NOMINAL,
-        "fitted_on": former["fitted_on"]
-        | {
-            stage: {
-                "items": sum(sample.stage == stage for _, sample in rows),
-                "conditions": list(dict.fromkeys(n for n, s in rows if s.stage == stage)),
-                "subjects": sorted({s.item.split("/")[0] for _, s in rows if s.stage == stage})
-                if stage != "calibrate"
-                else f"simulated rigs, seeds {FIT_RIGS.start} to {FIT_RIGS.stop - 1}",
-            }
-            for stage in models
-        },
-        "stages": former["stages"] | fitted,
+    data = {
+        stage: {
+            "items": sum(sample.stage == stage for _, sample in rows),
+            "conditions": list(dict.fromkeys(n for n, s in rows if s.stage == stage)),
+            "subjects": sorted({s.item.split("/")[0] for _, s in rows if s.stage == stage})
+            if stage != "calibrate"
+            else f"simulated rigs, seeds {FIT_RIGS.start} to {FIT_RIGS.stop - 1}",
+        }
+        for stage in models
     }
+    content = former | {
+        "stages": former["stages"] | {k: _rounded(asdict(model)) for k, model in models.items()}
+    }
+    for key in ("fitted_on", "items_fitted_on") if what == "all" else ("items_fitted_on",):
+        content[key] = former.get(key, {}) | data
     FILE.write_bytes(dump_json(content))
     error_models.cache_clear()
     print(f"wrote {FILE.name}: {', '.join(models)}", file=sys.stderr)

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
 
 from benchmarks.intervals_collect import Sample
 from express50.contract.stage import Unit
@@ -19,34 +18,41 @@ FLOORS = {"mm": 0.02, "px": 0.002, "alpha": 0.002, "frames": 0.3, "dB": 0.1}
 LEAST = {"mm": 1e-4, "px": 1e-4, "alpha": 1e-4, "frames": 0.5, "dB": 1e-4}
 """Bounds are no less: a peak lies somewhere within its frame."""
 ROW_LEVEL = 0.05  # share of a figure's variance within items under which it describes the item
-NORMAL = 1.645  # standard deviations to either side that hold nine in ten
 RIDGE = 0.003  # of weights within items: variance of logarithms
 # Of weights between items, as a share of each figure's own variance: a voxel's size varies little
 # in the data, so one ridge for all figures kept its weight near 0, and finer depth looked worse.
 ROW_RIDGE = 0.03
 
 
-def fit_model(rows: Sequence[tuple[str, Sample]], unit: Unit) -> ErrorModel:
+def fit_model(samples: Sequence[Sample], unit: Unit) -> ErrorModel:
     """Fit weights by least squares of logarithms, then the table; all items have equal weight.
 
     Figures of elements are fitted within items, and figures of whole items to the differences that
-    remain between items: otherwise a few items would decide what a pixel's figure means. The items'
-    intervals come from items of conditions that their model did not see. `rows` name the condition
-    of each sample.
+    remain between items: otherwise a few items would decide what a pixel's figure means.
     """
-    rows = [(name, s) for name, s in rows if not s.shared.any()]  # that is known, not fitted
-    names = list(dict.fromkeys(name for name, _ in rows))
-    model = _fit([sample for _, sample in rows], unit)
-    ratios: dict[str, list[float]] = {}
-    for name in names:
-        others = [sample for other, sample in rows if other != name]
-        unseen = _fit(others, unit) if others else model
-        for sample in (sample for other, sample in rows if other == name):
-            typical = error_bounds("", sample.figures, 0.0, unseen).typical
-            ratio = item_error(sample.errors, unit) / item_error(typical, unit)
-            person = sample.item.split("/")[0]
-            ratios.setdefault(person, []).append(float(np.log(max(ratio, TINY))))
-    return replace(model, item=_item_ratios(ratios, unit))
+    samples = [s for s in samples if not s.shared.any()]  # that is known, not fitted
+    return fit_items(_fit(samples, unit), samples)
+
+
+def fit_items(model: ErrorModel, samples: Sequence[Sample]) -> ErrorModel:
+    """Return a model with intervals of items' errors that hold for nine in ten such items.
+
+    They hold whatever the distribution of errors is (conformal prediction, Vovk et al. 2005), for
+    people and conditions like those of the samples.
+    """
+    if model.unit == "frames":  # whole frames: most are 0
+        return replace(model, item=(0.0, 0.0, 1.0))
+    ratios = np.sort(
+        [
+            item_error(s.errors, model.unit)
+            / item_error(error_bounds("", s.figures, 0.0, model).typical, model.unit)
+            for s in samples
+            if not s.shared.any()
+        ]
+    )
+    cut = max(int((1 - NOMINAL) / 2 * (len(ratios) + 1)) - 1, 0)  # as many left out at either end
+    middle = float(np.median(ratios))
+    return replace(model, item=(float(ratios[cut]), middle, float(ratios[-1 - cut])))
 
 
 def _fit(samples: Sequence[Sample], unit: Unit) -> ErrorModel:
@@ -145,30 +151,6 @@ def _quantile(values: np.ndarray, weights: np.ndarray, level: float) -> float:
     place = np.cumsum(weights[order]) / weights.sum()
     row = min(int(np.searchsorted(place, level)), len(values) - 1)
     return float(values[order[row]])
-
-
-def _item_ratios(ratios: dict[str, list[float]], unit: Unit) -> tuple[float, float, float]:
-    """Return the ends and middle of items' errors over what their elements let expect.
-
-    `ratios` are their logarithms by person. People differ more than items of one person do, and few
-    people were recorded: the ends are those of Student's prediction interval for another person's
-    item. With one person they lie a factor of two further away.
-    """
-    if unit == "frames":  # whole frames: most are 0
-        return 0.0, 0.0, 1.0
-    means = [float(np.mean(rows)) for rows in ratios.values()]
-    several = [float(np.var(rows)) for rows in ratios.values() if len(rows) > 1]
-    within = sum(several) / max(len(several), 1)
-    count, spread = len(means), np.log(2.0) + NORMAL * np.sqrt(within)
-    if count > 1:
-        between = float(np.var(means, ddof=1))
-        reach = float(stats.t.ppf((1 + NOMINAL) / 2, count - 1))
-        spread = float(
-            np.hypot(reach * np.sqrt(between * (1 + 1 / count)), NORMAL * np.sqrt(within))
-        )
-    middle = float(np.median([value for rows in ratios.values() for value in rows]))
-    low, value, high = (float(np.exp(middle + way * spread)) for way in (-1, 0, 1))
-    return low, value, high
 
 
 def ause(errors: np.ndarray, doubt: np.ndarray) -> float:

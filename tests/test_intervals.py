@@ -29,8 +29,25 @@ def test_intervals_of_rows_hold_the_true_coverage_nine_times_in_ten():
 def test_a_proportional_model_weighs_rigs_of_any_number_of_cameras_alike():
     def rig(count, ratio):
         figures = [{"stated_mm": np.full(count, 0.1)}]
-        return "rig", sampled("calibrate", f"rig {ratio}", figures, [np.full(count, 0.1 * ratio)])
+        return sampled("calibrate", f"rig {ratio}", figures, [np.full(count, 0.1 * ratio)])
 
     model = fit_model([rig(100, 1.0), rig(2, 2.0), rig(2, 3.0)], "mm")
     assert np.exp(model.typical[0]) == pytest.approx(2.0)
     assert np.exp(model.bound[0]) == pytest.approx(3.0)
+
+
+def test_an_items_interval_holds_nine_in_ten_of_unseen_items_even_if_a_few_are_far_off():
+    rng, held = np.random.default_rng(5), []
+
+    def rigs(count):
+        far = np.exp(rng.normal(0, np.where(rng.random(count) < 0.1, 2.0, 0.3)))
+        return [
+            sampled("calibrate", f"rig {k}", [{"stated_mm": np.ones(9)}], [np.full(9, ratio)])
+            for k, ratio in enumerate(far)
+        ]
+
+    for _ in range(40):
+        low, middle, high = fit_model(rigs(60), "mm").item
+        held += [low <= s.errors[0] / s.figures["stated_mm"][0] <= high for s in rigs(60)]
+        assert low < middle < high
+    assert 0.88 < np.mean(held) < 0.93

@@ -30,7 +30,7 @@ def run(dataset: Dataset, item: str, config: NoSettings, out: Path) -> Result:
 
 STAGE = Stage(
     name="register",
-    version=9,
+    version=10,
     config=NoSettings,
     items=peak_items,
     inputs=inputs,
