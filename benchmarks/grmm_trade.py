@@ -47,6 +47,7 @@ SETTINGS: dict[str, tuple[Changes, int]] = {  # name -> changes of tables, pixel
     "half the pixels per side": ({}, 2),
 }
 HEADING = "Settings of GRMM"
+NOISE_DB = 0.1  # of a run's PSNR
 
 
 class Smaller:
@@ -157,16 +158,20 @@ def as_markdown(rows: list[dict], people: int, cameras: int, size: int) -> list[
 
 
 def choices(rows: list[dict]) -> list[dict]:
-    """Find, for each budget, the setting with the best PSNR, as `grmm.config.choose` reads it."""
-    best: dict[float, dict] = {}
-    for row in rows:
-        if row["budget_s"] not in best or row["psnr_db"] > best[row["budget_s"]]["psnr_db"]:
-            best[row["budget_s"]] = row
-    return [
-        {"budget_s": budget, "setting": row["setting"], "psnr_db": row["psnr_db"]}
-        | {"changes": SETTINGS[row["setting"]][0]}
-        for budget, row in sorted(best.items())
-    ]
+    """Find each budget's setting as `grmm.config.choose` reads it: the quickest of the best ones.
+
+    That is, of those whose PSNR is the best within NOISE_DB, the one that draws quickest.
+    """
+    found = []
+    for budget in sorted({row["budget_s"] for row in rows}):
+        mine = [row for row in rows if row["budget_s"] == budget]
+        enough = max(row["psnr_db"] for row in mine) - NOISE_DB
+        best = min((r for r in mine if r["psnr_db"] > enough), key=lambda row: row["picture_s"])
+        found.append(
+            {"budget_s": budget, "setting": best["setting"], "psnr_db": best["psnr_db"]}
+            | {"changes": SETTINGS[best["setting"]][0]}
+        )
+    return found
 
 
 def main() -> None:

@@ -22,6 +22,7 @@ RIDGE = 0.003  # of weights within items: variance of logarithms
 # Of weights between items, as a share of each figure's own variance: a voxel's size varies little
 # in the data, so one ridge for all figures kept its weight near 0, and finer depth looked worse.
 ROW_RIDGE = 0.03
+MOST_WIDENED = 3.0  # intervals of items, for differences between people
 
 
 def fit_model(samples: Sequence[Sample], unit: Unit) -> ErrorModel:
@@ -35,24 +36,40 @@ def fit_model(samples: Sequence[Sample], unit: Unit) -> ErrorModel:
 
 
 def fit_items(model: ErrorModel, samples: Sequence[Sample]) -> ErrorModel:
-    """Return a model with intervals of items' errors that hold for nine in ten such items.
+    """Return a model with intervals that hold for nine in ten items of people not yet seen.
 
-    They hold whatever the distribution of errors is (conformal prediction, Vovk et al. 2005), for
-    people and conditions like those of the samples.
+    They hold for nine in ten of these items (conformal prediction, Vovk et al. 2005), and are
+    widened until each person's are held as often, on average, by those of the other people.
     """
     if model.unit == "frames":  # whole frames: most are 0
         return replace(model, item=(0.0, 0.0, 1.0))
-    ratios = np.sort(
-        [
-            item_error(s.errors, model.unit)
-            / item_error(error_bounds("", s.figures, 0.0, model).typical, model.unit)
-            for s in samples
-            if not s.shared.any()
-        ]
-    )
-    cut = max(int((1 - NOMINAL) / 2 * (len(ratios) + 1)) - 1, 0)  # as many left out at either end
-    middle = float(np.median(ratios))
-    return replace(model, item=(float(ratios[cut]), middle, float(ratios[-1 - cut])))
+    ratios: dict[str, list[float]] = {}
+    for sample in samples:
+        if not sample.shared.any():
+            typical = error_bounds("", sample.figures, 0.0, model).typical
+            ratio = item_error(sample.errors, model.unit) / item_error(typical, model.unit)
+            person = sample.item.split("/")[0]
+            ratios.setdefault(person, []).append(float(np.log(max(ratio, TINY))))
+    needed, weights = [], []
+    for person, own in ratios.items():
+        others = [values for other, values in ratios.items() if other != person]
+        low, middle, high = _ends(np.concatenate(others or [own]))
+        away = np.array(own) - middle
+        needed.append(np.abs(away) / np.maximum(np.where(away > 0, high, low), TINY))
+        weights.append(np.full(len(own), 1 / len(own)))
+    enough = _quantile(np.concatenate(needed), np.concatenate(weights), NOMINAL)
+    low, middle, high = _ends(np.concatenate([*ratios.values()]))
+    wider = np.clip(enough, 1.0, MOST_WIDENED) * np.array([-low, 0.0, high])
+    low, value, high = (float(v) for v in np.exp(middle + wider))
+    return replace(model, item=(low, value, high))
+
+
+def _ends(values: np.ndarray) -> tuple[float, float, float]:
+    """Return how far nine in ten values (N,) reach below the middle, the middle, and above it."""
+    ordered = np.sort(values)
+    cut = max(int((1 - NOMINAL) / 2 * (len(ordered) + 1)) - 1, 0)  # as many left out at either end
+    middle = float(np.median(ordered))
+    return middle - float(ordered[cut]), middle, float(ordered[-1 - cut]) - middle
 
 
 def _fit(samples: Sequence[Sample], unit: Unit) -> ErrorModel:

@@ -51,3 +51,19 @@ def test_an_items_interval_holds_nine_in_ten_of_unseen_items_even_if_a_few_are_f
         held += [low <= s.errors[0] / s.figures["stated_mm"][0] <= high for s in rigs(60)]
         assert low < middle < high
     assert 0.88 < np.mean(held) < 0.93
+
+
+def test_an_items_interval_is_wider_where_people_differ():
+    def item(apart):
+        rng = np.random.default_rng(7)
+        ratios = np.exp(np.array([-apart, 0, apart])[:, None] + rng.normal(0, 0.1, (3, 20)))
+        figures = [{"stated_mm": np.ones(9)}]
+        samples = [
+            sampled("calibrate", f"S{n}/{k}", figures, [np.full(9, ratio)])
+            for n, own in enumerate(ratios)
+            for k, ratio in enumerate(own)
+        ]
+        return np.ptp(np.log(fit_model(samples, "mm").item)), np.ptp(np.log(ratios))
+
+    (alike, range_alike), (apart, range_apart) = item(0.0), item(0.5)
+    assert alike < range_alike and apart > range_apart

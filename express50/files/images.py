@@ -197,7 +197,7 @@ def upright(image: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def read_alpha(path: Path) -> np.ndarray:
-    """Read an 8-bit grey image (H, W) uint8; FormatError if it is none or cannot be read."""
+    """Read an 8-bit grey image (H, W) uint8; FormatError if it is anything else."""
     alpha = read_image(path)
     if alpha.ndim != 2 or alpha.dtype != np.uint8:
         raise FormatError(f"{path}: {alpha.dtype} {alpha.shape}, expected an 8-bit grey matte")
