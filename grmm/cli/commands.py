@@ -94,8 +94,9 @@ def _machines_choice(seconds: float | None) -> tuple[str, dict[str, dict[str, An
         )
     choice = choose(seconds)
     which = "longest measured time that fits" if choice.budget_s <= seconds else "shortest measured"
+    what = f"demo with {choice.setting}" if choice.changes else choice.setting
     log(
-        f"auto: no GPU found; demo with {choice.setting}, which reached {choice.psnr_db:.1f} dB in "
+        f"auto: no GPU found; {what}, which reached {choice.psnr_db:.1f} dB in "
         f"{choice.budget_s:.0f} s of one core, the {which}"
     )
     return "demo", choice.changes
