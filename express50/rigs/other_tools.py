@@ -321,7 +321,7 @@ def read_idr(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
     The unit is the file's own; ``size`` is the width and height of the pictures.
 
     Raises:
-        CalibrationError: no size is given, or a matrix is no projection of a camera.
+        CalibrationError: no size is given, or a matrix is not that of a camera.
     """
     if size is None:
         raise CalibrationError(f"{path}: does not give the images' size; pass --size WIDTHxHEIGHT")

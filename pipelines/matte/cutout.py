@@ -192,7 +192,7 @@ def find_neighbours(view: CutView, place: HeadPlace) -> list[HeadPlace]:
     image, heads = view.rgb.copy(), [place]
     blank = image[box].mean((0, 1))
     while len(heads) <= MOST_NEIGHBOURS:
-        image[_head_of(view, heads[-1])] = blank  # a face is found once
+        image[_head_mask(view, heads[-1])] = blank  # a face is found once
         face = detect(load_network(), np.ascontiguousarray(image[box]))
         points = face.points + [box[1].start, box[0].start]
         found = place_head([LandmarkView(view.camera, points, face.sigma, face.score)])
@@ -210,10 +210,10 @@ def _leave_out(guess: np.ndarray, view: CutView, neighbours: Sequence[HeadPlace]
     sure = guess == cv2.GC_FGD
     for place in neighbours:
         guess[(_guess(view, place) == cv2.GC_FGD) & ~sure] = cv2.GC_BGD
-        guess[_head_of(view, place) & (guess == cv2.GC_PR_BGD)] = cv2.GC_BGD
+        guess[_head_mask(view, place) & (guess == cv2.GC_PR_BGD)] = cv2.GC_BGD
 
 
-def _head_of(view: CutView, place: HeadPlace) -> np.ndarray:
+def _head_mask(view: CutView, place: HeadPlace) -> np.ndarray:
     """Return where a head and most of its hair are in a view, (h, w) bool."""
     parts = parts_of_a_person()
     head = (parts[cv2.GC_PR_FGD][0], parts[cv2.GC_FGD][-1])

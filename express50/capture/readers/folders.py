@@ -189,7 +189,7 @@ def _files_by_folder(path: Path) -> tuple[str, dict[str, list[str]]]:
     places = {folder.name: footage_folder(folder) for folder in folders}
     videos = {name: _videos(path, place) for name, place in places.items()}
     kind = "videos" if any(videos.values()) else "frames"
-    files = videos if kind == "videos" else {n: _pictures(path, p) for n, p in places.items()}
+    files = videos if kind == "videos" else {n: pictures_in(path, p) for n, p in places.items()}
     files = {folder: names for folder, names in files.items() if names}
     return kind, files if len(files) > 1 else {}
 
@@ -199,7 +199,8 @@ def _videos(root: Path, folder: Path) -> list[str]:
     return [file.relative_to(root).as_posix() for file in found if fits_video(file)]
 
 
-def _pictures(root: Path, folder: Path) -> list[str]:
+def pictures_in(root: Path, folder: Path) -> list[str]:
+    """List the pictures in a folder below a root, relative to that."""
     return [(folder / name).relative_to(root).as_posix() for name in image_names(folder)]
 
 

@@ -19,7 +19,7 @@ from express50.capture.raw import (
     read_plates,
     unused_files,
 )
-from express50.capture.readers.folders import footage_folder
+from express50.capture.readers.folders import footage_folder, pictures_in
 from express50.capture.readers.selection import (
     Moment,
     Selection,
@@ -57,8 +57,7 @@ def read_photos(path: Path, selection: Selection) -> RawCapture:
         CaptureError: two names become one camera id, or no photograph can be used.
         CalibrationError: calibration.json is malformed.
     """
-    folder = footage_folder(path)
-    names = [(folder / name).relative_to(path).as_posix() for name in image_names(folder)]
+    names = pictures_in(path, footage_folder(path))
     ids = unique_ids(path, names, lambda name: Path(name).stem)
     check_selection(selection, [MOMENT], sorted(ids.values()))
     dropped: dict[str, str] = {}
