@@ -2,7 +2,8 @@
 
 Nothing marks which side of a tree is the cameras. ``calibration.json`` names them; otherwise
 names such as ``cam_01``, ``GoPro 2`` or a serial number tell. Where neither does, ``layout`` in
-capture.toml has to say it: to guess could take people for one person's expressions.
+capture.toml has to say it: to guess could take people for one person's expressions. Folders may
+hold files, or another level of folders: ``smile/cam_01.png`` and ``smile/cam_01/0001.png``.
 
 What may lie beside the footage is that of our own layout (docs/FORMAT.md): ``calibration.json``,
 ``board``, ``plates``, and ``cues.csv`` if the footage is one clip. Pictures and videos that were
@@ -13,7 +14,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 from express50.capture.raw import (
@@ -49,6 +51,11 @@ CAMERA = re.compile(r".*(cam|gopro|kinect|view).*|c[-_]?\d+|\d{5,}", re.IGNORECA
 NUMBER = re.compile(r"\d+")
 FRAME = re.compile(r"(frame|timestep|time|step|f|t)?[-_]?\d+", re.IGNORECASE)
 PERSON = re.compile(r"(s|sub|subj|subject|p|participant|person|id|actor)[-_]?\d+", re.IGNORECASE)
+# Some folder of most sets of expressions, and of few of people.
+EXPRESSION = re.compile(
+    r".*(neutral|smile|mouth|brow|jaw|lips|cheek|eyes|anger|happ|sad|surprise|disgust|fear).*",
+    re.IGNORECASE,
+)
 # Folders that only hold the footage, of a rig or of one of its moments, and folders beside these.
 WRAPPER = re.compile(
     r"(image|img|picture|photo|video|frame|timestep|recording|footage|rgb|raw|data)s?"
@@ -58,6 +65,9 @@ WRAPPER = re.compile(
 BESIDE = re.compile(
     r"plates|board|(fg_?)?masks?([-_].*)?|mattes?|alphas?|depths?|annotations?", re.IGNORECASE
 )
+
+
+HOLDS = {"videos": fits_video, "frames": lambda file: is_shown(file, IMAGE_SUFFIXES)}
 
 
 def footage_folder(path: Path) -> Path:
@@ -76,7 +86,7 @@ def footage_folder(path: Path) -> Path:
 
 
 def _holds_footage(path: Path) -> bool:
-    return any(is_shown(file, IMAGE_SUFFIXES) or fits_video(file) for file in path.iterdir())
+    return any(fits(file) for file in path.iterdir() for fits in HOLDS.values())
 
 
 def fits_videos(path: Path) -> bool:
@@ -84,33 +94,57 @@ def fits_videos(path: Path) -> bool:
     return path.is_dir() and any(map(fits_video, footage_folder(path).iterdir()))
 
 
+@dataclass(frozen=True)
+class Tree:
+    """The footage in the folders of a folder."""
+
+    kind: str  # frames or videos
+    deep: bool  # whether it lies in folders of the folders
+    places: dict[str, list[Path]]  # by folder: its files, or its folders of files
+
+    def inner(self) -> set[str]:
+        """Return the names on the inner side: those of its folders, or else of its files."""
+        places = (place for row in self.places.values() for place in row)
+        return {place.name if self.deep else place.stem for place in places}
+
+
 def fits_camera_folders(path: Path) -> bool:
-    """Return whether a folder holds a folder per camera, of videos or of numbered pictures."""
-    kind, files = _files_by_folder(path)
-    if kind == "frames" and _all(NUMBER, files):
-        numbers = sorted(map(int, files))
+    """Return whether a folder holds a folder per camera, with the footage of each expression.
+
+    That is one video or numbered pictures of all, a video of each, or a folder of each.
+    """
+    tree = _tree(path)
+    if tree.kind == "frames" and not tree.deep and _all(NUMBER, tree.places):
+        numbers = sorted(map(int, tree.places))
         if numbers and numbers[-1] - numbers[0] < len(numbers):  # they count frames
             return False
-    return _are_cameras(path, files)
+    return _are_cameras(path, tree.places)
 
 
 def fits_expression_folders(path: Path) -> bool:
-    """Return whether a folder holds a folder per expression, of a video or picture per camera."""
-    kind, files = _files_by_folder(path)
-    other = _all(PERSON, files) or (kind == "frames" and _all(FRAME, files))
-    return not other and _are_cameras(path, _stems(files))
+    """Return whether a folder holds a folder per expression, with the footage of each camera.
+
+    That is a video, a picture or a folder of each.
+    """
+    tree = _tree(path)
+    if tree.deep:  # people's rigs look the same
+        known = (path / "calibration.json").is_file() or any(map(EXPRESSION.match, tree.places))
+        return known and not _all(PERSON, tree.places) and _are_cameras(path, tree.inner())
+    other = _all(PERSON, tree.places) or (tree.kind == "frames" and _all(FRAME, tree.places))
+    return not other and _are_cameras(path, tree.inner())
 
 
 def fits_frame_folders(path: Path) -> bool:
     """Return whether a folder holds a folder per frame, of a picture per camera."""
-    kind, files = _files_by_folder(path)
-    named = not _all(NUMBER, files) or _are_cameras(path, _stems(files))
-    return kind == "frames" and bool(files) and _all(FRAME, files) and named
+    tree = _tree(path)
+    named = not _all(NUMBER, tree.places) or _are_cameras(path, tree.inner())
+    pictures = tree.kind == "frames" and not tree.deep
+    return pictures and bool(tree.places) and _all(FRAME, tree.places) and named
 
 
 def holds_folders(path: Path) -> bool:
     """Return whether a folder holds several folders with footage."""
-    return bool(_files_by_folder(path)[1])
+    return bool(_tree(path).places)
 
 
 def read_videos(path: Path, selection: Selection) -> RawCapture:
@@ -130,29 +164,34 @@ def read_videos(path: Path, selection: Selection) -> RawCapture:
 
 
 def read_camera_folders(path: Path, selection: Selection) -> RawCapture:
-    """Read a folder per camera: its pictures, its only video, or a video per expression.
+    """Read a folder per camera: its pictures, its only video, or a video or folder per expression.
 
     A camera's name before that of an expression is left out.
 
     Raises as `read_videos` does.
     """
-    kind, files = _files_by_folder(path)
-    one_clip = kind == "frames" or all(len(names) == 1 for names in files.values())
-    rows: dict[str, dict[Moment, str]] = {folder: {} for folder in files}
-    for folder, row in rows.items():
-        for name in files[folder]:
-            stem = Path(name).stem
-            sequence = CLIP if one_clip else stem.removeprefix(folder).strip("_- ") or stem
-            _add(row, (sequence, _number(name) if kind == "frames" else 0), name)
-    return _read(path, kind, rows, selection)
+    tree = _tree(path)
+    one_clip = not tree.deep and (
+        tree.kind == "frames" or all(len(row) == 1 for row in tree.places.values())
+    )
+    rows: dict[str, dict[Moment, str]] = {folder: {} for folder in tree.places}
+    for folder, places in tree.places.items():
+        for place in places:
+            name = place.name if tree.deep else place.stem
+            sequence = CLIP if one_clip else name.removeprefix(folder).strip("_- ") or name
+            for file in _files(path, tree, place):
+                _add(rows[folder], (sequence, _number(file) if tree.kind == "frames" else 0), file)
+    return _read(path, tree.kind, rows, selection)
 
 
 def read_expression_folders(path: Path, selection: Selection) -> RawCapture:
-    """Read a folder per expression, which has a video or a picture of each camera.
+    """Read a folder per expression, with a video, a picture or a folder of each camera.
 
     Raises as `read_videos` does.
     """
-    return _read_inner(path, selection, lambda folder: (folder, 0))
+    tree = _tree(path)
+    many = tree.deep and tree.kind == "frames"
+    return _read_inner(path, tree, selection, lambda f, name: (f, _number(name) if many else 0))
 
 
 def read_frame_folders(path: Path, selection: Selection) -> RawCapture:
@@ -160,38 +199,58 @@ def read_frame_folders(path: Path, selection: Selection) -> RawCapture:
 
     Raises as `read_videos` does.
     """
-    return _read_inner(path, selection, lambda folder: (CLIP, _number(folder)))
+    return _read_inner(path, _tree(path), selection, lambda folder, _: (CLIP, _number(folder)))
 
 
-def _read_inner(path: Path, selection: Selection, moment_of: Callable[[str], Moment]) -> RawCapture:
-    """Read folders that hold all cameras' files of one moment each."""
-    kind, files = _files_by_folder(path)
-    rows: dict[str, dict[Moment, str]] = {stem: {} for stem in sorted(_stems(files))}
-    for folder, names in files.items():
-        for name in names:
-            _add(rows[Path(name).stem], moment_of(folder), name)
-    return _read(path, kind, rows, selection)
+def _read_inner(
+    path: Path, tree: Tree, selection: Selection, moment_of: Callable[[str, str], Moment]
+) -> RawCapture:
+    """Read folders that hold all cameras' files; their moments are of the folder and the file."""
+    rows: dict[str, dict[Moment, str]] = {name: {} for name in sorted(tree.inner())}
+    for folder, places in tree.places.items():
+        for place in places:
+            row = rows[place.name if tree.deep else place.stem]
+            for file in _files(path, tree, place):
+                _add(row, moment_of(folder, file), file)
+    return _read(path, tree.kind, rows, selection)
 
 
-def _files_by_folder(path: Path) -> tuple[str, dict[str, list[str]]]:
-    """List the ``videos``, or else the pictures (``frames``), of each folder in a folder.
+def _tree(path: Path) -> Tree:
+    """Find the videos, or else the pictures, in the folders of a folder, or one level below them.
 
-    Their names are relative to the path. Under two folders with footage are none: a folder of
-    folders was meant.
+    Under two folders with footage are none: a folder of folders was meant.
     """
+    nothing = Tree("frames", False, {})
     if not path.is_dir() or (path.parent / "capture.toml").is_file():  # a part of our own layout
-        return "videos", {}
-    folders = [
-        inner
+        return nothing
+    folders = {
+        inner.name: footage_folder(inner)
         for inner in sorted(footage_folder(path).iterdir())
         if is_data_folder(inner) and inner.name not in ("plates", "board")
-    ]
-    places = {folder.name: footage_folder(folder) for folder in folders}
-    videos = {name: _videos(path, place) for name, place in places.items()}
-    kind = "videos" if any(videos.values()) else "frames"
-    files = videos if kind == "videos" else {n: pictures_in(path, p) for n, p in places.items()}
-    files = {folder: names for folder, names in files.items() if names}
-    return kind, files if len(files) > 1 else {}
+    }
+    for deep, (kind, holds) in product((False, True), HOLDS.items()):
+        found = {name: _places(folder, deep, holds) for name, folder in folders.items()}
+        if any(found.values()):
+            tree = Tree(kind, deep, {name: places for name, places in found.items() if places})
+            return tree if len(tree.places) > 1 else nothing
+    return nothing
+
+
+def _places(folder: Path, deep: bool, holds: Callable[[Path], bool]) -> list[Path]:
+    """List the files of a folder, or its folders of files."""
+    if not deep:
+        return sorted(filter(holds, folder.iterdir()))
+    inner = [path for path in folder.iterdir() if is_data_folder(path)]
+    inner = [path for path in inner if not BESIDE.fullmatch(path.name)]
+    return sorted(path for path in inner if any(map(holds, footage_folder(path).iterdir())))
+
+
+def _files(root: Path, tree: Tree, place: Path) -> list[str]:
+    """List the files at a place of a tree, relative to its root."""
+    if not tree.deep:
+        return [place.relative_to(root).as_posix()]
+    folder = footage_folder(place)
+    return _videos(root, folder) if tree.kind == "videos" else pictures_in(root, folder)
 
 
 def _videos(root: Path, folder: Path) -> list[str]:
@@ -202,10 +261,6 @@ def _videos(root: Path, folder: Path) -> list[str]:
 def pictures_in(root: Path, folder: Path) -> list[str]:
     """List the pictures in a folder below a root, relative to that."""
     return [(folder / name).relative_to(root).as_posix() for name in image_names(folder)]
-
-
-def _stems(files: Mapping[str, Collection[str]]) -> set[str]:
-    return {Path(name).stem for names in files.values() for name in names}
 
 
 def _are_cameras(path: Path, names: Collection[str]) -> bool:

@@ -85,11 +85,11 @@ LAYOUTS = (
     ),
     Layout("video", "a video file", videos.fits_video, videos.video_id, videos.read_video),
     Layout(
-        "camera_folders", "a folder per camera, such as cam_01/, of videos or numbered pictures",
+        "camera_folders", "a folder per camera, such as cam_01/, of videos, pictures or folders",
         folders.fits_camera_folders, folder_id, folders.read_camera_folders, named=True,
     ),
     Layout(
-        "expression_folders", "a folder per expression, of videos or pictures such as cam_01.mp4",
+        "expression_folders", "a folder per expression, of cam_01.mp4, cam_01.png or cam_01/ ...",
         folders.fits_expression_folders, folder_id, folders.read_expression_folders, named=True,
     ),
     Layout(

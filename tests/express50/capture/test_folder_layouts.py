@@ -76,6 +76,45 @@ def test_names_of_files_or_folders_are_expressions(tmp_path, layout, names):
 
 
 @pytest.mark.parametrize(
+    ("layout", "names"),
+    [
+        ("expression_folders", "{e}/cam{c}/{f:04d}.png"),
+        ("expression_folders", "images/{e}/22190{c}/frames/{f}.png"),
+        ("expression_folders", "{e}/cam{c}/GX01{f}.mp4"),
+        ("camera_folders", "cam{c}/{e}/{f:04d}.png"),
+        ("camera_folders", "cam{c}/{e}/video.mp4"),
+    ],
+)
+def test_cameras_and_expressions_may_be_two_levels_of_folders(tmp_path, layout, names):
+    frames = range(8, 11) if names.endswith("png") else [0]
+    parts = [(c, e, f) for c in (0, 1) for e in ("neutral", "smile") for f in frames]
+    root = write(tmp_path / "rig", [names.format(c=c, e=e, f=f) for c, e, f in parts])
+    write(root, ["plates/cam0.png"])
+    if names.endswith("png"):
+        for c, e, f in parts:
+            write_image(root / names.format(c=c, e=e, f=f), picture(c, f))
+    assert (detect(root).name, read_any(root).clips) == (layout, ("neutral", "smile"))
+    dataset = ingest_captures(tmp_path / "data", root)
+    index = read_index(dataset, "rig")
+    assert len(index.cameras) == 2
+    assert index.cues == (Cue("neutral", 0, 2), Cue("smile", 3, 5))
+    if names.endswith("png"):
+        assert index.cameras[min(index.cameras)].pts == (8, 9, 10) * 2
+        shown = read_frame(dataset, "rig", max(index.cameras), 5, False)
+        np.testing.assert_array_equal(shown, picture(1, 10))
+
+
+def test_rigs_of_people_are_not_expressions_of_one(tmp_path):
+    names = [f"{who}/cam{c}/{f}.png" for who in ("anna", "bob") for c in (0, 1) for f in (0, 1)]
+    root = write(tmp_path / "day", names)
+    with pytest.raises(CaptureError, match="or give each folder by itself if it is a person"):
+        read_any(root)
+    assert read_any(root / "anna").layout == "camera_folders"
+    (root / "capture.toml").write_text('layout = "expression_folders"')
+    assert read_any(root).clips == ("anna", "bob")
+
+
+@pytest.mark.parametrize(
     ("layout", "footage"),
     [
         ("videos", "videos/cam{c}.mp4"),
