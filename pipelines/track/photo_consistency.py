@@ -119,28 +119,28 @@ def search(views: PatchViews, reach: float) -> PatchSearch:
 def agreement(views: PatchViews, heights: np.ndarray) -> np.ndarray:
     """Score (S, D) how alike views see patches that are moved by heights (D,), metres.
 
-    Patches are bent to follow the mesh.
+    Patches are bent to follow the mesh. The score is 0 where fewer than two views see the place.
     """
     weights, places, normals = views.weights, views.places, views.normals
     if len(weights) > VIEWS:
         weights = np.where(weights >= np.sort(weights, axis=0)[-VIEWS], weights, 0.0)
-    shapes = _shapes(views)
-    count, size = len(places), PATCH * PATCH
-    total = np.zeros((count, len(heights), size), np.float32)
-    mass, square = np.zeros(count), np.zeros(count)
-    for (image, camera), weight in zip(views.images, weights, strict=True):
+    mass, square = weights.sum(0), (weights**2).sum(0)
+    pairs = mass**2 - square
+    score = np.zeros((len(places), len(heights)))
+    seen = np.flatnonzero(pairs > 0.1)
+    if not len(seen):
+        return score
+    shapes = _shapes(views, seen)
+    total = np.zeros((len(seen), len(heights), PATCH * PATCH), np.float32)
+    for (image, camera), weight in zip(views.images, weights[:, seen], strict=True):
         chosen = np.flatnonzero(weight > 0)
         if not len(chosen):
             continue
-        patches = _patches(image, camera, places[chosen], normals[chosen], heights, shapes[chosen])
+        at = seen[chosen]
+        patches = _patches(image, camera, places[at], normals[at], heights, shapes[chosen])
         total[chosen] += weight[chosen, None, None].astype(np.float32) * patches
-        mass[chosen] += weight[chosen]
-        square[chosen] += weight[chosen] ** 2
-    pairs = mass**2 - square
-    enough = pairs > 0.1
-    score = np.zeros((count, len(heights)))
-    together = np.einsum("sdk,sdk->sd", total[enough], total[enough]).astype(np.float64)
-    score[enough] = (together - square[enough, None]) / pairs[enough, None]
+    together = np.einsum("sdk,sdk->sd", total, total).astype(np.float64)
+    score[seen] = (together - square[seen, None]) / pairs[seen, None]
     return score
 
 
@@ -174,12 +174,12 @@ def _patches(
     return values
 
 
-def _shapes(views: PatchViews) -> np.ndarray:
-    """Lay a square grid (S, 3, PATCH^2) on the mesh about each place.
+def _shapes(views: PatchViews, chosen: np.ndarray) -> np.ndarray:
+    """Lay a square grid (N, 3, PATCH^2) on the mesh about each of the chosen places (N,).
 
     A nose is too round for flat patches.
     """
-    normals, spacing, centre = views.normals, SPACING_PX * views.pixel, views.mesh.mean(0)
+    normals, spacing, centre = views.normals[chosen], SPACING_PX * views.pixel, views.mesh.mean(0)
     scene = mesh_scene(views.mesh - centre, views.faces)
     # The tangents must not depend on the camera.
     axis = np.where(np.abs(normals[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
@@ -189,7 +189,7 @@ def _shapes(views: PatchViews) -> np.ndarray:
     v, u = np.meshgrid(grid, grid, indexing="ij")
     flat = u.reshape(1, -1, 1) * across[:, None] + v.reshape(1, -1, 1) * along[:, None]
     lift = 2.0 * spacing * PATCH
-    start = views.places[:, None] - centre + flat + lift * normals[:, None]
+    start = views.places[chosen, None] - centre + flat + lift * normals[:, None]
     hit = scene.cast_rays(join_rays(start, -normals[:, None]))["t_hit"].numpy()
     rise = np.where(np.isfinite(hit), lift - hit, 0.0)
     # A hit further away is another part of the face, which does not continue the patch.
@@ -236,6 +236,8 @@ def patch_terms(
     `reach` is in metres to either side, `weight` is the trust in the result. Vertices that are
     `covered` (V,) are left out.
     """
+    if len(pictures.crops) < 2:  # nothing to compare
+        return []
     faces = model.faces.numpy()
     images = [(root @ GREY, camera) for root, camera in pictures.images()]
     visibility, terms = Visibility(mesh, faces), []

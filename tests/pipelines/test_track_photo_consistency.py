@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.track.photo_consistency import PatchViews, surface_term
+from pipelines.track import photo_consistency
+from pipelines.track.photo_consistency import PatchViews, _patches, surface_term
 from pipelines.track.photo_consistency import search as search_patches
 from pipelines.track.terms import MeshPlaces, NormalTerm, information
 from tests.pipelines.term_checks import cost_at, gradient_at, slope_along
@@ -103,6 +104,30 @@ def test_one_view_or_the_same_view_twice_gives_no_measurement(pictures) -> None:
     assert nothing(*search(cameras[:1] * 2, images[:1] * 2))
     assert nothing(*search([], [], weights=np.zeros((0, 400))))
     assert nothing(*search(cameras, images, weights=np.zeros((4, 400))))
+
+
+def test_only_places_that_two_views_see_are_compared(pictures, monkeypatch) -> None:
+    cameras, images = pictures
+    vertices, faces = ball(RADIUS + 0.003)
+    samples = places_on(faces, vertices)
+    weights = seen_weights(cameras, samples, vertices, faces)[2] ** 2
+    weights[1:, ::2] = 0.0  # half of the places are left to one view
+    compared = []
+
+    def count(image, camera, places, *rest):
+        compared.append(len(places))
+        return _patches(image, camera, places, *rest)
+
+    monkeypatch.setattr(photo_consistency, "_patches", count)
+    whole = search(cameras, images)[0]
+    del compared[:]
+    half = search(cameras, images, weights=weights)[0]
+    assert 0 < sum(compared) <= (weights[:, 1::2] > 0).sum()
+    assert (half.score[::2] == 0).all() and (half.score[1::2] > 0.5).any()
+    np.testing.assert_allclose(half.score[1::2], whole.score[1::2], atol=1e-6)
+    del compared[:]
+    search(cameras[:1], images[:1])
+    assert not compared
 
 
 def test_a_view_that_shows_something_else_is_outvoted(pictures) -> None:
