@@ -284,24 +284,22 @@ def read_board(root: Path, cameras: Iterable[str]) -> dict | None:
             " docs/FORMAT.md"
         )
     config = read_toml(path, CaptureError)
-    files = {camera: _board_files(folder, camera) for camera in cameras}
-    return {"config": dates_as_text(config), "cameras": {k: v for k, v in files.items() if v}}
-
-
-def _board_files(folder: Path, camera: str) -> list[str]:
-    videos = [video for video in _videos(folder) if identifier(video.stem) == camera]
-    images: list[Path] = []
-    for inner in (path for path in sorted(folder.iterdir()) if identifier(path.name) == camera):
-        if inner.is_dir():
-            videos += _videos(inner)
-            images += [inner / name for name in image_names(inner)]
-    if len(videos) > 1 or (videos and images):
-        names = ", ".join(path.name for path in [*videos, *images][:4])
-        raise CaptureError(
-            f"{folder}: {camera} has {names}, expected one video or only images; move the others"
-            " away"
-        )
-    return [f"board/{path.relative_to(folder).as_posix()}" for path in videos or images]
+    found: dict[str, list[str]] = {}
+    for camera in cameras:
+        named = [path for path in sorted(folder.iterdir()) if identifier(path.name) == camera]
+        inside = [path for path in named if path.is_dir()]
+        videos = [video for video in _videos(folder) if identifier(video.stem) == camera]
+        videos += [video for inner in inside for video in _videos(inner)]
+        images = [inner / name for inner in inside for name in image_names(inner)]
+        if len(videos) > 1 or (videos and images):
+            names = ", ".join(path.name for path in [*videos, *images][:4])
+            raise CaptureError(
+                f"{folder}: {camera} has {names}, expected one video or only images; move the"
+                " others away"
+            )
+        if files := [f"board/{path.relative_to(folder).as_posix()}" for path in videos or images]:
+            found[camera] = files
+    return {"config": dates_as_text(config), "cameras": found}
 
 
 def unused_files(root: Path, cameras: Iterable[str]) -> dict[str, str]:

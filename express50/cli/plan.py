@@ -152,20 +152,19 @@ def _given_sizes(args: argparse.Namespace) -> dict[str, float]:
 def _table(rows: Sequence[Row], total: Mapping[str, Any], workers: int) -> Iterator[str]:
     columns = ["stage", "items", "s per item", "core hours", f"days on {workers}", "disk"]
     columns += ["peak memory", "preset", "sizes", "times what was measured"]
+    cells = []
+    for row in rows:
+        figures, measured = ["n/a"] * 5, ["", "0", row.why]
+        if not row.why:
+            hours = _hours(row.core_hours, row.core_hours_low, row.core_hours_high)
+            figures = [f"{row.seconds:.1f}", hours, f"{row.days:.2f}"]
+            figures += [decimal(int(row.disk or 0)), f">= {decimal(int(row.memory or 0))}"]
+            measured = [row.preset, str(row.sizes), row.how]
+        cells.append([row.stage, str(row.items), *figures, *measured])
     hours = _hours(total["core_hours"], total["core_hours_low"], total["core_hours_high"])
     days = f"{total['days']:.2f}"
-    cells = [_cells(row) for row in rows]
     cells.append(["sum", "", "", hours, days, decimal(int(total["disk"])), "", "", "", ""])
     return format_table(columns, cells)
-
-
-def _cells(row: Row) -> list[str]:
-    if row.why:
-        return [row.stage, str(row.items), *["n/a"] * 5, "", "0", row.why]
-    hours = _hours(row.core_hours, row.core_hours_low, row.core_hours_high)
-    figures = [f"{row.seconds:.1f}", hours, f"{row.days:.2f}"]
-    sizes = [decimal(int(row.disk or 0)), f">= {decimal(int(row.memory or 0))}"]
-    return [row.stage, str(row.items), *figures, *sizes, row.preset, str(row.sizes), row.how]
 
 
 def _hours(value: float | None, low: float | None, high: float | None) -> str:

@@ -153,7 +153,9 @@ def naming_full_disk(path: Path, aside: Path | None = None) -> Iterator[None]:
             raise
         raise DiskFullError(str(error).replace(str(aside), str(path))) from error
     except Exception as error:
-        causes = list(_causes(error))
+        causes: list[BaseException] = [error]
+        while cause := causes[-1].__cause__ or causes[-1].__context__:
+            causes.append(cause)
         numbers = [getattr(cause, "errno", None) for cause in causes]
         if errno.EFBIG in numbers:  # torch hides it behind an error of its own
             raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path)) from error
@@ -161,13 +163,6 @@ def naming_full_disk(path: Path, aside: Path | None = None) -> Iterator[None]:
             if number in numbers or any(os.strerror(number) in str(cause) for cause in causes):
                 raise disk_full(path, os.strerror(number)) from error
         raise
-
-
-def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    """Yield an error and what caused it."""
-    while error is not None:
-        yield error
-        error = error.__cause__ or error.__context__
 
 
 def is_full(path: Path) -> bool:

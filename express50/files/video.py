@@ -257,26 +257,20 @@ def video_tags(path: Path) -> VideoTags:
 
 
 def _tags(frame: av.VideoFrame, stream: av.VideoStream) -> VideoTags:
+    beyond = 0.0
+    # Without a flag, H.264 means 16 to 235 (ITU-T H.264, E.2.1), and every player reads it so. Some
+    # recorders of grey cameras store 0 to 255 and set no flag; darks and lights are then lost.
+    if not frame.color_range and frame.format.name in ("yuv420p", "yuv422p", "yuv444p"):
+        luma = np.frombuffer(frame.planes[0], np.uint8).reshape(-1, frame.planes[0].line_size)
+        luma = luma[: frame.height, : frame.width]
+        beyond = float(((luma < LIMITS[0]) | (luma > LIMITS[1])).mean())
     return VideoTags(
         round(frame.rotation / 90) % 4,
         HDR_CURVES.get(int(frame.color_trc), ""),
         bool(frame.interlaced_frame),
         float(stream.codec_context.sample_aspect_ratio or 1),
-        _beyond(frame),
+        beyond,
     )
-
-
-def _beyond(frame: av.VideoFrame) -> float:
-    """Return the share of luma far outside of 16 to 235 where no range is stated.
-
-    Without a flag, H.264 means 16 to 235 (ITU-T H.264, E.2.1), and every player reads it so. Some
-    recorders of grey cameras store 0 to 255 and set no flag; darks and lights are then lost.
-    """
-    if frame.color_range or frame.format.name not in ("yuv420p", "yuv422p", "yuv444p"):
-        return 0.0
-    luma = np.frombuffer(frame.planes[0], np.uint8).reshape(-1, frame.planes[0].line_size)
-    luma = luma[: frame.height, : frame.width]
-    return float(((luma < LIMITS[0]) | (luma > LIMITS[1])).mean())
 
 
 def iterate_video(

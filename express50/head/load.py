@@ -35,6 +35,9 @@ _KINDS = (
 )
 
 
+_log_once = cache(log)
+
+
 @dataclass(frozen=True)
 class HeadTopology:
     """A head model as far as labels need it: template (V, 3), faces (F, 3), masks (V,) by region.
@@ -83,8 +86,8 @@ def load_head(spec: str | Path) -> HeadModel:
             " and checkpoints name their model by its path: put it back there, or set the variable"
             f" {HEADS} to the folder that holds {path.name}"
         )
-    if path != Path(spec).expanduser():
-        _say_found(str(spec), path)
+    if path != Path(spec).expanduser():  # only its name is known to be the right one
+        _log_once(f"head model {spec} is not there, using {path}")
     if path.suffix == ".npz" and is_stored(path):
         return load_stored(path, path.stem)
     if path.suffix == ".npz" and _holds(path, "kintree_table"):
@@ -101,12 +104,6 @@ def load_head(spec: str | Path) -> HeadModel:
 
         return load_flame(path)
     raise HeadModelError(f"head model {str(spec)!r}: unknown kind of file; expected {_KINDS}")
-
-
-@cache
-def _say_found(spec: str, path: Path) -> None:
-    """Say once which file is used, because only its name is known to be the right one."""
-    log(f"head model {spec} is not there, using {path}")
 
 
 @cache

@@ -179,7 +179,17 @@ def read_points(
 
 def _read_raw(path: Path) -> Table:
     try:
-        return _read_npz(path) if path.suffix.lower() == ".npz" else _read_json(path)
+        if path.suffix.lower() == ".npz":
+            return _read_npz(path)
+        content = read_json(path, FormatError)
+        if content.get("schema") != SCHEMA:
+            raise ValueError(f"schema is {content.get('schema')!r}, expected {SCHEMA!r}")
+        table: Table = {}
+        for camera_id, frames in content["cameras"].items():
+            for frame, points in frames.items():
+                rows = [[np.nan, np.nan, 0.0] if p is None else [*p, 1.0][:3] for p in points]
+                table[camera_id, int(frame)] = np.array(rows, dtype=np.float64)
+        return table
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise FormatError(
             f"{path}: not a file of landmarks ({type(error).__name__}: {error}); expected the"
@@ -202,18 +212,6 @@ def _read_npz(path: Path) -> Table:
         raise ValueError(f"confidence has shape {confidence.shape}, expected {shape[:3]}")
     rows = np.concatenate([points, np.asarray(confidence)[..., None]], axis=-1)
     return {(c, int(f)): rows[i, j] for i, c in enumerate(cameras) for j, f in enumerate(frames)}
-
-
-def _read_json(path: Path) -> Table:
-    content = read_json(path, FormatError)
-    if content.get("schema") != SCHEMA:
-        raise ValueError(f"schema is {content.get('schema')!r}, expected {SCHEMA!r}")
-    table: Table = {}
-    for camera_id, frames in content["cameras"].items():
-        for frame, points in frames.items():
-            rows = [[np.nan, np.nan, 0.0] if p is None else [*p, 1.0][:3] for p in points]
-            table[camera_id, int(frame)] = np.array(rows, dtype=np.float64)
-    return table
 
 
 def _checked(rows: np.ndarray, camera: Camera, path: Path, key: tuple[str, int]) -> np.ndarray:

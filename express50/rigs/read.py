@@ -162,7 +162,7 @@ def read_opencv_yaml(path: Path, size: tuple[int, int] | None) -> dict[str, Came
         CalibrationError: a matrix is missing or has the wrong shape, or no size is known.
     """
     found = {}
-    for name, where, table in _easymocap(path) or _opencv_files(path):
+    for name, where, table in _opencv_cameras(path):
         K, dist = _matrix(table, _K, where), _matrix(table, _DIST, where)
         R, t = _matrix(table, _ROTATION, where), _matrix(table, _TRANSLATION, where)
         if K.shape != (3, 3):
@@ -189,28 +189,25 @@ def read_opencv_yaml(path: Path, size: tuple[int, int] | None) -> dict[str, Came
     return checked(found, path)
 
 
-def _opencv_files(path: Path) -> list[tuple[str, Path | str, dict]]:
-    """Return name, place and values of each camera's file."""
-    files = sorted(p for p in path.iterdir() if p.suffix in YAML) if path.is_dir() else [path]
-    return [(identifier(file.stem), file, _named_values(file)) for file in files]
+def _opencv_cameras(path: Path) -> list[tuple[str, Path | str, dict]]:
+    """Return name, place and values of each camera.
 
-
-def _easymocap(path: Path) -> list[tuple[str, Path | str, dict]]:
-    """Return the same from ``intri.yml`` and ``extri.yml``, which hold all cameras; else nothing.
-
-    Values are named ``K_01``, ``dist_01``, ``R_01``, ``Rot_01``, ``T_01``, after the camera.
+    EasyMocap has all cameras in ``intri.yml`` and ``extri.yml``, where values are named ``K_01``,
+    ``dist_01``, ``R_01``, ``Rot_01``, ``T_01``, after the camera. Others have a file per camera.
     """
     folder = path if path.is_dir() else path.parent
-    files = [folder / "intri.yml", folder / "extri.yml"]
-    if not (path in (folder, *files) and all(file.is_file() for file in files)):
-        return []
+    both = [folder / "intri.yml", folder / "extri.yml"]
+    files = both if path in (folder, *both) and all(file.is_file() for file in both) else []
     values = {key: value for file in files for key, value in _named_values(file).items()}
     found: list[tuple[str, Path | str, dict]] = []
     for camera in (key.removeprefix("K_") for key in values if key.startswith("K_")):
         end = f"_{camera}"
         own = {key.removesuffix(end): value for key, value in values.items() if key.endswith(end)}
         found.append((identifier(camera), f"{folder}: camera {camera}", own))
-    return found
+    if found:
+        return found
+    files = sorted(p for p in path.iterdir() if p.suffix in YAML) if path.is_dir() else [path]
+    return [(identifier(file.stem), file, _named_values(file)) for file in files]
 
 
 def _named_values(path: Path) -> dict:

@@ -300,7 +300,16 @@ def _compare(task: Task, former: Receipt, made: Made | None, ledger: Ledger, wor
         return
     made = made or Made(task.inputs, {})
     work.again[task.item] = why_outdated(task.stage, task.config, made, task.inputs)
-    if there and not _other_data(task, made.inputs):
+    if not there:
+        return
+    # A later stage must not read an output beside newer data of earlier stages. Files outside of
+    # the dataset are different: settings name them, or they are footage, which only the first
+    # stage reads.
+    stage, root = task.stage, task.dataset.root
+    found = stage.inputs(task.dataset, task.item, task.config)
+    outside = {n for n, at in found.items() if isinstance(at, Path) and not at.is_relative_to(root)}
+    names = set() if stage.prepare else {*made.inputs, *task.inputs} - outside
+    if all(made.inputs.get(name) == task.inputs.get(name) for name in names):
         work.still_valid.add(task.item)
 
 
@@ -318,19 +327,6 @@ def _is_there(task: Task, made: Made | None, ledger: Ledger) -> bool:
         return True
     files = {folder / name: mark.sha256 for name, mark in made.files.items()}  # a copy, perhaps
     return all(file.is_file() and ledger.sha256(file) == sha for file, sha in files.items())
-
-
-def _other_data(task: Task, before: Mapping[str, str]) -> bool:
-    """Return whether inputs from earlier stages have changed since an item's output was made.
-
-    A later stage must not read such an output beside the new data. Files outside of the dataset
-    are different: settings name them, or they are footage, which only the first stage reads.
-    """
-    stage, root = task.stage, task.dataset.root
-    found = stage.inputs(task.dataset, task.item, task.config)
-    outside = {n for n, at in found.items() if isinstance(at, Path) and not at.is_relative_to(root)}
-    names = set() if stage.prepare else {*before, *task.inputs} - outside
-    return any(before.get(name) != task.inputs.get(name) for name in names)
 
 
 def _run_items(

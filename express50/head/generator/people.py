@@ -112,25 +112,18 @@ def _skin_moves(
     far = np.linalg.norm(sample.places[nearest] - points[own], axis=1) > 4.0
     alike = (sample.normals[nearest] * normals).sum(1) > 0.3
     known = ~far & alike & ~np.isin(own, hidden_vertices(mesh))
-    moves = np.zeros((*points.shape, found.shape[-1]))
-    moves[own] = found
-    moves = _spread(moves, faces, own, known)
-    for row in (mesh.tag("lip0", side) for side in ("left", "right")):
-        moves[row] = 0.5 * (moves[row] + moves[row[::-1]])  # the lips meet in all people
-    return moves
-
-
-def _spread(moves: Array, faces: Array, own: Array, known: Array) -> Array:
-    """Fill in the unknown moves of vertices `own` from those around, as heat spreads."""
-    index = np.full(len(moves), -1)
+    # Unknown moves are filled in from those around, as heat spreads.
+    index = np.full(len(points), -1)
     index[own] = np.arange(len(own))
     links = edge_graph(index[faces], len(own))
     laplacian = sparse.diags(np.asarray(links.sum(1)).ravel()) - links
-    free = np.flatnonzero(~known)
-    flat = moves[own].reshape(len(own), -1)
+    free, flat = np.flatnonzero(~known), found.reshape(len(own), -1).astype(np.float64)
     right = -laplacian[free][:, known] @ flat[known]
     flat[free] = splu(laplacian[free][:, free].tocsc()).solve(right)
-    moves[own] = flat.reshape(len(own), *moves.shape[1:])
+    moves = np.zeros((*points.shape, found.shape[-1]))
+    moves[own] = flat.reshape(found.shape)
+    for row in (mesh.tag("lip0", side) for side in ("left", "right")):
+        moves[row] = 0.5 * (moves[row] + moves[row[::-1]])  # the lips meet in all people
     return moves
 
 
