@@ -120,7 +120,12 @@ class PageServer(ThreadingHTTPServer):
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         """Answer one request, in at most `LONGEST_S`."""
-        limit = Timer(LONGEST_S, _cut_off, [request])
+
+        def cut_off() -> None:
+            with suppress(OSError):  # closed already
+                request.shutdown(SHUT_RDWR)
+
+        limit = Timer(LONGEST_S, cut_off)
         limit.daemon = True
         limit.start()
         try:
@@ -134,11 +139,6 @@ class PageServer(ThreadingHTTPServer):
         error = sys.exc_info()[1]
         if not isinstance(error, OSError):
             log(f"a request failed: {type(error).__name__}: {error}")
-
-
-def _cut_off(connection: socket) -> None:
-    with suppress(OSError):  # closed already
-        connection.shutdown(SHUT_RDWR)
 
 
 class _Handler(BaseHTTPRequestHandler):

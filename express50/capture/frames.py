@@ -47,6 +47,7 @@ from express50.geometry.sampling import undistort_image
 STRIP = 64  # rows that `write_frame` compresses together
 BLOCK = 24  # neighbouring frames whose proxies are made together
 BLOCKS = 12  # kept in memory, 10 MB each at 480 pixels
+_Footage = tuple[Dataset, str, str, Path]  # dataset, subject, camera, and where the footage lies
 _READING = Lock()  # one thread at a time reads footage for `read_proxy`
 
 
@@ -410,12 +411,10 @@ def read_proxy(dataset: Dataset, subject: str, camera_id: str, frame: int) -> np
 
 
 @cached_by_file(BLOCKS)
-def _block_of_proxies(
-    path: Path, key: tuple[Dataset, str, str, Path], first: int, count: int
-) -> list[np.ndarray]:
+def _block_of_proxies(path: Path, key: _Footage, first: int, count: int) -> list[np.ndarray]:
     """Make the proxies of neighbouring frames: videos are decoded forward only."""
     dataset, subject, camera_id, _ = key
-    reader = _reader(path, *key)
+    reader = _reader(path, key)
     made = nearest_decoded(reader.source, first)
     side = max(decode_proxy(dataset.proxies_dir(subject), camera_id, made).shape)
     frames = range(first, min(first + count, reader.source.frames))
@@ -423,14 +422,9 @@ def _block_of_proxies(
 
 
 @cached_by_file(8)
-def _reader(
-    path: Path,  # noqa: ARG001
-    dataset: Dataset,
-    subject: str,
-    camera_id: str,
-    footage: Path,  # noqa: ARG001
-) -> FrameReader:
+def _reader(_index: Path, key: _Footage) -> FrameReader:
     """Return a reader that stays open as long as index and footage are the same."""
+    dataset, subject, camera_id, _ = key
     return FrameReader(read_index(dataset, subject), camera_id)
 
 

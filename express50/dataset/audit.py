@@ -303,10 +303,18 @@ class _StageAudit:
     def _changed(self, stage: str, item: str, marks: Mapping[str, FileMark]) -> Fault | None:
         folder = self.dataset.item_dir(stage, item)
         there = {path.relative_to(folder).as_posix(): path for path in files_of(folder)}
-        gone = sorted(marks.keys() - there.keys())
-        shared = sorted(marks.keys() & there.keys())
-        other = [name for name in shared if self._differs(there[name], marks[name])]
-        foreign = sorted(there.keys() - marks.keys())
+        gone, foreign = sorted(marks.keys() - there.keys()), sorted(there.keys() - marks.keys())
+        other = []
+        for name in sorted(marks.keys() & there.keys()):
+            mark, stat = marks[name], there[name].stat()
+            self.result.files += 1
+            self.result.bytes += stat.st_size
+            same = stat.st_size == mark.size
+            if same and (self.deep or stat.st_mtime_ns != mark.mtime_ns):  # as copying does
+                self.result.hashed += stat.st_size
+                same = file_sha256(there[name]) == mark.sha256
+            if not same:
+                other.append(name)
         states = {"missing": gone, "not as published": other, "not written by a run": foreign}
         words = [f"{few(names)} {state}" for state, names in states.items() if names]
         if words:
@@ -320,18 +328,6 @@ class _StageAudit:
         except FormatError as error:
             faults = [str(error)]
         return Fault(item, "shards", few(faults)) if faults else None
-
-    def _differs(self, path: Path, mark: FileMark) -> bool:
-        """Return True if a file's bytes changed; copying changes its time, so bytes decide."""
-        stat = path.stat()
-        self.result.files += 1
-        self.result.bytes += stat.st_size
-        if stat.st_size != mark.size:
-            return True
-        if not self.deep and stat.st_mtime_ns == mark.mtime_ns:
-            return False
-        self.result.hashed += stat.st_size
-        return file_sha256(path) != mark.sha256
 
     def _personal_faults(self, subjects: set[str]) -> Iterator[Fault]:
         """Find indices that hold keys of capture.toml that must stay out of the dataset."""

@@ -433,18 +433,6 @@ def error_text(name: str, error: Expected) -> str:
     return f"{name} {error.value:.2g} {error.unit} ({error.low:.2g} to {error.high:.2g})"
 
 
-def expected_lines(point: Point) -> Iterator[str]:
-    """Yield the errors to expect: those that stages state, and mere differences."""
-    texts = {name: error_text(name, error) for name, error in point.errors.items()}
-    stated = [text for name, text in texts.items() if point.errors[name].stated]
-    others = [text for name, text in texts.items() if not point.errors[name].stated]
-    if stated:
-        yield f"expected error: {', '.join(stated)}"
-    if others:
-        words = "difference from the most expensive settings (no stage states these errors)"
-        yield f"{words}: {', '.join(others)}"
-
-
 def choice_lines(load: Workload, point: Point, asked: str, spent: float) -> Iterator[str]:
     """Yield what is expected of a choice, and why each setting was chosen.
 
@@ -452,7 +440,11 @@ def choice_lines(load: Workload, point: Point, asked: str, spent: float) -> Iter
     """
     kind = "core time" if load.cores else count(load.width, "worker")
     yield f"{asked}, {kind}: {format_seconds(spent)} spent on measuring"
-    yield from expected_lines(point)
+    others = "difference from the most expensive settings (no stage states these errors)"
+    for stated, words in ((True, "expected error"), (False, others)):
+        texts = [error_text(n, e) for n, e in point.errors.items() if e.stated == stated]
+        if texts:
+            yield f"{words}: {', '.join(texts)}"
     yield f"done in {format_seconds(spent + point.seconds)}, measuring included"
     rows = []
     for stage in load.stages:

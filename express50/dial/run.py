@@ -262,18 +262,6 @@ def _any_left(summaries: Sequence[Summary]) -> bool:
     return any(summary.count("left") for summary in summaries)
 
 
-def ready_items(items: Sequence[str], before: Sequence[Summary]) -> tuple[list[str], list[str]]:
-    """Return a stage's items that can be made, and those that wait for an earlier stage.
-
-    Those of a subject wait if an earlier stage had no time for a part of it. All wait if the stage
-    before made nothing.
-    """
-    left = {o.item.split("/")[0] for s in before for o in s.outcomes if o.status == "left"}
-    nothing = all(outcome.status == "left" for outcome in before[-1].outcomes)
-    waiting = [item for item in items if nothing or item.split("/")[0] in left]
-    return [item for item in items if item not in waiting], waiting
-
-
 def _run_one(run: _Run, stage: Stage, before: Sequence[Summary]) -> Summary | None:
     """Run a stage until the budget ends; None if it has nothing to work on."""
     items = list(stage.items(run.chain.dataset))
@@ -281,7 +269,12 @@ def _run_one(run: _Run, stage: Stage, before: Sequence[Summary]) -> Summary | No
     if not items:  # an earlier stage made nothing
         return None
     if _any_left(before):
-        items, waiting = ready_items(items, before)
+        # A subject waits if an earlier stage had no time for a part of it; all wait if the stage
+        # before made nothing.
+        late = {o.item.split("/")[0] for s in before for o in s.outcomes if o.status == "left"}
+        nothing = all(outcome.status == "left" for outcome in before[-1].outcomes)
+        waiting = [item for item in items if nothing or item.split("/")[0] in late]
+        items = [item for item in items if item not in waiting]
     summary = Summary(stage.name, (), 0.0)
     if items:
         if stage.name not in run.state.begun:

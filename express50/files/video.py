@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from fractions import Fraction
 from itertools import chain, islice
 from pathlib import Path
-from types import TracebackType
 
 import av
 import cv2
@@ -477,12 +476,7 @@ class VideoFootage:
         frame = frame.reformat(format="yuv444p", dst_colorspace="ITU709")
         self._container.mux(self._stream.encode(frame))
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *unused: object) -> None:
         if kind is None:
             self._container.mux(self._stream.encode())
         self._container.close()

@@ -276,7 +276,17 @@ def find_with_fan(fan: torch.jit.ScriptModule, image: np.ndarray, face: Detectio
         heat = _heat(fan, batch)[0].double().numpy()
     if not np.isfinite(heat).all():
         raise ConfigError("landmarks: FAN's weights give NaN or infinite heat maps; use others")
-    found = [_peak(one) for one in heat]
+    found = []  # of each map's peak: place (2,) and spread in cells, corner origin, and height
+    for one in heat:
+        row, column = np.unravel_index(int(np.argmax(one)), one.shape)
+        rows = slice(max(row - REACH, 0), row + REACH + 1)
+        columns = slice(max(column - REACH, 0), column + REACH + 1)
+        share = np.clip(one[rows, columns], 0.0, None)
+        total = max(float(share.sum()), 1e-12)
+        y, x = cell_to_corner(np.mgrid[rows, columns][:, : share.shape[0], : share.shape[1]])
+        place = np.array([(share * x).sum(), (share * y).sum()]) / total
+        variance = float((share * ((x - place[0]) ** 2 + (y - place[1]) ** 2)).sum()) / total
+        found.append((place, (0.5 * variance) ** 0.5, float(one[row, column])))
     cells, spread, height = (np.array(part) for part in zip(*found, strict=True))
     step = FAN_CROP / HEAT
     points = transform_points(window, cells * step)
@@ -299,16 +309,3 @@ def _heat(fan: torch.jit.ScriptModule, batch: torch.Tensor) -> torch.Tensor:
     """Run FAN; a stack of hourglasses returns a list, whose last heat maps count."""
     output = fan(batch)
     return output[-1] if isinstance(output, list | tuple) else output
-
-
-def _peak(heat: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Find a heat map's peak: place (2,) in cells, corner origin, spread in cells, and height."""
-    row, column = np.unravel_index(int(np.argmax(heat)), heat.shape)
-    rows = slice(max(row - REACH, 0), row + REACH + 1)
-    columns = slice(max(column - REACH, 0), column + REACH + 1)
-    share = np.clip(heat[rows, columns], 0.0, None)
-    total = max(float(share.sum()), 1e-12)
-    y, x = cell_to_corner(np.mgrid[rows, columns][:, : share.shape[0], : share.shape[1]])
-    place = np.array([(share * x).sum(), (share * y).sum()]) / total
-    variance = float((share * ((x - place[0]) ** 2 + (y - place[1]) ** 2)).sum()) / total
-    return place, (0.5 * variance) ** 0.5, float(heat[row, column])
