@@ -33,8 +33,6 @@ _KINDS = (
     f'"{BUILTIN_NAME}", a FLAME .pkl, an ICT-FaceKit checkout, an .npz of its arrays, or a stored'
     " head model"
 )
-
-
 _log_once = cache(log)
 
 

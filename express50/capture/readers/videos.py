@@ -19,13 +19,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from express50.capture.colour_correction import check_matrix
-from express50.capture.raw import (
-    VIDEO_SUFFIXES,
-    RawCamera,
-    RawCapture,
-    is_data_folder,
-    is_shown,
-)
+from express50.capture.raw import VIDEO_SUFFIXES, RawCamera, RawCapture, is_data_folder, is_shown
 from express50.capture.readers.selection import (
     Moment,
     Selection,
