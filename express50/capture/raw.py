@@ -32,6 +32,10 @@ from express50.geometry.cameras import Camera
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mxf", ".mts", ".m2ts")
+# Photographs of phones and of cameras that nothing here decodes.
+UNDEVELOPED = (
+    ".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef",
+)  # fmt: skip
 # Windows reserves these names for devices, in any letter case.
 RESERVED = {"CON", "PRN", "AUX", "NUL"}
 RESERVED |= {f"{port}{n}" for port in ("COM", "LPT") for n in range(1, 10)}
@@ -212,6 +216,14 @@ def dates_as_text(value: object) -> object:
 def is_shown(path: Path, suffixes: Container[str]) -> bool:
     """Return whether a path's name has one of the suffixes, and is not that of a hidden file."""
     return path.suffix.lower() in suffixes and not path.name.startswith(".")
+
+
+def hint_at_undeveloped(files: Iterable[Path]) -> str:
+    """Return how to make files readable, as the end of an error, if some are `UNDEVELOPED`."""
+    suffixes = sorted({file.suffix.lower() for file in files} & set(UNDEVELOPED))
+    if not suffixes:
+        return ""
+    return f". Photographs such as *{suffixes[0]} are not read: export them as JPEG, PNG or TIFF"
 
 
 def is_data_folder(path: Path) -> bool:

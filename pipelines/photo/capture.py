@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from express50.capture.frames import read_cameras_of, read_peak_frame
-from express50.capture.raw import IMAGE_SUFFIXES, VIDEO_SUFFIXES
+from express50.capture.raw import IMAGE_SUFFIXES, VIDEO_SUFFIXES, hint_at_undeveloped
 from express50.contract.layout import Dataset
 from express50.dataset.tracks import read_track
 from express50.errors import CaptureError, FormatError, StageError, rounded_down
@@ -102,7 +102,7 @@ def open_picture(path: Path) -> PhotoSource:
     if suffix not in PHOTO_SUFFIXES:
         raise CaptureError(
             f"{path}: not a photograph or video; expected a file name that ends in "
-            f"{' '.join(PHOTO_SUFFIXES + VIDEO_SUFFIXES)}"
+            f"{' '.join(PHOTO_SUFFIXES + VIDEO_SUFFIXES)}{hint_at_undeveloped([path])}"
         )
     try:
         orientation, film = read_exif(path)

@@ -16,6 +16,7 @@ from express50.capture.raw import (
     VIDEO_SUFFIXES,
     RawCapture,
     check_identity,
+    hint_at_undeveloped,
     is_data_folder,
     read_capture,
     read_capture_toml,
@@ -141,6 +142,7 @@ def detect(path: Path, name: object = None) -> Layout:
     raise CaptureError(
         f"{path}: no known layout; got {', '.join(held[:5]) or 'an empty folder'}, expected one "
         f"of: {looks}; {OURS}: capture.toml and cameras/{unclear}"
+        + hint_at_undeveloped([path, *path.glob("*"), *path.glob("*/*")])
     )
 
 

@@ -200,3 +200,11 @@ def test_a_picture_without_a_number_is_named(tmp_path):
     write_image(root / "cam1/dark.png", picture(0, 0))
     with pytest.raises(CaptureError, match="dark.png: has no number in its name"):
         read_any(root)
+
+
+@pytest.mark.parametrize("name", ["a.HEIC", "cam0/a.NEF"])
+def test_photographs_that_have_to_be_converted_are_named(tmp_path, name):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).touch()
+    with pytest.raises(CaptureError, match=r"such as \*\.(heic|nef) are not read: export them as"):
+        read_any(tmp_path)
