@@ -49,10 +49,14 @@ def background_alpha(
     """
 
     def compute(rows: slice, columns: slice) -> np.ndarray:
-        pair = [_padded(x[rows, columns].astype(np.float32) / 255) for x in (frame, plate)]
-        answer = network(*pair)
-        _check_shape(network, answer, pair[0].shape[:2])
-        return answer[0, : rows.stop - rows.start, : columns.stop - columns.start]
+        height, width = rows.stop - rows.start, columns.stop - columns.start
+        # The network takes certain sizes only: the last row and column are repeated.
+        down, right = (max(LEAST_SIDE, n + -n % MULTIPLE) - n for n in (height, width))
+        pair = (x[rows, columns].astype(np.float32) / 255 for x in (frame, plate))
+        edge = 0, down, 0, right, cv2.BORDER_REPLICATE
+        answer = network(*(cv2.copyMakeBorder(image, *edge) for image in pair))
+        _check_shape(network, answer, (height + down, width + right))
+        return answer[0, :height, :width]
 
     alpha = in_tiles(frame.shape[:2], tile, OVERLAP, compute)
     return np.clip(alpha, 0, 1)
@@ -98,13 +102,6 @@ def refined(frame: np.ndarray, alpha: np.ndarray, factor: float) -> np.ndarray:
         return smooth_alpha(frame[part], alpha[part], band[part])
 
     return in_tiles(alpha.shape, REFINE_TILE, REFINE_OVERLAP, compute)
-
-
-def _padded(image: np.ndarray) -> np.ndarray:
-    """Repeat the last row and column of an image (H, W, 3) up to a size that the network takes."""
-    height, width = (max(LEAST_SIDE, n + -n % MULTIPLE) for n in image.shape[:2])
-    down, right = height - image.shape[0], width - image.shape[1]
-    return cv2.copyMakeBorder(image, 0, down, 0, right, cv2.BORDER_REPLICATE)
 
 
 def _check_shape(network: Network, answer: np.ndarray, size: tuple[int, ...]) -> None:

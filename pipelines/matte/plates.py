@@ -128,9 +128,13 @@ def match_plate(
     it is, it is compared beside the `person` as well: where one may be, (h, w) bool of any size.
     """
     first = _matched(plate, frame, valid)
-    person = _where_open(person, valid.shape)
     if first.sure or person is None:
         return first
+    border = _rim(person.shape, RIM, np.zeros_like(person))
+    if (~person[border]).mean() < LEAST_OPEN:
+        return first
+    size = valid.shape[::-1]
+    person = cv2.resize(person.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
     second = _matched(plate, frame, valid, person)
     # The fewer pixels are compared, the sooner a plate in other light seems to fit.
     border = valid & _rim(valid.shape, RIM, person)
@@ -168,17 +172,6 @@ def _rim(shape: tuple[int, ...], share: float, person: np.ndarray | None = None)
         rim[height - edge :] = True
         rim &= ~person
     return rim
-
-
-def _where_open(person: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray | None:
-    """Return a person (h, w) bool at a shape; None if they leave too little of the border open."""
-    if person is None:
-        return None
-    border = _rim(person.shape, RIM, np.zeros_like(person))
-    if (~person[border]).mean() < LEAST_OPEN:
-        return None
-    size = shape[::-1]
-    return cv2.resize(person.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
 
 
 def white_share(image: np.ndarray, valid: np.ndarray) -> float:

@@ -197,7 +197,7 @@ class _Shots:
 
 
 def _camera_matte(alpha: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> CameraMatte:
-    found = eight_bit(alpha, valid)
+    found = np.rint(np.where(valid, alpha, np.float32(0)) * 255).astype(np.uint8)
     return CameraMatte(found, shrink(frame, SHOWN), wall_noise(found, frame))
 
 
@@ -276,11 +276,6 @@ def _plate(
 def valid_pixels(camera: Camera) -> np.ndarray:
     """Return the pixels (H, W) bool with footage, except the outermost, which resampling mixes."""
     return cv2.erode(undistorted_mask(camera).astype(np.uint8), np.ones((3, 3))) > 0
-
-
-def eight_bit(alpha: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Return opacity (H, W) as uint8, 0 where a pixel is not valid."""
-    return np.rint(np.where(valid, alpha, np.float32(0)) * 255).astype(np.uint8)
 
 
 def _matte_function(method: str, weights: str, tile: int, shadow: float) -> MatteFunction:

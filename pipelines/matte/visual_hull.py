@@ -219,7 +219,11 @@ def evidence_of(view: MatteView, space: Space, place: np.ndarray) -> Evidence:
     front = cv2.erode(front[:-1].reshape(shape), disc)
     # By as much as the splats widened it, so that the rim does not count as solid.
     solid = cv2.erode(np.isfinite(front).astype(np.uint8), disc) > 0
-    solid &= _deep_enough(view, np.bincount(pixels[sure], minlength=front.size + 1)[:-1])
+    # Where the hull's corners stand out from the subject, rays pass only a few solid cells.
+    cells = np.bincount(pixels[sure], minlength=front.size + 1)[:-1]
+    chord = cv2.blur(cells.reshape(shape).astype(np.float32), (5, 5))
+    opaque = (view.alpha > INSIDE) & (chord > 0)
+    solid &= chord >= THICK * np.median(chord[opaque]) if opaque.any() else opaque
     return Evidence(
         known=splat(shape, pixels, spread),
         possible=splat(shape, pixels[possible], spread),
@@ -227,17 +231,6 @@ def evidence_of(view: MatteView, space: Space, place: np.ndarray) -> Evidence:
         solid=solid,
         front=front,
     )
-
-
-def _deep_enough(view: MatteView, cells: np.ndarray) -> np.ndarray:
-    """Return the pixels (h, w) bool whose rays pass enough of the solid `cells` (h * w,).
-
-    Between the silhouettes of few cameras the hull has corners that stand out from the subject.
-    Rays that miss the subject pass only a few cells of these corners.
-    """
-    chord = cv2.blur(cells.reshape(view.alpha.shape).astype(np.float32), (5, 5))
-    opaque = (view.alpha > INSIDE) & (chord > 0)
-    return chord >= THICK * np.median(chord[opaque]) if opaque.any() else opaque
 
 
 def ruled_out(view: MatteView, evidence: Evidence) -> np.ndarray:
@@ -346,7 +339,10 @@ def missed(
     if not solid.all():
         depth = cv2.distanceTransform(solid.astype(np.uint8), cv2.DIST_L2, 5)
     deep = depth > MARGIN * max(lacking.shape)
-    todo = lacking & (subject[view.name] | (depth > _corner_height(view, others) * depth.max()))
+    # The tangents of two cameras, each at an angle to this one, meet at 1 / cos(angle) radii.
+    cosines = sorted((_cosine(view, o) for o in others if o.name != view.name), reverse=True)
+    height = 1 / cosines[1] - 1 if len(cosines) > 1 and cosines[1] > WIDEST else 1.0
+    todo = lacking & (subject[view.name] | (depth > height * depth.max()))
     alike = shows_surface(view, evidence, todo, others, subject)
     alike = cv2.morphologyEx(alike.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2))) > 0
     count, spots = cv2.connectedComponents(alike.astype(np.uint8), connectivity=8)
@@ -359,15 +355,6 @@ def missed(
     left = float((lacking & deep & ~filled).sum()) / max(int(deep.sum()), 1)
     grown = cv2.dilate(filled.astype(np.uint8), np.ones((3, 3))) > 0
     return grown & (solid | (view.alpha >= INSIDE)), left
-
-
-def _corner_height(view: MatteView, others: Sequence[MatteView]) -> float:
-    """Estimate how far the others' hull stands out from a round subject here, in its radii.
-
-    The tangents of two cameras, each at an angle to this one, meet at 1 / cos(angle) radii.
-    """
-    cosines = sorted((_cosine(view, o) for o in others if o.name != view.name), reverse=True)
-    return 1 / cosines[1] - 1 if len(cosines) > 1 and cosines[1] > WIDEST else 1.0
 
 
 @dataclass(frozen=True)
