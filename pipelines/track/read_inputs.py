@@ -159,7 +159,13 @@ def _find_face(
     found = None
     for place in places:
         if follow is not None and found is None and np.isfinite(place).all():
-            found = agreed(cue, frame, _followed(read, cameras, follow, place))
+            near = [
+                _near(read, cameras[name], follow, place)
+                for name in _facing_cameras(cameras, place)
+            ]
+            views = [view for view in near if view is not None]
+            sure = sum(view.score >= FOLLOWED_SCORE for view in views)
+            found = agreed(cue, frame, views if sure > FOLLOWED_SHARE * len(near) else [])
     if found is None:
         found = agreed(cue, frame, search_views(read, cameras, frame, source))
     # A clip may be one long blink: the peaks show what open eyes look like.
@@ -172,17 +178,6 @@ def agreed(cue: str, frame: int, views: list[LandmarkView]) -> Observation | Non
     if observation is None or observation.inliers.sum(1).max() < MIN_LANDMARKS:
         return None
     return observation
-
-
-def _followed(
-    read: Read, cameras: Mapping[str, Camera], follow: Follow, expected: np.ndarray
-) -> list[LandmarkView]:
-    """Return the views with a face near expected landmarks (68, 3); none if it is lost."""
-    chosen = _facing_cameras(cameras, expected)
-    found = [_near(read, cameras[name], follow, expected) for name in chosen]
-    views = [view for view in found if view is not None]
-    sure = sum(view.score >= FOLLOWED_SCORE for view in views)
-    return views if sure > FOLLOWED_SHARE * len(chosen) else []
 
 
 def _near(read: Read, camera: Camera, follow: Follow, expected: np.ndarray) -> LandmarkView | None:
