@@ -18,7 +18,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -91,8 +90,7 @@ def fit(
     if continued:
         resume(state, checkpoint, made_from)
     held_out = [i for i in held_out if views.keys[i].expression in state.z_exp]
-    save = partial(save_unfinished, state, made_from=made_from)
-    keeping = partial(_kept, checkpoint, save, state.config.train.save_seconds)
+    keeping = partial(_kept, state, checkpoint, made_from)
     effort = run_stages(state, lambda: _scores(state, held_out), keeping)
     metrics = _report(state, held_out, judge) | effort | judge.missing()
     comparison_sheet(out / "given.jpg", views, state.given[:6], state.render)
@@ -157,8 +155,10 @@ def run_stages(
 
 
 @contextlib.contextmanager
-def _kept(path: Path, save: Callable[[Path], None], every: float) -> Iterator[Keep]:
+def _kept(state: FitState, path: Path, made_from: dict[str, object]) -> Iterator[Keep]:
     """Yield a function that saves after steps, and ends the fit after one in which Ctrl-C came."""
+    save = partial(save_unfinished, state, made_from=made_from)
+    every = state.config.train.save_seconds
     with deferred_interrupt() as interrupt, saving(path, save, every) as after_step:
 
         def keep(last: bool) -> None:
@@ -191,7 +191,7 @@ def invert_codes(state: FitState, limit: float = math.inf, keep: Keep | None = N
 
 def tune_decoders(state: FitState, limit: float = math.inf, keep: Keep | None = None) -> int:
     """Fine-tune the decoders with the locality loss (stage 2); returns all iterations."""
-    settings, train, rng = state.config.fit, state.config.train, state.rng
+    settings, train = state.config.fit, state.config.train
     # Adam moves the decoders; codes and refinement stay fixed.
     rates = {"decoders": settings.stage2_lr, "texels": settings.stage2_lr * train.texel_lr_scale}
     parameters = state.model.parameter_groups()
@@ -201,14 +201,15 @@ def tune_decoders(state: FitState, limit: float = math.inf, keep: Keep | None = 
     optimizer = use_optimizer(state, torch.optim.Adam(groups, fused=True))
     for number, _, item in _items(state, 2, settings.stage2_iterations, limit, keep):
         optimizer.zero_grad()
-        shade = random_camera(state, rng) if rng.random() < settings.shuffle_directions else None
+        shuffled = state.rng.random() < settings.shuffle_directions
+        shade = random_camera(state) if shuffled else None
         rendering = state.render(item, shade)
         # Few views do not say where the mesh should be: it stays near the tracked one.
         moved = losses.displacement_mm2(rendering.gaussians.displacement)
         loss = _footage_loss(state, rendering, item) + state.config.loss.displacement * moved
         if settings.locality and number % settings.locality_every == 0:
             weight = settings.locality * settings.locality_every
-            loss = loss + weight * locality_loss(state, item, rng)
+            loss = loss + weight * locality_loss(state, item)
         _finite(loss, number, 2).backward()
         optimizer.step()
     state.model.requires_grad_(False)
@@ -283,15 +284,15 @@ def _footage_loss(state: FitState, rendering: Rendering, item: HeadView) -> Tens
     return reconstruction(state, *((item.comparable(image), item.target) for image in images))
 
 
-def locality_loss(state: FitState, item: HeadView, rng: np.random.Generator) -> Tensor:
+def locality_loss(state: FitState, item: HeadView) -> Tensor:
     """Compare the tuned model and the loaded one between a training identity and the subject.
 
     Codes and coefficients are blended at a fixed t (weight of the subject), jaw and neck by SLERP
     (paper, supplement); a random training camera sees the mesh posed again from the blend.
     """
     frames = sorted(f for f in state.loaded.gallery.frames if f[0] in state.loaded.model.subjects)
-    frame = frames[int(rng.integers(len(frames)))]
-    view = random_camera(state, rng)
+    frame = frames[int(state.rng.integers(len(frames)))]
+    view = random_camera(state)
     own = next(i for i in state.given if state.views.keys[i] == item.key)
     mine = HeadCodes(
         z_id=state.z_id,
@@ -306,10 +307,10 @@ def locality_loss(state: FitState, item: HeadView, rng: np.random.Generator) -> 
     return reconstruction(state, (tuned.rgb, before.rgb), (tuned.image, before.image))
 
 
-def random_camera(state: FitState, rng: np.random.Generator) -> PinholeView:
+def random_camera(state: FitState) -> PinholeView:
     """Choose one of the training cameras."""
     cameras = state.loaded.gallery.cameras
-    return cameras[sorted(cameras)[int(rng.integers(len(cameras)))]]
+    return cameras[sorted(cameras)[int(state.rng.integers(len(cameras)))]]
 
 
 def _finite(loss: Tensor, iteration: int, stage: int) -> Tensor:
@@ -392,11 +393,9 @@ def fit_unseen(
     if path.exists():
         resume(state, path, made_from)
     path.parent.mkdir(parents=True, exist_ok=True)
-    save = partial(save_unfinished, state, made_from=made_from)
-    keeping = partial(_kept, path, save, state.config.train.save_seconds)
-    effort = run_stages(state, dict, keeping)
+    effort = run_stages(state, dict, partial(_kept, state, path, made_from))
     state.optimizer = None  # a finished fit takes a third of the space without it
-    save(path)
+    save_unfinished(state, path, made_from)
     return state, effort
 
 

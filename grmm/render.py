@@ -50,12 +50,6 @@ def to_uint8(image: Tensor) -> np.ndarray:
     return (image.detach().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()
 
 
-def depth_picture(depth: Tensor, alpha: Tensor) -> np.ndarray:
-    """Show depth (H, W) as grey (H, W, 3) uint8: near is bright, alpha <= 0.5 is black."""
-    grey = torch.where(alpha > 0.5, 1 - 0.85 * normalise_depth(depth, alpha), 0.0)
-    return to_uint8(grey[None].expand(3, -1, -1))
-
-
 @torch.no_grad()
 def comparison_sheet(path: Path, views: HeadViews, indices: Sequence[int], render: Render) -> None:
     """Write rows of pictures in the order of COLUMNS."""
@@ -64,7 +58,10 @@ def comparison_sheet(path: Path, views: HeadViews, indices: Sequence[int], rende
         item = views.item(index)
         out = item.hide_behind_torso(render(item))
         pictures = [to_uint8(image) for image in (item.target, out.image, out.rgb)]
-        pictures.append(depth_picture(out.depth, item.fill_behind_torso(out.alpha, out.depth, 0.0)))
+        alpha = item.fill_behind_torso(out.alpha, out.depth, 0.0)
+        near_is_bright = 1 - 0.85 * normalise_depth(out.depth, alpha)
+        grey = torch.where(alpha > 0.5, near_is_bright, 0.0)
+        pictures.append(to_uint8(grey[None].expand(3, -1, -1)))
         pictures.append(to_uint8(4 * (out.image - item.target).abs()))
         rows.append(pictures)
         labels.append(f"{item.key.subject} {item.key.expression} {item.key.camera}")
