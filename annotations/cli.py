@@ -290,15 +290,13 @@ def run_mark(args: argparse.Namespace) -> int:
 
 def run_flag(args: argparse.Namespace) -> int:
     """Append a flag with its reason."""
-    index = _index(args)
-    flag = make_flag(index, args.expression, args.reason, args.annotator)
+    flag = make_flag(_index(args), args.expression, args.reason, args.annotator)
     return _keep(args, flag, f"flagged {flag.reason!r}")
 
 
 def run_undo(args: argparse.Namespace) -> int:
     """Append an undo."""
-    index = _index(args)
-    undo = make_event(index, args.expression, "undo", args.annotator)
+    undo = make_event(_index(args), args.expression, "undo", args.annotator)
     events = read_labels(args.dataset, args.subject)
     last = last_event(events, args.expression, args.annotator)
     if last is None:

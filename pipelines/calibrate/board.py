@@ -80,8 +80,7 @@ def board_from_table(table: Mapping[str, object], where: str) -> Board:
         raise CalibrationError(
             f"{where}: a value has the wrong kind ({error}); counts are integers, lengths metres"
         ) from error
-    problem = _problem(board)
-    if problem:
+    if problem := _problem(board):
         raise CalibrationError(f"{where}: {problem}")
     return board
 

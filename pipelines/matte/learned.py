@@ -58,8 +58,7 @@ def background_alpha(
         _check_shape(network, answer, (height + down, width + right))
         return answer[0, :height, :width]
 
-    alpha = in_tiles(frame.shape[:2], tile, OVERLAP, compute)
-    return np.clip(alpha, 0, 1)
+    return np.clip(in_tiles(frame.shape[:2], tile, OVERLAP, compute), 0, 1)
 
 
 def salient_alpha(network: Network, frame: np.ndarray) -> np.ndarray:
