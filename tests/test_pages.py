@@ -32,6 +32,14 @@ def test_links_and_mentioned_files_exist(page):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_define_the_names_that_pages_look_for_in_them(page):
+    named = r"`(\w+)`(?: and `(\w+)`)? in `([\w/]+\.(?:py|h|js))`"
+    for *names, path in re.findall(named, page.read_text(encoding="utf-8")):
+        code = (REPOSITORY / path).read_text(encoding="utf-8")
+        assert [name for name in names if name not in code] == [], path
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_to_headings_lead_to_headings(page):
     links = re.findall(r"\]\(([^)#:]*)#([^)]+)\)", page.read_text(encoding="utf-8"))
     lost = [
