@@ -73,8 +73,8 @@ def run_photo(args: argparse.Namespace) -> int:
 
     check_options(args)
     picture = open_picture(args.picture)
-    clips = ("track.frames=clips",) if picture.video else ()
-    args.set = [*PHOTO_SETTINGS, *clips, *args.set]
+    clips, given = ("track.frames=clips",) if picture.video else (), args.set
+    args.set = [*PHOTO_SETTINGS, *clips, *given]
     cap_threads(1)
     subject = args.subject or subject_id(args.picture)
     dataset = Dataset(args.out)
@@ -83,10 +83,14 @@ def run_photo(args: argparse.Namespace) -> int:
         loaded = [stages()[name] for name in names]
         configs = [config_of(stage, args) for stage in loaded]
         folder = dataset.root / "photos" / subject
-        focal = make_photo_capture(
+        capture = make_photo_capture(
             picture, folder, subject, configs[-1],
             focal_px=args.focal_px, film_mm=args.film_mm, windows=args.windows,
         )  # fmt: skip
+        # Small windows take most of the time of frames without a face.
+        searches = (f"{name}.search={capture.search:.3g}" for name in ("observe", "track"))
+        args.set = [*PHOTO_SETTINGS, *searches, *clips, *given]
+        configs = [config_of(stage, args) for stage in loaded]
         ingest.add_captures(dataset, [folder])
         with Pool(0) as pool:
             summaries = []
@@ -100,7 +104,7 @@ def run_photo(args: argparse.Namespace) -> int:
         panel = dataset.root / "panels" / subject / "panel.jpg"
         if summaries[-1].ok:
             write_panel(dataset, subject, configs[-1], panel)
-    done = summaries[-1].ok
+    done, focal = summaries[-1].ok, capture.focal
     if args.json:
         say_json({"focal": vars(focal), "stages": [summary.to_json() for summary in summaries]})
     else:

@@ -38,7 +38,7 @@ from express50.head.load import load_head
 from express50.head.model import landmarks_of
 from express50.head.preview import render_preview
 from express50.landmarks.detector import FOUND_SCORE, SMALLEST, Detection, detect, detect_many
-from express50.landmarks.network import load_network
+from express50.landmarks.network import face_box, load_network
 from pipelines.calibrate.footage import focal_of_film
 from pipelines.track.basis import Basis, make_basis
 from pipelines.track.config import TrackConfig
@@ -140,6 +140,14 @@ class Focal:
     high: float
 
 
+@dataclass(frozen=True)
+class PhotoCapture:
+    """What was found while a capture was made."""
+
+    focal: Focal
+    search: float  # size of the smallest windows that show its faces, as a share of the longer side
+
+
 def make_photo_capture(
     picture: PhotoSource,
     folder: Path,
@@ -149,8 +157,8 @@ def make_photo_capture(
     focal_px: float | None = None,
     film_mm: float = 50.0,
     windows: int = 8,
-) -> Focal:
-    """Write capture.toml, footage, cues and calibration; returns the focal length used.
+) -> PhotoCapture:
+    """Write capture.toml, footage, cues and calibration; returns what was found.
 
     A photograph is one cue of one frame; a video is cut into `windows` cues of equal length, from
     each of which `align` takes a frame for the shared shape. An earlier capture of the same file
@@ -192,7 +200,11 @@ def make_photo_capture(
         f'picture_sha256 = "{digest}"\n'
     )
     write_bytes(folder / "capture.toml", meta.encode())
-    return focal
+    # A face is found in windows up to three times as large, so it may shrink to a third.
+    sides = [face_box(f.points)[1] / max(width, height) for f in faces if f.score >= FOUND_SCORE]
+    large = picture.video and bool(sides)
+    search = float(np.clip(min(sides), config.search, SMALLEST)) if large else config.search
+    return PhotoCapture(focal, search)
 
 
 def _check_folder(folder: Path, picture: Path, digest: str) -> None:

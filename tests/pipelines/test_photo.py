@@ -188,7 +188,9 @@ def test_a_photograph_on_its_side_is_tracked_as_an_upright_one(
     write_exif(tmp_path / "a.tif", np.rot90(upright, 1), 6, 50)
     picture = open_picture(tmp_path / "a.tif")
     config = TrackConfig()
-    focal = make_photo_capture(picture, tmp_path / "out", "a", config)
+    capture = make_photo_capture(picture, tmp_path / "out", "a", config)
+    focal = capture.focal
+    assert capture.search == config.search  # a photograph is searched once
     camera = read_cameras(tmp_path / "out/calibration.json")["photo"]
     assert (camera.width, camera.height) == (280, 360)
     np.testing.assert_allclose(camera.K[:2, 2], [140, 180])
@@ -208,13 +210,25 @@ def test_a_telephones_video_is_stored_upright(tmp_path: Path, astronaut: np.ndar
     write_video(tmp_path / "a.mp4", [np.ascontiguousarray(np.rot90(upright))] * 3, rate=30)
     turn_video(tmp_path / "a.mp4")
     picture = open_picture(tmp_path / "a.mp4")
-    make_photo_capture(picture, tmp_path / "out", "a", TrackConfig(), windows=1)
+    config = TrackConfig(search=0.08)
+    capture = make_photo_capture(picture, tmp_path / "out", "a", config, windows=1)
+    assert capture.search == 0.25  # the face is wider: smaller windows would show none
     camera = read_cameras(tmp_path / "out/calibration.json")["photo"]
     assert (camera.width, camera.height) == (280, 360)
     stored = [image for _, image in iterate_video(tmp_path / "out/cameras/photo/video.mp4")]
     assert len(stored) == 3 and stored[0].shape == upright.shape
     assert np.abs(stored[2].astype(int) - upright).mean() < 6
     assert "fps = 30" in (tmp_path / "out/capture.toml").read_text()
+
+
+def test_a_video_is_searched_in_windows_as_small_as_its_faces(tmp_path, astronaut) -> None:
+    small = cv2.resize(astronaut, (96, 96), interpolation=cv2.INTER_AREA)
+    wide = np.full((240, 480, 3), 90, np.uint8)
+    wide[60:156, 200:296] = small
+    write_video(tmp_path / "a.mp4", [wide] * 3)
+    config = TrackConfig(search=0.02)
+    capture = make_photo_capture(open_picture(tmp_path / "a.mp4"), tmp_path / "out", "a", config)
+    assert 0.04 < capture.search < 0.12
 
 
 def test_a_video_is_tracked_in_every_frame(tmp_path: Path, astronaut: np.ndarray) -> None:
