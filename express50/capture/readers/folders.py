@@ -102,10 +102,13 @@ class Tree:
     deep: bool  # whether it lies in folders of the folders
     places: dict[str, list[Path]]  # by folder: its files, or its folders of files
 
+    def name(self, place: Path) -> str:
+        """Return the name of a place: a folder's, or a file's without its ending."""
+        return place.name if self.deep else place.stem
+
     def inner(self) -> set[str]:
-        """Return the names on the inner side: those of its folders, or else of its files."""
-        places = (place for row in self.places.values() for place in row)
-        return {place.name if self.deep else place.stem for place in places}
+        """Return the names of all places."""
+        return {self.name(place) for row in self.places.values() for place in row}
 
 
 def fits_camera_folders(path: Path) -> bool:
@@ -177,7 +180,7 @@ def read_camera_folders(path: Path, selection: Selection) -> RawCapture:
     rows: dict[str, dict[Moment, str]] = {folder: {} for folder in tree.places}
     for folder, places in tree.places.items():
         for place in places:
-            name = place.name if tree.deep else place.stem
+            name = tree.name(place)
             sequence = CLIP if one_clip else name.removeprefix(folder).strip("_- ") or name
             for file in _files(path, tree, place):
                 _add(rows[folder], (sequence, _number(file) if tree.kind == "frames" else 0), file)
@@ -209,9 +212,8 @@ def _read_inner(
     rows: dict[str, dict[Moment, str]] = {name: {} for name in sorted(tree.inner())}
     for folder, places in tree.places.items():
         for place in places:
-            row = rows[place.name if tree.deep else place.stem]
             for file in _files(path, tree, place):
-                _add(row, moment_of(folder, file), file)
+                _add(rows[tree.name(place)], moment_of(folder, file), file)
     return _read(path, tree.kind, rows, selection)
 
 
