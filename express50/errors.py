@@ -104,10 +104,10 @@ def nearest(word: str, known: Iterable[str]) -> str:
     return f" (did you mean {best!r}?)" if _likeness(word, best) >= LIKENESS else ""
 
 
-def few(names: Sequence[str], count: int = 3) -> str:
+def few(names: Sequence[str], count: int = 3, between: str = ", ") -> str:
     """List the first names, then how many more there are."""
     more = f" and {len(names) - count} more" if len(names) > count else ""
-    return ", ".join(names[:count]) + more
+    return between.join(names[:count]) + more
 
 
 def rounded_down(value: float) -> str:

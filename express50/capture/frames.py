@@ -83,6 +83,11 @@ class FrameReader:
         self.camera_id = camera_id
         self.source = index.cameras[camera_id]
         self.path = index.capture / self.source.source
+        if not index.capture.exists():
+            raise CaptureError(
+                f"{index.capture}: no such folder or file; if the capture has moved, run"
+                " 'express50 ingest' with its new path"
+            )
         self._clip = 0
         self._video: VideoReader | None = None
 

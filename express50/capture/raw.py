@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from express50.capture.index import Cue
-from express50.errors import CalibrationError, CaptureError, few
+from express50.errors import CalibrationError, CaptureError, few, nearest
 from express50.files.calibration import read_cameras
 from express50.files.text import (
     ID,
@@ -147,7 +147,11 @@ def read_calibration(
     for name in sorted(set(calibration) - set(cameras) - set(dropped)):
         dropped[name] = "calibrated, but the capture has no footage of it"
     for name in sorted(set(cameras) - set(calibration)):
-        dropped[name] = "not in calibration.json; add it, or delete that file to calibrate all"
+        near = nearest(name, calibration.keys() - cameras.keys())
+        dropped[name] = (
+            f"not in calibration.json{near}; rename it, add it there, or delete that file to"
+            " calibrate all cameras"
+        )
         del cameras[name]
     return calibration
 

@@ -19,7 +19,7 @@ from typing import BinaryIO
 
 from rich.filesize import decimal
 
-from express50.errors import ConfigError, DiskError, DiskFullError
+from express50.errors import ConfigError, DiskError, DiskFullError, FormatError
 
 LEAST_FREE = 100e6  # bytes; a disk with less free space counts as full
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # Linux constants
@@ -36,9 +36,21 @@ FORMER = ".former"  # suffix of a folder that was moved out of the way
 
 
 def dump_json(value: object) -> bytes:
-    """Encode as deterministic JSON with sorted keys; ValueError if a number is not finite."""
+    """Encode as deterministic JSON with sorted keys.
+
+    Raises:
+        ValueError: a number is not finite.
+        FormatError: a text is not Unicode, as names of files may be.
+    """
     text = json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False)
-    return (text + "\n").encode()
+    try:
+        return (text + "\n").encode()
+    except UnicodeEncodeError as error:
+        line = text[: error.end].count("\n")
+        raise FormatError(
+            f"{text.splitlines()[line].strip()}: holds a name that is not UTF-8; rename that file"
+            " or folder"
+        ) from error
 
 
 def write_bytes(path: Path, data: bytes) -> None:

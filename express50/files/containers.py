@@ -63,16 +63,17 @@ def inside(root: Path, name: str) -> Path:
     """Return the path of a name relative to a folder.
 
     Raises:
-        CaptureError: the name is absolute or leads out of the folder. Links may lead out of it, as
-            those of git-annex do.
+        CaptureError: the name is absolute, cannot be shown, or leads out of the folder. Links may
+            lead out of it, as those of git-annex do.
     """
     pure = PurePosixPath(name)
-    out = pure.is_absolute() or ".." in pure.parts or not name.isprintable()
+    if not name.isprintable():
+        raise CaptureError(f"{root}: {name!r} has characters that cannot be shown; rename it")
     if any(len(part.encode(errors="replace")) > NAME_LIMIT for part in pure.parts):
         raise CaptureError(
             f"{root}: {name[:40]!r}... is too long, expected at most {NAME_LIMIT} bytes per part"
         )
-    if out:
+    if pure.is_absolute() or ".." in pure.parts:
         raise CaptureError(f"{root}: {name!r} leads out of this folder; expected a name inside it")
     return root / name
 

@@ -94,7 +94,8 @@ def stat_digest(path: Path) -> str:
 
 def text_digest(text: str) -> str:
     """Return the SHA-256 of a text in hexadecimal."""
-    return hashlib.sha256(text.encode()).hexdigest()
+    # Names of files may be no text; `dump_json` then says which.
+    return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()
 
 
 def value_digest(value: object) -> str:

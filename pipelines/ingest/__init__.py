@@ -97,7 +97,7 @@ def account(dataset: Dataset, subjects: Sequence[str]) -> Iterator[str]:
 
 STAGE = Stage(
     name="ingest",
-    version=9,
+    version=10,
     config=IngestConfig,
     presets=PRESETS,
     items=items,

@@ -118,7 +118,8 @@ def _capture_of(dataset: Dataset, item: str) -> Path:
     if not captures[item].exists():
         raise CaptureError(
             f"{captures[item]}: no such folder; run 'express50 ingest {dataset.root} CAPTURE' "
-            f"with the folder where {item}'s capture is now"
+            f"with the folder where {item}'s capture is now; if that has another name, write"
+            f" subject = {item!r} into a capture.toml in it first"
         )
     return captures[item]
 
@@ -158,7 +159,7 @@ def run(
         del cameras[name]
         remove_proxies(out / "proxies", name)
     if not cameras:
-        reasons = "; ".join(f"{name}: {why}" for name, why in sorted(dropped.items()))
+        reasons = few([f"{name}: {why}" for name, why in sorted(dropped.items())], between="; ")
         raise CaptureError(f"{raw.root}: no usable camera: {reasons or 'cameras/ is empty'}")
     if calibration is not None:
         write_cameras(out / "calibration.json", calibration)
@@ -230,7 +231,7 @@ def _with_cues(
 
     A camera with fewer frames in a clip than most is dropped, because the lost frames are unknown.
     """
-    if not raw.clips:
+    if not raw.clips or not cameras:
         return raw, {}
     table = {name: camera.clips for name, camera in cameras.items()}
     usual = tuple(usual_count(counts) for counts in zip(*table.values(), strict=True))

@@ -91,7 +91,7 @@ def test_malformed_cameras_are_one_error(renderme, key, value, message):
 
 @pytest.mark.parametrize("name", ["../x.png", "/etc/hostname", "a/../../x.png", "a\0b"])
 def test_names_cannot_lead_out(tmp_path, name):
-    with pytest.raises(CaptureError, match="leads out"):
+    with pytest.raises(CaptureError, match="leads out|cannot be shown"):
         inside(tmp_path, name)
 
 

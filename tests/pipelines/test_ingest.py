@@ -125,6 +125,15 @@ def test_capture_without_a_usable_camera_fails(dataset):
     assert not dataset.item_dir("ingest", "S001").exists()
 
 
+def test_a_rig_of_which_every_camera_is_damaged_fails_with_the_reasons(tmp_path):
+    for name in ("cam0", "cam1"):
+        write_frames(tmp_path / "rig" / name, noise_video_images(3))
+        (tmp_path / "rig" / name / "000001.png").write_bytes(b"junk")
+    dataset = Dataset(tmp_path / "data")
+    ingest.add_captures(dataset, [tmp_path / "rig"])
+    assert "no usable camera: cam0: " in run(dataset).outcomes[0].reason
+
+
 def test_wrong_calibration_fails_its_item_only(dataset, tmp_path):
     make_capture(tmp_path / "S002", subject="S002", cameras=2, frames=4)
     ingest.add_captures(dataset, [tmp_path / "S002"])

@@ -13,11 +13,13 @@ stored on their side are read upright. The footage may lie one folder deeper, as
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Mapping
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
+from express50.capture.index import Cue
 from express50.capture.raw import (
     IMAGE_SUFFIXES,
     RawCapture,
@@ -101,6 +103,7 @@ class Tree:
     kind: str  # frames or videos
     deep: bool  # whether it lies in folders of the folders
     places: dict[str, list[Path]]  # by folder: its files, or its folders of files
+    empty: tuple[str, ...] = ()  # folders without footage
 
     def name(self, place: Path) -> str:
         """Return the name of a place: a folder's, or a file's without its ending."""
@@ -177,7 +180,8 @@ def read_camera_folders(path: Path, selection: Selection) -> RawCapture:
     one_clip = not tree.deep and (
         tree.kind == "frames" or all(len(row) == 1 for row in tree.places.values())
     )
-    rows: dict[str, dict[Moment, str]] = {folder: {} for folder in tree.places}
+    empty = [name for name in tree.empty if _are_cameras(path, [*tree.places, name])]
+    rows: dict[str, dict[Moment, str]] = {folder: {} for folder in sorted([*tree.places, *empty])}
     for folder, places in tree.places.items():
         for place in places:
             name = tree.name(place)
@@ -233,8 +237,9 @@ def _tree(path: Path) -> Tree:
     for deep, (kind, holds) in product((False, True), HOLDS.items()):
         found = {name: _places(folder, deep, holds) for name, folder in folders.items()}
         if any(found.values()):
-            tree = Tree(kind, deep, {name: places for name, places in found.items() if places})
-            return tree if len(tree.places) > 1 else nothing
+            held = {name: places for name, places in found.items() if places}
+            empty = tuple(name for name, places in found.items() if not places)
+            return Tree(kind, deep, held, empty) if len(held) > 1 else nothing
     return nothing
 
 
@@ -263,6 +268,13 @@ def _videos(root: Path, folder: Path) -> list[str]:
 def pictures_in(root: Path, folder: Path) -> list[str]:
     """List the pictures in a folder below a root, relative to that."""
     return [(folder / name).relative_to(root).as_posix() for name in image_names(folder)]
+
+
+def _without_gaps(cue: Cue, gaps: Sequence[int]) -> Cue:
+    """Return a cue that counts the frames that are left, not those that the footage had."""
+    start = cue.start_frame - bisect_left(gaps, cue.start_frame)
+    end = cue.end_frame - bisect_right(gaps, cue.end_frame)
+    return Cue(cue.expression_id, start, end)
 
 
 def _are_cameras(path: Path, names: Collection[str]) -> bool:
@@ -307,7 +319,10 @@ def _read(
     turns: dict[str, int] = {}
     lost: dict[str, str] = {}
     for camera, row in wanted.items():
-        first = path / row[min(row)] if row else path
+        if not row:
+            lost[camera] = "its folder holds no footage, or none that is selected"
+            continue
+        first = path / row[min(row)]
         try:
             turns[camera] = (
                 ORIENTATION[video_tags(first).turn] if kind == "videos" else read_exif(first)[0]
@@ -321,13 +336,17 @@ def _read(
     calibration = read_calibration(path, cameras, dropped)
     clips = tuple(selection.expression(sequence) for sequence in line.sequences)
     cues = read_cues(path / "cues.csv") if line.sequences == (CLIP,) else ()
-    warnings = unused_files(path, ids.values())
+    cues = tuple(_without_gaps(cue, line.gaps) for cue in cues)
+    gone = [cue for cue in cues if cue.start_frame > cue.end_frame]
+    skipped = {f"expression {cue.expression_id}": "all of its frames were left out" for cue in gone}
+    warnings = unused_files(path, dict.fromkeys([*ids.values(), *dropped]))
     if line.sequences != (CLIP,) and (path / "cues.csv").is_file():
         warnings["cues.csv"] = "is not read, as the files are named by their expressions"
     return RawCapture(
         root=path, subject=folder_id(path), fps=first_fps(videos) if videos else FPS, meta={},
-        cues=cues, cameras=cameras, dropped=dropped, calibration=calibration,
+        cues=tuple(cue for cue in cues if cue not in gone), cameras=cameras, dropped=dropped,
+        calibration=calibration,
         plates=read_plates(path, cameras), board=read_board(path, cameras),
-        clips=() if cues else clips, skipped=selection.left_out(sequences) | line.skipped,
-        warnings=warnings,
+        clips=() if cues else clips, warnings=warnings,
+        skipped=selection.left_out(sequences) | line.skipped | skipped,
     )  # fmt: skip

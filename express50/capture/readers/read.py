@@ -25,7 +25,7 @@ from express50.capture.raw import (
 from express50.capture.readers import codec_avatars, folders, pictures, renderme, videos
 from express50.capture.readers.selection import Selection, folder_id, parse_selection
 from express50.contract.layout import Dataset, footage_source
-from express50.errors import CalibrationError, CaptureError, Express50Error, check_known
+from express50.errors import CalibrationError, CaptureError, Express50Error, check_known, few
 from express50.files.text import check_links
 from express50.geometry.cameras import Camera
 from express50.rigs.world_frame import judge
@@ -111,6 +111,11 @@ def detect(path: Path, name: object = None) -> Layout:
     if name is not None:
         names = [OURS, *(layout.name for layout in LAYOUTS)]
         check_known(str(path), "layout", [str(name)], names, CaptureError)
+    whole = path.parents[1] if path.parent.name == "cameras" else path.parent
+    part = f"{path}: part of the capture {whole}; give that folder instead"
+    is_part = (whole / "capture.toml").is_file()
+    if is_part and whole != path.parent:  # a camera's folder would pass for a rig of one camera
+        raise CaptureError(part)
     for layout in LAYOUTS:
         if name in (None, layout.name) and ((name and layout.named) or layout.fits(path)):
             return layout
@@ -126,22 +131,23 @@ def detect(path: Path, name: object = None) -> Layout:
             f"{path}: a capture in our own layout, expected one of another layout as 'source'; give"
             " that folder itself, and leave out what you do not need in its cameras/ and cues.csv"
         )
-    if (path.parent / "capture.toml").is_file():
-        raise CaptureError(f"{path}: part of the capture {path.parent}; give that folder instead")
-    unclear = ""
-    if folders.holds_folders(path):
-        unclear = (
-            ". Its folders hold footage: write 'layout' into a capture.toml beside them, or give"
-            " each folder by itself if it is a person"
+    if is_part:
+        raise CaptureError(part)
+    if name is None and folders.holds_folders(path):
+        layouts = ", ".join(layout.name for layout in LAYOUTS if layout.named)
+        raise CaptureError(
+            f"{path}: its folders ({few(held)}) hold footage, but their names do not tell whether"
+            " they are people, cameras, expressions or frames; give each folder by itself if it is"
+            f" a person, or else write 'layout' into a capture.toml beside them (one of {layouts})"
         )
-    elif found := _deeper(path):
+    if found := _deeper(path):
         raise CaptureError(
             f"{path}: no known layout, but {found[0]} has one ({found[1].looks}); give that folder,"
             " and others like it"
         )
     raise CaptureError(
         f"{path}: no known layout; got {', '.join(held[:5]) or 'an empty folder'}, expected one "
-        f"of: {looks}; {OURS}: capture.toml and cameras/{unclear}"
+        f"of: {looks}; {OURS}: capture.toml and cameras/"
         + hint_at_undeveloped([path, *path.glob("*"), *path.glob("*/*")])
     )
 

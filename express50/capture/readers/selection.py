@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from express50.capture.raw import RawCamera
+from express50.console import count
 from express50.errors import CaptureError, few
 from express50.files.text import identifier, is_number
 
@@ -127,6 +128,7 @@ class Timeline:
     """Footage of the moments that all taken cameras share."""
 
     cameras: dict[str, RawCamera]  # the taken cameras by id
+    gaps: tuple[int, ...]  # places of moments left out, among those that most cameras have
     sequences: tuple[str, ...]  # in order
     dropped: dict[str, str]  # cameras that were left out, with the reason
     skipped: dict[str, str]  # sequences and frames that were left out, with the reason
@@ -173,7 +175,9 @@ def common_timeline(
             "copy or download them again"
         )
     rank = {sequence: number for number, sequence in enumerate(order)}
-    moments = sorted(shared, key=lambda m: (rank[m[0]], m[1]))
+    whole = sorted(common, key=lambda m: (rank[m[0]], m[1]))
+    gaps = tuple(place for place, moment in enumerate(whole) if moment not in shared)
+    moments = [moment for moment in whole if moment in shared]
     lengths = Counter(sequence for sequence, _ in moments)
     images = kind == "frames"
     cameras = {
@@ -187,7 +191,7 @@ def common_timeline(
         )
         for camera, table in taken.items()
     }
-    return Timeline(cameras, tuple(lengths), lost, skipped)
+    return Timeline(cameras, gaps, tuple(lengths), lost, skipped)
 
 
 def _lacking_cameras(
@@ -215,7 +219,8 @@ def _reasons(moments: Collection[Moment], who: str, has: str, kind: str) -> dict
     for moment in sorted(moments):
         found.setdefault(moment[0], []).append(moment)
     return {
-        f"{len(lost)} of the {kind} of {sequence} ({who})": f"{who} {has} picture of {_words(lost)}"
+        f"{count(len(lost), kind[:-1])} of {sequence} ({who})": f"{who} {has} picture of"
+        f" {_words(lost)}"
         for sequence, lost in found.items()
     }
 

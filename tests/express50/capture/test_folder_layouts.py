@@ -107,7 +107,7 @@ def test_cameras_and_expressions_may_be_two_levels_of_folders(tmp_path, layout, 
 def test_rigs_of_people_are_not_expressions_of_one(tmp_path):
     names = [f"{who}/cam{c}/{f}.png" for who in ("anna", "bob") for c in (0, 1) for f in (0, 1)]
     root = write(tmp_path / "day", names)
-    with pytest.raises(CaptureError, match="or give each folder by itself if it is a person"):
+    with pytest.raises(CaptureError, match="give each folder by itself if it is a person"):
         read_any(root)
     assert read_any(root / "anna").layout == "camera_folders"
     (root / "capture.toml").write_text('layout = "expression_folders"')
@@ -155,7 +155,7 @@ def test_a_rig_further_below_is_named(tmp_path):
 
 def test_folders_beside_each_other_are_not_chosen_from(tmp_path):
     root = write(tmp_path / "rig", ["images/left.png", "other/left.png"])
-    with pytest.raises(CaptureError, match="no known layout"):
+    with pytest.raises(CaptureError, match="its folders .images, other. hold footage"):
         read_any(root)
 
 
@@ -181,9 +181,7 @@ def test_names_that_do_not_tell_are_not_guessed_at(tmp_path):
     pairs = [(s, c) for s in (1, 2) for c in (0, 1)]
     for kind in ("png", "mp4"):
         root = write(tmp_path / kind, [f"S00{s}/cam{c}.{kind}" for s, c in pairs])
-        with pytest.raises(
-            CaptureError, match="write 'layout' into a capture.toml beside them, or"
-        ):
+        with pytest.raises(CaptureError, match="or else write 'layout' into a capture.toml beside"):
             read_any(root)
     (root / "capture.toml").write_text('layout = "expression_folders"\nsequences = ["S001"]')
     found = read_any(root)
@@ -193,6 +191,39 @@ def test_names_that_do_not_tell_are_not_guessed_at(tmp_path):
     (empty / "capture.toml").write_text('layout = "frame_folders"')
     with pytest.raises(CaptureError, match="its cameras share no frames .it has no cameras"):
         read_any(empty)
+
+
+def test_cues_count_the_frames_that_one_camera_lacks(tmp_path):
+    """Otherwise all later expressions would be looked for one frame late."""
+    names = [f"cam{c}/{1001 + f}.png" for c in (0, 1) for f in range(9)]
+    root = write(tmp_path / "rig", [name for name in names if name != "cam1/1004.png"])
+    cues = "expression_id,start_frame,end_frame\nneutral,0,2\nsmile,3,3\nfrown,4,5\njaw,2,8\n"
+    (root / "cues.csv").write_text(cues + "late,7,9\n")
+    found = read_any(root)
+    assert found.cameras["cam0"].stamps == (1001, 1002, 1003, 1005, 1006, 1007, 1008, 1009)
+    assert {c.expression_id: (c.start_frame, c.end_frame) for c in found.cues} == {
+        "neutral": (0, 2), "frown": (3, 4), "jaw": (2, 7), "late": (6, 8)
+    }  # fmt: skip
+    assert "expression smile" in found.skipped
+
+
+def test_a_camera_folder_without_footage_is_named(tmp_path):
+    root = write(tmp_path / "rig", ["cam0/1.png", "cam1/1.png"])
+    for name in ("cam2", "notes"):
+        (root / name).mkdir()
+    found = read_any(root)
+    assert list(found.cameras) == ["cam0", "cam1"] and list(found.dropped) == ["cam2"]
+    write_cameras(root / "calibration.json", rig(["cam0", "cam1", "cam2", "cam3"]))
+    write(root, ["plates/cam2.png", "plates/cam3.png"])
+    found = read_any(root)
+    assert list(found.dropped) == ["cam2", "cam3"] and "plates" not in found.warnings
+
+
+def test_a_cameras_folder_of_our_own_layout_is_no_capture(tmp_path):
+    folder = write(tmp_path / "S001", ["cameras/cam0/video.mp4"]) / "cameras/cam0"
+    (tmp_path / "S001/capture.toml").write_text('subject = "S001"\nfps = 24\n')
+    with pytest.raises(CaptureError, match="part of the capture .*S001; give that folder"):
+        subject_of(folder)
 
 
 def test_a_picture_without_a_number_is_named(tmp_path):

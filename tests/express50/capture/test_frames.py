@@ -77,6 +77,9 @@ def test_changed_footage_is_noticed(tmp_path):
     write_image(tmp_path / "S001/cameras/cam00/frames/000002.png", other)
     with pytest.raises(CaptureError, match="frame 2 has hash .* changed since it was ingested"):
         read_frame(dataset, "S001", "cam00", 2, undistort=False)
+    (tmp_path / "S001").rename(tmp_path / "moved")
+    with pytest.raises(CaptureError, match="S001: no such folder .* has moved, run 'express50 in"):
+        read_frame(dataset, "S001", "cam00", 2, undistort=False)
 
 
 def test_unknown_camera_and_frame_are_refused(ingested):

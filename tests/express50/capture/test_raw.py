@@ -127,6 +127,9 @@ def test_cameras_on_one_side_of_the_calibration_only_are_dropped(raw):
     assert list(capture.cameras) == ["cam01", "cam02"]
     assert "not in calibration.json" in capture.dropped["cam00"]
     assert "the capture has no footage of it" in capture.dropped["cam77"]
+    table["CAM00"] = table.pop("cam77")
+    path.write_text(json.dumps(table))
+    assert "did you mean 'CAM00'" in read_capture(raw).dropped["cam00"]
 
 
 def test_board_is_listed_by_camera(raw):

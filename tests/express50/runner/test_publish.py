@@ -5,6 +5,7 @@ import os
 import pytest
 
 from express50.contract.layout import Dataset
+from express50.errors import FormatError
 from express50.files import atomic
 from express50.files.atomic import dump_json, folder_in_one_step, write_bytes, write_json
 from express50.runner.publish import clean_leftovers, publishing, run_folder, set_aside
@@ -150,3 +151,5 @@ def test_json_is_sorted_and_refuses_what_is_not_finite():
     )
     with pytest.raises(ValueError, match="not JSON compliant"):
         dump_json({"a": float("inf")})
+    with pytest.raises(FormatError, match="Söhne/M ller.*: holds a name that is not UTF-8"):
+        dump_json({"a": "Söhne/M\udcfcller"})
