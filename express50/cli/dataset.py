@@ -215,8 +215,7 @@ def run_prune(args: argparse.Namespace) -> int:
 
     dataset = existing_dataset(args.dataset)
     folders = [dataset.replaced_dir, dataset.stale_dir, dataset.pilot_dir]
-    trials = map(Dataset, dataset.pilot_dir.glob("*"))
-    if any(is_running(trial, name) for trial in trials for name in stages()):
+    if is_running(dataset, "run"):  # within a budget, or `tune`
         log("a trial is running, so trials are kept")
         folders.remove(dataset.pilot_dir)
     freed = map(empty, folders)

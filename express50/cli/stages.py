@@ -238,6 +238,7 @@ def _chain(args: argparse.Namespace) -> Iterator[Any]:
     """Open a dataset's chain with all settings of its stages; yield None if it cannot run."""
     from express50.dial.pilot import Chain
     from express50.runner.executor import Pool
+    from express50.runner.publish import stage_lock
     from express50.runner.worker import cap_threads
 
     if args.preset is not None:
@@ -271,7 +272,8 @@ def _chain(args: argparse.Namespace) -> Iterator[Any]:
         for stage in known:
             if stage.prepare is not None and args.captures:
                 stage.prepare(dataset, args.captures, args.replace)
-        yield Chain(known, dataset, ladders, pool, log if args.json else say)
+        with stage_lock(dataset, "run"):  # two would delete each other's trials
+            yield Chain(known, dataset, ladders, pool, log if args.json else say)
 
 
 def _exit_code(summaries: Sequence[Any], strict: bool) -> int:

@@ -3,11 +3,14 @@
 import pytest
 
 from express50.__main__ import main
-from express50.console import USAGE
+from express50.console import FAILED, USAGE
 from express50.contract.layout import Dataset
 from express50.dataset.report import render_page
 from express50.dial.measuring import tune
+from express50.runner.publish import stage_lock
 from tests.express50.dial.toy_chain import PAUSE, captures_of, chain_of
+from tests.stages import ingest_captures
+from tests.synth import make_capture
 
 
 @pytest.mark.parametrize(
@@ -25,6 +28,16 @@ def test_wrong_usage_is_one_line_and_starts_nothing(tmp_path, capsys, options, w
     error = capsys.readouterr().err
     assert words in error and error.count("\n") == 1
     assert not (tmp_path / "data").exists()
+
+
+def test_a_second_budgeted_run_at_once_is_refused(tmp_path, capsys):
+    """The second one's trials failed where the first had the stage, so it chose other settings."""
+    make_capture(tmp_path / "S001", cameras=2)
+    dataset = ingest_captures(tmp_path / "data", tmp_path / "S001")
+    with stage_lock(dataset, "run"):
+        for command in (["run", "--budget", "5m"], ["tune"]):
+            assert main([command[0], str(dataset.root), *command[1:]]) == FAILED
+            assert "another 'run' is running on this dataset; wait" in capsys.readouterr().err
 
 
 def test_tune_has_no_option_that_needs_chosen_settings(capsys):

@@ -10,7 +10,6 @@ from unittest.mock import Mock
 import pytest
 
 from express50.__main__ import main
-from express50.contract.layout import Dataset
 from express50.dataset.audit import audit
 from express50.runner import publish
 from express50.runner.ledger import Ledger
@@ -179,13 +178,14 @@ def test_prune_empties_the_store_and_says_what_it_freed(dataset, capsys):
 
 
 def test_prune_deletes_trials_unless_one_is_running(dataset, capsys):
-    trial = Dataset(dataset.pilot_dir / "0123")
-    with stage_lock(trial, "matte"):
-        (trial.root / "trial.json").write_text("{}")
+    trial = dataset.pilot_dir / "0123"
+    trial.mkdir(parents=True)
+    with stage_lock(dataset, "run"):
+        (trial / "trial.json").write_text("{}")
         assert main(["prune", str(dataset.root)]) == 0
         shown = capsys.readouterr()
         assert "freed 0 bytes" in shown.out and "a trial is running" in shown.err
-        assert (trial.root / "trial.json").is_file()
+        assert (trial / "trial.json").is_file()
     assert main(["prune", str(dataset.root)]) == 0
-    assert "freed 2 bytes in 2 files" in capsys.readouterr().out
+    assert "freed 2 bytes in 1 file\n" in capsys.readouterr().out
     assert not dataset.pilot_dir.exists()
