@@ -90,15 +90,15 @@ def _memory_problems(ledger: Ledger, stages: Iterable[Stage], pool: Pool) -> Ite
     total = psutil.virtual_memory().total
     if CGROUP_LIMIT.is_file() and (text := CGROUP_LIMIT.read_text().strip()).isdigit():
         total = min(total, int(text))
-    for stage in stages:
-        done = (r.peak_memory for r in ledger.read(stage.name).values() if r.status == "done")
-        peak = max(done, default=0)
-        fit = max(math.floor(total * WORKER_SHARE / max(peak, 1)), 1)
-        if pool.workers > fit:
-            yield (
-                f"{stage.name}: {pool.workers} workers need {decimal(peak)} each (as the largest "
-                f"item did), and this machine has {decimal(total)}; use --workers {fit}"
-            )
+    receipts = [receipt for stage in stages for receipt in ledger.read(stage.name).values()]
+    done = [(r.peak_memory, r.stage) for r in receipts if r.status == "done"]
+    peak, stage = max(done, default=(0, ""))
+    fit = max(math.floor(total * WORKER_SHARE / max(peak, 1)), 1)
+    if pool.workers > fit:
+        yield (
+            f"{stage}: {pool.workers} workers need {decimal(peak)} each (as the largest "
+            f"item did), and this machine has {decimal(total)}; use --workers {fit}"
+        )
 
 
 def expected_bytes(
