@@ -24,7 +24,7 @@ OUTSIDE, INSIDE, HELD = 0, 1, 2  # rows of the constant blocks and the first row
 VOXEL_LIMIT = 60_000_000
 BORDER = 1e-4  # metres; the least distance on the box's border, which closes a surface cut by it
 CHUNK = 1024  # blocks worked on at a time
-STEEPEST = 2.0  # how fast a function given to `build` may change, metres per metre
+STEEPEST = 2.0  # how fast hulls and what is merged with them change, metres per metre
 
 Values = Callable[[np.ndarray], np.ndarray]
 
@@ -152,11 +152,14 @@ def box_shape(extent: np.ndarray, voxel: float) -> tuple[int, int, int]:
     return int(x), int(y), int(z)
 
 
-def build(low: np.ndarray, high: np.ndarray, voxel: float, distance: Values) -> LevelSet:
+def build(
+    low: np.ndarray, high: np.ndarray, voxel: float, distance: Values, steepest: float = STEEPEST
+) -> LevelSet:
     """Make the grid of a function of points (N, 3), metres, in the box with corners (3,), (3,).
 
-    Blocks are chosen by the distance at their middles. Where it jumps, neighbouring signs differ
-    without a surface between them: these blocks are evaluated too, until none is left.
+    Blocks are chosen by the distance at their middles, which changes by at most ``steepest`` metres
+    per metre. Where it jumps, neighbouring signs differ without a surface between them: these
+    blocks are evaluated too, until none is left.
     """
     shape = box_shape(high - low, voxel)
     size = tuple(-(-n // BLOCK) for n in shape)
@@ -165,7 +168,7 @@ def build(low: np.ndarray, high: np.ndarray, voxel: float, distance: Values) -> 
     parts = np.array_split(middle, 1 + len(middle) // 100_000)
     guess = np.concatenate([distance(part) for part in parts]).reshape(size)
     to_corner = 3**0.5 * (BLOCK - 1) / 2
-    wanted = np.abs(guess) < (BAND + STEEPEST * to_corner) * voxel
+    wanted = np.abs(guess) < (BAND + steepest * to_corner) * voxel
     border = np.ones(size, bool)
     border[1:-1, 1:-1, 1:-1] = False
     wanted |= border & (guess < 0)

@@ -123,7 +123,8 @@ def tracked_surface(
     voxel = finest_voxel([view], (solid.low + solid.high) / 2, voxel_mm, voxel_px)
     low, high = solid.low - 4 * voxel, solid.high + 4 * voxel
     _check_size(low, high, voxel)
-    return _finished([view], [view], build(low, high, voxel, solid.distance), noise)
+    grid = build(low, high, voxel, solid.distance, steepest=1.0)  # exact distances
+    return _finished([view], [view], grid, noise)
 
 
 def finest_voxel(
