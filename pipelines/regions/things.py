@@ -13,8 +13,9 @@ front of it. A ray that ends on the face leaves no room for things in front: agr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -211,9 +212,10 @@ class _Sweep:
     face: np.ndarray  # (h, w) bool
     places: np.ndarray  # (h, w, 3) on the head, about its centre
     ways: np.ndarray  # (h, w, 3) unit, towards them
+    free: np.ndarray  # (HEIGHTS_M, h, w) bool, where there may be a thing in front of the face
+    # `_compared` fills these where there is room for things
     on_face: np.ndarray  # (h, w) best agreement within NEAR_M of the head
     before: np.ndarray  # (HEIGHTS_M, h, w) best agreement in front of the head
-    free: np.ndarray  # (HEIGHTS_M, h, w) bool, where there may be a thing in front of the face
 
     def face_view(self, center: np.ndarray) -> FaceView:
         """Tell the face from things; the head's `center` (3,) is in the world."""
@@ -320,26 +322,44 @@ def _sweep(head: TrackedHead, shots: Sequence[_Shot], own: int, face: np.ndarray
     places = unproject(part, cell_to_corner(cells), depth[window][row, column].ravel())
     ways = unit(places - camera.center)
     places, ways = (values.reshape(*shape, 3) for values in (places - head.center, ways))
-    lines = [_line(shot.camera, head.center, places, ways) for shot in shots]
-    free = np.repeat(face[None, *window], len(HEIGHTS_M), axis=0)
-    for line, shot in zip(lines, shots, strict=True):
-        for room, offset in zip(free, HEIGHTS_M, strict=True):
-            if room.any():
-                room &= _sampled(shot.alpha, _pixels_at(line, offset), 1.0) > 0.5
-    mine = _patches(shots[own].grey[window])
     sights = unit(np.array([shot.camera.center - head.center for shot in shots]))
     cosine = sights @ sights[own]
+    free = np.repeat(face[None, *window], len(HEIGHTS_M), axis=0)
+    for k in np.argsort(np.abs(cosine), kind="stable"):  # views from the side leave the least room
+        kept = partial(_in_matte, shots[k].alpha)
+        _narrow(free, head.center, places, ways, shots[k].camera, kept)
+    none = np.zeros(shape, np.float32), np.full(free.shape, np.float32(-1))
+    sweep = _Sweep(camera, depth, window, face[window], places, ways, free, *none)
     ranked = np.argsort(np.abs(cosine - BEST_APART), kind="stable").tolist()
-    chosen = [k for k in ranked if APART[0] < cosine[k] < APART[1]][:NEIGHBOURS]
-    near = [(shots[k], lines[k]) for k in chosen]
+    chosen = [shots[k] for k in ranked if APART[0] < cosine[k] < APART[1]][:NEIGHBOURS]
+    _compare(head, sweep, _patches(shots[own].grey[window]), chosen)
+    return sweep
+
+
+def _compare(
+    head: TrackedHead, sweep: _Sweep, mine: tuple[np.ndarray, ...], shots: Sequence[_Shot]
+) -> None:
+    """Fill in how well a view's `_patches` agree with other shots where there is room for things.
+
+    On a bare face that many cameras see, this is a hundredth of the pixels.
+    """
     step = STEPS_M[1] - STEPS_M[0]
     about = np.arange(-NEAR_M, NEAR_M + step / 2, step)
-    on_face = np.max([_agreement(mine, near, offset) for offset in about], axis=0)
-    before = np.full(free.shape, np.float32(-1))
-    for k, offset in enumerate(HEIGHTS_M):
-        if free[k].any():
-            before[k] = np.max([_agreement(mine, near, offset + more) for more in STEPS_M], axis=0)
-    return _Sweep(camera, depth, window, face[window], places, ways, on_face, before, free)
+    reach = np.ones((2 * PATCH_PX - 1, 2 * PATCH_PX - 1), np.uint8)  # patches are averaged again
+    count, parts = cv2.connectedComponents(cv2.dilate(sweep.free.any(0).astype(np.uint8), reach))
+    for number in range(1, count):
+        box = box_about(parts == number)
+        inside = parts[box] == number
+        patches = tuple(values[box] for values in mine)
+        places, ways = sweep.places[box], sweep.ways[box]
+        near = [(shot, _line(shot.camera, head.center, places, ways)) for shot in shots]
+        best = np.max([_agreement(patches, near, offset) for offset in about], axis=0)
+        sweep.on_face[box][inside] = best[inside]
+        for free, before, offset in zip(sweep.free, sweep.before, HEIGHTS_M, strict=True):
+            if free[box].any():
+                offsets = [offset + more for more in STEPS_M]
+                best = np.max([_agreement(patches, near, each) for each in offsets], axis=0)
+                before[box][inside] = best[inside]
 
 
 def _agreement(
@@ -397,9 +417,36 @@ def _sampled(
 def _carve(head: TrackedHead, sweep: _Sweep, views: Sequence[FaceView]) -> None:
     """Remove from a sweep the room in front of the face that other views see."""
     for view in views:
-        line = _line(view.camera, head.center, sweep.places, sweep.ways)
         ends = np.where(view.bare, view.depth - np.float32(NEAR_M), 0)
-        for room, offset in zip(sweep.free, HEIGHTS_M, strict=True):
-            if room.any():
-                point = _pixels_at(line, offset)
-                room &= point[2] >= _sampled(ends, point, 0.0)
+        kept = partial(_not_before, ends)
+        _narrow(sweep.free, head.center, sweep.places, sweep.ways, view.camera, kept)
+
+
+def _narrow(
+    free: np.ndarray,
+    center: np.ndarray,
+    places: np.ndarray,
+    ways: np.ndarray,
+    camera: Camera,
+    kept: Callable[[np.ndarray], np.ndarray],
+) -> None:
+    """Remove from the room (HEIGHTS_M, h, w) in front of places what a view does not keep.
+
+    `kept` marks the points (3, h, w) of `_pixels_at`.
+    """
+    box = box_about(free.max(0))
+    line = _line(camera, center, places[box], ways[box])
+    for room, offset in zip(free[:, *box], HEIGHTS_M, strict=True):
+        if room.any():
+            part = (slice(None), *box_about(room))
+            room[part[1:]] &= kept(_pixels_at((line[0][part], line[1][part]), offset))
+
+
+def _in_matte(alpha: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Mark the points (3, h, w) that lie in a matte (H, W) or outside of the picture."""
+    return _sampled(alpha, point, 1.0) > 0.5
+
+
+def _not_before(ends: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Mark the points (3, h, w) that lie no nearer than a picture of depths (H, W)."""
+    return point[2] >= _sampled(ends, point, 0.0)
