@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,10 +20,11 @@ from scipy.spatial import cKDTree
 
 from express50.capture.frames import FrameReader
 from express50.capture.index import Cue, Index
-from express50.capture.raw import RawCamera, check_focals, read_capture
+from express50.capture.raw import RawCamera, check_focals
+from express50.capture.readers.read import read_any
 from express50.errors import CalibrationError, CaptureError, FormatError
-from express50.files.containers import read_picture
-from express50.files.images import read_exif
+from express50.files.containers import inside, read_picture
+from express50.files.images import read_exif, upright
 from express50.files.video import iterate_video
 from express50.geometry.cameras import Camera, resized
 from express50.geometry.conventions import opencv_pixels_to_corner
@@ -85,15 +87,17 @@ def read_footage(index: Index, cameras: Mapping[str, Camera], count: int) -> Ima
 
 
 def read_raw_footage(root: Path, cameras: Mapping[str, Camera], count: int) -> Images:
-    """Yield reduced images of a raw capture at up to `count` instants, as `read_footage` does.
+    """Yield reduced images of a capture of any layout at up to `count` instants.
+
+    They are chosen as `read_footage` does.
 
     Only the first frame of a video without cues is read, because its length is unknown.
 
     Raises:
         CaptureError: the capture is unusable, or a camera has no such frame.
     """
-    capture = read_capture(root)
-    lengths = [len(camera.names) for camera in capture.cameras.values() if camera.names]
+    capture = read_any(root)
+    lengths = [len(one.names) for one in capture.cameras.values() if one.kind == "frames"]
     wanted = sorted(_middles(capture.cues, count)) or evenly(range(min(lengths, default=1)), count)
     for name in sorted(set(capture.cameras) & set(cameras)):
         for frame, image in _read_raw(capture.cameras[name], wanted):
@@ -114,9 +118,11 @@ def _read_raw(camera: RawCamera, wanted: list[int]) -> Iterator[tuple[int, np.nd
                 yield frame, read_picture(camera.path, camera.names[frame], camera.orientation)
             return
     else:
-        for length, (_, image) in enumerate(iterate_video(camera.path), 1):
+        videos = [inside(camera.path, name) for name in camera.names] or [camera.path]
+        images = chain.from_iterable(map(iterate_video, videos))
+        for length, (_, image) in enumerate(images, 1):
             if length - 1 in wanted:
-                yield length - 1, image
+                yield length - 1, upright(image, camera.orientation)
             if length > max(wanted):
                 return
     missing = min(frame for frame in wanted if frame >= length)

@@ -35,6 +35,7 @@ from pipelines.calibrate.tracks import (
 )
 from tests.balls import meet_ball
 from tests.pipelines.face_rigs import face_cameras, see
+from tests.synth import noise_video_images, turn_video, write_frames, write_video
 
 pytestmark = pytest.mark.usefixtures("no_faces")
 TURN, SHIFT = np.radians(0.3), 5e-3
@@ -286,6 +287,25 @@ def test_frame_sets_follow_the_cues_and_a_short_camera_is_named(footage, tmp_pat
     (tmp_path / "capture" / "cues.csv").write_text(cues)
     with pytest.raises(CaptureError, match="has 1 frames, expected a frame 3"):
         list(read_raw_footage(tmp_path / "capture", rig, 2))
+
+
+def test_footage_of_other_layouts_is_read(tmp_path):
+    """Pictures and turned videos of a rig in folders, as `ingest` reads them."""
+    rig = make_rig(2, 64)
+    (tmp_path / "videos").mkdir()
+    for name in rig:
+        write_frames(tmp_path / "pictures" / name, noise_video_images(3))
+        write_video(tmp_path / "videos" / f"{name}.mp4", noise_video_images(3))
+        turn_video(tmp_path / "videos" / f"{name}.mp4")
+    for layout in ("pictures", "videos"):
+        (tmp_path / layout / "cues.csv").write_text(
+            "expression_id,start_frame,end_frame\nsmile,1,1"
+        )
+        seen = list(read_raw_footage(tmp_path / layout, rig, 1))
+        assert [(frame, name) for frame, name, _ in seen] == [(1, name) for name in rig]
+        expected = noise_video_images(3)[1]
+        turned = expected if layout == "pictures" else np.rot90(expected, -1)
+        assert np.abs(seen[0][2].astype(int) - turned).mean() < 10
 
 
 def test_calibrate_warns_of_the_camera_and_goes_on(footage, tmp_path, capsys):
