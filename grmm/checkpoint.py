@@ -157,8 +157,9 @@ def read_content(path: Path) -> dict[str, Any]:
     Raises:
         FormatError: no such file, not a checkpoint of this format, or bytes in it have changed.
     """
-    remedy = "name the checkpoint.pt of 'grmm train' or 'grmm fit'; if it is damaged, copy it again"
-    remedy += " or make it again with --overwrite"
+    remedy = "name the checkpoint.pt of 'grmm train' or 'grmm fit'"
+    if path.is_file():
+        remedy += "; if it is damaged, copy it again or make it again with --overwrite"
     content = read_weights(path, FormatError, str(path), "a checkpoint", remedy)
     found = content.get("format") if isinstance(content, dict) else None
     if found != FORMAT:

@@ -269,7 +269,7 @@ def split_cues(cues: tuple[Cue, ...], frames: int) -> tuple[tuple[Cue, ...], dic
     """Return the cues inside the footage, and why the others are dropped."""
     outside = {
         cue.expression_id: f"cue runs from frame {cue.start_frame} to {cue.end_frame}, the "
-        f"footage has frames 0 to {frames - 1}; correct cues.csv"
+        f"footage has frames 0 to {frames - 1}, whatever its files are called; correct cues.csv"
         for cue in cues
         if cue.end_frame >= frames
     }
