@@ -15,8 +15,6 @@ from unittest import mock
 
 import torch
 from torch import Tensor, nn
-from torchmetrics.functional.image import lpips as torchmetrics_lpips
-from torchmetrics.image.fid import FrechetInceptionDistance
 
 from express50.errors import ConfigError
 from express50.files.arrays import DAMAGE
@@ -98,6 +96,9 @@ class PerceptualMetrics:
         pairs = [pair for rows in groups for pair in rows]
         if len(pairs) < FID_LEAST_IMAGES:
             return None
+        # Imported where it is needed: it takes seconds, and few have these networks.
+        from torchmetrics.image.fid import FrechetInceptionDistance
+
         features = nn.Identity()  # ready ones pass through, where torchmetrics expects a network
         features.num_features = len(pairs[0][0])
         metric = FrechetInceptionDistance(feature=features)
@@ -128,10 +129,12 @@ def alexnet_features() -> nn.Sequential:
 
 def load_lpips(path: Path) -> nn.Module:
     """Build torchmetrics' LPIPS on the AlexNet of a torchvision state dict; see `load_features`."""
+    from torchmetrics.functional.image import lpips
+
     backbone = load_features(path, "metrics.alexnet", "alexnet", alexnet_features())
     # Torchmetrics asks torchvision for the layers alone; not every build of torch has one.
-    with mock.patch.object(torchmetrics_lpips, "_get_tv_model_features", lambda *_: backbone):
-        return torchmetrics_lpips._NoTrainLpips(net="alex", pnet_rand=True)
+    with mock.patch.object(lpips, "_get_tv_model_features", lambda *_: backbone):
+        return lpips._NoTrainLpips(net="alex", pnet_rand=True)
 
 
 def load_inception(path: Path) -> torch.jit.ScriptModule:
