@@ -170,8 +170,10 @@ def find_face(source: Source, painter: ScanPainter) -> FacePose:
             camera = place_camera(middle, way, np.eye(3)[np.abs(way).argmin()], 0.8 * size)
             picture, inwards = painter.picture(camera)
             turned.append(inwards)
+            if inwards >= 0.5:  # the inside of a face, from behind
+                continue
             face = source(picture, camera.id, 0).face
-            if inwards < 0.5 and face.score > found:  # not the inside of a face, from behind
+            if face.score > found:
                 best, found = (camera, face), face.score
     if best is None or found < LEAST_SCORE:
         unseen = "no side of the scan shows a face; is it a head, its triangles facing out?"
