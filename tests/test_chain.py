@@ -34,10 +34,13 @@ STAGES = (
 SIZE = ["--set", "encode.size=96"]
 SETTINGS = {"encode": SIZE, "pack": [*SIZE, "--set", 'pack.test_subjects=["S002"]']}
 RECORDING = [
-    "--subjects=2", "--cameras=6", "--give-calibration", "--width=192", "--height=192",
-    "--frames-per-expression=4", "--board-frames=0",
-    "--expressions=neutral,smile,jaw_open", "--seed=3", "--workers=2",
+    "--subjects=1", "--cameras=6", "--give-calibration", "--width=192", "--height=192",
+    "--frames-per-expression=4", "--board-frames=0", "--seed=5", "--workers=1",
 ]  # fmt: skip
+PEOPLE = [
+    ["--first-subject=1", "--expressions=neutral,smile"],
+    ["--first-subject=2", "--expressions=neutral,jaw_open"],
+]
 
 
 def _captures(twin: Path) -> list[str]:
@@ -51,9 +54,12 @@ def _stage(name: str, dataset: Path, twin: Path) -> list[str]:
 
 @pytest.fixture(scope="module")
 def twin(tmp_path_factory):
-    """Two people, six cameras, three expressions."""
+    """Two people before six cameras; each shows the neutral expression and one of two others."""
     root = tmp_path_factory.mktemp("twin")
-    assert main(["twin", "record", str(root), *RECORDING]) == 0
+    for number, person in enumerate(PEOPLE):
+        alone = root / f"alone{number}"
+        assert main(["twin", "record", str(alone), *RECORDING, *person]) == 0
+        shutil.copytree(alone, root, dirs_exist_ok=True)
     return root
 
 
@@ -92,7 +98,7 @@ def test_each_peak_frame_is_decoded_once(dataset, reads):
         for frame in read_peaks(dataset, subject).values():
             expected += [(str(index.capture / c.source), frame) for c in index.cameras.values()]
     assert sorted(reads["frames"]) == sorted(expected)
-    assert len(expected) == 2 * 3 * 6
+    assert len(expected) == 2 * 2 * 6
     assert len({path for path, _ in reads["observe"]}) <= len(dataset.subjects())  # one camera
     others = reads.keys() - {"calibrate", "frames", "observe"}
     assert not [name for name in others if reads[name]]
@@ -104,20 +110,20 @@ def stage_bytes(root: Path) -> dict[str, bytes]:
 
 
 def test_footage_alone_gives_figures_close_to_the_truth(dataset, twin, tmp_path):
-    """Bounds are 1.5 times the measured errors; of shares, of what they lack to 1."""
+    """Bounds are at most 1.5 times the measured errors; of shares, of what they lack to 1."""
     figures = measure_dataset(dataset, twin / "truth", tmp_path / "accuracy")
     assert figures["align.peak_error_frames_median"] <= 0.75
-    assert figures["matte.mae"] < 0.012
+    assert figures["matte.mae"] < 0.0093
     assert figures["track.vertex_rmse_mm"] < 4.9
     assert figures["depth.abs_error_mm_median"] < 3.4
-    assert figures["depth.coverage"] > 0.95
-    assert figures["regions.head_mae"] < 0.0145 and figures["regions.iou_mean"] > 0.67
+    assert figures["depth.coverage"] > 0.967
+    assert figures["regions.head_mae"] < 0.0109 and figures["regions.iou_mean"] > 0.67
     assert (tmp_path / "accuracy" / "depth_error.jpg").exists()
 
 
 def test_shards_hold_every_view_and_split_by_subject(dataset):
     reader = ShardReader(dataset.item_dir("pack", "shards"))
-    assert len(reader) == 2 * 3 * 6
+    assert len(reader) == 2 * 2 * 6
     sample = reader.sample(0)
     assert sample["rgb"].shape == (96, 96, 3)
     assert sample["parts"].shape == (96, 96) and sample["meta"]["torso"] == "removed"
@@ -241,7 +247,7 @@ def test_report_and_training_follow(dataset, tmp_path):
     assert len({held_out, *given}) == 3
     shards = str(dataset.item_dir("pack", "shards"))
     out = dataset.root / "grmm" / "train"
-    assert grmm(["train", shards, str(out), "--preset", "demo", "--seconds", "6"]) == 0
+    assert grmm(["train", shards, str(out), "--preset", "demo", "--seconds", "3"]) == 0
     assert json.loads((out / "metrics.json").read_text())["iterations"] >= 1
     assert main(["report", str(dataset.root), "--out", str(tmp_path)]) == 0
     page = (tmp_path / "index.html").read_text()

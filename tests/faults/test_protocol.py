@@ -1,5 +1,6 @@
 """No state of the protocol is wrong, its mistakes are found, and the code does what it says."""
 
+import functools
 import itertools
 import os
 import shutil
@@ -53,7 +54,8 @@ def test_every_mistake_is_found(mistake):
     assert wrong == HARM[mistake] and way
 
 
-def ways(states: Iterable[State], step: str, rules: Rules) -> set[State]:
+@functools.cache  # runs that are killed one call later begin alike
+def ways(states: frozenset[State], step: str, rules: Rules) -> frozenset[State]:
     """Return the states after a step that was seen, with any number of unseen ones before it."""
     kills = ("kill driver", "kill worker") if step == "kill" else ()
     reached, new, after = set(states), list(states), set()
@@ -69,15 +71,18 @@ def ways(states: Iterable[State], step: str, rules: Rules) -> set[State]:
             if quiet and following not in reached:
                 reached.add(following)
                 new.append(following)
-    return {s for s in reached if not s.runs and not alive(s)} if step == "kill" else after
+    if step == "kill":
+        after = {s for s in reached if not s.runs and not alive(s)}
+    return frozenset(after)
 
 
 def alive(state: State) -> list:
     return [make for make in state.makes if not make.at.startswith("dead")]
 
 
-def follow(recorded: list[str], states: Iterable[State], rules: Rules) -> set[State]:
+def follow(recorded: list[str], states: Iterable[State], rules: Rules) -> frozenset[State]:
     """Return the states in which the model may be after what was recorded; fails if none."""
+    states = frozenset(states)
     for number, step in enumerate(recorded):
         states = ways(states, step, rules)
         assert states, f"after {recorded[:number]} the model has no step {step!r}"
