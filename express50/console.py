@@ -159,9 +159,7 @@ def run_handler(
             traceback.print_exception(error)
         return USAGE if isinstance(error, ConfigError) else FAILED
     except KeyboardInterrupt:
-        sys.stderr.write(
-            f"{program}: interrupted; finished work is kept, the same command makes the rest\n"
-        )
+        log(f"{program}: interrupted; finished work is kept, the same command makes the rest")
         return INTERRUPTED
 
 
@@ -314,7 +312,8 @@ def _naming_output() -> Iterator[None]:
 
 def log(line: str) -> None:
     """Write a line of progress to standard error; standard output is for results."""
-    with ignoring_closed_pipe(sys.stderr):
+    # Work does not stop because nobody can see it, as after the end of a connection.
+    with contextlib.suppress(OSError), ignoring_closed_pipe(sys.stderr):
         sys.stderr.write(printable(line) + "\n")
         sys.stderr.flush()
 

@@ -310,11 +310,15 @@ def append_log(path: Path, state: TrainState) -> None:
 
 @contextlib.contextmanager
 def deferred_interrupt() -> Iterator[Event]:
-    """Let the current iteration end before Ctrl-C or SIGTERM takes effect; they set the event."""
+    """Let the current iteration end before a stop takes effect: it sets the event.
+
+    That is Ctrl-C, SIGTERM, or the end of a terminal or connection, unless ``nohup`` ignores it.
+    """
     interrupt, former = Event(), {}
     try:
         if current_thread() is main_thread():  # no other gets signals
-            for number in (signal.SIGINT, signal.SIGTERM):
+            hangup = (signal.SIGHUP,) if signal.getsignal(signal.SIGHUP) == signal.SIG_DFL else ()
+            for number in (signal.SIGINT, signal.SIGTERM, *hangup):
                 former[number] = signal.signal(number, lambda *_: interrupt.set())
         yield interrupt
     finally:

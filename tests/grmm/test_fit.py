@@ -207,7 +207,7 @@ def at_step(monkeypatch, stage, iteration, act):
 
 @pytest.mark.parametrize(
     ("stage", "iteration", "number"),
-    [(1, 1, signal.SIGINT), (1, 2, signal.SIGINT), (2, 0, signal.SIGINT), (2, 1, signal.SIGTERM)],
+    [(1, 1, signal.SIGINT), (1, 2, signal.SIGHUP), (2, 0, signal.SIGINT), (2, 1, signal.SIGTERM)],
 )
 def test_an_interrupted_fit_goes_on_and_gives_the_same_bytes(
     loaded, views, tmp_path, monkeypatch, stage, iteration, number

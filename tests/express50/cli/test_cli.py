@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -378,6 +379,15 @@ def test_standard_streams_that_are_full_or_closed_are_one_line_at_most(stream):
     done = subprocess.run(["/bin/sh", "-c", command], capture_output=True, text=True)
     words = "express50: OSError: standard output: No space left on device; free some space\n"
     assert (done.returncode, done.stderr) == ((1, words) if full else (0, ""))
+
+
+def test_work_goes_on_where_progress_cannot_be_written(monkeypatch):
+    worked = False
+    with suppress(OSError), Path("/dev/full").open("w", buffering=1) as full:  # of its end
+        monkeypatch.setattr(sys, "stderr", full)
+        log("item 1 of 2")
+        worked = True
+    assert worked
 
 
 def made_by(*arguments: str) -> list[str]:
