@@ -90,10 +90,10 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
             " so the mesh follows the surface less: check calibration and synchronisation; cameras"
             " that stand far apart or see a small head agree less, too"
         )
-        warnings.append(Note(expression, why))
+        warnings.append(Note("mesh", why))
     elif metrics["seen_share"] < LEAST_SEEN:
         why = f"the surface was found at only {metrics['seen_share']:.0%} of the face's vertices"
-        warnings.append(Note(expression, why))
+        warnings.append(Note("mesh", why))
     expected = bounds.expected
     if shape_spread(track.shape) > LARGEST_SPREAD:  # the error model knows people only
         expected = None
