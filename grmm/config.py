@@ -68,7 +68,8 @@ class ModelConfig:
     """Channels of the refinement U-Net per level; empty for the ablation "without refinement".
     G9."""
     refine_alpha: bool = False
-    """Show the refinement alpha too: normalised depth is 0 at the nearest pixel and behind. G9."""
+    """Give the refinement alpha too: normalised depth is 0 both at the nearest pixel and in the
+    background. G9."""
     refine_unshuffle: int = 1
     """Pixel-unshuffle factor before the refinement; 2 makes it four times cheaper. G9."""
 
@@ -143,8 +144,8 @@ class DataConfig:
     """Ignore pixels where the torso is in front of the neck: each camera sees a different side
     of the collar. The paper treats them as background, which contradicts other views."""
     hide_behind_torso: bool = False
-    """Draw nothing where the footage's depth has the torso in front of it, if the shards know that
-    depth. Otherwise all cameras must agree on where the neck ends."""
+    """Draw the background where the footage's torso is nearer than what was drawn, if the shards
+    have the torso's depth. Otherwise all cameras must agree on where the neck ends."""
 
     def __post_init__(self) -> None:
         check_ranges("data", self, background=(0, 1))
@@ -258,7 +259,7 @@ def _plus(changes: Preset) -> Preset:
     return {table: PLUS.get(table, {}) | changes.get(table, {}) for table in {**PLUS, **changes}}
 
 
-# ``paper`` follows the paper exactly, ``paper-plus`` adds our changes at its sizes, ``small`` suits
+# ``paper`` has the paper's settings, ``paper-plus`` adds our changes at its sizes, ``small`` suits
 # one GPU, ``demo`` a few minutes on two CPU cores.
 PRESETS: dict[str, Preset] = {
     "paper": {},

@@ -23,7 +23,7 @@ class AlignConfig:
     """Settings of the align stage."""
 
     accept: float = 0.0
-    """Accept suggestions with at least this confidence without a person, 0 (all) to 1 (none)."""
+    """Accept suggestions with at least this confidence automatically, 0 (all) to 1 (none)."""
     match: bool = True
     """Match to the reference person's canonical frames; false takes each subject's own peak."""
 

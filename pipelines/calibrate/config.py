@@ -30,8 +30,9 @@ class CalibrateConfig:
     """Rough distance of the cameras from the head, at which solving from footage starts if neither
     EXIF nor capture.toml gives the focal lengths."""
     eye_distance_mm: float = 63.0
-    """Distance between the subject's pupils, which gives a solution from footage its metre. Adult
-    mean (Dodgson 2004, Variation and extrema of human interpupillary distance); measure it."""
+    """Distance between the subject's pupils, which sets the scale of a rig solved from
+    footage. The default is the adult mean (Dodgson 2004, Variation and extrema of human
+    interpupillary distance); measure it."""
     refine: str = "none"
     """What the footage corrects in a given calibration: "none", "poses", or "all" (lenses too).
     Cameras are only changed if held-out points then fit better. Where there is a board, leave the

@@ -18,7 +18,8 @@ class TrackConfig:
     """Settings that trade time for accuracy or select the frames to track."""
 
     head: str = BUILTIN_NAME
-    """Head model: procedural, the path of a FLAME pickle, or of ICT-FaceKit."""
+    """Head model: procedural (the built-in one), or the path of a FLAME pickle, of ICT-FaceKit or
+    of your own (docs/RECIPES.md)."""
     landmarks: str = "embedded"
     """Source of landmarks: embedded, fan:PATH of FAN's TorchScript weights, or the path of a file
     of points (docs/FORMAT.md)."""
