@@ -13,9 +13,8 @@ front of it. A ray that ends on the face leaves no room for things in front: agr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import cv2
 import numpy as np
@@ -326,8 +325,8 @@ def _sweep(head: TrackedHead, shots: Sequence[_Shot], own: int, face: np.ndarray
     cosine = sights @ sights[own]
     free = np.repeat(face[None, *window], len(HEIGHTS_M), axis=0)
     for k in np.argsort(np.abs(cosine), kind="stable"):  # views from the side leave the least room
-        kept = partial(_in_matte, shots[k].alpha)
-        _narrow(free, head.center, places, ways, shots[k].camera, kept)
+        ends = np.where(shots[k].alpha > 0.5, 0, np.float32(np.inf))
+        _narrow(free, head.center, places, ways, shots[k].camera, ends)
     none = np.zeros(shape, np.float32), np.full(free.shape, np.float32(-1))
     sweep = _Sweep(camera, depth, window, face[window], places, ways, free, *none)
     ranked = np.argsort(np.abs(cosine - BEST_APART), kind="stable").tolist()
@@ -418,8 +417,7 @@ def _carve(head: TrackedHead, sweep: _Sweep, views: Sequence[FaceView]) -> None:
     """Remove from a sweep the room in front of the face that other views see."""
     for view in views:
         ends = np.where(view.bare, view.depth - np.float32(NEAR_M), 0)
-        kept = partial(_not_before, ends)
-        _narrow(sweep.free, head.center, sweep.places, sweep.ways, view.camera, kept)
+        _narrow(sweep.free, head.center, sweep.places, sweep.ways, view.camera, ends)
 
 
 def _narrow(
@@ -428,25 +426,16 @@ def _narrow(
     places: np.ndarray,
     ways: np.ndarray,
     camera: Camera,
-    kept: Callable[[np.ndarray], np.ndarray],
+    ends: np.ndarray,
 ) -> None:
-    """Remove from the room (HEIGHTS_M, h, w) in front of places what a view does not keep.
+    """Remove from the room (HEIGHTS_M, h, w) in front of places what a view sees to be empty.
 
-    `kept` marks the points (3, h, w) of `_pixels_at`.
+    That is what lies nearer to its camera than `ends` (H, W), in metres.
     """
     box = box_about(free.max(0))
     line = _line(camera, center, places[box], ways[box])
     for room, offset in zip(free[:, *box], HEIGHTS_M, strict=True):
         if room.any():
             part = (slice(None), *box_about(room))
-            room[part[1:]] &= kept(_pixels_at((line[0][part], line[1][part]), offset))
-
-
-def _in_matte(alpha: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Mark the points (3, h, w) that lie in a matte (H, W) or outside of the picture."""
-    return _sampled(alpha, point, 1.0) > 0.5
-
-
-def _not_before(ends: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Mark the points (3, h, w) that lie no nearer than a picture of depths (H, W)."""
-    return point[2] >= _sampled(ends, point, 0.0)
+            point = _pixels_at((line[0][part], line[1][part]), offset)
+            room[part[1:]] &= point[2] >= _sampled(ends, point, 0.0)
