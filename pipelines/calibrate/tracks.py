@@ -199,7 +199,7 @@ def match_descriptors(
         np.copyto(likeness, -1.0, where=~allowed)
     rows, best = np.arange(len(a)), likeness.argmax(1)
     first = likeness[rows, best]
-    good = first == likeness.max(0)[best]  # `argmax(0)` takes ten times as long
+    good = first == likeness.max(0)[best]  # `argmax(0)` takes 30 times as long
     likeness[rows, best] = -1.0  # leaves the second best as the largest
     nearest, second = (np.sqrt(np.maximum(2 - 2 * v, 0)) for v in (first, likeness.max(1)))
     good &= nearest < RATIO * np.minimum(second, 1.0)

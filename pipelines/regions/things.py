@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -200,6 +201,11 @@ class _Shot:
     mesh: np.ndarray  # (H, W) labels of `render_head`
     depth: np.ndarray  # (H, W) depth of `render_head`
 
+    @cached_property
+    def ends(self) -> np.ndarray:
+        """Return how far (H, W) from the camera space is empty: everywhere beside the matte."""
+        return np.where(self.alpha > 0.5, 0, np.float32(np.inf))
+
 
 @dataclass(frozen=True)
 class _Sweep:
@@ -212,7 +218,7 @@ class _Sweep:
     places: np.ndarray  # (h, w, 3) on the head, about its centre
     ways: np.ndarray  # (h, w, 3) unit, towards them
     free: np.ndarray  # (HEIGHTS_M, h, w) bool, where there may be a thing in front of the face
-    # `_compared` fills these where there is room for things
+    # `_compare` fills these where there is room for things
     on_face: np.ndarray  # (h, w) best agreement within NEAR_M of the head
     before: np.ndarray  # (HEIGHTS_M, h, w) best agreement in front of the head
 
@@ -325,8 +331,7 @@ def _sweep(head: TrackedHead, shots: Sequence[_Shot], own: int, face: np.ndarray
     cosine = sights @ sights[own]
     free = np.repeat(face[None, *window], len(HEIGHTS_M), axis=0)
     for k in np.argsort(np.abs(cosine), kind="stable"):  # views from the side leave the least room
-        ends = np.where(shots[k].alpha > 0.5, 0, np.float32(np.inf))
-        _narrow(free, head.center, places, ways, shots[k].camera, ends)
+        _narrow(free, head.center, places, ways, shots[k].camera, shots[k].ends)
     none = np.zeros(shape, np.float32), np.full(free.shape, np.float32(-1))
     sweep = _Sweep(camera, depth, window, face[window], places, ways, free, *none)
     ranked = np.argsort(np.abs(cosine - BEST_APART), kind="stable").tolist()
