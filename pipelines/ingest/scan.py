@@ -182,8 +182,7 @@ def odd_footage(
             if path.is_file():  # no file: a member of a container
                 orientation, _ = read_exif(path)
                 if has_alpha(path):
-                    why = "has an alpha channel, which is left out: a later stage makes mattes"
-                    oddities.append(why)
+                    oddities.append("alpha channel left out: a later stage makes mattes")
         elif tags := measured[name].tags:
             path = inside(camera.path, camera.names[0]) if camera.names else camera.path
             orientation = ORIENTATION[tags.turn]
@@ -191,14 +190,13 @@ def odd_footage(
                 fps = video_fps(path)
                 if abs(fps - raw.fps) > FPS_SLACK * raw.fps:
                     oddities.append(
-                        f"is a video at {fps:.4g} fps, the capture says {raw.fps:.4g}; correct fps"
-                        " there"
+                        f"video at {fps:.4g} fps, the capture says {raw.fps:.4g}; correct fps there"
                     )
             oddities += [why] if (why := _uneven(source)) else []
             oddities += _odd_pictures(tags)
         if orientation != 1 and camera.orientation == 1:
             oddities.append(
-                "asks players to turn or mirror it, but is used as stored; calibration, board and"
+                "to be turned or mirrored by players, but used as stored; calibration, board and"
                 " plates must be as stored too"
             )
         if oddities:
@@ -210,21 +208,21 @@ def _odd_pictures(tags: VideoTags) -> list[str]:
     oddities = []
     if tags.hdr:
         oddities.append(
-            f"is HDR ({tags.hdr}), but is read as sRGB, so its colours are wrong; record it"
-            " without HDR, or convert it to BT.709"
+            f"HDR ({tags.hdr}), but read as sRGB, so the colours are wrong; record without HDR,"
+            " or convert to BT.709"
         )
     if tags.interlaced:
-        oddities.append("is interlaced: a picture mixes two moments; record progressive frames")
+        oddities.append("interlaced: a picture mixes two moments; record progressive frames")
     if tags.beyond > BEYOND:
         oddities.append(
-            f"states no range and is read as 16 to 235, but {tags.beyond:.0%} of its first picture"
+            f"no stated range: read as 16 to 235, but {tags.beyond:.0%} of the first picture"
             " lies outside; if it was recorded as 0 to 255, mark it so, for example with 'ffmpeg -i"
             " IN -c copy -bsf:v h264_metadata=video_full_range_flag=1 OUT.mp4'"
         )
     if tags.aspect != 1:
         oddities.append(
-            f"has pixels {tags.aspect:.3g} times as wide as high, but is used as stored; the"
-            " calibration must be as stored too"
+            f"pixels {tags.aspect:.3g} times as wide as high, but used as stored; the calibration"
+            " must be as stored too"
         )
     return oddities
 
@@ -238,7 +236,7 @@ def _uneven(source: CameraSource) -> str:
     share = float((np.abs(steps - usual) > np.maximum(1, 0.2 * usual)).mean())
     if share <= UNEVEN:
         return ""
-    return f"has a variable frame rate ({share:.0%} of its steps); record at a constant rate"
+    return f"variable frame rate ({share:.0%} of the steps); record at a constant rate"
 
 
 def source_sha256(camera: RawCamera) -> str:

@@ -334,11 +334,11 @@ def test_footage_unlike_what_is_said_of_it_is_a_warning(tmp_path):
     ingest.add_captures(dataset, [root])
     assert run(dataset).ok
     said = notes(dataset)
-    assert "is a video at 24 fps, the capture says 12" in said["camera cam00"]
+    assert "video at 24 fps, the capture says 12" in said["camera cam00"]
     assert "used as stored" in said["camera cam00"] and "stored" not in said["camera cam01"]
     assert "variable" not in said["camera cam00"]
-    assert "has an alpha channel, which is left out" in said["camera cam01"]
-    assert "has a variable frame rate" in said["camera cam02"]
+    assert "alpha channel left out" in said["camera cam01"]
+    assert "variable frame rate" in said["camera cam02"]
     assert "shares frames 8 to 11 with neutral" in said["expression smile"]
 
 
@@ -355,9 +355,9 @@ def test_videos_whose_pictures_are_not_what_they_seem_are_warned_of(tmp_path):
     ingest.add_captures(dataset, [root])
     assert run(dataset).ok
     said = notes(dataset)
-    assert "states no range and is read as 16 to 235" in said["camera cam03"]
-    assert "is HDR (HLG)" in said["camera cam00"]
-    assert "is interlaced" in said["camera cam01"]
+    assert "no stated range: read as 16 to 235" in said["camera cam03"]
+    assert "HDR (HLG)" in said["camera cam00"]
+    assert "interlaced:" in said["camera cam01"]
     assert "pixels 1.07 times as wide as high" in said["camera cam01"]
     assert "camera cam02" not in said
 
