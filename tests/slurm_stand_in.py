@@ -18,6 +18,8 @@ import os, pathlib, re, shutil, subprocess, sys
 home = pathlib.Path({home!r})
 if (home / "refuse").exists():
     sys.exit("sbatch: error: Batch job submission failed: Invalid partition name specified")
+if (home / "one").exists() and list(home.glob("*.sh")):
+    sys.exit("sbatch: error: QOSMaxSubmitJobPerUserLimit")
 number = str(1000 + len(list(home.glob("*.sh"))))
 script = home / (number + ".sh")
 shutil.copy(sys.argv[-1], script)
@@ -29,7 +31,11 @@ with open(output, "w") as file:
     job = subprocess.Popen(command, cwd=strip(options["chdir"]), stdout=file, stderr=file,
                            stdin=subprocess.DEVNULL, start_new_session=True)
 (home / (number + ".pid")).write_text(str(job.pid))
-print(number + ";stand-in")
+if (home / "wrapped").exists():
+    print("faces has 12 core hours left")
+    print("Submitted batch job " + number)
+else:
+    print(number + ";stand-in")
 """
 
 SQUEUE = """#!{python}

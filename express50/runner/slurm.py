@@ -21,6 +21,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from express50.console import count
 from express50.contract.config import build_dataclass
 from express50.errors import ConfigError, StageError, nearest
 from express50.files.text import read_toml
@@ -33,6 +34,8 @@ ALONE_SECONDS = 60  # a worker that cannot reach its scheduler for this long end
 
 TIME = re.compile(r"\d+(:\d\d){0,2}|\d+-\d+(:\d\d){0,2}")
 MEMORY = re.compile(r"(\d+)([MGT])(i?B)?")
+# Wrappers of sbatch may print more lines, or ignore --parsable.
+SUBMITTED = re.compile(r"^(?:Submitted batch job )?(\d+)(?:;.*)?$", re.MULTILINE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,8 +99,8 @@ def read_slurm(text: str, stages: Iterable[str]) -> dict[str, SlurmJob]:
             key, equals, value = (word.strip() for word in part.partition("="))
             if not equals or not key:
                 raise ConfigError(f"--slurm: {part!r} is not key=value; use a file for lists")
-            count = key in ("cores", "jobs", "gpus") and value.isdigit()
-            values[key] = int(value) if count else value
+            whole = key in ("cores", "jobs", "gpus") and value.isdigit()
+            values[key] = int(value) if whole else value
     tables = {key: value for key, value in values.items() if isinstance(value, dict)}
     common = {key: value for key, value in values.items() if key not in tables}
     for name in tables:
@@ -188,6 +191,7 @@ class SlurmWorkers(RemoteWorkers):
         self._names: dict[str, str] = {}  # of workers, by id of the job
         self._seen: set[str] = set()
         self._count = self._silent = 0
+        self._refusal = ""  # what sbatch last said
         self._next_look = 0.0
 
     def slots(self, stage: str, gpu: bool) -> int:
@@ -226,7 +230,10 @@ class SlurmWorkers(RemoteWorkers):
             except StageError as error:
                 if not self._names:
                     raise
-                sys.stderr.write(f"{error}; continuing with {len(self._names)} jobs\n")
+                if str(error) != self._refusal:  # it may refuse at every look, for hours
+                    jobs = count(len(self._names), "job")
+                    sys.stderr.write(f"{error}; continuing with {jobs}\n")
+                self._refusal = str(error)
                 return
             if self._count == 1:
                 sys.stderr.write(f"SLURM jobs are submitted; their output is in {self.logs}\n")
@@ -241,11 +248,13 @@ class SlurmWorkers(RemoteWorkers):
             file.write(script)
             file.flush()
             done = _call("sbatch", "--parsable", file.name)
-        number = done.stdout.strip().split(";")[0]
-        if done.returncode != 0 or not number.isdigit():
-            words = " ".join((done.stderr or done.stdout).split())
+        words = " ".join((done.stderr or done.stdout).split())
+        if done.returncode != 0:
             raise StageError(f"sbatch refused: {words or f'exit code {done.returncode}'}")
-        self._names[number] = name
+        numbers = SUBMITTED.findall(done.stdout)
+        if not numbers:
+            raise StageError(f"sbatch printed {words!r}, expected a line with the job's number")
+        self._names[numbers[-1]] = name
 
     def close(self) -> None:
         """Cancel the jobs that are left, and stop."""

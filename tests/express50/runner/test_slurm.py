@@ -162,6 +162,23 @@ def test_a_stage_runs_in_jobs_from_the_command_line(cluster, tmp_path, capture, 
     assert slurm_stand_in.all_end(cluster)
 
 
+def test_a_wrapper_of_sbatch_may_say_more_than_the_number(cluster, tmp_path):
+    (cluster / "wrapped").touch()
+    dataset = toy.make_dataset(tmp_path / "data", ["a", "b"])
+    assert {o.status for o in run_toy(dataset, small()).outcomes} == {"done"}
+    assert slurm_stand_in.all_end(cluster)
+
+
+def test_a_limit_on_jobs_is_said_once(cluster, tmp_path, capsys):
+    (cluster / "one").touch()
+    dataset = toy.make_dataset(tmp_path / "data", ["a", "b", "c"])
+    summary = run_toy(dataset, small(jobs=3), seconds=0.5)
+    assert {o.status for o in summary.outcomes} == {"done"}
+    said = capsys.readouterr().err
+    assert said.count("QOSMaxSubmitJobPerUserLimit; continuing with 1 job\n") == 1
+    assert slurm_stand_in.all_end(cluster)
+
+
 def test_items_of_a_job_at_its_time_limit_are_tried_again(cluster, tmp_path, monkeypatch):
     monkeypatch.setattr(pool, "SLURM_ATTEMPTS", 2)
     names = [f"item{n}" for n in range(5)] + ["bad1", "poison1"]
