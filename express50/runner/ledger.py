@@ -9,7 +9,7 @@ import json
 import sqlite3
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -149,6 +149,8 @@ class Ledger:
                 _check_schema(self._database)
                 return
             path.parent.mkdir(parents=True, exist_ok=True)
+            with suppress(FileExistsError), path.open("xb"):  # SQLite would ignore the umask
+                pass
             self._database = sqlite3.connect(path, timeout=60, isolation_level=None)
             _check_schema(self._database)
             self._database.execute("PRAGMA journal_mode=WAL")
@@ -181,6 +183,8 @@ class Ledger:
             if self._read_only:  # a reader must not be advised to delete
                 check = f"run 'express50 check {self._path.parent}'"
                 words = f"cannot be read as a ledger ({error}); {check}"
+            elif code == sqlite3.SQLITE_READONLY:
+                words = "not writable; check its owner and permissions"
             elif isinstance(error, sqlite3.OperationalError) and "no such" not in str(error):
                 words = (
                     f"the ledger cannot be used ({error}); fix that and run the same command again"

@@ -75,6 +75,23 @@ def test_digest_is_cached_until_size_time_or_inode_changes(ledger, tmp_path, mon
     assert ledger.sha256(path) == file_sha256(path) != first
 
 
+def test_the_umask_decides_who_else_may_write(tmp_path):
+    before = os.umask(0o002)  # as in datasets that a group shares
+    try:
+        with Ledger(tmp_path / "ledger.sqlite") as ledger:
+            ledger.forget("toy", [])
+            modes = {path.stat().st_mode & 0o777 for path in tmp_path.iterdir()}
+    finally:
+        os.umask(before)
+    assert modes == {0o664}
+
+
+def test_a_ledger_of_somebody_else_is_named_as_one(ledger):
+    ledger._database.execute("PRAGMA query_only=ON")  # what SQLite says of a file of mode 644, too
+    with pytest.raises(FormatError, match="not writable; check its owner and permissions"):
+        ledger.forget("toy", ["a"])
+
+
 def test_file_that_is_no_ledger_is_an_error(tmp_path):
     path = tmp_path / "ledger.sqlite"
     path.write_bytes(b"x" * 5000)
