@@ -160,32 +160,25 @@ def step(state: TrainState, parallel: torch.nn.Module, config: Config) -> None:
         shared = left == 0 or not isinstance(parallel, DistributedDataParallel)
         # Gradients are exchanged once per step, with the last view's.
         with contextlib.nullcontext() if shared else parallel.no_sync():
-            _add_gradients(state, parallel, item, config)
+            try:
+                rows = state.model.rows(*item.key.frame)
+                rendering = parallel(*rows, item.state, item.view, state.views.background)
+            except NotFiniteTensorError as error:
+                raise TrainError(
+                    f"iteration {state.iteration}: training diverged ({error}); lower train.lr and "
+                    "start over with --overwrite"
+                ) from None
+            terms = objective(state, rendering, item, config)
+            loss = torch.stack(list(terms.values())).sum()
+            state.terms = {name: term.detach() for name, term in terms.items()}
+            if not bool(torch.isfinite(loss)):
+                shown = {name: float(term) for name, term in state.terms.items()}
+                raise TrainError(
+                    f"iteration {state.iteration}: the objective is not finite at {item.key}: "
+                    f"{shown}; expected finite terms. Lower train.lr or check this sample"
+                )
+            (loss / config.train.accumulate).backward()
     state.optimizer.step()
-
-
-def _add_gradients(
-    state: TrainState, parallel: torch.nn.Module, item: HeadView, config: Config
-) -> None:
-    """Render one view and add its share of the step's gradient."""
-    try:
-        rows = state.model.rows(*item.key.frame)
-        rendering = parallel(*rows, item.state, item.view, state.views.background)
-    except NotFiniteTensorError as error:
-        raise TrainError(
-            f"iteration {state.iteration}: training diverged ({error}); lower train.lr and "
-            "start over with --overwrite"
-        ) from None
-    terms = objective(state, rendering, item, config)
-    loss = torch.stack(list(terms.values())).sum()
-    state.terms = {name: term.detach() for name, term in terms.items()}
-    if not bool(torch.isfinite(loss)):
-        shown = {name: float(term) for name, term in state.terms.items()}
-        raise TrainError(
-            f"iteration {state.iteration}: the objective is not finite at {item.key}: "
-            f"{shown}; expected finite terms. Lower train.lr or check this sample"
-        )
-    (loss / config.train.accumulate).backward()
 
 
 def objective(

@@ -25,9 +25,7 @@ LOGIT_LIMIT = 0.01  # colours are kept this far from 0 and 1 before the logit
 
 
 @torch.no_grad()
-def warm_start(
-    model: GRMM, views: HeadViews, indices: Sequence[int], images: int = IMAGES_PER_SUBJECT
-) -> None:
+def warm_start(model: GRMM, views: HeadViews, indices: Sequence[int]) -> None:
     """Write the mean texture into the colour decoder's bias, and subjects into modes and codes.
 
     With ``identity_modes`` the subjects' deviations from the mean texture are decomposed; each
@@ -36,7 +34,7 @@ def warm_start(
     textures, known = [], []
     for subject in model.subjects:
         own = [i for i in indices if views.keys[i].subject == subject]
-        colours, weight = project_texture(model, views, evenly(own, images))
+        colours, weight = project_texture(model, views, evenly(own, IMAGES_PER_SUBJECT))
         textures.append(colours)
         known.append(weight > 0)
     stack, seen = torch.stack(textures), torch.stack(known)[..., None]  # (S, N, 3), (S, N, 1)

@@ -235,7 +235,7 @@ def test_warm_start_shows_the_subjects_before_the_first_step(views):
     config = tiny_config()
     run = prepare(views, config)
     cold = summarise(evaluate(views, run.training, training_render(run.model, views)))
-    warm_start(run.model, views, run.training, 6)
+    warm_start(run.model, views, run.training)
     warm = summarise(evaluate(views, run.training, training_render(run.model, views)))
     assert warm["psnr_head_db"] > cold["psnr_head_db"] + 3
     colours = [run.model.appearance(z, views.state(0), views.item(0).view) for z in run.model.z_id]

@@ -12,7 +12,7 @@ import torch
 
 from express50.errors import TrainError
 from express50.files.arrays import read_weights
-from express50.landmarks.network import Output, heat_loss
+from express50.landmarks.network import heat_loss
 
 WARM_UP = 100  # steps
 HIGH_SHARE = 0.65  # of the run; then the learning rate falls linearly
@@ -78,20 +78,12 @@ def laplace_loss(
     return 0.2 * distance + (2 * log_scale + distance * torch.exp(-log_scale)), distance
 
 
-def point_loss(
-    output: Output, points: torch.Tensor, first: int = 0
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return losses and distances (B, N) of the landmarks from `first` on to points (B, N, 2).
-
-    The loss sums distance, likelihood and cross entropy; distances are in crop pixels.
-    """
-    found = output.points[:, first:], output.log_scale[:, first:], output.heat[:, first:]
-    return place_loss(*found, points)
-
-
 def place_loss(
     found: torch.Tensor, log_scale: torch.Tensor, heat: torch.Tensor, points: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return losses and distances (B, N) of found points (B, N, 2), see `point_loss`."""
+    """Return losses and distances (B, N) of found points (B, N, 2), in pixels of the crop.
+
+    The loss sums distance, likelihood and cross entropy.
+    """
     loss, distance = laplace_loss(found, log_scale, points)
     return loss + heat_loss(heat, points), distance

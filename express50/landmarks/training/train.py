@@ -45,7 +45,7 @@ from express50.landmarks.network import (
     save_network,
     trainable_network,
 )
-from express50.landmarks.training.descent import laplace_loss, minimise, place_loss, point_loss
+from express50.landmarks.training.descent import laplace_loss, minimise, place_loss
 from express50.landmarks.training.random_heads import BLINKS, random_head
 from express50.landmarks.training.scene import HeadScene, TrainingView
 from express50.landmarks.training.views import (
@@ -268,7 +268,8 @@ def crop_loss(net: LandmarkNet, crops: list[TrainingCrop]) -> torch.Tensor:
     seen = functional.binary_cross_entropy_with_logits(output.seen, visible, reduction="none")
     weight = torch.tensor([crop.weight for crop in crops])
     share = weight / weight.sum().clamp_min(1.0)
-    loss = (point_loss(output, marks)[0] + 0.5 * seen).mean(1) * share
+    loss, _ = place_loss(output.points, output.log_scale, output.heat, marks)
+    loss = (loss + 0.5 * seen).mean(1) * share
     edge = output.outline, output.outline_log_scale, output.outline_heat
     loss = loss + 0.5 * place_loss(*edge, outline)[0].mean(1) * share
     score = torch.tensor([crop.score for crop in crops])

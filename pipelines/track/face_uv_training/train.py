@@ -32,7 +32,7 @@ from express50.landmarks.network import (
     save_network,
     trainable_network,
 )
-from express50.landmarks.training.descent import minimise, point_loss
+from express50.landmarks.training.descent import minimise, place_loss
 from express50.landmarks.training.views import made_once
 from pipelines.track.config import UV_WEIGHTS
 from pipelines.track.face_uv import (
@@ -166,7 +166,9 @@ def make_batch(cases: list[Case], rng: np.random.Generator | None = None) -> UvB
 def marks_loss(net: LandmarkNet, batch: UvBatch) -> tuple[torch.Tensor, torch.Tensor]:
     """Return distance, likelihood and entropy of the known landmarks, and distances (B, 51)."""
     output = net(batch.images)
-    loss, distance = point_loss(output, batch.points, FIRST)
+    points, log_scale, heat = output.points, output.log_scale, output.heat
+    found = points[:, FIRST:], log_scale[:, FIRST:], heat[:, FIRST:]
+    loss, distance = place_loss(*found, batch.points)
     return (loss * batch.known).sum() / batch.known.sum().clamp_min(1.0), distance.detach()
 
 
