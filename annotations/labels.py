@@ -7,7 +7,6 @@ an automatically accepted suggestion. Nothing is ever rewritten: undo is an even
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
@@ -20,7 +19,7 @@ from express50 import __version__
 from express50.capture.index import Cue, Index, same_hash
 from express50.contract.layout import Dataset
 from express50.errors import AnnotationError, check_known
-from express50.files.atomic import sync_directory
+from express50.files.atomic import lock_file, sync_directory
 from express50.files.text import parse_json, read_bytes
 
 AUTOMATIC = "auto"
@@ -182,7 +181,7 @@ def append_label(dataset: Dataset, label: Label) -> None:
     line = (json.dumps(row, sort_keys=True) + "\n").encode()
     handle = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
+        lock_file(handle, path)
         size = os.fstat(handle).st_size
         if size and os.pread(handle, 1, size - 1) != b"\n":
             line = b"\n" + line  # a writer died half-way: its torn line must not absorb this one

@@ -25,6 +25,9 @@ from express50.errors import ConfigError, Express50Error, nearest
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 DEBUG = "EXPRESS50_DEBUG"  # environment variable
 REMEDY = "check the path, its permissions and the free disk space"
+NO_LOCKS = (
+    "its file system cannot lock files; mount it with locks (Lustre: -o flock), or use another disk"
+)
 REMEDIES = {
     errno.ENOENT: "check the path",
     errno.EEXIST: "give another path",
@@ -36,6 +39,7 @@ REMEDIES = {
     errno.ENOSPC: "free some space",
     errno.EDQUOT: "free some space, your quota is used up",
     errno.EFBIG: "its disk or 'ulimit -f' limits the size of files; use another disk or limit",
+    **dict.fromkeys((errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP), NO_LOCKS),
 }
 
 LATER = 0.05  # seconds, after which a callback of the garbage collection has ended

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import fcntl
 import json
 import os
 import shutil
@@ -15,7 +16,7 @@ import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, BinaryIO
 
 from rich.filesize import decimal
 
@@ -283,6 +284,14 @@ def link_file(source: str | Path, target: str | Path) -> None:
         os.link(source, target)
     except OSError:  # another file system, or one without hard links
         shutil.copy2(source, target)
+
+
+def lock_file(file: BinaryIO | IO[str] | int, path: Path, kind: int = fcntl.LOCK_EX) -> None:
+    """Lock an open file or folder as `fcntl.flock` does; its errors name no path, these do."""
+    try:
+        fcntl.flock(file, kind)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from None
 
 
 def sync_directory(path: Path) -> None:

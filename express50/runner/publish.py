@@ -27,6 +27,7 @@ from express50.errors import DiskFullError, Express50Error, FormatError, StageEr
 from express50.files.atomic import (
     FORMER,
     folder_in_one_step,
+    lock_file,
     naming_full_disk,
     put_back,
     sync_directory,
@@ -185,9 +186,9 @@ def stage_lock(dataset: Dataset, stage: str) -> Iterator[None]:
     path = dataset.staging_dir / f".{stage}.lock"
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w") as file:
-        if not _locked(file):
+        if not _locked(file, path):
             time.sleep(GLANCE_SECONDS)  # perhaps `is_running` has just looked
-            if not _locked(file):
+            if not _locked(file, path):
                 raise StageError(
                     f"{dataset.root}: another '{stage}' is running on this dataset; wait until it"
                     " ends"
@@ -195,9 +196,9 @@ def stage_lock(dataset: Dataset, stage: str) -> Iterator[None]:
         yield
 
 
-def _locked(file: IO[str], kind: int = fcntl.LOCK_EX) -> bool:
+def _locked(file: IO[str], path: Path, kind: int = fcntl.LOCK_EX) -> bool:
     try:
-        fcntl.flock(file, kind | fcntl.LOCK_NB)
+        lock_file(file, path, kind | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     return True
@@ -219,7 +220,7 @@ def is_running(dataset: Dataset, stage: str) -> bool:
         return False
     with path.open("r") as file:
         # The lock is shared and released at once; a stage that starts meanwhile tries again.
-        return not _locked(file, fcntl.LOCK_SH)
+        return not _locked(file, path, fcntl.LOCK_SH)
 
 
 def keeping(dataset: Dataset, former: Receipt | None) -> Keep | None:

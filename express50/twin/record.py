@@ -24,7 +24,7 @@ from express50.capture.expressions import select
 from express50.console import add_command, answer, count, log, number
 from express50.contract.config import field_documents
 from express50.errors import CaptureError
-from express50.files.atomic import dump_json, link_file, write_json
+from express50.files.atomic import dump_json, link_file, lock_file, write_json
 from express50.runner.worker import cap_threads
 from express50.twin import TwinConfig
 
@@ -106,7 +106,7 @@ def _alone(out: Path) -> Iterator[None]:
     folder = os.open(out, os.O_RDONLY)
     try:
         try:
-            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock_file(folder, out, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             words = f"{out}: another process records into this folder; wait until it ends"
             raise CaptureError(words) from None

@@ -1,14 +1,23 @@
 """Publishing: whole or absent, errors leave the former output, leftovers go."""
 
+import errno
+import fcntl
 import os
 
 import pytest
 
+from express50.console import system_error_line
 from express50.contract.layout import Dataset
 from express50.errors import FormatError
 from express50.files import atomic
 from express50.files.atomic import dump_json, folder_in_one_step, write_bytes, write_json
-from express50.runner.publish import clean_leftovers, publishing, run_folder, set_aside
+from express50.runner.publish import (
+    clean_leftovers,
+    publishing,
+    run_folder,
+    set_aside,
+    stage_lock,
+)
 
 ITEM = "S001/cam00"
 
@@ -153,3 +162,14 @@ def test_json_is_sorted_and_refuses_what_is_not_finite():
         dump_json({"a": float("inf")})
     with pytest.raises(FormatError, match="Söhne/M ller.*: holds a name that is not UTF-8"):
         dump_json({"a": "Söhne/M\udcfcller"})
+
+
+def test_a_file_system_without_locks_is_named_with_what_to_do(dataset, monkeypatch):
+    def refused(*unused):
+        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+
+    monkeypatch.setattr(fcntl, "flock", refused)  # as Lustre without -o flock
+    with pytest.raises(OSError, match="not implemented") as caught, stage_lock(dataset, "matte"):
+        pass
+    line = system_error_line(caught.value)
+    assert line.startswith(f"OSError: {dataset.staging_dir}/.matte.lock: ") and "-o flock" in line
