@@ -338,6 +338,19 @@ def make_picture(image: np.ndarray, camera: Camera, size: tuple[int, int]) -> np
     return undistorted if size == _size_of(camera) else reduce_light(undistorted, *size)
 
 
+def reduced(
+    camera: Camera, rgb: np.ndarray, alpha: np.ndarray, side: int
+) -> tuple[Camera, np.ndarray, np.ndarray]:
+    """Average a picture (H, W, 3) and its matte (H, W) down to at most ``side`` pixels.
+
+    The camera follows.
+    """
+    small = shrink(rgb, side)
+    if small is rgb:
+        return camera, rgb, alpha
+    return resized(camera, small.shape[1], small.shape[0]), small, shrink(alpha, side)
+
+
 def picture_sizes(dataset: Dataset, subject: str) -> dict[str, tuple[int, int]]:
     """Read width and height of a subject's pictures by camera; empty before the frames stage.
 

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import open3d as o3d
 
+from express50.capture.frames import reduced
 from express50.error_model import HEAD_SIZE_SPREAD, Bounds, error_bounds
 from express50.files.images import box_about
 from express50.geometry.cameras import Camera, crop_camera, cut_about, rays, resized, unproject
@@ -24,7 +25,7 @@ from express50.geometry.raycast import barycentrics, camera_rays, join_rays, mes
 from express50.geometry.sampling import bilinear, edge_width, local_moments
 from pipelines.depth.prior import TrackedSolid
 from pipelines.depth.surface import HeadSurface
-from pipelines.depth.views import INSIDE, in_picture, project_fast, reduced
+from pipelines.depth.views import INSIDE, in_picture, project_fast
 
 SURE_MM = 2.0  # bound at which confidence is a half
 COMPARED_SIDE = 512  # longest side, pixels, at which views are compared through the depth

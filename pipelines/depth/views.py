@@ -10,10 +10,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from express50.capture.frames import reduced
 from express50.contract.stage import Note
 from express50.errors import StageError
-from express50.files.images import box_about, resize_area, shrink
-from express50.geometry.cameras import Camera, nearest_to_lines, project, resized
+from express50.files.images import box_about, resize_area
+from express50.geometry.cameras import Camera, nearest_to_lines, project
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.sampling import bilinear
 from express50.geometry.transforms import is_rigid
@@ -66,16 +67,6 @@ def make_view(camera: Camera, rgb: np.ndarray, alpha: np.ndarray, side: int) -> 
         )
     alpha = repaired_matte(alpha)
     return DepthView(camera, rgb, alpha, silhouette_distance(alpha))
-
-
-def reduced(
-    camera: Camera, rgb: np.ndarray, alpha: np.ndarray, side: int
-) -> tuple[Camera, np.ndarray, np.ndarray]:
-    """Average a camera's images down to at most ``side`` pixels; the camera follows."""
-    small = shrink(rgb, side)
-    if small is rgb:
-        return camera, rgb, alpha
-    return resized(camera, small.shape[1], small.shape[0]), small, shrink(alpha, side)
 
 
 def repaired_matte(alpha: np.ndarray) -> np.ndarray:

@@ -192,8 +192,7 @@ def odd_footage(
                     oddities.append(
                         f"video at {fps:.4g} fps, the capture says {raw.fps:.4g}; correct fps there"
                     )
-            oddities += [why] if (why := _uneven(source)) else []
-            oddities += _odd_pictures(tags)
+            oddities += _odd_video(source, tags)
         if orientation != 1 and camera.orientation == 1:
             oddities.append(
                 "to be turned or mirrored by players, but used as stored; calibration, board and"
@@ -204,8 +203,16 @@ def odd_footage(
     return found
 
 
-def _odd_pictures(tags: VideoTags) -> list[str]:
-    oddities = []
+def _odd_video(source: CameraSource, tags: VideoTags) -> list[str]:
+    oddities, steps = [], _steps(source.pts, source.clips)
+    if steps.size:
+        usual = np.median(steps)
+        # A step is an integer number of ticks, so a difference of one tick may be rounding.
+        share = float((np.abs(steps - usual) > np.maximum(1, 0.2 * usual)).mean())
+        if share > UNEVEN:
+            oddities.append(
+                f"variable frame rate ({share:.0%} of the steps); record at a constant rate"
+            )
     if tags.hdr:
         oddities.append(
             f"HDR ({tags.hdr}), but read as sRGB, so the colours are wrong; record without HDR,"
@@ -225,18 +232,6 @@ def _odd_pictures(tags: VideoTags) -> list[str]:
             " must be as stored too"
         )
     return oddities
-
-
-def _uneven(source: CameraSource) -> str:
-    steps = _steps(source.pts, source.clips)
-    if not steps.size:
-        return ""
-    usual = np.median(steps)
-    # A step is an integer number of ticks, so a difference of one tick may be rounding.
-    share = float((np.abs(steps - usual) > np.maximum(1, 0.2 * usual)).mean())
-    if share <= UNEVEN:
-        return ""
-    return f"variable frame rate ({share:.0%} of the steps); record at a constant rate"
 
 
 def source_sha256(camera: RawCamera) -> str:

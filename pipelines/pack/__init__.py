@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from express50.contract.config import check_ranges
-from express50.contract.layout import Dataset, exclusion_reason
+from express50.contract.layout import Dataset, exclusion_reason, included_subjects
 from express50.contract.stage import Growth, Result, Stage
 
 
@@ -55,11 +55,6 @@ ENCODE_PRESETS: dict[str, dict[str, object]] = {
     "draft": {"size": 256, "profile": "compact"},
     "reference": {"size": 1024, "profile": "lossless"},
 }
-
-
-def included(dataset: Dataset) -> list[str]:
-    """List the subjects that no annotator excluded."""
-    return [name for name in dataset.subjects() if exclusion_reason(dataset, name) is None]
 
 
 def encode_inputs(dataset: Dataset, item: str, config: EncodeConfig) -> dict[str, Path | str]:
@@ -106,7 +101,8 @@ def inputs(dataset: Dataset, item: str, config: PackConfig) -> dict[str, Path | 
             if (folder / name).exists():
                 found[f"{subject} {name}"] = folder / name
     # Like the card, the receipt keeps nothing about people if there are too few.
-    return found | {"people": "\n".join(people_lines(read_people(dataset, included(dataset))))}
+    people = read_people(dataset, included_subjects(dataset))
+    return found | {"people": "\n".join(people_lines(people))}
 
 
 def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> Result:
@@ -121,7 +117,7 @@ ENCODE = Stage(
     version=4,
     config=EncodeConfig,
     presets=ENCODE_PRESETS,
-    items=included,
+    items=included_subjects,
     inputs=encode_inputs,
     run=encode_run,
     help="crop and encode each subject's samples (pack runs this first)",

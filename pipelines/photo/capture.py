@@ -241,7 +241,7 @@ def find_faces(path: Path, images: list[np.ndarray], config: TrackConfig) -> lis
     if len(images) > 1:
         seen = detect_many(net, images, DETECTOR_PASSES, max(SMALLEST, config.search))
         found = max(face.score for face in seen) >= FOUND_SCORE
-        chosen = [] if found else different(images, THOROUGH)
+        chosen = [] if found else different(images)
     seen += [detect(net, image, DETECTOR_PASSES, config.search) for image in chosen]
     faces = [face for face in seen if face.score >= FACE_SCORE]
     if not faces:
@@ -254,8 +254,8 @@ def find_faces(path: Path, images: list[np.ndarray], config: TrackConfig) -> lis
     return faces
 
 
-def different(images: Sequence[np.ndarray], count: int) -> list[np.ndarray]:
-    """Choose at most `count` images that are not alike, as different as possible."""
+def different(images: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Choose at most THOROUGH images that are not alike, as different as possible."""
     size = np.array(images[0].shape[1::-1])
     width, height = np.maximum(1, np.round(size * CELLS / size.max()).astype(int)).tolist()
     cells = [cv2.resize(i, (width, height), interpolation=cv2.INTER_AREA) for i in images]
@@ -264,7 +264,7 @@ def different(images: Sequence[np.ndarray], count: int) -> list[np.ndarray]:
     apart = np.full(len(images), np.inf)
     while True:
         apart = np.minimum(apart, np.abs(small - small[chosen[-1]]).max((1, 2, 3)))
-        if len(chosen) == count or apart.max() < ALIKE:
+        if len(chosen) == THOROUGH or apart.max() < ALIKE:
             return [images[one] for one in sorted(chosen)]
         chosen.append(int(apart.argmax()))
 

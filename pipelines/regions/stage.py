@@ -9,15 +9,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.capture.frames import read_cameras_of, read_matted_frame
+from express50.capture.frames import read_cameras_of, read_matted_frame, reduced
 from express50.contract.layout import Dataset
 from express50.contract.segmentation_labels import COLOURS, LABELS
 from express50.contract.stage import Note, Result
 from express50.dataset.depth_files import depth_file, read_depth
 from express50.dataset.tracks import existing_track, read_track
 from express50.errors import CaptureError, FormatError, StageError
-from express50.files.images import box_about, contact_sheet, fit_into, shrink, write_image
-from express50.geometry.cameras import Camera, cut_about, project, resized
+from express50.files.images import box_about, contact_sheet, fit_into, write_image
+from express50.geometry.cameras import Camera, cut_about, project
 from express50.geometry.sampling import evenly
 from express50.head.load import load_topology
 from pipelines.regions.colour import (
@@ -173,7 +173,7 @@ def judge_scalp_and_skin(
     for camera in evenly(seeing, STUDIED_CAMERAS):
         with contextlib.suppress(*UNREADABLE):  # the stage names them
             rgb, alpha = frames[camera.id] = read_frame_and_matte(dataset, item, camera)
-            camera, rgb, alpha, _ = _shrunk(camera, rgb, alpha, None, STUDIED_SIDE)
+            camera, rgb, alpha = reduced(camera, rgb, alpha, STUDIED_SIDE)
             mesh, _ = render_head(head, camera)
             votes.append(scalp_votes(rgb, mesh, alpha))
             colours += [c for c in (face_colours(rgb, alpha, mesh),) if c is not None]
@@ -187,7 +187,7 @@ def face_pictures(dataset: Dataset, item: str, head: TrackedHead) -> list[Pictur
     for camera in evenly(seeing, GLASSES_CAMERAS):
         with contextlib.suppress(*UNREADABLE):  # the stage names them
             pair = read_frame_and_matte(dataset, item, camera)
-            found.append(_shrunk(camera, *pair, None, STUDIED_SIDE)[:3])
+            found.append(reduced(camera, *pair, STUDIED_SIDE))
     return found
 
 
@@ -207,7 +207,9 @@ def label_view(
     `depth` (H, W) is in metres, 0 where unknown; `bare` says that the scalp is skin;
     `skin_colours` are those of `face_colours`, `glasses` the places (n, 3) of `find_glasses`.
     """
-    camera, rgb, alpha, depth = _shrunk(camera, rgb, alpha, depth, side)
+    camera, rgb, alpha = reduced(camera, rgb, alpha, side)
+    if depth is not None and depth.shape != alpha.shape:
+        depth = cv2.resize(depth, alpha.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
     whole = ViewLabels(np.zeros(alpha.shape, np.uint8), np.zeros(alpha.shape, bool))
     camera, window = _part(head, camera, alpha)
     rgb, alpha = rgb[window], alpha[window]
@@ -240,19 +242,6 @@ def _part(
     matte = np.array([(x, y), (x + width, y + height)])
     ends = np.concatenate([pixels, matte]) if width else pixels
     return cut_about(camera, ends, MARGIN)
-
-
-def _shrunk(
-    camera: Camera, rgb: np.ndarray, alpha: np.ndarray, depth: np.ndarray | None, side: int
-) -> tuple[Camera, np.ndarray, np.ndarray, np.ndarray | None]:
-    """Reduce camera, frame, matte and depth map to at most `side` pixels on the longer side."""
-    small = shrink(rgb, side)
-    if small is rgb:
-        return camera, rgb, alpha, depth
-    height, width = small.shape[:2]
-    if depth is not None:
-        depth = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
-    return resized(camera, width, height), small, shrink(alpha, side), depth
 
 
 def _write_view(

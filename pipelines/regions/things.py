@@ -22,8 +22,9 @@ import numpy as np
 import open3d as o3d
 from scipy import ndimage
 
+from express50.capture.frames import reduced
 from express50.contract.segmentation_labels import LABELS, label_mask
-from express50.files.images import LIGHT_OF_LEVEL, box_about, disc, shrink
+from express50.files.images import LIGHT_OF_LEVEL, box_about, disc
 from express50.geometry.cameras import (
     Camera,
     crop_camera,
@@ -31,7 +32,6 @@ from express50.geometry.cameras import (
     depth_in,
     inside_frame,
     project_pinhole,
-    resized,
     unproject,
 )
 from express50.geometry.conventions import cell_to_corner, corner_to_cell
@@ -255,7 +255,10 @@ def face_views(head: TrackedHead, pictures: Sequence[Picture]) -> list[FaceView]
         return []
     views = [sweep.face_view(head.center) for sweep in sweeps]
     for sweep in sweeps:
-        _carve(head, sweep, [view for view in views if view.camera is not sweep.camera])
+        for view in views:
+            if view.camera is not sweep.camera:  # where it sees the face, nothing is in front
+                ends = np.where(view.bare, view.depth - np.float32(NEAR_M), 0)
+                _narrow(sweep.free, head.center, sweep.places, sweep.ways, view.camera, ends)
     views = [sweep.face_view(head.center) for sweep in sweeps]
     pictured = {shot.camera.id: shot for shot in shots}
     views = [_up_to_edges(view, pictured[view.camera.id]) for view in views]
@@ -310,8 +313,8 @@ def _shot(head: TrackedHead, picture: Picture) -> _Shot | None:
     part, window = cut_about(camera, pixels, margin)
     if min(part.width, part.height) < PATCH_PX:
         return None
-    rgb, alpha = (shrink(np.ascontiguousarray(image[window]), SIDE) for image in (rgb, alpha))
-    camera = resized(part, rgb.shape[1], rgb.shape[0])
+    rgb, alpha = (np.ascontiguousarray(image[window]) for image in (rgb, alpha))
+    camera, rgb, alpha = reduced(part, rgb, alpha, SIDE)
     grey = np.sqrt(cv2.GaussianBlur(LIGHT_OF_LEVEL[rgb], (0, 0), 0.7)).mean(2)
     return _Shot(camera, rgb, alpha, grey, *render_head(head, camera))
 
@@ -377,10 +380,10 @@ def _agreement(
     best, size = np.full(mine[0].shape, np.float32(-1)), (PATCH_PX, PATCH_PX)
     for shot, line in near:
         point = _pixels_at(line, offset)
-        theirs = _patches(_sampled(shot.grey, point, 0.0, cv2.INTER_LINEAR))
-        hidden = _sampled(shot.depth, point, 0.0)
+        theirs = _patches(_sampled(shot.grey, point, cv2.INTER_LINEAR))
+        hidden = _sampled(shot.depth, point)
         seen = (hidden == 0) | (point[2] < hidden + HEIGHTS_M[0])
-        seen &= _sampled(shot.alpha, point, 0.0) > 0.5
+        seen &= _sampled(shot.alpha, point) > 0.5
         product = cv2.blur(mine[0] * theirs[0], size) - mine[1] * theirs[1]
         best = np.maximum(best, np.where(seen, product / (mine[2] * theirs[2]), -1))
     return cv2.blur(best, size)
@@ -409,20 +412,10 @@ def _pixels_at(line: _Line, offset: float) -> np.ndarray:
 
 
 def _sampled(
-    image: np.ndarray, point: np.ndarray, beyond: float, interpolation: int = cv2.INTER_NEAREST
+    image: np.ndarray, point: np.ndarray, interpolation: int = cv2.INTER_NEAREST
 ) -> np.ndarray:
-    """Look points (3, h, w) of `_pixels_at` up in an image (H, W), which is `beyond` outside."""
-    return cv2.remap(
-        image, point[0], point[1], interpolation,
-        borderMode=cv2.BORDER_CONSTANT, borderValue=beyond,
-    )  # fmt: skip
-
-
-def _carve(head: TrackedHead, sweep: _Sweep, views: Sequence[FaceView]) -> None:
-    """Remove from a sweep the room in front of the face that other views see."""
-    for view in views:
-        ends = np.where(view.bare, view.depth - np.float32(NEAR_M), 0)
-        _narrow(sweep.free, head.center, sweep.places, sweep.ways, view.camera, ends)
+    """Look points (3, h, w) of `_pixels_at` up in an image (H, W), which is 0 outside."""
+    return cv2.remap(image, point[0], point[1], interpolation, borderMode=cv2.BORDER_CONSTANT)
 
 
 def _narrow(
@@ -443,4 +436,4 @@ def _narrow(
         if room.any():
             part = (slice(None), *box_about(room))
             point = _pixels_at((line[0][part], line[1][part]), offset)
-            room[part[1:]] &= point[2] >= _sampled(ends, point, 0.0)
+            room[part[1:]] &= point[2] >= _sampled(ends, point)

@@ -10,9 +10,8 @@ from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
+from express50.capture.frames import reduced
 from express50.contract.layout import Dataset
-from express50.files.images import shrink
-from express50.geometry.cameras import resized
 from express50.head.model import HeadModel
 from pipelines.regions.colour import judge_scalp, scalp_votes
 from pipelines.regions.geometry import head_labels, make_head, render_head
@@ -296,9 +295,7 @@ def matted_pictures(pictures: FrameSetCrops) -> list[Picture]:
     found = []
     for crop in pictures.crops:
         if crop.alpha is not None:
-            rgb = shrink(crop.image, THING_SIDE)
-            camera = resized(crop.camera, rgb.shape[1], rgb.shape[0])
-            alpha = shrink(crop.alpha, THING_SIDE)
+            camera, rgb, alpha = reduced(crop.camera, crop.image, crop.alpha, THING_SIDE)
             found.append((camera, rgb, alpha.astype(np.float32) / 255))
     return found
 
