@@ -104,21 +104,17 @@ def run_photo(args: argparse.Namespace) -> int:
         panel = dataset.root / "panels" / subject / "panel.jpg"
         if summaries[-1].ok:
             write_panel(dataset, subject, configs[-1], panel)
-    done, focal = summaries[-1].ok, capture.focal
     if args.json:
-        say_json({"focal": vars(focal), "stages": [summary.to_json() for summary in summaries]})
-    else:
-        for summary in summaries:
-            say(*summary.lines())
-        say(
-            f"focal length {focal.pixels:.0f} px ({focal.source}); from the face alone, "
-            f"{focal.low:.0f} to {focal.high:.0f} px fit as well"
-        )
-        if not focal.low <= focal.pixels <= focal.high:
-            say("warning: the focal length is outside this range; check it, or give --focal-px")
-        if done:
-            say(f"track: {dataset.item_dir('track', subject)}", f"picture: {panel}")
-    return OK if done else FAILED
+        table = [summary.to_json() for summary in summaries]
+        say_json({"focal": vars(capture.focal), "stages": table})
+        return OK if summaries[-1].ok else FAILED
+    for summary in summaries:
+        say(*summary.lines())
+    say(*capture.focal.lines())
+    if not summaries[-1].ok:
+        return FAILED
+    say(f"track: {dataset.item_dir('track', subject)}", f"picture: {panel}")
+    return OK
 
 
 COMMAND = Command(WORDS, add_commands)

@@ -139,6 +139,17 @@ class Focal:
     low: float
     high: float
 
+    def lines(self) -> list[str]:
+        """Return the lines that say which focal length is used, and which others fit as well."""
+        low, high = self.low, self.high
+        words = f"from the face alone, {low:.0f} to {high:.0f} px fit as well"
+        found = [f"focal length {self.pixels:.0f} px ({self.source}); {words}"]
+        if not low <= self.pixels <= high:
+            found.append(
+                "warning: the focal length is outside this range; check it, or give --focal-px"
+            )
+        return found
+
 
 @dataclass(frozen=True)
 class PhotoCapture:

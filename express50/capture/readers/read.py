@@ -120,32 +120,40 @@ def detect(path: Path, name: object = None) -> Layout:
         if name in (None, layout.name) and ((name and layout.named) or layout.fits(path)):
             return layout
     check_links(*(path.iterdir() if path.is_dir() else ()))
-    looks = "; ".join(f"{x.name}: {x.looks}" for x in LAYOUTS if name in (None, x.name))
-    held = sorted(p.name for p in path.iterdir()) if path.is_dir() else ["a file"]
+    raise CaptureError(_why_none_fits(path, name, part if is_part else None))
+
+
+def _why_none_fits(path: Path, name: object, part: str | None) -> str:
+    """Return what a folder or file seems to be, and what to do.
+
+    `part` says of which capture it is a part, if it is.
+    """
     for depth in ("*", "*/*"):
         if below := sorted(path.glob(f"{depth}/capture.toml")):
             captures = below[0].parent.parent / "*"
-            raise CaptureError(f"{path}: a folder of captures, expected a capture; give {captures}")
+            return f"{path}: a folder of captures, expected a capture; give {captures}"
     if (path / "capture.toml").is_file() and (path / "cameras").is_dir():
-        raise CaptureError(
+        return (
             f"{path}: a capture in our own layout, expected one of another layout as 'source'; give"
             " that folder itself, and leave out what you do not need in its cameras/ and cues.csv"
         )
-    if is_part:
-        raise CaptureError(part)
+    if part is not None:
+        return part
+    held = sorted(p.name for p in path.iterdir()) if path.is_dir() else ["a file"]
     if name is None and folders.holds_folders(path):
         layouts = ", ".join(layout.name for layout in LAYOUTS if layout.named)
-        raise CaptureError(
+        return (
             f"{path}: its folders ({few(held)}) hold footage, but their names do not tell whether"
             " they are people, cameras, expressions or frames; give each folder by itself if it is"
             f" a person, or else write 'layout' into a capture.toml beside them (one of {layouts})"
         )
     if found := _deeper(path):
-        raise CaptureError(
+        return (
             f"{path}: no known layout, but {found[0]} has one ({found[1].looks}); give that folder,"
             " and others like it"
         )
-    raise CaptureError(
+    looks = "; ".join(f"{x.name}: {x.looks}" for x in LAYOUTS if name in (None, x.name))
+    return (
         f"{path}: no known layout; got {', '.join(held[:5]) or 'an empty folder'}, expected one "
         f"of: {looks}; {OURS}: capture.toml and cameras/"
         + hint_at_undeveloped([path, *path.glob("*"), *path.glob("*/*")])
