@@ -354,6 +354,7 @@ def _run_items(
     with showing(stage.name, total, progress) as show:
 
         def settle(receipt: Receipt) -> None:
+            receipt = replace(receipt, time=time.time())  # workers' clocks may differ
             if receipt.status != "failed":
                 record_published(dataset, ledger, receipt)
             elif receipt.item in work.still_valid:

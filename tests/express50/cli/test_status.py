@@ -21,6 +21,7 @@ from express50.cli import status as status_cli
 from express50.cli.status import SILENT_SECONDS, UNLOCKED_SECONDS, read_status, status_page
 from express50.console import format_seconds
 from express50.contract.layout import Dataset
+from express50.runner import executor, worker
 from express50.runner.ledger import Ledger, Receipt, Run
 from express50.runner.publish import is_running
 from pipelines import ingest
@@ -225,6 +226,18 @@ def test_page_follows_a_run_of_another_process_to_its_end(tmp_path, monkeypatch,
     text = page.read_text()
     assert "bad1" in text and "expected &#39;repaired&#39;" in text
     assert "script" not in parsed(text).seen
+
+
+def test_a_worker_whose_clock_is_behind_does_not_stop_the_run(tmp_path, monkeypatch):
+    def run_task(task):
+        made = worker.run_task(task)
+        return replace(made, time=made.time - 300)
+
+    monkeypatch.setattr(executor, "run_task", run_task)
+    dataset = toy.make_dataset(tmp_path / "data", ["a", "b"])
+    toy.run_toy(dataset, workers=0)
+    row = status_of_toy(dataset)
+    assert (row.state, row.counts()["done"], row.counts()["missing"]) == ("done", 2, 0)
 
 
 def test_a_killed_run_counts_as_stopped(tmp_path):
