@@ -69,7 +69,6 @@ def mean_age(metas: Sequence[Mapping], least: int = LEAST_PEOPLE) -> tuple[float
 
 
 def _age(meta: Mapping) -> float | None:
-    """Return the age in years; None if it is not given or out of range."""
     age = meta.get("age")
     known = is_number(age) and AGE_BANDS[0][0] <= age < AGE_BANDS[-1][1] + 1
     return age if known else None
@@ -89,7 +88,6 @@ def people_lines(people: Sequence[Mapping]) -> list[str]:
 
 
 def _count_table(name: str, counts: Mapping[str, int]) -> list[str]:
-    """Draw a table with a bar of one block per person, forty at most."""
     scale = min(1.0, 40 / max(counts.values()))
     rows = [
         f"| {' '.join(value.replace('|', '/').split())} | {count} | {'█' * round(count * scale)} |"

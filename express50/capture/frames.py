@@ -273,7 +273,6 @@ def read_plate_image(dataset: Dataset, subject: str, camera_id: str) -> np.ndarr
 
 
 def _read_written(path: Path, size: tuple[int, int] | None) -> np.ndarray:
-    """Read what ``write_frame`` wrote."""
     fix = "delete its folder and run 'express50 frames' again"
     try:
         image = read_image(path)

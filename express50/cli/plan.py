@@ -139,7 +139,6 @@ def run_plan(args: argparse.Namespace) -> int:
 
 
 def _given_sizes(args: argparse.Namespace) -> dict[str, float]:
-    """Return the campaign's sizes that options give, by their names in `target_of`."""
     sizes = {name: getattr(args, name) for name in SIZES if getattr(args, name) is not None}
     if "cameras" in sizes:
         sizes["views"] = sizes.pop("cameras")
@@ -309,12 +308,8 @@ def estimate(
 def totals(rows: Sequence[Row]) -> dict[str, Any]:
     """Add up the stages that were measured, and list those that were not."""
     known = [row for row in rows if not row.why]
-    return {
-        "core_hours": sum(row.core_hours or 0.0 for row in known),
-        "core_hours_low": sum(row.core_hours_low or 0.0 for row in known),
-        "core_hours_high": sum(row.core_hours_high or 0.0 for row in known),
-        "days": sum(row.days or 0.0 for row in known),
-        "disk": sum(row.disk or 0.0 for row in known),
+    names = ("core_hours", "core_hours_low", "core_hours_high", "days", "disk")
+    return {name: sum(getattr(row, name) or 0.0 for row in known) for name in names} | {
         "presets": dict(Counter(row.preset for row in known)),
         "not_measured": [row.stage for row in rows if row.why],
     }

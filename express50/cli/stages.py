@@ -253,10 +253,7 @@ def _chain(args: argparse.Namespace) -> Iterator[Any]:
     known, dataset = list(stages().values()), Dataset(args.dataset.resolve())
     _refuse_swapped(dataset, args.captures, args.command)
     ladders = {
-        stage.name: distinct_settings(
-            stage, lambda s, preset: resolve_config(s, preset, args.config, args.set, stages())
-        )
-        for stage in known
+        stage.name: distinct_settings(stage, args.config, args.set, stages()) for stage in known
     }
     slurm = _slurm_jobs(args)
     with (
@@ -283,7 +280,6 @@ def _exit_code(summaries: Sequence[Any], strict: bool) -> int:
 
 
 def _say_scripts(jobs: Iterable[Any], threads: int, logs: Path) -> int:
-    """Print the scripts of SLURM jobs."""
     from express50.runner.slurm import job_script
 
     for job in jobs:
@@ -310,7 +306,6 @@ def _refuse_swapped(dataset: Dataset, captures: Sequence[Path], command: str) ->
 
 
 def _say_account(stage: Stage, dataset: Dataset, summary: Any) -> None:
-    """Print the account of a stage."""
     say(*summary.lines())
     if stage.account is not None:
         done = [o.item for o in summary.outcomes if o.status == "done"]

@@ -11,7 +11,7 @@ import math
 import textwrap
 import tomllib
 import typing
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -54,14 +54,16 @@ def resolve_config(
     return build_config(stage, values)
 
 
-def distinct_settings(stage: Stage, resolve: Callable[[Stage, str], Any]) -> dict[str, Any]:
-    """Return a stage's configurations by preset, without those that equal standard's.
-
-    ``resolve(stage, preset)`` builds one.
-    """
-    standard = resolve(stage, "standard")
-    found = {preset: resolve(stage, preset) for preset in PRESETS}
-    return {k: c for k, c in found.items() if k == "standard" or c != standard}
+def distinct_settings(
+    stage: Stage,
+    file: Path | None = None,
+    assignments: Sequence[str] = (),
+    known_stages: Iterable[str] = (),
+) -> dict[str, Any]:
+    """Return what `resolve_config` builds by preset, without those that equal standard's."""
+    given = file, assignments, known_stages
+    found = {preset: resolve_config(stage, preset, *given) for preset in PRESETS}
+    return {k: c for k, c in found.items() if k == "standard" or c != found["standard"]}
 
 
 def read_tables(file: Path, known: Sequence[str]) -> dict[str, dict[str, object]]:

@@ -404,11 +404,9 @@ class _StageAudit:
             self._note(stage, f"outdated {few(items, 1)}: {why}; the next run makes them again")
 
     def _again(self, stage: str) -> str:
-        """Say how to make a stage's items again; a run with other settings makes all of them."""
         return f"run 'express50 {stage} {self.dataset.root}' with the same settings as before"
 
     def _waits(self, item: str) -> bool:
-        """Return True if something that the item may read is broken."""
         subject = item.split("/")[0]
         known = subject in self.receipts[self.stages[0].name]
         return bool(self.broken & {"", subject}) or (bool(self.broken) and not known)

@@ -21,13 +21,14 @@ from express50.dataset.tracks import (
     OF_FRAMES,
     HeadPoses,
     Track,
-    best_vertices,
     existing_track,
     read_sequence,
     read_track,
+    registration_of,
 )
 from express50.errors import FormatError, StageError, check_known
 from express50.files.atomic import dump_json, folder_in_one_step
+from express50.files.digests import file_sha256
 from express50.files.images import encode_png, read_image
 from express50.geometry.conventions import corner_to_cell
 from express50.geometry.meshes import encode_glb, split_seams, write_obj, write_ply
@@ -116,7 +117,12 @@ def with_registered(dataset: Dataset, head: Head) -> Head:
     Raises:
         FormatError: a registration is damaged, or belongs to another track.
     """
-    vertices = best_vertices(dataset, head.subject, head.track)
+    vertices, digest = head.track.vertices.copy(), file_sha256(dataset.track_file(head.subject))
+    for row, expression in enumerate(head.track.expressions):
+        path = dataset.registration_file(head.subject, expression)
+        found = registration_of(path, head.track, digest)
+        if found is not None:
+            vertices[row] = found.vertices
     return replace(head, track=replace(head.track, vertices=vertices))
 
 

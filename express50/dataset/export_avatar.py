@@ -149,7 +149,6 @@ def _write_view(
 
 
 def _described(camera: Camera, file: str) -> dict[str, object]:
-    """Make the fields of a transforms.json frame that depend on its camera."""
     K = camera.K
     return {
         "camera_id": camera.id,
@@ -166,7 +165,6 @@ def _described(camera: Camera, file: str) -> dict[str, object]:
 def _write_tables(
     frames: list[dict], steps: list[str], cameras: list[str], options: AvatarOptions, out: Path
 ) -> None:
-    """Write transforms.json and its training, validation and test splits."""
     held = options.test_expressions
     train = math.ceil(0.7 * len(steps))
     test = [k for k, name in enumerate(steps) if (k >= train if held is None else name in held)]

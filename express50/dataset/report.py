@@ -72,7 +72,6 @@ def render_page(dataset: Dataset, title: str | None = None) -> str:
 
 
 def _stage_view(dataset: Dataset, stage: str, receipts: list[Receipt]) -> dict:
-    """Collect what the template shows of one stage, from its published items and receipts."""
     root = dataset.stage_dir(stage)
     paths = sorted(root.rglob("metrics.json")) if root.is_dir() else []
     metrics = {str(p.parent.relative_to(root)): _table(p) for p in paths}
@@ -136,7 +135,6 @@ def _cards(dataset: Dataset, views: list[dict], summary: dict) -> list[dict[str,
 
 
 def _grmm_view(root: Path) -> list[dict]:
-    """Collect one part per folder below ``grmm``: train, fit, render."""
     folders = [root, *(p for p in sorted(root.iterdir()) if p.is_dir())] if root.is_dir() else []
     parts = []
     for folder in folders:
@@ -174,7 +172,6 @@ def _rows(table: dict, prefix: str = "") -> list[dict[str, str]]:
 
 
 def _table(path: Path) -> dict:
-    """Read a JSON table; return an empty one if there is no file."""
     return read_json_table(path, FormatError, AGAIN) if path.is_file() else {}
 
 

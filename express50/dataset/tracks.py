@@ -16,7 +16,7 @@ import numpy as np
 from express50.contract.layout import Dataset
 from express50.errors import FormatError, HeadModelError, StageError
 from express50.files.arrays import read_arrays
-from express50.files.digests import cached_by_file, file_sha256
+from express50.files.digests import cached_by_file
 from express50.files.text import ID
 from express50.geometry.shapes import check_finite, check_shape
 from express50.head import HEADS, head_files
@@ -256,21 +256,6 @@ def registration_of(path: Path, track: Track, digest: str) -> Registration | Non
     if found.track != digest or found.vertices.shape != track.vertices.shape[1:]:
         raise FormatError(f"{path}: belongs to another track; run 'express50 register' again")
     return found
-
-
-def best_vertices(dataset: Dataset, subject: str, track: Track) -> np.ndarray:
-    """Return the vertices (E, V, 3) float32 of a subject's track, registered where possible.
-
-    Raises:
-        FormatError: a registration is damaged, or belongs to another track.
-    """
-    vertices, digest = track.vertices.copy(), file_sha256(dataset.track_file(subject))
-    for row, expression in enumerate(track.expressions):
-        path = dataset.registration_file(subject, expression)
-        found = registration_of(path, track, digest)
-        if found is not None:
-            vertices[row] = found.vertices
-    return vertices
 
 
 def read_sequence(path: Path) -> Sequence:

@@ -428,9 +428,8 @@ def choose(points: Sequence[Point], seconds: float, goal: tuple[str, float] | No
 
 def error_text(name: str, error: Expected) -> str:
     """Write an expected error for people."""
-    if not error.stated:
-        return f"{name} {error.value:.2g} {error.unit}"
-    return f"{name} {error.value:.2g} {error.unit} ({error.low:.2g} to {error.high:.2g})"
+    text = f"{name} {error.value:.2g} {error.unit}"
+    return f"{text} ({error.low:.2g} to {error.high:.2g})" if error.stated else text
 
 
 def choice_lines(load: Workload, point: Point, asked: str, spent: float) -> Iterator[str]:

@@ -285,7 +285,6 @@ def _run_one(run: _Run, stage: Stage, before: Sequence[Summary]) -> Summary | No
 
 
 def _run_ready(run: _Run, stage: Stage, chosen: list[str] | None) -> Summary:
-    """Run chosen items of a stage, or all."""
     chain, clock, label = run.chain, run.clock, run.state.settings[stage.name]
     load = run.workload()
     items, item = item_seconds(load, stage, label)

@@ -9,6 +9,7 @@ import ctypes
 import errno
 import fcntl
 import json
+import math
 import os
 import shutil
 import tempfile
@@ -141,11 +142,17 @@ def check_file_writable(path: Path) -> None:
     check_folder_writable(path.parent)
 
 
+def free_space(path: Path) -> float:
+    """Return the free bytes on a path's disk; infinity for network drives that do not say."""
+    usage = shutil.disk_usage(nearest_existing(path))
+    return usage.free if usage.total else math.inf
+
+
 def check_space(folder: Path) -> None:
-    """Raise DiskFullError if the disk of an existing folder has less than `LEAST_FREE` left."""
-    usage = shutil.disk_usage(folder)
-    if usage.total and usage.free < LEAST_FREE:  # some network drives do not report their size
-        left, least = f"{usage.free / 1e6:.0f}", f"{LEAST_FREE / 1e6:.0f}"
+    """Raise DiskFullError if the disk of a folder has less than `LEAST_FREE` left."""
+    free = free_space(folder)
+    if free < LEAST_FREE:
+        left, least = f"{free / 1e6:.0f}", f"{LEAST_FREE / 1e6:.0f}"
         raise _disk_full(folder, f"{left} MB are free, expected at least {least}")
 
 
@@ -176,12 +183,6 @@ def naming_full_disk(path: Path, aside: Path | None = None) -> Iterator[None]:
             if number in numbers or any(os.strerror(number) in str(cause) for cause in causes):
                 raise disk_full(path, os.strerror(number)) from error
         raise
-
-
-def is_full(path: Path) -> bool:
-    """Say whether a disk has less than a megabyte left, for libraries that do not say why."""
-    usage = shutil.disk_usage(nearest_existing(path))
-    return bool(usage.total) and usage.free < 1e6
 
 
 def disk_full(path: Path, why: str) -> DiskFullError:

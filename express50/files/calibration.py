@@ -38,7 +38,6 @@ def parse_cameras(table: object, where: str) -> dict[str, Camera]:
 
 
 def _parse_camera(path: str, camera_id: str, row: object) -> Camera:
-    """Check one camera's entry and build it."""
     where = f"{path}: camera {camera_id}"
     if not ID.fullmatch(camera_id):  # it becomes a file name
         raise CalibrationError(

@@ -152,7 +152,6 @@ def open_image(path: Path) -> oiio.ImageInput:
 
 
 def _pixel_kind(given: object) -> str:
-    """Return what OpenImageIO calls the type of an image's pixels."""
     return str(given) if str(given) in ("uint8", "uint16") else "float"
 
 

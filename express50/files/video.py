@@ -111,7 +111,6 @@ def _open(path: Path) -> tuple[av.container.InputContainer, av.VideoStream]:
 
 
 def _pixels(path: Path, frame: av.VideoFrame) -> np.ndarray:
-    """Convert a frame to (H, W, 3) uint8."""
     size = frame.width * frame.height
     if not 0 < size <= PIXEL_LIMIT:
         raise CaptureError(

@@ -17,11 +17,6 @@ class NativeLibraryError(RuntimeError):
     """The native library is missing, stale or does not load."""
 
 
-def available() -> bool:
-    """Return whether the native library can be loaded on this machine."""
-    return not why_missing()
-
-
 @cache
 def why_missing() -> str:
     """Return one line on why the library cannot be loaded and how to fix it; empty when it can."""

@@ -26,7 +26,6 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 from xml.etree.ElementTree import Element
 
 import cv2
@@ -70,34 +69,28 @@ def read_calibration_toml(path: Path) -> dict[str, Camera]:
     if not isinstance(rows, dict):
         raise CalibrationError(f"{path}: cameras is not a table, expected [cameras.0] and so on")
     prefix = "cam_" if rows is not table else ""
-    return as_rig(
-        (
-            _toml_camera(f"{path}: [{key}]", str(row.get("name", f"{prefix}{key}")), row)
-            for key, row in rows.items()
-            if isinstance(row, dict) and {"rotation", "translation"} <= row.keys()
-        ),
-        path,
-    )
-
-
-def _toml_camera(where: str, name: str, row: dict[str, Any]) -> Camera:
-    if row.get("fisheye"):
-        raise CalibrationError(
-            f"{where}: is a fisheye, expected a perspective lens; undistort first"
-        )
-    rotation = row["rotation"]
-    if isinstance(rotation, list) and not any(isinstance(entry, list) for entry in rotation):
-        R = axis_angle_to_matrix(finite_array(rotation, (3,), f"{where} has rotation"))
-    else:
-        R = finite_array(rotation, (3, 3), f"{where} has rotation")
-    t = finite_array(row["translation"], (3,), f"{where} has translation")
-    size = size_from(row.get("size"), f"{where} has size")
-    K = K_from_opencv(finite_array(row.get("matrix"), (3, 3), f"{where} has matrix"))
-    dist = row.get("distortions", [])
-    count = len(dist) if isinstance(dist, list) else 0
-    dist = finite_array(dist, (count,), f"{where} has distortions")
-    pose = make_transform(R, t)
-    return camera_from_K(identifier(name), K, dist, size, pose)
+    cameras = []
+    for key, row in rows.items():
+        if not isinstance(row, dict) or not {"rotation", "translation"} <= row.keys():
+            continue
+        where, name = f"{path}: [{key}]", identifier(str(row.get("name", f"{prefix}{key}")))
+        if row.get("fisheye"):
+            raise CalibrationError(
+                f"{where}: is a fisheye, expected a perspective lens; undistort first"
+            )
+        rotation = row["rotation"]
+        if isinstance(rotation, list) and not any(isinstance(entry, list) for entry in rotation):
+            R = axis_angle_to_matrix(finite_array(rotation, (3,), f"{where} has rotation"))
+        else:
+            R = finite_array(rotation, (3, 3), f"{where} has rotation")
+        t = finite_array(row["translation"], (3,), f"{where} has translation")
+        size = size_from(row.get("size"), f"{where} has size")
+        K = K_from_opencv(finite_array(row.get("matrix"), (3, 3), f"{where} has matrix"))
+        dist = row.get("distortions", [])
+        count = len(dist) if isinstance(dist, list) else 0
+        dist = finite_array(dist, (count,), f"{where} has distortions")
+        cameras.append(camera_from_K(name, K, dist, size, make_transform(R, t)))
+    return as_rig(cameras, path)
 
 
 def read_kalibr(path: Path) -> dict[str, Camera]:

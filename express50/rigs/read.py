@@ -51,11 +51,12 @@ YAML = (".yml", ".yaml")
 
 
 class RigFormat(NamedTuple):
-    """A format's title, test and reader; the reader also gets the footage's size, or None."""
+    """A format's title, test and reader."""
 
     title: str
     fits: Callable[[Path], bool]
-    read: Callable[[Path, tuple[int, int] | None], dict[str, Camera]]
+    read: Callable[..., dict[str, Camera]]
+    sized: bool = False  # whether the reader also takes the footage's size, or None
 
 
 def _file(*ends: str, word: str = "") -> Callable[[Path], bool]:
@@ -72,47 +73,39 @@ def _files(*ends: str) -> Callable[[Path], bool]:
 
 # In the order in which they are tried.
 FORMATS = {
-    "renderme360": RigFormat("an .smc", _file(".smc"), lambda path, _: read_renderme(path)),
+    "renderme360": RigFormat("an .smc", _file(".smc"), read_renderme),
     "nersemble": RigFormat(
-        "NeRSemble's camera_params.json",
-        _file(".json", word='"world_2_cam"'),
-        lambda path, _: read_nersemble(path),
+        "NeRSemble's camera_params.json", _file(".json", word='"world_2_cam"'), read_nersemble
     ),
-    "colmap": RigFormat("a COLMAP model", is_colmap, lambda path, _: read_colmap_images(path)[0]),
-    "transforms": RigFormat("transforms.json", is_transforms, read_transforms),
+    "colmap": RigFormat("a COLMAP model", is_colmap, lambda path: read_colmap_images(path)[0]),
+    "transforms": RigFormat("transforms.json", is_transforms, read_transforms, sized=True),
     "toml": RigFormat(
         "caliscope's or aniposelib's TOML",
         _file(".toml", word="distortions"),
-        lambda path, _: read_calibration_toml(path),
+        read_calibration_toml,
     ),
-    "kalibr": RigFormat(
-        "Kalibr's camchain", _file(*YAML, word="camera_model"), lambda path, _: read_kalibr(path)
-    ),
+    "kalibr": RigFormat("Kalibr's camchain", _file(*YAML, word="camera_model"), read_kalibr),
     "qualisys": RigFormat(
-        "Qualisys' .qca.txt",
-        _file(".txt", ".xml", word="focalLengthU"),
-        lambda path, _: read_qualisys(path),
+        "Qualisys' .qca.txt", _file(".txt", ".xml", word="focalLengthU"), read_qualisys
     ),
-    "metashape": RigFormat(
-        "Metashape's XML", _file(".xml", word="<chunk"), lambda path, _: read_metashape(path)
-    ),
+    "metashape": RigFormat("Metashape's XML", _file(".xml", word="<chunk"), read_metashape),
     "realitycapture": RigFormat(
-        "RealityCapture's .xmp files", _files(".xmp"), read_reality_capture
+        "RealityCapture's .xmp files", _files(".xmp"), read_reality_capture, sized=True
     ),
-    "idr": RigFormat("IDR's or NeuS' .npz", _file(".npz", word="world_mat_0"), read_idr),
+    "idr": RigFormat(
+        "IDR's or NeuS' .npz", _file(".npz", word="world_mat_0"), read_idr, sized=True
+    ),
     "facescape": RigFormat(
-        "FaceScape's params.json",
-        _file(".json", word='"0_Rt"'),
-        lambda path, _: read_facescape(path),
+        "FaceScape's params.json", _file(".json", word='"0_Rt"'), read_facescape
     ),
-    "vggt": RigFormat("VGGT's .npz", _file(".npz"), read_vggt),
+    "vggt": RigFormat("VGGT's .npz", _file(".npz"), read_vggt, sized=True),
     "opencv": RigFormat(
-        "OpenCV YAML", _files(*YAML), lambda path, size: read_opencv_yaml(path, size)
+        "OpenCV YAML", _files(*YAML), lambda *given: read_opencv_yaml(*given), sized=True
     ),
     "express50": RigFormat(
         "our calibration.json",
         lambda path: path.is_file() and holds(path, '"world_to_camera"'),
-        lambda path, _: read_cameras(path),
+        read_cameras,
     ),
 }
 
@@ -147,7 +140,8 @@ def read_rig(
     Raises:
         CalibrationError: no format fits, or the content does not fit the format.
     """
-    found = FORMATS[kind or guess_format(path)].read(path, size)
+    known = FORMATS[kind or guess_format(path)]
+    found = known.read(path, size) if known.sized else known.read(path)
     if size is not None:
         found = {name: at_size(camera, size) for name, camera in found.items()}
     return in_metres(found, metres_per_unit)

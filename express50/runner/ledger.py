@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from express50.errors import FormatError
-from express50.files.atomic import disk_full, is_full
+from express50.files.atomic import disk_full, free_space
 from express50.files.digests import file_sha256
 from express50.files.text import parse_json
 
@@ -177,7 +177,7 @@ class Ledger:
         except (sqlite3.DatabaseError, ValueError, TypeError, OverflowError) as error:
             code = getattr(error, "sqlite_errorcode", 0) & 0xFF  # the rest says where
             # On a full disk SQLite often says only "disk I/O error".
-            hidden = code == sqlite3.SQLITE_IOERR and is_full(self._path)
+            hidden = code == sqlite3.SQLITE_IOERR and free_space(self._path) < 1e6
             if hidden or code == sqlite3.SQLITE_FULL:
                 raise disk_full(self._path, str(error)) from error
             if self._read_only:  # a reader must not be advised to delete

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -16,7 +15,7 @@ from express50.console import count, not_writable
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
 from express50.errors import ConfigError, Express50Error, FormatError, StageError, few
-from express50.files.atomic import LEAST_FREE, check_folder_writable, nearest_existing
+from express50.files.atomic import LEAST_FREE, check_folder_writable, free_space, nearest_existing
 from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger
 from express50.runner.publish import size_of
@@ -123,15 +122,13 @@ def expected_shortage(
 
 
 def _space_problems(dataset: Dataset, needs: Sequence[tuple[str, int, float]]) -> Iterator[str]:
-    usage = shutil.disk_usage(nearest_existing(dataset.root))
-    if not usage.total:  # some network drives do not report their size
-        return
+    free = free_space(dataset.root)
     need = sum(new * size for _, new, size in needs)
     # Replaced outputs are deleted when space is needed.
-    room = usage.free - LEAST_FREE + size_of(dataset.replaced_dir)[1]
+    room = free - LEAST_FREE + size_of(dataset.replaced_dir)[1]
     if room < 0:
         yield (
-            f"{dataset.root}: the disk is nearly full: {decimal(usage.free)} are left, expected "
+            f"{dataset.root}: the disk is nearly full: {decimal(int(free))} are left, expected "
             f"{decimal(int(LEAST_FREE))}; free some space"
         )
     elif need > room:

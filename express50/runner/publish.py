@@ -27,6 +27,7 @@ from express50.errors import DiskFullError, Express50Error, FormatError, StageEr
 from express50.files.atomic import (
     FORMER,
     folder_in_one_step,
+    free_space,
     lock_file,
     naming_full_disk,
     put_back,
@@ -289,8 +290,7 @@ def is_kept(dataset: Dataset, stage: str, item: str, fingerprint: str) -> bool:
 
 def make_room(dataset: Dataset) -> bool:
     """Empty the store if the disk is nearly full; return whether it was."""
-    usage = shutil.disk_usage(dataset.root)
-    short = bool(usage.total) and usage.free < LEAST_ROOM
+    short = free_space(dataset.root) < LEAST_ROOM
     if short:
         empty(dataset.replaced_dir)
     return short

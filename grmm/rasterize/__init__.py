@@ -95,7 +95,7 @@ def resolve_backend(backend: str = "auto", device: torch.device | str = "cpu") -
         return backend
     if torch.device(device).type == "cuda":
         return "gsplat"
-    if native.available():
+    if not native.why_missing():
         return "cpu"
     warnings.warn(f"rendering with the slow torch reference: {native.why_missing()}", stacklevel=3)
     return "reference"

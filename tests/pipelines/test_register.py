@@ -12,7 +12,7 @@ import torch
 from express50.contract.layout import Dataset
 from express50.contract.stage import NoSettings
 from express50.dataset.export import Head, with_registered
-from express50.dataset.tracks import best_vertices, read_registration, read_track
+from express50.dataset.tracks import read_registration, read_track
 from express50.errors import FormatError, StageError
 from express50.files.calibration import write_cameras
 from express50.geometry.meshes import cotangent_laplacian, read_surface, write_ply
@@ -280,7 +280,8 @@ def test_the_stage_writes_a_mesh_that_later_stages_take(dataset, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     track = read_track(dataset.track_file("S001"))
-    assert np.array_equal(best_vertices(dataset, "S001", track), track.vertices)
+    head = Head(subject="S001", track=track, model=load_head("procedural"), albedo=None)
+    assert np.array_equal(with_registered(dataset, head).track.vertices, track.vertices)
     result = STAGE.run(dataset, "S001/smile", NoSettings(), out)
     assert result.metrics["seen_share"] > 0.4 and not result.warnings
     assert result.metrics["residual_mm_median"] < 0.05
@@ -290,7 +291,7 @@ def test_the_stage_writes_a_mesh_that_later_stages_take(dataset, tmp_path):
     path.parent.mkdir(parents=True)
     (out / "registration.npz").rename(path)
     found = read_registration(path)
-    best = best_vertices(dataset, "S001", track)
+    best = with_registered(dataset, head).track.vertices
     assert np.array_equal(best, [track.vertices[0], found.vertices])
     assert np.abs(best[1] - track.vertices[1]).max() > 0.001
     assert found.seen.any() and np.isfinite(found.sigma).all()
@@ -300,12 +301,9 @@ def test_the_stage_writes_a_mesh_that_later_stages_take(dataset, tmp_path):
     assert np.isfinite(found.bound).all() and (found.bound > 0).all()
     stated = result.expected_error
     assert stated.unit == "mm" and 0 < stated.low <= stated.value <= stated.high
-    head = Head(subject="S001", track=track, model=load_head("procedural"), albedo=None)
-    exported = with_registered(dataset, head).track.vertices
-    assert np.array_equal(exported, [track.vertices[0], found.vertices])
     write_track(dataset.track_file("S001"), track_arrays("procedural", seed=7))
     with pytest.raises(FormatError):  # of another track
-        best_vertices(dataset, "S001", read_track(dataset.track_file("S001")))
+        with_registered(dataset, replace(head, track=read_track(dataset.track_file("S001"))))
 
 
 def test_no_error_is_stated_for_a_head_of_impossible_shape(dataset, tmp_path):

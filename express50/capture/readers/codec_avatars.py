@@ -129,7 +129,6 @@ def _read(
 
 
 def _ava256_cameras(path: Path) -> dict[str, Camera]:
-    """Read cameras by id (``cam<number>``), metres, for pictures of 2668 x 4096."""
     rows = read_json_table(path, CalibrationError).get("KRT")
     if not isinstance(rows, list) or not rows:
         raise CalibrationError(f"{path}: has no list of cameras called KRT; copy the file again")
@@ -153,7 +152,6 @@ def _ava256_cameras(path: Path) -> dict[str, Camera]:
 
 
 def _ava256_pictures(path: Path, name: str, wanted: list[Moment]) -> dict[Moment, str]:
-    """Name each wanted picture in a camera's zip."""
     archive = f"decoder/image/{name}.zip"
     check_links(path / "decoder/image", path / archive)
     if not (path / archive).is_file():
@@ -165,7 +163,6 @@ def _ava256_pictures(path: Path, name: str, wanted: list[Moment]) -> dict[Moment
 
 
 def _multiface_cameras(path: Path) -> dict[str, Camera]:
-    """Read the cameras of a KRT file, metres, for pictures of 1334 x 2048."""
     text, found = read_text(path, CalibrationError), {}
     for block in re.split(r"\n\s*\n", text.strip()):
         name, *rows = [line.strip() for line in block.splitlines()] or [""]

@@ -244,7 +244,6 @@ def _tree(path: Path) -> Tree:
 
 
 def _places(folder: Path, deep: bool, holds: Callable[[Path], bool]) -> list[Path]:
-    """List the files of a folder, or its folders of files."""
     if not deep:
         return sorted(filter(holds, folder.iterdir()))
     inner = [path for path in folder.iterdir() if is_data_folder(path)]
@@ -253,7 +252,6 @@ def _places(folder: Path, deep: bool, holds: Callable[[Path], bool]) -> list[Pat
 
 
 def _files(root: Path, tree: Tree, place: Path) -> list[str]:
-    """List the files at a place of a tree, relative to its root."""
     if not tree.deep:
         return [place.relative_to(root).as_posix()]
     folder = footage_folder(place)
@@ -307,7 +305,6 @@ def _add(row: dict[Moment, str], moment: Moment, name: str) -> None:
 def _read(
     path: Path, kind: str, rows: Mapping[str, Mapping[Moment, str]], selection: Selection
 ) -> RawCapture:
-    """Read files by moment, by camera's name."""
     ids = unique_ids(path, rows, str)
     sequences = sorted({sequence for row in rows.values() for sequence, _ in row})
     check_selection(selection, sequences, sorted(ids.values()))

@@ -141,7 +141,6 @@ def _read_posed(
     pictures: Mapping[str, Mapping[Moment, str]],
     selection: Selection,
 ) -> RawCapture:
-    """Read the existing pictures, by moment, by camera."""
     ids = unique_ids(root, calibration, str)
     check_selection(selection, [MOMENT], sorted(calibration))
     there = {

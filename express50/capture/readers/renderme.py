@@ -168,11 +168,7 @@ class PerformanceClip:
 def _selected_clips(
     path: Path, known: dict[str, Performance], selection: Selection
 ) -> tuple[dict[str, PerformanceClip], dict[str, str]]:
-    """Read the selected performances' clips of the selected cameras; say why others are skipped.
-
-    Raises:
-        CaptureError: a selected camera is in no clip.
-    """
+    """Read the selected performances' clips of the selected cameras; say why others are skipped."""
     usual = "*" if path.is_file() else USUAL
     clips, skipped, seen = {}, {}, set[str]()
     for part, performance in known.items():

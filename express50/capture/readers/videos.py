@@ -108,7 +108,6 @@ def read_participant(path: Path, selection: Selection) -> RawCapture:
 
 
 def _colours(path: Path, serials: set[str]) -> tuple[dict, dict[str, str]]:
-    """Read the corrections by camera, and warnings about cameras without one."""
     if not (path / COLOURS).is_file():
         return {}, {"colours": f"{COLOURS} is missing; colours stay as each camera recorded them"}
     table = read_json_table(path / COLOURS, CalibrationError)

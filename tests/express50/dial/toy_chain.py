@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from express50.capture.index import peak_items, read_index
-from express50.contract.config import distinct_settings, resolve_config
+from express50.contract.config import distinct_settings
 from express50.contract.layout import Dataset
 from express50.contract.stage import ExpectedError, Growth, Result, Stage
 from express50.dial.pilot import Chain
@@ -170,9 +170,7 @@ def captures_of(root: Path, subjects: int = 3, expressions: int = 4) -> list[Pat
 def chain_of(root: Path, captures: list[Path], said: list[str] | None = None) -> Chain:
     dataset = Dataset(root.resolve())
     ingest.add_captures(dataset, captures)
-    ladders = {
-        stage.name: distinct_settings(stage, lambda s, p: resolve_config(s, p)) for stage in STAGES
-    }
+    ladders = {stage.name: distinct_settings(stage) for stage in STAGES}
     ladders["ingest"] = {"standard": ladders["ingest"]["standard"]}
     tell = (said if said is not None else []).append
     return Chain(STAGES, dataset, ladders, Pool(0), tell, KINDS)
