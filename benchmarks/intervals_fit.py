@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import isotonic_regression
 
 from benchmarks.intervals_collect import Sample
 from express50.contract.stage import Unit
@@ -147,19 +148,8 @@ def _table(
     ]
     knots, typical, bound = np.array(rows).T
     kept = np.r_[True, np.diff(knots) > 1e-9]
-    typical, bound = (np.log(_rising(v[kept])) for v in (typical, bound))
+    typical, bound = (np.log(isotonic_regression(v[kept]).x) for v in (typical, bound))
     return knots[kept], typical, bound
-
-
-def _rising(values: np.ndarray) -> np.ndarray:
-    """Return the nearest values that do not fall (pool adjacent violators)."""
-    blocks: list[tuple[float, int]] = []
-    for value in values:
-        blocks.append((float(value), 1))
-        while len(blocks) > 1 and blocks[-2][0] > blocks[-1][0]:
-            (a, n), (b, m) = blocks[-2:]
-            blocks[-2:] = [((a * n + b * m) / (n + m), n + m)]
-    return np.concatenate([np.full(count, value) for value, count in blocks])
 
 
 def _quantile(values: np.ndarray, weights: np.ndarray, level: float) -> float:

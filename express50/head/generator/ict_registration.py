@@ -28,6 +28,7 @@ Array = np.ndarray
 
 FLIP, FLAT = np.array([-1.0, 1.0, 1.0]), np.array([0.0, 1.0, 1.0])  # mirrored; on the mid plane
 LIDS, LIPS = range(36, 48), range(60, 68)  # landmarks that rims replace
+FREE = [k for k in range(68) if k not in (*LIDS, *LIPS)]  # the others
 # Edges from the open ends of ICT's skin to the lids' margins, and to where closed lips meet.
 MARGIN_RING, SLIT_RINGS = 2, (7, 8)
 # The left ear's rim from the helix's root over the top to the lobe and up the front edge, (y, z) mm
@@ -91,13 +92,8 @@ def ict_skin(arrays: IctArrays) -> IctSkin:
 
 def rim_targets(mesh: WholeMesh, skin: IctSkin) -> RimTargets:
     """Return the goals of lids, lips and ears of both sides along ICT's."""
-    marks = skin.marks
     rows = [
-        (
-            mesh.tag("lid0", "left"),
-            _lid_margin(skin.ring(marks[42:48], (MARGIN_RING,)), marks),
-            4.0,
-        ),
+        (mesh.tag("lid0", "left"), _lid_margin(skin), 4.0),
         (mesh.tag("lip0", "left"), _slit(mesh, skin), 4.0),
         (*_ear_rim(mesh, skin), 0.5),
     ]
@@ -106,9 +102,11 @@ def rim_targets(mesh: WholeMesh, skin: IctSkin) -> RimTargets:
     return RimTargets(ids, goals, np.concatenate([np.full(2 * len(r), w) for r, _, w in rows]))
 
 
-def _lid_margin(ring: Array, marks: Array) -> Array:
+def _lid_margin(skin: IctSkin) -> Array:
     """Return the left lid margin (40, 3): upper lid outwards, lower lid back, as in `eyes`."""
+    marks = skin.marks
     inner, outer = marks[42], marks[45]
+    ring = skin.ring(marks[42:48], (MARGIN_RING,))
     ring = ring[ring[:, 0] > 0]
     line = inner + (ring[:, :1] - inner[0]) / (outer[0] - inner[0]) * (outer - inner)
     x = inner[0] + (0.5 - 0.5 * np.cos(np.linspace(0, np.pi, LID_SEGMENTS + 1))) * (
@@ -167,7 +165,6 @@ def warp_between(mesh: WholeMesh, skin: IctSkin) -> RBFInterpolator:
     targets = rim_targets(mesh, skin)
     faces, weights = embed_landmarks(mesh)
     own = (mesh.vertices[mesh.faces[faces]] * weights[..., None]).sum(1)
-    marks = _free_marks()
     body, other = (
         _outer_points(points, chin)
         for points, chin in (
@@ -175,15 +172,10 @@ def warp_between(mesh: WholeMesh, skin: IctSkin) -> RBFInterpolator:
             (skin.points[np.unique(skin.faces)], skin.marks[8, 1]),
         )
     )
-    here = np.concatenate([mesh.vertices[targets.ids], own[marks], body])
-    there = np.concatenate([targets.goals, skin.marks[marks], other])
+    here = np.concatenate([mesh.vertices[targets.ids], own[FREE], body])
+    there = np.concatenate([targets.goals, skin.marks[FREE], other])
     once = np.unique(here.round(3), axis=0, return_index=True)[1]
     return RBFInterpolator(here[once], there[once], kernel="thin_plate_spline", smoothing=5.0)
-
-
-def _free_marks() -> list[int]:
-    """Return the landmarks that no rim replaces."""
-    return [k for k in range(68) if k not in (*LIDS, *LIPS)]
 
 
 def _outer_points(points: Array, chin: float) -> Array:
@@ -216,14 +208,14 @@ def register_skin(mesh: WholeMesh, skin: IctSkin, own: Array, warp: RBFInterpola
     index[own] = np.arange(len(own))
     faces = index[mesh.faces[is_skin(mesh)]]
     mirror = index[mesh.mirror[own]]
-    targets, marks = rim_targets(mesh, skin), _free_marks()
+    targets = rim_targets(mesh, skin)
     sample = sample_skin(skin)
     tree = cKDTree(np.concatenate([sample.places, NORMAL_MM * sample.normals], axis=1))
     seen = ~np.isin(own, hidden_vertices(mesh))
     mark_faces, mark_weights = embed_landmarks(mesh)
-    rows = np.repeat(np.arange(len(marks)), 3), index[mesh.faces[mark_faces[marks]]].ravel()
-    at_marks = sparse.csr_matrix((mark_weights[marks].ravel(), rows), (len(marks), len(own)))
-    mark_trust = np.where(np.array(marks) < 17, 2.0, 6.0)
+    rows = np.repeat(np.arange(len(FREE)), 3), index[mesh.faces[mark_faces[FREE]]].ravel()
+    at_marks = sparse.csr_matrix((mark_weights[FREE].ravel(), rows), (len(FREE), len(own)))
+    mark_trust = np.where(np.array(FREE) < 17, 2.0, 6.0)
     held = np.zeros(len(own))
     np.add.at(held, index[targets.ids], 20.0 * targets.weights)
     fixed = at_marks.T @ sparse.diags(mark_trust) @ at_marks + sparse.diags(held + 1e-3)
@@ -246,7 +238,7 @@ def register_skin(mesh: WholeMesh, skin: IctSkin, own: Array, warp: RBFInterpola
         along = trust * (normals * towards).sum(1)
         right = along[:, None] * normals + 0.05 * trust[:, None] * towards
         right -= memory * stiffness * (bending @ (points - start))
-        right += at_marks.T @ (mark_trust[:, None] * (skin.marks[marks] - at_marks @ points))
+        right += at_marks.T @ (mark_trust[:, None] * (skin.marks[FREE] - at_marks @ points))
         pulled = np.zeros_like(points)
         weight = 20.0 * targets.weights[:, None]
         np.add.at(pulled, index[targets.ids], weight * (targets.goals - points[index[targets.ids]]))
