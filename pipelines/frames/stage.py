@@ -40,9 +40,6 @@ FACE = (
     " people, or delete the plate, and run 'express50 ingest' again"
 )
 
-Read = Callable[[str], np.ndarray]
-"""Camera id to its recorded image (H, W, 3); raises CaptureError."""
-
 
 def run(dataset: Dataset, item: str, out: Path, side: int) -> Result:
     """Write `<camera>.tif` per calibrated camera; a camera that cannot be read is dropped.
@@ -112,8 +109,8 @@ def _with_face(images: dict[str, np.ndarray]) -> list[str]:
     return [name for name in images if name in shown]
 
 
-def _reader(dataset: Dataset, subject: str, expression: str) -> Read:
-    """Make the function that reads one camera's recorded frame or plate."""
+def _reader(dataset: Dataset, subject: str, expression: str) -> Callable[[str], np.ndarray]:
+    """Make the function that reads one camera's recorded frame or plate (H, W, 3)."""
     index = read_index(dataset, subject)
     if expression == PLATES:
         return lambda camera: read_recorded_plate(index, camera)

@@ -135,7 +135,12 @@ def cut_out(
     guesses = [_guess(view, place) for view in small]
     for view, reduced, guess in zip(views, small, guesses, strict=True):
         if view.known is None:
-            _leave_out(guess, reduced, find_neighbours(view, place))
+            # Heads and necks of others are wall but where the person surely is, in front of
+            # them; their hair is wall where the person hardly is.
+            sure = guess == cv2.GC_FGD
+            for other in find_neighbours(view, place):
+                guess[(_guess(reduced, other) == cv2.GC_FGD) & ~sure] = cv2.GC_BGD
+                guess[_head_mask(reduced, other) & (guess == cv2.GC_PR_BGD)] = cv2.GC_BGD
     density = [place.density(view.camera) for view in small]
 
     def cut(labels: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -200,17 +205,6 @@ def find_neighbours(view: CutView, place: HeadPlace) -> list[HeadPlace]:
             break
         heads.append(HeadPlace(*found))
     return heads[1:]
-
-
-def _leave_out(guess: np.ndarray, view: CutView, neighbours: Sequence[HeadPlace]) -> None:
-    """Label neighbours' heads and necks in a guess (h, w) as wall, and their hair where it is free.
-
-    Where the person surely is, they are in front; hair is free where the person hardly is.
-    """
-    sure = guess == cv2.GC_FGD
-    for place in neighbours:
-        guess[(_guess(view, place) == cv2.GC_FGD) & ~sure] = cv2.GC_BGD
-        guess[_head_mask(view, place) & (guess == cv2.GC_PR_BGD)] = cv2.GC_BGD
 
 
 def _head_mask(view: CutView, place: HeadPlace) -> np.ndarray:

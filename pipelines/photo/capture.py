@@ -71,8 +71,6 @@ INDEPENDENT = 0.25
 # Focal lengths whose cost is at most this much above the least are as good: two deviations.
 AS_GOOD = 2.0
 CONSTRAINED_FACTOR = 1.6
-# World of a single camera: at the camera, y up, the camera looks along -z.
-CAM_FROM_WORLD = FLIP_YZ
 
 
 @dataclass(frozen=True)
@@ -313,9 +311,12 @@ def _write_footage(picture: PhotoSource, folder: Path) -> None:
 
 
 def single_camera(camera_id: str, width: int, height: int, focal: float) -> Camera:
-    """Return a pinhole camera at the world's origin with the principal point in the middle."""
+    """Return a pinhole camera with the principal point in the middle.
+
+    It stands at the world's origin and looks along -z; y points up.
+    """
     K = np.array([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
-    return pinhole_camera(camera_id, K, width, height, CAM_FROM_WORLD)
+    return pinhole_camera(camera_id, K, width, height, FLIP_YZ)
 
 
 def weigh_focal(

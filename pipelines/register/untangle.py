@@ -8,8 +8,6 @@ as the vertices around them do on average. Eyeballs and teeth do not move.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import open3d as o3d
 import scipy.sparse as sparse
@@ -83,15 +81,6 @@ def untangled(model: HeadModel, mesh: np.ndarray) -> np.ndarray:
     return best
 
 
-@dataclass(frozen=True)
-class Pushes:
-    """Moves of vertices: ids (N,), directions (N, 3), and metres along them (N,)."""
-
-    ids: np.ndarray
-    ways: np.ndarray
-    moves: np.ndarray
-
-
 class Skin:
     """A mesh (V, 3) that can be pushed, and its model at rest, aligned with it."""
 
@@ -131,7 +120,7 @@ class Skin:
 
     def parting(self, mesh: np.ndarray, pairs: np.ndarray, step: int) -> np.ndarray:
         """Return moves (V, 3) that separate the pairs further; steps count from 0."""
-        push = self.pushes(mesh, pairs, step)
+        ids, ways, lengths = self.pushes(mesh, pairs, step)
         near, _ = cKDTree(mesh[np.unique(self.faces[pairs])]).query(
             mesh, distance_upper_bound=PATCH_M
         )
@@ -140,19 +129,23 @@ class Skin:
         place[patch] = np.arange(len(patch))
         bend = self.bend[:, patch]
         smooth = bend.T @ bend + sparse.identity(len(patch))
-        rows = np.repeat(np.arange(len(push.ids)), 3)
-        columns = (3 * place[push.ids][:, None] + np.arange(3)).ravel()
-        shape = len(push.ids), 3 * len(patch)
-        along = sparse.csr_matrix((push.ways.ravel(), (rows, columns)), shape)
+        rows = np.repeat(np.arange(len(ids)), 3)
+        columns = (3 * place[ids][:, None] + np.arange(3)).ravel()
+        shape = len(ids), 3 * len(patch)
+        along = sparse.csr_matrix((ways.ravel(), (rows, columns)), shape)
         matrix = sparse.kron(smooth, sparse.identity(3)) + PUSH * along.T @ along
-        wanted = PUSH * along.T @ push.moves
+        wanted = PUSH * along.T @ lengths
         moves = np.zeros_like(mesh)
         solved = spsolve(matrix.tocsc(), wanted, permc_spec="MMD_AT_PLUS_A")
         moves[patch] = solved.reshape(-1, 3)
         return moves
 
-    def pushes(self, mesh: np.ndarray, pairs: np.ndarray, step: int) -> Pushes:
-        """Return the moves after which a plane lies between the faces of every pair.
+    def pushes(
+        self, mesh: np.ndarray, pairs: np.ndarray, step: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return moves after which a plane lies between the faces of every pair.
+
+        They are vertices' ids (N,), directions (N, 3), and metres along them (N,).
 
         In the first steps opposed faces move back against their normals; all others move in the
         direction in which they lie apart at rest.
@@ -178,4 +171,4 @@ class Skin:
         ids = self.faces[pairs].ravel()
         some = (moves != 0) & self.free[ids]
         ways = np.broadcast_to(way[:, None, None], corners.shape).reshape(-1, 3)
-        return Pushes(ids[some], ways[some], moves[some])
+        return ids[some], ways[some], moves[some]
