@@ -24,6 +24,7 @@ from express50.contract.stage import Stage
 from express50.files.calibration import read_cameras, write_cameras
 from express50.geometry.cameras import Camera, pinhole
 from express50.geometry.sampling import undistort_image, undistorted_mask
+from express50.runner.executor import Pool
 from express50.runner.runner import run_stage
 from express50.twin import TwinConfig
 from express50.twin.record import print_progress, record
@@ -76,7 +77,7 @@ def named_or_recorded(
 def run_or_stop(stage: Stage, dataset: Dataset, preset: str = "standard", **values: Any) -> None:
     """Run a stage in this process; stop the benchmark when an item fails."""
     config = build_config(stage, {**stage.presets.get(preset, {}), **values})
-    summary = run_stage(stage, dataset, config, workers=0, progress=False)
+    summary = run_stage(stage, dataset, config, pool=Pool(0), progress=False)
     if not summary.ok:
         sys.exit("\n".join(summary.lines()))
 

@@ -25,6 +25,7 @@ from express50.contract.stage import Result, Stage
 from express50.errors import Express50Error
 from express50.files import atomic
 from express50.files.atomic import dump_json
+from express50.runner.executor import Pool
 from express50.runner.runner import run_stage
 
 PIECES = 4
@@ -142,9 +143,8 @@ def main() -> int:
     args = parser.parse_args()
     config = build_config(STAGE, {"notes": args.notes})
     try:
-        summary = run_stage(
-            STAGE, Dataset(args.root), config, None, args.workers, args.scheduler, progress=False
-        )
+        with Pool(args.workers, args.scheduler) as pool:
+            summary = run_stage(STAGE, Dataset(args.root), config, pool=pool, progress=False)
     except Express50Error as error:
         print(error, file=sys.stderr)
         return 2

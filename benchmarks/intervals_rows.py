@@ -25,6 +25,7 @@ from express50.contract.layout import Dataset
 from express50.files.calibration import read_cameras, write_cameras
 from express50.files.images import read_image, write_image
 from express50.geometry.transforms import axis_angle_to_matrix
+from express50.runner.executor import Pool
 from express50.runner.runner import run_stage
 from express50.twin import TwinConfig, rig
 from express50.twin.record import record
@@ -122,7 +123,7 @@ def run_chain(dataset: Dataset, capture: Path, peaks: dict[str, int], preset: st
         settings = build_config(stage.STAGE, chosen)
         if stage is frames:
             write_peaks(dataset, capture.name, peaks)
-        summary = run_stage(stage.STAGE, dataset, settings, workers=0, progress=False)
+        summary = run_stage(stage.STAGE, dataset, settings, pool=Pool(0), progress=False)
         for line in (outcome.reason for outcome in summary.outcomes if outcome.reason):
             print(f"{dataset.root.name}: {stage.STAGE.name}: {line}", file=sys.stderr)
         if not summary.count("done") + summary.count("skipped"):

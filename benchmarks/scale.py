@@ -26,6 +26,7 @@ from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import stages
 from express50.dial.figures import footage_of
+from express50.runner.executor import Pool
 from express50.runner.runner import run_stage
 from express50.runner.worker import core_seconds, peak_memory, reset_peak_memory
 
@@ -53,7 +54,7 @@ def run_alone(name: str, root: Path, preset: str) -> dict[str, float]:
     stage = stages()[name]
     reset_peak_memory()
     summary = run_stage(
-        stage, Dataset(root), resolve_config(stage, preset), workers=0, progress=False
+        stage, Dataset(root), resolve_config(stage, preset), pool=Pool(0), progress=False
     )
     failed = [outcome.reason for outcome in summary.outcomes if outcome.reason]
     if failed:

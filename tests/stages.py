@@ -10,6 +10,7 @@ from typing import Any
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
+from express50.runner.executor import Pool
 from express50.runner.runner import Summary, run_stage
 from pipelines import ingest
 
@@ -23,7 +24,7 @@ def run_here(
 ) -> Summary:
     """Run a stage with a preset in which some settings are others."""
     config = build_config(stage, {**stage.presets.get(preset, {}), **settings})
-    return run_stage(stage, dataset, config, items, workers=0, progress=False)
+    return run_stage(stage, dataset, config, items, pool=Pool(0), progress=False)
 
 
 def metrics_of(dataset: Dataset, stage: str, item: str) -> dict[str, Any]:

@@ -7,7 +7,6 @@ import functools
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -159,19 +158,16 @@ def run_stage(
     dataset: Dataset,
     config: Any,
     items: Sequence[str] | None = None,
-    workers: int = 2,
-    scheduler: str | None = None,
+    *,
+    pool: Pool,
     progress: bool = True,
-    pool: Pool | None = None,
     monitor: RunMonitor | None = None,
 ) -> Summary:
     """Bring a stage's outputs up to date; return the account of all items.
 
     A bad item is in the account; it does not raise. By default all items are run, and outputs of
-    items that no longer exist are set aside. `workers` are local processes, and with 0 all runs in
-    this one; `scheduler` is the address of a dask scheduler to use instead; `pool` replaces both
-    with workers shared with other stages. `progress` is shown on standard error. `monitor` sees
-    every receipt, and says when no further item may begin.
+    items that no longer exist are set aside. Workers are those of the `pool`. `progress` is shown
+    on standard error. `monitor` sees every receipt, and says when no further item may begin.
 
     Raises:
         StageError: the stage has no items, or another run holds it.
@@ -184,22 +180,18 @@ def run_stage(
     if not chosen:
         before = "name a CAPTURE" if stage.prepare else _what_is_missing(dataset)
         raise StageError(f"{dataset.root}: {stage.name} has nothing to do; {before}")
-    shared = nullcontext(pool) if pool else Pool(workers, scheduler)
-    with shared as workers_pool, stage_lock(dataset, stage.name), Ledger(dataset.ledger) as ledger:
+    with stage_lock(dataset, stage.name), Ledger(dataset.ledger) as ledger:
         clean_leftovers(dataset, stage.name)
         path, data = dataset.config_file(stage.name), config_toml(stage.name, config).encode()
         if not path.is_file() or path.read_bytes() != data:
             write_bytes(path, data)
         if items is None:
             _set_aside_gone(stage, dataset, chosen, ledger, progress)
-        threads = workers_pool.threads
         with RunLog(dataset.ledger, stage.name, len(chosen)) as log:
             if shortage := expected_shortage(dataset, ledger, stage.name, chosen):
                 raise NotReadyError(shortage)
-            work = _sort_items(stage, dataset, config, chosen, ledger, threads)
-            outcomes = _run_items(
-                stage, dataset, work, ledger, workers_pool, progress, log, monitor
-            )
+            work = _sort_items(stage, dataset, config, chosen, ledger, pool.threads)
+            outcomes = _run_items(stage, dataset, work, ledger, pool, progress, log, monitor)
     missing = set(chosen) - set(outcomes)
     if monitor is not None and monitor.closed():
         outcomes |= {item: Outcome(item, "left") for item in missing}

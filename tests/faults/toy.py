@@ -135,7 +135,8 @@ def run_toy(
     **values: Any,
 ):
     """Run the toy, or another stage with its settings."""
-    return run_stage(stage, dataset, ToyConfig(**values), items, workers=workers, progress=False)
+    with Pool(workers) as pool:
+        return run_stage(stage, dataset, ToyConfig(**values), items, pool=pool, progress=False)
 
 
 def tree(root: Path) -> dict[str, bytes]:

@@ -15,6 +15,7 @@ from express50.files.calibration import write_cameras
 from express50.files.images import write_image
 from express50.geometry.cameras import Camera
 from express50.head.load import load_head
+from express50.runner.executor import Pool
 from express50.runner.runner import run_stage
 from pipelines import frames, ingest
 from tests.pipelines.bump_head import render, ring
@@ -100,7 +101,7 @@ def write_track(dataset: Dataset, subject: str) -> None:
 
 def published(dataset: Dataset, stage: Stage, config: object) -> dict:
     """Run a stage in this process; returns the metrics of its items."""
-    run_stage(stage, dataset, config, workers=0, progress=False)
+    run_stage(stage, dataset, config, pool=Pool(0), progress=False)
     found = {}
     for item in stage.items(dataset):
         path = dataset.item_dir(stage.name, item) / "metrics.json"

@@ -18,6 +18,7 @@ from express50.dial.pilot import Pilot, guessed, keep_for_run, trial_seconds
 from express50.dial.run import RunState, closing_lines, reserved, run_file, run_within
 from express50.errors import ConfigError, StageError
 from express50.files.atomic import write_json
+from express50.runner.executor import Pool
 from express50.runner.runner import run_stage
 from tests.express50.dial.toy_chain import (
     FAILS,
@@ -230,7 +231,7 @@ def test_an_interrupted_run_goes_on_with_its_choices_and_ends_alike(
     other = chain_of(tmp_path / "other", captures)
     for stage in other.stages:
         config = other.ladders[stage.name][state.settings[stage.name]]
-        run_stage(stage, other.dataset, config, workers=0, progress=False)
+        run_stage(stage, other.dataset, config, pool=Pool(0), progress=False)
     assert outputs(tmp_path / "d") == outputs(tmp_path / "other")
 
 

@@ -115,8 +115,11 @@ def test_one_item_at_a_time_on_each_device(devices):
 def test_no_device_on_this_machine_is_one_error(tmp_path, devices):
     devices(0)
     dataset = toy.make_dataset(tmp_path / "data", ["a", "b"])
-    with pytest.raises(StageError, match="toy needs a GPU .* nvidia-smi lists none"):
-        run_stage(GREEDY, dataset, toy.ToyConfig(), workers=2, progress=False)
+    with (
+        Pool(2) as pool,
+        pytest.raises(StageError, match="toy needs a GPU .* nvidia-smi lists none"),
+    ):
+        run_stage(GREEDY, dataset, toy.ToyConfig(), pool=pool, progress=False)
 
 
 def test_item_without_cuda_is_refused_rather_than_done_on_the_processor(tmp_path, monkeypatch):
@@ -124,7 +127,7 @@ def test_item_without_cuda_is_refused_rather_than_done_on_the_processor(tmp_path
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     dataset = toy.make_dataset(tmp_path / "data", ["a"])
-    (outcome,) = run_stage(GREEDY, dataset, toy.ToyConfig(), workers=0, progress=False).outcomes
+    (outcome,) = run_stage(GREEDY, dataset, toy.ToyConfig(), pool=Pool(0), progress=False).outcomes
     assert "torch finds no CUDA device here" in outcome.reason
 
 

@@ -12,6 +12,7 @@ import pytest
 from express50.__main__ import main
 from express50.dataset.audit import audit
 from express50.runner import publish
+from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger
 from express50.runner.publish import stage_lock
 from express50.runner.runner import run_stage
@@ -67,7 +68,7 @@ def test_items_that_come_back_to_the_list_are_restored(dataset, capsys):
     run_toy(dataset)
     assert not dataset.item_dir("toy", "a").exists() and kept(dataset) == ["a"]
     (dataset.root / "a.txt").rename(dataset.root / "in" / "a.txt")
-    back = run_stage(toy.STAGE, dataset, toy.ToyConfig(), workers=0)
+    back = run_stage(toy.STAGE, dataset, toy.ToyConfig(), pool=Pool(0))
     assert "toy 1/1 a restored\n" in capsys.readouterr().err
     assert [o.restored for o in back.outcomes] == [False, True]
     assert "  restored 1: same as before" in list(back.lines())

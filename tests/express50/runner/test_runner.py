@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import errno
-import functools
 import logging
 import os
 import resource
@@ -103,7 +102,7 @@ def test_finished_work_that_is_made_again_is_said_before_it_is_made(tmp_path, ca
 
     def said(items=None, **values):
         capsys.readouterr()
-        run_stage(toy.STAGE, dataset, toy.ToyConfig(**values), items, workers=0)
+        run_stage(toy.STAGE, dataset, toy.ToyConfig(**values), items, pool=Pool(0))
         return capsys.readouterr().err
 
     assert "again" not in said() + said()
@@ -382,7 +381,7 @@ def test_an_item_whose_input_is_missing_is_shown_as_failed(tmp_path, capsys):
         raise StageError("not calibrated")
 
     waiting = dataclasses.replace(toy.STAGE, inputs=without)
-    run_stage(waiting, make_dataset(tmp_path / "data", ["a"]), toy.ToyConfig(), workers=0)
+    run_stage(waiting, make_dataset(tmp_path / "data", ["a"]), toy.ToyConfig(), pool=Pool(0))
     assert "toy 1/1 a failed 0.0 s: StageError: not calibrated" in capsys.readouterr().err
 
 
@@ -484,7 +483,7 @@ def test_unreachable_scheduler_is_one_error_and_leaves_what_is_made(tmp_path, mo
     monkeypatch.setattr(clusters, "CONNECT_SECONDS", 0.5)
     config, nowhere = toy.ToyConfig(word="b"), "tcp://127.0.0.1:9"
     with pytest.raises(StageError, match="scheduler tcp://127.0.0.1:9: cannot connect"):
-        run_stage(toy.STAGE, dataset, config, scheduler=nowhere, progress=False)
+        run_stage(toy.STAGE, dataset, config, pool=Pool(scheduler=nowhere), progress=False)
     assert statuses(run_toy(dataset)) == {"a": "skipped", "b": "skipped"}
 
 
@@ -495,9 +494,8 @@ def test_given_scheduler_is_used_and_left_running(tmp_path):
     with LocalCluster(
         n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None
     ) as cluster:
-        summary = run_stage(
-            toy.STAGE, dataset, toy.ToyConfig(), scheduler=cluster.scheduler_address, progress=False
-        )
+        with Pool(scheduler=cluster.scheduler_address) as pool:
+            summary = run_stage(toy.STAGE, dataset, toy.ToyConfig(), pool=pool, progress=False)
         with Client(cluster) as client:
             assert len(client.nthreads()) == 1
     assert summary.count("done") == 3
@@ -510,11 +508,13 @@ def test_two_runs_of_one_item_on_one_scheduler_both_make_it(tmp_path):
     config, options = toy.ToyConfig(seconds=0.1), {"dashboard_address": None, "protocol": "tcp://"}
     field_documents(toy.ToyConfig)  # CPython 3.11 may fail if two threads parse source at once
     with LocalCluster(n_workers=2, threads_per_worker=1, **options) as cluster:
-        go = functools.partial(
-            run_stage, toy.STAGE, config=config, scheduler=cluster.scheduler_address, progress=False
-        )
-        with ThreadPoolExecutor(2) as pool:
-            assert all(summary.count("done") == 2 for summary in pool.map(go, datasets))
+
+        def go(dataset):
+            with Pool(scheduler=cluster.scheduler_address) as pool:
+                return run_stage(toy.STAGE, dataset, config, pool=pool, progress=False)
+
+        with ThreadPoolExecutor(2) as threads:
+            assert all(summary.count("done") == 2 for summary in threads.map(go, datasets))
     for dataset in datasets:
         assert all(dataset.item_dir("toy", item).is_dir() for item in ("a", "b"))
 
@@ -528,14 +528,11 @@ def test_lost_scheduler_is_one_error_and_what_is_done_is_kept(tmp_path):
     logging.getLogger("distributed.client").addHandler(heard)
     timer = threading.Timer(1.0, cluster.close)
     timer.start()
-    with pytest.raises(StageError, match="lost the dask scheduler"):
-        run_stage(
-            toy.STAGE,
-            dataset,
-            toy.ToyConfig(seconds=0.1),
-            scheduler=cluster.scheduler_address,
-            progress=False,
-        )
+    with (
+        Pool(scheduler=cluster.scheduler_address) as pool,
+        pytest.raises(StageError, match="lost the dask scheduler"),
+    ):
+        run_stage(toy.STAGE, dataset, toy.ToyConfig(seconds=0.1), pool=pool, progress=False)
     timer.join()
     logging.getLogger("distributed.client").removeHandler(heard)
     assert not heard.buffer  # else a page of tracebacks stands before the one line
@@ -561,8 +558,10 @@ def test_bar_on_a_terminal_shows_counts_and_failures(tmp_path):
     dataset = make_dataset(tmp_path / "data", ["a", "b", "bad1"])
     code = (
         "import sys; from pathlib import Path; from tests.faults import toy;"
+        "from express50.runner.executor import Pool;"
         "from express50.runner.runner import run_stage;"
-        "run_stage(toy.STAGE, toy.Dataset(Path(sys.argv[1])), toy.ToyConfig(seconds=.1), workers=0)"
+        "dataset = toy.Dataset(Path(sys.argv[1]));"
+        "run_stage(toy.STAGE, dataset, toy.ToyConfig(seconds=.1), pool=Pool(0))"
     )
     driver, terminal = os.openpty()
     repository = Path(__file__).resolve().parents[3]
