@@ -94,8 +94,8 @@ def check_known(
     for name in wanted:
         if name not in known:
             near = nearest(name, known) if len(known) > FEW else ""
-            listed = ", ".join(known) or "none"
-            raise kind(f"{where}: no {what} {name!r}{near}; expected one of {listed}")
+            listed = f"expected one of {', '.join(known)}" if known else "there is none"
+            raise kind(f"{where}: no {what} {name!r}{near}; {listed}")
 
 
 def nearest(word: str, known: Iterable[str]) -> str:

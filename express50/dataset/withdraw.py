@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from express50.capture.index import read_index
-from express50.contract.layout import Dataset
+from express50.contract.layout import Dataset, existing_dataset
 from express50.errors import Express50Error, FormatError, check_known
 from express50.files.atomic import write_json
 from express50.files.digests import files_of, text_digest
@@ -81,12 +81,15 @@ def plan(dataset: Dataset, subject: str) -> dict[Path, str]:
     Each comes with the reason, which is empty for the subject's own.
 
     Raises:
+        ConfigError: the folder is no dataset, such as one of shards.
         UnknownNameError: the dataset has no such subject.
     """
     known = {*dataset.captures(), *dataset.subjects()}
     labelled = NAME.fullmatch(subject) and dataset.labels_file(subject).is_file()
     # Reject all other names: '', '..' or 'shards' would name folders that are not a person's.
     if not (subject in known or labelled or text_digest(subject) in withdrawn(dataset)):
+        if not known:
+            existing_dataset(dataset.root)
         check_known(str(dataset.root), "subject", [subject], sorted(known))
     paths = dict.fromkeys(sorted(_own_paths(dataset, subject)), "")
     mixed = set(_mixed_paths(dataset)) - paths.keys()  # what came back of the withdrawn is both

@@ -362,7 +362,8 @@ def _checked_splits(readers: Sequence[ShardReader]) -> dict[str, str]:
             if owners.setdefault(group, reader) is not reader:
                 raise FormatError(
                     f"{reader.root}: {'/'.join(group)} is in {owners[group].root} too, expected in"
-                    " one folder; leave it out of one of them with 'express50 shards split'"
+                    " one folder; leave it out of one of them with 'express50 shards split', or,"
+                    " if it is another person's, rename that capture and pack it again"
                 )
     splits: dict[str, str] = {}
     for reader in readers:
