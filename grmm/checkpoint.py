@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from express50.errors import ConfigError, FormatError, HeadModelError
+from express50.errors import ConfigError, FormatError, HeadModelError, TrainError
 from express50.files.arrays import DAMAGE, read_weights
 from express50.files.atomic import write_with
 from express50.files.text import reason
@@ -90,7 +90,17 @@ def save_checkpoint(
     optimizer: dict[str, Any] | None = None,
     loop: dict[str, Any] | None = None,
 ) -> None:
-    """Write a checkpoint atomically; the previous one stays until the new one is complete."""
+    """Write a checkpoint atomically; the previous one stays until the new one is complete.
+
+    Raises:
+        TrainError: a weight is NaN or Inf; `load_checkpoint` would refuse the file.
+    """
+    for name, tensor in model.state_dict().items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise TrainError(
+                f"{path}: not saved, because {name} holds NaN or Inf: training diverged. What was "
+                "saved before is kept; lower the learning rate and start over with --overwrite"
+            )
     # One array per parameter: thousands of small ones take seconds to write. Offsets once per
     # subject: they are larger than all other parameters together.
     frames = gallery.frames

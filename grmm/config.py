@@ -186,7 +186,7 @@ class TrainConfig:
     def __post_init__(self) -> None:
         check_ranges(
             "train", self, iterations=COUNT, accumulate=COUNT, evaluate_images=COUNT,
-            seed=NOT_NEGATIVE, lr=(1e-12, 1),
+            seed=(0, 2**63 - 1), lr=(1e-12, 1),
             seconds=NOT_NEGATIVE, save_seconds=NOT_NEGATIVE, final_lr=NOT_NEGATIVE,
             code_lr_scale=NOT_NEGATIVE, texel_lr_scale=NOT_NEGATIVE, refine_lr_scale=NOT_NEGATIVE,
         )  # fmt: skip

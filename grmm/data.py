@@ -47,6 +47,11 @@ class SampleKey:
         """Return subject and expression."""
         return self.subject, self.expression
 
+    @property
+    def name(self) -> str:
+        """Return the ids as messages show them: S001/smile/cam00."""
+        return f"{self.subject}/{self.expression}/{self.camera}"
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Tracked:
@@ -303,8 +308,7 @@ class HeadViews:
         log(words)
 
     def _where(self, index: int) -> str:
-        key = self.keys[index]
-        return f"{key.subject}/{key.expression}/{key.camera}"
+        return self.keys[index].name
 
     def place(self, index: int) -> Place:
         """Return a sample's place; raise FormatError for parameters of another head model."""

@@ -147,7 +147,7 @@ def compare(image: Tensor, item: HeadView, judge: PerceptualMetrics, kind: str =
     """
     if not bool(torch.isfinite(image).all()):
         raise TrainError(
-            f"{item.key}: the rendering holds NaN or Inf; expected colours. The checkpoint is "
+            f"{item.key.name}: the rendering holds NaN or Inf; expected colours. The checkpoint is "
             "damaged or was trained at too high a rate"
         )
     shown = item.comparable(image)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
+import warnings
 from datetime import timedelta
 from pathlib import Path
 from threading import Event
@@ -97,7 +98,9 @@ def train(
         warm_start(state.model, views, state.training)
     parallel: torch.nn.Module = state.model
     if world > 1:  # buffers are constants of the head model
-        parallel = DistributedDataParallel(state.model, broadcast_buffers=False)
+        # Speed alone, and only that of 1 x 1 convolutions.
+        warnings.filterwarnings("ignore", "Grad strides do not match bucket view strides")
+        parallel = DistributedDataParallel(state.model, forward_sync_buffers=False)
     if rank == 0:
         out.mkdir(parents=True, exist_ok=True)
         check_space(out)
@@ -172,10 +175,11 @@ def step(state: TrainState, parallel: torch.nn.Module, config: Config) -> None:
             loss = torch.stack(list(terms.values())).sum()
             state.terms = {name: term.detach() for name, term in terms.items()}
             if not bool(torch.isfinite(loss)):
-                shown = {name: float(term) for name, term in state.terms.items()}
+                shown = (f"{name} {float(term):.4g}" for name, term in state.terms.items())
                 raise TrainError(
-                    f"iteration {state.iteration}: the objective is not finite at {item.key}: "
-                    f"{shown}; expected finite terms. Lower train.lr or check this sample"
+                    f"iteration {state.iteration}: the objective is not finite at {item.key.name}"
+                    f" ({', '.join(shown)}); check this sample, or lower train.lr and start over"
+                    " with --overwrite"
                 )
             (loss / config.train.accumulate).backward()
     state.optimizer.step()

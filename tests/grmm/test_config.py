@@ -75,7 +75,7 @@ def test_assignments_stand_over_toml_over_preset(tmp_path):
         ("model.refine_unshuffle=0", "expected 1 or more"),
         ("model.refine_widths=[8, 0]", "expected widths of 1 or more"),
         ("train.evaluate_images=0", "expected 1 or more"),
-        ("train.seed=-1", "expected 0 or more"),
+        ("train.seed=-1", "expected 0 to "),
         ("fit.stage2_iterations=-1", "expected 0 or more"),
     ],
 )

@@ -282,6 +282,18 @@ def test_objective_that_is_not_finite_stops_with_the_sample_named(source, tmp_pa
         train(Poisoned(size=32), ellipsoid_head(), tmp_path, tiny_config())
 
 
+def test_weights_that_are_not_finite_do_not_replace_the_last_checkpoint(source, tmp_path):
+    def poisoned(state, rendering, item):  # a term of 0 whose gradient is NaN, from step 2 on
+        opacity = rendering.gaussians.opacities.sum()
+        return {"own": (0 * opacity).sqrt() if state.iteration else 0 * opacity}
+
+    config = tiny_config(train={"save_seconds": 1e-9})
+    with pytest.raises(TrainError, match=r"not saved, because .* holds NaN or Inf"):
+        train(source, ellipsoid_head(), tmp_path, config, own_terms=poisoned)
+    saved = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    assert saved["loop"]["iteration"] == 1
+
+
 def test_evaluation_is_written_as_table_and_means(tmp_path, views):
     run = prepare(views, tiny_config())
     rows = evaluate(views, [0, 4], training_render(run.model, views))
