@@ -282,7 +282,7 @@ class HeadViews:
 
     def _read(self, index: int) -> Sample:
         sample = self.source.read(index)
-        where, size = self._where(index), sample.image.shape[:2]
+        where, size = self.keys[index].name, sample.image.shape[:2]
         for name in ("alpha", "depth", "parts"):
             array = getattr(sample, name)
             if array is not None and array.shape != size:
@@ -296,7 +296,7 @@ class HeadViews:
     def check_mattes(self, indices: Sequence[int]) -> None:
         """Look at some views' mattes, evenly spread, and log empty ones; TrainError if all are."""
         looked = evenly(indices, CHECKED_MATTES)
-        empty = [self._where(i) for i in looked if not bool(self.item(i).mask.any())]
+        empty = [self.keys[i].name for i in looked if not bool(self.item(i).mask.any())]
         if not empty:
             return
         words = (
@@ -307,13 +307,10 @@ class HeadViews:
             raise TrainError(words)
         log(words)
 
-    def _where(self, index: int) -> str:
-        return self.keys[index].name
-
     def place(self, index: int) -> Place:
         """Return a sample's place; raise FormatError for parameters of another head model."""
         place = self.source.place(index)
-        check_tracked(self._where(index), place.tracked, self.head)
+        check_tracked(self.keys[index].name, place.tracked, self.head)
         return place
 
     def state(self, index: int) -> HeadState:

@@ -98,7 +98,7 @@ def train(
         warm_start(state.model, views, state.training)
     parallel: torch.nn.Module = state.model
     if world > 1:  # buffers are constants of the head model
-        # Speed alone, and only that of 1 x 1 convolutions.
+        # Layouts differ for 1 x 1 convolutions; that costs little time and changes no result.
         warnings.filterwarnings("ignore", "Grad strides do not match bucket view strides")
         parallel = DistributedDataParallel(state.model, forward_sync_buffers=False)
     if rank == 0:

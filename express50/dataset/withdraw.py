@@ -81,7 +81,7 @@ def plan(dataset: Dataset, subject: str) -> dict[Path, str]:
     Each comes with the reason, which is empty for the subject's own.
 
     Raises:
-        ConfigError: the folder is no dataset, such as one of shards.
+        ConfigError: the folder is not a dataset; it may hold shards.
         UnknownNameError: the dataset has no such subject.
     """
     known = {*dataset.captures(), *dataset.subjects()}

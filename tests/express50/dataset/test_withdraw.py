@@ -142,7 +142,7 @@ def test_outputs_that_were_replaced_go_too(dataset):
     assert list(files_naming(any_id_finder(digests), dataset.root)) == [entry / "cam00.png"]
 
 
-def test_a_folder_that_is_no_dataset_is_named_as_such(tmp_path, capsys):
+def test_a_folder_that_is_not_a_dataset_is_named_as_such(tmp_path, capsys):
     (tmp_path / "merged").mkdir()  # as 'shards merge' makes one
     assert main(["subject", "withdraw", str(tmp_path / "merged"), "S001"]) == 2
     assert "merged: not a dataset (no ledger.sqlite)" in capsys.readouterr().err
