@@ -239,7 +239,8 @@ def run_withdraw(args: argparse.Namespace) -> int:
         ways = "would take the person's codes and frames, if there are any, out of"
         lines += [f"{ways} {path}" for path in models]
         data = {"subject": args.subject, "would_remove": list(paths), "why": paths}
-        return answer(args, data, *lines, "add --yes to remove")
+        end = "add --yes to remove" if lines else f"nothing of {args.subject} is left"
+        return answer(args, data, *lines, end)
     done = withdraw(dataset, args.subject, args.checkpoint, hook("redact_checkpoint"))
     data = {
         "subject": done.subject,
@@ -263,6 +264,8 @@ def run_withdraw(args: argparse.Namespace) -> int:
         "run 'express50 run' with the settings of your last run to make again what was removed, "
         "then 'express50 report'; train models that saw the person again (their other weights keep "
         "an influence), and delete exports outside the dataset"
+        if lines
+        else f"nothing of {done.subject} is left"
     )
     answer(args, data, *lines)
     return FAILED if done.remaining else OK

@@ -92,8 +92,9 @@ def plan(dataset: Dataset, subject: str) -> dict[Path, str]:
             existing_dataset(dataset.root)
         check_known(str(dataset.root), "subject", [subject], sorted(known))
     paths = dict.fromkeys(sorted(_own_paths(dataset, subject)), "")
-    mixed = set(_mixed_paths(dataset)) - paths.keys()  # what came back of the withdrawn is both
-    paths |= dict.fromkeys(sorted(mixed), "may hold several people's data")
+    if paths or subject in known:  # else an earlier withdrawal removed what mixes people
+        mixed = set(_mixed_paths(dataset)) - paths.keys()  # what came back of the withdrawn is both
+        paths |= dict.fromkeys(sorted(mixed), "may hold several people's data")
     # Other subjects' outputs that name this one, such as peaks matched to the reference person's.
     gone, naming, why = set(paths), [], f"made with data of {subject}; the next run makes it again"
     for path in files_naming(dataset_id_finder(dataset, subject), dataset.root):

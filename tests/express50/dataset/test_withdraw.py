@@ -338,6 +338,16 @@ def test_what_came_back_is_withdrawn_again(dataset):
     assert list(files_naming(id_finder("S001"), dataset.root)) == []
 
 
+def test_a_second_withdrawal_keeps_what_was_made_again_without_the_person(dataset, capsys):
+    withdraw(dataset, "S001")
+    with publishing(dataset, "pack", "shards") as out:
+        (out / "metrics.json").write_text("{}")
+    for words in ([], ["--yes"]):
+        assert main(["subject", "withdraw", str(dataset.root), "S001", *words]) == 0
+        assert capsys.readouterr().out == "nothing of S001 is left\n"
+    assert dataset.item_dir("pack", "shards").exists()
+
+
 PERSON = 'name = "Jane Roe"\nage = 4711e-2\ngender = "feminine"\nconsent_id = "C-77"\n'
 
 
