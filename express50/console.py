@@ -15,12 +15,12 @@ import textwrap
 import traceback
 import warnings
 from _thread import interrupt_main
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from threading import Timer
 from typing import IO, Any
 
-from express50.errors import ConfigError, Express50Error, nearest
+from express50.errors import ConfigError, Express50Error, few, nearest
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 DEBUG = "EXPRESS50_DEBUG"  # environment variable
@@ -393,6 +393,16 @@ def format_table(header: list[str], rows: list[list[str]]) -> Iterator[str]:
             for cell, width, number in zip(row, widths, right, strict=True)
         )
         yield "  ".join(cells).rstrip()
+
+
+def group_lines(rows: Iterable[tuple[str, str]]) -> Iterator[str]:
+    """Make lines of ("stage item", finding); a stage's items with the same finding share one."""
+    groups: dict[tuple[str, str], list[str]] = {}
+    for place, finding in rows:
+        stage, _, item = place.partition(" ")
+        groups.setdefault((stage, finding), []).append(item)
+    for (stage, finding), items in groups.items():
+        yield f"{stage} {few(items)}".rstrip() + f": {finding}"
 
 
 def format_seconds(seconds: float) -> str:

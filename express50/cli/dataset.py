@@ -19,6 +19,7 @@ from express50.console import (
     add_command,
     answer,
     count,
+    group_lines,
     log,
     number,
     say,
@@ -195,10 +196,11 @@ def run_check(args: argparse.Namespace) -> int:
         "bytes_read": result.hashed,
         "seconds": round(seconds, 3),
     }
-    lines = [
-        f"{one.where}: {one.what}; {'FIXED' if one.fixed else 'fix'}: {one.fix}"
+    rows = (
+        (one.where, f"{one.what}; {'FIXED' if one.fixed else 'fix'}: {one.fix}")
         for one in result.findings
-    ]
+    )
+    lines = [*group_lines(rows)]
     lines += [f"note: {note}" for note in result.notes]
     found, fixed = len(result.findings), sum(one.fixed for one in result.findings)
     verdict = f"{count(found, 'finding')}, {fixed} fixed, {found - fixed} left"

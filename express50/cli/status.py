@@ -23,6 +23,7 @@ from express50.console import (
     count,
     format_seconds,
     format_table,
+    group_lines,
     number,
     say,
 )
@@ -173,9 +174,9 @@ def _lines(table: list[StageStatus]) -> Iterator[str]:
         if notes:
             parts = few([f"{what} of {item}" for what, item in notes])
             yield f"dropped {row.stage}: {count(len(notes), 'part')}, {parts}; 'report' says why"
-    for row in table:
-        for receipt in row.failed:
-            yield f"failed {receipt.stage} {receipt.item}: {receipt.reason}"
+    failed = (receipt for row in table for receipt in row.failed)
+    for line in group_lines((f"{one.stage} {one.item}", one.reason) for one in failed):
+        yield f"failed {line}"
 
 
 def _trial_lines(dataset: Dataset) -> Iterator[str]:
@@ -190,12 +191,9 @@ def _trial_lines(dataset: Dataset) -> Iterator[str]:
 
 
 def _outdated_lines(why: Mapping[tuple[str, str], str]) -> Iterator[str]:
-    groups: dict[tuple[str, str], list[str]] = {}
-    for (stage, item), words in why.items():
-        groups.setdefault((stage, words), []).append(item)
-    for (stage, words), items in groups.items():
-        yield f"outdated {stage} {few(items, 2)}: {words}"
-    if groups:
+    for line in group_lines((f"{stage} {item}", words) for (stage, item), words in why.items()):
+        yield f"outdated {line}"
+    if why:
         yield "the next run makes these again, or takes back kept outputs of the same settings"
 
 

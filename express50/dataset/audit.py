@@ -351,12 +351,12 @@ class _StageAudit:
             how = "move files that no run wrote out of the folder, then check again"
         elif not known and fault.kind == "unknown":
             how = f"{stage} no longer has such an item; delete it if you do not need it"
+        elif fault.kind == OUTDATED:  # a run finds this by itself
+            fixed, how = self.fix, again
         elif self.fix:
             fixed, how = True, f"set aside; to make it again, {again}"
             set_aside(self.dataset, stage, fault.item)
             self.ledger.forget(stage, [fault.item])
-        elif fault.kind == OUTDATED:  # a run finds this by itself
-            how = again
         else:
             how = (
                 f"{REPAIR}, then {again}" if known else f"{REPAIR}; the stage has no such item now"

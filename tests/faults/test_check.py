@@ -135,9 +135,19 @@ def test_upstream_made_anew_with_other_bytes_blames_what_was_made_of_the_old(dat
     one = found["outdated", "after S001"]
     assert "changed since it was made: toy" in one.what
     assert one.fix == f"run 'express50 after {dataset.root}' with the same settings as before"
+    old = toy.tree(dataset.stage_dir("after"))
     assert look(dataset, fix=True)[1].sound
+    assert toy.tree(dataset.stage_dir("after")) == old  # until a run has better ones
     assert toy.run_toy(dataset, stage=LATER).count("done") == 2
     assert look(dataset)[0] == {}
+
+
+def test_items_with_the_same_finding_share_a_line(dataset, capsys, monkeypatch):
+    monkeypatch.setattr("express50.cli.dataset.stages", lambda: {s.name: s for s in STAGES})
+    shutil.rmtree(dataset.stage_dir("after"))
+    assert main(["check", str(dataset.root)]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("after S001, S002: the ledger has a receipt, but") and len(lines) < 4
 
 
 def test_a_run_alone_makes_outdated_outputs_again(dataset):
