@@ -12,6 +12,7 @@ import contextlib
 import os
 import time
 import warnings
+from collections.abc import Callable, Mapping
 from datetime import timedelta
 from pathlib import Path
 from threading import Event
@@ -23,7 +24,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from express50 import native
 from express50.console import count, log
-from express50.errors import NotReadyError, TrainError
+from express50.errors import FormatError, NotReadyError, TrainError
 from express50.files.atomic import check_space, write_json
 from express50.geometry.sampling import evenly
 from express50.head.model import HeadModel
@@ -124,11 +125,22 @@ def train(
     def save_to(path: Path) -> None:
         save(state, path, config, source.head, gallery)
 
+    def late() -> bool:  # several processes would have to agree, view by view
+        state.seconds = time.perf_counter() - started
+        return world == 1 and finished(state, config)
+
     started, every = time.perf_counter() - state.seconds, config.train.save_seconds
     with deferred_interrupt() as interrupt, saving(checkpoint, save_to, every) as keep:
         while not finished(state, config):
             set_rates(state, config)
-            step(state, parallel, config)
+            order = state.shuffle.state()
+            try:
+                step(state, parallel, config, late)
+            except (FormatError, OSError):  # a shard was damaged or removed; no step is lost
+                state.shuffle.restore(order)
+                if rank == 0 and state.iteration:
+                    keep(True)
+                raise
             state.iteration += 1
             state.seconds = time.perf_counter() - started
             if world > 1:
@@ -149,13 +161,26 @@ def train(
 
     # --- The report ----------------------------------------------------------------------------
     metrics = report(state, config, out, perceptual) if rank == 0 else {}
-    if rank == 0 and float(str(metrics["psnr_train_db"])) < GREY_DB:
-        log("training images score worse than plain grey: training diverged; lower train.lr")
+    if diverged(metrics):
+        log(
+            "training images score worse than plain grey: training diverged; lower train.lr and "
+            "start over with --overwrite"
+        )
     return metrics
 
 
-def step(state: TrainState, parallel: torch.nn.Module, config: Config) -> None:
-    """Take one optimiser step over ``accumulate`` views; TrainError if something is not finite."""
+def step(
+    state: TrainState,
+    parallel: torch.nn.Module,
+    config: Config,
+    late: Callable[[], bool] = lambda: False,
+) -> None:
+    """Take one optimiser step over ``accumulate`` views, or over those seen when it is ``late``.
+
+    Raises:
+        TrainError: something is not finite.
+        FormatError, OSError: a view cannot be read.
+    """
     state.optimizer.zero_grad(set_to_none=True)
     for left in reversed(range(config.train.accumulate)):
         item = state.views.item(state.shuffle.next(), crop=True)
@@ -182,6 +207,8 @@ def step(state: TrainState, parallel: torch.nn.Module, config: Config) -> None:
                     " with --overwrite"
                 )
             (loss / config.train.accumulate).backward()
+        if late():
+            break
     state.optimizer.step()
 
 
@@ -263,6 +290,11 @@ def report(
             comparison_sheet(out / "preview" / f"{name}.jpg", views, evenly(indices, 6), render)
     write_json(out / "metrics.json", metrics)
     return metrics
+
+
+def diverged(metrics: Mapping[str, object]) -> bool:
+    """Return whether a grey picture would score better; False for no metrics."""
+    return float(str(metrics.get("psnr_train_db", GREY_DB))) < GREY_DB
 
 
 def join_processes() -> tuple[int, int, torch.device]:

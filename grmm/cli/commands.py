@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from express50.console import OK, answer, count, figure_label, log, say
+from express50.console import FAILED, OK, answer, count, figure_label, log, say
 from express50.contract.config import config_toml, known_assignments
 from express50.errors import ConfigError, check_known
 from express50.files.atomic import (
@@ -48,7 +48,7 @@ def train(args: argparse.Namespace) -> int:
     """Train, or resume from the checkpoint in OUT."""
     from express50.head.load import load_head
     from grmm.shard_source import open_shards
-    from grmm.train import train
+    from grmm.train import diverged, train
 
     check_folder_writable(args.out)
     # First, because most wrong commands name a wrong folder, and no budget helps against that.
@@ -62,7 +62,8 @@ def train(args: argparse.Namespace) -> int:
     names = ("psnr_heldout_view_db", *new, "psnr_train_db", "ssim", "iterations", "gaussians")
     values = {name: metrics.get(name) for name in names}
     lines = [f"{figure_label(k)}: {'n/a' if v is None else v}" for k, v in values.items()]
-    return answer(args, metrics, *lines, f"wrote {args.out / 'checkpoint.pt'}")
+    code = answer(args, metrics, *lines, f"wrote {args.out / 'checkpoint.pt'}")
+    return FAILED if diverged(metrics) else code
 
 
 def train_config(args: argparse.Namespace) -> Config:

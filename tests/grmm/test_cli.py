@@ -370,9 +370,10 @@ def test_training_saves_by_time_and_tells_that_it_diverged(shards, tmp_path, cap
 
     monkeypatch.setattr(grmm.train, "save", spy)
     monkeypatch.setattr(grmm.train, "GREY_DB", 99.0)
-    assert main(["train", str(shards), str(tmp_path), *TINY, "--set=train.save_seconds=1e-6"]) == 0
+    assert main(["train", str(shards), str(tmp_path), *TINY, "--set=train.save_seconds=1e-6"]) == 1
     assert saved == [1, 2, 3]
-    assert "lower train.lr" in capsys.readouterr().err
+    assert "lower train.lr and start over with --overwrite" in capsys.readouterr().err
+    assert (tmp_path / "metrics.json").exists()
 
 
 def test_flags_stand_above_assignments():

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from express50.contract.segmentation_labels import LABELS
-from express50.errors import ConfigError, DiskFullError, TrainError
+from express50.errors import ConfigError, DiskFullError, FormatError, TrainError
 from express50.files.atomic import write_with
 from grmm import checkpoint
 from grmm import train as train_module
@@ -217,6 +217,36 @@ def test_interrupt_leaves_a_checkpoint_to_resume(tmp_path, source, monkeypatch):
     monkeypatch.setattr(module, "step", real)
     config = tiny_config(train={"iterations": 5})
     assert train(source, ellipsoid_head(), tmp_path, config, resume=True)["iterations"] == 5
+
+
+def test_a_long_step_ends_with_the_time(tmp_path, source):
+    settings = {"seconds": 0.5, "accumulate": 10**6}
+    metrics = train(source, ellipsoid_head(), tmp_path, tiny_config(train=settings))
+    assert metrics["iterations"] == 1 and metrics["seconds"] < 20
+    assert metrics["psnr_train_db"] > 10
+
+
+def test_a_sample_that_cannot_be_read_any_more_loses_no_step(tmp_path, source, monkeypatch):
+    straight, broken = tmp_path / "straight", tmp_path / "broken"
+    config = tiny_config(train={"iterations": 5, "accumulate": 2, "final_lr": 1.0})
+    train(source, ellipsoid_head(), straight, config)
+    taken, item = [], HeadViews.item
+
+    def damaged(views, index, *, crop=False):
+        taken.append(crop)
+        if crop and sum(taken) == 8:  # the second view of the fourth step
+            raise FormatError("train-000000.tar: damaged")
+        return item(views, index, crop=crop)
+
+    monkeypatch.setattr(HeadViews, "item", damaged)
+    with pytest.raises(FormatError, match="damaged"):
+        train(source, ellipsoid_head(), broken, config)
+    assert state_of(broken)["loop"]["iteration"] == 3
+    train(source, ellipsoid_head(), broken, config, resume=True)
+    a, b = state_of(straight), state_of(broken)
+    for content in (a, b):
+        content["loop"].pop("seconds")
+    assert_equal(a, b)
 
 
 def test_rates_fall_along_a_cosine(views):
