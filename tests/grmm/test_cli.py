@@ -82,15 +82,15 @@ def test_training_again_goes_on_and_refuses_what_differs(shards, tmp_path, capsy
     assert [step["iteration"] for step in steps] == [3, 4]
 
     before = (tmp_path / "checkpoint.pt").read_bytes()
-    assert main([*train, "--set=train.lr=0.5"]) == 2
+    assert main([*train, "--set=train.lr=0.003"]) == 2
     printed = capsys.readouterr().err
-    assert "train.lr 0.002 -> 0.5" in printed and "--overwrite" in printed
+    assert "train.lr 0.002 -> 0.003" in printed and "--overwrite" in printed
     write_shards(tmp_path / "others", EllipsoidSource(subjects=3, size=24))
     assert main(["train", str(tmp_path / "others"), str(tmp_path), *TINY]) == 2
     assert "the samples of the shards" in capsys.readouterr().err
     assert (tmp_path / "checkpoint.pt").read_bytes() == before
 
-    assert main([*train, "--overwrite", "--set=train.lr=0.5"]) == 0
+    assert main([*train, "--overwrite", "--set=train.lr=0.003"]) == 0
     assert "resuming" not in capsys.readouterr().err
     assert json.loads((tmp_path / "metrics.json").read_text())["iterations"] == 3
 
