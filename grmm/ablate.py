@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import t as student_t
 
-from express50.console import log
+from express50.console import count, format_seconds, log
 from express50.errors import ConfigError, FormatError, check_known
 from express50.files.atomic import dump_json, write_bytes, write_json
 from express50.files.digests import file_sha256
@@ -44,12 +44,12 @@ from grmm.fit import (
     NOVEL_VIEW,
     FitProtocol,
     evaluate_unseen,
-    given_views,
+    unseen_views,
 )
 from grmm.metrics import PerceptualMetrics
 from grmm.shard_source import open_shards
 from grmm.train import train
-from grmm.train_state import best_device, with_map_size
+from grmm.train_state import best_device, differences, split_samples, with_map_size
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,12 +113,13 @@ class Ablation:
         source = open_shards(self.test or self.roots, "*")
         trained = {key.subject for key in open_shards(self.roots, "train").keys}
         known = {key.subject for key in source.keys}
-        if self.test and (both := sorted(known & trained)):
+        people = list(self.subjects) or sorted(known if self.test else known - trained)
+        if both := sorted(trained.intersection(people)):
             raise ConfigError(
-                f"{', '.join(map(str, self.test))}: {', '.join(both)} are also trained on; expected"
-                " other people in shards to test on"
+                f"{', '.join(both)} are also trained on; expected people that training does not"
+                " see: choose others (--fit-subjects) or shards of others (--test)"
             )
-        return source, list(self.subjects) or sorted(known - trained)
+        return source, people
 
 
 def ablate(run: Ablation, names: Sequence[str] = ()) -> dict[str, Any]:
@@ -136,11 +137,22 @@ def ablate(run: Ablation, names: Sequence[str] = ()) -> dict[str, Any]:
         variants.pop("no_modes", None)
     source, people = run.unseen()
     head = load_head(source.head)
+    views = HeadViews(open_shards(run.roots, "train"), head)
+    drawn = {views.keys[i].expression for i in split_samples(views.keys, config)[0]}
     for subject in people:  # before hours of training
-        given_views(HeadViews(source, head), subject, run.protocol)
+        unseen_views(drawn, HeadViews(source, head), subject, run.protocol)
     # Every row has as many Gaussians as the full model.
-    config = with_map_size(config, HeadViews(open_shards(run.roots, "train"), head))
+    config = with_map_size(config, views)
     run = replace(run, config=config)
+    trainings = run.seeds * sum(not variant.trains_as for variant in variants.values())
+    fits = run.seeds * len(variants) * len(people)
+    efforts = [
+        count(n, what) + (f" of {format_seconds(s)} ({format_seconds(n * s)})" if n and s else "")
+        for n, what, s in (
+            (trainings, "training", config.train.seconds), (fits, "fit", config.fit.seconds),
+        )
+    ]  # fmt: skip
+    log(f"ablate: {' and '.join(efforts)}, except for rows that are measured already")
     rows: dict[str, list[dict]] = {}
     table: dict[str, Any] = {}
     for seed in range(run.seeds):
@@ -222,8 +234,10 @@ def _train(used: Sequence[Path], folder: Path, settings: Config) -> None:
     mark, checkpoint = folder / "settings.json", folder / "checkpoint.pt"
     if not mark.exists() or mark.read_bytes() != wanted:
         if checkpoint.exists():  # it may have taken hours
+            trained = load_checkpoint(checkpoint).config
+            changed = differences(trained, settings, tables, ()) or ["the samples of the shards"]
             raise ConfigError(
-                f"{folder}: was trained with other settings or samples (settings.json has them);"
+                f"{folder}: was trained with other settings or samples ({'; '.join(changed)});"
                 " name another OUT, or delete this folder to train the row again"
             )
         write_bytes(mark, wanted)

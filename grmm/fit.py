@@ -12,7 +12,7 @@ import contextlib
 import hashlib
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -362,7 +362,7 @@ def evaluate_unseen(
     Raises:
         ConfigError: the shards hold no such views, or nothing is left to measure.
     """
-    given, own = unseen_views(loaded, views, subject, protocol, among)
+    given, own = unseen_views(loaded.model.expressions, views, subject, protocol, among)
     state, effort = fit_unseen(loaded, views, given, folder)
     rows = []
     for kind, fitted in ((NOVEL_VIEW, True), (NOVEL_EXPRESSION, False)):
@@ -400,16 +400,19 @@ def fit_unseen(
 
 
 def unseen_views(
-    loaded: Checkpoint,
+    trained: Collection[str],
     views: HeadViews,
     subject: str,
     protocol: FitProtocol,
     among: Sequence[int] | None = None,
 ) -> tuple[list[int], list[int]]:
-    """Choose a person's views to fit from and to measure, and log what cannot be measured."""
+    """Choose a person's views to fit from and to measure, and log what cannot be measured.
+
+    Expressions can be drawn if they are fitted or among those ``trained``.
+    """
     given = given_views(views, subject, protocol)
     cameras = {views.keys[i].camera for i in given}
-    known = {*(views.keys[i].expression for i in given), *loaded.model.expressions}
+    known = {*(views.keys[i].expression for i in given), *trained}
     own = [
         i
         for i in (range(len(views.keys)) if among is None else among)

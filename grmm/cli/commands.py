@@ -125,12 +125,7 @@ def fit(args: argparse.Namespace) -> int:
     if made.exists() and made.samefile(args.checkpoint):
         raise ConfigError(f"{made} is the checkpoint to fit from; name another folder")
     loaded = _load(args.checkpoint, [*args.set, *_metric_settings(args)], args.seconds)
-    if "iteration" not in loaded.loop and len(loaded.model.subjects) == 1:
-        log(
-            f"{args.checkpoint} is a fit of {loaded.model.subjects[0]}: it knows one person only; "
-            "fit people from a checkpoint of 'grmm train'"
-        )
-    elif args.subject in loaded.model.subjects:
+    if not _warns_of_fit(args.checkpoint, loaded) and args.subject in loaded.model.subjects:
         log(f"{args.subject} was trained on, so the figures are not those of an unseen person")
     views = loaded.views(ShardSource(args.shards, "*"))
     given = select(views.keys, args.subject, args.expression, args.cameras)
@@ -141,6 +136,23 @@ def fit(args: argparse.Namespace) -> int:
     psnr = f"{figure_label('psnr_db')}: {metrics['psnr_db']}"
     line = f"{psnr} ({metrics['psnr_is_of']}), after {reached}"
     return answer(args, metrics, line, f"wrote {args.out}")
+
+
+def _warns_of_fit(path: Path, loaded: Checkpoint) -> bool:
+    """Return whether a checkpoint is a fit, and if so, say that nobody should be fitted from it."""
+    if is_fit := "iteration" not in loaded.loop and len(loaded.model.subjects) == 1:
+        log(
+            f"{path} is a fit of {loaded.model.subjects[0]}: it knows one person only; "
+            "fit people from a checkpoint of 'grmm train'"
+        )
+    return is_fit
+
+
+def _check_evaluation_folder(out: Path) -> None:
+    """Refuse a folder that cannot be written to; say what will be replaced in it."""
+    check_folder_writable(out)
+    if (out / "evaluation.csv").exists():
+        log(f"{out}: its evaluation will be replaced; to keep it, stop and name another folder")
 
 
 def render(args: argparse.Namespace) -> int:
@@ -255,7 +267,7 @@ def evaluate(args: argparse.Namespace) -> int:
     from grmm.metrics import PerceptualMetrics
     from grmm.shard_source import ShardSource
 
-    check_folder_writable(args.out)
+    _check_evaluation_folder(args.out)
     _require(args, "fit_cameras", "fit_budget")
     loaded = _load(args.checkpoint, _metric_settings(args), args.fit_budget)
     source = ShardSource(args.shards, "*")
@@ -273,8 +285,11 @@ def evaluate(args: argparse.Namespace) -> int:
             "--holdout-cameras"
         )
     protocol = _protocol(args)
+    if unseen:
+        _warns_of_fit(args.checkpoint, loaded)
     for subject, chosen in unseen.items():  # before anybody is fitted for nothing
-        _, unseen[subject] = unseen_views(loaded, views, subject, protocol, chosen)
+        trained = loaded.model.expressions
+        _, unseen[subject] = unseen_views(trained, views, subject, protocol, chosen)
     fits = args.out / FITS
     fits.mkdir(parents=True, exist_ok=True)
     check_space(fits)  # before anybody is measured for nothing
@@ -346,7 +361,7 @@ def score(args: argparse.Namespace) -> int:
     from grmm.metrics import PerceptualMetrics
     from grmm.shard_source import ShardSource, select
 
-    check_folder_writable(args.out)
+    _check_evaluation_folder(args.out)
     # `evaluate` leaves these pixels out too, of all presets but `paper`.
     data = DataConfig(background=args.background, skip_hidden_neck=True)
     source = ShardSource(args.shards, "*")

@@ -100,19 +100,35 @@ def test_a_stopped_ablation_keeps_the_people_it_has_fitted(roots, tmp_path, monk
 
 
 def test_rows_of_other_samples_are_not_replaced(tmp_path, monkeypatch):
-    gone_on = []
-    monkeypatch.setattr(ablate_module, "train", lambda *a, resume, **k: gone_on.append(resume))
-    config = tiny_config()
+    gone_on, real = [], ablate_module.train
+
+    def counted(*arguments, resume):
+        gone_on.append(resume)
+        real(*arguments, resume=resume)
+
+    monkeypatch.setattr(ablate_module, "train", counted)
+    config, row = tiny_config(train={"iterations": 1}), tmp_path / "row"
     packed = [
         write_shards(tmp_path / str(size), EllipsoidSource(subjects=3, size=size))
         for size in (32, 24)
     ]
     for _ in range(2):
-        ablate_module._train([packed[0]], tmp_path / "row", config)
-        (tmp_path / "row" / "checkpoint.pt").touch()
-    with pytest.raises(ConfigError, match="row: was trained with other settings or samples"):
-        ablate_module._train([packed[1]], tmp_path / "row", config)
-    assert gone_on == [False, True] and (tmp_path / "row" / "checkpoint.pt").exists()
+        ablate_module._train([packed[0]], row, config)
+    before = (row / "checkpoint.pt").read_bytes()
+    with pytest.raises(ConfigError, match=r"row: was trained .* \(the samples of the shards\);"):
+        ablate_module._train([packed[1]], row, config)
+    longer = tiny_config(train={"iterations": 1, "seconds": 9.0})
+    with pytest.raises(ConfigError, match=r"row: was trained .* \(train.seconds 0.0 -> 9.0\);"):
+        ablate_module._train([packed[0]], row, longer)
+    assert gone_on == [False, True] and (row / "checkpoint.pt").read_bytes() == before
+
+
+def test_what_cannot_be_measured_is_refused_before_training(roots, tmp_path, monkeypatch, capsys):
+    monkeypatch.delattr(ablate_module, "train")
+    assert main([*command(roots, tmp_path), "--fit-subjects=S001,S002"]) == 2
+    assert "S001 are also trained on; expected people that" in capsys.readouterr().err
+    assert main([*command(roots, tmp_path), "--fit-cameras=cam*"]) == 2
+    assert "S002: no view is left to measure" in capsys.readouterr().err
 
 
 def test_unknown_rows_are_named(roots, tmp_path, capsys):
@@ -200,6 +216,7 @@ def test_seeds_give_intervals_and_test_shards_give_people_alone(tmp_path, capsys
     arguments = [
         "ablate", str(roots[0]), str(tmp_path / "out"), *TINY, "--fit-expression=e0",
         "--holdout-cameras=cam01", "--fit-cameras=cam00", "--rows=no_mesh_decoder",
+        "--fit-budget=9s",
     ]  # fmt: skip
     assert main([*arguments, f"--test={roots[1]}", "--seeds=2"]) == 0
     table = json.loads((tmp_path / "out" / "ablation.json").read_text())["rows"]
@@ -211,12 +228,14 @@ def test_seeds_give_intervals_and_test_shards_give_people_alone(tmp_path, capsys
         runs.append([group["unseen"]["psnr_db"] for group in groups])
     gains = [own - full for own, full in runs]
     assert gains[0] != gains[1] and row["seeds"] == 2
+    said = capsys.readouterr()
+    assert "ablate: 4 trainings and 8 fits of 9.0 s (1:12 min), except for" in said.err
     assert row["difference_db"]["unseen"] == pytest.approx(np.mean(gains), abs=1e-3)
     # Student's 97.5 % point of one degree of freedom is 12.706; half of two values' spread
     assert row["interval_db"]["unseen"] == pytest.approx(
         12.706 * abs(gains[0] - gains[1]) / 2, abs=2e-3
     )
-    assert row["groups"]["unseen"]["images"] == 2 and " ± " in capsys.readouterr().out
+    assert row["groups"]["unseen"]["images"] == 2 and " ± " in said.out
     assert main([*arguments, f"--test={roots[0]}"]) == 2
     assert "S000, S001 are also trained on" in capsys.readouterr().err
 

@@ -196,6 +196,12 @@ def test_who_is_no_stranger_or_is_left_out_is_said(checkpoint, shards, tmp_path,
     assert "left out S002, whom training did not see" in said.err
     header, row, *_ = said.out.splitlines()
     assert header.split()[:4] == ["views", "images", "PSNR,", "dB"] and row.split()[2] == "1"
+    assert "will be replaced" not in said.err
+    evaluate[1] = str(tmp_path / "f" / "checkpoint.pt")
+    assert main([*evaluate, "--fit-cameras=cam00", "--fit-expression=e0"]) == 0
+    said = capsys.readouterr().err
+    assert "e: its evaluation will be replaced; to keep it, stop and name" in said
+    assert "is a fit of S001: it knows one person only" in said
 
 
 def test_a_summary_names_a_metric_that_is_missing_once():
