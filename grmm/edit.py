@@ -266,7 +266,7 @@ def _entry(text: str, count: int, name: str, what: str, names: Sequence[str] = (
         return names.index(text)
     if text.isdecimal() and int(text) < count:
         return int(text)
-    expected = f"expected 0 to {count - 1}"
+    expected = f"expected 0 to {count - 1}" if count else "one person or expression has none"
     if names:
         alike = [known for known in names if text.casefold() in known.casefold()]
         expected += f", or a name such as {few(alike or names)}"

@@ -103,7 +103,8 @@ class GRMM(Networks):
             "gradients": gradients[anchors.faces],
             "barycentrics": anchors.barycentrics.to(head.dtype),
             "scale_bias": initial_scales(spacing_mm, config),
-            "head_centre": head.template.mean(0),
+            # The middle of its box: the mean vertex is in the face, which has most of them.
+            "head_centre": (head.template.amin(0) + head.template.amax(0)) / 2,
         }
         for name, value in constants.items():
             self.register_buffer(name, value, persistent=False)

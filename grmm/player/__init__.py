@@ -39,7 +39,6 @@ from grmm.player.distillation import (
     sampled_poses,
     sampled_views,
     seen_angles,
-    turning_point,
     with_neck_cut,
 )
 from grmm.render import check_clips
@@ -214,7 +213,8 @@ def player_page(
     """
     back, arrays, content = stored(avatar)
     mesh, view = person.loaded.head, front_view(person.loaded, 1)
-    camera, target = view.cam_from_head.double().cpu(), turning_point(person.loaded)
+    camera = view.cam_from_head.double().cpu()
+    target = person.loaded.model.head_centre.double().cpu()
     centre = -camera[:3, :3].T @ camera[:3, 3]
     distance = float(camera[2, :3] @ (target - centre))
     yaw, pitch = (np.deg2rad(limits).tolist() for limits in seen_angles(person.loaded))

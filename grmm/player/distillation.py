@@ -219,14 +219,6 @@ def sampled_poses(person: Person, count: int, generator: torch.Generator) -> lis
     return poses
 
 
-def turning_point(loaded: Checkpoint) -> Tensor:
-    """Return the point (3,) of the head model that the player's camera turns about."""
-    heights = loaded.head.template[:, 1]
-    middle = (heights.amax() + heights.amin()) / 2
-    depth = loaded.model.head_centre[2]
-    return torch.stack([torch.zeros_like(middle), middle, depth]).double().cpu()
-
-
 def front_view(loaded: Checkpoint, size: int) -> PinholeView:
     """Return a square view from straight ahead, as far away as the training's frontal camera.
 
@@ -236,8 +228,7 @@ def front_view(loaded: Checkpoint, size: int) -> PinholeView:
     camera = frontal(loaded).cam_from_head.double().cpu()
     distance = float((camera[:3, :3] @ centre + camera[:3, 3]).norm())
     height = float(template[:, 1].max() - template[:, 1].min())
-    target = turning_point(loaded).numpy()
-    pose = look_at(target + [0.0, 0.0, distance], target)
+    pose = look_at(centre.numpy() + [0.0, 0.0, distance], centre.numpy())
     focal = 0.75 * size * distance / height
     K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]], dtype=torch.float64)
     K, cam_from_head = K.to(template.device), torch.from_numpy(pose).to(template.device)

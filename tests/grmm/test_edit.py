@@ -1,3 +1,5 @@
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -117,6 +119,13 @@ def test_wrong_controls_are_named(loaded, controls, message):
         controlled(loaded, trained_head(loaded, "S000", "e0"), controls)
     with pytest.raises(ConfigError, match="S9"):
         trained_head(loaded, "S9", "e0")
+
+
+def test_codes_of_one_person_have_no_direction_to_move_along(loaded):
+    lone = copy.deepcopy(loaded)
+    lone.model.z_id = torch.nn.Parameter(lone.model.z_id[:1].detach())
+    with pytest.raises(ConfigError, match="the 0 principal directions.*; one person .* has none"):
+        controlled(lone, trained_head(lone, "S000", "e0"), {"z_id.0": (1.0,)})
 
 
 def test_samples_have_the_mean_and_covariance_of_training(loaded):

@@ -319,6 +319,12 @@ def test_training_does_not_continue_an_unfinished_fit(loaded, views, tmp_path, m
         train(EllipsoidSource(size=32), ellipsoid_head(), tmp_path, loaded.config, resume=True)
 
 
+def test_a_fit_to_all_views_leaves_no_picture_of_held_out_ones(loaded, views, tmp_path):
+    (tmp_path / "held_out.jpg").write_bytes(b"of an earlier fit")
+    fit(loaded, views, unseen(views), [], tmp_path)
+    assert not (tmp_path / "held_out.jpg").exists()
+
+
 def test_views_of_two_subjects_are_refused(loaded, views, tmp_path):
     with pytest.raises(TrainError, match="2 subjects"):
         fit(loaded, views, [0, len(views.keys) - 1], [], tmp_path)

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 
+from express50.head.load import load_head
 from grmm.data import HeadViews
 from grmm.model import GRMM, initial_scales, quat_multiply
 from grmm.train import objective, step
@@ -13,6 +14,14 @@ def build(views, **model):
     torch.manual_seed(0)
     config = tiny_config(model=model)
     return config, GRMM(config.model, views.head, ("S000", "S001"), ("e0", "e1"))
+
+
+def test_the_head_turns_about_its_middle():
+    """Not about its mean vertex: most of them are in the face."""
+    head = load_head("procedural")
+    model = GRMM(tiny_config().model, head, ["S000"], ["neutral"])
+    reach = head.template - model.head_centre
+    torch.testing.assert_close(reach.amax(0), -reach.amin(0))
 
 
 def test_shapes(views):
