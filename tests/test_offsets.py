@@ -86,7 +86,7 @@ def test_rebuilt_vertices_are_the_tracked_ones(packed) -> None:
     assert np.abs(arrays["offsets"]).mean() > 1e-3
 
 
-def test_offsets_are_stored_once_a_subject_and_checked(packed, tmp_path) -> None:
+def test_offsets_are_stored_once_per_subject_and_checked(packed, tmp_path) -> None:
     root, arrays = packed
     assert [path.name for path in root.glob("*.npy")] == ["S001.offsets.npy"]
     assert verify(root) == []
@@ -166,7 +166,7 @@ def test_damaged_registered_meshes_are_one_clear_error(packed, tmp_path) -> None
         ShardReader(tmp_path, ()).registered("S002")
 
 
-def test_copied_samples_keep_what_lies_beside_their_shards(packed, tmp_path, monkeypatch) -> None:
+def test_copied_samples_keep_the_files_beside_their_shards(packed, tmp_path, monkeypatch) -> None:
     root, _ = packed
     names = ("S001.offsets.npy", "S001.registered.npz")
     parts = []

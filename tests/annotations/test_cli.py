@@ -384,7 +384,7 @@ def test_the_toolkits_own_names_are_refused(dataset, name):
     assert not dataset.labels_file("S001").exists()
 
 
-def test_a_flag_is_said_with_its_reason_and_who_gave_it(dataset, tmp_path, capsys):
+def test_a_flag_is_shown_with_its_reason_and_its_author(dataset, tmp_path, capsys):
     root = str(dataset.root)
     assert main(["annotate", "flag", root, "S001", "smile", "failed", "--annotator", "me"]) == 0
     assert capsys.readouterr().out.startswith("S001 smile: flagged 'failed' by me; run ")

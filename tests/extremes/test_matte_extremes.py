@@ -56,7 +56,7 @@ def test_mattes_without_a_common_subject_change_nothing():
     assert len(found.warnings) <= len(views) // 3
 
 
-def test_a_camera_amid_the_subject_or_turned_away_is_left_out():
+def test_a_camera_inside_the_subject_or_turned_away_is_left_out():
     clean = compare_mattes(disturbed(make_views()))
     for center in (np.array([0.0, 0.0, 0.05]), np.array([0.0, 0.0, 1.1])):
         rig = [camera for camera, _, _ in shots()]
@@ -89,7 +89,7 @@ def test_a_subject_cut_by_the_frames_edge_is_not_eaten():
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1)])
-def test_pictures_a_pixel_wide_are_survived(size):
+def test_pictures_one_pixel_wide_do_not_fail(size):
     rig = [scale_camera(c, size[0] / SIZE, size[1] / SIZE) for c in ring(8, SIZE)]
     ball = ball_of({camera.id: camera for camera in rig})
     image = np.full((size[1], size[0], 3), 90, np.uint8)

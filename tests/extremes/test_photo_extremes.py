@@ -110,7 +110,7 @@ def test_a_profile_is_found_and_fitted(basis, yaw: float) -> None:
 
 
 @pytest.mark.parametrize("yaw", [130.0, 180.0])
-def test_the_back_of_a_head_is_no_face(yaw: float) -> None:
+def test_the_back_of_a_head_is_not_a_face(yaw: float) -> None:
     with pytest.raises(CaptureError, match=r"back.png: no face found \(best score 0.0"):
         find_faces(Path("back.png"), [head_from(yaw)], TrackConfig())
 
@@ -131,7 +131,7 @@ def test_sliver_pictures_have_no_face_and_no_irises(size: tuple[int, int]) -> No
     assert (irises.confidence == 0).all() and np.isfinite(irises.centres).all()
 
 
-def test_a_face_hardly_tells_its_lens(basis, seen) -> None:
+def test_a_face_hardly_constrains_its_lens(basis, seen) -> None:
     """The range of focal lengths is wide, holds the guess, and a given one is kept."""
     found = weigh_focal(basis, [seen], (512, 512), (836.0, "guess"))
     assert found.source == "guess" and found.pixels == 836.0

@@ -104,7 +104,7 @@ def test_a_camera_a_kilometre_away_sees_a_head_of_a_few_pixels() -> None:
     assert (labels_of(wide, np.ones((8, 8))) < len(LABELS)).all()
 
 
-def test_figures_of_nothing_are_numbers_and_named() -> None:
+def test_figures_of_empty_input_are_finite_and_named() -> None:
     nothing = np.zeros((4, 4), bool)
     fit = mesh_fit(nothing, np.zeros((4, 4)), np.zeros((4, 4)))
     assert fit == {"mesh_in_matte": 0.0, "mesh_iou_head": 0.0}

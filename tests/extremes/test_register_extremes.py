@@ -51,7 +51,7 @@ def test_the_result_turns_and_shifts_with_the_world(head, here, angle, shift):
     ],
     ids=["one triangle", "a point", "needle, two-sided", "kilometres"],
 )
-def test_surfaces_that_are_hardly_there_move_little(head, vertices, faces):
+def test_transparent_surfaces_move_little(head, vertices, faces):
     model, mesh, _ = head
     laid = lay(model, mesh, GivenSurface(vertices, faces, np.ones(3)), DETAIL)
     assert finite(laid)

@@ -108,7 +108,7 @@ def test_one_mirrored_camera_without_any_calibration(monkeypatch) -> None:
     assert set(solved.cameras) == set(rig) - {"cam03"}
 
 
-def test_footage_without_a_feature_says_nothing_of_a_rig(balls) -> None:
+def test_footage_without_features_leaves_a_rig_unchecked(balls) -> None:
     rig, images = balls
     grey = {name: np.full_like(image, 90) for name, image in images.items()}
     found = check_footage(rig, test_calibrate_moves.features_of(grey))

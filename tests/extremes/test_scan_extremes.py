@@ -106,7 +106,7 @@ def test_few_landmarks_say_where_to_look_and_replace_what_is_found(head):
         (lambda m: np.roll(m, 1, 0), "in order"),
     ],
 )
-def test_points_that_are_no_face_are_refused(head, change, words):
+def test_points_that_do_not_form_a_face_are_refused(head, change, words):
     with pytest.raises(StageError, match=words):
         check_face(change(head[1]), head[1], "landmarks")
 

@@ -179,7 +179,7 @@ def test_cameras_given_twice_add_nothing_new() -> None:
     assert abs(np.median(np.linalg.norm(twice.goals, axis=1)) - RADIUS) < 4e-4
 
 
-def test_a_head_behind_its_own_camera_or_beyond_the_frame_is_no_shot() -> None:
+def test_a_head_behind_its_camera_or_outside_the_frame_gives_no_shot() -> None:
     camera, mesh = rig()[0], head_mesh()
     assert take(camera, mesh=mesh + 2.5 * camera.center) is None
     assert take(camera, mesh=mesh + [0.0, 3.0, 0.0]) is None

@@ -168,7 +168,7 @@ def evaluated(table, roots, tmp_path_factory):
     return out
 
 
-def test_evaluation_tells_what_was_held_out(evaluated):
+def test_evaluation_states_what_was_held_out(evaluated):
     kinds = json.loads((evaluated / "evaluation.json").read_text())["by_kind"]
     assert {kind: row["images"] for kind, row in kinds.items()} == {
         "seen view": 6,

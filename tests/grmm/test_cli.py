@@ -185,7 +185,7 @@ def test_evaluate_counts_its_images_on_standard_output(checkpoint, shards, tmp_p
     assert json.loads(capsys.readouterr().out)["images"] == 4, "two kinds by two cameras"
 
 
-def test_who_is_no_stranger_or_is_left_out_is_said(checkpoint, shards, tmp_path, capsys):
+def test_people_who_are_known_or_left_out_are_named(checkpoint, shards, tmp_path, capsys):
     fit = ["fit", str(checkpoint), str(shards), str(tmp_path / "f"), "--subject=S001"]
     short = ["--set=fit.stage1_iterations=0", "--set=fit.stage2_iterations=0"]
     assert main([*fit, "--cameras=cam00", *short]) == 0
@@ -365,7 +365,7 @@ def test_config_prints_settings_that_train_takes(tmp_path, capsys):
     assert train_config(args).train.lr == 0.003
 
 
-def test_training_saves_by_time_and_tells_that_it_diverged(shards, tmp_path, capsys, monkeypatch):
+def test_training_saves_by_time_and_reports_that_it_diverged(shards, tmp_path, capsys, monkeypatch):
     import grmm.train
 
     saved, save = [], grmm.train.save
@@ -505,7 +505,7 @@ def test_a_head_is_driven_by_tracked_clips(checkpoint, tmp_path, capsys):
         (["train", "a", "b", "--holdout-cameras=,"], "argument --holdout-cameras: got ','"),
     ],
 )
-def test_wrong_usage_is_said_with_what_was_given(arguments, message, capsys):
+def test_wrong_usage_is_an_error_that_quotes_the_arguments(arguments, message, capsys):
     with pytest.raises(SystemExit) as stop:
         main(arguments)
     assert stop.value.code == 2 and message in capsys.readouterr().err

@@ -88,7 +88,7 @@ def test_fewer_coefficients_are_padded(source):
     assert state.expression.tolist() == [1, 0, 0, 0]
 
 
-def test_missing_depth_is_no_depth():
+def test_missing_depth_stays_unknown():
     item = HeadViews(Changed(depth=None), ellipsoid_head()).item(0, crop=True)
     assert not item.depth_valid.any()
     assert item.depth.shape == item.mask.shape
@@ -117,7 +117,7 @@ def test_ranks_share_one_order_without_overlap():
     assert together == [alone.next() for _ in range(18)]
 
 
-def test_the_next_sample_is_decoded_beside_the_step():
+def test_the_next_sample_is_decoded_during_the_step():
     threads = {}
 
     class Noted(EllipsoidSource):

@@ -209,7 +209,7 @@ def at_step(monkeypatch, stage, iteration, act):
     ("stage", "iteration", "number"),
     [(1, 1, signal.SIGINT), (1, 2, signal.SIGHUP), (2, 0, signal.SIGINT), (2, 1, signal.SIGTERM)],
 )
-def test_an_interrupted_fit_goes_on_and_gives_the_same_bytes(
+def test_an_interrupted_fit_resumes_to_the_same_bytes(
     loaded, views, tmp_path, monkeypatch, stage, iteration, number
 ):
     tables = replace(loaded.config.fit, texture_warm_start=True, shuffle_directions=0.5)

@@ -115,7 +115,7 @@ def test_laplacian_gradient():
     assert gradcheck(lambda x: losses.laplacian_mm2(1e-3 * x, edges), (field,))
 
 
-def test_terms_of_nothing_are_zero():
+def test_terms_without_evidence_are_zero():
     none = torch.zeros(0, 3)
     assert float(losses.scale_mm(none)) == float(losses.displacement_mm2(none)) == 0.0
     assert float(losses.laplacian_mm2(none, torch.zeros(0, 2, dtype=torch.int64))) == 0.0

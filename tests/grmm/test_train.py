@@ -88,7 +88,7 @@ class Disk:
         write_with(path, write)
 
 
-def test_a_disk_that_fills_up_takes_the_weights_still(tmp_path, source, monkeypatch):
+def test_weights_are_saved_when_the_disk_fills_up(tmp_path, source, monkeypatch):
     disk, rates = Disk(tmp_path, 1e9), train_module.set_rates
 
     def fill_late(state, config):
@@ -226,7 +226,7 @@ def test_a_long_step_ends_with_the_time(tmp_path, source):
     assert metrics["psnr_train_db"] > 10
 
 
-def test_a_sample_that_cannot_be_read_any_more_loses_no_step(tmp_path, source, monkeypatch):
+def test_a_sample_that_becomes_unreadable_loses_no_step(tmp_path, source, monkeypatch):
     straight, broken = tmp_path / "straight", tmp_path / "broken"
     config = tiny_config(train={"iterations": 5, "accumulate": 2, "final_lr": 1.0})
     train(source, ellipsoid_head(), straight, config)

@@ -66,7 +66,7 @@ def test_moving_pictures_decode_only_what_changed(loaded, monkeypatch):
     assert calls[3:] == ["decode", "appearance"]
 
 
-def test_opacity_is_decoded_once_a_person(loaded, monkeypatch):
+def test_opacity_is_decoded_once_per_person(loaded, monkeypatch):
     """The saving: another expression of the same person has the same opacities, to the bit."""
     model, calls = loaded.model, []
     original = model.opacity.forward

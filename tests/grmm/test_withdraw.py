@@ -37,7 +37,7 @@ def test_codes_frames_and_the_optimizers_memory_go(trained):
     assert not redact(path, first)
 
 
-def test_frames_lent_to_another_persons_fit_go(trained):
+def test_frames_used_by_another_persons_fit_are_removed(trained):
     path = trained[0]
     content = read_content(path)
     lender = content["subjects"][0]

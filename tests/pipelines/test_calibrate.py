@@ -193,7 +193,7 @@ def test_a_camera_is_dropped_if_the_last_rejection_leaves_it_too_few_corners() -
     assert (solution.corners.camera != 3).all()
 
 
-def test_a_camera_that_sees_no_board_is_dropped_and_the_rest_goes_on() -> None:
+def test_a_camera_that_sees_no_board_is_dropped_and_the_others_are_solved() -> None:
     rig = make_rig(4)
     observations = observe(rig, board_motion(20, 8), 0.1)
     solution = solve(rig, observations.select(observations.camera != 3))

@@ -82,7 +82,7 @@ def test_the_stated_error_at_the_head_is_about_the_true_one(solved):
 
 
 @pytest.mark.parametrize(("value", "one"), [(None, False), (True, True), (False, False)])
-def test_capture_toml_says_whether_lenses_are_the_same(value, one):
+def test_capture_toml_states_whether_lenses_are_the_same(value, one):
     meta = {} if value is None else {"same_lens": value}
     assert has_one_lens(SimpleNamespace(meta=meta, capture=Path("cap"))) is one
 

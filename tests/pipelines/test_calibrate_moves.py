@@ -141,7 +141,7 @@ def test_no_camera_is_named_where_any_other_may_have_moved_instead():
     assert check_footage(rig, {0: FrameSetPoints(views, {})}).moved == {}
 
 
-def test_a_camera_without_common_points_is_said_to_be_unchecked(footage):
+def test_a_camera_without_common_points_is_reported_as_unchecked(footage):
     rig, images = footage
     blind = images | {"cam02": np.full_like(images["cam02"], 128)}
     verdict = check_footage(rig, features_of(blind))
@@ -308,7 +308,7 @@ def test_footage_of_other_layouts_is_read(tmp_path):
         assert np.abs(seen[0][2].astype(int) - turned).mean() < 10
 
 
-def test_calibrate_warns_of_the_camera_and_goes_on(footage, tmp_path, capsys):
+def test_calibrate_warns_of_the_camera_and_continues(footage, tmp_path, capsys):
     rig, images = footage
     write_capture(tmp_path / "capture", rig, images)
     write_cameras(tmp_path / "capture" / "calibration.json", bumped(rig, "cam03", (0, TURN, 0)))

@@ -125,7 +125,7 @@ def test_prior_counts_inner_sheets_and_capped_holes_as_inside():
     assert believed.tolist() == [1.0, 0.0]
 
 
-def test_prior_gives_way_where_the_hull_rises_far_above_it(shots):
+def test_prior_is_weaker_where_the_hull_rises_far_above_it(shots):
     """Hair and shoulders rise above the tracked mesh; they are kept whole, without a shell."""
     vertices, faces = mesh()
     prior = close_mesh(vertices, faces)
@@ -143,7 +143,7 @@ def test_prior_gives_way_where_the_hull_rises_far_above_it(shots):
     np.testing.assert_array_equal(merged[near >= 0.02], near[near >= 0.02])
 
 
-def test_what_glasses_hide_is_not_compared_and_the_head_is_believed_behind_them(shots):
+def test_what_glasses_hide_is_not_compared_and_the_head_is_kept_behind_them(shots):
     views = [make_view(*shot[:3], 1024) for shot in shots]
     bare = close_mesh(*mesh())
     front = np.array([[x, y, 0.125] for x in (-0.01, 0, 0.01) for y in (-0.01, 0, 0.01)])
@@ -159,7 +159,7 @@ def test_what_glasses_hide_is_not_compared_and_the_head_is_believed_behind_them(
     assert worn.trust(points, height).tolist() == [1, 0]
 
 
-def test_a_bare_face_is_believed_however_far_above_it_the_hull_lies():
+def test_a_bare_face_is_kept_however_far_above_it_the_hull_lies():
     vertices, faces = mesh()
     front, up = vertices[:, 2] > 0.05, vertices[:, 1] > 0.05
     model = HeadTopology(vertices, faces, {"face": front, "forehead": up})

@@ -35,7 +35,7 @@ def test_figures_are_those_of_all_pixels_and_none_where_nothing_was_measured():
     assert "n/a" in summary([empty])
 
 
-def test_the_tail_of_the_surest_pixels_leaves_out_those_of_least_confidence():
+def test_errors_of_the_surest_pixels_leave_out_the_least_confident():
     errors, sure = np.full(1000, 1.0), np.full(1000, 0.9)
     errors[:80], sure[:80] = 20.0, 0.1
     found = of_surest(errors, sure)["abs_error_mm_p95_of_surest"]

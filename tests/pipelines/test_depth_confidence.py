@@ -40,7 +40,7 @@ def wall(depth: np.ndarray, agreement: float = 0.6, **further: object) -> DepthM
     return DepthMaps(**{**vars(maps), "bounds": error_bounds("depth", figures)})
 
 
-def test_jumps_are_measured_and_nothing_is_said_off_the_surface():
+def test_jumps_are_measured_and_nothing_is_stated_off_the_surface():
     depth = np.full((SIDE, SIDE), 1.0)
     depth[:, 20:] = 1.2
     depth[30:] = 0

@@ -80,7 +80,7 @@ def test_a_frame_without_solid_or_without_soft_pixels_stays_as_it_is(alpha):
     assert (own_colours(frame, np.full((8, 8), alpha, np.uint8), None) == frame).all()
 
 
-def test_one_pixel_and_black_plates_are_no_trouble():
+def test_one_pixel_and_black_plates_do_not_fail():
     assert own_colours(np.zeros((1, 1, 3), np.uint8), np.full((1, 1), 7, np.uint8), None).shape
     alpha = ramp(16)
     for value in (0, 255):

@@ -60,7 +60,7 @@ def dataset(tmp_path, bent):
     return Dataset(shutil.copytree(bent.root, tmp_path / "dataset"))
 
 
-def test_a_lens_that_folds_leaves_black_and_says_so(dataset):
+def test_a_lens_that_folds_leaves_black_pixels_and_a_warning(dataset):
     rig = make_rig()
     name = next(iter(rig))
     rig[name] = replace(rig[name], params=(*rig[name].params[:4], -3.0, 0.0, 0.0, 0.0))
@@ -72,7 +72,7 @@ def test_a_lens_that_folds_leaves_black_and_says_so(dataset):
     assert not written[0, 0].any() and written[written.shape[0] // 2].any()
 
 
-def test_a_corner_beyond_the_lens_that_hides_nobody_is_no_warning(dataset, monkeypatch):
+def test_a_dark_corner_that_hides_nobody_gives_no_warning(dataset, monkeypatch):
     monkeypatch.setattr("pipelines.frames.stage.pictured_share", lambda camera: 0.9995)
     summary = run(dataset, image_side=64)
     assert summary.ok and not notes_of(dataset, "frames", "S001/neutral")

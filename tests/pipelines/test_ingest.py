@@ -316,7 +316,7 @@ def test_real_size_captures(shared, tmp_path):
     assert metrics(dataset, item="H900")["dropped"] == []
 
 
-def test_footage_unlike_what_is_said_of_it_is_a_warning(tmp_path):
+def test_footage_that_differs_from_its_description_is_a_warning(tmp_path):
     root = tmp_path / "S001"
     make_capture(root, cameras=3, frames=24, video=True)
     turned, clear, uneven = (root / f"cameras/cam0{n}/video.mp4" for n in range(3))

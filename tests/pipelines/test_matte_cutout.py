@@ -68,7 +68,7 @@ def alpha() -> np.ndarray:
     return alpha_of(data.astronaut())
 
 
-def test_hair_and_face_are_told_from_the_wall(alpha: np.ndarray) -> None:
+def test_hair_and_face_are_distinguished_from_the_wall(alpha: np.ndarray) -> None:
     assert all(alpha[y, x] > 0.95 for x, y in HEAD), [alpha[y, x] for x, y in HEAD]
     assert all(alpha[y, x] < 0.05 for x, y in BEHIND), [alpha[y, x] for x, y in BEHIND]
     soft = (alpha[:140] > 0.05) & (alpha[:140] < 0.95)

@@ -162,7 +162,7 @@ def test_alpha_of_a_known_mixture_is_exact_where_the_colours_are() -> None:
     assert at_zero == pytest.approx(deviation)
 
 
-def test_a_strand_brighter_than_its_neighbours_is_no_less_open() -> None:
+def test_brighter_strands_keep_their_opacity() -> None:
     alpha = np.linspace(0.2, 0.9, 8)
     mean, behind = np.array([[0.5, 0.35, 0.15]] * 8), np.array([[0.3, 0.3, 0.32]] * 8)
     seen = alpha[:, None] * 1.25 * mean + (1 - alpha[:, None]) * behind

@@ -175,7 +175,7 @@ def test_a_wrong_answer_is_one_line(tmp_path, how: str, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_wrong_answers_to_pairs(tmp_path) -> None:
+def test_networks_that_answer_pairs_wrongly_are_refused(tmp_path) -> None:
     black = np.zeros((80, 80, 3), np.uint8)
     for how, message in (("nan", "NaN"), ("small", r"gave shape \(1, 40, 40\)")):
         network = load_network(torchscript(BadPair(how), tmp_path / f"{how}.pt"), BGMV2)

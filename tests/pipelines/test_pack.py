@@ -257,7 +257,7 @@ def test_samples_of_two_cameras_agree_on_the_surface(packed):
     assert first["meta"]["label"]["annotator"] == "person" and first["meta"]["fps"] == 24
 
 
-def test_a_subject_without_peak_frames_is_told_to_align_first(ingested):
+def test_a_subject_without_peak_frames_is_an_error_that_names_align(ingested):
     with pytest.raises(StageError, match="not aligned; run 'express50 align"):
         read_subject(ingested, "S001")
 

@@ -154,7 +154,7 @@ def test_texture_is_baked_the_right_way_up_and_freed_of_gains_and_light() -> Non
     )
 
 
-def test_a_second_moment_tells_what_the_first_hides_and_changes_little_else() -> None:
+def test_a_second_frame_shows_what_the_first_hides_and_changes_little_else() -> None:
     model, cameras = ball_head(), rig((-0.8, -0.6, 0.6, 0.8))
     mesh = model.template.numpy()
     first = FrameSetCrops((), tuple(crop_of(c, broad) for c in cameras[:2]))

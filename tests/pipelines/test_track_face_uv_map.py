@@ -121,7 +121,7 @@ def ramp() -> Case:
     )
 
 
-def test_a_warp_moves_what_is_seen_and_says_so() -> None:
+def test_a_warp_moves_what_is_seen_and_reports_it() -> None:
     middle = (slice(20, -20), slice(20, -20))
     for seed in range(6):
         moved = warped(ramp(), np.random.default_rng(seed))

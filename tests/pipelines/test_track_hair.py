@@ -45,7 +45,7 @@ def target_of(cameras) -> Target:
     return Target(seen, np.full((len(views), 68), 2.0), neutral=True)
 
 
-def test_landmarks_in_a_beard_are_vague_and_its_rim_is_no_jaw():
+def test_landmarks_in_a_beard_are_uncertain_and_its_edge_is_not_the_jaw():
     model = load_head("procedural")
     hidden, things = np.zeros(len(model.template), bool), np.zeros((0, 3))
     target = target_of(rig()[:2])
@@ -57,7 +57,7 @@ def test_landmarks_in_a_beard_are_vague_and_its_rim_is_no_jaw():
     assert (found[:, 36] == 2.0).all()
 
 
-def test_landmarks_on_a_thing_are_vague_where_it_is_seen_and_those_beside_it_less_so():
+def test_landmarks_on_a_thing_are_uncertain_where_it_is_seen_and_those_beside_it_less_so():
     model, (one, other) = load_head("procedural"), rig()[:2]
     hidden, target = np.zeros(len(model.template), bool), target_of((one, other))
     # Before landmark 10 in one camera; the other sees it elsewhere.
@@ -110,14 +110,14 @@ def bald(
     return is_bald(head, FrameSetCrops((), tuple(crops)), mesh, np.eye(3))
 
 
-def test_hair_above_the_face_is_no_bald_head(scene):
+def test_hair_above_the_face_is_not_taken_for_a_bald_head(scene):
     assert not bald(scene, hair=True)
     assert bald(scene, hair=False)
     assert not bald(scene, hair=False, count=1), "it may be fair hair"
 
 
 @pytest.mark.parametrize("shade", [0.2, 0.35, 0.6])
-def test_hair_is_no_bald_head_in_hard_light(scene, shade):
+def test_hair_in_hard_light_is_not_taken_for_a_bald_head(scene, shade):
     assert not bald(scene, hair=True, shade=shade)
     assert bald(scene, hair=False, shade=0.8)
 

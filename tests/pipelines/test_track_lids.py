@@ -85,7 +85,7 @@ def test_an_eye_without_its_iris_is_shut(count):
         assert apart.max() < 0.002
 
 
-def test_eyes_shut_all_along_are_told_by_other_times():
+def test_eyes_shut_in_a_whole_clip_are_found_by_other_clips():
     shut, open_ = np.zeros((3, 2), dtype=bool), np.ones((3, 2), dtype=bool)
     clip = [observe(shut, "neutral") for _ in range(8)]
     assert all(not seen.shut for seen in shut_lids(clip))

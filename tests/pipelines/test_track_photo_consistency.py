@@ -148,7 +148,7 @@ def test_a_wrong_patch_among_right_ones_is_left_out(pictures) -> None:
     assert off.max() < 2.0 * found.pixel
 
 
-def test_few_samples_are_refused_rather_than_believed(pictures) -> None:
+def test_too_few_samples_are_refused(pictures) -> None:
     found, samples, places, normals = search(*pictures)
     some = slice(0, 30)
     few = type(found)(found.height[some], found.score[some], found.sharpness[some], found.pixel)

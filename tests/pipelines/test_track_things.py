@@ -58,7 +58,7 @@ def test_a_thing_before_the_face_is_found_and_a_bare_face_has_none(scene) -> Non
     assert len(found_on(model, FrameSetCrops((), ()))) == 0
 
 
-def test_every_view_tells_the_face_from_what_stands_before_it(scene) -> None:
+def test_every_view_distinguishes_the_face_from_what_is_before_it(scene) -> None:
     model, _, pictures, _ = scene
     head = make_head(model.template.numpy(), np.eye(3), head_labels(model))
     views = face_views(head, matted_pictures(pictures))

@@ -219,7 +219,7 @@ def test_a_camera_folder_without_footage_is_named(tmp_path):
     assert list(found.dropped) == ["cam2", "cam3"] and "plates" not in found.warnings
 
 
-def test_a_cameras_folder_of_our_own_layout_is_no_capture(tmp_path):
+def test_a_cameras_folder_of_our_own_layout_is_not_a_capture(tmp_path):
     folder = write(tmp_path / "S001", ["cameras/cam0/video.mp4"]) / "cameras/cam0"
     (tmp_path / "S001/capture.toml").write_text('subject = "S001"\nfps = 24\n')
     with pytest.raises(CaptureError, match="part of the capture .*S001; give that folder"):

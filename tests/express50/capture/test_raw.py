@@ -90,7 +90,7 @@ def test_camera_without_or_with_two_kinds_of_footage_is_dropped(raw):
 
 
 @pytest.mark.parametrize("name", ["cam.00", "cam+00", "cam 00", "\u043a\u0430\u043c00"])
-def test_cameras_whose_name_is_no_id_fail_the_capture(raw, name):
+def test_a_camera_whose_name_is_not_an_id_fails_the_capture(raw, name):
     """Without them the chain would run for hours on half of the rig."""
     (raw / "cameras" / "cam00").rename(raw / "cameras" / name)
     with pytest.raises(CaptureError, match="expected at most 120 letters"):
@@ -102,7 +102,7 @@ def test_cameras_whose_name_is_no_id_fail_the_capture(raw, name):
         read_capture(raw)
 
 
-def test_what_file_systems_add_is_no_camera(raw):
+def test_files_that_systems_add_are_not_cameras(raw):
     (raw / "cameras" / "@eaDir" / "cam00").mkdir(parents=True)
     (raw / "cameras" / ".DS_Store").touch()
     (raw / "cameras" / "empty one").mkdir()

@@ -278,7 +278,7 @@ def test_a_folder_of_videos_is_a_rig_with_what_lies_beside_them(tmp_path):
         read_any(folder)
 
 
-def test_a_file_that_is_no_video_costs_its_camera_alone(tmp_path):
+def test_a_file_that_is_not_a_video_drops_only_its_camera(tmp_path):
     folder = tmp_path / "rig"
     folder.mkdir()
     for name in ("left.mp4", "right.mp4"):

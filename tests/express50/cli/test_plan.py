@@ -83,7 +83,7 @@ def test_one_item_is_not_split_over_workers():
     assert row.items == 1 and row.days == pytest.approx(1.0)
 
 
-def test_what_was_not_measured_says_so():
+def test_what_was_not_measured_is_reported_as_such():
     chosen, measured = [stages()["depth"], stages()["track"]], {"depth": cost(2.0)}
     rows = estimate(chosen, SMALL, [(SMALL, measured)], 1)
     assert [row.why for row in rows] == ["", "was not run"]

@@ -399,7 +399,7 @@ def test_a_damaged_sequence_is_one_line(dataset, tmp_path, capsys, changes, word
     assert words in capsys.readouterr().err
 
 
-def test_clips_that_were_not_tracked_or_cannot_be_told(dataset, tmp_path, capsys):
+def test_clips_without_tracks_or_mattes_are_refused(dataset, tmp_path, capsys):
     assert export(dataset, tmp_path, "obj", "--subject", "S002", "--frames", "clips") == 1
     assert "track.frames=clips" in capsys.readouterr().err
     assert export(dataset, tmp_path, "gaussian-avatars", "--frames", "clips") == 2

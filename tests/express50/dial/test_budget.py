@@ -18,7 +18,7 @@ def test_budgets_are_read(text, seconds, cores):
 
 
 @pytest.mark.parametrize("text", ["", "2", "h", "0h", "2x", "1h2", "-1h", "1h 2m", "1h3ch", "nan"])
-def test_what_is_no_time_is_refused(text):
+def test_text_that_is_not_a_time_is_refused(text):
     with pytest.raises(ConfigError, match="expected a time such as 45m"):
         parse_budget(text)
 

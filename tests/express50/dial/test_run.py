@@ -205,7 +205,7 @@ def test_a_goal_that_untried_settings_may_reach_asks_for_more_time(tmp_path, cap
         go(tmp_path / "d", captures, "5m", "0.6mm")
 
 
-def test_errors_that_only_trials_or_only_results_state_are_no_broken_promise():
+def test_an_error_stated_by_only_the_trial_or_the_result_breaks_no_promise():
     said = {"value": 1.0, "low": 0.5, "high": 2.0, "unit": "mm", "stated": True}
     state = RunState(key="", budget="1h", goal="", finished=True, promised={"track": said},
                      stated={"depth": [1.0, 0.5, 2.0]})  # fmt: skip
@@ -286,7 +286,7 @@ def test_time_that_runs_out_leaves_items_for_a_larger_budget(tmp_path, captures,
     assert state.finished and summaries[-1].count("skipped") == made < 12
 
 
-def test_a_run_that_is_a_little_short_of_time_goes_on():
+def test_a_run_that_is_a_little_short_of_time_continues():
     assert reserved(own=5, rest=20, left=30, budget=40) == 20
     assert reserved(own=5, rest=20, left=22, budget=40) == 17  # late by 3 of 40
     assert reserved(own=5, rest=20, left=20, budget=40) == 20  # by 5: what is left is not begun

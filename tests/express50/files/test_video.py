@@ -124,7 +124,7 @@ def test_frames_outside_and_foreign_time_stamps_are_refused(video, shift, frame,
         VideoReader(video, pts).read(frame)
 
 
-def test_frame_count_is_decoded_not_believed(tmp_path):
+def test_frames_are_counted_by_decoding(tmp_path):
     """An edit list hides the first frames: the container still counts them, decoding does not."""
     images = noise_video_images(24)
     whole, cut = tmp_path / "whole.mp4", tmp_path / "cut.mp4"

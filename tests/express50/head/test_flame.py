@@ -171,7 +171,7 @@ def test_a_cut_file_is_refused_in_one_line(flame: Path, tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_an_npz_of_flames_arrays_is_told_from_ict_facekits(tmp_path: Path) -> None:
+def test_an_npz_of_flames_arrays_is_distinguished_from_ict_facekits(tmp_path: Path) -> None:
     np.savez(tmp_path / "flame.npz", **flame_dict())
     with pytest.raises(HeadModelError, match="holds FLAME's arrays, expected FLAME's .pkl"):
         load_head(tmp_path / "flame.npz")

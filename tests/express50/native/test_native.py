@@ -29,7 +29,7 @@ def test_the_best_variant_of_this_processor_is_loaded(fresh_loader):
     assert native.why_missing() == ""
 
 
-def test_a_missing_library_says_how_to_mend_it(fresh_loader, tmp_path, monkeypatch):
+def test_a_missing_library_error_says_how_to_build_it(fresh_loader, tmp_path, monkeypatch):
     monkeypatch.setattr(build, "library_file", lambda variant: tmp_path / f"{variant}.so")
     assert "was not built; build it with `python -m express50.native.build`" in native.why_missing()
 

@@ -144,7 +144,7 @@ class Scheduler:
         return {"a": 2, "b": 3}
 
 
-def test_a_scheduler_without_a_gpu_is_told_and_one_that_lost_it_is_waited_for(monkeypatch):
+def test_a_scheduler_without_a_gpu_is_an_error_and_one_that_lost_it_is_waited_for(monkeypatch):
     plain, offering = {"resources": {}}, {"resources": {"GPU": 1.0}}
     client = Scheduler()
     workers = RemoteWorkers(client)

@@ -92,7 +92,7 @@ def test_a_ledger_of_somebody_else_is_named_as_one(ledger):
         ledger.forget("toy", ["a"])
 
 
-def test_file_that_is_no_ledger_is_an_error(tmp_path):
+def test_a_file_that_is_not_a_ledger_is_an_error(tmp_path):
     path = tmp_path / "ledger.sqlite"
     path.write_bytes(b"x" * 5000)
     with pytest.raises(FormatError, match="not a ledger"):

@@ -37,7 +37,7 @@ def found(dataset, work=WORK, **pool):
         return list(problems(dataset, work, workers))
 
 
-def test_nothing_is_said_and_nothing_written_where_all_is_well(dataset):
+def test_nothing_is_printed_or_written_where_all_is_well(dataset):
     assert found(dataset) == []
     run_toy(dataset)
     before = tree(dataset.root)
@@ -46,7 +46,7 @@ def test_nothing_is_said_and_nothing_written_where_all_is_well(dataset):
     assert {k: v for k, v in after.items() if k in before or "ledger" not in k} == before
 
 
-def test_all_problems_are_said_at_once_and_nothing_is_started(dataset, monkeypatch, capsys):
+def test_all_problems_are_reported_at_once_and_nothing_is_started(dataset, monkeypatch, capsys):
     def bad_file(config):
         raise StageError("toy.word: /nope.bin: no such file")
 
@@ -155,14 +155,14 @@ def test_gpus_are_asked_for_of_every_stage(dataset, monkeypatch):
 
 
 @pytest.mark.parametrize("address", ["foo", "tcp://127.0.0.1:9", "127.0.0.1:9", "tcp://127.0.0.1"])
-def test_a_scheduler_that_is_not_there_is_said_at_once(dataset, address):
+def test_a_missing_scheduler_is_reported_at_once(dataset, address):
     began = time.monotonic()
     (line,) = found(dataset, scheduler=address)
     assert line.startswith(f"scheduler {address}: cannot connect (")
     assert time.monotonic() - began < 10  # it was 26 to 43 s
 
 
-def test_a_port_that_answers_otherwise_is_no_scheduler(dataset, monkeypatch):
+def test_a_port_of_another_service_is_not_a_scheduler(dataset, monkeypatch):
     monkeypatch.setattr(clusters, "CONNECT_SECONDS", 1.0)
     with socket.create_server(("127.0.0.1", 0)) as server:
 

@@ -155,7 +155,7 @@ def test_a_full_disk_takes_the_store_before_it_stops_a_run(tmp_path):
     assert summary.ok and tries == ["a", "z_full", "z_full"]
 
 
-def test_check_says_what_is_kept_and_finds_nothing_wrong_with_it(dataset):
+def test_check_reports_kept_outputs_and_finds_no_fault_in_them(dataset):
     run_toy(dataset, word="b")
     for deep in (False, True):
         result = audit(dataset, [toy.STAGE], deep=deep)

@@ -75,7 +75,7 @@ def test_footage_that_may_not_be_read_is_not_a_defect(tmp_path):
     assert not dataset.log_file("toy", "denied1").exists()
 
 
-def test_a_changed_input_setting_or_version_makes_an_item_again_and_is_said(tmp_path):
+def test_a_changed_input_setting_or_version_makes_an_item_again_and_is_reported(tmp_path):
     dataset = make_dataset(tmp_path / "data", ["a", "b"])
     newer = dataclasses.replace(toy.STAGE, version=2)
 
@@ -97,7 +97,7 @@ def test_a_changed_input_setting_or_version_makes_an_item_again_and_is_said(tmp_
     assert again(stage=newer, word="c") == ["", "output missing"]
 
 
-def test_finished_work_that_is_made_again_is_said_before_it_is_made(tmp_path, capsys):
+def test_finished_work_that_will_be_made_again_is_announced(tmp_path, capsys):
     dataset = make_dataset(tmp_path / "data", ["a", "b"])
 
     def said(items=None, **values):
@@ -241,7 +241,7 @@ def test_a_copied_dataset_is_up_to_date(tmp_path):
     assert statuses(run_toy(toy.Dataset(tmp_path / "copy"))) == {"a": "skipped"}
 
 
-def test_outputs_stand_until_new_ones_are_whole(tmp_path):
+def test_outputs_stay_until_new_ones_are_complete(tmp_path):
     """Another setting fails: what the former one made stays, with its receipt, and is said."""
     dataset = make_dataset(tmp_path / "data", ["a"])
     run_toy(dataset)

@@ -169,7 +169,7 @@ def test_a_wrapper_of_sbatch_may_say_more_than_the_number(cluster, tmp_path):
     assert slurm_stand_in.all_end(cluster)
 
 
-def test_a_limit_on_jobs_is_said_once(cluster, tmp_path, capsys):
+def test_a_limit_on_jobs_is_reported_once(cluster, tmp_path, capsys):
     (cluster / "one").touch()
     dataset = toy.make_dataset(tmp_path / "data", ["a", "b", "c"])
     summary = run_toy(dataset, small(jobs=3), seconds=0.5)

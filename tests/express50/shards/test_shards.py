@@ -208,7 +208,7 @@ def test_a_flipped_byte_is_found_and_named(shards, tmp_path, capsys):
     assert main(["shards", "verify", str(shards)]) == 0
 
 
-def test_verifying_no_folder_says_so_once(tmp_path):
+def test_verifying_a_missing_folder_gives_one_error(tmp_path):
     (tmp_path / "file").touch()
     for name, what in (("file", "is a file, not a folder"), ("absent", "no such folder")):
         (fault,) = verify(tmp_path / name)
