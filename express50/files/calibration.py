@@ -59,7 +59,8 @@ def _parse_camera(path: str, camera_id: str, row: object) -> Camera:
         raise CalibrationError(
             f"{where}: world_to_camera is not a rotation (R R^T differs from identity by"
             f" {np.abs(R @ R.T - np.eye(3)).max():.2g}, det {np.linalg.det(R):.3f});"
-            " expected an orthonormal matrix with det 1"
+            " expected an orthonormal matrix with det 1 (-1: an axis has the wrong sign; see"
+            " docs/CONVENTIONS.md)"
         )
     focals = params[: 2 if "fx" in MODELS[model] else 1]
     if not (focals > 0).all():
