@@ -97,17 +97,14 @@ def read_table(path: Path) -> list[Label]:
             raise AnnotationError(f"{path}: expected a list of events, got {type(rows).__name__}")
     else:
         table = csv.DictReader(io.StringIO(text, newline=""))
-        rows = ({k: _unquoted(v) for k, v in row.items()} for row in table)
+        rows = (
+            {k: v.removeprefix("'") if _FORMULA.match(str(v)) else v for k, v in row.items()}
+            for row in table
+        )
     try:
         return [_label(row, f"{path}: row {number}") for number, row in enumerate(rows, 1)]
     except csv.Error as error:
         raise AnnotationError(f"{path}: not CSV ({error}); export it again") from None
-
-
-def _unquoted(cell: object) -> object:
-    if isinstance(cell, str) and cell.startswith("'") and _FORMULA.match(cell):
-        return cell[1:]
-    return cell
 
 
 def _check_format(path: Path) -> None:

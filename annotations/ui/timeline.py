@@ -169,16 +169,14 @@ def draw_strip(content: StripContent | None, width: int, height: int) -> list[St
     wide, _ = frame_cells(content.view.last - content.view.first + 1, room)
     start = column_of(content.view, content.view.cursor, room)
     cursor = range(start, min(start + wide, room))
-    return [_finish(name, line, cursor, room) for name, line in named[-height:]]
-
-
-def _finish(name: str, line: Line, cursor: range, width: int) -> Strip:
-    """Join name, cells and the cursor's column to a strip of the full width."""
-    cells = (line + _blank(width))[:width]
-    for column in cursor:
-        glyph, style = cells[column]
-        cells[column] = glyph, theme.CURSOR_BAR if glyph in _BARS[1:] else style + theme.CURSOR
-    segments = [Segment(f"{name:<{GUTTER}}"[:GUTTER], theme.DIM)]
-    for style, run in groupby(cells, key=lambda cell: cell[1]):
-        segments.append(Segment("".join(glyph for glyph, _ in run), style))
-    return Strip(segments, GUTTER + width)
+    strips = []
+    for name, line in named[-height:]:
+        cells = (line + _blank(room))[:room]
+        for column in cursor:
+            glyph, style = cells[column]
+            cells[column] = glyph, theme.CURSOR_BAR if glyph in _BARS[1:] else style + theme.CURSOR
+        segments = [Segment(f"{name:<{GUTTER}}"[:GUTTER], theme.DIM)]
+        for style, run in groupby(cells, key=lambda cell: cell[1]):
+            segments.append(Segment("".join(glyph for glyph, _ in run), style))
+        strips.append(Strip(segments, GUTTER + room))
+    return strips

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
@@ -115,7 +115,13 @@ def show_status(args: argparse.Namespace) -> int:
             ]
             for s in table
         }
-        answer(args, rows, *_lines(table), *trials, *_outdated_lines(why))
+        old = group_lines((f"{stage} {item}", words) for (stage, item), words in why.items())
+        lines = [*_lines(table), *trials, *(f"outdated {line}" for line in old)]
+        if why:
+            lines.append(
+                "the next run makes these again, or takes back kept outputs of the same settings"
+            )
+        answer(args, rows, *lines)
     return FAILED if any(row.failed for row in table) else OK
 
 
@@ -188,13 +194,6 @@ def _trial_lines(dataset: Dataset) -> Iterator[str]:
                     f"running {row.stage}: a trial that measures its settings on a few expressions,"
                     " for 'run --budget' or 'tune'"
                 )
-
-
-def _outdated_lines(why: Mapping[tuple[str, str], str]) -> Iterator[str]:
-    for line in group_lines((f"{stage} {item}", words) for (stage, item), words in why.items()):
-        yield f"outdated {line}"
-    if why:
-        yield "the next run makes these again, or takes back kept outputs of the same settings"
 
 
 def read_status(

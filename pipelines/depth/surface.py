@@ -229,29 +229,26 @@ def advance(grid: LevelSet, vertices: np.ndarray, displacement: np.ndarray) -> L
     """
     index = np.rint((vertices - grid.origin) / grid.voxel).astype(int)
     index = np.clip(index, 0, np.array(grid.shape) - 1)
-    spread = [
-        smoothed(_scattered(grid, index, weight), sigma=1.2, truncate=7.0)
-        for weight in (displacement, np.ones(len(index)))
-    ]
+    # Sums of weights at the vertices' voxels, zero elsewhere, in blocks of their own.
+    places = tuple((index // BLOCK).T)
+    table = np.zeros_like(grid.table)
+    table[places] = HELD
+    table[table == HELD] = HELD + np.arange((table == HELD).sum())
+    inner = np.ravel_multi_index(tuple((index % BLOCK).T), (BLOCK,) * 3)
+    voxels = table[places].astype(np.int64) * BLOCK**3 + inner
+    size = (int(table.max()) + 1) * BLOCK**3
+    spread = []
+    for weight in (displacement, np.ones(len(index))):
+        sums = np.bincount(voxels, weight, size).astype(np.float32)
+        blocks = sums.reshape(-1, BLOCK, BLOCK, BLOCK)
+        sparse = LevelSet(grid.origin, grid.voxel, grid.shape, table, blocks)
+        spread.append(smoothed(sparse, sigma=1.2, truncate=7.0))
 
     def moved(values: np.ndarray, pull: np.ndarray, weight: np.ndarray) -> np.ndarray:
         known = weight > 1e-12
         return values - np.where(known, pull / np.where(known, weight, 1), 0)
 
     return combined(moved, grid, *spread)
-
-
-def _scattered(grid: LevelSet, index: np.ndarray, weight: np.ndarray) -> LevelSet:
-    """Sum weights (N,) at voxels (N, 3), zero elsewhere, in blocks of their own."""
-    places = tuple((index // BLOCK).T)
-    table = np.zeros_like(grid.table)
-    table[places] = HELD
-    table[table == HELD] = HELD + np.arange((table == HELD).sum())
-    inner = np.ravel_multi_index(tuple((index % BLOCK).T), (BLOCK,) * 3)
-    size = (int(table.max()) + 1) * BLOCK**3
-    sums = np.bincount(table[places].astype(np.int64) * BLOCK**3 + inner, weight, size)
-    blocks = sums.astype(np.float32).reshape(-1, BLOCK, BLOCK, BLOCK)
-    return LevelSet(grid.origin, grid.voxel, grid.shape, table, blocks)
 
 
 def fair(grid: LevelSet, sigma: float) -> LevelSet:

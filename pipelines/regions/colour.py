@@ -213,15 +213,14 @@ def scalp_votes(rgb: np.ndarray, labels: np.ndarray, alpha: np.ndarray) -> tuple
     least = max(LEAST, LEAST_SCALP * skin.sum())
     if not _sees_face(labels) or skin.sum() < LEAST or scalp.sum() < least:
         return 0, 0
-    of_face, of_scalp = (_some_ratios(rgb[mask]) for mask in (skin, scalp))
+    ratios = []
+    for pixels in (rgb[skin], rgb[scalp]):
+        chosen = np.linspace(0, len(pixels) - 1, COMPARED_PIXELS).astype(int)
+        ratios.append(_ratios(colour_logs(pixels[np.unique(chosen)])))
+    of_face, of_scalp = ratios
     middle = np.median(of_face, axis=0)
     usual, found = ((np.abs(v - middle) < UNLIKE).all(1).mean() for v in (of_face, of_scalp))
     return round(len(of_scalp) * usual), round(len(of_scalp) * found)
-
-
-def _some_ratios(pixels: np.ndarray) -> np.ndarray:
-    chosen = np.linspace(0, len(pixels) - 1, COMPARED_PIXELS).astype(int)
-    return _ratios(colour_logs(pixels[np.unique(chosen)]))
 
 
 def judge_scalp(votes: Sequence[tuple[int, int]]) -> Scalp:
