@@ -40,7 +40,13 @@ def load_flame(path: str | Path) -> HeadModel:
 
 def read_flame(path: Path) -> HeadModel:
     """Read FLAME as stored, without teeth or the inside of the mouth."""
-    files = _find_companions(path)
+    files = companions(path)
+    missing = [" or ".join(names) for kind, names in COMPANIONS.items() if kind not in files]
+    if missing:
+        raise HeadModelError(
+            f"{path}: missing beside the model: {'; '.join(missing)}; download them from the FLAME"
+            " project into the same folder"
+        )
     arrays = read_flame_arrays(path)
     faces = arrays["f"].astype(np.int64)
     _, uv, uv_corners, uv_faces, _ = read_obj(files["template"])
@@ -176,15 +182,3 @@ def _read_dict(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise _refusal(path, f"holds a {type(content).__name__}, expected a dict")
     return content
-
-
-def _find_companions(path: Path) -> dict[str, Path]:
-    """Find the model's other files; one HeadModelError lists all that are missing."""
-    found = companions(path)
-    missing = [" or ".join(names) for kind, names in COMPANIONS.items() if kind not in found]
-    if missing:
-        raise HeadModelError(
-            f"{path}: missing beside the model: {'; '.join(missing)}; download them from the FLAME"
-            " project into the same folder"
-        )
-    return found

@@ -198,6 +198,13 @@ def build_ict_head(arrays: IctArrays) -> HeadModel:
     faces = arrays.faces[shown]
     # Each landmark is put on the first face that has its vertex.
     face, corner = np.array([np.argwhere(faces == vertex)[0] for vertex in LANDMARKS]).T
+    # Of the UDIM tiles, packed into [0, 1], tile 0 (the face) gets 3/4 of the side, others 1/4.
+    uv = np.clip(arrays.uv, 0.0, None)
+    tile = np.minimum(np.floor(uv[:, 0]).astype(int), 7)
+    uv = uv - np.stack([tile, np.zeros_like(tile)], axis=1)
+    cells = [(0.75, 0.0), (0.75, 0.25), (0.75, 0.5), (0.75, 0.75)]
+    cells += [(0.0, 0.75), (0.25, 0.75), (0.5, 0.75)]
+    uv = np.array([(0.0, 0.0), *cells])[tile] + uv * np.where(tile == 0, 0.75, 0.25)[:, None]
     return HeadModel(
         name="ict",
         template=tensor(template),
@@ -207,7 +214,7 @@ def build_ict_head(arrays: IctArrays) -> HeadModel:
         joint_regressor=tensor(_regressor(template, joints, regions)),
         skinning=tensor(skinning),
         faces=torch.from_numpy(faces),
-        uv=tensor(_pack_udim(arrays.uv)),
+        uv=tensor(np.clip(uv, 0.0, 1.0)),
         uv_faces=torch.from_numpy(arrays.uv_faces[shown]),
         landmark_faces=torch.from_numpy(face),
         landmark_bary=tensor(np.eye(3)[corner]),
@@ -311,17 +318,6 @@ def _regressor(
         target = np.append(joint, 1.0) - system @ uniform
         rows[row, chosen] = uniform + np.linalg.lstsq(system, target, rcond=None)[0]
     return rows
-
-
-def _pack_udim(uv: np.ndarray) -> np.ndarray:
-    """Pack UDIM tiles into [0, 1]: tile 0 (the face) gets 3/4 of the side, the others 1/4."""
-    packed = np.clip(uv, 0.0, None)
-    tile = np.minimum(np.floor(packed[:, 0]).astype(int), 7)
-    packed = packed - np.stack([tile, np.zeros_like(tile)], axis=1)
-    cells = [(0.75, 0.0), (0.75, 0.25), (0.75, 0.5), (0.75, 0.75)]
-    cells += [(0.0, 0.75), (0.25, 0.75), (0.5, 0.75)]
-    corner = np.array([(0.0, 0.0), *cells])[tile]
-    return np.clip(corner + packed * np.where(tile == 0, 0.75, 0.25)[:, None], 0.0, 1.0)
 
 
 def ict_regions(

@@ -72,7 +72,14 @@ def render_preview(
     points = np.asarray(vertices, np.float32)
     faces = model.faces.cpu().numpy()
     scene = mesh_scene(points, faces)
-    origin, directions, axes = _camera(yaw, 2 * size)
+    angle, side = np.radians(yaw), 2 * size
+    back = np.array([np.sin(angle), 0.0, np.cos(angle)])
+    right = np.array([np.cos(angle), 0.0, -np.sin(angle)])
+    up = np.cross(back, right)
+    origin = np.array(_CENTER) + _AWAY * back
+    step = cell_centres(side) / side * _SPAN - _SPAN / 2
+    x, y = np.meshgrid(step, -step)
+    directions = unit(x[..., None] * right + y[..., None] * up - _AWAY * back)
     hits = scene.cast_rays(join_rays(origin, directions))
     distance = hits["t_hit"].numpy()
     seen = np.isfinite(distance)
@@ -86,23 +93,11 @@ def render_preview(
             colors[model.regions[region].cpu().numpy()] = color
     base = (colors[corner] * weights).sum(1)
     place = origin + distance[seen, None] * directions[seen]
-    shade = _shade(scene, place, n, axes, -directions[seen])
+    shade = _shade(scene, place, n, (right, up, back), -directions[seen])
     image = np.tile(np.array(_BACKGROUND), (*distance.shape, 1))
     image[seen] = base * shade[:, :1] + shade[:, 1:]
     image = image.reshape(size, 2, size, 2, 3).mean((1, 3))
     return (np.clip(image, 0, 1) ** (1 / 2.2) * 255 + 0.5).astype(np.uint8)
-
-
-def _camera(yaw: float, side: int) -> tuple[Array, Array, tuple[Array, Array, Array]]:
-    """Return the rays' origin, their unit directions (side,side,3), and axes right, up, back."""
-    a = np.radians(yaw)
-    back, right = np.array([np.sin(a), 0.0, np.cos(a)]), np.array([np.cos(a), 0.0, -np.sin(a)])
-    up = np.cross(back, right)
-    origin = np.array(_CENTER) + _AWAY * back
-    step = cell_centres(side) / side * _SPAN - _SPAN / 2
-    x, y = np.meshgrid(step, -step)
-    directions = unit(x[..., None] * right + y[..., None] * up - _AWAY * back)
-    return origin, directions, (right, up, back)
 
 
 def _shade(

@@ -65,8 +65,14 @@ def state_uncertainty(solution: BoardSolution, points: np.ndarray) -> dict[str, 
     keep = facing[solution.corners.camera]
     corners, errors = solution.corners.select(keep), solution.errors[keep]
     rig, head = BoardRig(cameras, solution.boards), head_points()
-    scale = 2 * max(float(np.median(np.linalg.norm(errors, axis=1))) / 1.1774, 1e-3)
-    sigma = _noise(corners, errors, scale)
+    length = np.linalg.norm(errors, axis=1)
+    scale = 2 * max(float(np.median(length)) / 1.1774, 1e-3)
+    # The corners' noise per camera, pixels, as a fit with Cauchy's loss passes it.
+    sigma, weight = np.full(len(corners.cameras), 1e-6), 1 / (1 + (length / scale) ** 2)
+    for i in np.unique(corners.camera):
+        mine = corners.camera == i
+        pull = np.sqrt(np.mean((weight[mine] * length[mine]) ** 2) / 2)
+        sigma[i] = max(pull / np.mean(weight[mine] ** 2), 1e-6)
     squared = _expected(rig, corners, points, sigma, head)
     # Each half has every other board frame, and only the cameras that both halves hold.
     side = np.searchsorted(np.unique(corners.frame), corners.frame) % 2
@@ -110,17 +116,6 @@ def camera_errors(
     offs = [project(found[n], points @ R.T + t)[0] - p for n, p in zip(names, seen, strict=True)]
     rms = np.sqrt(np.mean(np.sum(np.stack(offs) ** 2, axis=-1), axis=1))
     return dict(zip(names, rms.tolist(), strict=True))
-
-
-def _noise(corners: BoardCorners, errors: np.ndarray, scale: float) -> np.ndarray:
-    """Measure the corners' noise (C,) per camera, pixels, as a fit with Cauchy's loss passes it."""
-    length = np.linalg.norm(errors, axis=1)
-    weight, sigma = 1 / (1 + (length / scale) ** 2), np.full(len(corners.cameras), 1e-6)
-    for i in np.unique(corners.camera):
-        mine = corners.camera == i
-        pull = np.sqrt(np.mean((weight[mine] * length[mine]) ** 2) / 2)
-        sigma[i] = max(pull / np.mean(weight[mine] ** 2), 1e-6)
-    return sigma
 
 
 def _expected(

@@ -49,34 +49,28 @@ class LevelSet:
         """Interpolate distances (N,) float32 at world points (N, 3), clamped to the box."""
         out = np.empty(len(points), np.float32)
         last = np.array(self.shape) - 1
+        _, b, c = self.table.shape
+        table, voxels = self.table.ravel(), self.blocks.ravel()
         for start in range(0, len(points), 1 << 15):  # as many as fit into the nearest cache
             part = slice(start, start + (1 << 15))
-            out[part] = self._trilinear(
-                np.clip((points[part] - self.origin) / self.voxel, 0, last), last
-            )
-        return out
-
-    def _trilinear(self, index: np.ndarray, last: np.ndarray) -> np.ndarray:
-        """Interpolate values (N,) at fractional voxel indices (N, 3) within the box."""
-        low = np.minimum(index.astype(np.int32), np.maximum(last - 1, 0).astype(np.int32))
-        _, b, c = self.table.shape
-        block = low >> SHIFT
-        row = self._constant_row.take(block[:, 0] * (b * c) + block[:, 1] * c + block[:, 2])
-        out = self.blocks[:HELD, 0, 0, 0].take(row & 1)  # correct where the surface is far
-        near = np.flatnonzero(row < 0)
-        low = low[near]
-        share = (index[near] - low).astype(np.float32)
-        found = np.zeros(len(near), np.float32)
-        ends = []  # of each axis, low and high: offsets in the table and in a block, weight
-        for axis, (stride, step) in enumerate(zip((b * c, c, 1), (64, 8, 1), strict=True)):
-            at, weight = low[:, axis], share[:, axis]
-            ends.append([((i >> SHIFT) * stride, (i & (BLOCK - 1)) * step, w)
-                         for i, w in ((at, 1 - weight), (at + 1, weight))])  # fmt: skip
-        table, voxels = self.table.ravel(), self.blocks.ravel()
-        for x, y, z in product(*ends):
-            rows = table.take(x[0] + y[0] + z[0]).astype(np.int64)
-            found += voxels.take(rows * BLOCK**3 + (x[1] + y[1] + z[1])) * (x[2] * y[2] * z[2])
-        out[near] = found
+            index = np.clip((points[part] - self.origin) / self.voxel, 0, last)
+            low = np.minimum(index.astype(np.int32), np.maximum(last - 1, 0).astype(np.int32))
+            block = low >> SHIFT
+            row = self._constant_row.take(block[:, 0] * (b * c) + block[:, 1] * c + block[:, 2])
+            out[part] = self.blocks[:HELD, 0, 0, 0].take(row & 1)  # correct far from the surface
+            near = np.flatnonzero(row < 0)
+            low = low[near]
+            share = (index[near] - low).astype(np.float32)
+            found = np.zeros(len(near), np.float32)
+            ends = []  # of each axis, low and high: offsets in the table and in a block, weight
+            for axis, (stride, step) in enumerate(zip((b * c, c, 1), (64, 8, 1), strict=True)):
+                at, weight = low[:, axis], share[:, axis]
+                ends.append([((i >> SHIFT) * stride, (i & (BLOCK - 1)) * step, w)
+                             for i, w in ((at, 1 - weight), (at + 1, weight))])  # fmt: skip
+            for x, y, z in product(*ends):
+                rows = table.take(x[0] + y[0] + z[0]).astype(np.int64)
+                found += voxels.take(rows * BLOCK**3 + (x[1] + y[1] + z[1])) * (x[2] * y[2] * z[2])
+            out[start + near] = found
         return out
 
     @cached_property

@@ -320,7 +320,19 @@ class FaceFront:
             self.chin[np.argmax(pixels[self.chin] @ down)],
             self.left[np.argmax(pixels[self.left] @ across)],
         )
-        edge = self._edge(pixels)
+        # The outer edge of the front, smoothed.
+        used = pixels[np.unique(self.faces)]
+        low, size = used.min(0), float(np.ptp(used, axis=0).max())
+        scale = MASK_SHARE * MASK_SIDE / max(size, 1e-6)
+        shift = 0.5 * (1 - MASK_SHARE) * MASK_SIDE
+        mask = np.zeros((MASK_SIDE, MASK_SIDE), np.uint8)
+        corners = corner_to_cell((pixels - low) * scale + shift)
+        for triangle in np.round(corners[self.faces] * 16).astype(np.int32):
+            cv2.fillConvexPoly(mask, triangle, 255, shift=4)
+        inside = cv2.GaussianBlur(mask, (0, 0), SMOOTHING) > 127
+        found = cv2.findContours(inside.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+        edge = cell_to_corner(max(found, key=len)[:, 0].astype(np.float64))
+        edge = (edge - shift) / scale + low
         first, middle, last = (
             int(np.linalg.norm(edge - pixels[one], axis=1).argmin()) for one in ends
         )
@@ -331,23 +343,6 @@ class FaceFront:
             middle, last = len(edge) - middle, len(edge) - last
         halves = _spaced(edge[: middle + 1]), _spaced(edge[middle : last + 1])
         return np.concatenate([halves[0], halves[1][1:]])
-
-    def _edge(self, pixels: np.ndarray) -> np.ndarray:
-        """Return the outer edge (n, 2) of the front in a view, smoothed."""
-        used = pixels[np.unique(self.faces)]
-        low, size = used.min(0), float(np.ptp(used, axis=0).max())
-        scale = MASK_SHARE * MASK_SIDE / max(size, 1e-6)
-        shift = 0.5 * (1 - MASK_SHARE) * MASK_SIDE
-        mask = np.zeros((MASK_SIDE, MASK_SIDE), np.uint8)
-        corners = corner_to_cell((pixels - low) * scale + shift)
-        for triangle in np.round(corners[self.faces] * 16).astype(np.int32):
-            cv2.fillConvexPoly(mask, triangle, 255, shift=4)
-        mask = cv2.GaussianBlur(mask, (0, 0), SMOOTHING)
-        found, _ = cv2.findContours(
-            (mask > 127).view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
-        )
-        edge = max(found, key=len)[:, 0].astype(np.float64)
-        return (cell_to_corner(edge) - shift) / scale + low
 
 
 @lru_cache(maxsize=4)
