@@ -1,4 +1,4 @@
-"""``express50 status`` shows what is done, failed, running and missing, as a table or a live page.
+"""``express50 status`` shows what is done, failed, running and to do, as a table or a live page.
 
 It reads only the ledger.
 """
@@ -58,7 +58,7 @@ class StageStatus:
     failed: tuple[Receipt, ...]  # items whose last attempt failed, unless they are running again
     running: dict[str, float]  # start of each item in progress, seconds since 1970
     # number of items of the last run that are waiting, or were not reached, and had not failed
-    missing: int
+    to_do: int
     rate: float  # recent items per second; 0 before the first has finished
     left_s: float | None  # estimated seconds until the run ends; None if unknown
     seconds: float  # total seconds of all items
@@ -68,7 +68,7 @@ class StageStatus:
     def counts(self) -> dict[str, int]:
         """Return the number of items per outcome."""
         failed, running = len(self.failed), len(self.running)
-        return {"done": self.done, "failed": failed, "running": running, "missing": self.missing}
+        return {"done": self.done, "failed": failed, "running": running, "to do": self.to_do}
 
     def expected_error(self) -> str:
         """Return the median item's expected error in words; empty if the stage states none."""
@@ -80,7 +80,7 @@ def add_commands(subparsers: Any) -> None:
     words = "show what is done, failed or outdated, with expected errors, time and memory"
     parser = add_command(
         subparsers, "status", show_status, words, json=False,
-        description="Show for each stage how many items are done, failed, running or missing, its"
+        description="Show for each stage how many items are done, failed, running or to do, its"
         " time, memory and expected error; then what is outdated, and why. Exit code 1 if an item"
         " failed.",
     )  # fmt: skip
@@ -162,7 +162,7 @@ def _serve(dataset: Dataset, port: int) -> int:
 
 
 def _lines(table: list[StageStatus]) -> Iterator[str]:
-    header = ["stage", "done", "failed", "running", "missing"]
+    header = ["stage", "done", "failed", "running", "to do"]
     header += ["seconds", "peak MB", "state", "expected error"]
     rows = []
     for row in table:
@@ -220,7 +220,7 @@ def _stage(
 ) -> StageStatus:
     receipts = tuple(table.values())
     failed = {r.item: r for r in receipts if r.reason}
-    alive, open_items, former, missing, rate = False, 0, 0, 0, 0.0
+    alive, open_items, former, to_do, rate = False, 0, 0, 0, 0.0
     running: dict[str, float] = {}
     if run is not None:
         alive = not run.ended and -AHEAD_SECONDS < now - run.seen < silence
@@ -234,11 +234,11 @@ def _stage(
         until = now if alive else run.ended or run.seen
         rate = (len(ends) - 1) / max(until - ends[0], 1e-3)
         # Items waiting to be made again still have their old receipts: failed ones count as that,
-        # the others as missing. (A run of some items may not include all that failed before.)
+        # the others as to do. (A run of some items may not include all that failed before.)
         old = [r for r in receipts if r.time < run.begun]
         fresh = max(0, open_items - sum(bool(r.reason) for r in old))
         former = min(fresh, max(0, sum(not r.reason for r in old) - run.current))
-        missing = max(0, fresh - len(running.keys() - failed.keys()))
+        to_do = max(0, fresh - len(running.keys() - failed.keys()))
     if alive:
         state = "running"
     elif open_items or (run is not None and not run.ended):
@@ -251,7 +251,7 @@ def _stage(
         done=len(receipts) - len(failed) - former,
         failed=tuple(r for item, r in failed.items() if item not in running),
         running=running,
-        missing=missing,
+        to_do=to_do,
         rate=rate,
         left_s=open_items / rate if alive and rate > 0 else None,
         seconds=sum(r.seconds for r in receipts),
@@ -304,7 +304,7 @@ def status_page(name: str, table: Sequence[StageStatus], refresh_s: float | None
 
 
 def _cards(table: Sequence[StageStatus]) -> list[tuple[str, str]]:
-    names = ("done", "failed", "running", "missing")
+    names = ("done", "failed", "running", "to do")
     cards = [(name, f"{sum(stage.counts()[name] for stage in table):,}") for name in names]
     current = next((stage for stage in table if stage.state == "running"), None)
     if current is not None:

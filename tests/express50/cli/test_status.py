@@ -48,7 +48,7 @@ def of(tmp_path, run, receipts, now):
     return row
 
 
-def test_a_run_states_what_is_done_running_and_missing_and_when_it_ends(tmp_path):
+def test_a_run_states_what_is_done_running_and_to_do_and_when_it_ends(tmp_path):
     run = Run(
         stage="toy",
         items=14,
@@ -62,7 +62,7 @@ def test_a_run_states_what_is_done_running_and_missing_and_when_it_ends(tmp_path
     row = of(tmp_path, run, receipts, 120.0)
     assert (row.state, row.done, len(row.failed)) == ("running", 6, 1)
     assert sorted(row.running) == ["a5", "a6"]
-    assert row.missing == 14 - 2 - 6 - 2
+    assert row.to_do == 14 - 2 - 6 - 2
     assert row.rate == pytest.approx(6 / 20)
     assert row.left_s == pytest.approx((14 - 2 - 6) / (6 / 20))
     assert (row.seconds, row.peak_memory) == (14.0, 7)
@@ -88,7 +88,7 @@ def test_a_trial_of_a_budgeted_run_is_shown(tmp_path, capsys):
 def test_an_item_that_has_ended_since_the_last_sign_is_not_running(tmp_path):
     run = Run(stage="toy", items=2, begun=100.0, seen=110.0, running={"a": 105.0, "b": 105.0})
     row = of(tmp_path, run, [receipt("a", 111.0)], 112.0)
-    assert (list(row.running), row.done, row.missing) == (["b"], 1, 0)
+    assert (list(row.running), row.done, row.to_do) == (["b"], 1, 0)
 
 
 def test_items_that_failed_before_are_counted_once_while_they_wait(tmp_path):
@@ -96,7 +96,7 @@ def test_items_that_failed_before_are_counted_once_while_they_wait(tmp_path):
     old = [receipt("bad", 50.0, "failed"), receipt("worse", 50.0, "failed"), receipt("ok", 50.0)]
     row = of(tmp_path, run, [*old, receipt("new", 110.0)], 120.0)
     # Two have no receipt yet.
-    assert row.counts() == {"done": 2, "failed": 1, "running": 1, "missing": 2}
+    assert row.counts() == {"done": 2, "failed": 1, "running": 1, "to do": 2}
     assert [r.item for r in row.failed] == ["worse"]
 
 
@@ -104,7 +104,7 @@ def test_an_output_that_stood_when_its_item_failed_is_counted_once(tmp_path):
     stood = replace(receipt("a", 50.0), reason="CaptureError: no such folder")
     run = Run(stage="toy", items=2, begun=100.0, seen=119.0)
     row = of(tmp_path, run, [stood, receipt("b", 50.0)], 120.0)
-    assert row.counts() == {"done": 0, "failed": 1, "running": 0, "missing": 1}
+    assert row.counts() == {"done": 0, "failed": 1, "running": 0, "to do": 1}
 
 
 def test_the_rate_is_recent_and_falls_while_no_item_ends(tmp_path):
@@ -116,7 +116,7 @@ def test_the_rate_is_recent_and_falls_while_no_item_ends(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("run", "receipts", "state", "missing"),
+    ("run", "receipts", "state", "to_do"),
     [
         (None, [], "not run", 0),
         (Run(stage="toy", items=1, begun=1.0, seen=3.0, ended=3.0), ["done"], "done", 0),
@@ -130,10 +130,10 @@ def test_the_rate_is_recent_and_falls_while_no_item_ends(tmp_path):
         ),
     ],
 )
-def test_states(tmp_path, run, receipts, state, missing):
+def test_states(tmp_path, run, receipts, state, to_do):
     rows = [receipt(f"a{n}", 2.0, one) for n, one in enumerate(receipts)]
     row = of(tmp_path, run, rows, 4.0 + SILENT_SECONDS)
-    assert (row.state, row.missing, row.running) == (state, missing, {})
+    assert (row.state, row.to_do, row.running) == (state, to_do, {})
 
 
 class Tags(html.parser.HTMLParser):
@@ -174,7 +174,7 @@ def test_page_escapes_all_text_and_loads_nothing(tmp_path):
     row = of(tmp_path, run, [failed, receipt("slow", 110.0, seconds=4020.0)], 120.0)
     tags = parsed(status_page(evil, [row], 3.0))
     assert tags.seen.count("script") == 1  # its own, by which it loads itself again
-    for words in (evil + "2", "StageError: dark", "1:07 h", "running", "missing"):
+    for words in (evil + "2", "StageError: dark", "1:07 h", "running", "to do"):
         assert words in tags.text
     assert "script" not in parsed(status_page(evil, [row], None)).seen
 
@@ -216,13 +216,13 @@ def test_page_follows_a_run_of_another_process_to_its_end(tmp_path, monkeypatch,
     # Slow enough that a busy machine does not miss a run's middle between two looks.
     process = start(dataset, workers, slower=25)
     row = first_with(dataset, lambda row: row.state == "running" and row.running and row.done)
-    assert row.done + len(row.failed) + len(row.running) + row.missing == len(names)
+    assert row.done + len(row.failed) + len(row.running) + row.to_do == len(names)
     page = tmp_path / "page.html"
     monkeypatch.setattr(status_cli, "stages", lambda: {"toy": toy.STAGE})
     assert main(["status", str(dataset.root), "--page", str(page)]) == 1
     assert process.wait(timeout=60) == 1
     end = status_of_toy(dataset)
-    assert (end.state, end.done, len(end.failed), end.missing) == ("failed", 8, 1, 0)
+    assert (end.state, end.done, len(end.failed), end.to_do) == ("failed", 8, 1, 0)
     text = page.read_text()
     assert "bad1" in text and "expected &#39;repaired&#39;" in text
     assert "script" not in parsed(text).seen
@@ -237,7 +237,7 @@ def test_a_worker_whose_clock_is_behind_does_not_stop_the_run(tmp_path, monkeypa
     dataset = toy.make_dataset(tmp_path / "data", ["a", "b"])
     toy.run_toy(dataset, workers=0)
     row = status_of_toy(dataset)
-    assert (row.state, row.counts()["done"], row.counts()["missing"]) == ("done", 2, 0)
+    assert (row.state, row.counts()["done"], row.counts()["to do"]) == ("done", 2, 0)
 
 
 def test_a_killed_run_counts_as_stopped(tmp_path):
@@ -253,7 +253,7 @@ def test_a_killed_run_counts_as_stopped(tmp_path):
         soon, locked = time.time() + UNLOCKED_SECONDS, partial(is_running, dataset)
         (row,) = read_status(ledger, ["toy"], soon, locked)
     assert row.state == "stopped"
-    assert row.missing + row.done == 40 and row.missing > 0
+    assert row.to_do + row.done == 40 and row.to_do > 0
 
 
 def test_serve_answers_only_on_this_machine(tmp_path):

@@ -174,7 +174,7 @@ def test_stages_are_done_without_the_person(dataset):
     withdraw(dataset, "S001")
     with Ledger(dataset.ledger) as ledger:
         (status,) = read_status(ledger, ["ingest"])
-    assert (status.state, status.done, status.missing) == ("done", 1, 0)
+    assert (status.state, status.done, status.to_do) == ("done", 1, 0)
 
 
 def test_points_and_pixels_that_spell_an_id_by_chance_do_not_count(dataset):

@@ -215,7 +215,7 @@ def test_a_run_that_is_stopped_costs_nothing_that_was_made(tmp_path):
         run_toy(dataset, stage=mistyped, word="b")
     with Ledger(dataset.ledger) as ledger:
         (status,) = read_status(ledger, ["toy"])
-    assert (status.state, status.done, status.missing) == ("stopped", 1, 3)
+    assert (status.state, status.done, status.to_do) == ("stopped", 1, 3)
     skipped = dict.fromkeys("bcd", "skipped")
     assert statuses(run_toy(dataset)) == {"a": "done"} | skipped
 
