@@ -95,6 +95,11 @@ def run_export(args: argparse.Namespace) -> int:
         even_colour=args.even_colour, validation_camera=args.validation_camera,
         test_expressions=None if held is None else tuple(held),
     )  # fmt: skip
+    if args.format != "gaussian-avatars" and options != AvatarOptions():
+        raise ConfigError(
+            f"--format {args.format}: --background, --head-only, --downscale, --even-colour,"
+            " --test-expression and --validation-camera are for gaussian-avatars; leave them out"
+        )
     check_folder_writable(args.out)
     dataset, accounts = existing_dataset(args.dataset), []
     for subject in tracked_subjects(dataset, args.subject):
