@@ -22,7 +22,7 @@ from torch import Tensor
 from express50.console import figure_label, format_table
 from express50.contract.segmentation_labels import label_mask
 from express50.errors import FormatError, TrainError, few
-from express50.files.atomic import write_bytes, write_json
+from express50.files.atomic import naming_full_disk, write_bytes, write_json
 from express50.files.images import read_image, write_image
 from express50.files.text import is_number, no_folder
 from express50.shards.writer import sample_key
@@ -115,7 +115,7 @@ def evaluate(
             keep(index, out.image)
         if journal is not None:
             line = json.dumps({"made_from": journal.made_from, "row": row})
-            with journal.path.open("a", encoding="utf-8") as file:
+            with naming_full_disk(journal.path), journal.path.open("a", encoding="utf-8") as file:
                 file.write(f"\n{line}")  # the break first: it ends a line that was cut short
     return rows
 

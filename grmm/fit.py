@@ -423,7 +423,8 @@ def unseen_views(
     if not any(views.keys[i].expression in known for i in own):
         raise ConfigError(
             f"{subject}: no view is left to measure: cameras {', '.join(sorted(cameras))} are "
-            f"used for the fit, and only expressions {', '.join(sorted(known))} can be drawn"
+            f"used for the fit, and only expressions {', '.join(sorted(known))} can be drawn; "
+            "fit from fewer cameras (--fit-cameras) or measure other views"
         )
     return given, with_codes(views.keys, own, [subject], known)
 

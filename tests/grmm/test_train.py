@@ -6,6 +6,7 @@ import re
 import signal
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from grmm import train as train_module
 from grmm.data import HeadViews
 from grmm.evaluate import (
     NO_NETWORKS,
+    Journal,
     compare,
     component_effects,
     evaluate,
@@ -380,6 +382,14 @@ def test_held_out_expressions_are_not_trained_on():
     wrong = tiny_config(data={"holdout_expressions": ("S009/e0",)})
     with pytest.raises(ConfigError, match="S009/e0"):
         split_samples(keys, wrong)
+
+
+def test_an_evaluation_names_the_full_disk(views, monkeypatch):
+    monkeypatch.setattr("grmm.evaluate.journal_rows", lambda journal: {})
+    run = prepare(views, tiny_config())
+    journal, render = Journal(Path("/dev/full"), ""), training_render(run.model, views)
+    with pytest.raises(DiskFullError, match="/dev/full: the disk is full"):
+        evaluate(views, [0], render, journal=journal)
 
 
 def test_a_rendering_with_nan_is_refused_not_passed_over(views):
