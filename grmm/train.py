@@ -24,7 +24,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from express50 import native
 from express50.console import count, log
-from express50.errors import FormatError, NotReadyError, TrainError
+from express50.errors import NotReadyError, TrainError
 from express50.files.atomic import check_space, write_json
 from express50.geometry.sampling import evenly
 from express50.head.model import HeadModel
@@ -136,8 +136,10 @@ def train(
             order = state.shuffle.state()
             try:
                 step(state, parallel, config, late)
-            except (FormatError, OSError):  # a shard was damaged or removed; no step is lost
-                state.shuffle.restore(order)
+            except TrainError:
+                raise
+            except Exception:  # a damaged shard, too little memory, or another process has failed
+                state.shuffle.restore(order)  # nothing else has changed: keep the steps before
                 if rank == 0 and state.iteration:
                     keep(True)
                 raise
@@ -294,7 +296,8 @@ def report(
 
 def diverged(metrics: Mapping[str, object]) -> bool:
     """Return whether a grey picture would score better; False for no metrics."""
-    return float(str(metrics.get("psnr_train_db", GREY_DB))) < GREY_DB
+    psnr_db = metrics.get("psnr_train_db")
+    return isinstance(psnr_db, float) and psnr_db < GREY_DB
 
 
 def join_processes() -> tuple[int, int, torch.device]:

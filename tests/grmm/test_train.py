@@ -228,7 +228,8 @@ def test_a_long_step_ends_with_the_time(tmp_path, source):
     assert metrics["psnr_train_db"] > 10
 
 
-def test_a_sample_that_becomes_unreadable_loses_no_step(tmp_path, source, monkeypatch):
+@pytest.mark.parametrize("kind", [FormatError, OSError, torch.OutOfMemoryError])
+def test_a_sample_that_becomes_unusable_loses_no_step(tmp_path, source, monkeypatch, kind):
     straight, broken = tmp_path / "straight", tmp_path / "broken"
     config = tiny_config(train={"iterations": 5, "accumulate": 2, "final_lr": 1.0})
     train(source, ellipsoid_head(), straight, config)
@@ -237,11 +238,11 @@ def test_a_sample_that_becomes_unreadable_loses_no_step(tmp_path, source, monkey
     def damaged(views, index, *, crop=False):
         taken.append(crop)
         if crop and sum(taken) == 8:  # the second view of the fourth step
-            raise FormatError("train-000000.tar: damaged")
+            raise kind("train-000000.tar: damaged")
         return item(views, index, crop=crop)
 
     monkeypatch.setattr(HeadViews, "item", damaged)
-    with pytest.raises(FormatError, match="damaged"):
+    with pytest.raises(kind, match="damaged"):
         train(source, ellipsoid_head(), broken, config)
     assert state_of(broken)["loop"]["iteration"] == 3
     train(source, ellipsoid_head(), broken, config, resume=True)
