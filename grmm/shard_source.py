@@ -32,9 +32,11 @@ class ShardSource:
     def __init__(self, root: Path, split: str = "train") -> None:
         """Open the shards; FormatError unless they hold samples of one head model."""
         reader = ShardReader(root)
-        self.reader = reader if split == "*" else reader.select(split=split)
-        if not len(self.reader):
-            raise FormatError(f"{root}: no samples; rerun 'express50 pack'")
+        chosen = tuple(entry for entry in reader.entries if split in ("*", entry.split))
+        self.reader = ShardReader(root, chosen)
+        if not chosen:
+            what = "samples" if split == "*" else f"{split} samples, only of other splits"
+            raise FormatError(f"{root}: no {what}; rerun 'express50 pack' with more subjects")
         self.keys: Sequence[SampleKey] = [
             SampleKey(subject=entry.subject, expression=entry.expression, camera=entry.camera)
             for entry in self.reader.entries

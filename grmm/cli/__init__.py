@@ -39,7 +39,7 @@ def parse_seconds(text: str) -> float:
         seconds = 0.0
     if not 0 < seconds < float("inf"):
         raise argparse.ArgumentTypeError(
-            f"{text!r} is not a time; expected a number of seconds, or 60s, 5m, 1h"
+            f"{text!r} is not a time; expected a number of seconds above 0, or 60s, 5m, 1h"
         )
     return seconds
 

@@ -428,6 +428,14 @@ def shards_whose_meta_has(folder: Path, **changes) -> Path:
     return folder
 
 
+def test_shards_without_people_to_train_on_are_refused(tmp_path, capsys):
+    source = EllipsoidSource(subjects=1, size=32)
+    shards = write_shards(tmp_path / "shards", source, test_subjects=("S000",))
+    assert main(["train", str(shards), str(tmp_path / "out"), *TINY]) == 1
+    words = "shards: no train samples, only of other splits; rerun 'express50 pack' with more"
+    assert words in capsys.readouterr().err
+
+
 def test_samples_without_a_head_model_are_refused(tmp_path):
     with pytest.raises(FormatError, match="meta names no head model"):
         ShardSource(shards_whose_meta_has(tmp_path, head=None))
