@@ -240,10 +240,10 @@ def restore(state: TrainState, path: Path, config: Config, device: torch.device)
         )
     tables = ("model", "loss", "data", "train")
     changed = differences(loaded.config, config, tables, {("train", key) for key in CHANGEABLE})
-    names = (loaded.model.subjects, loaded.model.expressions)
-    if names != (state.model.subjects, state.model.expressions):
-        changed.append("the subjects or expressions of the shards")
-    elif loaded.loop.get("samples", state.views.source.digest) != state.views.source.digest:
+    for what in ("subjects", "expressions"):
+        if lone := sorted({*getattr(loaded.model, what)} ^ {*getattr(state.model, what)}):
+            changed.append(f"the {what} of the shards ({few(lone)} only before or only now)")
+    if loaded.loop.get("samples", state.views.source.digest) != state.views.source.digest:
         changed.append("the samples of the shards")
     refuse_changes(path, changed, "train into another folder")
     state.model.load_state_dict(loaded.model.state_dict())

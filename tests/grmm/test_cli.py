@@ -88,6 +88,10 @@ def test_training_again_goes_on_and_refuses_what_differs(shards, tmp_path, capsy
     write_shards(tmp_path / "others", EllipsoidSource(subjects=3, size=24))
     assert main(["train", str(tmp_path / "others"), str(tmp_path), *TINY]) == 2
     assert "the samples of the shards" in capsys.readouterr().err
+    write_shards(tmp_path / "fewer", EllipsoidSource(subjects=3, size=32), ("S001", "S002"))
+    assert main(["train", str(tmp_path / "fewer"), str(tmp_path), *TINY]) == 2
+    words = "the subjects of the shards (S001 only before or only now); the samples of the shards."
+    assert words in capsys.readouterr().err
     assert (tmp_path / "checkpoint.pt").read_bytes() == before
 
     assert main([*train, "--overwrite", "--set=train.lr=0.003"]) == 0
