@@ -22,6 +22,7 @@ DESCRIPTION = "Train the Gaussian Residual Morphable Model on packed shards, and
 EPILOG = """example:
   grmm train DATASET/pack/shards OUT --budget 10m
 exit codes: 0 all done; 1 failed; 2 wrong usage or settings"""
+MOST_PX = 8192  # of a picture's side
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -160,7 +161,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     ),
     "--camera": value("ID", "camera of the checkpoint (default: a frontal one)"),
     "--size": value(
-        "N", "longer side, pixels (default: as trained)", type=number(0, 8192), default=0
+        "N", "longer side, pixels (default: as trained)", type=number(0, MOST_PX), default=0
     ),
     "--yaw": value("DEG", "move the camera around the head, degrees", type=finite, default=0.0),
     "--pitch": value("DEG", "move the camera up, degrees", type=finite, default=0.0),
@@ -191,7 +192,10 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--format": {"choices": commands.FORMATS, "help": "format (default: by FILE's name)"},
     "--shards": value("SHARDS", "with .html: measure its loss on this footage", type=Path),
     "--still": value(
-        "N", "height of still pictures, pixels (default: %(default)s)", type=number(16), default=512
+        "N",
+        "height of still pictures, pixels (default: %(default)s)",
+        type=number(16, MOST_PX),
+        default=512,
     ),
     "--host": value(
         "ADDRESS", "address to listen on (default: this machine only)", default="127.0.0.1"
@@ -312,7 +316,7 @@ COMMANDS = {
         example="grmm view run/checkpoint.pt",
         changes={
             "--size": {
-                "type": number(16),
+                "type": number(16, MOST_PX),
                 "default": 320,
                 "help": "height while the picture moves, pixels (default: %(default)s)",
             }  # fmt: skip

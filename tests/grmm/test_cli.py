@@ -292,6 +292,7 @@ def test_a_file_that_cannot_be_written_is_named_as_it_was_given(checkpoint, tmp_
     "arguments",
     [["render", "--columns=0"], ["render", "--frames=0"], ["render", "--samples=-1"],
      ["render", "--size=100000"], ["view", "--port=99999"], ["view", "--size=0"],
+     ["view", "--size=100000"], ["view", "--still=100000"],
      ["render", "--yaw=nan"], ["render", "--seed=-1"]],
 )  # fmt: skip
 def test_numbers_that_cannot_be_are_refused_at_once(arguments, capsys):
