@@ -163,7 +163,10 @@ def run_handler(
             traceback.print_exception(error)
         return USAGE if isinstance(error, ConfigError) else FAILED
     except KeyboardInterrupt:
-        log(f"{program}: interrupted; finished work is kept, the same command makes the rest")
+        again = " without --overwrite" if getattr(args, "overwrite", False) else ""
+        log(
+            f"{program}: interrupted; finished work is kept, the same command{again} makes the rest"
+        )
         return INTERRUPTED
 
 

@@ -120,7 +120,9 @@ def test_a_stopped_fit_goes_on_and_another_is_refused(
     with monkeypatch.context() as patch:
         patch.setattr("grmm.fit._finite", lambda loss, *_: os.kill(os.getpid(), 2) or loss)
         assert main(fit) == 130
-    assert "the same command makes the rest" in capsys.readouterr().err
+        assert "the same command makes the rest" in capsys.readouterr().err
+        assert main([*fit, "--overwrite"]) == 130
+        assert "the same command without --overwrite makes the rest" in capsys.readouterr().err
     assert main([*fit, "--set=fit.stage2_lr=0.5"]) == 2
     assert "cannot resume, these differ: fit.stage2_lr " in capsys.readouterr().err
     assert main(fit) == 0
