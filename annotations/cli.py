@@ -45,7 +45,13 @@ from annotations.validate import (
 from annotations.worklist import ORDERS, coverage, effort, progress, worklist
 from express50.capture.index import Index, read_index
 from express50.console import FAILED, OK, add_command, answer, count, format_table, log, number
-from express50.contract.layout import Dataset, check_folder, exclusion_reason, included_subjects
+from express50.contract.layout import (
+    Dataset,
+    check_folder,
+    check_results_file,
+    exclusion_reason,
+    included_subjects,
+)
 from express50.errors import AnnotationError, ConfigError, UnknownNameError, check_known
 
 _FIGURES = ("clips", "within_1", "within_2", "within_4", "median_frames", "slip_rate", "alpha")
@@ -411,9 +417,9 @@ def run_sheet(args: argparse.Namespace) -> int:
     """Write the page."""
     from annotations.sheet import make_sheet, render_sheet
     from annotations.ui.frames import FaceFinder
-    from express50.files.atomic import check_file_writable, write_bytes
+    from express50.files.atomic import write_bytes
 
-    check_file_writable(args.file)
+    check_results_file(args.file)
     sheet = make_sheet(args.dataset, args.subject, args.expression, args.camera, args.sure)
     chosen = args.subject or args.expression
     around = args.around if args.around is not None else AROUND if chosen else 0
@@ -472,6 +478,7 @@ def run_exclusion(args: argparse.Namespace) -> int:
 
 def run_export(args: argparse.Namespace) -> int:
     """Write the events."""
+    check_results_file(args.file)
     chosen = chosen_subjects(args.dataset, args.subject) or args.dataset.subjects()
     events = [label for subject in chosen for label in read_labels(args.dataset, subject)]
     export_labels(events, args.file)

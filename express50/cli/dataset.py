@@ -26,7 +26,7 @@ from express50.console import (
     say_json,
     stdout_to_stderr,
 )
-from express50.contract.layout import Dataset, check_folder, existing_dataset
+from express50.contract.layout import Dataset, check_folder, check_results_file, existing_dataset
 from express50.contract.stage import hook, stages
 from express50.errors import FormatError
 
@@ -165,6 +165,7 @@ def run_show(args: argparse.Namespace) -> int:
         raise FormatError(f"{args.directory}: {what}")
     sample = reader.sample(keys.index(args.key) if args.key else 0)
     if args.out is not None:
+        check_results_file(args.out)
         write_image(args.out, sample_picture(sample))
     say_json(sample["meta"] | {"key": sample["key"]})
     return OK

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from express50.console import OK, add_command, answer, count, number, say, say_json
-from express50.contract.layout import existing_dataset
+from express50.contract.layout import check_results_file, check_results_folder, existing_dataset
 from express50.errors import ConfigError, StageError
 from express50.head import BUILTIN_NAME
 
@@ -82,7 +82,6 @@ def run_export(args: argparse.Namespace) -> int:
         with_registered,
     )
     from express50.dataset.export_avatar import AvatarOptions, export_avatar
-    from express50.files.atomic import check_folder_writable
 
     if args.frames == "clips" and args.format == "gaussian-avatars":
         raise ConfigError(
@@ -100,7 +99,7 @@ def run_export(args: argparse.Namespace) -> int:
             f"--format {args.format}: --background, --head-only, --downscale, --even-colour,"
             " --test-expression and --validation-camera are for gaussian-avatars; leave them out"
         )
-    check_folder_writable(args.out)
+    check_results_folder(args.out)
     dataset, accounts = existing_dataset(args.dataset), []
     for subject in tracked_subjects(dataset, args.subject):
         head = read_tracked(dataset, subject, args.expression)
@@ -140,13 +139,13 @@ def _lines(account: dict) -> list[str]:
 def run_report(args: argparse.Namespace) -> int:
     """Write DATASET/report/index.html from the stages' outputs."""
     from express50.dataset.report import render_page
-    from express50.files.atomic import check_file_writable, write_bytes
+    from express50.files.atomic import write_bytes
 
     dataset = existing_dataset(args.dataset)
     if not dataset.subjects():
         raise StageError(f"{args.dataset}: nothing is ingested; run 'express50 ingest' first")
     path = (args.out or dataset.report_dir) / "index.html"
-    check_file_writable(path)
+    check_results_file(path)
     page = render_page(dataset, args.title).encode()
     write_bytes(path, page)
     data = {"report": str(path), "bytes": len(page)}
@@ -155,7 +154,6 @@ def run_report(args: argparse.Namespace) -> int:
 
 def run_preview(args: argparse.Namespace) -> int:
     """Write a contact sheet of a head model."""
-    from express50.files.atomic import check_file_writable
     from express50.files.images import check_ending, write_image
     from express50.head.load import load_head
     from express50.head.preview import pose_sheet
@@ -167,7 +165,7 @@ def run_preview(args: argparse.Namespace) -> int:
     if not all(map(math.isfinite, yaws)):
         raise ConfigError(f"--yaws {args.yaws!r}: expected numbers with commas, such as 0,40,90")
     check_ending(args.out)
-    check_file_writable(args.out)
+    check_results_file(args.out)
     model = load_head(args.model)
     args.out.parent.mkdir(parents=True, exist_ok=True)
     write_image(args.out, pose_sheet(model, yaws, args.size))

@@ -21,7 +21,7 @@ from express50.console import (
     stdout_to_stderr,
 )
 from express50.contract.config import PRESETS, config_toml, distinct_settings, resolve_config
-from express50.contract.layout import Dataset, check_folder
+from express50.contract.layout import Dataset, check_folder, check_results_folder
 from express50.contract.stage import Stage, stages, with_required
 from express50.errors import ConfigError, check_known
 
@@ -297,6 +297,8 @@ def _refuse_swapped(dataset: Dataset, captures: Sequence[Path], command: str) ->
             f"the first argument is the dataset, and {root} is a capture; expected "
             f"'express50 {command} DATASET" + (f" {root}'" if command in ("ingest", "run") else "'")
         )
+    if not dataset.ledger.exists():
+        check_results_folder(root)
     for path in captures:
         if Dataset(path).ledger.exists():
             raise ConfigError(

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
 from express50.errors import AnnotationError, CaptureError, ConfigError, FormatError
+from express50.files.atomic import check_folder_writable
 from express50.files.text import NAME, parse_json, read_bytes, read_json_table, read_toml
 
 
@@ -221,6 +224,44 @@ def check_folder(dataset: Dataset) -> None:
         raise ConfigError(f"{root}: is a file, expected the folder of a dataset")
     if not root.is_dir():
         raise ConfigError(f"{root}: no such dataset; run 'express50 ingest {root} CAPTURE'")
+
+
+def check_results_folder(folder: Path) -> None:
+    """Refuse, before any work, a folder that cannot be written to or whose files stages write.
+
+    Raises:
+        ConfigError: it is a dataset, a stage's folder, a folder of shards, or a file.
+        OSError: the system refuses.
+    """
+    _refuse_datasets_own(folder)
+    if (folder / "index.json").is_file() and (folder / "manifest.json").is_file():
+        raise ConfigError(f"{folder}: holds shards; name another folder")
+    check_folder_writable(folder)
+
+
+def check_results_file(path: Path) -> None:
+    """Refuse, before any work, a file that cannot be written, or in a folder that stages write.
+
+    Raises:
+        ConfigError: it lies in a stage's folder, among labels or settings, or below a file.
+        OSError: it is a folder, or the system refuses.
+    """
+    _refuse_datasets_own(path)
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    check_folder_writable(path.parent)
+
+
+def _refuse_datasets_own(path: Path) -> None:
+    place = path.resolve()
+    for dataset in map(Dataset, (place, *place.parents)):
+        part = next(iter(place.relative_to(dataset.root).parts), "")
+        own = part in ("", "config", "labels") or dataset.config_file(part).is_file()
+        if own and dataset.ledger.is_file():
+            raise ConfigError(
+                f"{path}: belongs to the dataset {dataset.root}, whose files stages and annotators"
+                f" write; name a place outside, or below {dataset.root / 'grmm'}"
+            )
 
 
 def exclusion_reason(dataset: Dataset, subject: str) -> str | None:

@@ -130,18 +130,6 @@ def check_disk(folder: Path, name: Path) -> None:
             ) from error
 
 
-def check_file_writable(path: Path) -> None:
-    """Refuse, before any work, a file that cannot be written.
-
-    Raises:
-        ConfigError: it lies below a file.
-        OSError: it is a folder, or the system refuses.
-    """
-    if path.is_dir():
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    check_folder_writable(path.parent)
-
-
 def free_space(path: Path) -> float:
     """Return the free bytes on a path's disk; infinity for network drives that do not say."""
     usage = shutil.disk_usage(nearest_existing(path))

@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 from express50.console import FAILED, OK, answer, count, figure_label, log, say
 from express50.contract.config import config_toml, known_assignments
+from express50.contract.layout import check_results_file, check_results_folder
 from express50.errors import ConfigError, check_known
 from express50.files.atomic import (
-    check_file_writable,
-    check_folder_writable,
     check_space,
     dump_json,
     write_bytes,
@@ -50,7 +49,7 @@ def train(args: argparse.Namespace) -> int:
     from grmm.shard_source import open_shards
     from grmm.train import diverged, train
 
-    check_folder_writable(args.out)
+    check_results_folder(args.out)
     # First, because most wrong commands name a wrong folder, and no budget helps against that.
     source = open_shards([args.shards, *args.also], "train")
     config = train_config(args)
@@ -120,7 +119,7 @@ def fit(args: argparse.Namespace) -> int:
     from grmm.fit import fit
     from grmm.shard_source import ShardSource, select
 
-    check_folder_writable(args.out)
+    check_results_folder(args.out)
     made = args.out / "checkpoint.pt"
     if made.exists() and made.samefile(args.checkpoint):
         raise ConfigError(f"{made} is the checkpoint to fit from; name another folder")
@@ -150,7 +149,7 @@ def _warns_of_fit(path: Path, loaded: Checkpoint) -> bool:
 
 def _check_evaluation_folder(out: Path) -> None:
     """Refuse a folder that cannot be written to; say what will be replaced in it."""
-    check_folder_writable(out)
+    check_results_folder(out)
     if (out / "evaluation.csv").exists():
         log(f"{out}: its evaluation will be replaced; to keep it, stop and name another folder")
 
@@ -161,7 +160,7 @@ def render(args: argparse.Namespace) -> int:
     from express50.files.images import write_image
     from grmm import render
 
-    check_folder_writable(args.out)
+    check_results_folder(args.out)
     _require(args, "drive", "drive_cue")
     loaded = _load(args.checkpoint)
     model, head = loaded.model, _edited_head(loaded, args)
@@ -232,7 +231,7 @@ def export(args: argparse.Namespace) -> int:
     if form != "html" and (unused := [n for n in ("drive", "shards") if getattr(args, n)]):
         raise ConfigError(f"--{unused[0]} is only for .html pages, not for {args.out.name}")
     _require(args, "drive", "drive_cue")
-    check_file_writable(args.out)
+    check_results_file(args.out)
     loaded = _load(args.checkpoint)
     head, view = _edited_head(loaded, args), camera_of(loaded, args.camera, args.size)
     if form == "html":
@@ -389,7 +388,7 @@ def ablate(args: argparse.Namespace) -> int:
     from grmm.ablate import Ablation, ablate
     from grmm.shard_source import open_shards
 
-    check_folder_writable(args.out)
+    check_results_folder(args.out)
     open_shards([args.shards, *args.also], "train")  # first, as in `train`
     config = train_config(args)
     if args.fit_budget is not None:
@@ -419,6 +418,7 @@ def study_make(args: argparse.Namespace) -> int:
     """Write a study of two methods' pictures."""
     from grmm.study import make_study
 
+    check_results_folder(args.out)
     methods = list(zip(args.names, (args.ours, args.theirs), strict=True))
     study = make_study(
         args.out, args.reference, methods, args.examples, args.participants, args.seed

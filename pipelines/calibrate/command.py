@@ -24,6 +24,7 @@ from express50.console import (
     say,
     say_json,
 )
+from express50.contract.layout import check_results_file
 from express50.contract.stage import Command
 from express50.errors import CalibrationError, ConfigError
 
@@ -74,6 +75,7 @@ def run_import(args: argparse.Namespace) -> int:
     cameras, verdict = _read(args)
     if args.out.is_dir():
         raise ConfigError(f"{args.out} is a folder, expected a file such as calibration.json")
+    check_results_file(args.out)
     if args.out.exists() and args.out.samefile(args.source):
         raise ConfigError(
             f"{args.out} is both SOURCE and OUT, and a second import would scale it again; write"

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from express50.console import FAILED, OK, add_command, number, say, say_json, stdout_to_stderr
-from express50.contract.layout import Dataset
+from express50.contract.layout import Dataset, check_results_folder
 from express50.contract.stage import Command, stages
 from express50.errors import ConfigError
 from express50.files.text import ID
@@ -78,6 +78,8 @@ def run_photo(args: argparse.Namespace) -> int:
     cap_threads(1)
     subject = args.subject or subject_id(args.picture)
     dataset = Dataset(args.out)
+    if not dataset.ledger.exists():
+        check_results_folder(args.out)
     names = [name for name in STAGES if args.matte or name != "matte"]
     with stdout_to_stderr() if args.json else nullcontext():
         loaded = [stages()[name] for name in names]

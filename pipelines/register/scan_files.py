@@ -11,6 +11,7 @@ import numpy as np
 import open3d as o3d
 
 from express50.console import FAILED, OK, say, say_json
+from express50.contract.layout import check_results_folder
 from express50.dataset.export import write_head_obj
 from express50.dataset.tracks import read_track
 from express50.errors import ConfigError, Express50Error, FormatError
@@ -60,6 +61,7 @@ def run_scans(args: argparse.Namespace) -> int:
                 f"--{name.replace('_', '-')} is for datasets and has no effect with --scan; omit it"
             )
     load_head(args.head)  # refuse a wrong name before any work
+    check_results_folder(args.dataset)
     out, accounts = args.dataset, []
     files, former = list_scans(args.scan), read_index(out / INDEX)
     taken: set[str] = set()

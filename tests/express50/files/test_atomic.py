@@ -9,7 +9,6 @@ import pytest
 from express50.console import system_error_line
 from express50.errors import ConfigError, DiskFullError
 from express50.files.atomic import (
-    check_file_writable,
     check_folder_writable,
     folder_in_one_step,
     write_bytes,
@@ -26,8 +25,7 @@ def refuse(number):
 
 def test_what_can_be_written_is_left_as_it_was(tmp_path):
     (tmp_path / "page.html").write_text("old")
-    check_file_writable(tmp_path / "page.html")
-    check_file_writable(tmp_path / "new" / "deep" / "page.html")
+    check_folder_writable(tmp_path / "new" / "deep")
     check_folder_writable(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
 
@@ -35,9 +33,7 @@ def test_what_can_be_written_is_left_as_it_was(tmp_path):
 def test_what_cannot_be_written_is_named_as_it_was_given(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("x")
     with pytest.raises(ConfigError, match="file: is a file, expected a folder to write to"):
-        check_file_writable(tmp_path / "file" / "deep" / "page.html")
-    with pytest.raises(IsADirectoryError):
-        check_file_writable(tmp_path)
+        check_folder_writable(tmp_path / "file" / "deep")
     monkeypatch.setattr(tempfile, "TemporaryFile", refuse(errno.EROFS))
     with pytest.raises(OSError) as caught:  # noqa: PT011  (its line is compared)
         check_folder_writable(tmp_path / "out")
