@@ -21,7 +21,7 @@ from typing import IO, BinaryIO
 
 from rich.filesize import decimal
 
-from express50.errors import ConfigError, DiskError, DiskFullError, FormatError
+from express50.errors import ConfigError, DiskError, DiskFullError, FormatError, NotReadyError
 
 LEAST_FREE = 100e6  # bytes; a disk with less free space counts as full
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # Linux constants
@@ -281,6 +281,36 @@ def lock_file(file: BinaryIO | IO[str] | int, path: Path, kind: int = fcntl.LOCK
         fcntl.flock(file, kind)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from None
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Make a folder, and hold it so that no other command writes results into it meanwhile.
+
+    The system releases it however the process ends. File systems without locks hold nothing.
+
+    Raises:
+        NotReadyError: another process holds it.
+    """
+    made = not folder.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise NotReadyError(
+                f"{folder}: another process writes into this folder; wait until it ends, or name"
+                " another folder"
+            ) from None
+        except OSError:
+            pass
+        yield
+    finally:
+        os.close(descriptor)
+        with suppress(OSError):  # something was written
+            if made:
+                folder.rmdir()
 
 
 def sync_directory(path: Path) -> None:

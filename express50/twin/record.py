@@ -6,16 +6,14 @@ Worker processes film the subjects; each is then published complete or not at al
 from __future__ import annotations
 
 import argparse
-import fcntl
 import json
 import multiprocessing
 import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -24,7 +22,7 @@ from express50.capture.expressions import select
 from express50.console import add_command, answer, count, log, number
 from express50.contract.config import field_documents
 from express50.errors import CaptureError
-from express50.files.atomic import dump_json, link_file, lock_file, write_json
+from express50.files.atomic import alone_in, dump_json, link_file, write_json
 from express50.runner.worker import cap_threads
 from express50.twin import TwinConfig
 
@@ -91,28 +89,12 @@ def record_command(args: argparse.Namespace) -> int:
             f"warning: in pictures of {short} px the board is too small to calibrate cameras from;"
             f" use {BOARD_PX} px or more, or --give-calibration"
         )
-    with _alone(args.out):
+    with alone_in(args.out):
         recorded = record(config, args.out, args.workers, print_progress())
     captures, kept = args.out / "captures", args.subjects - len(recorded)
     rest = f"; {kept} recorded before" if kept else ""
     line = f"{count(len(recorded), 'subject')} recorded in {captures}{rest}"
     return answer(args, {"captures": str(captures), "recorded": recorded}, line)
-
-
-@contextmanager
-def _alone(out: Path) -> Iterator[None]:
-    """Make and lock a folder; the system releases the lock however the process ends."""
-    out.mkdir(parents=True, exist_ok=True)
-    folder = os.open(out, os.O_RDONLY)
-    try:
-        try:
-            lock_file(folder, out, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            words = f"{out}: another process records into this folder; wait until it ends"
-            raise CaptureError(words) from None
-        yield
-    finally:
-        os.close(folder)
 
 
 def record(

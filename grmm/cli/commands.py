@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import os
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -19,6 +21,7 @@ from express50.contract.config import config_toml, known_assignments
 from express50.contract.layout import check_results_file, check_results_folder
 from express50.errors import ConfigError, check_known
 from express50.files.atomic import (
+    alone_in,
     check_space,
     dump_json,
     write_bytes,
@@ -54,7 +57,9 @@ def train(args: argparse.Namespace) -> int:
     source = open_shards([args.shards, *args.also], "train")
     config = train_config(args)
     resume = not args.overwrite and (args.out / "checkpoint.pt").exists()
-    metrics = train(source, load_head(source.head), args.out, config, resume=resume)
+    first = os.environ.get("RANK", "0") == "0"  # of the processes that torchrun starts
+    with alone_in(args.out) if first else nullcontext():
+        metrics = train(source, load_head(source.head), args.out, config, resume=resume)
     if not metrics:  # only the first process of torchrun reports
         return OK
     new = ("psnr_heldout_expression_db",) if config.data.holdout_expressions else ()
@@ -129,8 +134,9 @@ def fit(args: argparse.Namespace) -> int:
     views = loaded.views(ShardSource(args.shards, "*"))
     given = select(views.keys, args.subject, args.expression, args.cameras)
     rest = sorted({*select(views.keys, args.subject, args.expression, "*")} - {*given})
-    continued = made.exists() and not args.overwrite
-    metrics = fit(loaded, views, given, rest, args.out, continued=continued)
+    with alone_in(args.out):
+        continued = made.exists() and not args.overwrite
+        metrics = fit(loaded, views, given, rest, args.out, continued=continued)
     reached = f"{metrics['seconds']} s, {metrics['iterations']} iterations"
     psnr = f"{figure_label('psnr_db')}: {metrics['psnr_db']}"
     line = f"{psnr} ({metrics['psnr_is_of']}), after {reached}"
@@ -402,7 +408,8 @@ def ablate(args: argparse.Namespace) -> int:
         seeds=args.seeds,
         test=args.test,
     )
-    table = ablate(run, _split_names(args.rows))
+    with alone_in(args.out):
+        table = ablate(run, _split_names(args.rows))
     return answer(args, table, (args.out / "ablation.md").read_text(encoding="utf-8"))
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from express50 import __version__
 from express50.errors import FormatError
+from express50.files.atomic import alone_in
 from express50.files.images import read_image
 from express50.shards.writer import PackedSample, ShardWriter
 from grmm.cli import build_parser, main
@@ -588,3 +589,10 @@ def test_the_guides_lines_of_python_draw_a_head(shards, checkpoint):
         block = block.replace(f'"{printed}"', f'"{name}"')
     exec(block, found := {})
     assert found["sample"]["rgb"].shape == found["image"].shape == (32, 32, 3)
+
+
+def test_two_trainings_into_one_folder_are_refused(shards, tmp_path, capsys):
+    with alone_in(tmp_path / "out"):
+        assert main(["train", str(shards), str(tmp_path / "out"), *TINY]) == 2
+    assert "another process writes into this folder" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

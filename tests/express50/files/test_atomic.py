@@ -1,14 +1,16 @@
 """Places to write to are tried before any work; errors of the disk name what the user gave."""
 
 import errno
+import fcntl
 import os
 import tempfile
 
 import pytest
 
 from express50.console import system_error_line
-from express50.errors import ConfigError, DiskFullError
+from express50.errors import ConfigError, DiskFullError, NotReadyError
 from express50.files.atomic import (
+    alone_in,
     check_folder_writable,
     folder_in_one_step,
     write_bytes,
@@ -80,3 +82,22 @@ def test_a_full_disk_is_named_by_the_place_that_a_folder_is_for(tmp_path):
         write_with(aside / "a.json", refuse(errno.ENOSPC))
     assert str(caught.value).startswith(f"{out / 'a.json'}: the disk is full (No space left on ")
     assert ".out.part" not in str(caught.value)
+
+
+def test_a_folder_is_held_by_one_command_and_left_as_it_was(tmp_path):
+    with alone_in(tmp_path / "out"):
+        other = alone_in(tmp_path / "out")
+        with pytest.raises(NotReadyError, match="another process writes into this folder"), other:
+            pass
+        assert (tmp_path / "out").is_dir()
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "out").mkdir()
+    with alone_in(tmp_path / "out"):
+        pass
+    assert (tmp_path / "out").is_dir()
+
+
+def test_a_file_system_without_locks_holds_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(fcntl, "flock", refuse(errno.ENOSYS))
+    with alone_in(tmp_path), alone_in(tmp_path):
+        (tmp_path / "a").touch()

@@ -139,8 +139,8 @@ def test_command_line_records_also_where_files_have_one_name(tmp_path, capsys, m
 def test_two_recordings_into_one_folder_are_refused(tmp_path, capsys):
     folder = os.open(tmp_path, os.O_RDONLY)
     fcntl.flock(folder, fcntl.LOCK_EX)
-    assert main(["twin", "record", str(tmp_path), "--subjects=1"]) == 1
-    assert "another process records into this folder" in capsys.readouterr().err
+    assert main(["twin", "record", str(tmp_path), "--subjects=1"]) == 2
+    assert "another process writes into this folder" in capsys.readouterr().err
     os.close(folder)
     assert not list(tmp_path.iterdir())
 
