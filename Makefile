@@ -72,5 +72,8 @@ train: $(READY) ## train GRMM on DATASET's shards for an hour, or continue; the 
 report: $(READY) ## write one HTML page of DATASET's results and pictures
 	$(BIN)/express50 report "$(DATASET)"
 
-clean: ## remove what was built, keep .venv
-	rm -rf build .mypy_cache .ruff_cache .pytest_cache
+clean: ## remove what was built, keep .venv and datasets such as build/dataset
+	rm -rf .mypy_cache .ruff_cache .pytest_cache
+	@for path in build/*; do \
+	    if [ -e "$$path/captures.json" ]; then echo "kept $$path"; else rm -rf "$$path"; fi; \
+	done

@@ -408,6 +408,16 @@ def test_make_takes_a_dataset_whose_name_has_spaces(target):
     assert words[3:5] == ["caps/S 1", "caps/S 2"] or target in ("depth", "train", "report")
 
 
+def test_make_clean_keeps_datasets(tmp_path):
+    for name in ("build/dataset/labels", "build/my data", "build/demo/data"):
+        (tmp_path / name).mkdir(parents=True)
+    for name in ("build/dataset/captures.json", "build/my data/captures.json", "build/log.txt"):
+        (tmp_path / name).touch()
+    subprocess.run(["make", "-f", REPOSITORY / "Makefile", "clean"], cwd=tmp_path, check=True)
+    assert sorted(path.name for path in (tmp_path / "build").iterdir()) == ["dataset", "my data"]
+    assert (tmp_path / "build/dataset/labels").is_dir()
+
+
 def test_make_takes_a_dataset_in_the_home_folder(monkeypatch):
     """Not every shell expands ~ in an argument to make."""
     monkeypatch.setenv("HOME", "/home/someone")
