@@ -479,9 +479,10 @@ def run_exclusion(args: argparse.Namespace) -> int:
 def run_export(args: argparse.Namespace) -> int:
     """Write the events."""
     check_results_file(args.file)
-    chosen = chosen_subjects(args.dataset, args.subject) or args.dataset.subjects()
-    events = [label for subject in chosen for label in read_labels(args.dataset, subject)]
-    export_labels(events, args.file)
+    stored = {subject: read_labels(args.dataset, subject) for subject in args.dataset.subjects()}
+    chosen = chosen_subjects(args.dataset, args.subject) or [*stored]
+    events = [label for subject in chosen for label in stored[subject]]
+    export_labels(events, args.file, {label for labels in stored.values() for label in labels})
     words = f"{args.file}: {count(len(events), 'event')} of {count(len(chosen), 'subject')}"
     return answer(args, {"file": str(args.file), "events": len(events)}, words)
 

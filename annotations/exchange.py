@@ -33,8 +33,10 @@ from annotations.labels import (
 )
 from annotations.validate import footage_problems
 from express50.capture.index import Index, read_index
+from express50.console import count
 from express50.contract.layout import Dataset
 from express50.errors import AnnotationError, check_known
+from express50.files.atomic import write_bytes
 from express50.files.text import NAME, parse_json, read_text
 
 LARGEST = 2**63
@@ -42,21 +44,37 @@ _FORMULA = re.compile(r"'*[=+\-@\t\r]")  # quotes before it too, so that reading
 _FIELDS = tuple(field.name for field in fields(Label))
 
 
-def export_labels(labels: Iterable[Label], path: Path) -> None:
-    """Write events as CSV or JSON, by the file's ending; AnnotationError for another one."""
+def export_labels(labels: Iterable[Label], path: Path, stored: Collection[Label] = ()) -> None:
+    """Write events as CSV or JSON, by the file's ending.
+
+    Raises:
+        AnnotationError: another ending; or the file exists and holds anything but ``stored``
+            events, such as those that somebody meant to import.
+    """
     _check_format(path)
+    if path.exists():
+        try:
+            new = set(read_table(path)) - set(stored)
+        except AnnotationError:
+            raise AnnotationError(f"{path}: is not a table of labels; name another file") from None
+        if new:
+            raise AnnotationError(
+                f"{path}: holds {count(len(new), 'event')} that the dataset does not have; add"
+                " them with 'express50 annotate import', or name another file"
+            )
     rows = [asdict(label) for label in labels]
     path.parent.mkdir(parents=True, exist_ok=True)
+    text = io.StringIO(newline="")
     if path.suffix == ".json":
         rows = [{k: v for k, v in row.items() if v is not None} for row in rows]
-        path.write_text(json.dumps(rows, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-        return
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, _FIELDS)
+        text.write(json.dumps(rows, indent=1, sort_keys=True) + "\n")
+    else:
+        writer = csv.DictWriter(text, _FIELDS)
         writer.writeheader()
         # Spreadsheets run a cell that begins like a formula; a quote before it makes it text.
         for row in rows:
             writer.writerow({k: f"'{v}" if _FORMULA.match(str(v)) else v for k, v in row.items()})
+    write_bytes(path, text.getvalue().encode())
 
 
 def import_labels(dataset: Dataset, path: Path) -> tuple[int, int]:

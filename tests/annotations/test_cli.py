@@ -147,6 +147,23 @@ def test_export_and_import_round_trip_without_loss_or_duplicates(
     assert {s: dataset.labels_file(s).read_text() for s in before} == before
 
 
+def test_export_replaces_no_events_that_are_not_stored(annotate, dataset, tmp_path, capsys):
+    """Somebody may have typed export for import."""
+    mark(annotate, "ann", "smile", 14)
+    file = tmp_path / "labels.json"
+    annotate("export", str(file))
+    assert annotate("export", str(file), "--subject", "S002")["events"] == 0  # all are stored
+    annotate("export", str(file))
+    rows = json.loads(file.read_text())
+    for text, error in (
+        (json.dumps([*rows, rows[0] | {"annotator": "bob"}]), "holds 1 event that the dataset"),
+        ('{"my": "notes"}', "is not a table of labels; name another file"),
+    ):
+        file.write_text(text)
+        assert main(["annotate", "export", str(dataset.root), str(file)]) == 1
+        assert error in capsys.readouterr().err and file.read_text() == text
+
+
 @pytest.mark.parametrize("name", ["labels.csv", "labels.json"])
 def test_importing_a_table_without_rows_says_so(annotate, dataset, tmp_path, capsys, name):
     annotate("export", str(tmp_path / name))
