@@ -581,16 +581,6 @@ def test_the_command_reads_its_own_arguments(monkeypatch, capsys):
     assert "[model]" in capsys.readouterr().out
 
 
-def test_the_guides_lines_of_python_draw_a_head(shards, checkpoint):
-    page = Path(__file__).resolve().parents[2] / "docs" / "GUIDE.md"
-    (block,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
-    ours = {"DATASET/pack/shards": shards, "OUT/checkpoint.pt": checkpoint, "smile": "e1"}
-    for printed, name in ours.items():
-        block = block.replace(f'"{printed}"', f'"{name}"')
-    exec(block, found := {})
-    assert found["sample"]["rgb"].shape == found["image"].shape == (32, 32, 3)
-
-
 def test_two_trainings_into_one_folder_are_refused(shards, tmp_path, capsys):
     with alone_in(tmp_path / "out"):
         assert main(["train", str(shards), str(tmp_path / "out"), *TINY]) == 2
