@@ -48,6 +48,7 @@ from express50.console import FAILED, OK, add_command, answer, count, format_tab
 from express50.contract.layout import (
     Dataset,
     check_folder,
+    check_page_file,
     check_results_file,
     exclusion_reason,
     included_subjects,
@@ -419,7 +420,7 @@ def run_sheet(args: argparse.Namespace) -> int:
     from annotations.ui.frames import FaceFinder
     from express50.files.atomic import write_bytes
 
-    check_results_file(args.file)
+    check_page_file(args.file)
     sheet = make_sheet(args.dataset, args.subject, args.expression, args.camera, args.sure)
     chosen = args.subject or args.expression
     around = args.around if args.around is not None else AROUND if chosen else 0

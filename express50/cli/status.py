@@ -27,7 +27,7 @@ from express50.console import (
     number,
     say,
 )
-from express50.contract.layout import Dataset, existing_dataset
+from express50.contract.layout import Dataset, check_page_file, existing_dataset
 from express50.contract.stage import stages, typical_error
 from express50.errors import few
 from express50.files.atomic import write_bytes
@@ -102,6 +102,7 @@ def show_status(args: argparse.Namespace) -> int:
     if args.serve is not None:
         return _serve(dataset, args.serve)
     if args.page is not None:
+        check_page_file(args.page)
         table = _keep_page(dataset, args.page)
     else:
         table = _read(dataset)

@@ -252,6 +252,17 @@ def check_results_file(path: Path) -> None:
     check_folder_writable(path.parent)
 
 
+def check_page_file(path: Path) -> None:
+    """Refuse a file that cannot be written as `check_results_file` does, or is not an HTML page.
+
+    Raises:
+        ConfigError: its name does not end in .html, so it may hold something else.
+    """
+    check_results_file(path)
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise ConfigError(f"{path}: expected the name of a page, which ends in .html")
+
+
 def _refuse_datasets_own(path: Path) -> None:
     place = path.resolve()
     for dataset in map(Dataset, (place, *place.parents)):

@@ -291,6 +291,7 @@ def test_invalid_input_prints_one_line_naming_it(annotate, dataset, capsys, word
     [
         (["next", "--count", "-3"], "--count: got '-3', expected a whole number, 0 to"),
         (["review", "--beyond", "-1"], "'-1', expected a whole number, 0 to"),
+        (["sheet", "labels.csv"], "labels.csv: expected the name of a page, which ends in .html"),
         (["sheet", "x.html", "--sure", "9"], "--sure: got '9', expected a number, 0 to 1"),
         (["sheet", "x.html", "--sure", "nan"], "got 'nan'"),
         (["review", "--settle", "S009", "smile", "14"], "no subject 'S009'"),
