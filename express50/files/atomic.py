@@ -287,7 +287,8 @@ def lock_file(file: BinaryIO | IO[str] | int, path: Path, kind: int = fcntl.LOCK
 def alone_in(folder: Path) -> Iterator[None]:
     """Make a folder, and hold it so that no other command writes results into it meanwhile.
 
-    The system releases it however the process ends. File systems without locks hold nothing.
+    The system releases it however the process ends. File systems without locks hold nothing. What
+    a killed command was writing is removed.
 
     Raises:
         NotReadyError: another process holds it.
@@ -298,6 +299,8 @@ def alone_in(folder: Path) -> Iterator[None]:
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            for aside in folder.glob(f".*.{32 * '[0-9a-f]'}"):  # of a command that was killed
+                aside.unlink(missing_ok=True)
         except BlockingIOError:
             raise NotReadyError(
                 f"{folder}: another process writes into this folder; wait until it ends, or name"

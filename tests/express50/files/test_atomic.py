@@ -92,9 +92,11 @@ def test_a_folder_is_held_by_one_command_and_left_as_it_was(tmp_path):
         assert (tmp_path / "out").is_dir()
     assert not (tmp_path / "out").exists()
     (tmp_path / "out").mkdir()
+    for name in (".checkpoint.pt.0123456789abcdef0123456789abcdef", ".checkpoint.pt.spare", "a"):
+        (tmp_path / "out" / name).touch()
     with alone_in(tmp_path / "out"):
         pass
-    assert (tmp_path / "out").is_dir()
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {".checkpoint.pt.spare", "a"}
 
 
 def test_a_file_system_without_locks_holds_nothing(tmp_path, monkeypatch):
