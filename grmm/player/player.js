@@ -188,7 +188,7 @@ function turn(dx, dy, zoom = 1) {
 function addControls() {
   for (const name of ["play", "follow", "reset"]) find(name).onclick = () => press(name);
   const held = new Map();
-  const apart = () => { const [a, b] = [...held.values()]; return Math.hypot(a[0] - b[0], a[1] - b[1]); };
+  const apart = () => { const [a, b] = [...held.values()]; return Math.max(1, Math.hypot(a[0] - b[0], a[1] - b[1])); };
   canvas.onpointerdown = event => {
     canvas.setPointerCapture(event.pointerId);
     held.set(event.pointerId, [event.clientX, event.clientY]);
