@@ -26,7 +26,13 @@ from express50.console import (
     say_json,
     stdout_to_stderr,
 )
-from express50.contract.layout import Dataset, check_folder, check_results_file, existing_dataset
+from express50.contract.layout import (
+    Dataset,
+    check_folder,
+    check_results_file,
+    check_results_folder,
+    existing_dataset,
+)
 from express50.contract.stage import hook, stages
 from express50.errors import FormatError
 
@@ -117,6 +123,7 @@ def run_split(args: argparse.Namespace) -> int:
     from express50.shards.reader import ShardReader
     from express50.shards.writer import copy_samples
 
+    check_results_folder(args.out)
     wanted = (args.subject, args.expression, args.camera, args.split)
     reader = ShardReader(args.directory).select(*wanted)
     say(f"{args.out}: {count(copy_samples([reader], args.out, args.shard_mb), 'sample')}")
@@ -128,6 +135,7 @@ def run_merge(args: argparse.Namespace) -> int:
     from express50.shards.reader import ShardReader
     from express50.shards.writer import copy_samples
 
+    check_results_folder(args.out)
     readers = [ShardReader(directory) for directory in args.directories]
     say(f"{args.out}: {count(copy_samples(readers, args.out, args.shard_mb), 'sample')}")
     return OK

@@ -23,7 +23,7 @@ import tarfile
 import zipfile
 import zlib
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
@@ -33,7 +33,7 @@ from typing import IO, Any
 from express50.capture.index import read_index
 from express50.contract.layout import Dataset, existing_dataset
 from express50.errors import Express50Error, FormatError, check_known
-from express50.files.atomic import write_json
+from express50.files.atomic import alone_in, write_json
 from express50.files.digests import files_of, text_digest
 from express50.files.text import NAME, read_json, read_json_table
 from express50.runner.ledger import Ledger
@@ -156,10 +156,15 @@ def withdraw(
     Raises:
         UnknownNameError: the dataset has no such subject.
         StageError: a stage is running.
+        NotReadyError: a model of the dataset, or one of ``checkpoints``, is being trained.
         FormatError: the ledger is damaged; nothing was removed.
     """
     finder = dataset_id_finder(dataset, subject)
-    with hold_stages(dataset, sorted(p.stem for p in (dataset.root / "config").glob("*.toml"))):
+    names, models = (dataset.root / "config").glob("*.toml"), dataset.root / "grmm"
+    places = [path for path in (models, *models.rglob("*"), *checkpoints) if path.exists()]
+    with hold_stages(dataset, sorted(path.stem for path in names)), ExitStack() as stack:
+        for folder in {path if path.is_dir() else path.parent for path in places}:
+            stack.enter_context(alone_in(folder))  # a training would save the person again
         paths = plan(dataset, subject)
         if dataset.ledger.is_file():
             # Check before anything is removed: a partial withdrawal cannot be repeated.
@@ -173,7 +178,7 @@ def withdraw(
         record = {"id_sha256": text_digest(subject), "time": now, "files": files}
         write_json(withdrawn_file(dataset), [*_withdrawals(dataset), record])
         for path in paths:
-            if path.is_dir():
+            if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)
             else:
                 path.unlink()
@@ -181,7 +186,7 @@ def withdraw(
         if dataset.ledger.is_file():
             with Ledger(dataset.ledger) as ledger:
                 ledger.erase(subject, dataset.root, paths, finder)
-        changed, own = [], sorted((dataset.root / "grmm").rglob("*.pt"))
+        changed, own = [], sorted(models.rglob("*.pt"))
         for path in [*own, *(path for path in checkpoints if path.is_file())]:
             with suppress(FormatError):  # not a GRMM checkpoint; it is searched for the id below
                 if redact(path, subject):

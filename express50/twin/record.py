@@ -227,7 +227,8 @@ def _check_settings(config: TwinConfig, out: Path) -> None:
     path = out / "twin.json"
     settings = {k: v for k, v in asdict(config).items() if k not in ("subjects", "first_subject")}
     now = json.loads(dump_json(settings))
-    begun = any((out / "captures").glob("*"))  # else nothing was recorded with the stored settings
+    # Else nothing was recorded with the stored settings. Captures may have been moved elsewhere.
+    begun = any(path for name in ("captures", "truth") for path in (out / name).glob("*"))
     former = json.loads(path.read_bytes()) if begun and path.is_file() else now
     changed = sorted(k for k in now | former if former.get(k) != now.get(k))
     if changed:

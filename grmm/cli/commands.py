@@ -10,7 +10,7 @@ import hashlib
 import os
 import shutil
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from express50.console import FAILED, OK, answer, count, figure_label, log, say
 from express50.contract.config import config_toml, known_assignments
 from express50.contract.layout import check_results_file, check_results_folder
-from express50.errors import ConfigError, check_known
+from express50.errors import ConfigError, FormatError, check_known
 from express50.files.atomic import (
     alone_in,
     check_space,
@@ -121,6 +121,7 @@ def config(args: argparse.Namespace) -> int:
 
 def fit(args: argparse.Namespace) -> int:
     """Fit an unseen person and report on the views that the fit did not use."""
+    from grmm.checkpoint import read_content
     from grmm.fit import fit
     from grmm.shard_source import ShardSource, select
 
@@ -128,6 +129,10 @@ def fit(args: argparse.Namespace) -> int:
     made = args.out / "checkpoint.pt"
     if made.exists() and made.samefile(args.checkpoint):
         raise ConfigError(f"{made} is the checkpoint to fit from; name another folder")
+    if made.exists() and args.overwrite:
+        with suppress(FormatError):  # a damaged one may be replaced
+            if "shuffle" in read_content(made).get("loop", {}):
+                raise ConfigError(f"{made} is of a training, not of a fit; name another folder")
     loaded = _load(args.checkpoint, [*args.set, *_metric_settings(args)], args.seconds)
     if not _warns_of_fit(args.checkpoint, loaded) and args.subject in loaded.model.subjects:
         log(f"{args.subject} was trained on, so the figures are not those of an unseen person")
@@ -273,6 +278,8 @@ def evaluate(args: argparse.Namespace) -> int:
     from grmm.shard_source import ShardSource
 
     _check_evaluation_folder(args.out)
+    if args.save:
+        check_results_folder(args.save)
     _require(args, "fit_cameras", "fit_budget")
     loaded = _load(args.checkpoint, _metric_settings(args), args.fit_budget)
     source = ShardSource(args.shards, "*")

@@ -81,6 +81,8 @@ def run_import(args: argparse.Namespace) -> int:
             f"{args.out} is both SOURCE and OUT, and a second import would scale it again; write"
             " to another file"
         )
+    if args.out.exists() and args.out.suffix != ".json":
+        raise ConfigError(f"{args.out} exists and is not a .json file; write to another file")
     if args.out.exists() and not args.overwrite:
         try:
             same = camera_rows(read_cameras(args.out)) == camera_rows(cameras)

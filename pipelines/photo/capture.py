@@ -12,6 +12,7 @@ import re
 import shutil
 import tomllib
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -197,10 +198,6 @@ def make_photo_capture(
     basis = make_basis(load_head(config.head))
     surest = sorted(faces, key=lambda face: -face.score)[:FOCAL_FACES]
     focal = weigh_focal(basis, surest, (width, height), start)
-    _write_footage(picture, folder / "cameras" / CAMERA)
-    camera = single_camera(CAMERA, width, height, focal.pixels)
-    write_bytes(folder / "calibration.json", dump_json(camera_rows({CAMERA: camera})))
-    write_bytes(folder / "cues.csv", _cues(frames, windows).encode())
     fps = video_fps(picture.path) if picture.video else PHOTO_FPS
     meta = (
         f'subject = "{subject}"\nfps = {fps:.6g}\n'
@@ -208,7 +205,11 @@ def make_photo_capture(
         f"focal_range_px = [{focal.low:.1f}, {focal.high:.1f}]\n"
         f'picture_sha256 = "{digest}"\n'
     )
-    write_bytes(folder / "capture.toml", meta.encode())
+    write_bytes(folder / "capture.toml", meta.encode())  # first: it says whose the folder is
+    _write_footage(picture, folder / "cameras" / CAMERA)
+    camera = single_camera(CAMERA, width, height, focal.pixels)
+    write_bytes(folder / "calibration.json", dump_json(camera_rows({CAMERA: camera})))
+    write_bytes(folder / "cues.csv", _cues(frames, windows).encode())
     # A face is found in windows up to three times as large, so it may shrink to a third.
     sides = [face_box(f.points)[1] / max(width, height) for f in faces if f.score >= FOUND_SCORE]
     large = picture.video and bool(sides)
@@ -217,15 +218,16 @@ def make_photo_capture(
 
 
 def _check_folder(folder: Path, picture: Path, digest: str) -> None:
-    """Raise CaptureError if a folder holds the capture of a picture with another digest."""
-    try:
-        known = tomllib.loads((folder / "capture.toml").read_text()).get("picture_sha256", digest)
-    except (OSError, ValueError):  # the folder is empty or holds nothing that could be lost
+    """Raise CaptureError if a folder holds anything but the capture of this picture."""
+    if not folder.is_dir() or not any(folder.iterdir()):
         return
+    known = None
+    with suppress(OSError, ValueError):
+        known = tomllib.loads((folder / "capture.toml").read_text()).get("picture_sha256")
     if known != digest:
+        other = "was made from another picture" if known else "is not a capture of this picture"
         raise CaptureError(
-            f"{picture}: {folder} was made from another picture; name this one with --subject, or"
-            " remove that folder"
+            f"{picture}: {folder} {other}; name this one with --subject, or remove that folder"
         )
 
 

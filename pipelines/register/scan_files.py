@@ -6,6 +6,7 @@ import argparse
 import csv
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import open3d as o3d
@@ -151,10 +152,12 @@ def register_scan(path: Path, head: str, folder: Path) -> dict:
     digests = [file_sha256(file) if file and file.is_file() else str(file) for file in files]
     identity = value_digest([VERSION, *digests])
     if folder.exists():
-        if not (folder / "metrics.json").is_file():
+        file, former = folder / "metrics.json", dict[str, Any]()
+        if file.is_file():
+            former = read_json_table(file, FormatError, "move the folder away")
+        if "identity" not in former:  # such as a fit of `grmm`, which has a metrics.json too
             raise FormatError(f"{folder}: is not a registration of a scan; name another folder")
-        former = read_json_table(folder / "metrics.json", FormatError, "delete the folder")
-        if former.get("identity") == identity:
+        if former["identity"] == identity:
             return former | {"skipped": True}
     scan, given = read_scan(path), np.full((68, 3), np.nan)
     if points is not None:

@@ -112,6 +112,9 @@ def test_fit_reports_held_out_views_and_writes_over_nothing(checkpoint, shards, 
     before = made.read_bytes()
     assert main(fit) == 2 and main([fit[0], str(made), *fit[2:], "--overwrite"]) == 2
     assert made.read_bytes() == before, "neither a former fit nor the checkpoint read is replaced"
+    trained = checkpoint.read_bytes()
+    assert main([fit[0], str(made), fit[2], str(checkpoint.parent), *fit[4:], "--overwrite"]) == 2
+    assert checkpoint.read_bytes() == trained, "--overwrite replaces fits, not trainings"
 
 
 def test_a_stopped_fit_goes_on_and_another_is_refused(
@@ -563,6 +566,13 @@ def test_options_that_would_do_nothing_are_refused(
     assert main([text.format(checkpoint, shards) for text in arguments]) == 2
     assert arguments[-1].partition("=")[0] in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_saved_pictures_do_not_go_among_a_datasets_own_files(checkpoint, tmp_path, capsys):
+    (tmp_path / "ledger.sqlite").touch()
+    evaluate = ["evaluate", str(checkpoint), "shards", str(tmp_path / "grmm")]
+    assert main([*evaluate, "--save", str(tmp_path / "labels")]) == 2
+    assert "belongs to the dataset" in capsys.readouterr().err
 
 
 def test_nobody_is_fitted_if_somebody_lacks_the_views(checkpoint, tmp_path, monkeypatch, capsys):

@@ -144,6 +144,20 @@ def test_a_second_picture_of_the_same_name_takes_nobodys_place(
     assert stored.read_bytes() == before
 
 
+@pytest.mark.parametrize("own", ["capture.toml", "notes.txt"])
+def test_a_capture_that_somebody_else_made_is_kept(
+    tmp_path: Path, astronaut: np.ndarray, own: str
+) -> None:
+    footage = tmp_path / "out/cameras/photo/frames/000000.png"
+    write_image(tmp_path / "eva.png", astronaut)
+    footage.parent.mkdir(parents=True)
+    footage.write_text("mine")
+    (tmp_path / "out" / own).write_text('subject = "eva"')
+    with pytest.raises(CaptureError, match="is not a capture of this picture"):
+        make_photo_capture(open_picture(tmp_path / "eva.png"), tmp_path / "out", "e", TrackConfig())
+    assert footage.read_text() == "mine"
+
+
 def test_folders_and_focal_lengths_of_no_lens_are_refused(
     tmp_path: Path, astronaut: np.ndarray
 ) -> None:

@@ -213,6 +213,9 @@ def test_wrong_options_are_refused_before_the_work(person, tmp_path):
     (tmp_path / "out" / "a" / "letter.txt").write_text("mine")
     assert run(tmp_path / "out", "--scan", scan) == 1
     assert (tmp_path / "out" / "a" / "letter.txt").read_text() == "mine"
+    (tmp_path / "out" / "a" / "metrics.json").write_text('{"psnr_db": 30}')
+    assert run(tmp_path / "out", "--scan", scan) == 1, "it may be the folder of a fit"
+    assert (tmp_path / "out" / "a" / "letter.txt").read_text() == "mine"
     (tmp_path / "out" / "index.csv").write_text("mine")
     assert run(tmp_path / "out", "--scan", scan) != 0
     assert (tmp_path / "out" / "index.csv").read_text() == "mine"

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from express50.__main__ import main
 from express50.contract.layout import Dataset, check_results_file, check_results_folder
 from express50.errors import ConfigError, FormatError
 
@@ -47,3 +48,12 @@ def test_results_do_not_go_among_a_datasets_own_files(tmp_path, monkeypatch):
     (tmp_path / "shards/manifest.json").touch()
     with pytest.raises(ConfigError, match="holds shards; name another folder"):
         check_results_folder(tmp_path / "shards")
+
+
+def test_shards_do_not_go_among_a_datasets_own_files(tmp_path, capsys):
+    (tmp_path / "config").mkdir()
+    for name in ("ledger.sqlite", "config/pack.toml"):
+        (tmp_path / name).touch()
+    for action in ("split", "merge"):
+        assert main(["shards", action, str(tmp_path), str(tmp_path / "pack/test")]) == 2
+        assert "belongs to the dataset" in capsys.readouterr().err

@@ -141,6 +141,10 @@ def test_command_writes_the_page_and_refuses_an_empty_folder(dataset, tmp_path, 
     assert json.loads(capsys.readouterr().out)["bytes"] > 1000
     assert main(["report", str(tmp_path / "nothing")]) == 2
     assert "no such dataset" in capsys.readouterr().err
+    to_site = ["report", str(dataset.root), "--out", str(tmp_path / "site")]
+    assert main(to_site) == 0 and main(to_site) == 0, "an earlier report is replaced"
+    (tmp_path / "site/index.html").write_text("mine")
+    assert main(to_site) == 2 and (tmp_path / "site/index.html").read_text() == "mine"
 
 
 def test_figures_read_as_a_person_would():

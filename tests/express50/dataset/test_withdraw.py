@@ -24,7 +24,14 @@ from express50.dataset.withdraw import (
     withdrawn,
     withdrawn_file,
 )
-from express50.errors import CaptureError, FormatError, StageError, UnknownNameError
+from express50.errors import (
+    CaptureError,
+    FormatError,
+    NotReadyError,
+    StageError,
+    UnknownNameError,
+)
+from express50.files.atomic import alone_in
 from express50.files.digests import text_digest
 from express50.runner import publish
 from express50.runner.ledger import Ledger, Made, Receipt, Run, mark_file
@@ -264,6 +271,19 @@ def test_no_subject_is_withdrawn_while_a_stage_runs(dataset):
         for files in (tree(dataset.root), before)
     )
     assert after == before
+
+
+def test_no_subject_is_withdrawn_while_a_model_is_trained(dataset):
+    with alone_in(dataset.root / "grmm/train"), pytest.raises(NotReadyError, match="grmm/train"):
+        withdraw(dataset, "S001")
+    assert "S001" in dataset.subjects()
+
+
+def test_a_link_to_a_capture_goes_and_the_capture_stays(dataset, tmp_path):
+    (dataset.root / "raw").mkdir()
+    (dataset.root / "raw/S001").symlink_to(tmp_path / "raw/S001")
+    withdraw(dataset, "S001")
+    assert not (dataset.root / "raw/S001").is_symlink() and any((tmp_path / "raw/S001").iterdir())
 
 
 @pytest.mark.parametrize("test", [id_finder("104"), any_id_finder({text_digest("104")})])

@@ -84,6 +84,9 @@ def test_import_writes_a_calibration_that_is_read_again(tmp_path, capsys):
     assert main(again) == 2 and out.read_text() == "{}"
     assert "--overwrite" in capsys.readouterr().err
     assert main([*again, "--overwrite"]) == 0
+    video = tmp_path / "cam0.mp4"
+    video.write_text("footage")
+    assert main([*again[:-1], str(video), "--overwrite"]) == 2 and video.read_text() == "footage"
     capsys.readouterr()
     assert main(["cameras", "import", str(out), str(out), "--scale", "2", "--overwrite"]) == 2
     assert "both SOURCE and OUT" in capsys.readouterr().err

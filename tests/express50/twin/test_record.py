@@ -91,6 +91,9 @@ def test_recording_again_keeps_what_is_there_and_adds_the_rest(tiny_config, tmp_
     assert tree(tmp_path / "captures" / "S001") == before
     with pytest.raises(CaptureError, match="seed differ"):
         record(dataclasses.replace(config, seed=9), tmp_path, workers=1)
+    (tmp_path / "captures").rename(tmp_path / "moved")
+    with pytest.raises(CaptureError, match="seed differ"):
+        record(dataclasses.replace(config, seed=9), tmp_path, workers=1)
 
 
 def test_settings_of_which_nothing_was_recorded_do_not_bind(tiny_config, tmp_path):
