@@ -84,6 +84,10 @@ class Parser(argparse.ArgumentParser):
         if empty and action.nargs != argparse.PARSER:  # those belong to a sub-command
             words = f"got {empty[0]!r}, expected a value; is a variable of your shell not set?"
             raise argparse.ArgumentError(action, words)
+        home = [text for text in arg_strings if text.startswith("~/")]
+        if home and action.type is Path:  # else a folder called ~ would be made
+            words = f"got {home[0]!r}, whose ~ no shell has replaced; write $HOME instead of ~"
+            raise argparse.ArgumentError(action, words)
         return super()._get_values(action, arg_strings)
 
     def _get_value(self, action: argparse.Action, text: str) -> Any:

@@ -305,6 +305,11 @@ def _refuse_swapped(dataset: Dataset, captures: Sequence[Path], command: str) ->
                 f"captures come after the dataset, and {path} is a dataset; expected "
                 f"'express50 {command} DATASET CAPTURE'"
             )
+        if not dataset.ledger.exists() and path.resolve() in root.resolve().parents:
+            raise ConfigError(
+                f"{root}: lies inside the capture {path}, which would change with every run; name"
+                " a dataset outside of it"
+            )
 
 
 def _say_account(stage: Stage, dataset: Dataset, summary: Any) -> None:

@@ -180,6 +180,7 @@ def test_bad_item_gives_exit_code_1_and_is_named(run, data, capture, tmp_path):
         (["run", "DATA", "CAP", "--first", "track", "--last", "ingest"], 2, "comes after"),
         (["run", "DATA", "CAP", "--first", "calibrate"], 2, "read no captures, but"),
         (["prune", ""], 2, "argument DATASET: got '', expected a value; is a variable"),
+        (["report", "DATA", "--out=~/page"], 2, "--out: got '~/page', whose ~ no shell has"),
         (["run", "DATA", "CAP", "--config", ""], 2, "argument --config: got ''"),
         (["run", "DATA", "CAP", "--preset", ""], 2, "argument --preset: got ''"),
         (["twin", "record", "DATA", "--expressions", " ,"], 2, "--expressions: got ' ,', expected"),
@@ -236,6 +237,12 @@ def test_a_dataset_in_the_place_of_a_capture_is_refused(run, data, capture):
     code, _, err = run("ingest", data.parent / "new", data)
     assert code == 2 and f"{data} is a dataset; expected 'express50 ingest DATASET CAPTURE'" in err
     assert not (data.parent / "new").exists()
+
+
+def test_a_dataset_inside_its_capture_is_refused(run, capture):
+    code, _, err = run("ingest", capture / "data", capture)
+    assert code == 2 and "lies inside the capture" in err
+    assert not (capture / "data").exists()
 
 
 def test_the_first_ingest_needs_a_capture(run, data):
