@@ -73,6 +73,7 @@ report: $(READY) ## write one HTML page of DATASET's results and pictures
 	$(BIN)/express50 report "$(DATASET)"
 
 clean: ## remove what was built, keep .venv and datasets such as build/dataset
+	@[ -d express50 ] || { echo "$(CURDIR): is not the repository, nothing is removed" >&2; exit 1; }
 	rm -rf .mypy_cache .ruff_cache .pytest_cache
 	@for path in build/*; do \
 	    if [ -e "$$path/captures.json" ]; then echo "kept $$path"; else rm -rf "$$path"; fi; \

@@ -420,7 +420,10 @@ def test_make_clean_keeps_datasets(tmp_path):
         (tmp_path / name).mkdir(parents=True)
     for name in ("build/dataset/captures.json", "build/my data/captures.json", "build/log.txt"):
         (tmp_path / name).touch()
-    subprocess.run(["make", "-f", REPOSITORY / "Makefile", "clean"], cwd=tmp_path, check=True)
+    clean = ["make", "-f", REPOSITORY / "Makefile", "clean"]
+    assert subprocess.run(clean, cwd=tmp_path).returncode and (tmp_path / "build/log.txt").exists()
+    (tmp_path / "express50").mkdir()  # only in a repository of this name
+    subprocess.run(clean, cwd=tmp_path, check=True)
     assert sorted(path.name for path in (tmp_path / "build").iterdir()) == ["dataset", "my data"]
     assert (tmp_path / "build/dataset/labels").is_dir()
 
