@@ -146,7 +146,8 @@ def run_report(args: argparse.Namespace) -> int:
         raise StageError(f"{args.dataset}: nothing is ingested; run 'express50 ingest' first")
     path = (args.out or dataset.report_dir) / "index.html"
     check_results_file(path)
-    if args.out and path.exists() and b":root { --ink:#1d2126;" not in path.read_bytes():
+    ours = b":root { --ink:#1d2126;"  # how the style sheet of our pages begins
+    if args.out and path.exists() and ours not in path.read_bytes():
         raise ConfigError(f"{path}: is another page; name another folder")
     page = render_page(dataset, args.title).encode()
     write_bytes(path, page)

@@ -6,7 +6,6 @@ import argparse
 import csv
 import io
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import open3d as o3d
@@ -152,9 +151,9 @@ def register_scan(path: Path, head: str, folder: Path) -> dict:
     digests = [file_sha256(file) if file and file.is_file() else str(file) for file in files]
     identity = value_digest([VERSION, *digests])
     if folder.exists():
-        file, former = folder / "metrics.json", dict[str, Any]()
-        if file.is_file():
-            former = read_json_table(file, FormatError, "move the folder away")
+        file = folder / "metrics.json"
+        fix = "move the folder away"
+        former = read_json_table(file, FormatError, fix) if file.is_file() else {}
         if "identity" not in former:  # such as a fit of `grmm`, which has a metrics.json too
             raise FormatError(f"{folder}: is not a registration of a scan; name another folder")
         if former["identity"] == identity:
