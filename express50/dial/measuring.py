@@ -246,18 +246,7 @@ def tune(chain: Chain) -> tuple[dict[str, Any], list[str]]:
     }
     folder = dial_dir(chain.dataset)
     write_json(folder / "front.json", table)
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    errors = [
-        f"{name}_{error.unit}{end}"
-        for name, error in points[-1].errors.items()
-        for end in ("", "_low", "_high")
-    ]
-    writer.writerow(["point", "seconds", *errors, *points[-1].settings])
-    for name, point in [*((str(k), p) for k, p in enumerate(points)), *presets.items()]:
-        figures = [f"{f:.5g}" for e in point.errors.values() for f in (e.value, e.low, e.high)]
-        writer.writerow([name, f"{point.seconds:.1f}", *figures, *point.settings.values()])
-    write_bytes(folder / "front.csv", out.getvalue().encode())
+    write_bytes(folder / "front.csv", _csv(points, presets).encode())
     shutil.rmtree(chain.dataset.pilot_dir, ignore_errors=True)
     return table, [*_lines(load, points, presets), f"wrote {folder}/front.json and front.csv"]
 
@@ -273,6 +262,22 @@ def preset_settings(load: Workload, preset: str) -> dict[str, str]:
         tried = labels_of(load, stage.name)
         found[stage.name] = preset if preset in tried else standard_of(dict.fromkeys(tried))
     return found
+
+
+def _csv(points: list[Point], presets: Mapping[str, Point]) -> str:
+    """Write a row per point: time, errors with intervals, settings."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    errors = [
+        f"{name}_{error.unit}{end}"
+        for name, error in points[-1].errors.items()
+        for end in ("", "_low", "_high")
+    ]
+    writer.writerow(["point", "seconds", *errors, *points[-1].settings])
+    for name, point in [*((str(k), p) for k, p in enumerate(points)), *presets.items()]:
+        figures = [f"{f:.5g}" for e in point.errors.values() for f in (e.value, e.low, e.high)]
+        writer.writerow([name, f"{point.seconds:.1f}", *figures, *point.settings.values()])
+    return out.getvalue()
 
 
 def _lines(load: Workload, points: list[Point], presets: Mapping[str, Point]) -> list[str]:

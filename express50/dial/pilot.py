@@ -211,7 +211,6 @@ def keep_for_run(dataset: Dataset, settings: Mapping[str, str]) -> None:
     of more stages come first: what a stage makes depends on the stages before it as well.
     """
     kept: set[tuple[str, str]] = set()
-    copy = dataset.pilot_dir / "copy"
 
     def alike(trial: Trial) -> int:
         differ = (k for k, name in enumerate(settings) if trial.settings[name] != settings[name])
@@ -228,13 +227,19 @@ def keep_for_run(dataset: Dataset, settings: Mapping[str, str]) -> None:
             for item in (i for i in made if (name, i) not in kept):
                 keep = keeping(dataset, replace(receipts[item], made=made[item]))
                 if keep is not None and folder.item_dir(name, item).is_dir():
-                    shutil.rmtree(copy, ignore_errors=True)
-                    shutil.copytree(folder.item_dir(name, item), copy, copy_function=_link)
-                    with suppress(FileNotFoundError):  # the peaks as they were before the cut
-                        whole = copy / whole_peaks(folder, item).name
-                        whole.replace(copy / folder.peaks_file(item).name)
-                    keep(copy)
+                    keep(_copied(folder, name, item))
                     kept.add((name, item))
+
+
+def _copied(trial: Dataset, stage: str, item: str) -> Path:
+    """Copy an output of a trial by links, with the peaks as they were before they were cut."""
+    copy = trial.root.parent / "copy"
+    shutil.rmtree(copy, ignore_errors=True)
+    shutil.copytree(trial.item_dir(stage, item), copy, copy_function=_link)
+    with suppress(FileNotFoundError):
+        whole = whole_peaks(trial, item).name
+        (copy / whole).replace(copy / trial.peaks_file(item).name)
+    return copy
 
 
 def _link(source: str, target: str) -> None:

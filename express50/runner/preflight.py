@@ -39,17 +39,7 @@ def problems(
             stage.try_files(config)
         except Express50Error as error:
             yield str(error)
-    try:
-        pool.reach()
-    except StageError as error:
-        yield str(error)
-    else:
-        for stage, config in work:
-            if stage.needs_gpu(config):
-                try:
-                    pool.check_gpu(stage.name)
-                except StageError as error:
-                    yield str(error)
+    yield from _worker_problems(work, pool)
     needs = []
     with suppress(FormatError):  # a damaged ledger: the first stage reports it
         if dataset.ledger.is_file():
@@ -77,6 +67,20 @@ def _folder_problems(dataset: Dataset, stages: Iterable[Stage]) -> Iterator[str]
                 break  # on a read-only disk, those inside are refused too
     for first, folders in refused.values():
         yield not_writable(few(folders), first)
+
+
+def _worker_problems(work: Sequence[tuple[Stage, Any]], pool: Pool) -> Iterator[str]:
+    try:
+        pool.reach()
+    except StageError as error:
+        yield str(error)
+        return
+    for stage, config in work:
+        if stage.needs_gpu(config):
+            try:
+                pool.check_gpu(stage.name)
+            except StageError as error:
+                yield str(error)
 
 
 def _memory_problems(ledger: Ledger, stages: Iterable[Stage], pool: Pool) -> Iterator[str]:

@@ -235,20 +235,20 @@ def _tree(path: Path) -> Tree:
         if is_data_folder(inner) and inner.name not in ("plates", "board")
     }
     for deep, (kind, holds) in product((False, True), HOLDS.items()):
-        found = {}
-        for name, folder in folders.items():
-            places = list(folder.iterdir())
-            if deep:
-                places = [p for p in places if is_data_folder(p) and not BESIDE.fullmatch(p.name)]
-                found[name] = [p for p in places if any(map(holds, footage_folder(p).iterdir()))]
-            else:
-                found[name] = list(filter(holds, places))
-            found[name].sort()
+        found = {name: _places(folder, deep, holds) for name, folder in folders.items()}
         if any(found.values()):
             held = {name: places for name, places in found.items() if places}
             empty = tuple(name for name, places in found.items() if not places)
             return Tree(kind, deep, held, empty) if len(held) > 1 else nothing
     return nothing
+
+
+def _places(folder: Path, deep: bool, holds: Callable[[Path], bool]) -> list[Path]:
+    if not deep:
+        return sorted(filter(holds, folder.iterdir()))
+    inner = [path for path in folder.iterdir() if is_data_folder(path)]
+    inner = [path for path in inner if not BESIDE.fullmatch(path.name)]
+    return sorted(path for path in inner if any(map(holds, footage_folder(path).iterdir())))
 
 
 def _files(root: Path, tree: Tree, place: Path) -> list[str]:
