@@ -139,8 +139,9 @@ def ablate(run: Ablation, names: Sequence[str] = ()) -> dict[str, Any]:
     head = load_head(source.head)
     views = HeadViews(open_shards(run.roots, "train"), head)
     drawn = {views.keys[i].expression for i in split_samples(views.keys, config)[0]}
+    measured = HeadViews(source, head)
     for subject in people:  # before hours of training
-        unseen_views(drawn, HeadViews(source, head), subject, run.protocol)
+        unseen_views(drawn, measured, subject, run.protocol)
     # Every row has as many Gaussians as the full model.
     config = with_map_size(config, views)
     run = replace(run, config=config)

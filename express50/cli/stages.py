@@ -152,7 +152,7 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
     # Set before a stage imports NumPy, whose BLAS reads the thread limit when it is loaded.
     cap_threads(args.threads)
     dataset = Dataset(args.dataset)
-    _refuse_swapped(dataset, getattr(args, "captures", ()), args.command)
+    _check_places(dataset, getattr(args, "captures", ()), args.command)
     slurm = _slurm_jobs(args)
     if slurm is not None and args.print_job:
         jobs = dict.fromkeys(slurm[stage.name] for stage in chosen)
@@ -251,7 +251,7 @@ def _chain(args: argparse.Namespace) -> Iterator[Any]:
         )
     cap_threads(args.threads)
     known, dataset = list(stages().values()), Dataset(args.dataset.resolve())
-    _refuse_swapped(dataset, args.captures, args.command)
+    _check_places(dataset, args.captures, args.command)
     ladders = {
         stage.name: distinct_settings(stage, args.config, args.set, stages()) for stage in known
     }
@@ -287,17 +287,17 @@ def _say_scripts(jobs: Iterable[Any], threads: int, logs: Path) -> int:
     return OK
 
 
-def _refuse_swapped(dataset: Dataset, captures: Sequence[Path], command: str) -> None:
-    """Raise ConfigError if a capture is in the place of the dataset, or the other way round."""
+def _check_places(dataset: Dataset, captures: Sequence[Path], command: str) -> None:
+    """Raise ConfigError if dataset and captures are swapped, or a new dataset lies in either."""
     from express50.capture.readers.read import is_capture
 
-    root = dataset.root
-    if root.is_dir() and not dataset.ledger.exists() and is_capture(root):
+    root, new = dataset.root, not dataset.ledger.exists()
+    if root.is_dir() and new and is_capture(root):
         raise ConfigError(
             f"the first argument is the dataset, and {root} is a capture; expected "
             f"'express50 {command} DATASET" + (f" {root}'" if command in ("ingest", "run") else "'")
         )
-    if not dataset.ledger.exists():
+    if new:
         check_results_folder(root)
     for path in captures:
         if Dataset(path).ledger.exists():
@@ -305,7 +305,7 @@ def _refuse_swapped(dataset: Dataset, captures: Sequence[Path], command: str) ->
                 f"captures come after the dataset, and {path} is a dataset; expected "
                 f"'express50 {command} DATASET CAPTURE'"
             )
-        if not dataset.ledger.exists() and path.resolve() in root.resolve().parents:
+        if new and path.resolve() in root.resolve().parents:
             raise ConfigError(
                 f"{root}: lies inside the capture {path}, which would change with every run; name"
                 " a dataset outside of it"

@@ -306,7 +306,7 @@ def alone_in(folder: Path) -> Iterator[None]:
                 f"{folder}: another process writes into this folder; wait until it ends, or name"
                 " another folder"
             ) from None
-        except OSError:
+        except OSError:  # a file system without locks
             pass
         yield
     finally:
