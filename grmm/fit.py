@@ -45,13 +45,12 @@ from grmm.metrics import PerceptualMetrics
 from grmm.model import PinholeView, Rendering
 from grmm.render import comparison_sheet
 from grmm.shard_source import select
-from grmm.train_state import deferred_interrupt, saving
+from grmm.train_state import SAY_SECONDS, deferred_interrupt, saving
 from grmm.warm_start import LOGIT_LIMIT, project_texture, spread_change
 
 Keep = Callable[[bool], None]
 """Is called after each step, with whether it was the last; may save the fit."""
 Keeping = Callable[[], contextlib.AbstractContextManager[Keep | None]]
-SAY_SECONDS = 10.0  # between lines of progress
 SCORED_PICTURES = 12  # pictures scored between the stages
 STAGE1_SHARE = 0.35  # of a time budget (G22)
 STAGE1_LR = 1e-2  # learning rate of the codes: they are few and start at a mean (G22)

@@ -38,6 +38,7 @@ from grmm.model import Rendering
 from grmm.rasterize import NotFiniteTensorError
 from grmm.render import comparison_sheet
 from grmm.train_state import (
+    SAY_SECONDS,
     Terms,
     TrainState,
     append_log,
@@ -55,7 +56,7 @@ from grmm.train_state import (
 )
 from grmm.warm_start import warm_start
 
-LOG_EVERY = 20  # iterations between lines of progress
+LOG_EVERY = 20  # iterations between lines of progress, at most
 DAY_STEPS = 10_000  # iterations that a CPU does in a day, at most
 GREY_DB = 10.0  # the score of a grey picture
 GLOO_SECONDS = 0.5  # for Gloo's threads to free tensors; 0.2 was enough in every run
@@ -130,6 +131,7 @@ def train(
         return world == 1 and finished(state, config)
 
     started, every = time.perf_counter() - state.seconds, config.train.save_seconds
+    said = state.seconds
     with deferred_interrupt() as interrupt, saving(checkpoint, save_to, every) as keep:
         while not finished(state, config):
             set_rates(state, config)
@@ -148,7 +150,9 @@ def train(
             if world > 1:
                 synchronise(state, interrupt, device)
             last = finished(state, config) or interrupt.is_set()
-            if rank == 0 and (state.iteration % LOG_EVERY == 0 or last):
+            due = state.iteration % LOG_EVERY == 0 or state.seconds - said >= SAY_SECONDS
+            if rank == 0 and (due or last):
+                said = state.seconds
                 log(progress_line(state, config))
                 append_log(out / "log.jsonl", state)
             if rank == 0:

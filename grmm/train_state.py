@@ -31,6 +31,7 @@ from grmm.model import GRMM, Rendering
 COVERED_TEXELS = 0.75  # of a map that head models' layouts use
 LARGEST_MAP = 512  # the paper's
 SAVING_SHARE = 0.05  # at most this share of the time
+SAY_SECONDS = 10.0  # between lines of progress, at most
 CHANGEABLE = {"iterations", "seconds", "save_seconds", "evaluate_images"}  # when a run is resumed
 
 
@@ -315,11 +316,18 @@ def deferred_interrupt() -> Iterator[Event]:
     That is Ctrl-C, SIGTERM, or the end of a terminal or connection, unless ``nohup`` ignores it.
     """
     interrupt, former = Event(), {}
+
+    def stop(number: int, frame: object) -> None:
+        if not interrupt.is_set():
+            interrupt.set()
+            with contextlib.suppress(RuntimeError):  # it came while another line was written
+                log("stopping: this step ends, then it is saved")
+
     try:
         if current_thread() is main_thread():  # no other gets signals
             hangup = (signal.SIGHUP,) if signal.getsignal(signal.SIGHUP) == signal.SIG_DFL else ()
             for number in (signal.SIGINT, signal.SIGTERM, *hangup):
-                former[number] = signal.signal(number, lambda *_: interrupt.set())
+                former[number] = signal.signal(number, stop)
         yield interrupt
     finally:
         for number, handler in former.items():

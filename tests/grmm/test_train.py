@@ -202,20 +202,28 @@ def test_time_budget_ends_the_run(tmp_path, source):
     assert metrics["seconds"] < 20
 
 
-def test_interrupt_leaves_a_checkpoint_to_resume(tmp_path, source, monkeypatch):
+def test_slow_steps_show_their_progress(tmp_path, source, monkeypatch, capsys):
+    monkeypatch.setattr(train_module, "SAY_SECONDS", 0.0)
+    train(source, ellipsoid_head(), tmp_path, tiny_config())
+    assert "iteration 1  " in capsys.readouterr().err
+
+
+def test_interrupt_leaves_a_checkpoint_to_resume(tmp_path, source, monkeypatch, capsys):
     from grmm import train as module
 
     real = module.step
 
     def interrupted(run, *rest):
         if run.iteration == 2:
-            os.kill(os.getpid(), signal.SIGINT)
+            for _ in range(2):
+                os.kill(os.getpid(), signal.SIGINT)
         real(run, *rest)
 
     monkeypatch.setattr(module, "step", interrupted)
     with pytest.raises(KeyboardInterrupt):
         train(source, ellipsoid_head(), tmp_path, tiny_config(train={"iterations": 5}))
     assert state_of(tmp_path)["loop"]["iteration"] == 3
+    assert capsys.readouterr().err.count("stopping: this step ends, then it is saved\n") == 1
     monkeypatch.setattr(module, "step", real)
     config = tiny_config(train={"iterations": 5})
     assert train(source, ellipsoid_head(), tmp_path, config, resume=True)["iterations"] == 5
