@@ -48,7 +48,7 @@ from grmm.fit import (
 )
 from grmm.metrics import PerceptualMetrics
 from grmm.shard_source import open_shards
-from grmm.train import train
+from grmm.train import diverged, train
 from grmm.train_state import best_device, differences, split_samples, with_map_size
 
 
@@ -125,16 +125,18 @@ class Ablation:
 def ablate(run: Ablation, names: Sequence[str] = ()) -> dict[str, Any]:
     """Measure every row that is not measured yet; write ablation.json and ablation.md.
 
-    ``names`` are the rows to measure; empty: all.
+    ``names`` are the rows to measure; empty: all. The tables also hold the others that were
+    measured in this folder with the same settings.
 
     Raises:
         ConfigError: an unknown row, nothing is held out, or a person lacks the views that it is to
             be fitted from.
     """
     config = with_holdout(run.roots, run.config)
-    variants = variants_of(run.roots, names)
+    variants, every = variants_of(run.roots, names), variants_of(run.roots, ())
     if not config.model.identity_modes:
         variants.pop("no_modes", None)
+        every.pop("no_modes")
     source, people = run.unseen()
     head = load_head(source.head)
     views = HeadViews(open_shards(run.roots, "train"), head)
@@ -157,9 +159,11 @@ def ablate(run: Ablation, names: Sequence[str] = ()) -> dict[str, Any]:
     rows: dict[str, list[dict]] = {}
     table: dict[str, Any] = {}
     for seed in range(run.seeds):
-        for name, variant in variants.items():
-            rows.setdefault(name, []).append(_row(run, name, variant, seed))
-            table = write_tables(run.out, rows, config)
+        for name, variant in every.items():
+            row = _row(run, name, variant, seed, wanted=name in variants)
+            if row is not None and len(rows.setdefault(name, [])) == seed:  # pairs are by seed
+                rows[name].append(row)
+                table = write_tables(run.out, rows, config)
     return table
 
 
@@ -192,8 +196,11 @@ def changed(config: Config, variant: Variant, used: Sequence[Path]) -> Config:
     return from_tables(tables)
 
 
-def _row(run: Ablation, name: str, variant: Variant, seed: int) -> dict:
-    """Measure one row, or read it from its file if it was measured with the same settings."""
+def _row(run: Ablation, name: str, variant: Variant, seed: int, wanted: bool) -> dict | None:
+    """Read one row from its file if it was measured with the same settings, or measure it.
+
+    None if it is not ``wanted`` and not measured.
+    """
     used = [root for root in run.roots if root != variant.without]
     settings = changed(run.config, variant, used)
     settings = replace(settings, train=replace(settings.train, seed=settings.train.seed + seed))
@@ -212,14 +219,21 @@ def _row(run: Ablation, name: str, variant: Variant, seed: int) -> dict:
         if row.get("digest") == digest:
             log(f"ablate: {name}{ending} is measured")
             return row
-        log(f"ablate: {name}{ending} was measured with other settings, so it is measured again")
+        if wanted:
+            log(f"ablate: {name}{ending} was measured with other settings, so it is measured again")
+    if not wanted:
+        return None
     folder = run.out / f"{variant.trains_as or name}{ending}"
     if not variant.trains_as:
         _train(used, folder, settings)
-    loaded = load_checkpoint(folder / "checkpoint.pt", best_device())
-    log(f"ablate: measuring {name}{ending}")
     fits = path.parent / FITS
-    row = measure(run, replace(loaded, config=settings), used, fits)
+    if diverged(read_json_table(folder / "metrics.json", FormatError)):
+        log(f"ablate: {name}{ending} diverged; lower train.lr for all rows, and name another OUT")
+        row: dict[str, Any] = {"groups": {}, "diverged": True}
+    else:
+        loaded = load_checkpoint(folder / "checkpoint.pt", best_device())
+        log(f"ablate: measuring {name}{ending}")
+        row = measure(run, replace(loaded, config=settings), used, fits)
     row |= {"digest": digest, "label": variant.label, "paper_db": variant.paper_db}
     row["against"] = variant.against
     write_json(path, row)
@@ -304,14 +318,19 @@ def variants_of(roots: Sequence[Path], names: Sequence[str]) -> dict[str, Varian
 def write_tables(out: Path, rows: Mapping[str, list[dict]], config: Config) -> dict[str, Any]:
     """Write ablation.json and ablation.md of the rows measured so far; returns the former.
 
-    Numbers are means over the seeds. Differences are taken seed by seed, to the row that a row is
-    compared with; ``interval_db`` is half of their mean's 95 % interval (Student's), None of one.
+    Numbers are means over the seeds; a row that diverged with any of them has none. Differences are
+    taken seed by seed, to the row that a row is compared with; ``interval_db`` is half of their
+    mean's 95 % interval (Student's), None of one.
     """
     table: dict[str, Any] = {}
     for name, runs in rows.items():
         others = rows.get(runs[0]["against"], rows["full"])
         row: dict[str, Any] = runs[-1] | {"seeds": len(runs), "difference_db": {}}
         row |= {"groups": {}, "interval_db": {}, "regions_db": {}}
+        table[name] = row
+        if any("diverged" in run for run in runs):
+            row |= {"label": f"{row['label']} (diverged)", "diverged": True}
+            continue
         for group, numbers in runs[0]["groups"].items():
             measured = [run["groups"][group] for run in runs]
             row["groups"][group] = {
@@ -326,7 +345,6 @@ def write_tables(out: Path, rows: Mapping[str, list[dict]], config: Config) -> d
             if whole is not None:
                 row["difference_db"][group], row["interval_db"][group] = whole
             row["regions_db"][group] = found
-        table[name] = row
     budget = {"seconds": config.train.seconds or None, "iterations": config.train.iterations}
     missing = PerceptualMetrics(config.metrics).missing()
     cameras = list(config.data.holdout_cameras)

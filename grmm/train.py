@@ -166,13 +166,7 @@ def train(
         time.sleep(GLOO_SECONDS)
 
     # --- The report ----------------------------------------------------------------------------
-    metrics = report(state, config, out, perceptual) if rank == 0 else {}
-    if diverged(metrics):
-        log(
-            "training images score worse than plain grey: training diverged; lower train.lr and "
-            "start over with --overwrite"
-        )
-    return metrics
+    return report(state, config, out, perceptual) if rank == 0 else {}
 
 
 def step(

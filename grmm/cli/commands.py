@@ -67,7 +67,13 @@ def train(args: argparse.Namespace) -> int:
     values = {name: metrics.get(name) for name in names}
     lines = [f"{figure_label(k)}: {'n/a' if v is None else v}" for k, v in values.items()]
     code = answer(args, metrics, *lines, f"wrote {args.out / 'checkpoint.pt'}")
-    return FAILED if diverged(metrics) else code
+    if diverged(metrics):
+        log(
+            "training images score worse than plain grey: training diverged; lower train.lr and "
+            "start over with --overwrite"
+        )
+        return FAILED
+    return code
 
 
 def train_config(args: argparse.Namespace) -> Config:
@@ -417,7 +423,8 @@ def ablate(args: argparse.Namespace) -> int:
     )
     with alone_in(args.out):
         table = ablate(run, _split_names(args.rows))
-    return answer(args, table, (args.out / "ablation.md").read_text(encoding="utf-8"))
+    code = answer(args, table, (args.out / "ablation.md").read_text(encoding="utf-8"))
+    return FAILED if any("diverged" in row for row in table["rows"].values()) else code
 
 
 def _protocol(args: argparse.Namespace) -> FitProtocol:

@@ -16,6 +16,8 @@ from grmm.shard_source import open_shards
 from tests.grmm.packed import TINY, write_shards
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
+STEADY = [*TINY, "--set=train.lr=1e-4"]  # three steps at the preset's rate are worse than grey
+
 
 @pytest.fixture(scope="module")
 def roots(tmp_path_factory):
@@ -37,7 +39,7 @@ def table(roots, tmp_path_factory):
 
 def command(roots, out):
     return [
-        "ablate", str(roots[0]), str(out), f"--also={roots[1]}", *TINY, "--fit-expression=e0",
+        "ablate", str(roots[0]), str(out), f"--also={roots[1]}", *STEADY, "--fit-expression=e0",
         "--holdout-cameras=cam01", "--holdout-expressions=S001/e1", "--fit-cameras=cam00",
     ]  # fmt: skip
 
@@ -80,6 +82,31 @@ def test_finished_rows_are_kept_and_changed_ones_measured_again(table, roots, mo
     (table / "no_residuals" / "row.json").unlink()
     assert main(command(roots, table)) == 0
     assert trained == ["no_residuals"]
+
+
+def test_rows_measured_earlier_stay_in_the_table(table, roots, monkeypatch):
+    monkeypatch.delattr(ablate_module, "train")
+    written = [(table / name).read_bytes() for name in ("ablation.json", "ablation.md")]
+    assert main([*command(roots, table), "--rows=no_mesh_decoder"]) == 0
+    assert [(table / name).read_bytes() for name in ("ablation.json", "ablation.md")] == written
+
+
+def test_a_row_that_diverged_is_marked_and_has_no_figures(roots, tmp_path, monkeypatch, capsys):
+    asked = []
+
+    def second(metrics):
+        asked.append(metrics["gaussians"])
+        return len(asked) == 2
+
+    monkeypatch.setattr(ablate_module, "diverged", second)
+    assert main([*command(roots, tmp_path), "--rows=no_mesh_decoder"]) == 1
+    said = capsys.readouterr()
+    assert "no_mesh_decoder diverged; lower train.lr for all rows, and name" in said.err
+    lines = said.out.splitlines()
+    assert lines[3].startswith("| W/o mesh decoder (diverged) | n/a | n/a |")
+    assert "n/a | n/a | +0.00 |" not in lines[2] and "| +0.00 |" in lines[2]
+    rows = json.loads((tmp_path / "ablation.json").read_text())["rows"]
+    assert rows["no_mesh_decoder"]["groups"] == {} and rows["full"]["groups"]["unseen"]
 
 
 def test_a_stopped_ablation_keeps_the_people_it_has_fitted(roots, tmp_path, monkeypatch):
@@ -214,7 +241,7 @@ def test_seeds_give_intervals_and_test_shards_give_people_alone(tmp_path, capsys
         for name, people in (("train", ("S000", "S001")), ("test", ("S002", "S003")))
     ]
     arguments = [
-        "ablate", str(roots[0]), str(tmp_path / "out"), *TINY, "--fit-expression=e0",
+        "ablate", str(roots[0]), str(tmp_path / "out"), *STEADY, "--fit-expression=e0",
         "--holdout-cameras=cam01", "--fit-cameras=cam00", "--rows=no_mesh_decoder",
         "--fit-budget=9s",
     ]  # fmt: skip
