@@ -229,7 +229,7 @@ def _row(run: Ablation, name: str, variant: Variant, seed: int, wanted: bool) ->
     fits = path.parent / FITS
     if diverged(read_json_table(folder / "metrics.json", FormatError)):
         log(f"ablate: {name}{ending} diverged; lower train.lr for all rows, and name another OUT")
-        row: dict[str, Any] = {"groups": {}, "diverged": True}
+        row = {"groups": {}, "diverged": True}
     else:
         loaded = load_checkpoint(folder / "checkpoint.pt", best_device())
         log(f"ablate: measuring {name}{ending}")
