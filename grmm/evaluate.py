@@ -21,7 +21,7 @@ from torch import Tensor
 
 from express50.console import figure_label, format_table
 from express50.contract.segmentation_labels import label_mask
-from express50.errors import FormatError, TrainError, few
+from express50.errors import ConfigError, FormatError, TrainError, few
 from express50.files.atomic import naming_full_disk, write_bytes, write_json
 from express50.files.images import read_image, write_image
 from express50.files.text import is_number, no_folder
@@ -223,12 +223,10 @@ def score(
     paths: dict[int, Path] = {}
     missing = []
     for index in indices:
-        name = sample_key(**vars(views.keys[index]))
-        files = [folder / f"{name}{suffix}" for suffix in SUFFIXES]
-        if found := next(filter(Path.is_file, files), None):
+        if found := find_picture(folder, views.keys[index]):
             paths[index] = found
         else:
-            missing.append(name)
+            missing.append(sample_key(**vars(views.keys[index])))
     if missing and not (partial and paths):
         raise FormatError(
             f"{folder}: {len(missing)} of {len(indices)} pictures are missing:"
@@ -251,6 +249,13 @@ def score(
     return rows
 
 
+def find_picture(folder: Path, key: SampleKey) -> Path | None:
+    """Return the picture of a sample in a folder of pictures; None if there is none."""
+    name = sample_key(**vars(key))
+    files = [folder / f"{name}{suffix}" for suffix in SUFFIXES]
+    return next(filter(Path.is_file, files), None)
+
+
 def _read_picture(path: Path, size: tuple[int, int]) -> np.ndarray:
     """Read (H, W, 3) uint8; grey is repeated over the channels, a fourth one is left out."""
     pixels = read_image(path)
@@ -264,8 +269,19 @@ def _read_picture(path: Path, size: tuple[int, int]) -> np.ndarray:
     return pixels[..., :3]
 
 
-def save_pictures(folder: Path, window: Window, views: HeadViews) -> Callable[[int, Tensor], None]:
-    """Make a function that writes renderings of samples as `score` reads them."""
+def save_pictures(
+    folder: Path, window: Window, views: HeadViews, new: Sequence[int]
+) -> Callable[[int, Tensor], None]:
+    """Make a function that writes renderings of samples as `score` reads them.
+
+    Raises:
+        ConfigError: the folder holds a picture of one of the ``new`` samples.
+    """
+    if old := [found.name for i in new if (found := find_picture(folder, views.keys[i]))]:
+        raise ConfigError(
+            f"{folder}: holds pictures of these samples ({few(old)}), perhaps another method's;"
+            " name another folder, or delete them"
+        )
     folder.mkdir(parents=True, exist_ok=True)
 
     def keep(index: int, image: Tensor) -> None:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import asdict, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -278,7 +279,7 @@ def view(args: argparse.Namespace) -> int:
 def evaluate(args: argparse.Namespace) -> int:
     """Measure a checkpoint on people it has codes for, and on people fitted first."""
     from express50.geometry.sampling import evenly
-    from grmm.evaluate import SEEN, evaluate, kind_of, save_pictures, training_render
+    from grmm.evaluate import SEEN, evaluate, journal_rows, kind_of, save_pictures, training_render
     from grmm.fit import FITS, evaluate_unseen, unseen_views
     from grmm.metrics import PerceptualMetrics
     from grmm.shard_source import ShardSource
@@ -290,7 +291,6 @@ def evaluate(args: argparse.Namespace) -> int:
     loaded = _load(args.checkpoint, _metric_settings(args), args.fit_budget)
     source = ShardSource(args.shards, "*")
     views = loaded.views(source)
-    keep = save_pictures(args.save, source.window, views) if args.save else None
     judge = PerceptualMetrics(loaded.config.metrics)
     kind = partial(kind_of, loaded)
     known, unseen = _split(loaded, views, args)
@@ -309,9 +309,12 @@ def evaluate(args: argparse.Namespace) -> int:
         trained = loaded.model.expressions
         _, unseen[subject] = unseen_views(trained, views, subject, protocol, chosen)
     fits = args.out / FITS
+    journal = _journal(args, loaded, source.digest, protocol, fits)
+    # After a stop, pictures are from this command.
+    new = [] if journal_rows(journal) else [*known, *chain.from_iterable(unseen.values())]
+    keep = save_pictures(args.save, source.window, views, new) if args.save else None
     fits.mkdir(parents=True, exist_ok=True)
     check_space(fits)  # before anybody is measured for nothing
-    journal = _journal(args, loaded, source.digest, protocol, fits)
     render = training_render(loaded.model, views)
     log(f"measuring {count(len(known), 'image')} of people with codes")
     rows = evaluate(views, known, render, judge, kind, keep, journal)

@@ -216,6 +216,21 @@ def test_saved_pictures_score_as_they_were_evaluated(evaluated, roots, tmp_path)
         assert theirs[name] == pytest.approx(ours[name], abs=tolerance)
 
 
+def test_saved_pictures_do_not_replace_others(evaluated, table, roots, tmp_path, capsys):
+    pictures = evaluated / "pictures"
+    before = {path.name: path.stat().st_mtime_ns for path in pictures.iterdir()}
+    arguments = [
+        "evaluate", str(table / "full" / "checkpoint.pt"), str(roots[0]), str(tmp_path / "out"),
+        "--subjects=S000", f"--save={pictures}",
+    ]  # fmt: skip
+    assert main(arguments) == 2
+    assert (
+        "pictures: holds pictures of these samples (S000_e0_cam00.png, " in capsys.readouterr().err
+    )
+    assert before == {path.name: path.stat().st_mtime_ns for path in pictures.iterdir()}
+    assert not (tmp_path / "out").exists()
+
+
 def test_missing_and_mis_sized_pictures_are_named(evaluated, roots, tmp_path, capsys):
     folder = evaluated / "pictures"
     score = ["score", str(folder), str(roots[0]), str(tmp_path)]

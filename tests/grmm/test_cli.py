@@ -341,7 +341,8 @@ def test_a_stopped_evaluation_keeps_the_people_it_has_fitted(
 def test_a_stopped_evaluation_keeps_what_it_has_measured(checkpoint, shards, tmp_path, monkeypatch):
     def evaluation(name: str) -> list[str]:
         fitted = ["--fit-cameras=cam00", "--fit-expression=e0"]
-        return ["evaluate", str(checkpoint), str(shards), str(tmp_path / name), *fitted]
+        saved = f"--save={tmp_path / name / 'pictures'}"
+        return ["evaluate", str(checkpoint), str(shards), str(tmp_path / name), *fitted, saved]
 
     measured = []
 
