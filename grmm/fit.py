@@ -95,8 +95,6 @@ def fit(
     comparison_sheet(out / "given.jpg", views, state.given[:6], state.render)
     if held_out:
         comparison_sheet(out / "held_out.jpg", views, held_out[:6], state.render)
-    else:  # that of an earlier fit in this folder
-        (out / "held_out.jpg").unlink(missing_ok=True)
     write_json(out / "metrics.json", metrics)
     save_fit(state, checkpoint)  # last, because then the fit counts as finished
     return metrics

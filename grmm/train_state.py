@@ -31,6 +31,9 @@ from grmm.model import GRMM, Rendering
 COVERED_TEXELS = 0.75  # of a map that head models' layouts use
 LARGEST_MAP = 512  # the paper's
 SAVING_SHARE = 0.05  # at most this share of the time
+REPORT = (  # files that show how good a checkpoint is
+    "metrics.json", "given.jpg", "held_out.jpg", "preview/training.jpg", "preview/heldout.jpg",
+)  # fmt: skip
 SAY_SECONDS = 10.0  # between lines of progress, at most
 CHANGEABLE = {"iterations", "seconds", "save_seconds", "evaluate_images"}  # when a run is resumed
 
@@ -180,7 +183,8 @@ def saving(
     """Yield a function to call after each step, which saves when it is time, or if told it is last.
 
     It is time when ``every`` seconds have passed (0: never), or more, if saving would otherwise
-    take more than `SAVING_SHARE` of the time. A spare file reserves the space for the next
+    take more than `SAVING_SHARE` of the time. The report on the checkpoint that is replaced goes,
+    so that none is left beside another's after a kill. A spare file reserves the space for the next
     checkpoint, so that the state can still be saved if others fill the disk meanwhile.
     """
     spare = path.with_name(f".{path.name}.spare")
@@ -197,6 +201,8 @@ def saving(
             with contextlib.suppress(OSError):  # none yet, or a disk without second names
                 spare.hardlink_to(path)
             save(path)
+            for name in REPORT:
+                (path.parent / name).unlink(missing_ok=True)
             saved = time.perf_counter()
             cost = saved - now
         elif not spare.exists():

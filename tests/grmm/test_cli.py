@@ -125,8 +125,11 @@ def test_a_stopped_fit_goes_on_and_another_is_refused(
         patch.setattr("grmm.fit._finite", lambda loss, *_: os.kill(os.getpid(), 2) or loss)
         assert main(fit) == 130
         assert "the same command makes the rest" in capsys.readouterr().err
+        for name in ("metrics.json", "given.jpg", "held_out.jpg"):
+            (tmp_path / name).write_text("of an earlier fit")
         assert main([*fit, "--overwrite"]) == 130
         assert "the same command without --overwrite makes the rest" in capsys.readouterr().err
+        assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]
     assert main([*fit, "--set=fit.stage2_lr=0.5"]) == 2
     assert "cannot resume, these differ: fit.stage2_lr " in capsys.readouterr().err
     assert main(fit) == 0
