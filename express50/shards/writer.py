@@ -357,13 +357,22 @@ def copy_samples(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> in
 def _checked_splits(readers: Sequence[ShardReader]) -> dict[str, str]:
     """Return the split of every subject; FormatError if folders contradict each other."""
     owners: dict[tuple[str, str], ShardReader] = {}
+    shapes: dict[str, object] = {}
     for reader in readers:
-        for group in reader.groups():
+        for group, (number, *_) in reader.groups().items():
             if owners.setdefault(group, reader) is not reader:
                 raise FormatError(
                     f"{reader.root}: {'/'.join(group)} is in {owners[group].root} too, expected in"
                     " one folder; leave it out of one of them with 'express50 shards split', or,"
                     " if it is another person's, rename that capture and pack it again"
+                )
+            track = reader.meta(number).get("track")
+            shape = track.get("shape") if isinstance(track, dict) else None
+            if shapes.setdefault(group[0], shape) != shape:  # a track has one for all frames
+                raise FormatError(
+                    f"{reader.root}: {group[0]} has another shape of the head than in the folders"
+                    " before; if it is another person, rename that capture and pack it again,"
+                    " otherwise pack this subject in one run"
                 )
     splits: dict[str, str] = {}
     for reader in readers:

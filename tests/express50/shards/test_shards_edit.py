@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -62,6 +63,20 @@ def test_a_subject_in_two_splits_is_refused(tmp_path: Path) -> None:
     write_manifest(tmp_path / "other")
     with pytest.raises(FormatError, match="S001 is in split 'test' here and in 'train'"):
         copy_samples([ShardReader(whole), ShardReader(tmp_path / "other")], tmp_path / "out", 1)
+
+
+def test_two_people_with_one_id_are_refused(tmp_path: Path) -> None:
+    readers = []
+    for expression, shape in (("smile", [0.5, -1.0]), ("pout", [0.5, -1.5])):
+        sample = make_sample("S001", expression, "cam00", 0)
+        meta = json.loads(sample.members["meta.json"]) | {"track": {"shape": shape}}
+        members = {**sample.members, "meta.json": json.dumps(meta).encode()}
+        writer = ShardWriter(tmp_path / expression, 10**6)
+        writer.add_group("train", [replace(sample, members=members)])
+        writer.close()
+        readers.append(ShardReader(tmp_path / expression))
+    with pytest.raises(FormatError, match="pout: S001 has another shape of the head"):
+        copy_samples(readers, tmp_path / "out", 1)
 
 
 def test_a_damaged_member_and_a_full_folder_are_refused(tmp_path: Path) -> None:
