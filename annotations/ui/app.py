@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import signal
 from collections.abc import Callable, Sequence
 from copy import copy
 from typing import ClassVar
@@ -10,6 +12,7 @@ from rich.text import Text
 from textual import events, work
 from textual.app import App, ComposeResult
 from textual.containers import Horizontal, Vertical
+from textual.drivers.linux_driver import LinuxDriver
 from textual.filter import LineFilter
 from textual.geometry import Size
 from textual.screen import Screen
@@ -422,6 +425,18 @@ class Player:
         return ran
 
 
+class KeyDriver(LinuxDriver):
+    """Passes over bytes that are not UTF-8, as some mice send, where Textual ends with an error."""
+
+    def run_input_thread(self) -> None:
+        """Read keys until the app ends."""
+        while True:
+            try:
+                return super().run_input_thread()
+            except UnicodeDecodeError:
+                continue
+
+
 class AnnotateApp(App[None]):
     """One session at the desk."""
 
@@ -433,7 +448,7 @@ class AnnotateApp(App[None]):
         self, session: Session, *, faces: FaceFinder | None = None, sixel_cell: Size | None = None
     ) -> None:
         """Show pictures as sixels where the pixels of a terminal's cell are given."""
-        super().__init__()
+        super().__init__(driver_class=KeyDriver)
         self.session = session
         self.cache = FrameCache(session.dataset)
         self.desk = Desk(session, self.cache, faces, sixel_cell)
@@ -443,7 +458,9 @@ class AnnotateApp(App[None]):
         return [theme.UNCOLOURED] if self.no_color else super().get_line_filters()
 
     def on_mount(self) -> None:
-        """Show the desk."""
+        """Show the desk; when the connection closes, end as by ``q``."""
+        if signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # nohup ignores it
+            asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self.exit)
         self.push_screen(self.desk)
 
     def on_unmount(self) -> None:

@@ -1,9 +1,18 @@
 """The real app through Textual's pilot: every key, every message, small terminals, no traceback."""
 
 import asyncio
+import fcntl
 import json
+import os
 import re
+import select
 import shutil
+import signal
+import struct
+import subprocess
+import sys
+import termios
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -514,3 +523,47 @@ def test_terminals_that_cannot_be_drawn_on_are_refused(
     monkeypatch.setenv("TERM", "one-of-tomorrow")  # not in this machine's list
     terminal.encoding = "UTF-8"
     cli._check_terminal()
+
+
+def read_until(terminal, words, seconds=60):
+    """What a pseudo-terminal shows until it shows some bytes, or ends."""
+    said, end = b"", time.monotonic() + seconds
+    while words not in said and time.monotonic() < end:
+        if select.select([terminal], [], [], 0.1)[0]:
+            try:
+                said += os.read(terminal, 1 << 16)
+            except OSError:  # no process has it open any more
+                break
+    return said
+
+
+@pytest.fixture
+def in_terminal(suggested):
+    """The annotator's process in a pseudo-terminal, and our end of it."""
+    ours, theirs = os.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("4H", 24, 80, 0, 0))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "express50", "annotate", "ui", suggested.root, "--annotator", "ann"],
+        stdin=theirs, stdout=theirs, stderr=theirs, env=os.environ | {"TERM": "xterm-256color"},
+    )  # fmt: skip
+    os.close(theirs)
+    yield process, ours
+    process.kill()
+    process.wait()
+    os.close(ours)
+
+
+def test_a_hangup_saves_and_restores_the_terminal(suggested, in_terminal):
+    process, terminal = in_terminal
+    before = termios.tcgetattr(terminal)
+    read_until(terminal, b"0/6")
+    os.write(terminal, b"\xff\xe9")  # not UTF-8, as mice of old terminals send
+    time.sleep(0.2)  # keys in the same read would be lost with it
+    os.write(terminal, b"\r")
+    read_until(terminal, b"1/6")
+    process.send_signal(signal.SIGHUP)
+    said = read_until(terminal, b"to use the labels")
+    assert b"\x1b[?1049l" in said  # back to the shell's screen
+    assert process.wait(30) == 0
+    assert termios.tcgetattr(terminal) == before
+    assert len(labels(suggested)) == 1
