@@ -80,11 +80,17 @@ def run_photo(args: argparse.Namespace) -> int:
     dataset = Dataset(args.out)
     if not dataset.ledger.exists():
         check_results_folder(args.out)
+    folder = dataset.root / "photos" / subject
+    known = dataset.captures().get(subject, folder)
+    if known.exists() and known.resolve() != folder.resolve():
+        raise ConfigError(
+            f"{args.out}: subject {subject} already has the capture {known}; give the picture"
+            " another id with --subject, or name another OUT"
+        )
     names = [name for name in STAGES if args.matte or name != "matte"]
     with stdout_to_stderr() if args.json else nullcontext():
         loaded = [stages()[name] for name in names]
         configs = [config_of(stage, args) for stage in loaded]
-        folder = dataset.root / "photos" / subject
         capture = make_photo_capture(
             picture, folder, subject, configs[-1],
             focal_px=args.focal_px, film_mm=args.film_mm, windows=args.windows,

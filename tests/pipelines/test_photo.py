@@ -15,6 +15,7 @@ import torch
 
 from express50.__main__ import main
 from express50.errors import CaptureError
+from express50.files.atomic import write_json
 from express50.files.calibration import read_cameras
 from express50.files.containers import read_picture
 from express50.files.images import write_image
@@ -142,6 +143,18 @@ def test_a_second_picture_of_the_same_name_takes_nobodys_place(
     assert stored.read_bytes() == before
     make_photo_capture(open_picture(stored), out, "eva", config)
     assert stored.read_bytes() == before
+
+
+def test_a_subject_with_a_capture_elsewhere_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    write_image(tmp_path / "eva.png", data.astronaut())
+    (tmp_path / "rig").mkdir()
+    write_json(tmp_path / "out" / "captures.json", {"S001": str(tmp_path / "rig")})
+    photo = ["photo", str(tmp_path / "eva.png"), str(tmp_path / "out"), "--subject", "S001"]
+    assert main(photo) == 2
+    assert "another id with --subject, or name another OUT" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["captures.json"]
 
 
 @pytest.mark.parametrize("own", ["capture.toml", "notes.txt"])
