@@ -76,5 +76,7 @@ clean: ## remove what was built, keep .venv and datasets such as build/dataset
 	@[ -d express50 ] || { echo "$(CURDIR): is not the repository, nothing is removed" >&2; exit 1; }
 	rm -rf .mypy_cache .ruff_cache .pytest_cache
 	@for path in build/*; do \
-	    if [ -e "$$path/captures.json" ]; then echo "kept $$path"; else rm -rf "$$path"; fi; \
+	    if [ -e "$$path/captures.json" ] || \
+	        { [ "$$path" = build/demo ] && ls build/demo/data 2>/dev/null | grep -qvx demo; }; \
+	    then echo "kept $$path"; else rm -rf "$$path"; fi; \
 	done

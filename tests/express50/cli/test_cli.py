@@ -416,7 +416,7 @@ def test_make_takes_a_dataset_whose_name_has_spaces(target):
 
 
 def test_make_clean_keeps_datasets(tmp_path):
-    for name in ("build/dataset/labels", "build/my data", "build/demo/data"):
+    for name in ("build/dataset/labels", "build/my data", "build/demo/data/demo"):
         (tmp_path / name).mkdir(parents=True)
     for name in ("build/dataset/captures.json", "build/my data/captures.json", "build/log.txt"):
         (tmp_path / name).touch()
@@ -426,6 +426,9 @@ def test_make_clean_keeps_datasets(tmp_path):
     subprocess.run(clean, cwd=tmp_path, check=True)
     assert sorted(path.name for path in (tmp_path / "build").iterdir()) == ["dataset", "my data"]
     assert (tmp_path / "build/dataset/labels").is_dir()
+    (tmp_path / "build/demo/data/S001+S002").mkdir(parents=True)  # make demo CAPTURES=...
+    subprocess.run(clean, cwd=tmp_path, check=True)
+    assert (tmp_path / "build/demo/data/S001+S002").is_dir()
 
 
 def test_make_takes_a_dataset_in_the_home_folder(monkeypatch):
