@@ -155,8 +155,10 @@ class FlagDialog(ModalScreen[str | None]):
             yield line
 
     def on_key(self, event: events.Key) -> None:
-        """Choose by digit."""
+        """Choose by digit; text that came before the line had the focus goes there."""
         line = self.query_one(Input)
+        if line.display and event.character is not None and event.is_printable:
+            line.insert_text_at_cursor(event.character)
         number = int(event.key) if event.key.isdigit() and not line.display else 0
         if 1 <= number <= len(FLAG_REASONS):
             self.dismiss(FLAG_REASONS[number - 1])

@@ -145,6 +145,13 @@ def test_a_flag_typed_before_its_dialog_is_drawn_is_saved(suggested, make_app):
     assert (flag.reason, flag.keys) == ("occluded", 2)
 
 
+def test_a_reason_typed_before_its_line_is_drawn_is_saved(suggested, make_app):
+    keys = ("f", "5", *"tongueless", "enter")
+    piloted(make_app(suggested), lambda pilot: type_ahead(pilot, keys, lambda: labels(suggested)))
+    (flag,) = labels(suggested)
+    assert (flag.reason, flag.keys) == ("tongueless", 13)
+
+
 def test_a_frame_typed_before_its_dialog_is_drawn_is_opened(suggested, make_app):
     app = make_app(suggested)
     keys = ("g", "7", "enter")
