@@ -113,7 +113,8 @@ class Desk(Screen[None]):
 
         Textual's bindings would act only after the next keys have been given to this screen.
         """
-        dialog, late = self.app.screen, copy(event)  # a copy was counted already
+        self.session.press()  # here, since a key may have waited for the decision before it
+        dialog, late = self.app.screen, copy(event)
         event.stop()
         if dialog is not self:
             dialog.call_after_refresh(lambda: (dialog.focused or dialog).post_message(late))
@@ -468,7 +469,8 @@ class AnnotateApp(App[None]):
         self.cache.close()
 
     async def on_event(self, event: events.Event) -> None:
-        """Count keys before they act, also those typed into dialogs."""
-        if isinstance(event, events.Key) and not event.is_forwarded:
+        """Count keys that are typed into dialogs."""
+        typed = isinstance(event, events.Key) and not event.is_forwarded
+        if typed and self.screen is not self.desk:
             self.session.press()
         await super().on_event(event)

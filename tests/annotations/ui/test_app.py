@@ -145,6 +145,17 @@ def test_a_flag_typed_before_its_dialog_is_drawn_is_saved(suggested, make_app):
     assert (flag.reason, flag.keys) == ("occluded", 2)
 
 
+def test_keys_typed_ahead_count_for_the_label_that_they_gave(suggested, make_app):
+    keys = ("right", "enter", "left", "left", "enter", "f", "3")
+    piloted(
+        make_app(suggested),
+        lambda pilot: type_ahead(pilot, keys, lambda: len(labels(suggested)) > 2),
+    )
+    assert [(label.frame, label.keys) for label in labels(suggested)] == [
+        (5, 2), (18, 3), (None, 2),
+    ]  # fmt: skip
+
+
 def test_a_reason_typed_before_its_line_is_drawn_is_saved(suggested, make_app):
     keys = ("f", "5", *"tongueless", "enter")
     piloted(make_app(suggested), lambda pilot: type_ahead(pilot, keys, lambda: labels(suggested)))
