@@ -117,8 +117,8 @@ def _add_labelling_actions(add: Callable[..., Callable]) -> None:
     argument("--order", choices=ORDERS, default="doubt", help=order)
     words = "hide suggestions and others' marks until you decide"
     argument("--blind", action="store_true", help=words)
-    words = "block characters, or sixels for terminals that draw them (xterm -ti vt340, foot,"
-    words += " WezTerm, iTerm2) (default: %(default)s)"
+    words = "block characters (grey, unless COLORTERM is truecolor), or sixels for terminals that"
+    words += " draw them (xterm -ti vt340, foot, WezTerm, iTerm2) (default: %(default)s)"
     argument("--pictures", choices=("blocks", "sixel"), default="blocks", help=words)
     words = "list the frames that align suggests, the most doubtful first"
     add("suggest", run_suggest, words, "subjects")
@@ -220,6 +220,8 @@ def run_ui(args: argparse.Namespace) -> int:
     if args.pictures == "sixel":
         cell = cell_size()
         os.environ.setdefault("COLORTERM", "truecolor")  # ssh does not pass it on
+    # Rich sees 16 colours in "screen", "alacritty" and others, which draw 256.
+    os.environ["TERM"] += "-256color"
     AnnotateApp(session, faces=FaceFinder(dataset), sixel_cell=cell).run()
     done, total = session.done, len(session.tasks)
     words = f"{done} of {total} done by {session.annotator}"

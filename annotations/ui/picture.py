@@ -84,7 +84,8 @@ class PicturePane(Widget):
 
     def _read(self, crop: FrameCrop) -> np.ndarray:
         picture = self._cache.get(crop)
-        if not self.app.no_color:
+        # A face in 256 colours is blotches, whereas the 24 greys among them show it well.
+        if not self.app.no_color and self.app.console.color_system != "256":
             return picture
         grey = picture @ np.array([0.299, 0.587, 0.114])  # luma, ITU-R BT.601
         return np.repeat(np.rint(grey).astype(np.uint8)[..., None], 3, axis=2)

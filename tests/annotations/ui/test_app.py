@@ -510,6 +510,23 @@ def test_no_color_leaves_words_without_colours_and_pictures_in_grey(
     assert all(red == green == blue for red, green, blue in found["frame"][0])
 
 
+@pytest.mark.parametrize(("term", "colorterm"), [("xterm", "truecolor"), ("xterm-256color", "")])
+def test_pictures_are_grey_unless_the_terminal_says_that_it_has_all_colours(
+    suggested, make_app, monkeypatch, term, colorterm
+):
+    monkeypatch.setenv("TERM", term)
+    monkeypatch.setenv("COLORTERM", colorterm)
+
+    def shades(app):
+        frame = app.desk.query_one("#frame")
+        styles = [s.style for row in frame.render_lines(frame.size.region) for s in row]
+        return {c.get_truecolor() for s in styles for c in (s.color, s.bgcolor)}
+
+    found = drive(make_app(suggested), check=shades)
+    assert len(found) > 3
+    assert all(red == green == blue for red, green, blue in found) == (not colorterm)
+
+
 def test_ctrl_z_is_bound_and_in_the_help(suggested, make_app, monkeypatch):
     stopped = []
 
