@@ -78,13 +78,14 @@ def fit(
     whose inputs and settings must be the same except for the budget.
 
     Raises:
-        TrainError: no views, or views of several subjects.
-        ConfigError: the checkpoint in OUT is of a finished fit, or of another one.
+        TrainError: all mattes are empty.
+        ConfigError: no views, or views of several subjects; the checkpoint in OUT is of a finished
+            fit, or of another one.
     """
     judge = PerceptualMetrics(loaded.config.metrics)  # first, because it may reject its files
+    state, checkpoint = start(loaded, views, list(given)), out / "checkpoint.pt"
     out.mkdir(parents=True, exist_ok=True)
     check_space(out)
-    state, checkpoint = start(loaded, views, list(given)), out / "checkpoint.pt"
     made_from = inputs(state)
     if continued:
         resume(state, checkpoint, made_from)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from express50.console import log
-from express50.errors import ConfigError, TrainError
+from express50.errors import ConfigError
 from grmm import losses
 from grmm.checkpoint import Checkpoint, Gallery, collect_gallery, load_checkpoint, save_checkpoint
 from grmm.config import Config
@@ -70,9 +70,9 @@ def start(loaded: Checkpoint, views: HeadViews, given: list[int]) -> FitState:
     """Start from the mean codes and a copy of the model; known expressions keep their codes."""
     subjects = sorted({views.keys[i].subject for i in given})
     if len(subjects) != 1:
-        raise TrainError(
+        raise ConfigError(
             f"got views of {len(subjects)} subjects ({', '.join(subjects) or 'none'}), "
-            "expected one; check --subject, --expression and --cameras"
+            "expected one; choose one with --subject"
         )
     views.check_mattes(given)
     model = loaded.model

@@ -247,6 +247,8 @@ def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
         (["train", "{shards}", "{out}", *TINY, "--holdout-cameras=x"], 2,
          "data.holdout_cameras names x; expected some of cam00, cam01, cam02"),
         (["fit", "{checkpoint}", "{shards}", "{out}", "--subject=S9"], 2, "no subject is"),
+        (["fit", "{checkpoint}", "{shards}", "{out}/fit", "--subject=*"], 2,
+         "got views of 3 subjects (S000, S001, S002), expected one; choose one with --subject"),
         (["fit", "{checkpoint}", "{shards}", "{out}", "--subject=S002", "--set=train.lr=1"], 2,
          "expected fit, metrics, loss"),
         (["fit", "{checkpoint}", "{shards}", "{out}", "--subject=S002", "--cameras=cam00,cam9"], 2,

@@ -326,7 +326,7 @@ def test_a_fit_to_all_views_leaves_no_picture_of_held_out_ones(loaded, views, tm
 
 
 def test_views_of_two_subjects_are_refused(loaded, views, tmp_path):
-    with pytest.raises(TrainError, match="2 subjects"):
+    with pytest.raises(ConfigError, match="2 subjects"):
         fit(loaded, views, [0, len(views.keys) - 1], [], tmp_path)
 
 
