@@ -160,6 +160,8 @@ def test_the_command_writes_the_page_and_counts(labelled, tmp_path, capsys):
     assert said["tiles"]["flagged"] == 1 and said["tiles"]["missing"] == 1
     page = Page(file.read_text())
     assert set(page.tiles["S002", "neutral"]) >= {"data-strip"}
+    numbers = re.search("#strip span {.*?}", file.read_text())[0]
+    assert "inset:100% 0 auto" in numbers and "background" not in numbers  # below the small faces
     assert main([*words[:4], "--camera", "top"]) == 2
     assert "top" in capsys.readouterr().err
     (tmp_path / "taken").write_text("x")
