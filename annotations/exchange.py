@@ -120,9 +120,12 @@ def read_table(path: Path) -> list[Label]:
             for row in table
         )
     try:
-        return [_label(row, f"{path}: row {number}") for number, row in enumerate(rows, 1)]
+        labels = [_label(row, f"{path}: row {number}") for number, row in enumerate(rows, 1)]
     except csv.Error as error:
         raise AnnotationError(f"{path}: not CSV ({error}); export it again") from None
+    if path.suffix == ".csv" and not labels and set(REQUIRED) - set(table.fieldnames or REQUIRED):
+        raise AnnotationError(f"{path}: not a table of labels, which have {', '.join(REQUIRED)}")
+    return labels
 
 
 def _check_format(path: Path) -> None:

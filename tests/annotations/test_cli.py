@@ -162,6 +162,11 @@ def test_export_replaces_no_events_that_are_not_stored(annotate, dataset, tmp_pa
         file.write_text(text)
         assert main(["annotate", "export", str(dataset.root), str(file)]) == 1
         assert error in capsys.readouterr().err and file.read_text() == text
+    form = tmp_path / "form.csv"
+    form.write_text("name,age\n")  # to be filled in
+    for action, error in (("export", "is not a table of labels"), ("import", "which have subject")):
+        assert main(["annotate", action, str(dataset.root), str(form)]) == 1
+        assert error in capsys.readouterr().err and form.read_text() == "name,age\n"
 
 
 @pytest.mark.parametrize("name", ["labels.csv", "labels.json"])
