@@ -23,12 +23,12 @@ from express50.geometry.sampling import evenly
 from express50.geometry.transforms import make_transform
 from express50.head.model import HeadModel, pose
 from grmm.config import DataConfig
-from grmm.head_crop import behind_torso, crop_view, head_window
+from grmm.head_crop import behind_torso, crop_view, head_window, sees_head
 from grmm.model import HeadState, PinholeView, Rendering
 
 NO_OFFSETS = np.zeros((0, 3), np.float32)
 CACHE_BYTES = 512 << 20  # of decoded samples: a few hundred of 512 px
-CHECKED_MATTES = 64  # mattes before training: decoding those of a large dataset takes minutes
+CHECKED_MATTES = 64  # before training, or one per camera: those of a dataset take minutes
 DEFAULTS = DataConfig()  # black behind the head
 Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
@@ -294,14 +294,24 @@ class HeadViews:
         return sample
 
     def check_mattes(self, indices: Sequence[int]) -> None:
-        """Look at some views' mattes, evenly spread, and log empty ones; TrainError if all are."""
-        looked = evenly(indices, CHECKED_MATTES)
-        empty = [self.keys[i].name for i in looked if not bool(self.item(i).mask.any())]
+        """Look at views, evenly spread and one per camera, and log which show no head.
+
+        Raises:
+            TrainError: none does.
+        """
+        cameras = {self.keys[i].camera: i for i in indices}
+        looked = sorted({*evenly(indices, CHECKED_MATTES), *cameras.values()})
+        items = ((i, self.item(i)) for i in looked)
+        empty = [
+            self.keys[i].name
+            for i, item in items
+            if not (item.mask.any() and sees_head(item.view, item.state.vertices))
+        ]
         if not empty:
             return
         words = (
-            f"the mattes of {len(empty)} of {len(looked)} views are empty ({few(empty)});"
-            " check them with 'express50 report' and pack again, or give other views"
+            f"{len(empty)} of {len(looked)} views show no head, by their mattes or cameras"
+            f" ({few(empty)}); check them with 'express50 report' and pack again, or give others"
         )
         if len(empty) == len(looked):
             raise TrainError(words)

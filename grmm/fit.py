@@ -78,7 +78,7 @@ def fit(
     whose inputs and settings must be the same except for the budget.
 
     Raises:
-        TrainError: all mattes are empty.
+        TrainError: no view shows the head.
         ConfigError: no views, or views of several subjects; the checkpoint in OUT is of a finished
             fit, or of another one.
     """

@@ -96,6 +96,13 @@ def head_window(
     return spans[0], spans[1]
 
 
+def sees_head(view: PinholeView, vertices: Tensor) -> bool:
+    """Return whether the projected mesh (V, 3) reaches into the picture."""
+    extents = _extents(vertices, vertices.new_zeros(len(vertices)), view, NEAR_VERTEX_M)
+    sizes = view.width, view.height
+    return all(low < size and high > 0 for (low, high), size in zip(extents, sizes, strict=True))
+
+
 def _extents(
     points: Tensor, radii: Tensor, view: PinholeView, near_m: float, margin_px: float = 0.0
 ) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -335,7 +335,7 @@ def test_views_with_empty_mattes_are_refused(loaded, views, tmp_path, monkeypatc
     monkeypatch.setattr(
         views.source, "read", lambda i: replace(read(i), alpha=np.zeros_like(read(i).alpha))
     )
-    with pytest.raises(TrainError, match="the mattes of 2 of 2 views are empty .S002/e0/cam00, "):
+    with pytest.raises(TrainError, match="2 of 2 views show no head, by .* .S002/e0/cam00, "):
         fit(loaded, views, unseen(views), [], tmp_path)
 
 

@@ -150,7 +150,7 @@ def test_empty_mattes_are_named_before_training(tmp_path, source, monkeypatch, c
         return replace(sample, alpha=sample.alpha * (index >= empty))
 
     monkeypatch.setattr(source, "read", read)
-    words = f"the mattes of {empty} of 12 views are empty (S000/e0/cam00"
+    words = f"{empty} of 12 views show no head, by their mattes or cameras (S000/e0/cam00"
     if empty == 12:
         with pytest.raises(TrainError, match=re.escape(words)):
             train(source, ellipsoid_head(), tmp_path, tiny_config())
@@ -158,6 +158,21 @@ def test_empty_mattes_are_named_before_training(tmp_path, source, monkeypatch, c
     else:
         train(source, ellipsoid_head(), tmp_path, tiny_config(train={"iterations": 1}))
         assert words in capsys.readouterr().err
+
+
+def test_a_camera_that_sees_no_head_is_named_before_training(tmp_path, monkeypatch, capsys):
+    class Averted(EllipsoidSource):
+        def read(self, index):
+            sample, turned = super().read(index), np.diag([-1.0, 1, -1, 1])
+            away = turned @ sample.place.cam_from_world
+            place = replace(sample.place, cam_from_world=away)
+            return replace(sample, place=place) if self.keys[index].camera == "cam01" else sample
+
+    monkeypatch.setattr("grmm.data.CHECKED_MATTES", 2)  # not those of cam01
+    config = tiny_config(train={"iterations": 1})
+    train(Averted(size=32), ellipsoid_head(), tmp_path, config)
+    words = "1 of 4 views show no head, by their mattes or cameras (S001/e1/cam01); check them"
+    assert words in capsys.readouterr().err
 
 
 def test_files_of_metrics_are_checked_before_training(tmp_path, source):
