@@ -185,7 +185,9 @@ class Desk(Screen[None]):
             self._write("#words", Text(f" {self.scene.description}", style=theme.TEXT))
 
     def _draw_message(self) -> None:
-        self._write("#message", self._said or words.hint_line(self.app.size.width))
+        scene = self.scene
+        matches = scene is not None and scene.reference is not None and not scene.is_reference
+        self._write("#message", self._said or words.hint_line(self.app.size.width, matches))
 
     def _write(self, where: str, text: Text) -> None:
         line = self.query_one(where, Static)

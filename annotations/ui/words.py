@@ -24,6 +24,7 @@ from annotations.ui.theme import GROUPS, HINTS
 from annotations.validate import describe, in_spite_of
 
 LEAST_CELLS = 6  # fewer say nothing
+WIDE = 80  # columns
 
 
 def fit(left: Text, right: Text, width: int) -> Text:
@@ -39,7 +40,7 @@ def fit(left: Text, right: Text, width: int) -> Text:
 
 
 def status_line(session: Session, scene: TaskScene, width: int) -> Text:
-    """Show expression and subject; progress, doubt and the label's cost so far."""
+    """Show expression and subject; progress and the label's cost so far."""
     left = Text.assemble(
         (f" {scene.name} ", f"bold {theme.GROUND} on {theme.ACCENT}"),
         (f"  {scene.task.subject}", f"bold {theme.TEXT}"),
@@ -51,13 +52,7 @@ def status_line(session: Session, scene: TaskScene, width: int) -> Text:
     spent = session.effort()
     right = Text(style=theme.FAINT)
     right.append(f"{session.done}/{len(session.tasks)}", f"bold {theme.TEXT}")
-    right.append(" done")
-    if not session.hidden(scene.task):
-        right.append("  doubt ")
-        doubt = scene.task.doubt
-        colour = theme.RED if doubt >= 0.5 else theme.ACCENT if doubt >= 0.2 else theme.GREEN
-        right.append(f"{doubt:.2f}", colour)
-    right.append(f"  {spent.seconds:.0f} s  {spent.keys} key{'' if spent.keys == 1 else 's'} ")
+    right.append(f" done  {spent.seconds:.0f} s  {spent.keys} key{'' if spent.keys == 1 else 's'} ")
     return fit(left, right, width)
 
 
@@ -66,9 +61,12 @@ def frame_title(scene: TaskScene, view: CueView | None, look: FrameLook | None, 
     if look is None or view is None:
         return Text(f" {scene.task.subject}", style=theme.FAINT)
     tags = Text()
-    if view.cursor in view.candidates:
-        rank = view.candidates.index(view.cursor) + 1
-        tags.append("  suggested" if rank == 1 else f"  suggestion {rank}", theme.GREEN)
+    if scene.suggestion is not None and view.cursor == scene.suggestion.frame in view.candidates:
+        sure = scene.suggestion.confidence
+        colour = theme.GREEN if sure > 0.8 else theme.ACCENT if sure > 0.5 else theme.RED
+        tags.append(f"  suggested, {sure:.0%} sure", colour)
+    elif view.cursor in view.candidates:
+        tags.append(f"  suggestion {view.candidates.index(view.cursor) + 1}", theme.GREEN)
     if scene.mine is not None and scene.mine.action == "flag":
         tags.append(f"  ⚑ {scene.mine.reason}", theme.RED)
     elif scene.mine is not None and scene.mine.frame == view.cursor:
@@ -105,11 +103,17 @@ def reference_title(scene: TaskScene, look: FrameLook | None, width: int) -> Tex
 
 
 @lru_cache(maxsize=8)
-def hint_line(width: int) -> Text:
-    """List as many keys as fit, the most used first; help and quit, the last, always do."""
+def hint_line(width: int, matches: bool) -> Text:
+    """List as many keys as fit, the most used first; help and quit, the last, always do.
+
+    In wide terminals the first says what to look for: a frame that matches the reference's.
+    """
+    goal = "match the reference" if matches else "find the clearest"
     text = Text(" ")
     room = width - cell_len("? help  q quit")
     for keys, words in HINTS:
+        if width >= WIDE and keys == HINTS[0][0]:
+            words = goal
         piece = cell_len(keys) + cell_len(words) + 3
         if keys in ("?", "q") or text.cell_len + piece <= room:
             text.append(keys, f"bold {theme.ACCENT}")

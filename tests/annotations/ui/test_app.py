@@ -244,12 +244,24 @@ def test_blind_hides_suggestions_curves_and_marks_until_the_decision(suggested, 
 
 
 def test_narrow_lines_keep_the_essential_parts():
-    line = fit(Text(" Jaw open  S001"), Text("2/24 done  doubt 0.04  25 s  0 keys "), 40)
+    line = fit(Text(" Jaw open  S001"), Text("2/24 done  25 s  0 keys and more"), 40)
     assert line.plain.startswith(" Jaw open  S001") and line.cell_len == 40
     assert fit(Text("x" * 50), Text("cam05"), 40).plain == "x" * 39 + "…"
     for width in (40, 60, 80, 200):
-        assert hint_line(width).plain.rstrip().endswith("? help  q quit")
-    assert "Enter mark" in hint_line(40).plain
+        assert hint_line(width, True).plain.rstrip().endswith("? help  q quit")
+    assert hint_line(40, True).plain.startswith(" ←→ frame  Enter mark")
+
+
+@pytest.mark.parametrize(
+    ("subject", "hint"), [("S001", "find the clearest"), ("S002", "match the reference")]
+)
+def test_the_screen_says_what_to_look_for_and_how_sure_a_suggestion_is(
+    suggested, make_app, subject, hint
+):
+    app = make_app(suggested, subjects=[subject])
+    said, title = drive(app, check=lambda app: (line(app, "message"), line(app, "frame-title")))
+    assert f"←→ {hint}  Enter mark" in said
+    assert "suggested, 90% sure" in title
 
 
 def test_help_scrolls_in_a_low_terminal(suggested, make_app):
