@@ -140,6 +140,12 @@ def undone(label: Label) -> str:
 SCROLLING = ("up", "down", "pageup", "pagedown", "home", "end")
 
 
+def take_early(line: Input, event: events.Key) -> None:
+    """Write what was typed before the line had the focus: later, the line keeps it to itself."""
+    if line.display and event.character is not None and event.is_printable:
+        line.insert_text_at_cursor(event.character)
+
+
 class FlagDialog(ModalScreen[str | None]):
     """Asks for the reason of a flag: a digit decides at once, ``5`` opens a line of text."""
 
@@ -159,10 +165,9 @@ class FlagDialog(ModalScreen[str | None]):
             yield line
 
     def on_key(self, event: events.Key) -> None:
-        """Choose by digit; text that came before the line had the focus goes there."""
+        """Choose by digit."""
         line = self.query_one(Input)
-        if line.display and event.character is not None and event.is_printable:
-            line.insert_text_at_cursor(event.character)
+        take_early(line, event)
         number = int(event.key) if event.key.isdigit() and not line.display else 0
         if 1 <= number <= len(FLAG_REASONS):
             self.dismiss(FLAG_REASONS[number - 1])
@@ -191,6 +196,10 @@ class FrameDialog(ModalScreen[int | None]):
             box.border_title = f"go to frame ({self._first} to {self._last})"
             box.border_subtitle = "Esc: stay"
             yield Input(type="integer", max_length=9)
+
+    def on_key(self, event: events.Key) -> None:
+        """Take the first digits."""
+        take_early(self.query_one(Input), event)
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
         """Go to the number; without one stay, and outside the window ask again."""

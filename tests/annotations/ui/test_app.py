@@ -171,6 +171,21 @@ def test_a_frame_typed_before_its_dialog_is_drawn_is_opened(suggested, make_app)
     assert app.session.effort().keys == 3
 
 
+def test_a_digit_that_reaches_the_dialog_before_its_line_does_is_kept(suggested, make_app):
+    app = make_app(suggested)
+
+    async def act(pilot):
+        await pilot.press("g")
+        early = events.Key("1", "1")
+        early._set_forwarded()  # as a busy app does that has no focus yet
+        app.screen.post_message(early)
+        await pilot.pause()
+        await pilot.press("2", "enter")
+        return app.desk.view.cursor
+
+    assert piloted(app, act) == 12
+
+
 def test_a_mark_against_a_settlement_says_that_it_does_not_count(suggested, make_app):
     mark = make_mark(read_index(suggested, "S001"), "neutral", 6, "cam01", "eve")
     append_label(suggested, replace(mark, action="settle"))
