@@ -179,7 +179,8 @@ class Desk(Screen[None]):
         return [self.query_one(name, PicturePane).shape for name in shown]
 
     def _draw_status(self) -> None:
-        if self.scene is not None:
+        # Below a dialog every change draws the whole screen again, for a large part of a second.
+        if self.scene is not None and self.is_active:
             width = self.app.size.width
             self._write("#status", words.status_line(self.session, self.scene, width))
             self._write("#words", Text(f" {self.scene.description}", style=theme.TEXT))

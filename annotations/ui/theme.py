@@ -68,7 +68,7 @@ Screen {{ background: {GROUND}; color: {TEXT}; layout: vertical; }}
 #middle, #right {{ margin-left: 1; }}
 #frame, #second, #reference {{ width: 100%; height: 1fr; }}
 #strip {{ width: 100%; height: 5; }}
-ModalScreen {{ align: center middle; background: {GROUND} 60%; }}
+ModalScreen {{ align: center middle; background: {GROUND} 0%; }}
 .dialog {{
     width: auto; min-width: 40; max-width: 100%; height: auto; max-height: 100%; padding: 0 2;
     background: {PANEL}; border: round {ACCENT}; overflow-y: auto;

@@ -186,6 +186,24 @@ def test_a_digit_that_reaches_the_dialog_before_its_line_does_is_kept(suggested,
     assert piloted(app, act) == 12
 
 
+def test_the_clock_rests_below_a_dialog_which_dims_nothing(suggested, make_app):
+    """Each change below a dialog, and tinting, draws the whole screen again."""
+    app = make_app(suggested)
+
+    async def act(pilot):
+        await pilot.press("f")
+        before = line(app, "status")
+        app.session._clock = lambda: app.session._last_key + 30
+        app.desk._draw_status()
+        below = line(app, "status")
+        ground = app.screen.styles.background.a
+        await pilot.press("escape")
+        app.desk._draw_status()
+        return before == below != line(app, "status"), ground
+
+    assert piloted(app, act) == (True, 0)
+
+
 def test_a_mark_against_a_settlement_says_that_it_does_not_count(suggested, make_app):
     mark = make_mark(read_index(suggested, "S001"), "neutral", 6, "cam01", "eve")
     append_label(suggested, replace(mark, action="settle"))
