@@ -330,7 +330,8 @@ def _scores(state: FitState, held_out: Sequence[int]) -> Scores:
         for name, indices in chosen.items()
     }
     shown = [f"{figure_label(k)}: {v}" for k, v in scores.items() if v is not None]
-    log(f"fit: {'; '.join(shown)}")
+    when = ("mean code", "after stage 1", "after stage 2")[len(state.done.scores)]
+    log(f"fit, {when}: {'; '.join(shown)}")
     return scores
 
 

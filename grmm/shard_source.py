@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,6 +20,7 @@ from express50.shards.reader import ShardReader
 from grmm.data import Place, Sample, SampleKey, Tracked
 
 FOCALS = 0.05, 1e4  # least and largest focal length, sides of the picture: 168 to 0.006 degrees
+log_once = functools.cache(log)  # a command may open shards often
 INSET_PX = 2  # of the footage's border, which undistortion cannot fill
 SIZES: dict[str, tuple[int, ...] | None] = {  # of what is tracked; None: any vector
     "shape": None, "expression": None, "neck": (3,), "jaw": (3,), "eyes": (6,), "R": (3, 3),
@@ -47,7 +49,7 @@ class ShardSource:
             raise FormatError(f"{where}: meta names no head model; rerun 'express50 pack'")
         self.head = head
         if first.get("torso") != "removed" and not first.get("parts"):
-            log(
+            log_once(
                 f"{root}: has no part labels, so shoulders count as head; to leave them out, run"
                 " 'express50 regions' and pack the dataset again"
             )

@@ -304,7 +304,8 @@ COMMANDS = {
             "out": {
                 "metavar": "FILE",
                 "help": "file to write: .html plays in a browser; .ply, .spz, and .glb with "
-                "--format splats hold splats; .glb a textured mesh; .npz all arrays and codes",
+                "--format splats hold splats; .glb a textured mesh, with --format arkit one with "
+                "ARKit's blend shapes; .npz all arrays and codes",
             },
             "--drive": {"help": "with .html: tracked clips for it to play"},
         },
@@ -333,6 +334,7 @@ COMMANDS = {
         options=f"renders shards out {CHOICE} --background --partial {METRICS} --json",
         help="measure another method's pictures on shards",
         example="grmm score headnerf/ shards out --cameras cam06",
+        changes={"--images": {"help": "measure at most this many images, evenly spread"}},
     ),
     "ablate": GrmmCommand(
         handler=commands.ablate,

@@ -520,6 +520,9 @@ def _frame_head(loaded: Checkpoint, text: str, expression: str | None = None) ->
     from grmm.edit import trained_head
 
     subject, _, named = text.partition("/")
+    model = loaded.model
+    if text in model.expressions and text not in model.subjects:
+        raise ConfigError(f"{text!r}: expected SUBJECT/EXPRESSION: {model.subjects[0]}/{text}")
     return trained_head(loaded, *_frame(loaded, subject, named or expression))
 
 

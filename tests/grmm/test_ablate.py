@@ -271,6 +271,7 @@ def test_seeds_give_intervals_and_test_shards_give_people_alone(tmp_path, capsys
     gains = [own - full for own, full in runs]
     assert gains[0] != gains[1] and row["seeds"] == 2
     said = capsys.readouterr()
+    assert said.err.count("has no part labels") == 2, "once per folder of shards"
     assert "ablate: 4 trainings and 8 fits of 9.0 s (1:12 min), except for" in said.err
     assert row["difference_db"]["unseen"] == pytest.approx(np.mean(gains), abs=1e-3)
     # Student's 97.5 % point of one degree of freedom is 12.706; half of two values' spread

@@ -274,6 +274,8 @@ def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
         (["render", "{checkpoint}", "{out}", "--samples=3000"], 2,
          "3000 x 2 pictures of 32 x 32 px is larger than 65000 px; lower --size, --samples"),
         (["render", "{checkpoint}", "{out}", "--to=S000/e9"], 2, "e9"),
+        (["render", "{checkpoint}", "{out}", "--expression-of=e1"], 2,
+         "'e1': expected SUBJECT/EXPRESSION: S000/e1"),
         (["render", "{checkpoint}", "{out}", "--control=z_id.0=1e30"], 2,
          "control z_id.0: got 1e+30, expected -1000 to 1000"),
         (["export", "{checkpoint}", "{out}/head.obj"], 2, "expected one of .html, .ply, .spz"),

@@ -1,6 +1,7 @@
 import json
 import math
 import os
+import re
 import signal
 from dataclasses import replace
 
@@ -108,11 +109,17 @@ def test_reconstruction_has_the_perceptual_term_where_weights_are_given(loaded, 
     torch.testing.assert_close(reconstruction(state, (0.5 * target, target)), expected)
 
 
-def test_fit_improves_on_the_mean_code_and_reports_both_views(loaded, views, tmp_path):
+def test_fit_improves_on_the_mean_code_and_reports_both_views(loaded, views, tmp_path, capsys):
     settings = replace(loaded.config.fit, stage1_iterations=10, stage2_iterations=25)
     loaded = replace(loaded, config=replace(loaded.config, fit=settings))
     given = unseen(views, "cam00") + unseen(views, "cam01")
     metrics = fit(loaded, views, given, unseen(views, "cam02"), tmp_path)
+    said = capsys.readouterr().err
+    assert re.findall("fit, (.*): PSNR given", said) == [
+        "mean code",
+        "after stage 1",
+        "after stage 2",
+    ]
     stages = metrics["stages"]
     assert stages["stage2"]["psnr_given_db"] > stages["mean_code"]["psnr_given_db"] + 1
     assert metrics["psnr_db"] == stages["stage2"]["psnr_held_out_db"]
