@@ -16,7 +16,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from express50.contract.segmentation_labels import LABELS, label_mask
-from express50.files.images import LIGHT_OF_LEVEL
+from express50.files.images import LIGHT_OF_LEVEL, disc, edge_distance
 from express50.geometry.sampling import robust_moments
 from pipelines.regions.geometry import HAIR, SCALP, TORSO, HeadGeometry
 
@@ -39,6 +39,8 @@ UNSEEN_CLASS_SHARE = 1.2e-4  # of every cell of a class without samples: spread 
 
 # Places, metres above the neck's end, where geometry is sure of a class.
 SURE_BELOW, SURE_ABOVE = -0.01, 0.10
+# Lower hair hangs from the head in strands as wide as this; wisps reach this far from them.
+STRAND_M, WISP_M = 0.005, 0.02
 
 # Log-priors by place, nats: UNLIKELY marks what occurs at edges, IMPOSSIBLE what cannot be.
 UNLIKELY, IMPOSSIBLE = -1.0, -20.0
@@ -116,11 +118,13 @@ def label_by_colour(
     geometry: HeadGeometry,
     bare: bool,
     skin_colours: np.ndarray | None,
+    metre_px: float,
 ) -> np.ndarray:
     """Label pixels (H, W) uint8 by geometry, and hair, skin, ears, neck and torso by colour too.
 
     The frame (H, W, 3) is uint8 sRGB, alpha (H, W) in [0, 1]; `bare` says that the scalp is skin;
-    `skin_colours` is the sum of the counts of `face_colours` of other views.
+    `skin_colours` is the sum of the counts of `face_colours` of other views; `metre_px` is the
+    number of pixels that a metre spans at the head.
     """
     labels, cells = geometry.labels(), _cells(rgb)
     solid = alpha > SOLID
@@ -147,12 +151,29 @@ def label_by_colour(
         if taught.sum() >= LEAST:
             shares = gaussian_filter(taught, SMOOTH) / taught.sum()
             row[:] = np.log(np.maximum(shares, 0) + RARE)[cells]
-    best = (likely + _priors(labels, geometry, beyond)).argmax(0)
+    scores = likely + _priors(labels, geometry, beyond)
+    best = scores.argmax(0)
+    loose = _loose((best == 0) & (alpha > 0), geometry.height > SURE_ABOVE, metre_px)
+    best = np.where(loose, 1 + scores[1:].argmax(0), best)
     around = (geometry.mesh > 0) | geometry.rim | bare
     kept = np.isin(geometry.near, (SKIN, NECK, EARS)) & around
     skin_label = np.where(kept, geometry.near, SKIN)
     unsure = (geometry.mesh == 0) | np.isin(geometry.mesh, list(_ON_MESH))
     return np.where(unsure, np.choose(best, [HAIR, skin_label, TORSO]), labels).astype(np.uint8)
+
+
+def _loose(hair: np.ndarray, above: np.ndarray, metre_px: float) -> np.ndarray:
+    """Find hair (H, W) that does not hang from the hair above (H, W) bool.
+
+    Collars and the edges of shoulders often have the colours of hair.
+    """
+    narrow = disc(max(1, int(STRAND_M * metre_px) // 2))
+    thick = cv2.morphologyEx(hair.astype(np.uint8), cv2.MORPH_OPEN, narrow)
+    _, part = cv2.connectedComponents(thick, connectivity=8)
+    hanging = (thick > 0) & np.isin(part, part[above & (thick > 0)])
+    if not hanging.any():  # a picture of the neck alone does not show where its hair comes from
+        return hanging
+    return hair & ~above & (edge_distance(~hanging) > WISP_M * metre_px)
 
 
 Cells = tuple[np.ndarray, ...]

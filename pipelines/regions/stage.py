@@ -215,7 +215,8 @@ def label_view(
     rgb, alpha = rgb[window], alpha[window]
     depth = None if depth is None else depth[window]
     geometry = head_geometry(head, camera, alpha, depth)
-    labels = label_by_colour(rgb, alpha, geometry, bare, skin_colours)
+    metre_px = camera.K[0, 0] / np.linalg.norm(head.center - camera.center)
+    labels = label_by_colour(rgb, alpha, geometry, bare, skin_colours, metre_px)
     labels = np.where(labels == SCALP, SKIN if bare else HAIR, labels)
     if glasses is not None and len(glasses):
         # Hair covers the temples of glasses, so nothing on scalp and ears is labelled.
@@ -223,8 +224,7 @@ def label_view(
         worn = shown_in_front(glasses, camera, geometry.depth) & ~bearing
         labels = np.where(worn, np.uint8(LABELS.index("apparel")), labels)
     if depth is not None:
-        distance = np.linalg.norm(head.center - camera.center)
-        hand = find_hands(geometry, labels, camera.K[0, 0] / distance)
+        hand = find_hands(geometry, labels, metre_px)
         labels = np.where(hand, np.uint8(LABELS.index("hand")), labels)
     whole.labels[window] = np.where(alpha > 0, labels, np.uint8(0))
     whole.mesh[window] = geometry.mesh > 0

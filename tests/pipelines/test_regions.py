@@ -95,6 +95,21 @@ def test_colours_separate_collar_and_locks_from_neck_and_shoulders(azimuth: int)
     assert sad[0] < 0.25 * sad[1]
 
 
+def test_a_piece_of_shirt_in_the_colour_of_hair_is_torso_and_a_hanging_lock_is_hair() -> None:
+    scene = make_scene(0)
+    shirt = label_mask(scene.labels, "torso")
+    piece = shirt & (np.arange(160) < 60) & (np.arange(160)[:, None] < 140)
+    assert piece.sum() > 100
+    noise = np.random.default_rng(2).normal(0, 4, scene.rgb.shape)
+    dark = np.clip(np.array(COLOURS["hair"]) + noise, 0, 255)
+    labels = labels_of(
+        replace(scene, rgb=np.where(piece[..., None], dark, scene.rgb).astype(np.uint8))
+    )
+    assert label_mask(labels, "torso")[piece].mean() > 0.95
+    lock = label_mask(scene.labels, "hair") & (np.arange(160)[:, None] > 110)
+    assert label_mask(labels_of(scene), "hair")[lock].mean() > 0.7
+
+
 def test_without_colours_the_necks_end_still_takes_most_of_the_torso_away() -> None:
     scene = make_scene(0)
     true_head = label_mask(scene.labels, *HEAD)
