@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import signal
 from collections.abc import Callable, Sequence
 from copy import copy
@@ -43,6 +44,7 @@ from express50.errors import Express50Error
 
 TASKS_AHEAD, FRAMES_AHEAD = 2, 12  # pictures that are made before their task is opened
 SAY_SECONDS = 5.0
+GARBAGE = 50_000  # new objects that start a pass of the garbage collection; Python's own: 700
 BLINK_SECONDS = 0.45
 SLOWEST, FASTEST = 2.0, 30.0  # frames per second that are played
 # Rows of the strip by the terminal's height: pictures come first.
@@ -465,6 +467,8 @@ class AnnotateApp(App[None]):
         """Show the desk; when the connection closes, end as by ``q``."""
         if signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # nohup ignores it
             asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self.exit)
+        # A full pass takes up to a second, since pictures are many objects; they make no cycles.
+        gc.set_threshold(GARBAGE)
         self.push_screen(self.desk)
 
     def on_unmount(self) -> None:

@@ -161,11 +161,12 @@ def _to_step(colours: np.ndarray) -> np.ndarray:
 @lru_cache(maxsize=1 << 16)
 def _style(pair: int) -> Style:
     """Return the style of a foreground and a background, 24 bits each."""
-    front, back = (
-        Color.from_triplet(ColorTriplet(value >> 16 & 255, value >> 8 & 255, value & 255))
-        for value in (pair >> 24, pair)
-    )
-    return Style.from_color(front, back)
+    return Style.from_color(_colour(pair >> 24), _colour(pair & 0xFFFFFF))
+
+
+@lru_cache(maxsize=1 << 15)  # all there are
+def _colour(value: int) -> Color:
+    return Color.from_triplet(ColorTriplet(value >> 16, value >> 8 & 255, value & 255))
 
 
 def encode_sixel(picture: np.ndarray) -> str:

@@ -2,6 +2,7 @@
 
 import asyncio
 import fcntl
+import gc
 import json
 import os
 import re
@@ -202,6 +203,11 @@ def test_the_clock_rests_below_a_dialog_which_dims_nothing(suggested, make_app):
         return before == below != line(app, "status"), ground
 
     assert piloted(app, act) == (True, 0)
+
+
+def test_no_picture_waits_for_the_garbage_collection(suggested, make_app):
+    gc.set_threshold(700, 10, 10)
+    assert drive(make_app(suggested), check=lambda app: gc.get_threshold()[0]) >= 50_000
 
 
 def test_a_mark_against_a_settlement_says_that_it_does_not_count(suggested, make_app):
