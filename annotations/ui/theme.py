@@ -136,7 +136,7 @@ LOOK = (
     KeyAction("space", "Space", "play", "play the window, or stop"),
     KeyAction("question_mark,f1", "?", "help", "this help"),
     KeyAction("ctrl+z", "Ctrl-Z", "app.suspend_process", "suspend; fg resumes"),
-    KeyAction("q", "q", "app.quit", "quit; every mark is already saved"),
+    KeyAction("q,ctrl+c", "q Ctrl-C", "app.quit", "quit; every mark is already saved"),
 )
 GROUPS = (MOVE, DECIDE, LOOK)
 HINTS = (

@@ -205,6 +205,19 @@ def test_the_clock_rests_below_a_dialog_which_dims_nothing(suggested, make_app):
     assert piloted(app, act) == (True, 0)
 
 
+@pytest.mark.parametrize("key", ["q", "ctrl+c", "ctrl+q"])
+def test_q_and_what_ends_other_programs_quit(suggested, make_app, monkeypatch, key):
+    quits = []
+
+    async def leave(app):
+        quits.append(app)
+
+    monkeypatch.setattr(app_module.AnnotateApp, "action_quit", leave)
+    app = make_app(suggested)
+    drive(app, key)
+    assert quits == [app]
+
+
 def test_no_picture_waits_for_the_garbage_collection(suggested, make_app):
     gc.set_threshold(700, 10, 10)
     assert drive(make_app(suggested), check=lambda app: gc.get_threshold()[0]) >= 50_000
