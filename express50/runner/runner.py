@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from express50.console import count as count_of
-from express50.console import format_seconds
+from express50.console import format_seconds, group_lines
 from express50.console import log as write
 from express50.contract.config import config_toml
 from express50.contract.layout import Dataset
@@ -118,9 +118,10 @@ class Summary:
                 yield f"  failed {outcome.item}: {outcome.reason}"
             for what, why in _joined(outcome.dropped):
                 yield f"  dropped {what} of {outcome.item}: {why}"
-        doubtful = [(o.item, *note) for o in self.outcomes for note in _joined(o.warnings)]
-        for item, what, why in doubtful[:WARNINGS]:
-            yield f"  warning {item}: {what}: {why}"
+        doubts = ((o.item, *note) for o in self.outcomes for note in _joined(o.warnings))
+        doubtful = [*group_lines((f"warning {item}", f"{on}: {why}") for item, on, why in doubts)]
+        for line in doubtful[:WARNINGS]:
+            yield f"  {line}"
         if len(doubtful) > WARNINGS:
             yield f"  and {len(doubtful) - WARNINGS} more warnings: see the items' metrics.json"
 

@@ -26,7 +26,7 @@ from express50.runner import publish
 from express50.runner.clusters import RemoteWorkers
 from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger
-from express50.runner.runner import run_stage, select_items
+from express50.runner.runner import Outcome, Summary, run_stage, select_items
 from express50.runner.worker import Task, keep_freed_memory, peak_memory, reset_peak_memory
 from tests.faults import toy
 from tests.faults.toy import make_dataset, run_toy, tree
@@ -57,6 +57,15 @@ def test_one_bad_item_never_stops_the_others(tmp_path):
     lines = "\n".join(summary.lines())
     assert all(name in lines for name in (*failed, "cam03"))
     assert all(not (dataset.item_dir("toy", name)).exists() for name in failed)
+
+
+def test_a_warning_of_many_items_is_one_line():
+    wide = Note("cam05", "the subject leaves the image at the right (22%)")
+    items = [f"S001/e{number}" for number in range(5)]
+    outcomes = [Outcome(item, "done", warnings=(wide, Note("cam06", item))) for item in items]
+    found = [line for line in Summary("matte", tuple(outcomes), 1.0).lines() if "warning" in line]
+    assert found[0] == f"  warning S001/e0, S001/e1, S001/e2 and 2 more: cam05: {wide.why}"
+    assert len(found) == 1 + len(items)
 
 
 def test_unexpected_error_leaves_its_traceback_in_a_log_that_success_removes(tmp_path):
