@@ -59,6 +59,7 @@ LEAST_SCALP = 0.1  # pixels of scalp per pixel of the face: temples alone are of
 # Most by which a bare scalp differs from the face's middle, in brightness and ratios of colours.
 # Spreads of the face's own do not help: they are wide in hard light, where hair then passes for it.
 UNLIKE = WITHIN * LEAST_SPREAD
+COHERENT = 0.75  # share of a face near its middle colour below which a fringe may cover it
 BARE = 0.7  # share of the scalp in the face's colours, over the same of the face, of bare scalps
 
 
@@ -67,7 +68,8 @@ def face_colours(rgb: np.ndarray, alpha: np.ndarray, mesh: np.ndarray) -> np.nda
 
     The frame (H, W, 3) is uint8 sRGB, alpha (H, W) in [0, 1], `mesh` (H, W) the mesh's labels.
     """
-    skin = bare_skin(rgb, (mesh == SKIN) & (alpha > SOLID))
+    skin, neck = ((mesh == label) & (alpha > SOLID) for label in (SKIN, NECK))
+    skin = bare_skin(rgb, skin, neck)
     return _counts(_cells(rgb), skin) if _sees_face(mesh) and skin.sum() >= LEAST else None
 
 
@@ -91,20 +93,29 @@ def like_skin(values: np.ndarray, face: np.ndarray) -> np.ndarray:
     return (np.abs(_ratios(values) - usual) < WITHIN * np.maximum(spread, LEAST_SPREAD)).all(1)
 
 
-def bare_skin(rgb: np.ndarray, skin: np.ndarray) -> np.ndarray:
+def bare_skin(rgb: np.ndarray, skin: np.ndarray, neck: np.ndarray) -> np.ndarray:
     """Leave a beard or a fringe, whose colours are unlike most of it, out of the skin (H, W).
 
-    Brows, nostrils and shadows stay: they are a smaller share than COVERED.
+    The neck (H, W) shows the colours of skin where a fringe covers most of the face. Brows,
+    nostrils and shadows stay: they are a smaller share than COVERED.
     """
     if not skin.any():
         return skin
-    logs = colour_logs(rgb[skin])
-    alike = like_skin(logs, logs)
+    alike = like_skin(colour_logs(rgb[skin]), colour_logs(rgb[_uncovered(rgb, skin, neck)]))
     if alike.mean() > 1 - COVERED:
         return skin
     kept = skin.copy()
     kept[skin] = alike
     return kept
+
+
+def _uncovered(rgb: np.ndarray, face: np.ndarray, neck: np.ndarray) -> np.ndarray:
+    """Return the pixels of the face (H, W), or those of the neck if a fringe covers the face."""
+    if neck.sum() < LEAST:
+        return face
+    (of_face, usual), (of_neck, _) = (_middle(_some_ratios(rgb[mask])) for mask in (face, neck))
+    # Skin is redder than most hair, and than the collars that hide necks.
+    return neck if usual < COHERENT and of_neck[1] > of_face[1] + UNLIKE[1] else face
 
 
 def _sees_face(mesh: np.ndarray) -> bool:
@@ -133,7 +144,7 @@ def label_by_colour(
     if skin.sum() < LEAST:  # the neck, which hair may cover, teaches only where no face does
         skin = skin | (solid & (labels == NECK) & (geometry.height > SURE_ABOVE))
     if _sees_face(geometry.mesh):  # from behind, most of it may be hair
-        skin = bare_skin(rgb, skin)
+        skin = bare_skin(rgb, skin, solid & (labels == NECK))
     torso = solid & (labels == TORSO) & (geometry.height < SURE_BELOW)
     beyond = IMPOSSIBLE
     if bare:
@@ -223,6 +234,18 @@ class Scalp:
     skin_coloured: float | None
 
 
+def _some_ratios(pixels: np.ndarray) -> np.ndarray:
+    """Return `_ratios` of COMPARED_PIXELS of the pixels (N, 3) uint8, or of all."""
+    chosen = np.linspace(0, len(pixels) - 1, COMPARED_PIXELS).astype(int)
+    return _ratios(colour_logs(pixels[np.unique(chosen)]))
+
+
+def _middle(ratios: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the median (3,) of `_ratios` (N, 3), and the share of them near it."""
+    middle = np.median(ratios, axis=0)
+    return middle, float((np.abs(ratios - middle) < UNLIKE).all(1).mean())
+
+
 def scalp_votes(rgb: np.ndarray, labels: np.ndarray, alpha: np.ndarray) -> tuple[int, int]:
     """Count the pixels of a scalp that have the face's colours if it is bare, and those that do.
 
@@ -230,17 +253,14 @@ def scalp_votes(rgb: np.ndarray, labels: np.ndarray, alpha: np.ndarray) -> tuple
     face or with little of the scalp count none. The frame (H, W, 3) is uint8 sRGB; `labels` (H, W)
     are the mesh's, SCALP among them; alpha (H, W) is in [0, 1].
     """
-    skin, scalp = ((labels == label) & (alpha > SOLID) for label in (SKIN, SCALP))
+    solid = alpha > SOLID
+    skin, neck, scalp = ((labels == label) & solid for label in (SKIN, NECK, SCALP))
     least = max(LEAST, LEAST_SCALP * skin.sum())
     if not _sees_face(labels) or skin.sum() < LEAST or scalp.sum() < least:
         return 0, 0
-    ratios = []
-    for pixels in (rgb[skin], rgb[scalp]):
-        chosen = np.linspace(0, len(pixels) - 1, COMPARED_PIXELS).astype(int)
-        ratios.append(_ratios(colour_logs(pixels[np.unique(chosen)])))
-    of_face, of_scalp = ratios
-    middle = np.median(of_face, axis=0)
-    usual, found = ((np.abs(v - middle) < UNLIKE).all(1).mean() for v in (of_face, of_scalp))
+    of_scalp = _some_ratios(rgb[scalp])
+    middle, usual = _middle(_some_ratios(rgb[_uncovered(rgb, skin, neck)]))
+    found = (np.abs(of_scalp - middle) < UNLIKE).all(1).mean()
     return round(len(of_scalp) * usual), round(len(of_scalp) * found)
 
 

@@ -170,6 +170,20 @@ def test_a_bald_scalp_is_recognised_by_its_colours() -> None:
     assert judge_scalp([]).skin_coloured is None and not judge_scalp([]).is_skin
 
 
+def test_a_fringe_over_most_of_the_face_is_not_taken_for_its_skin() -> None:
+    scene = make_scene(0)
+    mesh = render_head(scene.head, scene.camera)[0]
+    face = label_mask(mesh, "skin") & (scene.alpha > 0)
+    fringe = face & (np.cumsum(face).reshape(face.shape) < 0.7 * face.sum())
+    hair = fringe | (mesh == SCALP)
+    grey = 45 + np.random.default_rng(3).normal(0, 4, scene.rgb.shape)
+    rgb = np.where(hair[..., None], grey, scene.rgb).astype(np.uint8)
+    scalp = judge_scalp([scalp_votes(rgb, mesh, scene.alpha)])
+    assert not scalp.is_skin and scalp.skin_coloured is not None and scalp.skin_coloured < 0.1
+    kept = bare_skin(rgb, face, label_mask(mesh, "neck"))
+    assert not kept[fringe].any() and kept[face & ~fringe].mean() > 0.95
+
+
 def test_from_behind_the_skin_is_that_of_the_face() -> None:
     front, back = make_scene(0), make_scene(180)
     colours = face_colours(front.rgb, front.alpha, render_head(front.head, front.camera)[0])
@@ -342,7 +356,8 @@ def test_a_fringe_is_left_out_of_skin_colours_and_brows_are_not(rows: int, left_
     rgb[:rows] = (60, 40, 30)
     skin = np.ones((40, 40), bool)
     skin[:, 0] = False
-    kept = bare_skin(rgb, skin)
+    none = np.zeros_like(skin)
+    kept = bare_skin(rgb, skin, none)
     assert kept[rows:].sum() > 0.99 * skin[rows:].sum() and not kept[:, 0].any()
     assert kept[:rows].any() == (rows > 0 and not left_out)
-    assert not bare_skin(rgb, ~np.ones_like(skin)).any()
+    assert not bare_skin(rgb, none, none).any()
