@@ -161,8 +161,8 @@ def ablate(run: Ablation, names: Sequence[str] = ()) -> dict[str, Any]:
     for seed in range(run.seeds):
         for name, variant in every.items():
             row = _row(run, name, variant, seed, wanted=name in variants)
-            if row is not None and len(rows.setdefault(name, [])) == seed:  # pairs are by seed
-                rows[name].append(row)
+            if row is not None and len(rows.get(name, ())) == seed:  # pairs are by seed
+                rows.setdefault(name, []).append(row)
                 table = write_tables(run.out, rows, config)
     return table
 

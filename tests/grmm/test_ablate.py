@@ -283,6 +283,18 @@ def test_seeds_give_intervals_and_test_shards_give_people_alone(tmp_path, capsys
     assert "S000, S001 are also trained on" in capsys.readouterr().err
 
 
+def test_a_row_without_its_first_seed_is_left_out(table, roots, tmp_path, monkeypatch):
+    row = json.loads((table / "full" / "row.json").read_text())
+
+    def measured(run, name, variant, seed, wanted):
+        return None if (name, seed) == ("no_mesh_decoder", 0) else row
+
+    monkeypatch.setattr(ablate_module, "_row", measured)
+    assert main([*command(roots, tmp_path), "--rows=full", "--seeds=2"]) == 0
+    rows = json.loads((tmp_path / "ablation.json").read_text())["rows"]
+    assert "no_mesh_decoder" not in rows and rows["no_refinement"]["seeds"] == 2
+
+
 def test_the_benchmark_names_what_is_lost_beyond_its_interval():
     row = {
         "difference_db": {"view": -0.5, "unseen": -0.1},
