@@ -101,7 +101,8 @@ def bare_skin(rgb: np.ndarray, skin: np.ndarray, neck: np.ndarray) -> np.ndarray
     """
     if not skin.any():
         return skin
-    alike = like_skin(colour_logs(rgb[skin]), colour_logs(rgb[_uncovered(rgb, skin, neck)]))
+    logs, sure = colour_logs(rgb[skin]), _uncovered(rgb, skin, neck)
+    alike = like_skin(logs, logs if sure is skin else colour_logs(rgb[sure]))
     if alike.mean() > 1 - COVERED:
         return skin
     kept = skin.copy()
@@ -113,9 +114,11 @@ def _uncovered(rgb: np.ndarray, face: np.ndarray, neck: np.ndarray) -> np.ndarra
     """Return the pixels of the face (H, W), or those of the neck if a fringe covers the face."""
     if neck.sum() < LEAST:
         return face
-    (of_face, usual), (of_neck, _) = (_middle(_some_ratios(rgb[mask])) for mask in (face, neck))
+    of_face, of_neck = (_some_ratios(rgb[mask]) for mask in (face, neck))
+    middle = np.median(of_face, axis=0)
     # Skin is redder than most hair, and than the collars that hide necks.
-    return neck if usual < COHERENT and of_neck[1] > of_face[1] + UNLIKE[1] else face
+    redder = np.median(of_neck[:, 1]) > middle[1] + UNLIKE[1]
+    return neck if redder and _share_near(middle, of_face) < COHERENT else face
 
 
 def _sees_face(mesh: np.ndarray) -> bool:
@@ -240,10 +243,9 @@ def _some_ratios(pixels: np.ndarray) -> np.ndarray:
     return _ratios(colour_logs(pixels[np.unique(chosen)]))
 
 
-def _middle(ratios: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the median (3,) of `_ratios` (N, 3), and the share of them near it."""
-    middle = np.median(ratios, axis=0)
-    return middle, float((np.abs(ratios - middle) < UNLIKE).all(1).mean())
+def _share_near(middle: np.ndarray, ratios: np.ndarray) -> float:
+    """Measure the share of `_ratios` (N, 3) that could be skin of the middle colour (3,)."""
+    return float((np.abs(ratios - middle) < UNLIKE).all(1).mean())
 
 
 def scalp_votes(rgb: np.ndarray, labels: np.ndarray, alpha: np.ndarray) -> tuple[int, int]:
@@ -258,9 +260,10 @@ def scalp_votes(rgb: np.ndarray, labels: np.ndarray, alpha: np.ndarray) -> tuple
     least = max(LEAST, LEAST_SCALP * skin.sum())
     if not _sees_face(labels) or skin.sum() < LEAST or scalp.sum() < least:
         return 0, 0
-    of_scalp = _some_ratios(rgb[scalp])
-    middle, usual = _middle(_some_ratios(rgb[_uncovered(rgb, skin, neck)]))
-    found = (np.abs(of_scalp - middle) < UNLIKE).all(1).mean()
+    sure = _uncovered(rgb, skin, neck)
+    of_skin, of_scalp = (_some_ratios(rgb[mask]) for mask in (sure, scalp))
+    middle = np.median(of_skin, axis=0)
+    usual, found = (_share_near(middle, ratios) for ratios in (of_skin, of_scalp))
     return round(len(of_scalp) * usual), round(len(of_scalp) * found)
 
 
