@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -155,8 +155,13 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
     _check_places(dataset, getattr(args, "captures", ()), args.command)
     slurm = _slurm_jobs(args)
     if slurm is not None and args.print_job:
-        jobs = dict.fromkeys(slurm[stage.name] for stage in chosen)
-        return _say_scripts(jobs, args.threads, Dataset(dataset.root.resolve()).slurm_dir)
+        from express50.runner.slurm import job_script
+
+        logs = Dataset(dataset.root.resolve()).slurm_dir
+        for job in dict.fromkeys(slurm[stage.name] for stage in chosen):
+            address, name = "tcp://ADDRESS-OF-THE-RUN", "express50-N"
+            say(job_script(job, address, name, args.threads, logs).rstrip())
+        return OK
     summaries: list[Summary] = []
     with (
         stdout_to_stderr() if args.json else nullcontext(),
@@ -277,14 +282,6 @@ def _exit_code(summaries: Sequence[Any], strict: bool) -> int:
     """Return whether no item failed or, with ``strict``, lost a part."""
     dropped = strict and any(o.dropped for summary in summaries for o in summary.outcomes)
     return OK if all(summary.ok for summary in summaries) and not dropped else FAILED
-
-
-def _say_scripts(jobs: Iterable[Any], threads: int, logs: Path) -> int:
-    from express50.runner.slurm import job_script
-
-    for job in jobs:
-        say(job_script(job, "tcp://ADDRESS-OF-THE-RUN", "express50-N", threads, logs).rstrip())
-    return OK
 
 
 def _check_places(dataset: Dataset, captures: Sequence[Path], command: str) -> None:
