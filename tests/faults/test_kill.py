@@ -15,14 +15,11 @@ from pathlib import Path
 import pytest
 
 from express50.__main__ import main
-from express50.contract.layout import Dataset
-from pipelines import ingest
 from tests import slurm_stand_in
 from tests.express50.dataset.tracked import track_arrays, write_track
 from tests.express50.head.flame_files import write_flame
 from tests.faults import toy
 from tests.pipelines.bump_dataset import make_dataset
-from tests.synth import make_capture
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 NAMES = [f"item{number}" for number in range(6)] + ["S001/cam00", "S001/cam01"]
@@ -95,24 +92,6 @@ def test_killed_driver_leaves_whole_items_and_a_rerun_completes(tmp_path, worker
     assert kills > 0
     assert toy.tree(hurt.stage_dir("toy")) == toy.tree(calm.stage_dir("toy"))
     assert [p for p in hurt.staging_dir.iterdir() if not p.name.endswith(".lock")] == []
-
-
-def test_killed_ingest_reruns_to_the_same_bytes(tmp_path):
-    make_capture(tmp_path / "S001", cameras=4, frames=24, size=96, video=True)
-    calm, hurt = Dataset(tmp_path / "calm"), Dataset(tmp_path / "hurt")
-    for dataset in (calm, hurt):
-        ingest.add_captures(dataset, [tmp_path / "S001"])
-    seconds = timed(["express50.__main__", "ingest", str(calm.root)])
-    expected = toy.tree(calm.stage_dir("ingest"))
-
-    def check():
-        assert toy.tree(hurt.stage_dir("ingest")) in ({}, expected)
-
-    rng = random.Random(3)
-    delays = [seconds * part for part in (0.6, *(rng.uniform(0.1, 0.95) for _ in range(5)))]
-    command = ["express50.__main__", "ingest", str(hurt.root)]
-    assert kill_until_done(command, check, delays) > 0
-    assert toy.tree(hurt.stage_dir("ingest")) == expected
 
 
 def test_interrupt_stops_soon_and_is_resumable(tmp_path):

@@ -74,7 +74,7 @@ def _work(stage: str, item: str, steps: int, times: int) -> None:
     if os.environ.get(STOPS) == f"{stage} {item}":
         del os.environ[STOPS]
         raise KeyboardInterrupt
-    pause(float(os.environ.get(PAUSE, "0.004")) * steps * times)
+    pause(float(os.environ.get(PAUSE, "0.001")) * steps * times)
 
 
 def count_pauses(monkeypatch: pytest.MonkeyPatch, working: float = 1.0) -> None:

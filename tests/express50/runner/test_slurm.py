@@ -203,7 +203,7 @@ def test_items_of_a_job_at_its_time_limit_are_tried_again(cluster, tmp_path, mon
     assert "died 2 times" in reason and "its job reached 10" in reason
     assert len(slurm_stand_in.pids(cluster)) >= 2
     (calm.root / "in" / "poison1.txt").unlink()
-    toy.run_toy(calm, seconds=0.4)
+    toy.run_toy(calm)
     assert toy.tree(hurt.stage_dir("toy")) == toy.tree(calm.stage_dir("toy"))
     assert slurm_stand_in.all_end(cluster)
 
