@@ -30,11 +30,10 @@ def finite(laid) -> bool:
     return all(np.isfinite(x).all() for x in (laid.vertices, laid.residual, laid.sigma))
 
 
-@pytest.mark.parametrize(("angle", "shift"), [(0.4, -1000.0), (-3.1, 1000.0)])  # seconds each
-def test_the_result_turns_and_shifts_with_the_world(head, here, angle, shift):
+def test_the_result_turns_and_shifts_with_the_world(head, here):
     model, mesh, outside = head
     faces, trust = model.faces.numpy(), np.ones(len(mesh))
-    R, t = axis_angle_to_matrix(np.array([0.3, 1.0, -0.2]) * angle), np.array([shift, 0.5, -shift])
+    R, t = axis_angle_to_matrix(np.array([-0.9, -3.1, 0.6])), np.array([1000.0, 0.5, -1000.0])
     there = lay(model, mesh @ R.T + t, GivenSurface(outside @ R.T + t, faces, trust), DETAIL)
     assert finite(there)
     off = np.linalg.norm(there.vertices - (here.vertices @ R.T + t), axis=1)
