@@ -12,8 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from express50.__main__ import main
 from express50.errors import FormatError, UnknownNameError
@@ -82,13 +80,6 @@ def test_digests_taken_while_writing_are_those_of_the_files(tmp_path):
     taken = (root / "manifest.json").read_bytes()
     write_manifest(root)
     assert (root / "manifest.json").read_bytes() == taken
-
-
-@given(st.text("abcXYZ019_-.", min_size=1, max_size=100), st.integers(0, 8**11 - 1))
-def test_a_header_is_tarfiles_own(name, size):
-    info = tarfile.TarInfo(name)
-    info.size = size
-    assert tar_header(name, size) == info.tobuf(tarfile.USTAR_FORMAT, "ascii", "strict")
 
 
 @pytest.mark.parametrize(("name", "size"), [("a" * 101, 0), ("ä", 0), ("a", 8**11)])
