@@ -71,13 +71,12 @@ class MeasuredApp(AnnotateApp):
     def __init__(self, session: Session, **options: Any) -> None:
         super().__init__(session, **options)
         self.painted = 0
-        self.sent_bytes = 0
 
     def _display(self, screen: Any, renderable: Any) -> None:
         """Encode what is drawn even though no terminal is there, then note the time."""
         super()._display(screen, renderable)
         if hasattr(renderable, "render_segments"):
-            self.sent_bytes += len(renderable.render_segments(self.console).encode())
+            renderable.render_segments(self.console).encode()
             self.painted += 1
 
 
