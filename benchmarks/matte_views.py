@@ -168,7 +168,9 @@ def measure(keyed: list[Keyed], sheet: Path | None) -> Figures:
     ball = ball_of({k.shot.camera.id: k.shot.camera for k in keyed})
     if ball is None:
         sys.exit("the rig looks at no one place; name another --dataset")
-    views = [make_view(k.shot.camera, ball, k.shot.frame, k.alpha) for k in keyed]
+    views = [
+        make_view(k.shot.camera, ball, k.shot.frame, k.alpha, plate=k.shot.plate) for k in keyed
+    ]
     found = compare_mattes(views)
     after = [
         corrected(k.alpha, found.removed.get(k.shot.camera.id), found.filled.get(k.shot.camera.id))

@@ -74,6 +74,7 @@ class CameraMatte:
     noise: float  # `wall_noise` of the full frame
     plated: bool = True
     sure: bool = True  # unless a plate had to be changed
+    plate: np.ndarray | None = None  # reduced to `SHOWN`, in the frame's exposure
 
 
 def run(
@@ -99,7 +100,9 @@ def run(
     elif ball is None:
         found = Agreement(unchanged="the cameras do not look at one place")
     else:
-        views = [make_view(cameras[n], ball, m.rgb, m.alpha) for n, m in mattes.items()]
+        views = [
+            make_view(cameras[n], ball, m.rgb, m.alpha, plate=m.plate) for n, m in mattes.items()
+        ]
         found = compare_mattes(views)
     final = {
         name: corrected(alpha, found.removed.get(name), found.filled.get(name))
@@ -193,7 +196,10 @@ class _Shots:
             return None, why
         alpha = self.matte_one(frame, None if found is None else found.plate, valid)
         own = _camera_matte(alpha, frame, valid)
-        return replace(own, sure=found is None or found.sure), why
+        if found is None:
+            return own, why
+        plate = exposed(shrink(found.plate, SHOWN), exposure_gain(frame, found.plate))
+        return replace(own, sure=found.sure, plate=np.rint(plate).astype(np.uint8)), why
 
 
 def _camera_matte(alpha: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> CameraMatte:
@@ -294,14 +300,16 @@ def _matte_function(method: str, weights: str, tile: int, shadow: float) -> Matt
 
 
 def make_view(
-    camera: Camera, ball: Ball, image: np.ndarray, alpha: np.ndarray, side: int = SIDE
-) -> MatteView:
-    """Reduce a recorded camera with its undistorted image and alpha, uint8, of any two sizes."""
+    camera: Camera, ball: Ball, image: np.ndarray, alpha: np.ndarray, side: int = SIDE,
+    plate: np.ndarray | None = None,
+) -> MatteView:  # fmt: skip
+    """Reduce a recorded camera with its undistorted image, alpha and plate, uint8, of any sizes."""
     rgb = shrink(image, side)
     size = rgb.shape[1], rgb.shape[0]
     small = resized(camera, *size)
     share = resize_area(alpha, *size).astype(np.float32) / 255
-    return MatteView.of(pinhole(small), ball, rgb, share, undistorted_mask(small))
+    behind = None if plate is None else resize_area(plate, *size)
+    return MatteView.of(pinhole(small), ball, rgb, share, undistorted_mask(small), behind)
 
 
 def corrected(

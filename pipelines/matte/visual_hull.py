@@ -7,9 +7,10 @@ cameras see clear background). Outside the ball few cameras see anything: only p
 subject continues out of the ball, such as the shoulders, are possible there.
 
 A camera removes what the other views rule out (moving shadows, things that only some cameras see).
-It fills what the others see as solid but it could not separate from its background. A camera whose
-matte disagrees with the others both where it is opaque and where it is clear is reported and
-ignored.
+They cannot rule out the part of a shadow that the subject hides from them, but it darkens the plate
+as the removed part does, and goes with it. A camera fills what the others see as solid but it could
+not separate from its background. A camera whose matte disagrees with the others both where it is
+opaque and where it is clear is reported and ignored.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import numpy as np
 from scipy import ndimage
 
 from express50.contract.stage import Note
+from express50.files.images import LIGHT_OF_LEVEL
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import cell_centres, opencv_pixels_to_corner
 from express50.rigs.world_frame import meeting_point
@@ -62,18 +64,20 @@ class MatteView:
     rgb: np.ndarray  # (h, w, 3) uint8
     alpha: np.ndarray  # (h, w) float32 in [0, 1]
     valid: np.ndarray  # (h, w) bool, pixels with footage
+    plate: np.ndarray | None = None  # (h, w, 3) uint8, if the camera has one
 
     @classmethod
     def of(
-        cls, camera: Camera, ball: Ball, rgb: np.ndarray, alpha: np.ndarray, valid: np.ndarray
-    ) -> MatteView:
+        cls, camera: Camera, ball: Ball, rgb: np.ndarray, alpha: np.ndarray, valid: np.ndarray,
+        plate: np.ndarray | None = None,
+    ) -> MatteView:  # fmt: skip
         """Place a pinhole camera's picture in the ball's coordinates."""
         R, t = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
         # Over the radius, so that depths are in its units too and float32 suffices.
         offset = (R @ ball.center + t) / ball.radius
         projection = np.column_stack([camera.K @ R, camera.K @ offset]).astype(np.float32)
         center = (camera.center - ball.center) / ball.radius
-        return cls(camera.id, projection, center, rgb, alpha, valid)
+        return cls(camera.id, projection, center, rgb, alpha, valid, plate)
 
 
 @dataclass(frozen=True)
@@ -183,6 +187,9 @@ THICK = 0.5  # share of a ray's median length in the hull under which it only gr
 NEIGHBOURS = 4  # cameras in which a surface's colour is looked up
 WIDEST = 0.2  # cosine of the largest angle to them
 SEARCH = (-0.3, 0.1, 17)  # radii in front of and behind the others' hull where a surface may be
+# Shadows, natural logarithms of light over the plate's: the largest difference between channels,
+# the least depth, and how far one shadow varies; DARK is added to light.
+GREY, DEEP, SAME_SHADE, DARK = 0.2, 0.3, 0.25, 2e-3
 SMALLEST = 5e-4  # share of the image: filled spots are at least this large
 LARGEST = 0.4  # share of the subject: if more lacks, the matte is wrong rather than holed
 
@@ -256,6 +263,25 @@ def ruled_out(view: MatteView, evidence: Evidence) -> np.ndarray:
     bad = doubtful & np.isin(parts, np.unique(parts[wrong]))
     # One pixel more, for the faint pixels around.
     return (cv2.dilate(bad.astype(np.uint8), np.ones((3, 3))) > 0) & ~evidence.likely
+
+
+def rest_of_shadow(view: MatteView, removed: np.ndarray, solid: np.ndarray) -> np.ndarray:
+    """Return the pixels (h, w) bool of a shadow that the other views rule out in part only.
+
+    They darken the plate as the `removed` part (h, w) does, all channels alike, and are connected
+    to it. The others' `solid` (h, w) stays.
+    """
+    sure = removed & (view.alpha > INSIDE)
+    if view.plate is None or not sure.any():
+        return np.zeros(sure.shape, bool)
+    light, plate = (LIGHT_OF_LEVEL[image] + DARK for image in (view.rgb, view.plate))
+    darker = np.log(light / plate)
+    usual = np.median(darker[sure], axis=0)
+    if np.ptp(usual) > GREY or usual.mean() > -DEEP:
+        return np.zeros(sure.shape, bool)
+    alike = (np.abs(darker - usual) < SAME_SHADE).all(-1) & (view.alpha > FAINT) & ~solid
+    _, parts = cv2.connectedComponents((alike | removed).astype(np.uint8), connectivity=4)
+    return alike & np.isin(parts, np.unique(parts[removed]))
 
 
 def shows_surface(
@@ -437,6 +463,7 @@ def _compare(
     for view in views:
         mine = found[view.name]
         bad = ruled_out(view, mine)
+        bad |= rest_of_shadow(view, bad, mine.solid)
         spots, lacking = missed(view, mine, views, subject)
         opaque = view.alpha > INSIDE
         stray = float((opaque & ~mine.likely).sum()) / int(opaque.sum())

@@ -52,6 +52,24 @@ def test_a_shadow_that_touches_the_head_goes_up_to_the_hull():
     assert gone[shade].mean() > 0.6 and not gone[head].any()
 
 
+@pytest.mark.parametrize(
+    ("tint", "least", "most"), [((1, 1, 1), 0.93, 1), ((1, 0.4, 0.4), 0.5, 0.9)]
+)
+def test_of_a_shadow_the_part_that_the_others_cannot_see_goes_too(tint, least, most):
+    """What has another colour than the darkened plate may be the subject's."""
+    views = make_views()
+    head = views[5].alpha > 0
+    shade = disc(0.2, 0.45, 0.15) & ~head
+    plate = np.broadcast_to(BACKDROP, (SIZE, SIZE, 3))
+    dark = np.rint(0.5 * BACKDROP * np.array(tint)).astype(np.uint8)
+    rgb = np.where(head[..., None], views[5].rgb, plate)
+    rgb[shade] = dark
+    views = with_alpha(views, {5: np.maximum(views[5].alpha, shade)})
+    views[5] = replace(views[5], rgb=rgb, plate=plate)
+    gone = compare_mattes(views).removed[views[5].name]
+    assert least <= gone[shade].mean() <= most and not gone[head].any()
+
+
 def test_hair_at_the_rim_stays_and_a_cable_goes():
     views = make_views()
     column = SIZE // 2
