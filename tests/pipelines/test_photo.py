@@ -9,7 +9,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 import torch
 
@@ -25,7 +24,7 @@ from express50.head.model import landmarks, pose
 from pipelines.photo import capture
 from pipelines.photo.capture import find_faces, make_photo_capture, open_picture, subject_id
 from pipelines.track.config import TrackConfig
-from tests.synth import turn_video, write_video
+from tests.synth import turn_video, write_photo, write_video
 
 data = pytest.importorskip("skimage.data")
 
@@ -197,22 +196,13 @@ def test_photographs_of_kinds_that_no_rig_writes_are_read(
     assert np.abs(stored.astype(int) - astronaut).mean() < 4
 
 
-def write_exif(path: Path, image: np.ndarray, orientation: int, film: int) -> None:
-    spec = oiio.ImageSpec(image.shape[1], image.shape[0], 3, "uint8")
-    spec.attribute("Orientation", orientation)
-    spec.attribute("Exif:FocalLengthIn35mmFilm", film)
-    file = oiio.ImageOutput.create(str(path))
-    file.open(str(path), spec)
-    file.write_image(np.ascontiguousarray(image))
-    file.close()
-
-
 def test_a_photograph_on_its_side_is_tracked_as_an_upright_one(
     tmp_path: Path, astronaut: np.ndarray
 ) -> None:
     """Size, principal point, focal length and face are those of the upright picture."""
     upright = np.ascontiguousarray(astronaut[:360, 80:360])
-    write_exif(tmp_path / "a.tif", np.rot90(upright, 1), 6, 50)
+    tags = {"Orientation": 6, "Exif_FocalLengthIn35mmFilm": 50}
+    write_photo(tmp_path / "a.tif", np.rot90(upright, 1), **tags)
     picture = open_picture(tmp_path / "a.tif")
     config = TrackConfig()
     capture = make_photo_capture(picture, tmp_path / "out", "a", config)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 
 from express50.capture.frames import read_proxy
@@ -15,7 +14,7 @@ from express50.errors import FormatError
 from express50.files.images import read_exif, upright
 from pipelines.calibrate.footage import known_focals
 from tests.stages import ingest_captures
-from tests.synth import read_frame
+from tests.synth import read_frame, write_photo
 
 WIDTH, HEIGHT, FILM_MM = 64, 48, 28
 # What a camera stores of the upright picture under each orientation, as EXIF defines them: where
@@ -35,17 +34,6 @@ STORED = {
 def scene() -> np.ndarray:
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     return np.stack([4 * x, 5 * y, 0 * x + 90], -1).astype(np.uint8)
-
-
-def write_photo(path: Path, image: np.ndarray, **attributes: object) -> Path:
-    spec = oiio.ImageSpec(image.shape[1], image.shape[0], 3, "uint8")
-    for name, value in attributes.items():
-        spec.attribute(name.replace("Exif_", "Exif:"), value)
-    spec.attribute("Compression", "jpeg:98")
-    file = oiio.ImageOutput.create(str(path))
-    assert file.open(str(path), spec) and file.write_image(np.ascontiguousarray(image))
-    file.close()
-    return path
 
 
 @pytest.fixture(scope="module")

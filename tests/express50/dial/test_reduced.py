@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from express50.capture.frames import read_cameras_of, read_peak_frame
-from express50.capture.index import peak_items, read_index
+from express50.capture.index import peak_items
 from express50.contract.layout import Dataset
 from express50.contract.stage import ExpectedError, Growth, Result, Stage
 from express50.dial.budget import parse_budget
@@ -19,7 +18,6 @@ from express50.dial.pilot import Chain
 from express50.dial.results import ResultKind
 from express50.dial.run import run_within
 from express50.errors import FormatError
-from express50.files.atomic import write_json
 from express50.files.calibration import write_cameras
 from express50.files.text import read_json_table
 from express50.runner.executor import Pool
@@ -38,20 +36,6 @@ def _calibrate(dataset: Dataset, item: str, config: NoConfig, out: Path) -> Resu
     return Result()
 
 
-def _align(dataset: Dataset, item: str, config: NoConfig, out: Path) -> Result:
-    index = read_index(dataset, item)
-    rows = {}
-    for cue in index.cues:
-        footage, frame = index.cameras["cam00"], cue.start_frame
-        rows[cue.expression_id] = {
-            "frame": frame, "camera": "cam00", "pts": footage.pts[frame],
-            "dhash": footage.dhash[frame],
-        }  # fmt: skip
-    write_json(out / "peaks.json", rows)
-    return Result()
-
-
-ALIGN = replace(toy_chain.ALIGN, run=_align)
 CALIBRATE = Stage(
     name="calibrate", version=1, config=NoConfig, items=Dataset.subjects, run=_calibrate,
     inputs=lambda dataset, item, config: {"index": dataset.index_file(item)},
@@ -94,7 +78,8 @@ def _apart(a: Dataset, b: Dataset, subject: str, names: list[str]) -> list[float
 
 
 def chain_of(root: Path, captures: list[Path]) -> Chain:
-    dataset, work = Dataset(root.resolve()), (ingest.STAGE, ALIGN, CALIBRATE, FRAMES, LOOK)
+    dataset = Dataset(root.resolve())
+    work = (ingest.STAGE, toy_chain.ALIGN, CALIBRATE, FRAMES, LOOK)
     ingest.add_captures(dataset, captures)
     ladders = {stage.name: {"standard": stage.config()} for stage in work}
     ladders["frames"] = {n: FRAMES.config(image_side=side) for n, side in SIDES.items()}

@@ -48,10 +48,13 @@ class NoConfig:
 
 
 def _align(dataset: Dataset, item: str, config: NoConfig, out: Path) -> Result:
+    index = read_index(dataset, item)
     rows = {}
-    for cue in read_index(dataset, item).cues:
+    for cue in index.cues:
+        footage, frame = index.cameras["cam00"], cue.start_frame
         rows[cue.expression_id] = {
-            "frame": cue.start_frame, "camera": "cam00", "pts": 0, "dhash": ""
+            "frame": frame, "camera": "cam00", "pts": footage.pts[frame],
+            "dhash": footage.dhash[frame],
         }  # fmt: skip
     (out / "peaks.json").write_text(json.dumps(rows))
     return Result()
