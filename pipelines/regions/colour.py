@@ -32,8 +32,10 @@ FEATURES = 0.003  # share of the mesh that eyes and lips fill where a view sees 
 SHARED = 10_000  # pixels that skin colours of the view itself and of others count as, if both count
 COVERED = 0.1  # share of odd colours in a view's skin that is a beard; bare faces have 0.02 to 0.05
 DARK = 1e-3  # root of light that is added to pixels: keeps logarithms finite
-# Least spreads of the logarithms of brightness and of two ratios of colours; and how many are skin.
-LEAST_SPREAD, WITHIN = np.array([0.2, 0.03, 0.03]), 3.0
+# Least and most spreads of the logarithms of brightness and of two ratios of colours, and how many
+# of them are skin. Hard light spreads brightness; ratios are spread further only if hair counts.
+LEAST_SPREAD, MOST_SPREAD = np.array([0.2, 0.03, 0.03]), np.array([np.inf, 0.07, 0.07])
+WITHIN = 3.0
 RARE = 1e-6  # share of a cell without samples: keeps logarithms finite
 UNSEEN_CLASS_SHARE = 1.2e-4  # of every cell of a class without samples: spread over 8000 cells
 
@@ -59,6 +61,9 @@ LEAST_SCALP = 0.1  # pixels of scalp per pixel of the face: temples alone are of
 # Most by which a bare scalp differs from the face's middle, in brightness and ratios of colours.
 # Spreads of the face's own do not help: they are wide in hard light, where hair then passes for it.
 UNLIKE = WITHIN * LEAST_SPREAD
+# Share of the variance of a face's redness between its two groups from which it has two colours:
+# normal values have 0.64, even ones 0.75.
+TWO_COLOURED = 0.77
 COHERENT = 0.75  # share of a face near its middle colour below which a fringe may cover it
 BARE = 0.7  # share of the scalp in the face's colours, over the same of the face, of bare scalps
 
@@ -87,10 +92,34 @@ def _ratios(logs: np.ndarray) -> np.ndarray:
     return np.stack([(r + g + b) / 3.0, r - g, g - b], axis=1)
 
 
+def _redder(redness: np.ndarray) -> np.ndarray:
+    """Mark the redder (N,) of two groups of values (N,); all of them unless they are far apart.
+
+    Otsu's threshold splits them. Skin is redder than beards, fringes and sunglasses, which together
+    may cover so much of a face that its median and spread say little about skin.
+    """
+    order = np.sort(redness.astype(np.float64))
+    if len(order) < LEAST:
+        return np.ones(redness.shape, bool)
+    count = np.arange(1, len(order))
+    total = np.cumsum(order)
+    low = total[:-1] / count
+    apart = (total[-1] - total[:-1]) / (len(order) - count) - low
+    share = count / len(order)
+    between = share * (1 - share) * apart**2
+    cut = int(between.argmax())
+    two = between[cut] > TWO_COLOURED * order.var() and apart[cut] > 2 * UNLIKE[1]
+    if not two or min(share[cut], 1 - share[cut]) < COVERED:
+        return np.ones(redness.shape, bool)
+    return redness > order[cut]
+
+
 def like_skin(values: np.ndarray, face: np.ndarray) -> np.ndarray:
-    """Mark the colours (N, 3) that are like most of the face's (M, 3); logarithms of root light."""
-    usual, spread = robust_moments(_ratios(face))
-    return (np.abs(_ratios(values) - usual) < WITHIN * np.maximum(spread, LEAST_SPREAD)).all(1)
+    """Mark the colours (N, 3) that are like the skin of a face (M, 3); logarithms of root light."""
+    known = _ratios(face)
+    usual, spread = robust_moments(known[_redder(known[:, 1])])
+    spread = np.clip(spread, LEAST_SPREAD, MOST_SPREAD)
+    return (np.abs(_ratios(values) - usual) < WITHIN * spread).all(1)
 
 
 def bare_skin(rgb: np.ndarray, skin: np.ndarray, neck: np.ndarray) -> np.ndarray:
@@ -146,14 +175,17 @@ def label_by_colour(
     skin = solid & (geometry.mesh > 0) & (labels == SKIN)
     if skin.sum() < LEAST:  # the neck, which hair may cover, teaches only where no face does
         skin = skin | (solid & (labels == NECK) & (geometry.height > SURE_ABOVE))
+    covered = np.zeros_like(skin)
     if _sees_face(geometry.mesh):  # from behind, most of it may be hair
-        skin = bare_skin(rgb, skin, solid & (labels == NECK))
+        face, skin = skin, bare_skin(rgb, skin, solid & (labels == NECK))
+        covered = face & ~skin
     torso = solid & (labels == TORSO) & (geometry.height < SURE_BELOW)
     beyond = IMPOSSIBLE
     if bare:
-        # Without a scalp hair has no samples, and what juts out of the mesh may as well be skin.
+        # Without a scalp hair has the samples of a beard, if any, and what juts out of the mesh may
+        # as well be skin.
         labels = np.where(labels == SCALP, SKIN, labels)
-        hair, beyond = np.zeros_like(hair), 0.0
+        hair, beyond = covered, 0.0
     counts = [_counts(cells, mask) for mask in (hair, skin, torso)]
     if skin_colours is not None and not bare and not _sees_face(geometry.mesh):
         # Half of each, because the back of a neck may be darker than any face.
@@ -165,6 +197,8 @@ def label_by_colour(
         if taught.sum() >= LEAST:
             shares = gaussian_filter(taught, SMOOTH) / taught.sum()
             row[:] = np.log(np.maximum(shares, 0) + RARE)[cells]
+    if bare:  # what else has a beard's colours are shadows and clothes
+        likely[0][geometry.near != SKIN] = np.log(UNSEEN_CLASS_SHARE)
     scores = likely + _priors(labels, geometry, beyond)
     best = scores.argmax(0)
     loose = _loose((best == 0) & (alpha > 0), geometry.height > SURE_ABOVE, metre_px)

@@ -170,6 +170,20 @@ def test_a_bald_scalp_is_recognised_by_its_colours() -> None:
     assert judge_scalp([]).skin_coloured is None and not judge_scalp([]).is_skin
 
 
+def test_the_beard_of_a_bald_head_in_light_from_one_side_is_hair() -> None:
+    """Skin in the shade is as dark as the beard."""
+    scene = make_scene(0, size=300, hair=False)
+    skin = label_mask(scene.labels, "skin")
+    beard = skin & (np.arange(300)[:, None] > np.nonzero(label_mask(scene.labels, "lips"))[0].max())
+    columns = np.nonzero(skin)[1]
+    light = np.clip((np.arange(300) - columns.min()) / np.ptp(columns), 0.2, 1)
+    rgb = scene.rgb * light[:, None]
+    rgb[beard] = np.random.default_rng(0).normal(26, 4, (int(beard.sum()), 1))
+    dark = replace(scene, rgb=np.rint(np.clip(rgb, 0, 255)).astype(np.uint8))
+    hair = label_mask(labels_of(dark, bare=True), "hair")
+    assert hair[beard].mean() > 0.95 and hair[~beard].mean() < 0.02
+
+
 def test_a_fringe_over_most_of_the_face_is_not_taken_for_its_skin() -> None:
     scene = make_scene(0)
     mesh = render_head(scene.head, scene.camera)[0]

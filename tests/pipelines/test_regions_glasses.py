@@ -84,6 +84,27 @@ def test_glasses_are_found_with_their_lenses_and_labelled() -> None:
     assert not label_mask(bare, "apparel").any()
 
 
+def beard_and_hair() -> np.ndarray:
+    """Points (N, 3) all over the chin, and over the forehead's upper half."""
+    head = scenes()[0].head
+    lips = head.vertices[head.labels.vertices == LABELS.index("lips"), 1]
+    kind = (head.labels.vertices[head.labels.faces] == LABELS.index("skin")).all(1)
+    skin = head.vertices[head.labels.faces[kind]]
+    low, high = skin[..., 1].min(1), skin[..., 1].max(1)
+    corners = np.random.default_rng(0).dirichlet(np.ones(3), 8)  # dots over every triangle
+    return (corners @ skin[(high < lips.max() + 0.012) | (low > 0.065)]).reshape(-1, 3)
+
+
+def test_sunglasses_between_beard_and_hair_are_found() -> None:
+    """Together they cover as much of the face as skin does."""
+    discs = [rims(radius=radius) for radius in np.arange(0.002, RADIUS, 0.002)]
+    places = np.concatenate([*discs, rims(), beard_and_hair()])
+    found = find_glasses(scenes()[0].head, pictures(places))
+    for eye in eyes():
+        near = np.linalg.norm(found - eye - [0, 0, LIFT_M], axis=1)
+        assert (near < RADIUS).sum() > 1000
+
+
 def test_a_rim_with_a_gap_is_closed() -> None:
     found = find_glasses(scenes()[0].head, pictures(rims(0.8)))
     for eye in eyes():
