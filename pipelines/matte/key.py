@@ -39,9 +39,11 @@ SPREAD = 0.2  # share by which hair may be brighter or darker than visible hair 
 LOW = 1.2  # deviations at which noise and subject are equally likely; alpha is 0 below
 HIGH = 6.0  # deviations that prove foreground; weaker pixels must be connected to such ones
 FIRM = 0.5  # share of the nearby subject's difference over which a pixel looks opaque
-# Deviations by which a subject differs where single pixels stand out from noise, and how often
-# noisier pictures are blurred (docs/LOG.md, "Underexposed footage").
-PLAIN, SOFTENINGS = 4.8, 2
+# Single pixels stand out from noise if the subject differs by PLAIN deviations in all but a share
+# FAINT of its pixels, each judged by the strongest of STRONGEST x STRONGEST. Noisier pictures are
+# blurred up to SOFTENINGS times (docs/LOG.md, "Noisy footage").
+PLAIN, FAINT, STRONGEST, SOFTENINGS = 4.2, 0.04, 5, 3
+SHADED = 1.6  # deviations: areas that differ by less from the darkened plate are in shadow
 CORE = 0.018  # radius of the disc that must fit inside a part of the subject for it to be solid
 OPEN = 1.5  # deviations: an area that differs by less shows the plate
 BLACK, WHITE = 24, 250  # grey levels beyond which two surfaces may look the same
@@ -67,8 +69,8 @@ def key_alpha(
     """Return the opacity (H, W) float32 in [0, 1] of a frame (H, W, 3) uint8 against its plate.
 
     Pixels outside `valid` (H, W) get 0. Darkening of the plate by up to `shadow` is a shadow.
-    Pictures in which the subject hardly exceeds the noise are blurred and keyed again; `softened`
-    counts how often.
+    Pictures in which parts of the subject hardly exceed the noise are blurred and keyed again;
+    `softened` counts how often.
     """
     alpha, given = np.zeros(valid.shape, np.float32), (frame, plate)
     length = max(valid.shape)
@@ -77,11 +79,11 @@ def key_alpha(
     frame, image = frame[whole], frame[whole].astype(np.float32)
     dark, difference, unshaded = plate_difference(image, model, shadow, length)
     difference = np.where(valid[whole], difference, 0.0)
-    region = subject_region(difference, valid.size)
-    seen = difference[region & (difference > LOW)]  # without the gaps between strands
-    if softened < SOFTENINGS and not (seen.size and np.median(seen) > PLAIN):
+    strength = _strength(difference, np.where(valid[whole], unshaded, 0.0), valid.size)
+    if softened < SOFTENINGS and not (strength.size and np.quantile(strength, FAINT) > PLAIN):
         frame, plate = (cv2.GaussianBlur(image, (0, 0), 2.0**softened) for image in given)
         return key_alpha(frame, plate, valid, shadow, softened + 1)
+    region = subject_region(difference, valid.size)
     if not region.any():
         return alpha
     # The remaining steps work around the subject only.
@@ -101,6 +103,17 @@ def key_alpha(
     alpha[whole][window] = _opacity(frame, difference, dark, support, part, length)
     alpha[~valid] = 0.0
     return alpha
+
+
+def _strength(difference: np.ndarray, unshaded: np.ndarray, size: int) -> np.ndarray:
+    """Return the strongest difference close to each of the subject's pixels, without shadows.
+
+    So neither soft edges nor gaps between strands count. In noise, a dark shirt looks like a
+    shadow, but unlike one it differs from the darkened plate in the average of pixels.
+    """
+    smooth = smoothed(difference)
+    there = subject_region(unshaded, size) & (smooth > SHADED)
+    return cv2.dilate(smooth, np.ones((STRONGEST, STRONGEST), np.uint8))[there]
 
 
 def subject_window(

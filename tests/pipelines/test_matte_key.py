@@ -86,6 +86,19 @@ def test_a_subject_that_hardly_exceeds_the_noise_is_found() -> None:
     assert mae(key(empty), empty) == 0
 
 
+def test_a_shirt_that_hardly_exceeds_the_noise_is_found_beside_a_face_that_does() -> None:
+    rng = np.random.default_rng(1)
+    alpha = np.zeros((256, 256), np.float32)
+    cv2.circle(alpha, (128, 90), 45, 1.0, -1)
+    alpha[125:160, 110:146] = alpha[150:, 60:196] = 1.0
+    wall = np.full((256, 256, 3), (110, 112, 115), np.float32)
+    face_and_shirt = np.where(np.arange(256)[:, None, None] < 140, (200, 150, 130), (92, 90, 105))
+    still = np.where(alpha[..., None] > 0, face_and_shirt, wall)
+    frame, plate = (np.rint(p + rng.normal(0, 6, p.shape)).astype(np.uint8) for p in (still, wall))
+    found = key_alpha(frame, plate, np.ones(alpha.shape, bool), 0.25)
+    assert np.abs(found - alpha).mean() < 0.02
+
+
 def test_exposure_change_between_plate_and_frame_is_undone() -> None:
     scene = make_scene(6, "dark", gain=0.9)
     gain = exposure_gain(scene.frame, scene.plate)
