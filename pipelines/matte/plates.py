@@ -39,6 +39,10 @@ RIM, ODD_STEPS, GOOD_SHARE, LEAST_GAIN = 0.06, 12.0, 0.97, 0.01
 WIDE_RIM = 0.15  # width of the rim by which a plate is aligned
 MOST_MOVED = 0.03  # share of the longer side; alignments that move the plate further are rejected
 LEAST_SHARE = 0.9  # a plate that explains less shows another set
+LEAST_UNSHADED = 0.75  # of a rim, beside which a shadow on the plate is explained
+# Shadows darken all channels alike: the largest difference of logarithms of light, to which DARK is
+# added; hard ones are HARD deep at least, which other walls hardly are.
+GREY, DARK, HARD = 0.2, 2e-3, 0.7
 LEAST_OPEN = 0.2  # of a frame's border that the person leaves open, so that a plate can be compared
 WHITE, MOST_WHITE = 250, 0.3  # level, and share of a rim, from which the exposure is unknown
 ALIGN_SIDE = 960  # pixels of the pictures that are aligned
@@ -181,13 +185,22 @@ def white_share(image: np.ndarray, valid: np.ndarray) -> float:
 
 
 def _explained(plate: np.ndarray, frame: np.ndarray, rim: np.ndarray) -> float:
-    """Return the share of a rim (H, W) where plate and frame differ by less than ODD_STEPS."""
+    """Return the share of a rim (H, W) where plate and frame differ by less than ODD_STEPS.
+
+    Where that is most of the rim, the rest may show the plate in a hard shadow of its colours.
+    """
     plate, frame = shrink(plate, ALIGN_SIDE), shrink(frame, ALIGN_SIDE)
     rim = shrink(rim.astype(np.uint8) * 255, ALIGN_SIDE) == 255
     if not rim.any():  # nothing speaks against the plate
         return 1.0
-    off = frame.astype(np.float32) - exposed(plate, exposure_gain(frame, plate))
-    return float((_largest(cv2.blur(off, (3, 3))[rim]) < ODD_STEPS).mean())
+    seen, shown = frame.astype(np.float32), exposed(plate, exposure_gain(frame, plate))
+    alike = _largest(cv2.blur(seen - shown, (3, 3))[rim]) < ODD_STEPS
+    if alike.mean() < LEAST_UNSHADED:
+        return float(alike.mean())
+    light, full = (to_light(cv2.blur(image, (3, 3))[rim]) + DARK for image in (seen, shown))
+    darker = np.log(light / full)
+    shaded = (darker.max(1) < -HARD) & (np.ptp(darker, axis=1) < GREY)
+    return float((alike | shaded).mean())
 
 
 def _aligned(plate: np.ndarray, frame: np.ndarray, rim: np.ndarray) -> np.ndarray:

@@ -27,6 +27,7 @@ from express50.files.images import LIGHT_OF_LEVEL
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import cell_centres, opencv_pixels_to_corner
 from express50.rigs.world_frame import meeting_point
+from pipelines.matte.plates import DARK, GREY
 
 CUBE = 1.6  # half side of the cube, in radii of the ball
 BODY = 0.8  # radii that the subject may extend beyond where it leaves the ball
@@ -187,9 +188,8 @@ THICK = 0.5  # share of a ray's median length in the hull under which it only gr
 NEIGHBOURS = 4  # cameras in which a surface's colour is looked up
 WIDEST = 0.2  # cosine of the largest angle to them
 SEARCH = (-0.3, 0.1, 17)  # radii in front of and behind the others' hull where a surface may be
-# Shadows, natural logarithms of light over the plate's: the largest difference between channels,
-# the least depth, and how far one shadow varies; DARK is added to light.
-GREY, DEEP, SAME_SHADE, DARK = 0.2, 0.3, 0.25, 2e-3
+# Shadows, natural logarithms of light over the plate's: the least depth, and how far one varies.
+DEEP, SAME_SHADE = 0.3, 0.25
 SMALLEST = 5e-4  # share of the image: filled spots are at least this large
 LARGEST = 0.4  # share of the subject: if more lacks, the matte is wrong rather than holed
 

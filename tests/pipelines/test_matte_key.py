@@ -343,6 +343,16 @@ def test_a_plate_is_compared_beside_a_person_whose_place_is_known() -> None:
     assert match_plate(other.plate, frame, valid, person).share < 0.5
 
 
+@pytest.mark.parametrize(("light", "kept"), [((0.2, 0.2, 0.2), True), ((0.2, 0.5, 0.9), False)])
+def test_a_plate_with_a_hard_shadow_on_its_border_fits(light: tuple, kept: bool) -> None:
+    """What is there in another colour does not show the plate."""
+    scene = hair_before("dark", "cluttered", 256, np.random.default_rng(0))
+    frame = scene.frame.copy()
+    frame[:100, :16] = 255 * linear_to_srgb(srgb_to_linear(frame[:100, :16] / 255) * light)
+    matched = match_plate(scene.plate, frame, np.ones((256, 256), bool))
+    assert (matched.share >= LEAST_SHARE) == kept == matched.sure
+
+
 @pytest.mark.parametrize("shape", [(2, 2), (8, 300), (64, 64)])
 @pytest.mark.parametrize("level", [0, 255])
 def test_blank_and_tiny_plates_give_finite_mattes(shape: tuple[int, int], level: int) -> None:
