@@ -186,8 +186,8 @@ def tar_header(name: str, size: int) -> bytes:
     """Return the USTAR header (512,) of a file; mode 0644, owner, group and time 0.
 
     Raises:
-        FormatError: the name is not ASCII or has over 100 characters, or the size has over 11
-            octal digits (8 GiB).
+        FormatError: the name is not ASCII or does not fit (100 characters, without folders), or
+            the size has over 11 octal digits (8 GiB).
     """
     info = tarfile.TarInfo(name)
     info.size = size

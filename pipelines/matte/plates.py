@@ -197,8 +197,7 @@ def _explained(plate: np.ndarray, frame: np.ndarray, rim: np.ndarray) -> float:
     alike = _largest(cv2.blur(seen - shown, (3, 3))[rim]) < ODD_STEPS
     if alike.mean() < LEAST_UNSHADED:
         return float(alike.mean())
-    light, full = (to_light(cv2.blur(image, (3, 3))[rim]) + DARK for image in (seen, shown))
-    darker = np.log(light / full)
+    darker = darkening(cv2.blur(seen, (3, 3))[rim], cv2.blur(shown, (3, 3))[rim])
     shaded = (darker.max(1) < -HARD) & (np.ptp(darker, axis=1) < GREY)
     return float((alike | shaded).mean())
 
@@ -347,6 +346,11 @@ def _contrast_share(error: np.ndarray, by_level: np.ndarray, contrast: np.ndarra
 def to_light(values: np.ndarray) -> np.ndarray:
     """Return linear light in [0, 1], float32, of sRGB values in 8-bit steps."""
     return srgb_to_linear(np.clip(values, 0, 255) / 255.0).astype(np.float32)
+
+
+def darkening(image: np.ndarray, plate: np.ndarray) -> np.ndarray:
+    """Return logarithms (..., 3) of an image's light over its plate's; both are sRGB values."""
+    return np.log((to_light(image) + DARK) / (to_light(plate) + DARK))
 
 
 def light_noise(plate: np.ndarray, sigma: np.ndarray, whiten: np.ndarray) -> np.ndarray:

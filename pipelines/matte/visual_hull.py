@@ -23,11 +23,10 @@ import numpy as np
 from scipy import ndimage
 
 from express50.contract.stage import Note
-from express50.files.images import LIGHT_OF_LEVEL
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import cell_centres, opencv_pixels_to_corner
 from express50.rigs.world_frame import meeting_point
-from pipelines.matte.plates import DARK, GREY
+from pipelines.matte.plates import GREY, darkening
 
 CUBE = 1.6  # half side of the cube, in radii of the ball
 BODY = 0.8  # radii that the subject may extend beyond where it leaves the ball
@@ -274,8 +273,7 @@ def rest_of_shadow(view: MatteView, removed: np.ndarray, solid: np.ndarray) -> n
     sure = removed & (view.alpha > INSIDE)
     if view.plate is None or not sure.any():
         return np.zeros(sure.shape, bool)
-    light, plate = (LIGHT_OF_LEVEL[image] + DARK for image in (view.rgb, view.plate))
-    darker = np.log(light / plate)
+    darker = darkening(view.rgb, view.plate)
     usual = np.median(darker[sure], axis=0)
     if np.ptp(usual) > GREY or usual.mean() > -DEEP:
         return np.zeros(sure.shape, bool)
