@@ -247,27 +247,15 @@ def _tensor(
 
 
 def _read_torch_storage(data: object) -> np.ndarray:
-    """Read a storage pickled into an array file, as torch.storage._load_from_bytes does.
+    """Read a storage pickled into an array file, as torch.storage._load_from_bytes does."""
+    import torch
 
-    Layout: pickles of magic, protocol, system information, the storage, its keys; then for each key
-    an int64 count and the raw little-endian numbers.
-    """
     if not isinstance(data, bytes):
         raise pickle.UnpicklingError("torch storage without bytes")
-    stream = io.BytesIO(data)
-    for _ in range(3):
-        SafeUnpickler(stream, encoding="latin1").load()
-    reader = SafeUnpickler(stream, encoding="latin1")
-    reader.storages, reader.longest = {}, len(data)  # type: ignore[attr-defined]
-    storage = reader.load()
-    keys = SafeUnpickler(stream, encoding="latin1").load()
-    if not isinstance(keys, list) or not isinstance(storage, np.ndarray) or len(keys) != 1:
-        raise pickle.UnpicklingError("a torch storage with an unknown layout")
-    count = int(np.frombuffer(stream.read(8), "<i8", count=1)[0])
-    raw = stream.read(storage.nbytes)
-    if count != storage.size or len(raw) != storage.nbytes:
-        raise pickle.UnpicklingError("a torch storage that is cut short")
-    return np.frombuffer(raw, storage.dtype).copy()
+    storage = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    if not isinstance(storage, torch.TypedStorage):
+        raise pickle.UnpicklingError("a torch storage that holds something else")
+    return torch.tensor([], dtype=storage.dtype).set_(storage).numpy()
 
 
 _NUMPY = ("numpy.core.multiarray", "numpy._core.multiarray")
@@ -291,13 +279,6 @@ _ALLOWED = MappingProxyType(
         ("torch.storage", "_load_from_bytes"): _read_torch_storage,
     }
 )
-_STORAGE_DTYPES = MappingProxyType(
-    {
-        "FloatStorage": np.float32, "DoubleStorage": np.float64, "HalfStorage": np.float16,
-        "LongStorage": np.int64, "IntStorage": np.int32, "ShortStorage": np.int16,
-        "ByteStorage": np.uint8, "CharStorage": np.int8, "BoolStorage": np.bool_,
-    }
-)  # fmt: skip
 
 
 class SafeUnpickler(pickle.Unpickler):
@@ -313,19 +294,7 @@ class SafeUnpickler(pickle.Unpickler):
             return ColumnMatrix
         if module.startswith("scipy.sparse") and name in ("csr_matrix", "csr_array"):
             return SparseMatrix
-        if module == "torch" and name in _STORAGE_DTYPES:
-            return type(name, (Record,), {})
         raise pickle.UnpicklingError(f"it names {module}.{name}, which is not on the allow list")
-
-    def persistent_load(self, pid: object) -> np.ndarray:
-        """Make a storage of torch's old format: ("storage", type, key, location, count, view)."""
-        storages = getattr(self, "storages", None)
-        if storages is None or not isinstance(pid, tuple) or len(pid) < 5 or pid[0] != "storage":
-            raise pickle.UnpicklingError("a persistent id outside a torch storage")
-        dtype, count = _STORAGE_DTYPES[pid[1].__name__], int(pid[4])
-        if not 0 <= count <= self.longest:  # type: ignore[attr-defined]
-            raise pickle.UnpicklingError(f"a torch storage of {count} numbers, more than it holds")
-        return storages.setdefault(str(pid[2]), np.zeros(count, dtype))
 
 
 def read_pickle(path: Path) -> Any:  # noqa: ANN401 (whatever the file holds)

@@ -58,7 +58,7 @@ class Receipt:
     reason: str = ""
     metrics: dict = field(default_factory=dict)  # what the stage returned
     seconds: float = 0.0  # wall time of the attempt
-    core_seconds: float = 0.0  # processor time of the attempt; 0 in receipts of older versions
+    core_seconds: float = 0.0  # processor time of the attempt
     peak_memory: int = 0  # largest resident memory while it ran, bytes
     attempts: int = 1  # number of tries in that run
     time: float = field(default_factory=time.time)  # end of the last attempt, seconds since 1970
@@ -158,10 +158,6 @@ class Ledger:
             # after each would slow every item. `forget` waits, as its removals must not be lost.
             self._database.execute("PRAGMA synchronous=NORMAL")
             self._database.executescript(SCHEMA)
-            if "core_seconds" not in self._columns():  # made by an older version
-                self._database.execute(
-                    "ALTER TABLE receipts ADD COLUMN core_seconds REAL NOT NULL DEFAULT 0"
-                )
 
     def __enter__(self) -> Ledger:
         return self
@@ -240,9 +236,7 @@ class Ledger:
     def read(self, stage: str, item: str | None = None) -> dict[str, Receipt]:
         """Read a stage's receipts by item, sorted, or one; FormatError if a row is damaged."""
         found = {}
-        older = self._columns() or COLUMNS  # no table, where nothing was made yet
-        columns = tuple(name for name in COLUMNS if name in older)
-        for values in self._rows(columns, *_of("receipts", stage, item)):
+        for values in self._rows(COLUMNS, *_of("receipts", stage, item)):
             values["metrics"] = self._parsed(values["metrics"], stage)
             receipt = Receipt(**values)
             if any(type(getattr(receipt, k)) is not kind for k, kind in KINDS.items()):
@@ -251,10 +245,6 @@ class Ledger:
                 )
             found[receipt.item] = receipt
         return found
-
-    def _columns(self) -> set[str]:
-        with self._damage():
-            return {row[1] for row in self._database.execute("PRAGMA table_info(receipts)")}
 
     def made(self, stage: str, item: str | None = None) -> dict[str, Made]:
         """Read inputs, settings and files of a stage's published items, sorted, or of one item.
@@ -303,7 +293,7 @@ class Ledger:
         return table
 
     def _rows(self, names: tuple[str, ...], source: str, *values: str) -> list[dict[str, Any]]:
-        """Read rows as tables; none where the ledger is new, or older than the table."""
+        """Read rows as tables; none where the ledger is new."""
         query = f"SELECT {', '.join(names)} FROM {source}"
         with self._damage():
             try:

@@ -40,18 +40,6 @@ def test_newer_receipt_takes_the_place_of_the_older(ledger):
     assert ledger.read("track") == {}
 
 
-def test_a_ledger_from_before_core_seconds_is_read_and_written(tmp_path):
-    path = tmp_path / "old.sqlite"
-    with Ledger(path) as ledger:
-        ledger.write(receipt(seconds=2.0))
-        ledger._database.execute("ALTER TABLE receipts DROP COLUMN core_seconds")
-    with Ledger(path, read_only=True) as ledger:
-        assert ledger.read("track")["S001"].seconds == 2.0
-    with Ledger(path) as ledger:
-        ledger.write(receipt("S002", core_seconds=3.0))
-        assert [r.core_seconds for r in ledger.read("track").values()] == [0.0, 3.0]
-
-
 def test_two_processes_may_write(tmp_path):
     with Ledger(tmp_path / "l.sqlite") as one, Ledger(tmp_path / "l.sqlite") as two:
         one.write(receipt("a"))
