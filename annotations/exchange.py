@@ -1,10 +1,10 @@
 """Import labels from elsewhere: CSV or JSON files, and RenderMe-360's rule.
 
 A file holds every event; importing it neither loses nor duplicates any. The 12 expressions of
-RenderMe-360 are recorded so that the performer holds the target at the end of the clip; the
-dataset's users take the last frame (RenderMe-360's processing tools). Its releases end
-at different frames, so ingest stores which release was read and the number of its last frame, and
-a label repeats them. A rule's label ranks below any person's and above a suggestion.
+RenderMe-360 are recorded so that the performer holds the target at the end of the clip. The
+dataset's users take the last frame (RenderMe-360's processing tools). Its releases end at different
+frames, so ingest stores which release was read and the number of its last frame, and a label
+repeats them. A rule's label ranks below any person's and above a suggestion.
 """
 
 from __future__ import annotations

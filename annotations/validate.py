@@ -2,9 +2,9 @@
 
 The installed hook ``label_problems`` names this module; see ``pyproject.toml``.
 
-Krippendorff's alpha is taken on time within the clip, 0 to 1: on absolute frame numbers, which
-spread over a whole recording, it is near 1 whatever the annotators do. An adjudication keeps both
-originals.
+Krippendorff's alpha is taken on time within the clip, 0 to 1. On absolute frame numbers, which
+spread over a whole recording, it would be near 1 whatever the annotators do. An adjudication keeps
+both originals.
 """
 
 from __future__ import annotations

@@ -210,10 +210,7 @@ def figures(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> dict
     """Return errors of a rig after a rigid motion onto the true one."""
     motion = align_worlds(estimated, true)
     moved = {name: transform_camera(camera, motion) for name, camera in estimated.items()}
-    return rig_errors(moved, true) | {
-        "head_px": head_error(estimated, true),
-        "cameras": len(moved),
-    }
+    return rig_errors(moved, true) | {"head_px": head_error(estimated, true), "cameras": len(moved)}
 
 
 def head_error(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> float:

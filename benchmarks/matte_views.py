@@ -60,14 +60,7 @@ from express50.geometry.sampling import evenly
 from express50.twin import TwinConfig
 from express50.twin.truth import Truth
 from pipelines.matte import MatteConfig
-from pipelines.matte.cutout import (
-    CutView,
-    cut_out,
-    find_head,
-    make_cut_view,
-    region_of,
-    soft_alpha,
-)
+from pipelines.matte.cutout import CutView, cut_out, find_head, make_cut_view, region_of, soft_alpha
 from pipelines.matte.key import key_alpha
 from pipelines.matte.plates import LEAST_SHARE, match_plate
 from pipelines.matte.stage import corrected, make_view

@@ -1,11 +1,11 @@
 """Estimate how wrong results probably are, from figures that stages measure without ground truth.
 
 A stage describes each element of a result (a pixel, a vertex, a camera, a peak) by a few positive
-figures: residuals, standard deviations, sizes. The weighted sum of their logarithms is a score; a
-monotonic table maps the score to the typical error and to a bound that nine errors in ten stay
-under. Weights and tables were fitted on synthetic people by ``python -m benchmarks.intervals
---fit`` and are in ``error_models.json``, with a description of the data. Figures are clipped to the
-range of that data; a figure that is not finite counts as the worst in it.
+figures: residuals, standard deviations, sizes. The weighted sum of their logarithms is a score. A
+monotonic table maps it to the typical error, and to a bound that nine errors in ten stay under.
+Weights and tables were fitted on synthetic people by ``python -m benchmarks.intervals --fit`` and
+are in ``error_models.json``, with a description of the data. Figures are clipped to the range of
+that data; a figure that is not finite counts as the worst in it.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Run the paper's ablations: rows trained and fitted under one budget, and one table.
 
 Finished rows are kept: a row is measured again only when its settings, the shards or the protocol
-differ from those it was measured with; a half-trained row continues from its checkpoint, and a
+differ from those it was measured with. A half-trained row continues from its checkpoint, and a
 half-measured one from its fits.
 """
 
@@ -38,14 +38,7 @@ from grmm.evaluate import (
     mean,
     training_render,
 )
-from grmm.fit import (
-    FITS,
-    NOVEL_EXPRESSION,
-    NOVEL_VIEW,
-    FitProtocol,
-    evaluate_unseen,
-    unseen_views,
-)
+from grmm.fit import FITS, NOVEL_EXPRESSION, NOVEL_VIEW, FitProtocol, evaluate_unseen, unseen_views
 from grmm.metrics import PerceptualMetrics
 from grmm.shard_source import open_shards
 from grmm.train import diverged, train

@@ -1,8 +1,8 @@
 """Make and edit heads in the model's space: everything that a picture needs but the camera.
 
 FLAME's parameters (the tracked mesh) and the residual codes are separate inputs of the model, so
-each can be changed alone: one subject's codes with another's expression, a wider jaw under the
-same codes, a code moved along its principal directions under the same jaw.
+each can be changed alone. Examples are one subject's codes with another's expression, a wider jaw
+under the same codes, and a code moved along its principal directions under the same jaw.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Export one head: PLY for splat viewers, GLB for other 3D software, NPZ for arrays.
 
-A textured mesh may get ARKit's 52 blend shapes as glTF morph targets. Each moves one or two
-coefficients that the head model has by name (the built-in head, ICT-FaceKit), the jaw or an eye;
-what the mesh decoder adds for these parameters is included.
+A textured mesh may get ARKit's 52 blend shapes as glTF morph targets. Each moves the jaw, an eye,
+or one or two coefficients that the head model has by name (the built-in head, ICT-FaceKit). What
+the mesh decoder adds for these parameters is included.
 
 Gaussians are written as 3DGS' PLY, as GLB with KHR_gaussian_splatting (the ratified glTF extension:
 linear scales, opacities from 0 to 1, quaternions xyzw, display-referred sRGB) and as Niantic's SPZ,
@@ -118,8 +118,8 @@ def decoded(
     """Decode a head; colours are those that ``view`` sees, before refinement.
 
     Beside the Gaussians come the vertices (V, 3), metres, of the deformed mesh v_rec + v_id +
-    M_face v_exp, and its texture (n_g, n_g, 3) uint8 sRGB, which holds the Gaussians' colours and
-    the mean colour where no face covers a texel.
+    M_face v_exp, and its texture (n_g, n_g, 3) uint8 sRGB. The texture holds the Gaussians'
+    colours, and the mean colour where no face covers a texel.
     """
     model, state = loaded.model, head.state(loaded)
     gaussians = model.geometry(head.z_id, head.z_exp, state)

@@ -247,7 +247,7 @@ def start_texture(state: FitState) -> None:
     """Put the colours that the given views show into the bias (FitConfig.texture_warm_start).
 
     Texels that no view shows change like seen texels that looked similar before and lie near them
-    or near their mirror image: a paler face comes with paler ears.
+    or near their mirror image. So a paler face comes with paler ears.
     """
     model = state.model
     shown = []
@@ -288,7 +288,7 @@ def locality_loss(state: FitState, item: HeadView) -> Tensor:
     """Compare the tuned model and the loaded one between a training identity and the subject.
 
     Codes and coefficients are blended at a fixed t (weight of the subject), jaw and neck by SLERP
-    (paper, supplement); a random training camera sees the mesh posed again from the blend.
+    (paper, supplement). A random training camera sees the mesh posed again from the blend.
     """
     frames = sorted(f for f in state.loaded.gallery.frames if f[0] in state.loaded.model.subjects)
     frame = frames[int(state.rng.integers(len(frames)))]

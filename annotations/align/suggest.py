@@ -1,7 +1,7 @@
 """Suggest the frame of a clip that matches the reference's, or else its apex.
 
 All curves are projections of a face's features (``features.py``) on one direction, found from the
-clip itself: frames that show the expression define the direction, which in turn ranks the frames.
+clip itself. Frames that show the expression define the direction, which in turn ranks the frames.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Choose the cameras that see the face best, and write its landmarks and pictures in every frame.
 
-The network uses one window per clip, and head motion is averaged over time: both keep the jitter of
+The network uses one window per clip, and head motion is averaged over time. Both keep the jitter of
 single detections out of the curves in which expressions are searched for.
 """
 
@@ -231,8 +231,8 @@ def find_points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find landmarks (T, 68, 2), corner-origin pixels, and scores (T,) in T frames (H, W, 3) uint8.
 
-    The face is searched for in the middle frame only, in windows from ``smallest`` on (`detect`);
-    all frames and their mirror images are then looked at through the same window, except those
+    The face is searched for in the middle frame only, in windows from ``smallest`` on (`detect`).
+    All frames and their mirror images are then looked at through the same window, except those
     where the face has left it.
     """
     import torch

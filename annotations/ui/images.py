@@ -1,9 +1,9 @@
 """Draw pictures as lines of the terminal: block characters in any terminal, or sixels.
 
-A half block gives a cell 1 x 2 pixels; quadrants give it 2 x 2, each in one of the cell's two
-colours, split so that the error is least. Sixels are the DEC graphics that xterm, WezTerm,
-foot and iTerm2 draw (DEC VT330/VT340 Programmer Reference, volume 2, chapter 14): a sixel is a
-column of six pixels of one colour, and each band of six rows is written once per colour in it.
+A half block gives a cell 1 x 2 pixels. Quadrants give it 2 x 2, each in one of the cell's two
+colours, split so that the error is least. Sixels are the DEC graphics that xterm, WezTerm, foot and
+iTerm2 draw (DEC VT330/VT340 Programmer Reference, volume 2, chapter 14): a sixel is a column of six
+pixels of one colour, and each band of six rows is written once per colour in it.
 """
 
 from __future__ import annotations

@@ -67,8 +67,8 @@ class PicturePane(Widget):
     def render_lines(self, crop: Region) -> list[Strip]:
         """Return the lines of the picture, past Textual's cache of styled lines.
 
-        That cache rewrites the style of every segment, which costs more than all the rest: a
-        picture has thousands, and no border or padding that it would be needed for.
+        That cache rewrites the style of every segment, which costs more than all the rest. A
+        picture has thousands of them, and no border or padding that would need it.
         """
         if self.look is None:
             lines = self._written(self._words)

@@ -406,8 +406,8 @@ def read_gains(dataset: Dataset, subject: str) -> dict[str, np.ndarray]:
 def read_proxy(dataset: Dataset, subject: str, camera_id: str, frame: int) -> np.ndarray:
     """Read the small JPEG copy (h, w, 3) uint8 sRGB of a frame, which takes milliseconds.
 
-    The copy of a frame that ingest did not decode is made from the footage, with those of the
-    frames around it: a tenth of a second per frame at 4K.
+    The copy of a frame that ingest did not decode is made from the footage, together with those of
+    the frames around it. At 4K this takes a tenth of a second per frame.
 
     Raises:
         StageError: the subject is not ingested.

@@ -1,7 +1,7 @@
 """Withdraw a subject: remove everything a dataset holds about a person, then search for the id.
 
-Everything that mixes subjects (packed shards, reports, trained models' pictures) is removed, and
-running its command makes it again without the person; others' outputs that name the person go too.
+Everything that mixes subjects (packed shards, reports, trained models' pictures) is removed;
+running its command makes it again without the person. Others' outputs that name the person go too.
 A checkpoint loses the person's codes and frames; only retraining removes what its other weights
 learned. The raw capture lies outside the dataset: deleting it is up to its owner.
 

@@ -1,7 +1,7 @@
 """Choose settings: predict time and errors of the whole chain from a pilot, and say why.
 
-A cheaper setting of one stage is assumed to change a result independently of the other stages:
-squared differences add up, on top of the error that remains at the most expensive settings. What
+A cheaper setting of one stage is assumed to change a result independently of the other stages.
+Squared differences add up, on top of the error that remains at the most expensive settings. What
 remains follows from the errors that stages state; where no stage states one, only the differences
 are known.
 

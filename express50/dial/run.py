@@ -312,8 +312,8 @@ def _run_ready(run: _Run, stage: Stage, chosen: list[str] | None) -> Summary:
 def reserved(own: float, rest: float, left: float, budget: float) -> float:
     """Return the seconds that a stage must leave to those after it.
 
-    Where its own seconds and the rest are over the time left by a tenth of the budget at most, the
-    run continues and ends late, rather than with nothing made.
+    If its own seconds and the rest exceed the time left by at most a tenth of the budget, the run
+    continues and ends late, rather than with nothing made.
     """
     short = own + rest - left
     return rest - short if 0 < short <= GRACE * budget else rest

@@ -1,11 +1,11 @@
 """Read arrays from ``.npz``, ``.npy``, pickle and torch files without executing anything.
 
 Sizes are checked before memory is allocated: each array's shape and type must fit the size of the
-file, and all arrays of a file together must stay below a limit. FLAME's files are Python 2 pickles
-that name chumpy and scipy classes; landmark embeddings hold torch tensors. None of those libraries
-is imported: every class comes from a short allow list, and those of chumpy, scipy and torch are
-replaced by records that only keep their state. A pickle that names anything else is refused before
-anything is called. Torch's own files are read with ``weights_only``.
+file. All arrays of a file together must stay below a limit. FLAME's files are Python 2 pickles that
+name chumpy and scipy classes; landmark embeddings hold torch tensors. Every class comes from a
+short allow list, and those of chumpy and scipy are replaced by records that only keep their state.
+A pickle that names anything else is refused before anything is called. Torch's own files, and
+storages inside a pickle, are read with ``weights_only``.
 """
 
 from __future__ import annotations

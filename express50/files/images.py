@@ -290,7 +290,7 @@ def encode_jpeg(image: np.ndarray, quality: int = 95) -> bytes:
 def encode_png(image: np.ndarray) -> bytes:
     """Encode a grey or RGB image (H, W[, C]) uint8 or uint16, with alpha or without, as PNG.
 
-    Each row is stored as its difference from the one above and compressed by libdeflate: libpng
+    Each row is stored as its difference from the one above and compressed by libdeflate. Libpng
     takes three to five times as long for as many bytes (docs/LOG.md).
 
     Raises:
@@ -380,9 +380,9 @@ def is_cut_short(data: bytes | mmap.mmap) -> bool:
     """Return True if a JPEG stops before its end marker; False for other bytes.
 
     Decoders fill what is missing with grey and do not report it. Thumbnails in the header have end
-    markers of their own, and some cameras write more data after the picture's, so the search starts
-    after the first scan's header. In a scan, 0xFF is always followed by a byte that says what it is
-    (ITU-T T.81, B.1.1.5), so no other data looks like an end marker.
+    markers of their own, so the search starts after the first scan's header. Some cameras write
+    more data after the picture's end marker. In a scan, 0xFF is always followed by a byte that says
+    what it is (ITU-T T.81, B.1.1.5), so no other data looks like an end marker.
     """
     if data[:2] != b"\xff\xd8":
         return False
@@ -517,9 +517,9 @@ def edge_distance(mask: np.ndarray) -> np.ndarray:
     """Measure the distance (H, W) float32 of each pixel of a mask (H, W) to the nearest outside it.
 
     Distances are in pixels, zero outside; the mask must have an outside. The last bit of OpenCV's
-    square roots depends on where the mask lies in memory; squared distances are integers, and
-    rounding them gives the same bytes everywhere (up to 1,400 pixels from the edge, beyond which
-    float32 cannot distinguish them).
+    square roots depends on where the mask lies in memory. Squared distances are integers, so
+    rounding them gives the same bytes everywhere, up to 1,400 pixels from the edge, beyond which
+    float32 cannot distinguish them.
     """
     rough = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return np.sqrt(np.rint(np.square(rough)))

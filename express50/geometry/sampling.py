@@ -53,7 +53,7 @@ def undistort_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 def pictured_share(camera: Camera) -> float:
     """Return the share of the pinhole camera's pixels that the lens pictures, from a coarse grid.
 
-    It is below 1 if the distortion folds within the image: its coefficients then belong to another
+    It is below 1 if the distortion folds within the image. Its coefficients then belong to another
     image size, or were fitted only to points near the centre.
     """
     across = np.linspace(0, camera.width, COARSE)

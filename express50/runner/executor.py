@@ -80,8 +80,8 @@ class Pool:
 
         ``begin`` is called when a task is handed to a worker; once ``closed`` returns True, no
         further task is. A task whose worker died is tried again when nothing else runs, so that
-        neighbours that died with it are not blamed, and is set aside when that fails too. SLURM
-        jobs share a time limit but no memory, so there all such tasks are tried again together.
+        neighbours that died with it are not blamed. If that fails too, it is set aside. SLURM jobs
+        share a time limit but no memory, so there all such tasks are tried again together.
 
         Raises:
             StageError: the scheduler cannot be reached or went away, or offers no GPU that the

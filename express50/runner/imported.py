@@ -1,7 +1,7 @@
 """Publish results of other tools as a stage's output, with a receipt that marks them as imported.
 
 Later stages treat an imported item like the stage's own output. A run keeps it whatever the stage's
-settings are. It is valid for the cameras and peak frames that it was imported for: if these change,
+settings are. It is valid for the cameras and peak frames that it was imported for. If these change,
 it is set aside, and the stage does not make the item until the import is repeated or removed.
 """
 

@@ -1,8 +1,8 @@
 """Paint skin as a texture over directions from the head's centre.
 
-The texture does not use the head model's UV map: a place on the mean head is looked up by its
-azimuth and elevation, so any head model can be painted. Hidden places (nostrils, the back of the
-ear) have the colour of the surface in front of them.
+A place on the mean head is looked up by its azimuth and elevation, not in the head model's UV map,
+so that any head model can be painted. Hidden places (nostrils, the back of the ear) have the colour
+of the surface in front of them.
 """
 
 from __future__ import annotations

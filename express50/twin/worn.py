@@ -1,7 +1,7 @@
 """Make what people wear and hold: glasses, a hand, beards, fringes, a microphone, a mask.
 
-Worn hair grows as on the scalp. Glasses and microphones are rigid with the skull, beards and masks
-follow the skin below them, and a hand is in front of another part of the face per cue window.
+Worn hair grows as on the scalp. Glasses and microphones are rigid with the skull; beards and masks
+follow the skin below them. A hand is in front of another part of the face in each cue window.
 """
 
 from __future__ import annotations

@@ -21,13 +21,7 @@ from express50.console import FAILED, OK, answer, count, figure_label, log, say
 from express50.contract.config import config_toml, known_assignments
 from express50.contract.layout import check_results_file, check_results_folder
 from express50.errors import ConfigError, FormatError, check_known
-from express50.files.atomic import (
-    alone_in,
-    check_space,
-    dump_json,
-    write_bytes,
-    write_json,
-)
+from express50.files.atomic import alone_in, check_space, dump_json, write_bytes, write_json
 from express50.files.digests import file_sha256
 from grmm.config import TABLES, Config, as_tables, choose, from_tables, resolve
 from grmm.deviations import paper_diff

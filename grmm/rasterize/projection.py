@@ -1,10 +1,10 @@
 """Project and blend 3D Gaussians in the readable torch form that every backend follows.
 
-The projection is computed in float64 and only its results are rounded to the dtype of ``means``:
-needle-shaped and huge Gaussians cancel badly in float32, and N small matrices cost little.
+The projection is computed in float64, and only its results are rounded to the dtype of ``means``.
+Needle-shaped and huge Gaussians cancel badly in float32, and N small matrices cost little.
 `rasterize_reference` is the oracle: slow, for any device and float type. Tile by tile it forms
-every (Gaussian, pixel) pair. It checks the other backends and renders small scenes where the
-native library was not built.
+every (Gaussian, pixel) pair. It checks the other backends and renders small scenes where the native
+library was not built.
 
 Sources: EWA splatting (Zwicker et al. 2001) as in 3DGS (Kerbl et al. 2023), with the guards of
 gsplat (Ye et al. 2025: dilation, field-of-view clamp of the Jacobian, near plane, 1/255 cut-off);
@@ -175,7 +175,7 @@ def _regression(rows: Tensor, variances: Tensor) -> tuple[Tensor, Tensor, Tensor
     Cov(uv)^-1 Cov(uv, t). It equals the plane of RaDe-GS without inverting a 3x3 matrix, and the
     dilated Cov(uv) keeps it bounded for flat Gaussians.
 
-    Determinants are computed from cross products of the rows (Cauchy-Binet): for a needle,
+    Determinants are computed from cross products of the rows (Cauchy-Binet). For a needle,
     ``xx * yy - xy**2`` would be the difference of two numbers that agree in all digits.
     """
     u, v, t = rows.unbind(1)

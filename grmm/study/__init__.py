@@ -1,8 +1,8 @@
 """Ask people which of two methods is better, as the paper did: make a study, and its table.
 
 A study is counterbalanced twice: A is the first method in half of the examples, and every second
-participant sees the mirrored assignment: over two participants, each example shows each
-method once on each side. Every participant sees the examples in a different order.
+participant sees the mirrored assignment. So for two participants, each example shows each method
+once on each side. Every participant sees the examples in a different order.
 
 Answers are one JSON object per line; the last answer to a question counts. Judgments of one
 participant are correlated, so intervals come from a bootstrap that draws whole participants with
@@ -116,7 +116,7 @@ def _pictures(folder: Path) -> dict[str, Path]:
 def _copy(path: Path, out: Path, seed: int) -> str:
     """Write a picture as PNG under a digest; returns that name, relative to OUT.
 
-    The digest is of what the picture shows and where it came from: two methods that made the same
+    The digest is of what the picture shows and where it came from. Two methods that made the same
     picture must not be recognised by a shared address either.
     """
     pixels = read_image(path)

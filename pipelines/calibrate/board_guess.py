@@ -198,10 +198,10 @@ def relative_pose(
 ) -> tuple[np.ndarray, float] | None:
     """Find the pose to_from_from (4, 4) on which shared frames agree, and its weight in corners.
 
-    `camera` and `views` are those of the camera the pose leads to. The candidate that predicts
-    most corners in other frames is averaged with those near it. None if it explains less than half
-    of the frames, unless it explains a quarter and three: a camera with bad images stays, but one
-    that is out of step explains only the frame that its pose is from.
+    `camera` and `views` are those of the camera the pose leads to. The candidate that predicts most
+    corners in other frames is averaged with those near it. None if it explains less than half of
+    the frames, unless it explains a quarter and three. So a camera with bad images stays; one that
+    is out of step explains only the frame that its pose is from.
     """
     shared = sorted(set(from_poses) & set(to_poses))
     candidates = [

@@ -1,8 +1,8 @@
 """Measure cameras' colour gains against each other, per channel, on the board's white paper.
 
-Matt paper reflects nearly the same light in all directions, so a camera's gain is the light that it
-records of a square over what the others record at the same instant. Faces do not serve: their gloss
-differs between cameras by more than the gains do (docs/LOG.md).
+Matt paper reflects nearly the same light in all directions. So a camera's gain is the light that it
+records of a square, over what the others record at the same instant. Faces do not serve: their
+gloss differs between cameras by more than the gains do (docs/LOG.md).
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ def read_footage(index: Index, cameras: Mapping[str, Camera], count: int) -> Ima
     """Yield reduced images of ingested footage at up to `count` instants.
 
     The instants are the middles of cues, or spread over all frames where there are no cues. If the
-    first camera has a key frame earlier in the cue, that is taken instead: in 4K footage with one
+    first camera has a key frame earlier in the cue, that is taken instead. In 4K footage with one
     key frame per second, it is read in a tenth of the time.
     """
     cues = [cue for cue in index.cues if cue.end_frame < index.frames]

@@ -3,7 +3,7 @@
 The covariance of all cameras follows from the derivatives of the corners' errors, boards' poses
 eliminated. It is carried over to points at the head, after worlds are aligned by these points,
 because later stages depend on nothing else. It assumes independent errors of corners and a true
-lens model, so it is enlarged where corners of one image are off together, and where rigs from two
+lens model. So it is enlarged where corners of one image are off together, and where rigs from two
 halves of the board images differ by more than it predicts.
 
 Source: mrcal's projection uncertainty (Kogan, https://mrcal.secretsauce.net/uncertainty.html).
@@ -107,7 +107,7 @@ def camera_errors(
     """Return by camera the rms distance, pixels, of points (N, 3) in two rigs' pictures.
 
     The points are the true rig's. Worlds are laid on each other by the points as either rig
-    triangulates them: a camera's rotation and principal point trade places without harm there, and
+    triangulates them. A camera's rotation and principal point trade places without harm there, but
     would tilt a fit to the cameras themselves.
     """
     names = sorted(found)

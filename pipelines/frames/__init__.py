@@ -1,8 +1,8 @@
 """Write each labelled peak frame once, undistorted, colour-corrected and reduced, and the plates.
 
-An item is an expression of a subject with all cameras: a changed label then redoes one expression
-only, and a seek in 4K H.264 costs half a second with any grouping. The clean plates of a subject
-and the sizes of its pictures are one more item.
+An item is an expression of a subject with all cameras, so that a changed label redoes one
+expression only. A seek in 4K H.264 costs half a second with any grouping. The clean plates of a
+subject and the sizes of its pictures are one more item.
 """
 
 from __future__ import annotations

@@ -91,8 +91,8 @@ def run(dataset: Dataset, item: str, out: Path, side: int) -> Result:
 def _with_face(images: dict[str, np.ndarray]) -> list[str]:
     """Return the cameras whose picture (H, W, 3) uint8 shows a large face.
 
-    Some pictures are looked at first (an empty one takes a core second), and the others only if one
-    of them shows a face: who stands in one plate usually stands in all.
+    Some pictures are looked at first, as an empty one takes a core second. The others follow only
+    if one of them shows a face: who stands in one plate usually stands in all.
     """
     from express50.landmarks.detector import detect_many
     from express50.landmarks.network import load_network

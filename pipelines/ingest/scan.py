@@ -169,9 +169,7 @@ def _steps(pts: tuple[int, ...], clips: tuple[int, ...]) -> np.ndarray:
 
 
 def odd_footage(
-    raw: RawCapture,
-    cameras: Mapping[str, CameraSource],
-    measured: Mapping[str, CameraMeasurements],
+    raw: RawCapture, cameras: Mapping[str, CameraSource], measured: Mapping[str, CameraMeasurements]
 ) -> dict[str, str]:
     """Return warnings about rate, time stamps, channels and orientation, by camera."""
     found = {}

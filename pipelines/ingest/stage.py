@@ -1,7 +1,7 @@
 """Decode every camera once, and write the frame index, the proxies and a contact sheet.
 
-Every later stage names frames by decode index; the index holds each frame's time stamp and hash,
-so that a label can be checked against the footage it was made on. Proxies are small JPEGs in an
+Every later stage names frames by decode index. The index holds each frame's time stamp and hash, so
+that a label can be checked against the footage it was made on. Proxies are small JPEGs in an
 indexed tar, because a random seek in 4K H.264 costs half a second. The same pass checks sync, focus
 and light: faults are warnings, and the figures go to checks.json.
 

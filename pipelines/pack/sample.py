@@ -327,8 +327,8 @@ def cut_depth(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Cut depth (H, W), metres, and its validity to (size, size); surfaces are never blended.
 
-    Each new pixel's centre takes the bilinear mean of inverse depth, which is exact on planes,
-    where its four neighbours are valid and lie on one surface; else its nearest pixel.
+    Each new pixel takes the bilinear mean of inverse depth at its centre, which is exact on planes,
+    if its four neighbours are valid and lie on one surface; else the nearest pixel.
     """
     window, known = _window(depth, crop), _window(valid, crop)
     inverse = np.where(known, 1.0 / np.where(known, window, 1.0), 0.0)

@@ -220,8 +220,8 @@ def split_subjects(
     """Divide the subjects into ``train`` and ``test``; no subject is in both.
 
     Without named test subjects a hash of each subject's id decides, so that a subject stays in its
-    split when others join. Where no hash falls below the fraction, of two or more the one with the
-    lowest is chosen, unless the fraction is 0; it returns to training when a lower one joins.
+    split when others join. If no hash of two or more falls below the fraction, the lowest is
+    chosen, unless the fraction is 0. It returns to training when a lower one joins.
 
     Raises:
         StageError: a named subject does not exist, or nobody is left to train on.

@@ -170,9 +170,9 @@ def make_photo_capture(
 ) -> PhotoCapture:
     """Write capture.toml, footage, cues and calibration; returns what was found.
 
-    A photograph is one cue of one frame; a video is cut into `windows` cues of equal length, from
-    each of which `align` takes a frame for the shared shape. An earlier capture of the same file
-    in `folder` is overwritten. `film_mm` is assumed where neither `focal_px` nor EXIF is known.
+    A photograph is one cue of one frame. A video is cut into `windows` cues of equal length, and
+    `align` takes a frame from each for the shared shape. An earlier capture of the same file in
+    `folder` is overwritten. `film_mm` is assumed where neither `focal_px` nor EXIF is known.
 
     Raises:
         CaptureError: the picture cannot be read or shows no face, the folder has another picture,

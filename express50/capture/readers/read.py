@@ -3,7 +3,7 @@
 A layout is a row of a plain table: its name, what it looks like, a test, the subject's id, and a
 reader that turns it into a `RawCapture`. Nothing is copied or unpacked. A folder with capture.toml
 may name where the footage lies (``source``), which layout it is (``layout``) and which parts to
-take, so that read-only datasets need no file of ours beside them.
+take. So read-only datasets need no file of ours beside them.
 """
 
 from __future__ import annotations

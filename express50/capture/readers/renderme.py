@@ -1,10 +1,10 @@
 """Read RenderMe-360: a folder of one actor's ``.smc`` files (HDF5), or one such file.
 
-There are two releases. The full one (21 actors) has pictures in ``raw/<id>/<id>_e0_raw.smc``
-and cameras in ``anno/<id>/<id>_e0_anno.smc``; the one of 500 actors has both in ``<id>_e0.smc``,
-but only key frames of an expression. An expression's peak is the last frame of its clip in both,
-but that is frame 119 of one and 12 of the other: the release and the frame's own number are stored.
-``RT`` is camera to world. Source: the dataset's published layout and reader.
+There are two releases. The full one (21 actors) has pictures in ``raw/<id>/<id>_e0_raw.smc`` and
+cameras in ``anno/<id>/<id>_e0_anno.smc``; the one of 500 actors has both in ``<id>_e0.smc``, but
+only key frames of an expression. An expression's peak is the last frame of its clip in both, but
+that is frame 119 of one and 12 of the other. Therefore the release and the frame's own number are
+stored. ``RT`` is camera to world. Source: the dataset's published layout and reader.
 """
 
 from __future__ import annotations

@@ -24,13 +24,7 @@ from express50.dataset.withdraw import (
     withdrawn,
     withdrawn_file,
 )
-from express50.errors import (
-    CaptureError,
-    FormatError,
-    NotReadyError,
-    StageError,
-    UnknownNameError,
-)
+from express50.errors import CaptureError, FormatError, NotReadyError, StageError, UnknownNameError
 from express50.files.atomic import alone_in
 from express50.files.digests import text_digest
 from express50.runner import publish

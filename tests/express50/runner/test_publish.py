@@ -11,13 +11,7 @@ from express50.contract.layout import Dataset
 from express50.errors import FormatError
 from express50.files import atomic
 from express50.files.atomic import dump_json, folder_in_one_step, write_bytes, write_json
-from express50.runner.publish import (
-    clean_leftovers,
-    publishing,
-    run_folder,
-    set_aside,
-    stage_lock,
-)
+from express50.runner.publish import clean_leftovers, publishing, run_folder, set_aside, stage_lock
 
 ITEM = "S001/cam00"
 
