@@ -43,6 +43,8 @@ UNSEEN_CLASS_SHARE = 1.2e-4  # of every cell of a class without samples: spread 
 SURE_BELOW, SURE_ABOVE = -0.01, 0.10
 # Lower hair hangs from the head in strands as wide as this; wisps reach this far from them.
 STRAND_M, WISP_M = 0.005, 0.02
+# Skin apart from the head that covers less than this share of it is a speck of the torso.
+SPECK = 0.02
 
 # Log-priors by place, nats: UNLIKELY marks what occurs at edges, IMPOSSIBLE what cannot be.
 UNLIKELY, IMPOSSIBLE = -1.0, -20.0
@@ -207,7 +209,19 @@ def label_by_colour(
     kept = np.isin(geometry.near, (SKIN, NECK, EARS)) & around
     skin_label = np.where(kept, geometry.near, SKIN)
     unsure = (geometry.mesh == 0) | np.isin(geometry.mesh, list(_ON_MESH))
-    return np.where(unsure, np.choose(best, [HAIR, skin_label, TORSO]), labels).astype(np.uint8)
+    labels = np.where(unsure, np.choose(best, [HAIR, skin_label, TORSO]), labels).astype(np.uint8)
+    specks = unsure & (best == 1) & _small_parts((labels != TORSO) & (alpha > 0))
+    return np.where(specks, TORSO, labels)
+
+
+def _small_parts(head: np.ndarray) -> np.ndarray:
+    """Find the parts (H, W) of the head (H, W) bool that are apart and small.
+
+    In noise, shirts have single pixels in the colours of skin.
+    """
+    _, part, stats, _ = cv2.connectedComponentsWithStats(head.astype(np.uint8), connectivity=8)
+    area = stats[:, cv2.CC_STAT_AREA]
+    return head & (area < SPECK * area[1:].max(initial=0))[part]
 
 
 def _loose(hair: np.ndarray, above: np.ndarray, metre_px: float) -> np.ndarray:

@@ -6,6 +6,7 @@ import json
 import shutil
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -108,6 +109,16 @@ def test_a_piece_of_shirt_in_the_colour_of_hair_is_torso_and_a_hanging_lock_is_h
     assert label_mask(labels, "torso")[piece].mean() > 0.95
     lock = label_mask(scene.labels, "hair") & (np.arange(160)[:, None] > 110)
     assert label_mask(labels_of(scene), "hair")[lock].mean() > 0.7
+
+
+def test_a_speck_of_shirt_in_the_colour_of_skin_is_torso() -> None:
+    scene = make_scene(180)
+    shirt = label_mask(scene.labels, "torso")
+    alone = cv2.erode(shirt.astype(np.uint8), np.ones((9, 9)))  # not beside the neck
+    specks = (alone > 0) & (np.arange(160) % 8 < 2) & (np.arange(160)[:, None] % 8 < 2)
+    rgb = np.where(specks[..., None], COLOURS["skin"], scene.rgb).astype(np.uint8)
+    labels = labels_of(replace(scene, rgb=rgb))
+    assert label_mask(labels, "torso")[specks].all()
 
 
 def test_without_colours_the_necks_end_still_takes_most_of_the_torso_away() -> None:
