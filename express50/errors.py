@@ -79,6 +79,10 @@ class TrainError(Express50Error):
     """Training or fitting cannot continue."""
 
 
+class DivergedError(TrainError):
+    """Training or fitting has reached NaN or Inf."""
+
+
 def check_known(
     where: str,
     what: str,

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.stats import t as student_t
 
 from express50.console import count, format_seconds, log
-from express50.errors import ConfigError, FormatError, check_known
+from express50.errors import ConfigError, DivergedError, FormatError, check_known
 from express50.files.atomic import dump_json, write_bytes, write_json
 from express50.files.digests import file_sha256
 from express50.files.text import markdown_table, read_json_table
@@ -217,16 +217,20 @@ def _row(run: Ablation, name: str, variant: Variant, seed: int, wanted: bool) ->
     if not wanted:
         return None
     folder = run.out / f"{variant.trains_as or name}{ending}"
-    if not variant.trains_as:
-        _train(used, folder, settings)
     fits = path.parent / FITS
-    if diverged(read_json_table(folder / "metrics.json", FormatError)):
-        log(f"ablate: {name}{ending} diverged; lower train.lr for all rows, and name another OUT")
-        row = {"groups": {}, "diverged": True}
-    else:
+    try:
+        if not variant.trains_as:
+            _train(used, folder, settings)
+        metrics = folder / "metrics.json"
+        if not metrics.exists() or diverged(read_json_table(metrics, FormatError)):
+            raise DivergedError(f"{folder}: training left no usable model")
         loaded = load_checkpoint(folder / "checkpoint.pt", best_device())
         log(f"ablate: measuring {name}{ending}")
         row = measure(run, replace(loaded, config=settings), used, fits)
+    except DivergedError as error:  # the other rows do not depend on it
+        log(f"ablate: {error}")
+        log(f"ablate: {name}{ending} diverged; lower train.lr for all rows, and name another OUT")
+        row = {"groups": {}, "diverged": True}
     row |= {"digest": digest, "label": variant.label, "paper_db": variant.paper_db}
     row["against"] = variant.against
     write_json(path, row)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from express50.errors import ConfigError, FormatError, HeadModelError, TrainError
+from express50.errors import ConfigError, DivergedError, FormatError, HeadModelError
 from express50.files.arrays import DAMAGE, read_weights
 from express50.files.atomic import write_with
 from express50.files.text import reason
@@ -93,11 +93,11 @@ def save_checkpoint(
     """Write a checkpoint atomically; the previous one stays until the new one is complete.
 
     Raises:
-        TrainError: a weight is NaN or Inf; `load_checkpoint` would refuse the file.
+        DivergedError: a weight is NaN or Inf; `load_checkpoint` would refuse the file.
     """
     for name, tensor in model.state_dict().items():
         if not bool(torch.isfinite(tensor).all()):
-            raise TrainError(
+            raise DivergedError(
                 f"{path}: not saved, because {name} holds NaN or Inf: training diverged. What was "
                 "saved before is kept; lower the learning rate and start over with --overwrite"
             )

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from express50.console import figure_label, format_table
 from express50.contract.segmentation_labels import label_mask
-from express50.errors import ConfigError, FormatError, TrainError, few
+from express50.errors import ConfigError, DivergedError, FormatError, few
 from express50.files.atomic import naming_full_disk, write_bytes, write_json
 from express50.files.images import read_image, write_image
 from express50.files.text import is_number, no_folder
@@ -143,10 +143,10 @@ def compare(image: Tensor, item: HeadView, judge: PerceptualMetrics, kind: str =
     those of REGIONS pixels with such labels (NaN without labels, and under LEAST_PX).
 
     Raises:
-        TrainError: the picture is not finite; a mean would silently skip it.
+        DivergedError: the picture is not finite; a mean would silently skip it.
     """
     if not bool(torch.isfinite(image).all()):
-        raise TrainError(
+        raise DivergedError(
             f"{item.key.name}: the rendering holds NaN or Inf; expected colours. The checkpoint is "
             "damaged or was trained at too high a rate"
         )

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from express50.console import figure_label, format_seconds, log
-from express50.errors import ConfigError, TrainError
+from express50.errors import ConfigError, DivergedError
 from express50.files.atomic import check_space, dump_json, write_json
 from express50.geometry.sampling import evenly
 from grmm import losses
@@ -316,7 +316,7 @@ def random_camera(state: FitState) -> PinholeView:
 def _finite(loss: Tensor, iteration: int, stage: int) -> Tensor:
     if not bool(torch.isfinite(loss)):
         remedy = "lower fit.stage2_lr or check" if stage == 2 else "check"
-        raise TrainError(
+        raise DivergedError(
             f"fit, stage {stage}, iteration {iteration}: the objective is {float(loss.detach())}, "
             f"expected a finite number; {remedy} the tracked parameters"
         )

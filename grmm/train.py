@@ -24,7 +24,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from express50 import native
 from express50.console import count, log
-from express50.errors import NotReadyError, TrainError
+from express50.errors import DivergedError, NotReadyError
 from express50.files.atomic import check_space, write_json
 from express50.geometry.sampling import evenly
 from express50.head.model import HeadModel
@@ -78,7 +78,8 @@ def train(
     terms to the objective. Returns the content of metrics.json; empty in processes but the first.
 
     Raises:
-        TrainError: nothing to train on, or the objective is not finite.
+        TrainError: nothing to train on.
+        DivergedError: the objective or a weight is not finite.
         ConfigError: the configuration differs from the one resumed, or there is neither a GPU nor
             the native library.
     """
@@ -138,7 +139,7 @@ def train(
             order = state.shuffle.state()
             try:
                 step(state, parallel, config, late)
-            except TrainError:
+            except DivergedError:
                 raise
             except Exception:  # a damaged shard, too little memory, or another process has failed
                 state.shuffle.restore(order)  # nothing else has changed: keep the steps before
@@ -178,7 +179,7 @@ def step(
     """Take one optimiser step over ``accumulate`` views, or over those seen when it is ``late``.
 
     Raises:
-        TrainError: something is not finite.
+        DivergedError: something is not finite.
         FormatError, OSError: a view cannot be read.
     """
     state.optimizer.zero_grad(set_to_none=True)
@@ -192,7 +193,7 @@ def step(
                 rows = state.model.rows(*item.key.frame)
                 rendering = parallel(*rows, item.state, item.view, state.views.background)
             except NotFiniteTensorError as error:
-                raise TrainError(
+                raise DivergedError(
                     f"iteration {state.iteration}: training diverged ({error}); lower train.lr and "
                     "start over with --overwrite"
                 ) from None
@@ -201,7 +202,7 @@ def step(
             state.terms = {name: term.detach() for name, term in terms.items()}
             if not bool(torch.isfinite(loss)):
                 shown = (f"{name} {float(term):.4g}" for name, term in state.terms.items())
-                raise TrainError(
+                raise DivergedError(
                     f"iteration {state.iteration}: the objective is not finite at {item.key.name}"
                     f" ({', '.join(shown)}); check this sample, or lower train.lr and start over"
                     " with --overwrite"

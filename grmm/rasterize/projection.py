@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from express50.errors import TrainError
+from express50.errors import DivergedError
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.transforms_torch import quat_to_matrix
 
@@ -32,7 +32,7 @@ FOV_MARGIN = 0.15  # the Jacobian is clamped this part of the image size beyond 
 TILE = 32  # pixels of the reference; only speed and memory depend on it
 
 
-class NotFiniteTensorError(TrainError, ValueError):
+class NotFiniteTensorError(DivergedError, ValueError):
     """An argument of ``rasterize`` holds NaN, Inf or numbers too large to square."""
 
 

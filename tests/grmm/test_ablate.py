@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from benchmarks.ablate import differences, earned
-from express50.errors import ConfigError, FormatError
+from express50.errors import ConfigError, DivergedError, FormatError
 from express50.files.images import read_image, write_image
 from grmm import ablate as ablate_module
 from grmm.ablate import VARIANTS
@@ -107,6 +107,26 @@ def test_a_row_that_diverged_is_marked_and_has_no_figures(roots, tmp_path, monke
     assert "n/a | n/a | +0.00 |" not in lines[2] and "| +0.00 |" in lines[2]
     rows = json.loads((tmp_path / "ablation.json").read_text())["rows"]
     assert rows["no_mesh_decoder"]["groups"] == {} and rows["full"]["groups"]["unseen"]
+
+
+def test_a_row_whose_training_is_not_finite_does_not_stop_the_others(
+    roots, tmp_path, monkeypatch, capsys
+):
+    real = ablate_module.train
+
+    def train(source, head, folder, *rest, **options):
+        if folder.name == "full":
+            raise DivergedError("iteration 1: the objective is not finite")
+        return real(source, head, folder, *rest, **options)
+
+    monkeypatch.setattr(ablate_module, "train", train)
+    assert main([*command(roots, tmp_path), "--rows=no_locality,no_mesh_decoder"]) == 1
+    said = capsys.readouterr().err
+    assert "iteration 1: the objective is not finite" in said
+    assert "full diverged" in said and "no_locality diverged" in said
+    rows = json.loads((tmp_path / "ablation.json").read_text())["rows"]
+    assert rows["no_locality"]["groups"] == rows["full"]["groups"] == {}
+    assert rows["no_mesh_decoder"]["groups"]["unseen"]
 
 
 def test_a_stopped_ablation_keeps_the_people_it_has_fitted(roots, tmp_path, monkeypatch):
