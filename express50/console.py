@@ -90,15 +90,6 @@ class Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, words)
         return super()._get_values(action, arg_strings)
 
-    def _get_value(self, action: argparse.Action, text: str) -> Any:
-        try:
-            return super()._get_value(action, text)
-        except argparse.ArgumentError:
-            if action.type not in (int, float):
-                raise
-            wanted = "a whole number" if action.type is int else "a number"
-            raise argparse.ArgumentError(action, f"got {text!r}, expected {wanted}") from None
-
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:
             known = [str(choice) for choice in action.choices]

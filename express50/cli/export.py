@@ -38,7 +38,7 @@ def add_commands(subparsers: Any) -> None:
     words = "masks without the torso, from the regions stage"
     add("--head-only", action="store_true", help=words)
     words = "make pictures N times smaller (default: 1)"
-    add("--downscale", type=int, default=1, metavar="N", help=words)
+    add("--downscale", type=number(1), default=1, metavar="N", help=words)
     words = "divide out the cameras' colour gains that calibrate measured on a board"
     add("--even-colour", action="store_true", help=words)
     words = "expression to hold out for testing; may be repeated (default: the last three tenths)"

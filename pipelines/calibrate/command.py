@@ -65,7 +65,7 @@ def add_commands(subparsers: Any) -> None:
         words = "size of the footage, pixels; K is scaled to it"
         add("--size", type=picture_size, metavar="WIDTHxHEIGHT", help=words)
         words = "metres per unit of SOURCE's world (default: 1)"
-        add("--scale", type=float, default=1.0, metavar="METRES", help=words)
+        add("--scale", type=number(1e-9, kind=float), default=1.0, metavar="METRES", help=words)
 
 
 def run_import(args: argparse.Namespace) -> int:

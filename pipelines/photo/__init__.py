@@ -34,9 +34,10 @@ def add_commands(subparsers: Any) -> None:
     parser.add_argument("out", type=Path, metavar="OUT", help="dataset to make or extend")
     parser.add_argument("--subject", metavar="ID", help="subject's id (default: the file's name)")
     lens = parser.add_mutually_exclusive_group()
-    lens.add_argument("--focal-px", type=float, metavar="PX", help="focal length, pixels")
+    length = number(1, kind=float)
+    lens.add_argument("--focal-px", type=length, metavar="PX", help="focal length, pixels")
     lens.add_argument(
-        "--film-mm", type=float, default=50.0, metavar="MM",
+        "--film-mm", type=length, default=50.0, metavar="MM",
         help="focal length to assume if EXIF has none, mm on 35 mm film (default: 50)",
     )  # fmt: skip
     parser.add_argument(
@@ -52,15 +53,6 @@ def add_commands(subparsers: Any) -> None:
     add_config_options(parser)
 
 
-def check_options(args: argparse.Namespace) -> None:
-    """Refuse options that no capture can have."""
-    if args.subject is not None and not ID.fullmatch(args.subject):
-        raise ConfigError(f"--subject {args.subject!r}: expected letters, digits, '_' and '-'")
-    for name, value in (("--focal-px", args.focal_px), ("--film-mm", args.film_mm)):
-        if value is not None and not 0 < value < float("inf"):
-            raise ConfigError(f"{name} {value}: expected a number above 0")
-
-
 def run_photo(args: argparse.Namespace) -> int:
     """Make the capture and run the stages on it."""
     # Imported here: the list of commands must not wait for torch.
@@ -71,7 +63,8 @@ def run_photo(args: argparse.Namespace) -> int:
     from pipelines import ingest
     from pipelines.photo.capture import make_photo_capture, open_picture, subject_id, write_panel
 
-    check_options(args)
+    if args.subject is not None and not ID.fullmatch(args.subject):
+        raise ConfigError(f"--subject {args.subject!r}: expected letters, digits, '_' and '-'")
     picture = open_picture(args.picture)
     clips, given = ("track.frames=clips",) if picture.video else (), args.set
     args.set = [*PHOTO_SETTINGS, *clips, *given]

@@ -336,7 +336,7 @@ def test_colour_gains_are_divided_out(dataset, tmp_path) -> None:
         (["--format=glb", "--downscale=2"], 2, "--format glb: --background, --head-only"),
         (["--format=gaussian-avatars", "--validation-camera=x"], 2, "expected one of cam00, cam01"),
         (["--format=gaussian-avatars", "--test-expression=x"], 2, "no expression 'x'; expected"),
-        (["--format=gaussian-avatars", "--downscale=0"], 2, "--downscale 0: expected 1 (full"),
+        (["--format=gaussian-avatars", "--downscale=0"], 2, "got '0', expected a whole"),
         (["--format=gaussian-avatars", "--downscale=99"], 2, "downscale 99: expected 1"),
         (["--format=gaussian-avatars", "--head-only", "--expression=smile", "--subject=S001"], 1,
          "express50 regions"),
