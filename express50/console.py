@@ -113,7 +113,7 @@ class Parser(argparse.ArgumentParser):
         return found, left
 
 
-def number(low: int, high: int = 1 << 20, kind: type = int) -> Callable[[str], Any]:
+def number(low: float, high: float = 1 << 20, kind: type = int) -> Callable[[str], Any]:
     """Make an argument type of numbers from ``low`` to ``high``, by default whole ones."""
 
     def parse(text: str) -> Any:
