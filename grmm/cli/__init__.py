@@ -7,7 +7,6 @@ of options. `grmm.cli.commands` implements the commands.
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +22,7 @@ EPILOG = """example:
   grmm train DATASET/pack/shards OUT --budget 10m
 exit codes: 0 all done; 1 failed; 2 wrong usage or settings"""
 MOST_PX = 8192  # of a picture's side
+ANGLE = number(-36000, 36000, float)  # degrees: a hundred turns
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -43,17 +43,6 @@ def parse_seconds(text: str) -> float:
             f"{text!r} is not a time; expected a number of seconds above 0, or 60s, 5m, 1h"
         )
     return seconds
-
-
-def finite(text: str) -> float:
-    """Parse a number that is neither NaN nor infinite."""
-    try:
-        found = float(text)
-    except ValueError:
-        found = math.nan
-    if not math.isfinite(found):
-        raise argparse.ArgumentTypeError(f"{text!r}, expected a finite number")
-    return found
 
 
 def value(metavar: str, words: str, **settings: Any) -> dict[str, Any]:
@@ -163,11 +152,11 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--size": value(
         "N", "longer side, pixels (default: as trained)", type=number(0, MOST_PX), default=0
     ),
-    "--yaw": value("DEG", "move the camera around the head, degrees", type=finite, default=0.0),
-    "--pitch": value("DEG", "move the camera up, degrees", type=finite, default=0.0),
+    "--yaw": value("DEG", "move the camera around the head, degrees", type=ANGLE, default=0.0),
+    "--pitch": value("DEG", "move the camera up, degrees", type=ANGLE, default=0.0),
     "--turntable": flag("write turntable.mp4"),
     "--degrees": value(
-        "DEG", "angle that the turntable covers (default: 360)", type=finite, default=360.0
+        "DEG", "angle that the turntable covers (default: 360)", type=ANGLE, default=360.0
     ),
     "--frames": value(
         "N", "number of frames of a video (default: %(default)s)", type=number(1), default=72
@@ -183,7 +172,10 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "N", "write samples.jpg with this many new heads", type=number(0), default=0
     ),
     "--spread": value(
-        "FACTOR", "spread of the samples (default: 1, as in training)", type=finite, default=1.0
+        "FACTOR",
+        "spread of the samples (default: 1, as in training)",
+        type=number(0, 100, float),
+        default=1.0,
     ),
     "--seed": value("N", "random seed (default: 0)", type=number(0), default=0),
     "--columns": value(
