@@ -57,7 +57,7 @@ OFF: dict[str, object] = {
     "pipelines.track.schedule.find_worn_glasses": lambda *_: np.zeros((0, 3)),
     "pipelines.depth.stage.face_views": lambda *_: [],
     "pipelines.regions.stage.find_hands": lambda _, labels, __: np.zeros(labels.shape, bool),
-    "pipelines.regions.colour.bare_skin": lambda _, skin: skin,
+    "pipelines.regions.colour.bare_skin": lambda _, skin, *__: skin,
 }
 Row = dict[str, float]
 

@@ -75,8 +75,8 @@ def face_colours(rgb: np.ndarray, alpha: np.ndarray, mesh: np.ndarray) -> np.nda
 
     The frame (H, W, 3) is uint8 sRGB, alpha (H, W) in [0, 1], `mesh` (H, W) the mesh's labels.
     """
-    skin, neck = ((mesh == label) & (alpha > SOLID) for label in (SKIN, NECK))
-    skin = bare_skin(rgb, skin, neck)
+    solid = alpha > SOLID
+    skin = bare_skin(rgb, (mesh == SKIN) & solid, mesh, solid)
     return _counts(_cells(rgb), skin) if _sees_face(mesh) and skin.sum() >= LEAST else None
 
 
@@ -124,15 +124,15 @@ def like_skin(values: np.ndarray, face: np.ndarray) -> np.ndarray:
     return (np.abs(_ratios(values) - usual) < WITHIN * spread).all(1)
 
 
-def bare_skin(rgb: np.ndarray, skin: np.ndarray, neck: np.ndarray) -> np.ndarray:
-    """Leave a beard or a fringe, whose colours are unlike most of it, out of the skin (H, W).
+def bare_skin(rgb: np.ndarray, skin: np.ndarray, mesh: np.ndarray, solid: np.ndarray) -> np.ndarray:
+    """Leave beards and hair, whose colours are unlike most of it, out of the skin (H, W).
 
-    The neck (H, W) shows the colours of skin where a fringe covers most of the face. Brows,
-    nostrils and shadows stay: they are a smaller share than COVERED.
+    Brows, nostrils and shadows stay: they are a smaller share than COVERED. The mesh's labels
+    (H, W) say where skin is seen if hair covers most of the face; the matte is `solid` (H, W).
     """
     if not skin.any():
         return skin
-    logs, sure = colour_logs(rgb[skin]), _uncovered(rgb, skin, neck)
+    logs, sure = colour_logs(rgb[skin]), _uncovered(rgb, skin, mesh, solid)
     alike = like_skin(logs, logs if sure is skin else colour_logs(rgb[sure]))
     if alike.mean() > 1 - COVERED:
         return skin
@@ -141,15 +141,45 @@ def bare_skin(rgb: np.ndarray, skin: np.ndarray, neck: np.ndarray) -> np.ndarray
     return kept
 
 
-def _uncovered(rgb: np.ndarray, face: np.ndarray, neck: np.ndarray) -> np.ndarray:
-    """Return the pixels of the face (H, W), or those of the neck if a fringe covers the face."""
+def _uncovered(
+    rgb: np.ndarray, face: np.ndarray, mesh: np.ndarray, solid: np.ndarray
+) -> np.ndarray:
+    """Return pixels (H, W) of skin: the face's, or some that hair does not cover.
+
+    Long hair over the face's sides leaves what is between eyes and mouth; a fringe hides that, too,
+    but not the neck.
+    """
+    middle = _middle_of_face(rgb, mesh, solid)
+    if middle is not None:
+        of_face, of_middle = (np.median(_some_ratios(rgb[mask]), axis=0) for mask in (face, middle))
+        apart = np.abs(of_face - of_middle)
+        return face if (apart < UNLIKE / 2).all() else middle
+    neck = (mesh == NECK) & solid
     if neck.sum() < LEAST:
         return face
     of_face, of_neck = (_some_ratios(rgb[mask]) for mask in (face, neck))
-    middle = np.median(of_face, axis=0)
+    usual = np.median(of_face, axis=0)
     # Skin is redder than most hair, and than the collars that hide necks.
-    redder = np.median(of_neck[:, 1]) > middle[1] + UNLIKE[1]
-    return neck if redder and _share_near(middle, of_face) < COHERENT else face
+    redder = np.median(of_neck[:, 1]) > usual[1] + UNLIKE[1]
+    return neck if redder and _share_near(usual, of_face) < COHERENT else face
+
+
+def _middle_of_face(rgb: np.ndarray, mesh: np.ndarray, solid: np.ndarray) -> np.ndarray | None:
+    """Return the skin (H, W) bool between eyes and mouth, if it has one colour; else None.
+
+    Neither beards nor long hair cover it, but fringes and sunglasses do.
+    """
+    features = label_mask(mesh, "eyes", "lips")
+    if not features.any():
+        return None
+    between = np.zeros(mesh.shape, np.uint8)
+    ends = np.argwhere(features)[:, ::-1].astype(np.int32)
+    cv2.fillConvexPoly(between, cv2.convexHull(ends), 1)
+    skin = (between > 0) & (mesh == SKIN) & solid
+    if skin.sum() < LEAST:
+        return None
+    ratios = _some_ratios(rgb[skin])
+    return skin if _share_near(np.median(ratios, axis=0), ratios) > COHERENT else None
 
 
 def _sees_face(mesh: np.ndarray) -> bool:
@@ -174,13 +204,16 @@ def label_by_colour(
     labels, cells = geometry.labels(), _cells(rgb)
     solid = alpha > SOLID
     hair = solid & ((labels == SCALP) | ((labels == HAIR) & (geometry.height > SURE_ABOVE)))
-    skin = solid & (geometry.mesh > 0) & (labels == SKIN)
-    if skin.sum() < LEAST:  # the neck, which hair may cover, teaches only where no face does
+    sees_face = _sees_face(geometry.mesh)
+    face = solid & (geometry.mesh > 0) & (labels == SKIN)
+    skin = face & (geometry.off == 0)  # in front of it are hair and hands
+    hidden = not sees_face or 2 * skin.sum() < face.sum()
+    if skin.sum() < LEAST and not sees_face:  # hair may cover the neck
         skin = skin | (solid & (labels == NECK) & (geometry.height > SURE_ABOVE))
     covered = np.zeros_like(skin)
-    if _sees_face(geometry.mesh):  # from behind, most of it may be hair
-        face, skin = skin, bare_skin(rgb, skin, solid & (labels == NECK))
-        covered = face & ~skin
+    if sees_face:  # from behind, most of it may be hair
+        taught, skin = skin, bare_skin(rgb, skin, geometry.mesh, solid)
+        covered = taught & ~skin
     torso = solid & (labels == TORSO) & (geometry.height < SURE_BELOW)
     beyond = IMPOSSIBLE
     if bare:
@@ -189,7 +222,7 @@ def label_by_colour(
         labels = np.where(labels == SCALP, SKIN, labels)
         hair, beyond = covered, 0.0
     counts = [_counts(cells, mask) for mask in (hair, skin, torso)]
-    if skin_colours is not None and not bare and not _sees_face(geometry.mesh):
+    if skin_colours is not None and not bare and hidden:
         # Half of each, because the back of a neck may be darker than any face.
         own, others = (c / np.float32(max(c.sum(), 1.0)) for c in (counts[1], skin_colours))
         counts[1] = SHARED * (own + others)
@@ -304,14 +337,15 @@ def scalp_votes(rgb: np.ndarray, labels: np.ndarray, alpha: np.ndarray) -> tuple
     are the mesh's, SCALP among them; alpha (H, W) is in [0, 1].
     """
     solid = alpha > SOLID
-    skin, neck, scalp = ((labels == label) & solid for label in (SKIN, NECK, SCALP))
+    skin, scalp = ((labels == label) & solid for label in (SKIN, SCALP))
     least = max(LEAST, LEAST_SCALP * skin.sum())
     if not _sees_face(labels) or skin.sum() < LEAST or scalp.sum() < least:
         return 0, 0
-    sure = _uncovered(rgb, skin, neck)
+    middle = _middle_of_face(rgb, labels, solid)
+    sure = _uncovered(rgb, skin, labels, solid) if middle is None else middle
     of_skin, of_scalp = (_some_ratios(rgb[mask]) for mask in (sure, scalp))
-    middle = np.median(of_skin, axis=0)
-    usual, found = (_share_near(middle, ratios) for ratios in (of_skin, of_scalp))
+    usual_colour = np.median(of_skin, axis=0)
+    usual, found = (_share_near(usual_colour, ratios) for ratios in (of_skin, of_scalp))
     return round(len(of_scalp) * usual), round(len(of_scalp) * found)
 
 

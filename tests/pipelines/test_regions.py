@@ -205,8 +205,44 @@ def test_a_fringe_over_most_of_the_face_is_not_taken_for_its_skin() -> None:
     rgb = np.where(hair[..., None], grey, scene.rgb).astype(np.uint8)
     scalp = judge_scalp([scalp_votes(rgb, mesh, scene.alpha)])
     assert not scalp.is_skin and scalp.skin_coloured is not None and scalp.skin_coloured < 0.1
-    kept = bare_skin(rgb, face, label_mask(mesh, "neck"))
+    kept = bare_skin(rgb, face, mesh, scene.alpha > 0)
     assert not kept[fringe].any() and kept[face & ~fringe].mean() > 0.95
+
+
+@pytest.mark.parametrize("scarf", [False, True])
+def test_long_fair_hair_and_a_scarf_are_not_taken_for_skin(scarf: bool) -> None:
+    """The hair hides most of the face, in a darker shade of the skin's colour; the scarf is red."""
+    scene = make_scene(0, size=300)
+    mesh = render_head(scene.head, scene.camera)[0]
+    rows, columns = np.nonzero(label_mask(mesh, "eyes", "lips"))
+    shown = np.zeros(mesh.shape, bool)
+    shown[rows.min() : rows.max(), columns.min() : columns.max()] = True
+    hair = (label_mask(mesh, "skin") & ~shown) | (mesh == SCALP)
+    rgb = np.where(hair[..., None], scene.rgb * 0.5, scene.rgb)
+    rgb[label_mask(mesh, "neck") & scarf] = (170, 20, 30)
+    rgb, solid = rgb.astype(np.uint8), scene.alpha > 0
+    assert not judge_scalp([scalp_votes(rgb, mesh, scene.alpha)]).is_skin
+    skin = label_mask(mesh, "skin") & solid
+    kept = bare_skin(rgb, skin, mesh, solid)
+    assert not kept[hair].any() and kept[skin & ~hair].mean() > 0.95
+
+
+@pytest.mark.parametrize("shown", [0.0, 0.1])
+def test_hair_before_a_face_seen_from_the_side_is_neither_skin_nor_a_hand(shown: float) -> None:
+    scene, front = make_scene(75), make_scene(0)
+    mesh, depth = render_head(scene.head, scene.camera)
+    face = label_mask(mesh, "skin", "lips", "eyes")
+    nose = np.quantile(np.nonzero(face)[1], shown)
+    hair = (mesh > 0) & (np.arange(mesh.shape[1]) >= nose)
+    noise = np.random.default_rng(1).normal(0, 4, scene.rgb.shape)
+    locks = np.clip(np.array(COLOURS["hair"]) + noise, 0, 255)
+    rgb = np.where(hair[..., None], locks, scene.rgb).astype(np.uint8)
+    nearer = np.where(hair, depth - 0.03, scene.depth).astype(np.float32)
+    colours = face_colours(front.rgb, front.alpha, render_head(front.head, front.camera)[0])
+    pictures = rgb, scene.alpha, nearer
+    labels = label_view(scene.head, scene.camera, *pictures, False, SIDE, colours).labels
+    assert label_mask(labels, "hair")[hair & face].mean() > 0.9
+    assert not label_mask(labels, "hand").any()
 
 
 def test_from_behind_the_skin_is_that_of_the_face() -> None:
@@ -381,8 +417,8 @@ def test_a_fringe_is_left_out_of_skin_colours_and_brows_are_not(rows: int, left_
     rgb[:rows] = (60, 40, 30)
     skin = np.ones((40, 40), bool)
     skin[:, 0] = False
-    none = np.zeros_like(skin)
-    kept = bare_skin(rgb, skin, none)
+    mesh = skin.astype(np.uint8) * LABELS.index("skin")
+    kept = bare_skin(rgb, skin, mesh, skin)
     assert kept[rows:].sum() > 0.99 * skin[rows:].sum() and not kept[:, 0].any()
     assert kept[:rows].any() == (rows > 0 and not left_out)
-    assert not bare_skin(rgb, none, none).any()
+    assert not bare_skin(rgb, ~skin & False, mesh, skin).any()
