@@ -126,7 +126,7 @@ def measure(dataset_root: Path, truth_root: Path, item: str, name: str) -> dict 
     start = time.process_time()
     found: dict = {}
     if name in PRESETS:
-        solid, _ = read_tracked(dataset, item, views)
+        views, solid, _ = read_tracked(dataset, item, views)
         surface = reconstruct(views, solid, config.voxel_mm, config.voxel_px, config.noise)
         mesh = surface.vertices, surface.faces
         names = ("voxels_allocated", "voxels_dense", "grid_bytes", "voxel_mm")

@@ -57,7 +57,7 @@ def measure(dataset_root: Path, truth_root: Path, item: str, axis: str, value: f
     if axis == "views":
         views = evenly(views, int(value))
     start = time.process_time()
-    solid, _ = read_tracked(dataset, item, views)
+    views, solid, _ = read_tracked(dataset, item, views)
     surface = reconstruct(views, solid, config.voxel_mm, config.voxel_px, config.noise)
     seconds = time.process_time() - start
     found = score((surface.vertices, surface.faces), truth, subject, frame, pictures)

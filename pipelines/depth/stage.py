@@ -31,7 +31,7 @@ from pipelines.depth.maps import (
 from pipelines.depth.prior import TrackedSolid, bare_triangles, close_mesh, matte_agreement
 from pipelines.depth.reconstruct import reconstruct, tracked_surface
 from pipelines.depth.surface import HeadSurface
-from pipelines.depth.views import DepthView, make_view, without_contradiction
+from pipelines.depth.views import DepthView, make_view, with_face, without_contradiction
 from pipelines.regions.geometry import head_labels, make_head
 from pipelines.regions.things import face_views
 
@@ -63,7 +63,7 @@ def run(
             f"{item}: {len(views)} usable cameras, expected at least 2 with a"
             f" matte of the head ({why or 'no others are calibrated'}); run 'express50 matte'"
         )
-    solid, track = read_tracked(dataset, item, views)
+    views, solid, track = read_tracked(dataset, item, views)
     if len(views) > 1:
         surface = reconstruct(views, solid, *fineness)
     elif solid is not None:
@@ -129,22 +129,26 @@ def read_views(
 
 def read_tracked(
     dataset: Dataset, item: str, views: list[DepthView]
-) -> tuple[TrackedSolid | None, dict]:
-    """Read the tracked mesh if it agrees with the mattes, and describe it for the metrics."""
+) -> tuple[list[DepthView], TrackedSolid | None, dict]:
+    """Read the tracked mesh if it agrees with the mattes, and describe it for the metrics.
+
+    Also returns the views, with the parts of the face that their mattes lack.
+    """
     subject, expression = item.split("/")
     path = dataset.track_file(subject)
     if not path.is_file():
-        return None, {"used": False, "why": "it is not tracked"}
+        return views, None, {"used": False, "why": "it is not tracked"}
     track = read_track(path)
     if expression not in track.expressions:
-        return None, {"used": False, "why": f"{expression} is not tracked"}
+        return views, None, {"used": False, "why": f"{expression} is not tracked"}
     model = load_topology(track.head)
     vertices, faces = track.mesh(expression, len(model.template), path), model.faces
     agreement = matte_agreement(views, vertices, faces)
     if agreement < AGREEMENT:
         why = f"only {agreement:.0%} of it lies in the mattes, under {AGREEMENT:.0%}"
-        return None, {"used": False, "why": why, "agreement": agreement}
+        return views, None, {"used": False, "why": why, "agreement": agreement}
     head = make_head(vertices, track.R[track.row(expression)], head_labels(model))
+    views = [with_face(view, head) for view in views]
     found = face_views(head, [(view.camera, view.rgb, view.alpha) for view in views])
     solid, glasses = close_mesh(vertices, faces), track.glasses_in(expression)
     if found:
@@ -153,12 +157,9 @@ def read_tracked(
         solid = replace(solid, bare=bare_triangles(model))
     if glasses is not None:
         solid = replace(solid, glasses=glasses)
-    return solid, {
-        "used": True,
-        "agreement": agreement,
-        "glasses": len(solid.glasses) > 0,
-        "things": len(found) > 0,
-    }
+    used = {"used": True, "agreement": agreement}
+    seen = {"glasses": len(solid.glasses) > 0, "things": len(found) > 0}
+    return views, solid, used | seen
 
 
 def write_maps(out: Path, camera_id: str, maps: DepthMaps) -> None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from express50.capture.frames import reduced
+from express50.contract.segmentation_labels import label_mask
 from express50.contract.stage import Note
 from express50.errors import StageError
 from express50.files.images import box_about, resize_area
@@ -18,12 +19,14 @@ from express50.geometry.cameras import Camera, nearest_to_lines, project
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.sampling import bilinear
 from express50.geometry.transforms import is_rigid
+from pipelines.regions.geometry import FACE, TrackedHead, render_head
 
 INSIDE = 0.5  # alpha at a silhouette
 EMPTY = 0.002  # share of the image below which a matte holds no head
 FULL = 0.98  # share above which a matte cuts nothing out
 SPECK = 0.01  # share of a matte's largest part below which other parts are dropped
 HOLE = 0.05  # share of the matte up to which a hole in it is filled
+LOST_M = 0.004  # metres inside the tracked outline: the face of a matte without holes reaches there
 UPSAMPLE = 3  # times that a matte is enlarged before distances to its outline are measured
 ENLARGED_PX = 16  # up to so far around it; further away, a pixel's error does not matter
 UNSEEN = 1.0  # metres; the distance given to space that too few cameras see
@@ -84,6 +87,23 @@ def repaired_matte(alpha: np.ndarray) -> np.ndarray:
     border = np.unique(np.r_[labels[[0, -1]].ravel(), labels[:, [0, -1]].ravel()])
     holes = np.setdiff1d(np.flatnonzero(gaps < HOLE * mask.sum()) + 1, border)
     return np.where(np.isin(labels, holes), np.float32(1), kept)
+
+
+def with_face(view: DepthView, head: TrackedHead) -> DepthView:
+    """Add to a view's matte the parts of a tracked face that it lacks.
+
+    A wall with the colour of skin takes them out of a matte, and each would pierce the whole hull.
+    Parts count if they reach further inside the mesh's outline than the track is wrong.
+    """
+    mesh, depth = render_head(head, view.camera)
+    lacking = label_mask(mesh, *FACE) & (view.alpha <= INSIDE)
+    inside = _mask_distance(mesh > 0) * depth / view.camera.K[0, 0]
+    _, part = cv2.connectedComponents(lacking.astype(np.uint8), connectivity=8)
+    lost = lacking & np.isin(part, part[lacking & (inside > LOST_M)])
+    if not lost.any():
+        return view
+    alpha = np.where(lost, np.float32(1), view.alpha)
+    return replace(view, alpha=alpha, silhouette_px=silhouette_distance(alpha))
 
 
 def silhouette_distance(alpha: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from express50.contract.segmentation_labels import label_mask
 from express50.errors import StageError
 from express50.geometry.cameras import rays, unproject
 from express50.geometry.raycast import mesh_scene
@@ -22,10 +23,13 @@ from pipelines.depth.views import (
     hull_distance,
     make_view,
     silhouette_distance,
+    with_face,
     without_contradiction,
 )
+from pipelines.regions.geometry import FACE, render_head
 from pipelines.regions.things import FaceView
 from tests.pipelines.bump_head import mesh, render, ring
+from tests.pipelines.region_scenes import camera_at, tracked
 
 QUICK = 4.0  # millimetres per voxel
 
@@ -198,6 +202,25 @@ def test_a_matte_that_contradicts_the_others_is_left_out(shots, views):
     kept, why = without_contradiction([*views[:3], make_view(camera, rgb, half, 1024), *views[4:]])
     assert [note.what for note in why] == [camera.id] and len(kept) == 7
     assert without_contradiction(views)[1] == []
+
+
+def test_what_a_matte_lacks_of_the_tracked_face_is_added():
+    head, camera = tracked(), camera_at(75, size=200)
+    labels = render_head(head, camera)[0]
+    matte = (labels > 0).astype(np.float32)
+    whole = make_view(camera, np.zeros((200, 200, 3), np.uint8), matte, 1024)
+    face, rows = label_mask(labels, *FACE), np.nonzero(label_mask(labels, "lips"))[0]
+    for deep_m, added in ((0.02, True), (0.002, False)):
+        pixels = round(deep_m * camera.K[0, 0])
+        alpha = whole.alpha.copy()
+        for row in range(rows.min() - 20, rows.max()):  # from the nose's tip to the mouth
+            tip = np.flatnonzero(alpha[row])[0]
+            alpha[row, tip : tip + pixels] = 0
+        lacking = replace(whole, alpha=alpha, silhouette_px=silhouette_distance(alpha))
+        mended = with_face(lacking, head)
+        assert (mended.alpha[face] == 1).all() == added and (mended is not lacking) == added
+        assert np.array_equal(mended.silhouette_px, silhouette_distance(mended.alpha))
+    assert with_face(whole, head) is whole
 
 
 def test_unusable_mattes_are_refused(shots):
