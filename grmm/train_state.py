@@ -250,7 +250,7 @@ def restore(state: TrainState, path: Path, config: Config, device: torch.device)
     for what in ("subjects", "expressions"):
         if lone := sorted({*getattr(loaded.model, what)} ^ {*getattr(state.model, what)}):
             changed.append(f"the {what} of the shards ({few(lone)} only before or only now)")
-    if loaded.loop.get("samples", state.views.source.digest) != state.views.source.digest:
+    if loaded.loop["samples"] != state.views.source.digest:
         changed.append("the samples of the shards")
     refuse_changes(path, changed, "train into another folder")
     state.model.load_state_dict(loaded.model.state_dict())

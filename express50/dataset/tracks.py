@@ -110,7 +110,7 @@ class Sequence(HeadPoses):
     """Holds a subject's head in every frame of its tracked clips."""
 
     cues: tuple[str, ...]  # clip ids, one per frame
-    rate: float  # frames per second; 24 if the file does not say
+    rate: float  # frames per second
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -269,7 +269,7 @@ def read_sequence(path: Path) -> Sequence:
     make = "'express50 track --set track.frames=clips', or 'express50 photo' on a video"
     with _arrays_of(path, "sequence", SEQUENCE_SCHEMA, make=make) as arrays:
         cues = arrays["cues"]
-        numbers, rate = _checked(arrays, cues, {}), float(arrays.get("rate", RIG_RATE))
+        numbers, rate = _checked(arrays, cues, {}), float(arrays["rate"])
         if not 0 < rate < np.inf:
             raise ValueError(f"rate is {rate:g}, expected frames per second")
         names = tuple(cues.tolist())

@@ -36,7 +36,7 @@ class Made:
 
     inputs: dict[str, str]  # their digests
     files: dict[str, FileMark]  # what was published
-    # of the stage, as written in TOML; empty in ledgers that did not keep them
+    # of the stage, as written in TOML; empty for imports
     settings: dict[str, str] = field(default_factory=dict)
     version: int = 0  # of the stage; 0 where that is not known
 

@@ -89,7 +89,7 @@ def test_jitter_is_of_the_error_not_of_the_motion(source, tmp_path) -> None:
     def jitter(wobble: float, count: int = 4) -> dict:
         t = rows["t"] + wobble * np.array([[1.0], [-1.0], [1.0], [-1.0]]) * [1.0, 0.0, 0.0]
         sequence = {k: v[:count] for k, v in (rows | {"t": t, "frames": np.array(frames)}).items()}
-        sequence["cues"] = np.array(["smile"] * count)
+        sequence |= {"cues": np.array(["smile"] * count), "rate": np.array(24.0)}
         np.savez(tmp_path / "sequence.npz", **shared, **sequence)
         return clip_errors(dataset, truth, SUBJECT, "smile", tmp_path)
 

@@ -363,6 +363,7 @@ def write_sequence(dataset: Dataset, subject: str, **changes: object) -> dict[st
     sequence = mixed | {
         "schema": "express50.sequence/1", "head": str(track["head"]), "shape": track["shape"],
         "cues": np.array([first] * 3 + [second] * 3), "frames": np.arange(5, 11),
+        "rate": 24.0,
     } | changes  # fmt: skip
     np.savez(dataset.item_dir("track", subject) / "sequence.npz", **sequence)
     return sequence
