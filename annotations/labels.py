@@ -209,7 +209,7 @@ def unreadable_lines(dataset: Dataset, subject: str) -> list[int]:
 
 
 def _lines(dataset: Dataset, subject: str) -> Iterator[tuple[int, Label | None]]:
-    """Yield numbers and events of a subject's lines; None where a line cannot be read."""
+    """Yield numbers and events of a subject's lines; None if a line cannot be read."""
     path = dataset.labels_file(subject)
     if not path.exists():
         return
@@ -268,7 +268,7 @@ def labels_of(labels: Iterable[Label], annotator: str) -> dict[str, Label]:
 
 
 def last_event(labels: Iterable[Label], expression: str, annotator: str) -> Label | None:
-    """Return the event that an undo would take back; None where nothing of theirs is left."""
+    """Return the event that an undo would take back; None if nothing of theirs is left."""
     stack = _stacks(labels).get((expression, annotator))
     return stack[-1] if stack else None
 

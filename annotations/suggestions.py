@@ -105,7 +105,7 @@ def choose_reference(dataset: Dataset, subject: str) -> None:
 def canonical(dataset: Dataset, expression: str) -> CanonicalFrame | None:
     """Find the reference's frame of an expression: its label in force, else its suggestion.
 
-    None where the reference has neither, or its performance is flagged.
+    None if the reference has neither, or its performance is flagged.
     """
     subject = reference_subject(dataset)
     label = current_labels(read_labels(dataset, subject)).get(expression)

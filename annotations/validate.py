@@ -36,7 +36,7 @@ FLAG = "flag:"  # prefix of a free-text reason, which might otherwise be a misty
 WITHIN = (1, 2, 4)  # frames
 SLIP_FRAMES = 12  # frames; further apart, two people did not mean the same moment
 BOOTSTRAP = 1000
-# Of times within clips: far below one frame of a day's recording, far above what rounding leaves.
+# A spread of times within clips: far below a frame of a day's recording, far above rounding.
 _NO_SPREAD = 1e-24
 
 
@@ -112,7 +112,7 @@ def footage_problems(index: Index, label: Label) -> Iterator[tuple[str, str]]:
 
 @dataclass(frozen=True)
 class Disagreement:
-    """Different labels of one clip; ``spread`` in frames, None where some saw no peak at all."""
+    """Different labels of one clip; ``spread`` in frames, None if some saw no peak at all."""
 
     subject: str
     expression: str
@@ -226,7 +226,7 @@ def agreement(clips: Sequence[MarkedClip]) -> dict[str, object]:
     """Compute figures over clips; each pair of annotators of a clip counts once.
 
     They are ``clips``, ``pairs``, ``within_1``, ``within_2``, ``within_4``, ``median_frames``,
-    ``slip_rate``, ``alpha`` and ``alpha_interval`` (95 %, bootstrap over clips), None where there
+    ``slip_rate``, ``alpha`` and ``alpha_interval`` (95 %, bootstrap over clips), None if there
     is nothing to compare.
     """
     clips = [clip for clip in clips if len(clip.frames) > 1]
@@ -258,7 +258,7 @@ def clip_times(clip: MarkedClip) -> np.ndarray:
 def interval_alpha(units: Sequence[np.ndarray]) -> float | None:
     """Compute Krippendorff's alpha with the interval metric from two or more values of each unit.
 
-    None where it is undefined: all values are the same, or there is one unit alone, whose spread is
+    None if it is undefined: all values are the same, or there is one unit alone, whose spread is
     also the expected one.
 
     The mean squared difference of all pairs of values is twice their variance, which gives a closed

@@ -178,7 +178,7 @@ def true_errors(dataset: Dataset, truth: Truth) -> dict[str, float]:
 
 
 def figures(runs: Sequence[Run], grid: Sequence[Run], true: bool) -> dict:
-    """Compute the figures of the issue from all runs; None where no run has any."""
+    """Compute the figures of the issue from all runs; None if no run has any."""
     asked, everyone = runs, [run for run in (*runs, *grid) if run.finished]
     runs, grid = ([run for run in some if run.finished] for some in (runs, grid))
     scale = {}
@@ -227,7 +227,7 @@ def missed(run: Run, everyone: Sequence[Run]) -> float:
 
 
 def saved(runs: Sequence[Run], grid: Sequence[Run], final) -> float | None:  # noqa: ANN001
-    """Return the time that the dial saves at the error of the best preset; None where it has not.
+    """Return the time that the dial saves at the error of the best preset; None if it has not.
 
     The best preset is the one with the least error, the quicker of two that differ by under 2 %.
     """

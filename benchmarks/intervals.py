@@ -218,7 +218,7 @@ def spread(shares: Mapping[str, Sequence[float]]) -> Iterator[tuple[str, list[fl
     """Yield each condition and the ends of its coverage's interval, from shares of people.
 
     People of few conditions say little of how much they differ, so the variance is that of all;
-    None where no condition has two people.
+    None if no condition has two people.
     """
     free = sum(len(own) - 1 for own in shares.values())
     squares = sum(float(np.var(own)) * len(own) for own in shares.values())

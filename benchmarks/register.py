@@ -160,7 +160,7 @@ def visible(
 
 
 def errors(case: Case, mesh: np.ndarray, sigma: np.ndarray | None = None) -> Figures:
-    """Return errors of a mesh (V, 3) of a case, millimetres; None where they have no meaning."""
+    """Return errors of a mesh (V, 3) of a case, millimetres; None if they have no meaning."""
     middle = case.true[0].mean(0)
     caster = mesh_scene(case.true[0] - middle, case.true[1])
     query = o3d.core.Tensor((mesh[case.seen] - middle).astype(np.float32))

@@ -209,7 +209,7 @@ def mean(values: list[float]) -> float | None:
 def r_squared(found: np.ndarray, true: np.ndarray) -> float | None:
     """Return 1 - squared error / variance about each coefficient's mean over frames, (E, X).
 
-    Pooled over coefficients; None where nothing varies.
+    Pooled over coefficients; None if nothing varies.
     """
     spread = float(((true - true.mean(0)) ** 2).sum())
     return round(1.0 - float(((found - true) ** 2).sum()) / spread, 4) if spread else None

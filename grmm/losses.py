@@ -186,7 +186,7 @@ def vgg_features() -> nn.Sequential:
 
 
 def load_vgg(path: str, device: torch.device | str = "cpu") -> VGGDistance | None:
-    """Read the state dict of loss.vgg16 as `load_features` does; None where it is empty."""
+    """Read the state dict of loss.vgg16 as `load_features` does; None if it is empty."""
     if not path:
         return None
     features = load_features(Path(path), "loss.vgg16", "vgg16", vgg_features())

@@ -91,7 +91,7 @@ class PerceptualMetrics:
         self.features.setdefault(group, []).append((found[0].double(), found[1].double()))
 
     def fid(self, group: str | None = None) -> float | None:
-        """Return the FID of a group, or of all images; None where there are fewer than two."""
+        """Return the FID of a group, or of all images; None if there are fewer than two."""
         groups = self.features.values() if group is None else [self.features.get(group, [])]
         pairs = [pair for rows in groups for pair in rows]
         if len(pairs) < FID_LEAST_IMAGES:

@@ -104,7 +104,7 @@ def best_device() -> torch.device:
 
 
 def gpu() -> tuple[str, float] | None:
-    """Return the name and the memory, GiB, of this process' GPU; None where there is none."""
+    """Return the name and the memory, GiB, of this process' GPU; None if there is none."""
     device = best_device()
     if device.type == "cpu":
         return None

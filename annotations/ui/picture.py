@@ -50,7 +50,7 @@ class PicturePane(Widget):
         self._cache = cache
         self._blocks = Painter()
         self._painter = painter
-        self.look: FrameLook | None = None  # None where words replace it
+        self.look: FrameLook | None = None  # None if words replace it
         self._words = ""
 
     def show(self, look: FrameLook | None, words: str) -> None:

@@ -30,13 +30,13 @@ class TaskScene:
     task: LabelTask  # subject, expression and doubt
     name: str  # of the expression
     description: str  # of the expression
-    index: Index | None = None  # the subject's footage; None where it cannot be read
+    index: Index | None = None  # the subject's footage; None if it cannot be read
     first: int = 0  # frame of the cue window
     last: int = 0  # frame of the cue window, inclusive
     cameras: tuple[str, ...] = ()  # ids from the suggestion's on, which sees the face best
-    suggestion: Suggested | None = None  # what align suggested; None where it did not run
+    suggestion: Suggested | None = None  # what align suggested; None if it did not run
     reference: CanonicalFrame | None = None  # the reference's frame of the expression
-    reference_index: Index | None = None  # the reference's footage; None where it cannot be read
+    reference_index: Index | None = None  # the reference's footage; None if it cannot be read
     is_reference: bool = False  # whether this subject is the reference itself
     mine: Label | None = None  # this annotator's label, or None
     in_force: Label | None = None  # the label in force, whoever gave it

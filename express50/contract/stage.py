@@ -57,7 +57,7 @@ class ExpectedError:
         if not all(map(math.isfinite, figures)) or list(figures) != sorted(figures):
             raise StageError(
                 f"expected error: got low, value, high = {figures}; expected finite numbers in"
-                " rising order (state None where the error is not known)"
+                " rising order (state None if the error is not known)"
             )
         if self.unit not in get_args(Unit):
             raise StageError(
@@ -89,7 +89,7 @@ class Result:
     metrics: Mapping[str, Any] = field(default_factory=dict)  # deterministic, for JSON
     dropped: Sequence[Note] = ()  # parts of the item that were left out
     warnings: Sequence[Note] = ()  # parts that were kept although something about them is doubtful
-    expected_error: ExpectedError | None = None  # None where the stage cannot say
+    expected_error: ExpectedError | None = None  # None if the stage cannot say
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of ``metrics.json``."""

@@ -6,8 +6,8 @@ remains follows from the errors that stages state; where no stage states one, on
 are known.
 
 The law of an item's seconds is a constant (libraries, the head model) plus a part proportional to
-the sizes that the stage names in its `Growth`. Two sizes determine both; one leaves only the
-proportional part. Of more, those near the size in question count most.
+the sizes that the stage names in its `Growth`. Two sizes determine both; from one, only the
+proportional part follows. Of three or more sizes, those near the one in question count most.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def forecast(samples: Sequence[MeasuredSize], work: float) -> Forecast:
 
 
 def typical_seconds(samples: Sequence[MeasuredSize], work: float) -> float:
-    """Predict as `forecast` does, without an interval and as quickly as it can be done."""
+    """Predict the seconds of an item as `forecast` does, but quickly and without an interval."""
     return _law(*_weighed(samples), work)
 
 
@@ -155,7 +155,7 @@ class Workload:
 
 
 def cost_at(load: Workload, name: str, label: str) -> tuple[Cost, Trial] | None:
-    """Find what a stage cost in the pilot, and in which trial; None where it was not measured."""
+    """Find what a stage cost in the pilot, and in which trial; None if it was not measured."""
     trials = load.measured.trials
     for trial in trials:
         whole = trial.footage.expressions == trials[0].footage.expressions
@@ -196,8 +196,8 @@ def item_seconds(load: Workload, stage: Stage, label: str) -> tuple[int, float]:
 def taken_over(load: Workload, trial: Trial) -> dict[str, tuple[str, float]]:
     """Return, by stage, a trial's setting and the share of the items that a run takes from it.
 
-    Where it had fewer expressions than the script, an item of all of them is another one, and so
-    is everything after it.
+    If the trial had fewer expressions than the script, an item that covers all of them differs, and
+    so does everything after it.
     """
     found, whole = {}, trial.footage.expressions >= trial.scripted
     for stage in load.stages:
@@ -253,7 +253,7 @@ def stage_seconds(load: Workload, stage: Stage, label: str, left: float = 1.0) -
 def remaining_error(load: Workload, result: str) -> tuple[float, float, float] | None:
     """Return the squared error at the most expensive settings, and its interval as two ratios.
 
-    None where no stage states this error.
+    None if no stage states this error.
     """
     losses = load.measured.losses
     trials = [trial for trial in load.measured.trials if result in trial.errors]
@@ -291,7 +291,7 @@ def expected_errors(load: Workload, lost: Mapping[str, float]) -> dict[str, Expe
         if rest is not None:
             value = math.sqrt(rest[0] + lost.get(kind.name, 0.0))
             low, high = (value * ratio for ratio in rest[1:])
-            if not rest[0]:  # of an error of 0 the interval is as wide as it is stated
+            if not rest[0]:  # the interval of an error of 0 is the stated one
                 stated = [
                     t.errors[kind.name] for t in load.measured.trials if kind.name in t.errors
                 ]
@@ -348,7 +348,7 @@ def front(load: Workload) -> list[Point]:
 def scales(load: Workload) -> dict[str, float]:
     """Return the unit that a result's error is counted in: the error at the best settings.
 
-    Where that is 0, as of peaks that are right to the frame, it is the largest difference. Results
+    If that is 0, as for peaks that are right to the frame, it is the largest difference. Results
     that no setting changes are left out.
     """
     found = {}

@@ -136,7 +136,7 @@ def dial_dir(dataset: Dataset) -> Path:
 
 
 def read_measured(path: Path, key: str | None = None) -> PilotFigures | None:
-    """Read what was measured; None where nothing was, or with another key."""
+    """Read what was measured; None if nothing was, or with another key."""
     if not path.is_file():
         return None
     table = read_json_table(path, FormatError, "delete it, and it is measured again")

@@ -37,7 +37,7 @@ class ResultKind:
 
     name: str  # for people
     unit: str  # of its error
-    # paths of it; of a subject's expression and camera. Of several, the last one counts.
+    # its paths by dataset, subject, expression and camera; of several, the last one counts
     places: Sequence[Callable[[Dataset, str, str, str], Path]]
     # how far the results of a subject in two datasets differ, of each of the expressions
     apart: Callable[[Dataset, Dataset, str, Sequence[str]], Iterable[float]]

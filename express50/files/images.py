@@ -81,7 +81,7 @@ def read_image(path: Path) -> np.ndarray:
 def _plain_png(path: Path) -> np.ndarray | None:
     """Read a PNG of 8 or 16 bits without a palette, in half of OpenImageIO's time.
 
-    None if it is another file, or one that OpenImageIO has to describe.
+    None for any other file, and for one that OpenImageIO has to refuse.
 
     Raises:
         FormatError: it is damaged. OpenImageIO's decoder would print that as well.
@@ -107,7 +107,7 @@ def _plain_png(path: Path) -> np.ndarray | None:
 def _own_png(data: bytes, shape: tuple[int, ...]) -> np.ndarray | None:
     """Decode a PNG as `encode_png` makes them, in a third of libpng's time.
 
-    None if it is another one, or damaged: libpng says how.
+    None if another program wrote it, or if it is damaged: libpng then says how.
     """
     kind, end = np.dtype(f">u{data[24] // 8}"), len(data) - len(PNG_END)
     length = math.prod(shape[1:]) * kind.itemsize + 1  # of a row, with its filter type

@@ -238,7 +238,7 @@ class VideoTags:
     hdr: str  # name of its transfer curve if that is one for high dynamic range, else empty
     interlaced: bool  # whether a picture holds two half pictures of different moments
     aspect: float  # width over height of a pixel
-    beyond: float  # share of the first picture that the range hardly has, if none is stated
+    beyond: float  # share of the first picture far outside 16 to 235, if no range is stated
 
 
 def video_tags(path: Path) -> VideoTags:
@@ -418,10 +418,10 @@ class VideoReader:
                 first = next(frames, None)
             except DAMAGE:  # no index to seek with
                 break
-            except CaptureError:  # what came first lacks what it refers to
+            except CaptureError:  # the first picture lacks its reference
                 continue
-            # What is displayed after a key frame needs nothing from before it. A later key frame,
-            # or a picture that lacks what it refers to, comes first if the nearest was too near.
+            # Pictures displayed after a key frame need nothing from before it. If the nearest key
+            # frame was too near, a later one comes first, or a picture without its reference.
             near = first is not None and first.key_frame and first.pts <= self.pts[frame]
             if first is not None and (near or target < frame):
                 self._frames, self._next = chain([first], frames), bisect_left(self.pts, first.pts)

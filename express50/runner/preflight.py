@@ -105,7 +105,7 @@ def expected_bytes(
 ) -> tuple[str, int, float] | None:
     """Return the stage, how many items have no output yet, and the mean bytes of those that have.
 
-    None where nothing is left to do, or nothing was measured.
+    None if nothing is left to do, or nothing was measured.
     """
     made = ledger.made(stage)
     new = len(set(items) - made.keys())

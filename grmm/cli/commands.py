@@ -48,7 +48,7 @@ def train(args: argparse.Namespace) -> int:
     from grmm.train import diverged, train
 
     check_results_folder(args.out)
-    # First, because most wrong commands name a wrong folder, and no budget helps against that.
+    # First, because most wrong commands name a wrong folder.
     source = open_shards([args.shards, *args.also], "train")
     config = train_config(args)
     resume = not args.overwrite and (args.out / "checkpoint.pt").exists()

@@ -61,7 +61,7 @@ def check_in_view(cameras: Mapping[str, Camera], vertices: np.ndarray, where: st
 
 
 def check_landmarks(observation: Observation | None, marks: np.ndarray, where: str) -> float | None:
-    """Return how far landmarks (68, 3), world, are off those seen; None where none are.
+    """Return how far landmarks (68, 3), world, are off those seen; None if none are.
 
     It is the median of their distances over the height of the face.
 
@@ -154,7 +154,7 @@ def check_face_depth(
 ) -> float | None:
     """Return the median metres between maps (H, W), metres, and triangulated landmarks.
 
-    None where the footage shows no face that two cameras agree on.
+    None if the footage shows no face that two cameras agree on.
 
     Raises:
         StageError: they are too far apart.

@@ -233,7 +233,7 @@ def check_masks(cameras: Mapping[str, Camera], masks: Mapping[str, np.ndarray], 
 def check_depths(
     cameras: Mapping[str, Camera], depths: Mapping[str, np.ndarray], where: str
 ) -> float | None:
-    """Return the share of pixels on which views (H, W), metres, agree; None where none overlap.
+    """Return the share of pixels on which views (H, W), metres, agree; None if none overlap.
 
     Raises:
         StageError: too few do, or many more would by another unit or measure, which it names.

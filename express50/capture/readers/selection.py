@@ -38,7 +38,7 @@ class Selection:
     sequences: tuple[str, ...] = ()  # shell patterns; none takes the layout's usual ones
     cameras: tuple[str, ...] = ()  # shell patterns of cameras to take; none takes all
     expressions: Mapping[str, str] = field(default_factory=dict)  # our expression id by sequence
-    # length of one unit of the calibration's world; None where it is not given
+    # length of one unit of the calibration's world; None if it is not given
     metres_per_unit: float | None = None
 
     def has_sequence(self, name: str, usual: str = "*") -> bool:

@@ -138,7 +138,7 @@ class Clip:
 
 
 def parse_name(stem: str) -> Clip | None:
-    """Parse a file's name without its ending; None where it is not one of RAVDESS."""
+    """Parse a file's name without its ending; None if it is not one of RAVDESS."""
     match = NAME.fullmatch(stem)
     if match is None:
         return None
