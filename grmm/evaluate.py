@@ -7,8 +7,6 @@ way as our renderings: with the same crop, background and pixels.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -22,7 +20,7 @@ from torch import Tensor
 from express50.console import figure_label, format_table
 from express50.contract.segmentation_labels import label_mask
 from express50.errors import ConfigError, DivergedError, FormatError, few
-from express50.files.atomic import naming_full_disk, write_bytes, write_json
+from express50.files.atomic import naming_full_disk, write_csv, write_json
 from express50.files.images import read_image, write_image
 from express50.files.text import is_number, no_folder
 from express50.shards.writer import sample_key
@@ -324,13 +322,10 @@ def write_evaluation(
     out: Path, rows: Sequence[Row], judge: PerceptualMetrics = NO_NETWORKS
 ) -> dict[str, object]:
     """Write evaluation.csv (one row per image) and evaluation.json (means); returns the means."""
-    buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, fieldnames=[*IDS, *NUMBERS], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(
+    rounded = (
         {k: round(v, 5) if isinstance(v, float) else v for k, v in row.items()} for row in rows
     )
-    write_bytes(out / "evaluation.csv", buffer.getvalue().encode())
+    write_csv(out / "evaluation.csv", [*IDS, *NUMBERS], rounded)
     summary = summarise(rows, judge)
     write_json(out / "evaluation.json", summary)
     return summary

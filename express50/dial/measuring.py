@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import shutil
 from collections.abc import Mapping
@@ -29,7 +27,7 @@ from express50.dial.choice import (
 from express50.dial.figures import PilotFigures, Trial, dial_dir, footage_of, read_measured
 from express50.dial.pilot import TRIAL_EXPRESSIONS, Chain, Pilot, broken_stage, measure, standard_of
 from express50.errors import ConfigError, StageError
-from express50.files.atomic import write_bytes, write_json
+from express50.files.atomic import write_csv, write_json
 from express50.runner.ledger import Ledger
 
 PILOT_SUBJECTS = 3  # most subjects that are tried, while the footage of each proves bad
@@ -246,7 +244,9 @@ def tune(chain: Chain) -> tuple[dict[str, Any], list[str]]:
     }
     folder = dial_dir(chain.dataset)
     write_json(folder / "front.json", table)
-    write_bytes(folder / "front.csv", _csv(points, presets).encode())
+    named = {str(number): point for number, point in enumerate(points)} | presets
+    rows = [_csv_row(name, point) for name, point in named.items()]
+    write_csv(folder / "front.csv", list(rows[0]), rows)
     shutil.rmtree(chain.dataset.pilot_dir, ignore_errors=True)
     return table, [*_lines(load, points, presets), f"wrote {folder}/front.json and front.csv"]
 
@@ -264,20 +264,14 @@ def preset_settings(load: Workload, preset: str) -> dict[str, str]:
     return found
 
 
-def _csv(points: list[Point], presets: Mapping[str, Point]) -> str:
-    """Write a row per point: time, errors with intervals, settings."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    errors = [
-        f"{name}_{error.unit}{end}"
-        for name, error in points[-1].errors.items()
-        for end in ("", "_low", "_high")
-    ]
-    writer.writerow(["point", "seconds", *errors, *points[-1].settings])
-    for name, point in [*((str(k), p) for k, p in enumerate(points)), *presets.items()]:
-        figures = [f"{f:.5g}" for e in point.errors.values() for f in (e.value, e.low, e.high)]
-        writer.writerow([name, f"{point.seconds:.1f}", *figures, *point.settings.values()])
-    return out.getvalue()
+def _csv_row(name: str, point: Point) -> dict[str, str]:
+    """Return the time, the errors with their intervals, and the settings of a point."""
+    errors = {
+        f"{result}_{error.unit}{end}": f"{figure:.5g}"
+        for result, error in point.errors.items()
+        for end, figure in (("", error.value), ("_low", error.low), ("_high", error.high))
+    }
+    return {"point": name, "seconds": f"{point.seconds:.1f}"} | errors | point.settings
 
 
 def _lines(load: Workload, points: list[Point], presets: Mapping[str, Point]) -> list[str]:

@@ -5,16 +5,18 @@ A full disk raises one kind of error, which stops a run before it computes what 
 
 from __future__ import annotations
 
+import csv
 import ctypes
 import errno
 import fcntl
+import io
 import json
 import math
 import os
 import shutil
 import tempfile
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, BinaryIO
@@ -84,6 +86,15 @@ def write_with(path: Path, write: Callable[[BinaryIO], object]) -> None:
 def write_json(path: Path, value: object) -> None:
     """Write deterministic JSON in one step."""
     write_bytes(path, dump_json(value))
+
+
+def write_csv(path: Path, names: Sequence[str], rows: Iterable[Mapping[str, object]]) -> None:
+    """Write a table with these columns in one step; what else a row holds is left out."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, names, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_bytes(path, text.getvalue().encode())
 
 
 def nearest_existing(path: Path) -> Path:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import io
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from express50.contract.layout import check_results_folder
 from express50.dataset.export import write_head_obj
 from express50.dataset.tracks import read_track
 from express50.errors import ConfigError, Express50Error, FormatError
-from express50.files.atomic import dump_json, folder_in_one_step, write_bytes
+from express50.files.atomic import dump_json, folder_in_one_step, write_csv
 from express50.files.digests import file_sha256, value_digest
 from express50.files.text import ID, read_json_table, read_text
 from express50.geometry.raycast import mesh_scene
@@ -116,11 +115,7 @@ def write_index(path: Path, former: dict[str, dict[str, str]], accounts: list[di
             files = {"parameters": f"{name}/track.npz", "mesh": f"{name}/head.obj"}
             row |= files | {"warnings": "; ".join(account["warnings"])}
         rows[name] = row
-    text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows[name] for name in sorted(rows))
-    write_bytes(path, text.getvalue().encode())
+    write_csv(path, COLUMNS, [rows[name] for name in sorted(rows)])
 
 
 def list_scans(paths: list[Path]) -> list[Path]:
