@@ -66,6 +66,9 @@ UNLIKE = WITHIN * LEAST_SPREAD
 # Share of the variance of a face's redness between its two groups from which it has two colours:
 # normal values have 0.64, even ones 0.75.
 TWO_COLOURED = 0.77
+# The redder group's share of a side of the face is less than this in less red light, and more than
+# the rest in redder light.
+OTHER_LIGHT = 0.4
 COHERENT = 0.75  # share of a face near its middle colour below which a fringe may cover it
 BARE = 0.7  # share of the scalp in the face's colours, over the same of the face, of bare scalps
 
@@ -119,9 +122,44 @@ def _redder(redness: np.ndarray) -> np.ndarray:
 def like_skin(values: np.ndarray, face: np.ndarray) -> np.ndarray:
     """Mark the colours (N, 3) that are like the skin of a face (M, 3); logarithms of root light."""
     known = _ratios(face)
-    usual, spread = robust_moments(known[_redder(known[:, 1])])
-    spread = np.clip(spread, LEAST_SPREAD, MOST_SPREAD)
-    return (np.abs(_ratios(values) - usual) < WITHIN * spread).all(1)
+    low, high = _range_of_most(known[_redder(known[:, 1])])
+    ratios = _ratios(values)
+    return ((ratios > low) & (ratios < high)).all(1)
+
+
+def _range_of_most(known: np.ndarray) -> np.ndarray:
+    """Return the least and the greatest of the `_ratios` (2, 3) that most of some (M, 3) have."""
+    usual, spread = robust_moments(known)
+    reach = WITHIN * np.clip(spread, LEAST_SPREAD, MOST_SPREAD)
+    return np.stack([usual - reach, usual + reach])
+
+
+def like_skin_around(face: np.ndarray, left: np.ndarray) -> np.ndarray:
+    """Mark the colours (N,) of a face (N, 3) that are like most of it; logarithms of root light.
+
+    `left` (N,) bool marks those on one side: in `two_lights`, skin has the colours of either side
+    and those in between.
+    """
+    if not two_lights(face, left):
+        return like_skin(face, face)
+    ratios = _ratios(face)
+    ranges = np.stack([_range_of_most(ratios[side]) for side in (left, ~left)])
+    low, high = ranges[:, 0].min(0), ranges[:, 1].max(0)
+    return ((ratios > low) & (ratios < high)).all(1)
+
+
+def two_lights(face: np.ndarray, left: np.ndarray) -> bool:
+    """Return whether light of another colour falls on one side of a face, as in `like_skin_around`.
+
+    It does not darken that side much. Beards, fringes and glasses do, or are on both sides.
+    """
+    ratios = _ratios(face)
+    redder = _redder(ratios[:, 1])
+    if redder.all() or min(left.sum(), (~left).sum()) < LEAST:
+        return False
+    less, more = sorted(float(redder[side].mean()) for side in (left, ~left))
+    darker = np.median(ratios[redder, 0]) - np.median(ratios[~redder, 0])
+    return bool(less < OTHER_LIGHT and more > 1 - OTHER_LIGHT and darker < UNLIKE[0])
 
 
 def bare_skin(rgb: np.ndarray, skin: np.ndarray, mesh: np.ndarray, solid: np.ndarray) -> np.ndarray:
@@ -132,13 +170,29 @@ def bare_skin(rgb: np.ndarray, skin: np.ndarray, mesh: np.ndarray, solid: np.nda
     """
     if not skin.any():
         return skin
-    logs, sure = colour_logs(rgb[skin]), _uncovered(rgb, skin, mesh, solid)
-    alike = like_skin(logs, logs if sure is skin else colour_logs(rgb[sure]))
+    logs, left = colour_logs(rgb[skin]), left_of_middle(mesh)[skin]
+    sure = skin if two_lights(logs, left) else _uncovered(rgb, skin, mesh, solid)
+    if sure is skin:
+        alike = like_skin_around(logs, left)
+    else:
+        alike = like_skin(logs, colour_logs(rgb[sure]))
     if alike.mean() > 1 - COVERED:
         return skin
     kept = skin.copy()
     kept[skin] = alike
     return kept
+
+
+def left_of_middle(mesh: np.ndarray) -> np.ndarray:
+    """Mark the pixels (H, W) on one side of the line through eyes and mouth of a mesh's labels."""
+    ends = [np.argwhere(label_mask(mesh, name)) for name in ("eyes", "lips")]
+    if not all(map(len, ends)):
+        return np.zeros(mesh.shape, bool)
+    eyes, lips = (end.mean(0) for end in ends)
+    row, column = np.ogrid[: mesh.shape[0], : mesh.shape[1]]
+    down, across = lips - eyes
+    left: np.ndarray = (column - eyes[1]) * down > (row - eyes[0]) * across
+    return left
 
 
 def _uncovered(

@@ -9,7 +9,7 @@ from typing import Literal
 from express50.contract.config import check_ranges
 from express50.head import BUILTIN_NAME, absolute_head
 
-VERSION = 31
+VERSION = 32
 UV_WEIGHTS = Path(__file__).with_name("face_uv_weights.npz")
 
 

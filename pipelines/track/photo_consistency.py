@@ -19,7 +19,7 @@ from express50.geometry.conventions import corner_to_cell
 from express50.geometry.raycast import join_rays, mesh_scene
 from express50.geometry.transforms import unit
 from express50.head.model import HeadModel, in_regions
-from pipelines.regions.colour import like_skin
+from pipelines.regions.colour import like_skin_around
 from pipelines.track.surface import (
     COVERED,
     FEATURES,
@@ -273,7 +273,8 @@ def under_hair(
     views = views[:, seen, None]
     logs = np.log(np.maximum(view_colours(pictures.images(), views[..., 0], places[seen]), 0.01))
     middle = np.nanmedian(np.where(views > 0, logs, np.nan), axis=0)
-    odd = ~like_skin(middle, middle)
+    left = samples.at(model.template.double().numpy())[seen, 0] > 0
+    odd = ~like_skin_around(middle, left)
     face = np.flatnonzero(in_regions(model, UNCOVERED_SKIN))
     near = cKDTree(places[seen]).query(mesh[face], HAIR_NEIGHBOURS)[1]
     hidden[face] = odd[near].mean(1) > HAIR_SHARE

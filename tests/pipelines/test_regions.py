@@ -17,7 +17,13 @@ from express50.files.images import read_image, write_image
 from express50.head.load import load_head
 from express50.head.model import pose
 from pipelines.regions import STAGE, RegionsConfig
-from pipelines.regions.colour import bare_skin, face_colours, judge_scalp, scalp_votes
+from pipelines.regions.colour import (
+    bare_skin,
+    face_colours,
+    judge_scalp,
+    left_of_middle,
+    scalp_votes,
+)
 from pipelines.regions.geometry import (
     SCALP,
     find_hands,
@@ -225,6 +231,25 @@ def test_long_fair_hair_and_a_scarf_are_not_taken_for_skin(scarf: bool) -> None:
     skin = label_mask(mesh, "skin") & solid
     kept = bare_skin(rgb, skin, mesh, solid)
     assert not kept[hair].any() and kept[skin & ~hair].mean() > 0.95
+
+
+def test_a_face_in_red_light_from_one_side_and_blue_from_the_other_is_skin() -> None:
+    scene = make_scene(20, size=300)
+    mesh = render_head(scene.head, scene.camera)[0]
+    left = left_of_middle(mesh)[..., None]
+    rgb = (scene.rgb * np.where(left, (1, 0.7, 0.75), (0.7, 0.75, 1))).astype(np.uint8)
+    solid = scene.alpha > 0
+    skin = label_mask(mesh, "skin") & solid
+    assert bare_skin(rgb, skin, mesh, solid)[skin].mean() > 0.99
+    labels = labels_of(replace(scene, rgb=rgb))
+    assert label_mask(labels, "skin")[skin & label_mask(scene.labels, "skin")].mean() > 0.95
+    # On one side a fringe, which is darker; on both a beard.
+    rows = np.arange(300)[:, None] > np.nonzero(label_mask(mesh, "lips"))[0].min()
+    for hair, shade in ((left[..., 0] & ~rows, 0.3), (rows & skin, 0.8)):
+        grey = (shade * scene.rgb.mean(2, keepdims=True)) * np.ones(3)
+        worn = np.where(hair[..., None], grey, scene.rgb).astype(np.uint8)
+        kept = bare_skin(worn, skin, mesh, solid)
+        assert not kept[hair & skin].any() and kept[skin & ~hair].mean() > 0.95
 
 
 @pytest.mark.parametrize("shown", [0.0, 0.1])

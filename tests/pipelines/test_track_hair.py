@@ -12,7 +12,7 @@ from express50.geometry.transforms import look_at
 from express50.head.load import load_head
 from express50.head.model import pose
 from pipelines.regions.colour import SKIN as FACE_SKIN
-from pipelines.regions.colour import like_skin
+from pipelines.regions.colour import like_skin, like_skin_around
 from pipelines.regions.geometry import SCALP, head_labels, make_head, render_head
 from pipelines.track.observe import LandmarkView, Observation
 from pipelines.track.schedule import (
@@ -34,6 +34,19 @@ def test_shading_is_like_skin_and_hair_is_not():
     hair = np.log([0.2, 0.15, 0.12]) + rng.normal(0, 0.1, (100, 1))
     face = np.concatenate([skin, hair])
     assert like_skin(skin, face).mean() > 0.95 and not like_skin(hair, face).any()
+
+
+@pytest.mark.parametrize(("other", "alike"), [((0.45, 0.5, 0.6), True), ((0.2, 0.2, 0.2), False)])
+def test_another_light_on_one_side_is_not_hair(other: tuple[float, ...], alike: bool) -> None:
+    """The other side is lit in blue, or most of it is covered by dark hair."""
+    rng = np.random.default_rng(0)
+    left = np.arange(400) < 200
+    colours = np.where((np.arange(400) < 170)[:, None], other, (0.8, 0.6, 0.5))
+    face = np.log(colours) + rng.normal(0, 0.1, (400, 1)) + rng.normal(0, 0.01, (400, 3))
+    found = like_skin_around(face, left)
+    assert found[~left].mean() > 0.95 and (found[:170].mean() > 0.95) == alike
+    none = np.zeros(400, bool)
+    assert not like_skin_around(face, none)[:170].any()
 
 
 def target_of(cameras) -> Target:
