@@ -205,23 +205,20 @@ def withdrawn_file(dataset: Dataset) -> Path:
 
 def withdrawn(dataset: Dataset) -> set[str]:
     """Return the SHA-256 digests of withdrawn subjects' ids; the ids themselves are not kept."""
-    return {_digest(row) for row in _withdrawals(dataset)}
+    return {row["id_sha256"] for row in _withdrawals(dataset)}
 
 
-def _withdrawals(dataset: Dataset) -> list:
-    """Read the records of withdrawals; old ones are plain digests, without time and count."""
+def _withdrawals(dataset: Dataset) -> list[dict[str, Any]]:
+    """Read the records of withdrawals."""
     path = withdrawn_file(dataset)
     if not path.is_file():
         return []
     fix = "restore it: it lists people who must not be added again"
     rows = read_json(path, FormatError, fix)
-    if not isinstance(rows, list) or not all(isinstance(_digest(row), str) for row in rows):
-        raise FormatError(f"{path}: expected a list of digests; {fix}")
+    whole = isinstance(rows, list) and all(isinstance(row, dict) for row in rows)
+    if not whole or not all(isinstance(row.get("id_sha256"), str) for row in rows):
+        raise FormatError(f"{path}: expected a list of records with id_sha256; {fix}")
     return rows
-
-
-def _digest(row: Any) -> Any:
-    return row.get("id_sha256") if isinstance(row, dict) else row
 
 
 def dataset_id_finder(dataset: Dataset, subject: str) -> Finder:

@@ -252,8 +252,6 @@ def test_the_record_says_when_and_how_much_but_not_who(dataset):
     assert row["files"] == done.files == count and "S001" not in text
     assert datetime.fromisoformat(row["time"]).tzinfo is not None
     assert withdrawn(dataset) == {row["id_sha256"]} == {text_digest("S001")}
-    withdrawn_file(dataset).write_text(json.dumps([text_digest("S001")]))  # as it once was
-    assert withdrawn(dataset) == {text_digest("S001")}
 
 
 def test_no_subject_is_withdrawn_while_a_stage_runs(dataset):
