@@ -1,9 +1,9 @@
 """Separate hair, skin and torso by colour where geometry alone is not sure.
 
 Pixels that geometry is sure of give histograms of the colours of hair, skin and torso; every other
-pixel takes the class that its colour and place make most likely. In views from behind, where hair
-may cover all skin, half of the skin's colours come from views of the face. The constants were set
-on the digital twin's four people (docs/LOG.md, Parts).
+pixel takes the class that its colour and place make most likely. In views from behind, or of a face
+that hair hides, half of the skin's colours come from views of the face. The constants were set on
+the digital twin's four people (docs/LOG.md, Parts).
 """
 
 from __future__ import annotations
