@@ -91,8 +91,10 @@ class FrameReader:
         self._clip = 0
         self._video: VideoReader | None = None
 
-    def read(self, frame: int) -> np.ndarray:
+    def read(self, frame: int, exact: bool = False) -> np.ndarray:
         """Read an image (H, W, 3) uint8 sRGB by decode index, colours corrected, not undistorted.
+
+        `exact` colours of a video take longer to make (`VideoReader.read_exactly`).
 
         Raises:
             CaptureError: there is no such frame, or the footage changed since it was ingested.
@@ -121,6 +123,8 @@ class FrameReader:
                 "the footage, or how this version reads it, changed since it was ingested: run"
                 " 'express50 ingest' again"
             )
+        if exact and video is not None:
+            image = upright(video.read_exactly(number), orientation)
         return corrected(image, self.source)
 
     def key_frame(self, frame: int) -> int:

@@ -18,6 +18,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+from av.video.reformatter import Interpolation
 
 from express50.errors import CaptureError
 from express50.files.images import encode_jpeg, encode_png
@@ -36,6 +37,14 @@ CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mxf,mpegts"
 HDR_CURVES = {16: "PQ", 18: "HLG"}
 # Weights of red and blue in luma by H.273's matrix coefficients: BT.709, BT.601 (two), BT.2020.
 LUMA = {1: (0.2126, 0.0722), 5: (0.299, 0.114), 6: (0.299, 0.114), 9: (0.2627, 0.0593)}
+# FFmpeg's quick way to RGB is a level too dark for pictures of reduced chroma, and draws that chroma
+# in blocks. This way takes twice as long.
+EXACT = (
+    Interpolation.BILINEAR
+    | Interpolation.FULL_CHR_H_INT
+    | Interpolation.ACCURATE_RND
+    | Interpolation.BITEXACT
+)
 LIMITED = 1  # colour range of 16 to 235 and 16 to 240, as cameras record
 LIMITS = 8, 247  # luma of 16 to 235 that noise and sharp edges hardly reach
 UNTIMED = "frames have no time stamps; remux it, for example with 'ffmpeg -i IN -c copy OUT.mp4'"
@@ -110,7 +119,9 @@ def _open(path: Path) -> tuple[av.container.InputContainer, av.VideoStream]:
     return container, stream
 
 
-def _pixels(path: Path, frame: av.VideoFrame) -> np.ndarray:
+def _pixels(
+    path: Path, frame: av.VideoFrame, way: Interpolation = Interpolation.BILINEAR
+) -> np.ndarray:
     size = frame.width * frame.height
     if not 0 < size <= PIXEL_LIMIT:
         raise CaptureError(
@@ -121,7 +132,7 @@ def _pixels(path: Path, frame: av.VideoFrame) -> np.ndarray:
     try:
         if frame.format.name == "yuv444p" and frame.color_range == LIMITED and weights:
             return _full_chroma(frame, *weights)
-        return frame.to_ndarray(format="rgb24")
+        return frame.to_ndarray(format="rgb24", interpolation=way)
     except DAMAGE as error:
         raise CaptureError(f"{path}: a frame cannot be converted ({reason(error)})") from error
 
@@ -353,6 +364,7 @@ class VideoReader:
         self._container, self._stream = _open(path)
         self._frames = self._decode()
         self._next = 0  # decode index of the first frame that _frames can still yield
+        self._last: av.VideoFrame | None = None
 
     def read(self, frame: int) -> np.ndarray:
         """Read the image (H, W, 3) uint8 sRGB at a decode index.
@@ -360,23 +372,36 @@ class VideoReader:
         Raises:
             CaptureError: there is no such frame, or time stamps differ from the index.
         """
+        return _pixels(self.path, self._frame(frame))
+
+    def read_exactly(self, frame: int) -> np.ndarray:
+        """Read as `read` does, with the colours that the file states.
+
+        What `read` returns is a level darker where chroma is reduced. Hashes are made from it, and
+        labels hold hashes, so it has to stay as it is.
+        """
+        return _pixels(self.path, self._frame(frame), EXACT)
+
+    def _frame(self, frame: int) -> av.VideoFrame:
         if not 0 <= frame < len(self.pts):
             raise CaptureError(
                 f"{self.path}: frame {frame} does not exist, expected 0 to {len(self.pts) - 1}"
             )
+        if self._last is not None and self._last.pts == self.pts[frame]:
+            return self._last
         self._wanted = self.pts[frame]
         if not self._next <= frame < self._next + 2 * REORDER:
             self._seek(frame)
-        image = self._decode_until(frame)
-        if image is None:
+        self._last = self._decode_until(frame)
+        if self._last is None:
             self.restart()
-            image = self._decode_until(frame)
-        if image is None:
+            self._last = self._decode_until(frame)
+        if self._last is None:
             raise CaptureError(
                 f"{self.path}: no frame with time stamp {self.pts[frame]} (frame {frame}); the "
                 "file changed since it was ingested, run 'express50 ingest' again"
             )
-        return image
+        return self._last
 
     def key_frame(self, frame: int) -> int:
         """Return the last frame up to this one that is decoded alone; this one if unknown.
@@ -398,7 +423,7 @@ class VideoReader:
         self._container.close()
         self._container, self._stream = _open(self.path)
         self._frames = self._decode()
-        self._next = 0
+        self._next, self._last = 0, None
 
     def close(self) -> None:
         """Close the file."""
@@ -428,13 +453,13 @@ class VideoReader:
                 return
         self.restart()
 
-    def _decode_until(self, frame: int) -> np.ndarray | None:
+    def _decode_until(self, frame: int) -> av.VideoFrame | None:
         """Decode forward to the frame; return None if the stream is already past it or ends."""
         wanted = self.pts[frame]
         for decoded in self._frames:
             if decoded.pts == wanted:
                 self._next = frame + 1
-                return _pixels(self.path, decoded)
+                return decoded
             if decoded.pts > wanted:
                 return None
         return None

@@ -73,7 +73,7 @@ def run(dataset: Dataset, item: str, config: FramesConfig, out: Path) -> Result:
 
 STAGE = Stage(
     name="frames",
-    version=6,
+    version=7,
     config=FramesConfig,
     items=items,
     inputs=inputs,

@@ -119,6 +119,6 @@ def _reader(dataset: Dataset, subject: str, expression: str) -> Callable[[str], 
 
     def read(camera: str) -> np.ndarray:
         with closing(FrameReader(index, camera)) as reader:
-            return reader.read(peak.frame)
+            return reader.read(peak.frame, exact=True)
 
     return read

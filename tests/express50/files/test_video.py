@@ -68,6 +68,31 @@ def test_full_chroma_gives_ffmpegs_colours(monkeypatch, shape, matrix, space):
     assert (ours == ffmpegs).mean() > 0.9 or ours.size < 10
 
 
+def test_exact_colours_of_reduced_chroma(tmp_path):
+    rows, columns = np.mgrid[:64, :96]
+    image = np.stack([columns * 2, 200 - columns, 60 + 2 * rows], axis=2).astype(np.uint8)
+    # H.273, equations 38 to 42, BT.601: the luma and chroma of the picture, by rounding alone.
+    red, green, blue = image.transpose(2, 0, 1) / 255
+    luma = 0.299 * red + 0.587 * green + 0.114 * blue
+    chroma = ((blue - luma) / 1.772, (red - luma) / 1.402)
+    planes = [16 + 219 * luma, *(128 + 224 * c.reshape(32, 2, 48, 2).mean((1, 3)) for c in chroma)]
+    frame = av.VideoFrame(96, 64, "yuv420p")
+    frame.pts = 0
+    for plane, values in zip(frame.planes, planes, strict=True):
+        rows_of_bytes = np.zeros((plane.height, plane.line_size), np.uint8)
+        rows_of_bytes[:, : plane.width] = np.rint(values)
+        plane.update(rows_of_bytes.tobytes())
+    with av.open(str(tmp_path / "video.mkv"), "w") as container:
+        stream = container.add_stream("ffv1", rate=24)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    reader = VideoReader(tmp_path / "video.mkv", (0,))
+    quick, exact = reader.read(0).astype(int) - image, reader.read_exactly(0).astype(int) - image
+    assert np.abs(exact.mean((0, 1))).max() < 0.25 and np.abs(exact).mean() < 0.6
+    assert np.abs(quick.mean((0, 1))).max() > 1.0  # otherwise it is not needed any more
+
+
 def test_a_read_decodes_what_it_needs_from_the_nearest_key_frame(tmp_path, monkeypatch):
     path, decoded = tmp_path / "video.mp4", []
     write_video(path, noise_video_images(FRAMES), gop=12, b_frames=2)
