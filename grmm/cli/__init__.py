@@ -7,6 +7,7 @@ of options. `grmm.cli.commands` implements the commands.
 from __future__ import annotations
 
 import argparse
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,8 @@ from typing import Any
 
 from express50 import __version__
 from express50.console import Parser, add_command, number, run_handler
+from express50.dial.budget import parse_budget
+from express50.errors import ConfigError
 from grmm.cli import commands
 from grmm.config import PRESETS, TABLES
 
@@ -32,17 +35,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def parse_seconds(text: str) -> float:
-    """Parse a budget in seconds: ``90``, ``60s``, ``5m``, ``1.5h``; ArgumentTypeError otherwise."""
-    unit = {"s": 1.0, "m": 60.0, "h": 3600.0}.get(text[-1:], 0.0)
-    try:
-        seconds = float(text[:-1]) * unit if unit else float(text)
-    except ValueError:
-        seconds = 0.0
-    if not 0 < seconds < float("inf"):
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not a time; expected a number of seconds above 0, or 60s, 5m, 1h"
-        )
-    return seconds
+    """Parse a time as `parse_budget` does, or a number of seconds; ArgumentTypeError otherwise."""
+    with contextlib.suppress(ConfigError):
+        budget = parse_budget(f"{text}s" if text[-1:].isdigit() else text)
+        if not budget.cores:
+            return budget.seconds
+    raise argparse.ArgumentTypeError(
+        f"{text!r} is not a time; expected a number of seconds above 0, or 60s, 5m, 1h30m"
+    )
 
 
 def value(metavar: str, words: str, **settings: Any) -> dict[str, Any]:

@@ -540,6 +540,7 @@ def test_a_head_is_driven_by_tracked_clips(checkpoint, tmp_path, capsys):
     ("arguments", "message"),
     [
         (["train", "a", "b", "--budget", "-4m"], "'-4m' is not a time; expected a number of"),
+        (["train", "a", "b", "--budget", "4ch"], "'4ch' is not a time; expected a number of"),
         (["trian"], "unknown 'trian' (did you mean 'train'?)"),
         (["render", "a", "b", "--to", ""], "argument --to: got '', expected a value; is a"),
         (["train", "a", "b", "--holdout-cameras=,"], "argument --holdout-cameras: got ','"),
