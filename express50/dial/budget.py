@@ -45,7 +45,8 @@ def parse_budget(text: str) -> Budget:
     parts = PART.findall(text)
     seconds = sum(float(number) * SECONDS[unit] for number, unit in parts)
     cores = any(unit == "ch" for _, unit in parts)
-    if "".join(map("".join, parts)) != text or not 0 < seconds < math.inf or (cores and len(parts) > 1):
+    read = "".join(map("".join, parts)) == text and not (cores and len(parts) > 1)
+    if not (read and 0 < seconds < math.inf):
         raise ConfigError(
             f"--budget {text!r}: expected a time such as 45m, 2h or 1h30m, or core hours such as"
             " 40ch"

@@ -37,8 +37,8 @@ CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mxf,mpegts"
 HDR_CURVES = {16: "PQ", 18: "HLG"}
 # Weights of red and blue in luma by H.273's matrix coefficients: BT.709, BT.601 (two), BT.2020.
 LUMA = {1: (0.2126, 0.0722), 5: (0.299, 0.114), 6: (0.299, 0.114), 9: (0.2627, 0.0593)}
-# FFmpeg's quick way to RGB is a level too dark for pictures of reduced chroma, and draws that chroma
-# in blocks. This way takes twice as long.
+# FFmpeg's quick way to RGB is a level too dark for pictures of reduced chroma, which it draws in
+# blocks. This way takes twice as long.
 EXACT = (
     Interpolation.BILINEAR
     | Interpolation.FULL_CHR_H_INT
