@@ -76,9 +76,9 @@ def dataset(twin, reads, tmp_path_factory):
     original = FrameReader.read
     for name in STAGES:
 
-        def counted(self, frame, rows=reads[name]):
+        def counted(self, frame, exact=False, rows=reads[name]):
             rows.append((str(self.path), frame))
-            return original(self, frame)
+            return original(self, frame, exact)
 
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(FrameReader, "read", counted)

@@ -262,8 +262,11 @@ def label_by_colour(
     face = solid & (geometry.mesh > 0) & (labels == SKIN)
     skin = face & (geometry.off == 0)  # in front of it are hair and hands
     hidden = not sees_face or 2 * skin.sum() < face.sum()
-    if skin.sum() < LEAST and not sees_face:  # hair may cover the neck
-        skin = skin | (solid & (labels == NECK) & (geometry.height > SURE_ABOVE))
+    if skin.sum() < LEAST:
+        if not sees_face:  # hair may cover the neck
+            skin = skin | (solid & (labels == NECK) & (geometry.height > SURE_ABOVE))
+        elif skin_colours is None:  # all of the face is hidden, and no other view shows it
+            skin = face
     covered = np.zeros_like(skin)
     if sees_face:  # from behind, most of it may be hair
         taught, skin = skin, bare_skin(rgb, skin, geometry.mesh, solid)
