@@ -18,7 +18,8 @@ def redact(path: Path, subject: str) -> bool:
         FormatError: the file is not a checkpoint of 'grmm train' or 'fit'.
     """
     content = read_content(path)
-    named = {*content["subjects"], *content["offsets"]}
+    # The first checkpoints have neither offsets nor parameters, but hold people, too.
+    named = {*content["subjects"], *content.get("offsets", {})}
     named |= {frame["subject"] for frame in content["frames"]}
     if subject not in named:
         return False
@@ -38,8 +39,8 @@ def redact(path: Path, subject: str) -> bool:
         "expressions": [content["expressions"][row] for row in kept],
         "model": content["model"] | codes,
         "frames": frames,
-        "parameters": {k: v[places] for k, v in content["parameters"].items()},
-        "offsets": {k: v for k, v in content["offsets"].items() if k != subject},
+        "parameters": {k: v[places] for k, v in content.get("parameters", {}).items()},
+        "offsets": {k: v for k, v in content.get("offsets", {}).items() if k != subject},
         "optimizer": {},
         "loop": {},
     }
