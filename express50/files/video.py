@@ -120,7 +120,7 @@ def _open(path: Path) -> tuple[av.container.InputContainer, av.VideoStream]:
 
 
 def _pixels(
-    path: Path, frame: av.VideoFrame, way: Interpolation = Interpolation.BILINEAR
+    path: Path, frame: av.VideoFrame, conversion: Interpolation = Interpolation.BILINEAR
 ) -> np.ndarray:
     size = frame.width * frame.height
     if not 0 < size <= PIXEL_LIMIT:
@@ -132,7 +132,7 @@ def _pixels(
     try:
         if frame.format.name == "yuv444p" and frame.color_range == LIMITED and weights:
             return _full_chroma(frame, *weights)
-        return frame.to_ndarray(format="rgb24", interpolation=way)
+        return frame.to_ndarray(format="rgb24", interpolation=conversion)
     except DAMAGE as error:
         raise CaptureError(f"{path}: a frame cannot be converted ({reason(error)})") from error
 

@@ -26,7 +26,7 @@ EMPTY = 0.002  # share of the image below which a matte holds no head
 FULL = 0.98  # share above which a matte cuts nothing out
 SPECK = 0.01  # share of a matte's largest part below which other parts are dropped
 HOLE = 0.05  # share of the matte up to which a hole in it is filled
-LOST_M = 0.004  # metres inside the tracked outline: the face of a matte without holes reaches there
+LOST_M = 0.004  # metres inside the tracked outline, where an error of the track does not reach
 UPSAMPLE = 3  # times that a matte is enlarged before distances to its outline are measured
 ENLARGED_PX = 16  # up to so far around it; further away, a pixel's error does not matter
 UNSEEN = 1.0  # metres; the distance given to space that too few cameras see
@@ -93,7 +93,7 @@ def with_face(view: DepthView, head: TrackedHead) -> DepthView:
     """Add to a view's matte the parts of a tracked face that it lacks.
 
     A wall with the colour of skin takes them out of a matte, and each would pierce the whole hull.
-    Parts count if they reach further inside the mesh's outline than the track is wrong.
+    A part counts if it reaches further inside the mesh's outline than tracks are usually off.
     """
     mesh, depth = render_head(head, view.camera)
     lacking = label_mask(mesh, *FACE) & (view.alpha <= INSIDE)

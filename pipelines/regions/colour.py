@@ -128,7 +128,7 @@ def like_skin(values: np.ndarray, face: np.ndarray) -> np.ndarray:
 
 
 def _range_of_most(known: np.ndarray) -> np.ndarray:
-    """Return the least and the greatest of the `_ratios` (2, 3) that most of some (M, 3) have."""
+    """Return the lower and upper limits (2, 3) within which most of some `_ratios` (M, 3) lie."""
     usual, spread = robust_moments(known)
     reach = WITHIN * np.clip(spread, LEAST_SPREAD, MOST_SPREAD)
     return np.stack([usual - reach, usual + reach])
@@ -137,10 +137,10 @@ def _range_of_most(known: np.ndarray) -> np.ndarray:
 def like_skin_around(face: np.ndarray, left: np.ndarray) -> np.ndarray:
     """Mark the colours (N,) of a face (N, 3) that are like most of it; logarithms of root light.
 
-    `left` (N,) bool marks those on one side: in `two_lights`, skin has the colours of either side
+    `left` (N,) bool marks those on one side: in `_two_lights`, skin has the colours of either side
     and those in between.
     """
-    if not two_lights(face, left):
+    if not _two_lights(face, left):
         return like_skin(face, face)
     ratios = _ratios(face)
     ranges = np.stack([_range_of_most(ratios[side]) for side in (left, ~left)])
@@ -148,7 +148,7 @@ def like_skin_around(face: np.ndarray, left: np.ndarray) -> np.ndarray:
     return ((ratios > low) & (ratios < high)).all(1)
 
 
-def two_lights(face: np.ndarray, left: np.ndarray) -> bool:
+def _two_lights(face: np.ndarray, left: np.ndarray) -> bool:
     """Return whether light of another colour falls on one side of a face, as in `like_skin_around`.
 
     It does not darken that side much. Beards, fringes and glasses do, or are on both sides.
@@ -171,8 +171,8 @@ def bare_skin(rgb: np.ndarray, skin: np.ndarray, mesh: np.ndarray, solid: np.nda
     if not skin.any():
         return skin
     logs, left = colour_logs(rgb[skin]), left_of_middle(mesh)[skin]
-    sure = skin if two_lights(logs, left) else _uncovered(rgb, skin, mesh, solid)
-    if sure is skin:
+    sure = _uncovered(rgb, skin, mesh, solid)
+    if sure is skin or _two_lights(logs, left):
         alike = like_skin_around(logs, left)
     else:
         alike = like_skin(logs, colour_logs(rgb[sure]))

@@ -217,9 +217,10 @@ def test_what_a_matte_lacks_of_the_tracked_face_is_added():
             tip = np.flatnonzero(alpha[row])[0]
             alpha[row, tip : tip + pixels] = 0
         lacking = replace(whole, alpha=alpha, silhouette_px=silhouette_distance(alpha))
-        mended = with_face(lacking, head)
-        assert (mended.alpha[face] == 1).all() == added and (mended is not lacking) == added
-        assert np.array_equal(mended.silhouette_px, silhouette_distance(mended.alpha))
+        found = with_face(lacking, head)
+        assert (found is not lacking) == added
+        assert (found.alpha[face] == 1).all() == added
+        assert np.array_equal(found.silhouette_px, silhouette_distance(found.alpha))
     assert with_face(whole, head) is whole
 
 
