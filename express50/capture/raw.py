@@ -28,6 +28,7 @@ from express50.files.text import (
     read_text,
     read_toml,
 )
+from express50.files.video import common_fps
 from express50.geometry.cameras import Camera
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr")
@@ -43,6 +44,7 @@ RESERVED |= {f"{port}{n}" for port in ("COM", "LPT") for n in range(1, 10)}
 FILES_READ = ("capture.toml", "cues.csv", "calibration.json")
 DATA_SUFFIXES = (".csv", ".json", ".npz", ".toml", ".xml", ".yaml", ".yml")
 CUE_COLUMNS = ("expression_id", "start_frame", "end_frame")
+ANY_FPS = 24.0  # a placeholder where the rate is not needed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,6 +118,9 @@ def read_capture(root: Path) -> RawCapture:
         except CaptureError as error:
             dropped[path.name] = str(error)
     calibration = read_calibration(root, cameras, dropped)
+    if "fps" not in meta:
+        videos = [camera.path for camera in cameras.values() if camera.kind == "video"]
+        meta["fps"] = common_fps(root / "capture.toml", videos)
     return RawCapture(
         root=root,
         subject=meta["subject"],
@@ -157,15 +162,15 @@ def read_calibration(
 
 
 def read_meta(root: Path) -> dict:
-    """Read capture.toml; CaptureError if it is missing, or subject or fps are invalid."""
+    """Read capture.toml; CaptureError if it is missing, or subject or a given fps is invalid."""
     path = root / "capture.toml"
     if not path.is_file():
         what = "has no capture.toml" if root.is_dir() else no_folder(root)
         raise CaptureError(
-            f"{root}: {what}; expected a capture folder whose capture.toml gives subject and fps"
+            f"{root}: {what}; expected a capture folder whose capture.toml gives the subject"
         )
     meta = read_capture_toml(root)
-    check_identity(path, meta.get("subject"), meta.get("fps"))
+    check_identity(path, meta.get("subject"), meta.get("fps", ANY_FPS))
     return meta
 
 

@@ -45,6 +45,7 @@ EXACT = (
     | Interpolation.ACCURATE_RND
     | Interpolation.BITEXACT
 )
+FPS_SLACK = 0.02  # of the rate: less than from 24 to 25 frames per second
 LIMITED = 1  # colour range of 16 to 235 and 16 to 240, as cameras record
 LIMITS = 8, 247  # luma of 16 to 235 that noise and sharp edges hardly reach
 UNTIMED = "frames have no time stamps; remux it, for example with 'ffmpeg -i IN -c copy OUT.mp4'"
@@ -205,6 +206,27 @@ def video_fps(path: Path) -> float:
     if not 0 < rate <= 10_000:
         raise CaptureError(f"{path}: has no frame rate; set fps in capture.toml")
     return rate
+
+
+def common_fps(table: Path, videos: Iterable[Path]) -> float:
+    """Return the frame rate that videos state; a video that cannot be opened says nothing.
+
+    Raises:
+        CaptureError: they differ or state none; it asks for a rate in the `table`.
+    """
+    stated = []
+    for path in videos:
+        with suppress(CaptureError):
+            stated.append((video_fps(path), path))
+    if not stated:
+        raise CaptureError(f"{table}: no fps, and no video states it; add it, such as 'fps = 24'")
+    (slow, slowest), (fast, fastest) = min(stated), max(stated)
+    if fast > (1 + FPS_SLACK) * slow:
+        raise CaptureError(
+            f"{table}: no fps, and videos differ: {slowest} says {slow:.4g}, {fastest} says"
+            f" {fast:.4g}; add the rate at which all were recorded, such as 'fps = 24'"
+        )
+    return slow
 
 
 def frame_times(path: Path) -> tuple[int, ...]:

@@ -20,10 +20,15 @@ from express50.files.atomic import dump_json
 from express50.files.containers import WITHIN, inside, read_picture
 from express50.files.digests import file_sha256, text_digest
 from express50.files.images import ORIENTATION, encode_jpeg, has_alpha, read_exif, shrink, upright
-from express50.files.video import VideoTags, iterate_sparsely, iterate_video, video_fps
+from express50.files.video import (
+    FPS_SLACK,
+    VideoTags,
+    iterate_sparsely,
+    iterate_video,
+    video_fps,
+)
 from pipelines.ingest.quality import CameraMeasurements, FrameMeasures
 
-FPS_SLACK = 0.02  # of the rate: less than from 24 to 25 frames per second
 BEYOND = 0.01  # share of the first picture outside of a range that no flag states
 UNEVEN = 0.1  # share of the steps that differ; a lost frame now and then is counted as a gap
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from express50.capture.raw import (
+    ANY_FPS,
     VIDEO_SUFFIXES,
     RawCapture,
     check_identity,
@@ -31,7 +32,6 @@ from express50.geometry.cameras import Camera
 from express50.rigs.world_frame import judge
 
 OURS = "express50"
-FPS = 24.0  # a placeholder, if only the subject is needed
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,9 @@ def subject_of(path: Path) -> str:
     meta, source = read_capture_toml(path), footage_source(path)
     layout = detect(source, meta.get("layout"))
     subject = meta.get("subject") or layout.subject_of(source)
-    check_identity(path / "capture.toml" if path.is_dir() else path, subject, meta.get("fps", FPS))
+    check_identity(
+        path / "capture.toml" if path.is_dir() else path, subject, meta.get("fps", ANY_FPS)
+    )
     return subject
 
 
