@@ -32,7 +32,10 @@ from express50.files.video import common_fps
 from express50.geometry.cameras import Camera
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr")
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mxf", ".mts", ".m2ts")
+VIDEO_SUFFIXES = (
+    ".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mxf", ".mts", ".m2ts", ".ts", ".mpg",
+    ".mpeg", ".wmv", ".flv",
+)  # fmt: skip
 # Photographs of phones and of cameras that nothing here decodes.
 UNDEVELOPED = (
     ".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef",

@@ -32,7 +32,7 @@ REORDER = 16
 LEAVING_OUT = ("h264", "hevc")
 # Accepted containers. FFmpeg goes by content: a playlist named video.mp4 would make it read other
 # files.
-CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mxf,mpegts"
+CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mxf,mpegts,mpeg,asf,flv"
 # ITU-T H.273, table 3; their pictures look pale and flat if taken for sRGB.
 HDR_CURVES = {16: "PQ", 18: "HLG"}
 # Weights of red and blue in luma by H.273's matrix coefficients: BT.709, BT.601 (two), BT.2020.
@@ -50,7 +50,7 @@ LIMITED = 1  # colour range of 16 to 235 and 16 to 240, as cameras record
 LIMITS = 8, 247  # luma of 16 to 235 that noise and sharp edges hardly reach
 UNTIMED = "frames have no time stamps; remux it, for example with 'ffmpeg -i IN -c copy OUT.mp4'"
 UNORDERED = (
-    "time stamps of frames are not in order, as in AVI and MXF files with B-frames; encode it"
+    "time stamps of frames are not in order, as in AVI, MXF and WMV files with B-frames; encode it"
     " again, for example with 'ffmpeg -i IN -crf 14 OUT.mp4'"
 )
 BOXES = 1_000_000  # per file; a fragment of one second has two
