@@ -1,6 +1,7 @@
 """Frame-exact video: counts by decoding, seeks by time stamp, truncation is an error."""
 
 import av
+import cv2
 import numpy as np
 import pytest
 
@@ -11,6 +12,7 @@ from express50.files.video import (
     VideoReader,
     VideoTags,
     check_whole,
+    frame_times,
     iterate_sparsely,
     iterate_video,
     video_tags,
@@ -96,6 +98,18 @@ def test_exact_colours_of_reduced_chroma(tmp_path):
     quick, exact = reader.read(0).astype(int) - image, reader.read_exactly(0).astype(int) - image
     assert np.abs(exact.mean((0, 1))).max() < 0.25 and np.abs(exact).mean() < 0.6
     assert np.abs(quick.mean((0, 1))).max() > 1.0  # otherwise it is not needed any more
+
+
+def test_colours_of_hd_video_without_a_colour_matrix_are_those_that_opencv_wrote(tmp_path):
+    """Players take BT.709 for it; this would be 5 levels off here."""
+    rows, columns = np.mgrid[:720, :1280]
+    image = np.stack([30 + columns // 7, 200 - columns // 11, 60 + rows // 8], 2).astype(np.uint8)
+    path = tmp_path / "video.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 24, (1280, 720))
+    writer.write(np.ascontiguousarray(image[..., ::-1]))
+    writer.release()
+    read = VideoReader(path, frame_times(path)).read_exactly(0)
+    assert np.abs(read.astype(int) - image).mean() < 3
 
 
 def test_a_read_decodes_what_it_needs_from_the_nearest_key_frame(tmp_path, monkeypatch):
