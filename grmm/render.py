@@ -16,6 +16,7 @@ from torch import Tensor
 from express50.dataset import tracks
 from express50.errors import ConfigError, check_known
 from express50.files.images import contact_sheet, write_image
+from express50.files.video import BT601, LIMITED
 from grmm.checkpoint import Checkpoint
 from grmm.data import HeadViews, stacked
 from grmm.edit import (
@@ -318,6 +319,8 @@ def write_video(path: Path, frames: Iterable[np.ndarray], rate: float = tracks.R
             stream = container.add_stream("libx264", rate=Fraction(rate).limit_denominator(1001))
             stream.pix_fmt = "yuv420p"
             stream.options = {"crf": "16", "preset": "veryfast"}
+            # What FFmpeg makes of RGB. Unsaid, players take BT.709 from 720 lines on.
+            stream.codec_context.colorspace, stream.codec_context.color_range = BT601, LIMITED
             for number, frame in enumerate(frames):
                 odd = [(0, side % 2) for side in frame.shape[:2]]
                 even = np.pad(frame, [*odd, (0, 0)], mode="edge")

@@ -33,10 +33,11 @@ LEAVING_OUT = ("h264", "hevc")
 # Accepted containers. FFmpeg goes by content: a playlist named video.mp4 would make it read other
 # files.
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mxf,mpegts,mpeg,asf,flv"
+BT709, BT601 = 1, 6  # ITU-T H.273, table 4
 # ITU-T H.273, table 3; their pictures look pale and flat if taken for sRGB.
 HDR_CURVES = {16: "PQ", 18: "HLG"}
 # Weights of red and blue in luma by H.273's matrix coefficients: BT.709, BT.601 (two), BT.2020.
-LUMA = {1: (0.2126, 0.0722), 5: (0.299, 0.114), 6: (0.299, 0.114), 9: (0.2627, 0.0593)}
+LUMA = {BT709: (0.2126, 0.0722), 5: (0.299, 0.114), BT601: (0.299, 0.114), 9: (0.2627, 0.0593)}
 # FFmpeg's quick way to RGB is a level too dark for pictures of reduced chroma, which it draws in
 # blocks. This way takes twice as long.
 EXACT = (
@@ -487,9 +488,6 @@ class VideoReader:
         return None
 
 
-_BT709 = 1
-
-
 class VideoFootage:
     """Writes ``video.mp4``: H.264, 4:4:4, BT.709.
 
@@ -509,7 +507,7 @@ class VideoFootage:
         }  # fmt: skip
         context = stream.codec_context
         context.thread_count, context.gop_size = 1, 24
-        context.colorspace = context.color_primaries = context.color_trc = _BT709
+        context.colorspace = context.color_primaries = context.color_trc = BT709
         context.color_range = LIMITED
         self._stream = stream
 

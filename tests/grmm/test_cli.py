@@ -14,6 +14,7 @@ from express50 import __version__
 from express50.errors import FormatError
 from express50.files.atomic import alone_in
 from express50.files.images import read_image
+from express50.files.video import BT601, EXACT, LIMITED
 from express50.shards.writer import PackedSample, ShardWriter
 from grmm.cli import build_parser, main
 from grmm.cli.commands import train_config
@@ -181,6 +182,16 @@ def test_a_video_has_even_sides(size, drawn, tmp_path):
         pictures = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
     assert [picture.shape[:2] for picture in pictures] == [drawn] * 2
     assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
+
+
+def test_a_video_states_how_its_colours_are_read(tmp_path):
+    """Players took those of 720 lines and more for BT.709: seven levels off here."""
+    write_video(tmp_path / "a.mp4", [np.full((720, 64, 3), (200, 60, 40), np.uint8)])
+    with av.open(str(tmp_path / "a.mp4")) as video:
+        frame = next(video.decode(video=0))
+    assert (frame.colorspace, frame.color_range) == (BT601, LIMITED)
+    read = frame.to_ndarray(format="rgb24", interpolation=EXACT).astype(int)
+    assert np.abs(read - (200, 60, 40)).max() <= 2
 
 
 def test_a_video_that_cannot_be_written_leaves_no_part_of_it(tmp_path):
