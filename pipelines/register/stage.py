@@ -87,8 +87,9 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
     if agreement is not None and agreement < agreeing:
         why = (
             f"cameras agree on bare skin by {rounded_down(agreement)}, expected {AGREEING} or more,"
-            " so the mesh follows the surface less: check calibration and synchronisation; cameras"
-            " that stand far apart or see a small head agree less, too"
+            " so the mesh follows the surface less: check calibration and synchronisation, and"
+            " whether the face is dark, noisy or blurred; cameras that stand far apart or see a"
+            " small head agree less, too"
         )
         warnings.append(Note("mesh", why))
     elif metrics["seen_share"] < LEAST_SEEN:

@@ -268,7 +268,9 @@ def test_a_surface_on_which_views_disagree_is_not_followed(dataset, tmp_path):
         found[views] = STAGE.run(dataset, "S001/smile", NoSettings(), tmp_path / str(views))
     assert not found[1].warnings and found[1].metrics["seen_share"] > 0.4
     assert found[1].metrics["skin_agreement"] == pytest.approx(0.4)
-    assert "cameras agree on bare skin by 0.40, expected 0.6" in found[4].warnings[0].why
+    why = found[4].warnings[0].why
+    assert "cameras agree on bare skin by 0.40, expected 0.6" in why
+    assert "whether the face is dark" in why  # noise has the same effect as a wrong rig
     assert found[4].metrics["moved_mm_p95"] < 0.7 * found[1].metrics["moved_mm_p95"]
     write_surface(path, surface.vertices, surface.faces, 0.599)
     (tmp_path / "nearly").mkdir()
