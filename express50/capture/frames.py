@@ -312,10 +312,9 @@ def read_cameras_of(dataset: Dataset, subject: str, undistorted: bool = True) ->
     """
     sizes = picture_sizes(dataset, subject)
     cameras = {
-        name: camera if sizes.get(name, _size_of(camera)) == _size_of(camera)
-        else resized(camera, *sizes[name])
+        name: resized(camera, *sizes.get(name, _size_of(camera)))
         for name, camera in read_recorded_cameras(dataset, subject).items()
-    }  # fmt: skip
+    }
     return {name: pinhole(c) if undistorted else c for name, c in cameras.items()}
 
 

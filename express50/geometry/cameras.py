@@ -96,6 +96,8 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
         raise ValueError(
             f"{camera.id}: image is {camera.width}x{camera.height}, expected at least 1x1"
         )
+    if (width, height) == (camera.width, camera.height):
+        return camera
     return scale_camera(camera, width / camera.width, height / camera.height)
 
 

@@ -46,14 +46,12 @@ Images = Iterable[tuple[int, str, np.ndarray]]
 def reduced_camera(camera: Camera) -> Camera:
     """Return the camera of an image with a long side of `LONG_SIDE` at most."""
     share = min(1.0, LONG_SIDE / max(camera.width, camera.height))
-    size = round(camera.width * share), round(camera.height * share)
-    return camera if share == 1.0 else resized(camera, *size)
+    return resized(camera, round(camera.width * share), round(camera.height * share))
 
 
 def at_footage_size(small: Camera, camera: Camera) -> Camera:
     """Return a reduced camera at the size of the footage, that of `camera`."""
-    size = (camera.width, camera.height)
-    return small if size == (small.width, small.height) else resized(small, *size)
+    return resized(small, camera.width, camera.height)
 
 
 def _reduced(camera: Camera, image: np.ndarray, frame: int) -> np.ndarray:

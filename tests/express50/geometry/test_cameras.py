@@ -109,6 +109,11 @@ def test_scaling_a_one_focal_model_keeps_it_right():
     )
 
 
+def test_a_camera_of_the_wanted_size_is_unchanged():
+    camera = Camera("a", 64, 48, "SIMPLE_PINHOLE", (80, 31, 25), POSE)
+    assert cameras.resized(camera, 64, 48) is camera
+
+
 def test_rays_that_part_meet_nowhere():
     left = cameras.pinhole_camera("l", np.diag([300.0, 300.0, 1.0]), 320, 240, np.eye(4))
     pose = np.eye(4)
