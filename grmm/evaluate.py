@@ -93,9 +93,10 @@ def evaluate(
     """Measure samples, one row of numbers each; see `compare`.
 
     ``depth_mm`` is the median absolute error where both depths are known (NaN: nowhere). ``keep``
-    gets every index with its picture (3, H, W). What the ``journal`` holds is not measured again.
+    gets every index with its picture (3, H, W). What the ``journal`` holds is not measured again,
+    unless the ``judge`` needs all pictures, for FID.
     """
-    rows, known = [], journal_rows(journal)
+    rows, known = [], {} if judge.inception else journal_rows(journal)
     for index in indices:
         key = views.keys[index]
         if held := known.get((*vars(key).values(), kind(key))):

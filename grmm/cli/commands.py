@@ -325,12 +325,10 @@ def evaluate(args: argparse.Namespace) -> int:
 
 def _journal(
     args: argparse.Namespace, loaded: Checkpoint, samples: str, protocol: FitProtocol, folder: Path
-) -> Journal | None:
-    """Name the file from which a stopped evaluation continues; None if FID needs all pictures."""
+) -> Journal:
+    """Name the file from which a stopped evaluation continues."""
     from grmm.evaluate import Journal
 
-    if loaded.config.metrics.inception:
-        return None
     made_from = {
         "checkpoint": file_sha256(args.checkpoint),
         "samples": samples,

@@ -9,6 +9,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+import torch
 
 from express50 import __version__
 from express50.errors import FormatError
@@ -383,6 +384,34 @@ def test_a_stopped_evaluation_keeps_what_it_has_measured(checkpoint, shards, tmp
     files = [tmp_path / name / "evaluation.csv" for name in ("whole", "stopped")]
     assert files[0].read_bytes() == files[1].read_bytes()
     assert not journal.exists()
+
+
+def test_a_stopped_evaluation_that_measures_fid_replaces_its_own_pictures(
+    checkpoint, shards, tmp_path, monkeypatch, capsys
+):
+    """The same command refused them as another method's."""
+
+    class Inception(torch.nn.Module):
+        def forward(self, images: torch.Tensor, return_features: bool = False) -> torch.Tensor:
+            return images.float().mean([2, 3])
+
+    torch.jit.script(Inception()).save(str(tmp_path / "inception.pt"))
+    arguments = ["evaluate", str(checkpoint), str(shards), str(tmp_path / "e"), "--cameras=cam01"]
+    arguments += [f"--save={tmp_path / 'e/pictures'}", f"--inception={tmp_path / 'inception.pt'}"]
+    measured = []
+
+    def stopped(*given):
+        measured.append(given)
+        if len(measured) == 3:
+            raise KeyboardInterrupt
+        return compare(*given)
+
+    monkeypatch.setattr("grmm.evaluate.compare", stopped)
+    assert main(arguments) == 130
+    assert main([*arguments, "--json"]) == 0
+    assert len(measured) == 3 + 4, "FID needs all pictures"
+    assert json.loads(capsys.readouterr().out)["fid"] > 0
+    assert main(arguments) == 2, "a finished evaluation's pictures are not replaced"
 
 
 def test_config_prints_settings_that_train_takes(tmp_path, capsys):
