@@ -17,8 +17,10 @@ from express50.files.atomic import alone_in
 from express50.files.images import read_image
 from express50.files.video import BT601, EXACT, LIMITED
 from express50.shards.writer import PackedSample, ShardWriter
+from grmm.checkpoint import load_checkpoint
 from grmm.cli import build_parser, main
-from grmm.cli.commands import train_config
+from grmm.cli.commands import _edited_head, train_config
+from grmm.edit import trained_head
 from grmm.evaluate import IDS, NUMBERS, compare, summarise, summary_lines
 from grmm.render import write_video
 from grmm.shard_source import ShardSource, seen_window
@@ -174,6 +176,18 @@ def test_render_writes_a_picture_per_frame_and_pair(checkpoint, tmp_path, capsys
     picture, grid = (read_image(tmp_path / name) for name in ("picture.png", "grid.jpg"))
     assert picture.std() > 10, "a head, not one grey"
     assert grid.shape[0] >= 2 * picture.shape[0] and grid.shape[1] >= 2 * picture.shape[1]
+
+
+def test_residual_codes_of_others_leave_the_mesh_as_it_is(checkpoint, tmp_path):
+    loaded, given = load_checkpoint(checkpoint), ["render", str(checkpoint), str(tmp_path)]
+    given += ["--subject=S000", "--expression=e0"]
+    plain = _edited_head(loaded, build_parser().parse_args(given))
+    edited = [*given, "--z-id-of=S001", "--z-exp-of=e1"]
+    head = _edited_head(loaded, build_parser().parse_args(edited))
+    donor = trained_head(loaded, "S001", "e1")
+    assert torch.equal(head.z_id, donor.z_id) and not torch.equal(head.z_id, plain.z_id)
+    assert torch.equal(head.z_exp, donor.z_exp) and not torch.equal(head.z_exp, plain.z_exp)
+    assert head.tracked is plain.tracked
 
 
 @pytest.mark.parametrize(("size", "drawn"), [((1, 1), (2, 2)), ((5, 8), (6, 8))])
