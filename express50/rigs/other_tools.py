@@ -20,6 +20,8 @@
 - IDR and NeuS: ``world_mat_<i>`` is K [R|t], world to pixels from the first pixel's centre;
   ``scale_mat_<i>`` only tells where the object is. FaceScape: ``<i>_K``, ``<i>_Rt`` and so on,
   world to camera; OpenCV's axes, pixels and distortion.
+- Panoptic Studio: a list of cameras with ``K``, ``distCoef``, ``R`` and ``t``, world to camera;
+  centimetres, OpenCV's axes and distortion.
 """
 
 from __future__ import annotations
@@ -352,6 +354,25 @@ def read_facescape(path: Path) -> dict[str, Camera]:
         size = size_from([table.get(f"{name}_{side}") for side in ("width", "height")], what)
         dist = finite_array(table.get(f"{name}_distortion"), (5,), what)
         found.append(camera_from_K(identifier(name), lens, dist, size, pose))
+    return as_rig(found, path)
+
+
+def read_panoptic(path: Path) -> dict[str, Camera]:
+    """Read the cameras of CMU's Panoptic Studio, named as its videos, such as ``hd_00_05``.
+
+    Raises:
+        CalibrationError: there are no cameras, or one lacks a value.
+    """
+    rows = read_json_table(path, CalibrationError).get("cameras")
+    found = []
+    for row in filter(lambda row: isinstance(row, dict), rows if isinstance(rows, list) else []):
+        name = identifier(f"{row.get('type')}_{row.get('name')}")
+        what = f"{path}: camera {name} has an array"
+        K, R = (finite_array(row.get(key), (3, 3), what) for key in ("K", "R"))
+        pose = make_transform(R, 0.01 * finite_array(row.get("t"), (3, 1), what).ravel())
+        dist = finite_array(row.get("distCoef"), (5,), what)
+        size = size_from(row.get("resolution"), what)
+        found.append(camera_from_K(name, K_from_opencv(K), dist, size, pose))
     return as_rig(found, path)
 
 

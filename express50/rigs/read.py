@@ -34,6 +34,7 @@ from express50.rigs.other_tools import (
     read_kalibr,
     read_metashape,
     read_nersemble,
+    read_panoptic,
     read_qualisys,
     read_reality_capture,
     read_renderme,
@@ -97,6 +98,9 @@ FORMATS = {
     ),
     "facescape": RigFormat(
         "FaceScape's params.json", _file(".json", word='"0_Rt"'), read_facescape
+    ),
+    "panoptic": RigFormat(
+        "Panoptic Studio's .json", _file(".json", word='"distCoef"'), read_panoptic
     ),
     "vggt": RigFormat("VGGT's .npz", _file(".npz"), read_vggt, sized=True),
     "opencv": RigFormat(

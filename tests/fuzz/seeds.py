@@ -243,6 +243,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "qualisys/Calib.qca.txt": _tool("qualisys"),
     "metashape/cameras.xml": _tool("metashape"),
     "realitycapture/cam00.xmp": _tool("realitycapture"),
+    "panoptic/calibration_a.json": _tool("panoptic"),
     "vggt/predictions.npz": _tool("vggt"),
     **{f"a.{end}": lambda root, end=end: read_image(root / f"a.{end}")
        for end in ("png", "jpg", "tif", "exr")},

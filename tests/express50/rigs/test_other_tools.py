@@ -221,7 +221,22 @@ def write_facescape(folder):
     return folder / "params.json", {str(n): p for n, p in enumerate(pixels)}
 
 
+def write_panoptic(folder):
+    """Write cameras in centimetres, as calibration_<sequence>.json."""
+    rows = [
+        {"name": f"00_{n:02d}", "type": "hd", "resolution": SIZE, "panel": 0, "node": n}
+        | {"K": listed(K), "distCoef": DIST, "R": listed(pose[:3, :3])}
+        | {"t": listed(100 * pose[:3, 3:])}
+        for n, pose in enumerate(RIG.values())
+    ]
+    path = folder / "calibration_a.json"
+    path.write_text(json.dumps({"calibDataSource": "a", "cameras": rows}))
+    pixels = [opencv_pixels(pose) + 0.5 for pose in RIG.values()]
+    return path, {f"hd_00_{n:02d}": p for n, p in enumerate(pixels)}
+
+
 WRITERS = {
+    "panoptic": ("panoptic", write_panoptic),
     "idr": ("idr", write_idr),
     "facescape": ("facescape", write_facescape),
     "caliscope": ("toml", write_caliscope),
@@ -289,6 +304,9 @@ def test_a_metashape_chunk_without_a_world_is_its_own(tmp_path):
             "camera 0 has an array: got nothing|shape",
         ),
         ("facescape", '"1_distortion"', '"1_d"', "camera 1 has an array: got nothing"),
+        ("panoptic", '"t"', '"T"', "camera hd_00_00 has an array: got nothing"),
+        ("panoptic", '"distCoef": [', '"distCoef": [1, ', r"got shape \(6,\), expected \(5,\)"),
+        ("panoptic", '"cameras"', '"kameras"', "cameras"),
         ("realitycapture", "brown3t2", "division", "cam00.xmp: lens division"),
         ("realitycapture", 'Skew="0"', 'Skew="0.1"', "no skew"),
         ("realitycapture", "Position>", "Position>1 ", "cam00.xmp has xcr:Position"),
