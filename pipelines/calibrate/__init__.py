@@ -37,7 +37,7 @@ def run(dataset: Dataset, item: str, config: CalibrateConfig, out: Path) -> Resu
 
 STAGE = Stage(
     name="calibrate",
-    version=16,
+    version=17,
     config=CalibrateConfig,
     presets=PRESETS,
     items=Dataset.subjects,  # a rig may be bumped between two: each has its own cameras

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
 from express50.errors import CalibrationError
-from express50.geometry.cameras import MODELS, Camera, pinhole, project
+from express50.geometry.cameras import MODELS, Camera, pinhole, project, triangulate
 from express50.geometry.transforms import matrix_to_axis_angle
 from pipelines.calibrate.adjuster import (
     AdjustedRig,
@@ -68,6 +69,7 @@ class CameraMove:
     shift_px: float
     turn_deg: float
     move_mm: float
+    odd_face: bool  # its face is so far off that it may be another person's
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,10 @@ def check_footage(
             f"{len(cameras)} cameras; three or more are needed to say which one has moved"
         )
     now = {name: reduced_camera(camera) for name, camera in cameras.items()}
-    now, exchanged, size = _judge_faces(now, seen)
+    odd = {frame: _odd_faces(now, points) for frame, points in seen.items()}
+    now, exchanged, size = _judge_faces(
+        now, {frame: points.without(odd[frame]) for frame, points in seen.items()}
+    )
     moved: list[str] = []
     for band, least_shift in MOVE_BANDS:
         tracks = join_tracks(now, seen, band, verified=False)
@@ -112,6 +117,7 @@ def check_footage(
         name: CameraMove(
             _picture_shift(cameras[name], corrected[name], fit, tracks),
             *_turn_and_move(cameras[name], corrected[name]),
+            any(name in names for names in odd.values()),
         )
         for name in moved
     }
@@ -130,6 +136,28 @@ def check_footage(
         size=size,
         cameras=corrected,
     )
+
+
+def _odd_faces(cameras: Mapping[str, Camera], seen: FrameSetPoints) -> set[str]:
+    """Name the cameras whose face is not where at least three cameras, and most, see one.
+
+    It is another person's, or the camera has moved far.
+    """
+    views = [(cameras[name], pixels.mean(0)) for name, pixels, _ in seen.landmarks]
+    if len(views) < 4:
+        return set()
+    middles = np.stack([middle for _, middle in views])
+    places = np.concatenate([
+        triangulate([views[a][0], views[b][0]], middles[[a, b], None])
+        for a, b in combinations(range(len(views)), 2)
+    ])  # fmt: skip
+    off = np.stack([np.linalg.norm(project(c, places)[0] - middle, axis=1) for c, middle in views])
+    reach = [MOVE_BANDS[0][0] * np.hypot(camera.width, camera.height) for camera, _ in views]
+    near = off < np.array(reach)[:, None]  # a NaN is not
+    kept = near[:, near.sum(0).argmax()]
+    if kept.sum() <= max(2, len(views) / 2):
+        return set()
+    return {name for (name, _, _), keep in zip(seen.landmarks, kept, strict=True) if not keep}
 
 
 def _judge_faces(

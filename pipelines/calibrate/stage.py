@@ -110,9 +110,10 @@ def _write(rig: CalibratedRig, check: FootageCheck | None, out: Path) -> Result:
             "unjudged": [name for name in names if name not in gains],
         }
     moved = {
-        name: f"seems to have moved since it was calibrated: its picture is off by"
-        f" {move.shift_px:.1f} px (turned {move.turn_deg:.2f} degrees, moved"
-        f" {move.move_mm:.1f} mm); calibrate the rig again, or leave the camera out"
+        name: "seems to have moved since it was calibrated"
+        + (", unless the face in its picture is another person's" if move.odd_face else "")
+        + f": its picture is off by {move.shift_px:.1f} px (turned {move.turn_deg:.2f} degrees,"
+        f" moved {move.move_mm:.1f} mm); calibrate the rig again, or leave the camera out"
         for name, move in (check.moved.items() if check else ())
     }
     moved |= check.mirrored if check else {}

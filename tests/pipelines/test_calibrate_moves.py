@@ -334,6 +334,20 @@ def test_faces_find_nothing_odd_about_a_true_rig(faces):
     assert verdict.exchanged == () and verdict.size == "" and verdict.moved == {}
 
 
+@pytest.mark.parametrize(("count", "features", "at"), [(6, 0, (590, 180)), (4, 60, (40, 180))])
+def test_a_face_of_another_person_says_nothing_about_the_other_cameras(count, features, at):
+    """The outermost camera sees somebody in front of the wall more clearly than the subject."""
+    rig = face_cameras(count)
+    odd = {}
+    for frame, points in see(rig, features=features, landmark_px=0.2).items():
+        *views, (last, pixels, sigma) = points.landmarks
+        views.append((last, 0.6 * (pixels - pixels.mean(0)) + at, sigma))
+        odd[frame] = replace(points, landmarks=views)
+    verdict = check_footage(rig, odd)
+    assert verdict.exchanged == () and verdict.size == ""
+    assert all(name == last and move.odd_face for name, move in verdict.moved.items())
+
+
 @pytest.mark.parametrize(
     "pairs",
     [(("cam01", "cam04"),), (("cam02", "cam03"),), (("cam00", "cam02"), ("cam03", "cam05"))],
