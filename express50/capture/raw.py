@@ -258,6 +258,9 @@ def _read_camera(folder: Path) -> RawCamera:
         return RawCamera(id=folder.name, kind="video", path=found[0])
     if not frames.is_dir():
         other = f"; rename {videos[0].name} to video{videos[0].suffix}" if videos else ""
+        held = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+        if held and not videos:
+            other = f" (or another of {' '.join(VIDEO_SUFFIXES)}); got {few(held)}"
         raise CaptureError(
             f"{folder}: holds no footage, expected video.mp4 or frames/000000.png{other}"
         )
@@ -368,13 +371,14 @@ def read_cues(path: Path) -> tuple[Cue, ...]:
     check_links(path)
     if not path.is_file():
         return ()
-    text = read_text(path, CaptureError, TOML_LIMIT)
-    reader = csv.DictReader(text.splitlines(), skipinitialspace=True)
+    lines = read_text(path, CaptureError, TOML_LIMIT).splitlines() or [""]
+    # Excel separates by semicolons in countries where a comma separates decimals.
+    reader = csv.DictReader(lines, skipinitialspace=True, delimiter=";" if ";" in lines[0] else ",")
     try:
         missing = [name for name in CUE_COLUMNS if name not in (reader.fieldnames or ())]
         if missing:
             raise CaptureError(
-                f"{path}: no column {', '.join(missing)}; got {reader.fieldnames}, expected "
+                f"{path}: no column {', '.join(missing)}; got {lines[0]!r:.100}, expected "
                 f"{','.join(CUE_COLUMNS)} in the first line"
             )
         cues = [_read_cue(path, reader.line_num, row) for row in reader]

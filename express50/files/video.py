@@ -210,17 +210,21 @@ def video_fps(path: Path) -> float:
 
 
 def common_fps(table: Path, videos: Iterable[Path]) -> float:
-    """Return the frame rate that videos state; a video that cannot be opened says nothing.
+    """Return the frame rate that videos state, except those that cannot be opened.
 
     Raises:
         CaptureError: they differ or state none; it asks for a rate in the `table`.
     """
-    stated = []
+    stated, unread = [], ""
     for path in videos:
-        with suppress(CaptureError):
+        try:
             stated.append((video_fps(path), path))
+        except CaptureError as error:
+            unread = unread or f" ({error})"
     if not stated:
-        raise CaptureError(f"{table}: no fps, and no video states it; add it, such as 'fps = 24'")
+        raise CaptureError(
+            f"{table}: no fps, and no video states it{unread}; add it, such as 'fps = 24'"
+        )
     (slow, slowest), (fast, fastest) = min(stated), max(stated)
     if fast > (1 + FPS_SLACK) * slow:
         raise CaptureError(

@@ -61,6 +61,11 @@ def test_images_without_a_frame_rate_are_refused(raw):
     (raw / "capture.toml").write_text('subject = "S001"\n')
     with pytest.raises(CaptureError, match="no fps, and no video states it; add it"):
         read_capture(raw)
+    for name in ("cam00", "cam01"):
+        (raw / "cameras" / name / "frames").rename(raw / "cameras" / name / "photos")
+        (raw / "cameras" / name / "video.mp4").write_bytes(b"no video")
+    with pytest.raises(CaptureError, match=r"states it \(.*cam00/video.mp4: cannot be opened"):
+        read_capture(raw)
 
 
 def test_missing_parts_are_named(tmp_path, raw):
@@ -101,9 +106,11 @@ def test_frame_numbers_need_no_leading_zeros(raw):
 def test_camera_without_or_with_two_kinds_of_footage_is_dropped(raw):
     (raw / "cameras/cam00/video.mp4").touch()
     (raw / "cameras/cam01/frames").rename(raw / "cameras/cam01/photos")
+    (raw / "cameras/cam01/video.ogv").touch()
     dropped = read_capture(raw).dropped
     assert "holds video.mp4, frames/, expected only one" in dropped["cam00"]
-    assert "holds no footage" in dropped["cam01"]
+    assert "holds no footage, expected video.mp4 or frames/000000.png" in dropped["cam01"]
+    assert "got photos, video.ogv" in dropped["cam01"]
 
 
 @pytest.mark.parametrize("name", ["cam.00", "cam+00", "cam 00", "\u043a\u0430\u043c00"])
@@ -179,7 +186,7 @@ def test_board_is_listed_by_camera(raw):
     ("text", "message"),
     [
         ("expression,start_frame,end_frame\n", "no column expression_id"),
-        ("", "no column expression_id, start_frame, end_frame"),
+        ("", "no column expression_id, start_frame, end_frame; got '', expected"),
         ("expression_id,start_frame,end_frame\nsmile,0,x\n", ":2: frames are '0' and 'x'"),
         ("expression_id,start_frame,end_frame\nsmile,0\n", ":2: frames are '0' and None"),
         ("expression_id,start_frame,end_frame\nsmile,5,4\n", ":2: smile runs from 5 to 4"),
@@ -201,6 +208,8 @@ def test_cues_may_come_from_a_spreadsheet(tmp_path):
     path.write_bytes(
         b"\xef\xbb\xbfexpression_id, start_frame, end_frame, note\r\nsmile, 0, 4, ok\r\n"
     )
+    assert read_cues(path) == (Cue("smile", 0, 4),)
+    path.write_text("expression_id;start_frame;end_frame\nsmile;0;4\n")
     assert read_cues(path) == (Cue("smile", 0, 4),)
     assert read_cues(tmp_path / "absent.csv") == ()
 
