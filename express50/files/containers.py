@@ -178,6 +178,8 @@ _open_zip = cached_by_file(OPEN_FILES)(zipfile.ZipFile)
 
 def open_hdf5(path: Path) -> h5py.File:
     """Open an HDF5 file, the last few stay open; CaptureError if it is missing or damaged."""
+    if path.is_dir():
+        raise CaptureError(f"{path}: is a folder, expected an HDF5 file such as .smc")
     with _damage_is_one_error(DAMAGE, f"{path}: cannot be opened as HDF5"):
         return _hdf5_of(path, "r")
 

@@ -122,6 +122,8 @@ def guess_format(path: Path) -> str:
     if found is None:
         if path.suffix == ".json":
             read_json(path, CalibrationError)  # reports what is wrong if it is not JSON
+        if (path / "calibration.json").is_file():
+            raise CalibrationError(f"{path}: a capture; give its calibration.json")
         titles = [known.title for known in FORMATS.values()]
         raise CalibrationError(
             f"{path}: is not a known calibration; expected {', '.join(titles[:-1])} or"
@@ -205,6 +207,8 @@ def _opencv_cameras(path: Path) -> list[tuple[str, Path | str, dict]]:
     if found:
         return found
     files = sorted(p for p in path.iterdir() if p.suffix in YAML) if path.is_dir() else [path]
+    if not files:
+        raise CalibrationError(f"{path}: holds no {' or '.join(YAML)} file; name OpenCV's folder")
     return [(identifier(file.stem), file, _named_values(file)) for file in files]
 
 

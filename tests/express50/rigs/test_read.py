@@ -298,6 +298,16 @@ def test_rubbish_is_one_clear_error(tmp_path, content):
             read_rig(path, kind)
 
 
+def test_folders_are_answered_with_what_to_give(tmp_path):
+    (tmp_path / "calibration.json").touch()
+    with pytest.raises(CalibrationError, match="a capture; give its calibration.json"):
+        read_rig(tmp_path)
+    with pytest.raises(CalibrationError, match=r"holds no \.yml or \.yaml file"):
+        read_rig(tmp_path, "opencv")
+    with pytest.raises(CalibrationError, match="is a folder, expected an HDF5 file such as .smc$"):
+        read_rig(tmp_path, "renderme360")
+
+
 def test_thin_prism_distortion_is_refused(tmp_path):
     write_yaml(tmp_path / "yaml", make_rig(count=1))
     file = tmp_path / "yaml" / "cam00.yml"
