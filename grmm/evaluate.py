@@ -227,10 +227,11 @@ def score(
         else:
             missing.append(sample_key(**vars(views.keys[index])))
     if missing and not (partial and paths):
+        part = "score part of them with --partial or choose samples with --subjects, --expressions,"
         raise FormatError(
             f"{folder}: {len(missing)} of {len(indices)} pictures are missing:"
-            f" {few(missing, NAMED)}; expected SUBJECT_EXPRESSION_CAMERA.png. Score part of them"
-            " with --partial or choose samples with --subjects, --expressions, --cameras"
+            f" {few(missing, NAMED)}; expected SUBJECT_EXPRESSION_CAMERA.png"
+            + ("" if partial else f"; {part} --cameras")
         )
     rows, wrong = [], []
     for index, path in paths.items():

@@ -155,9 +155,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--yaw": value("DEG", "move the camera around the head, degrees", type=ANGLE, default=0.0),
     "--pitch": value("DEG", "move the camera up, degrees", type=ANGLE, default=0.0),
     "--turntable": flag("write turntable.mp4"),
-    "--degrees": value(
-        "DEG", "angle that the turntable covers (default: 360)", type=ANGLE, default=360.0
-    ),
+    "--degrees": value("DEG", "angle that the turntable covers (default: 360)", type=ANGLE),
     "--frames": value(
         "N", "number of frames of a video (default: %(default)s)", type=number(1), default=72
     ),
@@ -175,7 +173,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "FACTOR",
         "spread of the samples (default: 1, as in training)",
         type=number(0, 100, float),
-        default=1.0,
     ),
     "--seed": value("N", "random seed (default: 0)", type=number(0), default=0),
     "--columns": value(

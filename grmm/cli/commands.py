@@ -174,6 +174,10 @@ def render(args: argparse.Namespace) -> int:
 
     check_results_folder(args.out)
     _require(args, "drive", "drive_cue")
+    _require(args, "turntable", "degrees")
+    _require(args, "samples", "spread")
+    degrees = 360.0 if args.degrees is None else args.degrees
+    spread = 1.0 if args.spread is None else args.spread
     loaded = _load(args.checkpoint)
     model, head = loaded.model, _edited_head(loaded, args)
     clips = render.read_clips(args.drive, args.drive_cue) if args.drive else None
@@ -191,7 +195,7 @@ def render(args: argparse.Namespace) -> int:
     videos: dict[str, Any] = {}
     rates: dict[str, float] = {}
     if args.turntable:
-        videos["turntable"] = render.turntable(loaded, head, view, args.frames, args.degrees)
+        videos["turntable"] = render.turntable(loaded, head, view, args.frames, degrees)
     if args.to:
         end = _frame_head(loaded, args.to, args.expression)
         videos["interpolation"] = render.interpolation(loaded, head, end, view, args.frames)
@@ -204,7 +208,7 @@ def render(args: argparse.Namespace) -> int:
         sheets[name] = function(loaded, *values)
 
     if args.samples:  # first, because it needs several people
-        draw("samples", render.sample_sheet, head, view, args.samples, args.seed, args.spread)
+        draw("samples", render.sample_sheet, head, view, args.samples, args.seed, spread)
     if args.views:
         draw("views", render.novel_views, head, view)
     if args.controls:

@@ -262,6 +262,9 @@ def test_missing_and_mis_sized_pictures_are_named(evaluated, roots, tmp_path, ca
         write_image(path, whole[:20])
         assert main([*score, "--partial"]) == 1
         assert "S000_e0_cam01.png is 32 x 20, expected 32 x 32" in capsys.readouterr().err
+        assert main(["score", str(roots[0]), *score[2:], "--partial"]) == 1
+        assert "18 of 18 pictures are missing" in (said := capsys.readouterr().err)
+        assert "--partial" not in said
         path.write_bytes(b"noise")
         assert main([*score, "--partial"]) == 1
         assert "cannot be read" in capsys.readouterr().err

@@ -619,6 +619,8 @@ def test_only_the_first_process_reports(shards, tmp_path, monkeypatch, capsys):
         ["export", "{0}", "head.glb", "--shards=somewhere"],
         ["export", "{0}", "head.html", "--drive-cue=smile"],
         ["render", "{0}", "pictures", "--drive-cue=smile"],
+        ["render", "{0}", "pictures", "--degrees=90"],
+        ["render", "{0}", "pictures", "--spread=2"],
         ["evaluate", "{0}", "{1}", "out", "--fit-budget=5s"],
     ],
 )
