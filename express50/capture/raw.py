@@ -36,9 +36,10 @@ VIDEO_SUFFIXES = (
     ".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mxf", ".mts", ".m2ts", ".ts", ".mpg",
     ".mpeg", ".wmv", ".flv",
 )  # fmt: skip
-# Photographs of phones and of cameras that nothing here decodes.
+# Pictures and videos of phones, cameras and the web that are not read.
 UNDEVELOPED = (
     ".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef",
+    ".webp", ".avif", ".gif", ".bmp", ".jp2", ".ogv", ".3gp", ".vob", ".braw", ".r3d", ".crm",
 )  # fmt: skip
 # Windows reserves these names for devices, in any letter case.
 RESERVED = {"CON", "PRN", "AUX", "NUL"}
@@ -235,7 +236,7 @@ def hint_at_undeveloped(files: Iterable[Path]) -> str:
     suffixes = sorted({file.suffix.lower() for file in files} & set(UNDEVELOPED))
     if not suffixes:
         return ""
-    return f". Photographs such as *{suffixes[0]} are not read: export them as JPEG, PNG or TIFF"
+    return f". Files such as *{suffixes[0]} are not read: export them as JPEG, PNG, TIFF or .mp4"
 
 
 def is_data_folder(path: Path) -> bool:
