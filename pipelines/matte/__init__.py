@@ -92,7 +92,7 @@ def needs_gpu(config: MatteConfig) -> bool:
 
 STAGE = Stage(
     name="matte",
-    version=30,
+    version=31,
     config=MatteConfig,
     items=peak_items,
     inputs=inputs,

@@ -51,6 +51,7 @@ MANY = 7  # the hull of fewer cameras is so much larger than the person that it 
 SLACK_PX = (3.0, 1.5)  # of `_corrected_labels`, per round
 COLOURS, RARE = 32, 1e-5  # colour cells along each axis of Lab; share of a cell that is never seen
 UNSEEN = 2 / COLOURS**3  # the person does not have colours of a smaller share
+CLEARLY = 4.0  # ratio of shares from which a colour is the person's, not the wall's
 CELLS = 96  # cells along each side of the cube in which cameras are compared
 
 # Lengths on the head, metres.
@@ -149,7 +150,7 @@ def cut_out(
             for view, own, guess, scale in zip(small, labels, guesses, density, strict=True)
         ]
 
-    masks = cut(guesses)
+    masks = cut([_with_own_colours(*pair) for pair in zip(small, guesses, strict=True)])
     if ball is not None and len(views) >= FEWEST:
         for slack in SLACK_PX:
             masks = cut(_corrected_labels(small, guesses, masks, ball, slack))
@@ -315,6 +316,17 @@ def _cut(view: CutView, labels: np.ndarray, guess: np.ndarray, density: float) -
     return person | (holes & (stats[:, cv2.CC_STAT_AREA] < HOLE_M2 * density**2)[parts])
 
 
+def _with_own_colours(view: CutView, guess: np.ndarray) -> np.ndarray:
+    """Take what has the head's colours, not the wall's, for the person in a guess (h, w).
+
+    GrabCut would learn a ponytail as one more colour of a plain wall.
+    """
+    cells = _cells_of(cv2.GaussianBlur(view.rgb, (0, 0), 1))
+    own, wall = (_shares(cells[(guess == v) & view.valid]) for v in (cv2.GC_FGD, cv2.GC_BGD))
+    like = (own > CLEARLY * np.maximum(wall, UNSEEN))[cells]
+    return np.where(like & (guess == cv2.GC_PR_BGD), np.uint8(cv2.GC_PR_FGD), guess)
+
+
 def _corrected_labels(
     views: Sequence[CutView],
     guesses: Sequence[np.ndarray],
@@ -371,10 +383,7 @@ def _foreign(views: Sequence[MatteView], sure: Sequence[np.ndarray]) -> list[np.
     most of it is left out, because its cut may include some wall. As cameras differ, colours of
     the view's own `sure` pixels (h, w) count too.
     """
-    cells = []  # of Lab colour
-    for view in views:
-        lab = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2LAB).astype(np.int64) // (256 // COLOURS)
-        cells.append((lab[..., 0] * COLOURS + lab[..., 1]) * COLOURS + lab[..., 2])
+    cells = [_cells_of(view.rgb) for view in views]
     person = np.array(
         [_shares(cell[view.alpha > 0]) for cell, view in zip(cells, views, strict=True)]
     )
@@ -385,6 +394,13 @@ def _foreign(views: Sequence[MatteView], sure: Sequence[np.ndarray]) -> list[np.
         known = np.maximum(known, _shares(cells[k][one]))
         found.append((known < UNSEEN)[cells[k]])
     return found
+
+
+def _cells_of(rgb: np.ndarray) -> np.ndarray:
+    """Return the number (h, w) of each pixel's cell of Lab colour."""
+    lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB).astype(np.int64) // (256 // COLOURS)
+    cells: np.ndarray = (lab[..., 0] * COLOURS + lab[..., 1]) * COLOURS + lab[..., 2]
+    return cells
 
 
 def _shares(cells: np.ndarray) -> np.ndarray:

@@ -27,6 +27,7 @@ from pipelines.matte import STAGE as MATTE
 from pipelines.matte import MatteConfig, stage
 from pipelines.matte.cutout import (
     CutView,
+    HeadPlace,
     cut_out,
     find_head,
     find_neighbours,
@@ -107,6 +108,38 @@ def test_small_and_large_pictures_are_cut_alike(alpha: np.ndarray, scale: float)
     )
     found = cv2.resize(alpha_of(image), (512, 256), interpolation=cv2.INTER_AREA)
     assert np.abs(found - alpha[:256])[ABOVE_THE_SUIT].mean() < 0.02
+
+
+def test_a_ponytail_belongs_to_the_person() -> None:
+    """Seen from the side, it hangs where the head's shape makes wall more likely."""
+    camera = single_camera("photo", 360, 360, 500.0)
+    turn = np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]])  # the face looks to the right
+    world = np.linalg.inv(camera.cam_from_world)
+    place = HeadPlace(1.0, world[:3, :3] @ turn, world[:3] @ [0, 0, 0.8, 1])
+    image = np.full((360, 360, 3), 150.0)
+    shapes = {  # heights and depths on the head, metres
+        (160, 160, 160): [(-0.08, -0.06), (-0.3, -0.12), (-0.5, -0.12), (-0.5, 0.1), (-0.3, 0.1)],
+        (200, 150, 120): [(0.05, 0.1), (-0.08, 0.09), (-0.15, 0.0), (-0.15, -0.06), (0.05, 0.0)],
+        (90, 50, 25): [(0.13, 0.03), (0.08, 0.09), (-0.04, 0.0), (-0.04, -0.1), (0.1, -0.1)],
+        (150, 85, 40): [(0.11, 0.03), (0.08, 0.04), (-0.03, 0.0), (-0.03, -0.03), (0.1, -0.05)],
+        (25, 20, 20): [(0.06, -0.09), (0.05, -0.09), (0.02, -0.13), (0.03, -0.13)],
+        (110, 60, 30): [
+            (0.04, -0.115),
+            (0.04, -0.14),
+            (-0.08, -0.2),
+            (-0.22, -0.19),
+            (-0.22, -0.15),
+            (-0.08, -0.12),
+        ],
+    }
+    for colour, places in shapes.items():
+        pixels = place.pixels(np.array([(0, *p) for p in places]), camera)
+        cv2.fillPoly(image, [pixels.round().astype(np.int32)], colour)
+    image += np.random.default_rng(0).normal(0, 4, image.shape)
+    view = make_cut_view(camera, image.clip(0, 255).astype(np.uint8), np.ones((360, 360), bool))
+    mask = cut_out([view], None, place)["photo"].mask
+    ((x, y),) = place.pixels(np.array([[0, -0.12, -0.17]]), camera) * mask.shape[0] / 360
+    assert mask[int(y), int(x)] and mask.mean() < 0.4
 
 
 def test_a_neighbour_is_wall() -> None:
