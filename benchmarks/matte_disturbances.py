@@ -86,13 +86,14 @@ DISTURBANCES: dict[str, Callable[[list[Shot]], list[Shot]]] = {
 }
 
 
-def walls(shots: list[Shot]) -> dict[str, list[Shot]]:
-    """Return the shots before other walls, with plates of them.
+def walls(shots: list[Shot], first: list[Shot]) -> dict[str, list[Shot]]:
+    """Return the shots before other walls, with plates of them; `first` are those of one moment.
 
-    `bland` is a grey wall with light falling off, `skin` and `shirt` have the subject's colours,
-    `cluttered` is as in ``benchmarks.matte_scenes``; every camera sees another part of the room.
+    `bland` is a grey wall with light falling off, `skin` and `shirt` have the colours of the person
+    at that moment, `cluttered` is as in ``benchmarks.matte_scenes``; every camera sees another part
+    of the room.
     """
-    front = shots[len(shots) // 2]
+    front = first[len(first) // 2]
     height, width = front.true.shape
     skin, shirt = (
         np.median(

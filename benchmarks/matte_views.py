@@ -10,11 +10,12 @@ the cameras have agreed, with all cameras and with every third:
 - ``patch``: a patch of the skin has one colour in all views, and two have the same behind it;
 - ``bumped``: one camera was turned after calibration, its matte is right where it now looks.
 
-``no_plate`` withholds the plates: mattes of all cameras together (`cut_out`), before the set as
-recorded, bland and cluttered walls, and walls of the skin's and the shirt's colour. Beside its
-``sad`` are that of the key, which has the plates (``sad_plate``), and that of each camera cut alone
-(``sad_alone``). ``sad_ratio_to_plate`` and ``worst_ratio``, that of the worst camera, are printed
-per scene and of all scenes together.
+``no_plate`` withholds the plates: mattes of all cameras together (`cut_out`), with the walls that
+all moments show (`learn_walls`), before the set as recorded, bland and cluttered walls, and walls
+of the skin's and the shirt's colour. Beside its ``sad`` are that of the key, which has the plates
+(``sad_plate``), that of one moment without the others (``sad_moment``), and that of each camera cut
+alone (``sad_alone``). ``sad_ratio_to_plate`` and ``worst_ratio``, that of the worst camera, are
+printed per scene and of all scenes together.
 
 ``plates`` has the same figures for plates that were shifted, or taken in other light or elsewhere,
 in front of the recorded and the cluttered set: ``sad`` as `match_plate` brings them to the frame
@@ -60,16 +61,19 @@ from express50.geometry.sampling import evenly
 from express50.twin import TwinConfig
 from express50.twin.truth import Truth
 from pipelines.matte import MatteConfig
-from pipelines.matte.cutout import CutView, cut_out, find_head, make_cut_view, region_of, soft_alpha
+from pipelines.matte.cutout import CutView, cut_out, find_head, make_cut_view, region_of
 from pipelines.matte.key import key_alpha
 from pipelines.matte.plates import LEAST_SHARE, match_plate
 from pipelines.matte.stage import corrected, make_view
 from pipelines.matte.visual_hull import ball_of, compare_mattes
+from pipelines.matte.wall import MOMENTS, Wall, learn_walls, soft_alpha
 
 RIG = TwinConfig(
     subjects=1, first_subject=61, cameras=24, width=384, height=384, footage="jpg",
-    expressions=("neutral", "jaw_open"), frames_per_expression=4, board_frames=0,
-    give_calibration=True,
+    expressions=(
+        "neutral", "smile", "brow_raise", "cheeks_puff", "nose_wrinkle", "pucker", "wink_left",
+        "jaw_open",
+    ), frames_per_expression=4, board_frames=0, give_calibration=True,
 )  # fmt: skip
 Figures = dict[str, float]
 
@@ -97,7 +101,6 @@ def main() -> int:
     twin = replace(RIG, first_subject=args.subject)
     dataset, truth = named_or_recorded(args, twin, args.recording)
     rows: dict[tuple[int, str], list[Figures]] = {}
-    bare: dict[tuple[int, str], list[Figures]] = {}
     plates: dict[str, list[Figures]] = {}
     for subject, frame in moments(dataset, truth, args.peaks):
         clean = shots_of(dataset, truth, subject, frame)
@@ -110,17 +113,11 @@ def main() -> int:
                 rows.setdefault((len(keyed[::step]), scene), []).append(row)
                 words = subject, frame, scene, len(keyed[::step]), rounded(row)
                 print(*words, file=sys.stderr)
-        if not args.plates_only:
-            for scene, shots in {"recorded": clean, **walls(clean)}.items():
-                for step in (1, 3):
-                    sheet = sheet_of(args, f"no-plate-{scene}", step, frame)
-                    bare.setdefault((len(shots[::step]), scene), []).append(
-                        without_plates(shots[::step], sheet)
-                    )
-        for scene, shots in {"recorded": clean, "cluttered": walls(clean)["cluttered"]}.items():
+        for scene in ("recorded", "cluttered"):
+            shots = scenes(clean, clean)[scene]
             for wrong, plated in other_plates(shots[::4]).items():
                 plates.setdefault(f"{scene}_{wrong}", []).append(with_plates(plated, shots[::4]))
-    unplated = by_scene(bare, "plate")
+    unplated = {} if args.plates_only else by_scene(bare_rows(args, dataset, truth), "plate")
     result = {
         "benchmark": "matte_views",
         **by_scene(rows, "key"),
@@ -186,26 +183,65 @@ def write_sheet(path: Path, pictures: list[list[np.ndarray]], shots: list[Shot])
     write_image(path, contact_sheet(pictures[:8], [shot.camera.id for shot in shots[:8]]))
 
 
-def without_plates(shots: list[Shot], sheet: Path | None) -> Figures:
+def scenes(shots: list[Shot], first: list[Shot]) -> dict[str, list[Shot]]:
+    """Return the shots as recorded and before other walls."""
+    return {"recorded": shots, **walls(shots, first)}
+
+
+def bare_rows(
+    args: argparse.Namespace, dataset: Dataset, truth: Truth
+) -> dict[tuple[int, str], list[Figures]]:
+    """Return the errors without plates, by number of cameras and scene."""
+    rows: dict[tuple[int, str], list[Figures]] = {}
+    for subject in dataset.subjects():
+        frames = evenly(list(truth.peaks(subject).values()), MOMENTS)
+        taken = [shots_of(dataset, truth, subject, frame) for frame in frames]
+        everywhere = [scenes(shots, taken[0]) for shots in taken]
+        for scene in everywhere[0]:
+            for step in (1, 3):
+                shots = [moment[scene][::step] for moment in everywhere]
+                learned = learned_walls(shots)
+                for k in evenly(range(len(frames)), args.peaks):
+                    sheet = sheet_of(args, f"no-plate-{scene}", step, frames[k])
+                    row = without_plates(shots[k], learned, sheet)
+                    rows.setdefault((len(shots[k]), scene), []).append(row)
+                    print(scene, len(shots[k]), rounded(row), file=sys.stderr, flush=True)
+    return rows
+
+
+def learned_walls(moments: list[list[Shot]]) -> dict[str, Wall]:
+    """Return the walls that the cameras show at several moments."""
+    shots = [{shot.camera.id: shot for shot in moment} for moment in moments]
+    cameras = {name: shot.camera for name, shot in shots[0].items()}
+    read = lambda name, k: shots[k][name].frame  # noqa: E731
+    return dict(learn_walls(cameras, read, range(len(shots)), cameras))
+
+
+def without_plates(shots: list[Shot], learned: dict[str, Wall], sheet: Path | None) -> Figures:
     """Return the errors of a moment whose plates are withheld, beside those with plates."""
-    started = time.process_time()
     ball = ball_of({shot.camera.id: shot.camera for shot in shots})
     views = [make_cut_view(pinhole(shot.camera), shot.frame, shot.valid) for shot in shots]
+    started = time.process_time()
     cuts = cut_out(views, ball)
-    alphas = [soft_alpha(shot.frame, shot.valid, cuts[shot.camera.id]) for shot in shots]
+    alphas = [
+        soft_alpha(shot.frame, shot.valid, cuts[shot.camera.id], learned.get(shot.camera.id))
+        for shot in shots
+    ]
     seconds = time.process_time() - started
+    moment = [soft_alpha(shot.frame, shot.valid, cuts[shot.camera.id]) for shot in shots]
     alone = [_alone(shot, view) for shot, view in zip(shots, views, strict=True)]
     keyed = [key(shot).alpha / 255 for shot in shots]
     if sheet is not None:
         steps = [(255 * alpha).astype(np.uint8) for alpha in alphas]
         write_sheet(sheet, [[s.frame, a] for s, a in zip(shots, steps, strict=True)], shots)
-    sad, sad_plate, sad_alone = (
+    sad, sad_plate, sad_moment, sad_alone = (
         np.array([errors(a, shot.true)["sad"] for a, shot in zip(found, shots, strict=True)])
-        for found in (alphas, keyed, alone)
+        for found in (alphas, keyed, moment, alone)
     )
     return {
         "sad": float(sad.mean()),
         "sad_plate": float(sad_plate.mean()),
+        "sad_moment": float(sad_moment.mean()),
         "sad_alone": float(sad_alone.mean()),
         "worst_ratio": float((sad / sad_plate).max()),
         "seconds_per_view": seconds / len(shots),

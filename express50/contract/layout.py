@@ -141,6 +141,10 @@ class Dataset:
         """Return the path of a camera's undistorted, colour-corrected clean plate."""
         return self.frame_file(subject, PLATES, camera)
 
+    def wall_file(self, subject: str, camera: str) -> Path:
+        """Return the path of the wall that a camera without a plate saw at several moments."""
+        return self.item_dir("frames", f"{subject}/{PLATES}") / f"{camera}.wall.png"
+
     def picture_sizes_file(self, subject: str) -> Path:
         """Return the path of the sizes of a subject's peak frames and plates, by camera."""
         return self.item_dir("frames", f"{subject}/{PLATES}") / "pictures.json"

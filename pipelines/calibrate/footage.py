@@ -64,22 +64,27 @@ def _reduced(camera: Camera, image: np.ndarray, frame: int) -> np.ndarray:
     return cv2.resize(image, (small.width, small.height), interpolation=cv2.INTER_AREA)
 
 
-def read_footage(index: Index, cameras: Mapping[str, Camera], count: int) -> Images:
-    """Yield reduced images of ingested footage at up to `count` instants.
+def instants(index: Index, camera: str, count: int) -> list[int]:
+    """Choose up to `count` frames of ingested footage.
 
-    The instants are the middles of cues, or spread over all frames where there are no cues. If the
-    first camera has a key frame earlier in the cue, that is taken instead. In 4K footage with one
-    key frame per second, it is read in a tenth of the time.
+    They are the middles of cues, or spread over all frames where there are no cues. If a camera has
+    a key frame earlier in the cue, that is taken instead. In 4K footage with one key frame per
+    second, it is read in a tenth of the time.
     """
     cues = [cue for cue in index.cues if cue.end_frame < index.frames]
     spread = evenly(range(index.frames), count)
     starts = _middles(cues, count) or dict(zip(spread, [0, *(f + 1 for f in spread)], strict=False))
+    with closing(FrameReader(index, camera)) as reader:
+        keys = {frame: reader.key_frame(frame) for frame in starts}
+    return sorted({key if key >= starts[frame] else frame for frame, key in keys.items()})
+
+
+def read_footage(index: Index, cameras: Mapping[str, Camera], count: int) -> Images:
+    """Yield reduced images of ingested footage at up to `count` instants, see `instants`."""
     wanted: list[int] = []
     for name in sorted(cameras):
+        wanted = wanted or instants(index, name, count)
         with closing(FrameReader(index, name)) as reader:
-            if not wanted:
-                keys = {frame: reader.key_frame(frame) for frame in starts}
-                wanted = sorted({key if key >= starts[f] else f for f, key in keys.items()})
             for frame in wanted:
                 yield frame, name, _reduced(cameras[name], reader.read(frame), frame)
 

@@ -22,6 +22,7 @@ from express50.contract.stage import Note, Result
 from express50.errors import CaptureError, StageError
 from express50.files.atomic import write_json
 from express50.files.images import shrink, shrunk_size, tile_sheet, write_image
+from express50.geometry.cameras import resized
 from express50.geometry.sampling import evenly, pictured_share
 
 COLUMNS = 6  # of the contact sheet
@@ -78,6 +79,7 @@ def run(dataset: Dataset, item: str, out: Path, side: int) -> Result:
         tiles[name] = shrink(image, TILE)
     if plates:
         warnings += [Note(name, FACE) for name in _with_face(tiles)]
+        _write_walls(dataset, subject, sizes, out)
     if not tiles and not plates:
         why = "; ".join(map(str, dropped[:3]))
         raise StageError(f"{item}: no camera could be read ({why or 'none is calibrated'})")
@@ -86,6 +88,34 @@ def run(dataset: Dataset, item: str, out: Path, side: int) -> Result:
         sheet = tile_sheet(tiles, COLUMNS, TILE)
         write_image(out / "qc" / "frames.jpg", sheet, quality=88)
     return Result({"frames": len(tiles)}, dropped, warnings)
+
+
+def _write_walls(
+    dataset: Dataset, subject: str, sizes: dict[str, tuple[int, int]], out: Path
+) -> None:
+    """Write `<camera>.wall.png`, the wall behind the person, of each camera without a plate.
+
+    It is learned from several moments, whatever the labels, so that a changed label does not change
+    the mattes of other expressions.
+    """
+    index, cameras = read_index(dataset, subject), read_recorded_cameras(dataset, subject)
+    wanted = [name for name in cameras if name not in index.plates]
+    if not wanted or index.frames < 2:
+        return
+    from pipelines.calibrate.footage import instants
+    from pipelines.matte.wall import LEAST_MOMENTS, MOMENTS, learn_walls
+
+    frames = instants(index, wanted[0], MOMENTS)
+    if len(frames) < LEAST_MOMENTS:  # a few long clips
+        frames = evenly(range(index.frames), LEAST_MOMENTS)
+
+    def read(name: str, frame: int) -> np.ndarray:
+        with closing(FrameReader(index, name)) as reader:
+            return make_picture(reader.read(frame, exact=True), cameras[name], sizes[name])
+
+    pictured = {name: resized(camera, *sizes[name]) for name, camera in cameras.items()}
+    for name, wall in learn_walls(pictured, read, frames, wanted):
+        (out / f"{name}.wall.png").write_bytes(wall.encoded())
 
 
 def _with_face(images: dict[str, np.ndarray]) -> list[str]:

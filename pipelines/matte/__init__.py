@@ -48,7 +48,7 @@ class MatteConfig:
 
 
 def inputs(dataset: Dataset, item: str, config: MatteConfig) -> dict[str, Path | str]:
-    """Name the cameras, the frames, the plates that the method uses, and the weights."""
+    """Name the cameras, the frames, the plates and walls that the method uses, and the weights."""
     from express50.capture.frames import frame_inputs, read_cameras_of
 
     subject, expression = item.split("/")
@@ -59,6 +59,9 @@ def inputs(dataset: Dataset, item: str, config: MatteConfig) -> dict[str, Path |
     if config.method in ("key", "bgmv2"):
         plates = {c: dataset.plate_file(subject, c) for c in read_cameras_of(dataset, subject)}
         found |= {f"plate {c}": path for c, path in plates.items() if path.is_file()}
+    if config.method in ("key", "grabcut"):
+        walls = {c: dataset.wall_file(subject, c) for c in read_cameras_of(dataset, subject)}
+        found |= {f"wall {c}": path for c, path in walls.items() if path.is_file()}
     if config.weights:
         from pipelines.networks import weights_file  # torch takes seconds to import
 
@@ -92,7 +95,7 @@ def needs_gpu(config: MatteConfig) -> bool:
 
 STAGE = Stage(
     name="matte",
-    version=31,
+    version=32,
     config=MatteConfig,
     items=peak_items,
     inputs=inputs,

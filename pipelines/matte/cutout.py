@@ -5,11 +5,6 @@ shoulders are in every picture, even from behind. GrabCut (Rother, Kolmogorov an
 their outlines by colours; heads of other people close by count as wall. Then the cameras correct
 each other: the person is nowhere that others see past them, and, if they are many, everywhere that
 all others see them; GrabCut runs again within these limits. A single camera has its colours only.
-
-Around an outline, alpha is the posterior mean of a mixture (Bayesian matting, Chuang et al. 2001)
-of two colours, the person's nearby and the wall's. The wall behind the person is interpolated from
-what is seen beside them, and the error of that is measured where the wall is seen. In front of a
-plain wall this is as good as a plate; in front of a cluttered one the outline decides.
 """
 
 from __future__ import annotations
@@ -23,11 +18,10 @@ import numpy as np
 from scipy.ndimage import binary_fill_holes, gaussian_filter
 
 from express50.errors import NoFaceError
-from express50.files.images import box_about, edge_distance, shrink
+from express50.files.images import box_about, shrink
 from express50.geometry.cameras import Camera, resized
 from express50.geometry.conventions import corner_to_cell
 from express50.geometry.transforms import transform_points
-from pipelines.matte.plates import local_colours, nearest_first, to_light
 from pipelines.matte.visual_hull import (
     FEWEST,
     Ball,
@@ -54,24 +48,17 @@ UNSEEN = 2 / COLOURS**3  # the person does not have colours of a smaller share
 CLEARLY = 4.0  # ratio of shares from which a colour is the person's, not the wall's
 CELLS = 96  # cells along each side of the cube in which cameras are compared
 
-# Lengths on the head, metres.
-OUTER_M, INNER_M = 0.014, 0.010  # alpha is solved this far outside and inside the outline
-RIM_M = (0.004, 0.015)  # the person's colours are sampled this deep inside the outline
-REACH_M, WALL_M = 0.006, 0.004  # nearest distance from which colours of person and wall are taken
-RING_M = 0.014  # width of the ring in which the wall's error is measured
-DOUBT_M = 0.0018  # scale of an outline's logistic error; 1.8 times as much is the deviation
-SPREAD = 0.15  # share by which hair may be brighter or darker than visible hair nearby
-NOISE = 1.5  # standard deviation of a pixel, 8-bit steps
-OPACITIES = np.linspace(0.0, 1.0, 9)
-MIXED, ODD = 0.2, 0.02  # probability of a soft pixel on the outline, of a wrong one far from it
-
 
 @dataclass(frozen=True)
 class Cut:
-    """A person's outline in one camera: mask (h, w) bool, and its pixels per metre of the head."""
+    """A person's outline in one camera: mask (h, w) bool, and its pixels per metre of the head.
+
+    `body` (h, w) bool is where the body below the neck may be; None if that is not known.
+    """
 
     mask: np.ndarray
     density: float
+    body: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -121,12 +108,14 @@ def make_cut_view(
 
 
 def cut_out(
-    views: Sequence[CutView], ball: Ball | None, place: HeadPlace | None = None
-) -> dict[str, Cut]:
+    views: Sequence[CutView], ball: Ball | None, place: HeadPlace | None = None,
+    alone: bool = False,
+) -> dict[str, Cut]:  # fmt: skip
     """Find the person's outline in all cameras of a frame set.
 
     `ball` is the volume that the cameras look at; None if they share none. `place` is from
-    `find_head`, which is called if it is not given.
+    `find_head`, which is called if it is not given. Other people are not searched if the person is
+    said to be `alone`.
 
     Raises:
         NoFaceError: no camera shows a face.
@@ -139,7 +128,7 @@ def cut_out(
             # Heads and necks of others are wall but where the person surely is, in front of
             # them; their hair is wall where the person hardly is.
             sure = guess == cv2.GC_FGD
-            for other in find_neighbours(view, place):
+            for other in () if alone else find_neighbours(view, place):
                 guess[(_guess(reduced, other) == cv2.GC_FGD) & ~sure] = cv2.GC_BGD
                 guess[_head_mask(reduced, other) & (guess == cv2.GC_PR_BGD)] = cv2.GC_BGD
     density = [place.density(view.camera) for view in small]
@@ -154,7 +143,8 @@ def cut_out(
     if ball is not None and len(views) >= FEWEST:
         for slack in SLACK_PX:
             masks = cut(_corrected_labels(small, guesses, masks, ball, slack))
-    cuts = map(Cut, masks, density)
+    bodies = [_guess(view, place, {1: (trunk_of_a_person(),)}) > 0 for view in small]
+    cuts = map(Cut, masks, density, bodies)
     return {view.name: found for view, found in zip(small, cuts, strict=True)}
 
 
@@ -256,6 +246,17 @@ def parts_of_a_person() -> dict[int, tuple[np.ndarray, ...]]:
         cv2.GC_PR_FGD: (likely, vertices, torso),
         cv2.GC_FGD: (sure, neck, face.mean(0) + 0.95 * (face - face.mean(0))),
     }
+
+
+@cache
+def trunk_of_a_person() -> np.ndarray:
+    """Return the corners (N, 3) of a slab about the body below the neck, head space, metres."""
+    from express50.head.load import load_builtin
+
+    vertices = load_builtin().template.double().numpy()
+    bottom = float(vertices[:, 1].min())
+    back = float(np.mean(vertices[vertices[:, 1] < bottom + 0.02, 2]))
+    return _slab((0.3, 0.34), (bottom + 0.01, bottom - 0.9), (back, back), 0.25)
 
 
 def _slab(
@@ -408,76 +409,3 @@ def _shares(cells: np.ndarray) -> np.ndarray:
     counts = np.bincount(cells.ravel(), minlength=COLOURS**3).reshape((COLOURS,) * 3)
     smooth = gaussian_filter(counts.astype(np.float32), 1.0).ravel()
     return smooth / max(len(cells), 1) + RARE
-
-
-def soft_alpha(frame: np.ndarray, valid: np.ndarray, cut: Cut) -> np.ndarray:
-    """Solve opacity (H, W) float32 around an outline that was cut in a reduced picture.
-
-    The frame is (H, W, 3) uint8, undistorted; pixels outside ``valid`` (H, W) get 0.
-    """
-    height, width = valid.shape
-    mask = cv2.resize(cut.mask.astype(np.float32), (width, height)) > 0.5
-    density = cut.density * max(height, width) / max(cut.mask.shape)
-    if not mask.any():
-        return np.zeros(valid.shape, np.float32)
-    depth = edge_distance(mask) - edge_distance(~mask) if not mask.all() else mask * np.inf
-    depth = (depth / density).astype(np.float32)  # metres inside the outline
-    band = valid & (depth > -OUTER_M) & (depth < INNER_M)
-    alpha = (valid & (depth >= INNER_M)).astype(np.float32)
-    if band.any():
-        alpha[band] = _posterior(frame.astype(np.float32), valid, depth, band, density)
-    return alpha
-
-
-def _posterior(
-    image: np.ndarray, valid: np.ndarray, depth: np.ndarray, band: np.ndarray, density: float
-) -> np.ndarray:
-    """Return the posterior mean opacity (N,) of a band's pixels (H, W), from person and wall."""
-    # The wall is interpolated behind the person. Its error is measured in a ring where it is seen,
-    # by filling that from outside.
-    seen, reach = valid & (depth <= -OUTER_M), WALL_M * density
-    ring = seen & (depth > -OUTER_M - RING_M)
-    further, ring_weight = (mask.astype(np.float32) for mask in (seen & ~ring, ring))
-    missed = np.where(ring[..., None], image - _filled(image, further, reach), 0) ** 2
-    wall_error = np.sqrt(np.maximum(_filled(missed, ring_weight, 4 * reach), NOISE**2))
-    wall = _filled(image, seen.astype(np.float32), reach)
-    light, behind = to_light(image), to_light(wall)[band]
-    rim = (valid & (depth > RIM_M[0]) & (depth < RIM_M[1])).astype(np.float32)
-    mean, covariance = local_colours(light, rim, band, REACH_M * density, SPREAD)
-    level = np.clip(wall[band], 1, 254)
-    slope = (to_light(level + 1) - to_light(level - 1)) / 2
-    own, error = (NOISE * slope) ** 2, (wall_error[band] * slope) ** 2
-    inside = np.clip(1 / (1 + np.exp(-depth[band] / DOUBT_M)), ODD, 1 - ODD)
-    soft = MIXED * np.exp(-np.abs(depth[band]) / (4 * DOUBT_M)) + ODD
-    chances = np.log([
-        (1 - inside) * (1 - soft), *([soft / (len(OPACITIES) - 2)] * (len(OPACITIES) - 2)),
-        inside * (1 - soft),
-    ])  # fmt: skip
-    for row, opacity in enumerate(OPACITIES):
-        off = light[band] - opacity * mean - (1 - opacity) * behind
-        variance = own + (1 - opacity) ** 2 * error
-        chances[row] += _log_density(off, opacity**2 * covariance, variance)
-    weight = np.exp(chances - chances.max(0))
-    return (OPACITIES @ weight / weight.sum(0)).astype(np.float32)
-
-
-def _log_density(off: np.ndarray, covariance: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Return log densities (N,) of normal errors (N, 3), up to a constant.
-
-    The covariance is `covariance` (N, 3, 3) plus `variance` (N, 3) on its diagonal. Solved with
-    cofactors: NumPy's solver takes ten times as long for this many small matrices.
-    """
-    a, b, c = (covariance[:, k, k] + variance[:, k] + 1e-8 for k in range(3))
-    d, e, f = covariance[:, 1, 2], covariance[:, 0, 2], covariance[:, 0, 1]
-    x, y, z = off.T.astype(np.float64)
-    A, B, C = b * c - d * d, a * c - e * e, a * b - f * f
-    D, E, F = e * f - a * d, d * f - b * e, d * e - c * f
-    determinant = np.maximum(a * A + f * F + e * E, 1e-30)
-    square = A * x * x + B * y * y + C * z * z + 2 * (D * y * z + E * x * z + F * x * y)
-    return -0.5 * (square / determinant + np.log(determinant))
-
-
-def _filled(image: np.ndarray, weight: np.ndarray, reach: float) -> np.ndarray:
-    """Average an image (H, W, 3) by weights (H, W) over the nearest distance that has any."""
-    mass = nearest_first(weight, reach, 6, least=1e-12)
-    return nearest_first(image * weight[..., None], reach, 6) / mass[..., None]

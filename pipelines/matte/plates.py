@@ -134,34 +134,36 @@ def match_plate(
     first = _matched(plate, frame, valid)
     if first.sure or person is None:
         return first
-    border = _rim(person.shape, RIM, np.zeros_like(person))
+    border = border_of(person.shape, RIM, np.zeros_like(person))
     if (~person[border]).mean() < LEAST_OPEN:
         return first
     size = valid.shape[::-1]
     person = cv2.resize(person.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
     second = _matched(plate, frame, valid, person)
     # The fewer pixels are compared, the sooner a plate in other light seems to fit.
-    border = valid & _rim(valid.shape, RIM, person)
-    return first if _explained(first.plate, frame, border) > second.share else second
+    border = valid & border_of(valid.shape, RIM, person)
+    return first if explained_share(first.plate, frame, border) > second.share else second
 
 
 def _matched(
     plate: np.ndarray, frame: np.ndarray, valid: np.ndarray, person: np.ndarray | None = None
 ) -> MatchedPlate:
     """Match a plate by the frame's top and upper sides, or by its border beside a person (H, W)."""
-    rim = valid & _rim(valid.shape, RIM, person)
-    best = MatchedPlate(plate, _explained(plate, frame, rim), beside=person is not None)
+    rim = valid & border_of(valid.shape, RIM, person)
+    best = MatchedPlate(plate, explained_share(plate, frame, rim), beside=person is not None)
     if best.share > GOOD_SHARE:
         return replace(best, sure=True)
-    wide = _rim(valid.shape, WIDE_RIM, person)
+    wide = border_of(valid.shape, WIDE_RIM, person)
     for light in (plate, _evened(plate, frame, rim)):
         for image in (light, _aligned(light, frame, valid & wide)):
-            found = replace(best, plate=image, share=_explained(image, frame, rim))
+            found = replace(best, plate=image, share=explained_share(image, frame, rim))
             best = found if found.share > best.share + LEAST_GAIN else best
     return best
 
 
-def _rim(shape: tuple[int, ...], share: float, person: np.ndarray | None = None) -> np.ndarray:
+def border_of(
+    shape: tuple[int, ...], share: float = RIM, person: np.ndarray | None = None
+) -> np.ndarray:
     """Mark the top and the upper sides (H, W) of an image; `share` of the longer side wide.
 
     Where a person may be (H, W) bool, if known, is left out instead of the lower part.
@@ -180,11 +182,11 @@ def _rim(shape: tuple[int, ...], share: float, person: np.ndarray | None = None)
 
 def white_share(image: np.ndarray, valid: np.ndarray) -> float:
     """Return the share of an image's top and sides that is too bright to compare."""
-    rim = valid & _rim(valid.shape, RIM)
+    rim = valid & border_of(valid.shape)
     return float((image[rim] >= WHITE).any(-1).mean()) if rim.any() else 0.0
 
 
-def _explained(plate: np.ndarray, frame: np.ndarray, rim: np.ndarray) -> float:
+def explained_share(plate: np.ndarray, frame: np.ndarray, rim: np.ndarray) -> float:
     """Return the share of a rim (H, W) where plate and frame differ by less than ODD_STEPS.
 
     Where that is most of the rim, the rest may show the plate in a hard shadow of its colours.

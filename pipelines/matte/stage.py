@@ -24,7 +24,6 @@ from pipelines.matte.cutout import (
     find_head,
     make_cut_view,
     region_of,
-    soft_alpha,
 )
 from pipelines.matte.key import dilated, key_alpha
 from pipelines.matte.plates import (
@@ -46,6 +45,7 @@ from pipelines.matte.visual_hull import (
     ball_of,
     compare_mattes,
 )
+from pipelines.matte.wall import Wall, read_wall, soft_alpha, valid_pixels
 
 COLUMNS = 6  # of the contact sheet
 TILE = 240
@@ -186,6 +186,11 @@ class _Shots:
         frame = read_peak_frame(self.dataset, subject, expression, name)
         return frame, valid_pixels(self.cameras[name])
 
+    def wall(self, name: str, frame: np.ndarray, valid: np.ndarray) -> Wall | None:
+        """Read the wall that other moments show, if it is that of this frame."""
+        found = read_wall(self.dataset, self.item.split("/")[0], name)
+        return found if found is not None and found.fits(frame, valid) else None
+
     def matte(
         self, name: str, frame: np.ndarray, valid: np.ndarray, person: np.ndarray | None = None
     ) -> tuple[CameraMatte | None, str]:
@@ -236,7 +241,8 @@ def _with_other_views(
     cuts = cut_out(ordered, ball, place) if unplated else {}
     for name in unplated:
         frame, valid = shots.read(name)
-        cut = _camera_matte(soft_alpha(frame, valid, cuts[name]), frame, valid)
+        alpha = soft_alpha(frame, valid, cuts[name], shots.wall(name, frame, valid))
+        cut = _camera_matte(alpha, frame, valid)
         rest[name] = replace(cut, plated=False)
     return rest
 
@@ -277,11 +283,6 @@ def _plate(
         f" {LEAST_SHARE:.0%}: it shows another set or place, so the camera was matted without it;"
         " photograph the plate again"
     )
-
-
-def valid_pixels(camera: Camera) -> np.ndarray:
-    """Return the pixels (H, W) bool with footage, except the outermost, which resampling mixes."""
-    return cv2.erode(undistorted_mask(camera).astype(np.uint8), np.ones((3, 3))) > 0
 
 
 def _matte_function(method: str, weights: str, tile: int, shadow: float) -> MatteFunction:

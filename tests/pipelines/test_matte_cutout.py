@@ -33,10 +33,10 @@ from pipelines.matte.cutout import (
     find_neighbours,
     make_cut_view,
     parts_of_a_person,
-    soft_alpha,
 )
 from pipelines.matte.key import key_alpha
-from pipelines.matte.stage import CameraMatte, camera_mattes, valid_pixels
+from pipelines.matte.stage import CameraMatte, camera_mattes
+from pipelines.matte.wall import soft_alpha, valid_pixels
 from pipelines.photo.capture import make_photo_capture, open_picture, single_camera
 from pipelines.track.config import TrackConfig
 from tests.pipelines.matte_rig import turned
