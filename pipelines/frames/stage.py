@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 import cv2
@@ -105,7 +105,9 @@ def _write_walls(
     from pipelines.calibrate.footage import instants
     from pipelines.matte.wall import LEAST_MOMENTS, MOMENTS, learn_walls
 
-    frames = instants(index, wanted[0], MOMENTS)
+    frames: list[int] = []
+    with suppress(CaptureError):  # unless this camera's footage is damaged
+        frames = instants(index, wanted[0], MOMENTS)
     if len(frames) < LEAST_MOMENTS:  # a few long clips
         frames = evenly(range(index.frames), LEAST_MOMENTS)
 

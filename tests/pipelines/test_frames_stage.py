@@ -12,6 +12,7 @@ import skimage.data
 
 from express50.capture import frames as frames_module
 from express50.capture.frames import (
+    picture_sizes,
     read_peak_frame,
     read_plate_image,
     read_recorded_plate,
@@ -31,7 +32,9 @@ from express50.files.images import (
 )
 from express50.geometry.cameras import pinhole, project
 from express50.geometry.sampling import undistort_image
-from pipelines.frames import STAGE
+from pipelines.calibrate import footage
+from pipelines.frames import STAGE, stage
+from pipelines.matte import wall
 from tests.pipelines.test_matte_stage import make_dataset
 from tests.stages import metrics_of, notes_of, run_here
 from tests.synth import make_capture, make_rig, read_frame
@@ -272,3 +275,22 @@ def test_a_plate_that_shows_a_face_is_named(tmp_path):
     (outcome,) = run_here(STAGE, dataset, ["S001/_plates"], preset="draft", image_side=120).outcomes
     (note,) = outcome.warnings
     assert note.what == "cam01" and "its plate shows a face" in note.why
+
+
+def test_a_damaged_camera_does_not_hide_the_walls_of_the_others(dataset, monkeypatch):
+    index = replace(read_index(dataset, "S001"), plates={})
+    seen = {}
+
+    def damaged(*unused):
+        raise CaptureError("damaged")
+
+    def learn(cameras, read, frames, wanted):
+        seen.update(frames=list(frames), wanted=wanted)
+        return iter(())
+
+    monkeypatch.setattr(stage, "read_index", lambda *unused: index)
+    monkeypatch.setattr(footage, "instants", damaged)
+    monkeypatch.setattr(wall, "learn_walls", learn)
+    stage._write_walls(dataset, "S001", picture_sizes(dataset, "S001"), dataset.root)
+    assert seen["wanted"] == sorted(index.cameras)
+    assert len(seen["frames"]) == 4 and max(seen["frames"]) < index.frames
