@@ -235,7 +235,7 @@ def read_peak_frame(dataset: Dataset, subject: str, expression: str, camera_id: 
             f"{path}: no frame of {camera_id}; run 'express50 frames {dataset.root}', or see "
             f"'express50 status {dataset.root}' for the reason"
         )
-    return _read_written(path, picture_sizes(dataset, subject).get(camera_id))
+    return read_written(path, picture_sizes(dataset, subject).get(camera_id))
 
 
 def read_matted_frame(dataset: Dataset, item: str, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -273,17 +273,23 @@ def read_plate_image(dataset: Dataset, subject: str, camera_id: str) -> np.ndarr
     """
     path = dataset.plate_file(subject, camera_id)
     size = picture_sizes(dataset, subject).get(camera_id)
-    return _read_written(path, size) if path.is_file() else None
+    return read_written(path, size) if path.is_file() else None
 
 
-def _read_written(path: Path, size: tuple[int, int] | None) -> np.ndarray:
+def read_written(path: Path, size: tuple[int, int] | None, channels: int = 3) -> np.ndarray:
+    """Read a picture (H, W, channels) uint8 that the frames stage wrote, of a size if one is given.
+
+    Raises:
+        CaptureError: it is damaged, or another picture.
+    """
     fix = "delete its folder and run 'express50 frames' again"
     try:
         image = read_image(path)
     except FormatError as error:
         raise CaptureError(f"{path}: truncated or damaged; {fix}") from error
-    if image.dtype != np.uint8 or image.shape[2:] != (3,):
-        raise CaptureError(f"{path}: {image.dtype} {image.shape}, expected 8-bit RGB; {fix}")
+    if image.dtype != np.uint8 or image.shape[2:] != (channels,):
+        kind = f"8 bits and {channels} channels"
+        raise CaptureError(f"{path}: {image.dtype} {image.shape}, expected {kind}; {fix}")
     found = (image.shape[1], image.shape[0])
     if size not in (None, found):
         raise CaptureError(

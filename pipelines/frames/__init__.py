@@ -2,8 +2,8 @@
 
 An item is an expression of a subject with all cameras, so that a changed label redoes one
 expression only. A seek in 4K H.264 costs half a second with any grouping. The clean plates of a
-subject and the sizes of its pictures are one more item. Cameras without a plate have the wall there
-that several expressions show (`pipelines/matte/wall.py`).
+subject and the sizes of its pictures are one more item. For cameras without a plate, it holds
+the wall that several moments show (`pipelines/matte/wall.py`).
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ STAGE = Stage(
     help="write the labelled peak frames, undistorted and colour-corrected",
     purpose="Peak frames and clean plates as every later stage reads them: undistorted to the"
     " calibrated pinhole camera, colour-corrected, lossless, and reduced if the settings say so."
-    " Without a clean plate, the wall is learned from several expressions.",
+    " Without a clean plate, the wall is learned from several moments.",
     growth=Growth(
         items=("subjects", "expressions"),
         time=("views", "converted"),

@@ -117,7 +117,7 @@ def _write_walls(
 
     pictured = {name: resized(camera, *sizes[name]) for name, camera in cameras.items()}
     for name, wall in learn_walls(pictured, read, frames, wanted):
-        (out / f"{name}.wall.png").write_bytes(wall.encoded())
+        write_image(out / f"{name}.wall.png", wall.picture())
 
 
 def _with_face(images: dict[str, np.ndarray]) -> list[str]:

@@ -19,12 +19,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from express50.capture.frames import read_written
 from express50.contract.layout import Dataset
-from express50.errors import CaptureError, FormatError, NoFaceError
+from express50.errors import CaptureError, NoFaceError
 from express50.files.images import (
     edge_distance,
-    encode_png,
-    read_image,
     shrink,
 )
 from express50.geometry.cameras import Camera, pinhole
@@ -94,9 +93,9 @@ class Wall:
         shown = exposed(wall.colour, exposure_gain(frame, wall.colour))
         return shown, np.where(wall.error < UNSEEN, wall.error, np.inf).astype(np.float32)
 
-    def encoded(self) -> bytes:
-        """Encode it as PNG; its opacity is 255 less the error."""
-        return encode_png(np.dstack([self.colour, UNSEEN - self.error]))
+    def picture(self) -> np.ndarray:
+        """Return it as a picture (H, W, 4), whose opacity is 255 less the error."""
+        return np.dstack([self.colour, UNSEEN - self.error])
 
 
 def read_wall(dataset: Dataset, subject: str, camera: str) -> Wall | None:
@@ -108,13 +107,7 @@ def read_wall(dataset: Dataset, subject: str, camera: str) -> Wall | None:
     path = dataset.wall_file(subject, camera)
     if not path.is_file():
         return None
-    fix = "delete its folder and run 'express50 frames' again"
-    try:
-        image = read_image(path)
-    except FormatError as error:
-        raise CaptureError(f"{path}: truncated or damaged; {fix}") from error
-    if image.dtype != np.uint8 or image.shape[2:] != (4,):
-        raise CaptureError(f"{path}: {image.dtype} {image.shape}, expected 8-bit RGBA; {fix}")
+    image = read_written(path, None, channels=4)
     return Wall(np.ascontiguousarray(image[..., :3]), UNSEEN - image[..., 3])
 
 

@@ -12,7 +12,7 @@ from benchmarks.common import recorded, write_peaks
 from express50.capture.frames import read_cameras_of
 from express50.contract.layout import Dataset
 from express50.errors import CaptureError
-from express50.files.images import read_alpha
+from express50.files.images import read_alpha, write_image
 from express50.geometry.cameras import pinhole
 from express50.twin import TwinConfig
 from express50.twin.record import record
@@ -123,7 +123,7 @@ def test_a_wall_survives_its_file(tmp_path) -> None:
     error = rng.integers(0, 256, (9, 7), np.uint8)
     wall = Wall(rng.integers(0, 256, (9, 7, 3), np.uint8), error)
     path.parent.mkdir(parents=True)
-    path.write_bytes(wall.encoded())
+    write_image(path, wall.picture())
     found = read_wall(dataset, "S001", "cam01")
     assert found is not None
     np.testing.assert_array_equal(found.colour, wall.colour)
