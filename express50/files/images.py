@@ -31,6 +31,9 @@ CUT = "truncated: the JPEG has no end marker; copy it again"
 DEPTH_UNIT_M = 5e-5  # one step of a 16-bit depth map; 3.28 m at most, 0.025 mm rounding
 DEPTH_LIMIT_M = DEPTH_UNIT_M * 65535
 JPEG_ENDINGS = (".jpg", ".jpeg")
+# Of TIFF (6.0, section 8): grey, RGB, palette and YCbCr. Conversions of others are guesses: inks
+# need their printer's profile, and OpenImageIO's CIELAB is off by 30 of 255 levels.
+PHOTOMETRIC = (0, 1, 2, 3, 6)
 JPEG_SIDE, PNG_SIDE = 65500, 1_000_000  # pixels; encoder and decoder refuse longer sides
 PNG_START = b"\x89PNG\r\n\x1a\n"
 PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
@@ -139,15 +142,23 @@ def open_image(path: Path) -> oiio.ImageInput:
     """Open an image file and read its header; the caller closes it.
 
     Raises:
-        FormatError: it is missing or not an image.
+        FormatError: it is missing, not an image, or holds no grey or RGB, such as CMYK.
     """
     straight = oiio.ImageSpec()
     straight.attribute("oiio:UnassociatedAlpha", 1)  # otherwise colours are multiplied by alpha
     source = oiio.ImageInput.open(str(path), straight) if Path(path).is_file() else None
     if source is None:
         why = _error_text(oiio.geterror) or "it cannot be opened"
-        why = not_fetched(Path(path)) or f"cannot be read as an image ({why}); copy it again"
+        fix = "copy it again, or export it in RGB as PNG, JPEG or TIFF"
+        why = not_fetched(Path(path)) or f"cannot be read as an image ({why}); {fix}"
         raise FormatError(f"{path}: {why}")
+    spec = source.spec()
+    number = spec.get_int_attribute("tiff:PhotometricInterpretation", 2)
+    kind = spec.get_string_attribute("jpeg:ColorSpace")
+    if number not in PHOTOMETRIC or kind in ("CMYK", "YCbCrK"):
+        kind = kind or spec.get_string_attribute("tiff:ColorSpace") or f"photometric {number}"
+        source.close()
+        raise FormatError(f"{path}: holds {kind}, expected grey or RGB; export it in RGB")
     return source
 
 

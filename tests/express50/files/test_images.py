@@ -8,6 +8,7 @@ import cv2
 import imagecodecs
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.ndimage import distance_transform_edt
 
 from express50.errors import CaptureError, DiskFullError, FormatError
@@ -131,6 +132,20 @@ def test_damaged_and_missing_files_are_named(tmp_path):
         images.read_image(path)
     with pytest.raises(FormatError, match="12 bytes"):
         images.decode_image(b"not an image")
+
+
+@pytest.mark.parametrize(
+    ("ending", "mode", "word"),
+    [("tif", "CMYK", "CMYK"), ("tif", "LAB", "CIELAB"), ("jpg", "CMYK", "CMYK")],
+)
+def test_colours_that_cannot_be_converted_truly_are_refused(tmp_path, ending, mode, word):
+    path = tmp_path / f"inks.{ending}"
+    Image.new(mode, (8, 8)).save(path)
+    for read in (images.read_image, images.read_exif):
+        with pytest.raises(FormatError, match=f"holds {word}, expected grey or RGB; export it"):
+            read(path)
+    Image.new("YCbCr", (8, 8), (90, 128, 128)).save(tmp_path / "video.tif")
+    assert np.ptp(images.read_image(tmp_path / "video.tif").astype(int) - 90) <= 1
 
 
 def test_srgb_curves_are_inverse():
