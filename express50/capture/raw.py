@@ -20,8 +20,8 @@ from express50.files.calibration import read_cameras
 from express50.files.text import (
     ID,
     TOML_LIMIT,
-    check_links,
     identifier,
+    is_given,
     is_number,
     no_folder,
     not_fetched,
@@ -39,7 +39,8 @@ VIDEO_SUFFIXES = (
 # Pictures and videos of phones, cameras and the web that are not read.
 UNDEVELOPED = (
     ".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef",
-    ".webp", ".avif", ".gif", ".bmp", ".jp2", ".ogv", ".3gp", ".vob", ".braw", ".r3d", ".crm",
+    ".iiq", ".3fr", ".srw", ".webp", ".avif", ".gif", ".bmp", ".jp2", ".jxl", ".jfif", ".dpx",
+    ".tga", ".ppm", ".pgm", ".hdr", ".psd", ".ogv", ".3gp", ".vob", ".braw", ".r3d", ".crm",
 )  # fmt: skip
 # Windows reserves these names for devices, in any letter case.
 RESERVED = {"CON", "PRN", "AUX", "NUL"}
@@ -48,6 +49,7 @@ RESERVED |= {f"{port}{n}" for port in ("COM", "LPT") for n in range(1, 10)}
 FILES_READ = ("capture.toml", "cues.csv", "calibration.json")
 DATA_SUFFIXES = (".csv", ".json", ".npz", ".toml", ".xml", ".yaml", ".yml")
 CUE_COLUMNS = ("expression_id", "start_frame", "end_frame")
+EXPORT = "not read: export them as JPEG, PNG, TIFF or .mp4"
 ANY_FPS = 24.0  # a placeholder where the rate is not needed
 
 
@@ -149,8 +151,7 @@ def read_calibration(
         CalibrationError: it is malformed.
     """
     given = root / "calibration.json"
-    check_links(given)
-    if not given.is_file():
+    if not is_given(given):
         return None
     calibration = read_cameras(given)
     for name in sorted(set(calibration) - set(cameras) - set(dropped)):
@@ -185,8 +186,7 @@ def read_capture_toml(root: Path) -> dict:
         CaptureError: it cannot be read or is not TOML.
     """
     path = root / "capture.toml"
-    check_links(path)
-    table = read_toml(path, CaptureError) if path.is_file() else {}
+    table = read_toml(path, CaptureError) if is_given(path) else {}
     return {key: dates_as_text(value) for key, value in table.items()}
 
 
@@ -236,7 +236,7 @@ def hint_at_undeveloped(files: Iterable[Path]) -> str:
     suffixes = sorted({file.suffix.lower() for file in files} & set(UNDEVELOPED))
     if not suffixes:
         return ""
-    return f". Files such as *{suffixes[0]} are not read: export them as JPEG, PNG, TIFF or .mp4"
+    return f". Files such as *{suffixes[0]} are {EXPORT}"
 
 
 def is_data_folder(path: Path) -> bool:
@@ -305,8 +305,7 @@ def read_board(root: Path, cameras: Iterable[str]) -> dict | None:
     if not folder.is_dir():
         return None
     path = folder / "board.toml"
-    check_links(path)
-    if not path.is_file():
+    if not is_given(path):
         raise CaptureError(
             f"{folder}: has no board.toml; write one that describes the ChArUco board, see"
             " docs/FORMAT.md"
@@ -333,8 +332,8 @@ def read_board(root: Path, cameras: Iterable[str]) -> dict | None:
 def unused_files(root: Path, cameras: Iterable[str]) -> dict[str, str]:
     """Return what a capture holds that nothing reads, with what to do: a name may be misspelt.
 
-    These are files of ``plates`` and ``board`` that belong to no camera, and tables, settings and
-    calibrations beside those that are read.
+    These are files of ``plates`` and ``board`` that belong to no camera, pictures and videos in
+    formats that are not read, and tables, settings and calibrations beside those that are read.
     """
     known, found = list(cameras), {}
     for part, suffixes in (("plates", IMAGE_SUFFIXES), ("board", VIDEO_SUFFIXES)):
@@ -359,6 +358,11 @@ def unused_files(root: Path, cameras: Iterable[str]) -> dict[str, str]:
             f"holds {few(names)}, which nothing reads; cues come from cues.csv, cameras from"
             " calibration.json (make it with 'express50 cameras import')"
         )
+    files = sorted(file for depth in ("*", "*/*", "*/*/*") for file in root.glob(depth))
+    read = {f.with_suffix("") for f in files if is_shown(f, IMAGE_SUFFIXES + VIDEO_SUFFIXES)}
+    unread = [f for f in files if is_shown(f, UNDEVELOPED) and f.with_suffix("") not in read]
+    if unread:  # raw files beside their JPEGs are usual
+        found["files"] = f"{few([str(f.relative_to(root)) for f in unread])}: {EXPORT}"
     return found
 
 
@@ -369,8 +373,7 @@ def read_cues(path: Path) -> tuple[Cue, ...]:
         CaptureError: a column is missing, a value is not a frame number, a cue ends before it
             starts, or an expression appears twice.
     """
-    check_links(path)
-    if not path.is_file():
+    if not is_given(path):
         return ()
     lines = read_text(path, CaptureError, TOML_LIMIT).splitlines() or [""]
     # Excel separates by semicolons in countries where a comma separates decimals.

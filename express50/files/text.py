@@ -99,6 +99,18 @@ def check_links(*paths: Path) -> None:
             raise CaptureError(f"{path}: {not_fetched(path)}")
 
 
+def is_given(path: Path) -> bool:
+    """Return whether an optional file is there.
+
+    Raises:
+        CaptureError: it is a broken link, or a folder, which would pass for absent.
+    """
+    check_links(path)
+    if path.is_dir():
+        raise CaptureError(f"{path}: is a folder, expected a file; put the file in its place")
+    return path.exists()
+
+
 def read_text(path: Path, kind: Kind, limit: int = TEXT_LIMIT, fix: str = AGAIN) -> str:
     """Read a file as UTF-8, dropping a byte order mark; line ends become newlines.
 

@@ -233,6 +233,14 @@ def test_a_picture_without_a_number_is_named(tmp_path):
         read_any(root)
 
 
+def test_pictures_that_have_to_be_converted_are_named_beside_others(tmp_path):
+    write(tmp_path, ("cam0.jpg", "cam1.png", "plates/cam0.png"))
+    for name in ("cam0.CR2", "cam2.HEIC", "plates/cam1.webp", ".cam3.heic"):
+        (tmp_path / name).touch()
+    named = "cam2.HEIC, plates/cam1.webp: not read: export them as JPEG, PNG, TIFF or .mp4"
+    assert read_any(tmp_path).warnings == {"files": named}
+
+
 @pytest.mark.parametrize("name", ["a.HEIC", "cam0/a.NEF", "a.ogv", "cam0/a.webp"])
 def test_files_that_have_to_be_converted_are_named(tmp_path, name):
     (tmp_path / name).parent.mkdir(exist_ok=True)

@@ -7,6 +7,7 @@ import pytest
 
 from express50.capture.index import Cue
 from express50.capture.raw import read_capture, read_cues, read_meta
+from express50.capture.readers.read import read_any
 from express50.errors import CalibrationError, CaptureError
 from tests.synth import make_capture, make_rig, render_ball, write_video
 
@@ -212,6 +213,16 @@ def test_cues_may_come_from_a_spreadsheet(tmp_path):
     path.write_text("expression_id;start_frame;end_frame\nsmile;0;4\n")
     assert read_cues(path) == (Cue("smile", 0, 4),)
     assert read_cues(tmp_path / "absent.csv") == ()
+
+
+@pytest.mark.parametrize(
+    "name", ["cues.csv", "capture.toml", "calibration.json", "board/board.toml"]
+)
+def test_a_folder_in_place_of_a_file_is_not_taken_for_a_missing_file(raw, name):
+    (raw / name).unlink(missing_ok=True)
+    (raw / name).mkdir(parents=True)
+    with pytest.raises(CaptureError, match=rf"{name}: is a folder, expected a file; put the file"):
+        read_any(raw)
 
 
 def test_tables_and_calibrations_that_nothing_reads_are_named(raw):
