@@ -157,7 +157,9 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--turntable": flag("write turntable.mp4"),
     "--degrees": value("DEG", "angle that the turntable covers (default: 360)", type=ANGLE),
     "--frames": value(
-        "N", "number of frames of a video (default: %(default)s)", type=number(1), default=72
+        "N",
+        f"frames of turntable or interpolation (default: {commands.VIDEO_FRAMES})",
+        type=number(1),
     ),
     "--to": value("SUBJECT/EXPRESSION", "write interpolation.mp4, which ends at this expression"),
     "--drive": value(
@@ -174,7 +176,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "spread of the samples (default: 1, as in training)",
         type=number(0, 100, float),
     ),
-    "--seed": value("N", "random seed (default: 0)", type=number(0), default=0),
+    "--seed": value("N", "random seed (default: 0)", type=number(0)),
     "--columns": value(
         "N", "number of expressions in grid.jpg (default: %(default)s)", type=number(1), default=8
     ),

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 AUTO = "auto"  # in place of a preset
 PAPER_GIB = 20  # GPU memory for the paper's size; a step takes 3.5 on a CPU, plus the networks
+VIDEO_FRAMES = 72  # unless given
 FORMATS = ("html", "ply", "spz", "splats", "arkit", "glb", "npz")  # of an exported head
 HOLDOUTS = ("holdout_cameras", "holdout_expressions")
 CHANGEABLE = ("fit", "metrics", "loss")  # tables that may differ from those of training
@@ -175,9 +176,11 @@ def render(args: argparse.Namespace) -> int:
     check_results_folder(args.out)
     _require(args, "drive", "drive_cue")
     _require(args, "turntable", "degrees")
-    _require(args, "samples", "spread")
+    _require(args, "turntable to", "frames")
+    _require(args, "samples", "spread", "seed")
     degrees = 360.0 if args.degrees is None else args.degrees
     spread = 1.0 if args.spread is None else args.spread
+    length = args.frames or VIDEO_FRAMES
     loaded = _load(args.checkpoint)
     model, head = loaded.model, _edited_head(loaded, args)
     clips = render.read_clips(args.drive, args.drive_cue) if args.drive else None
@@ -195,10 +198,10 @@ def render(args: argparse.Namespace) -> int:
     videos: dict[str, Any] = {}
     rates: dict[str, float] = {}
     if args.turntable:
-        videos["turntable"] = render.turntable(loaded, head, view, args.frames, degrees)
+        videos["turntable"] = render.turntable(loaded, head, view, length, degrees)
     if args.to:
         end = _frame_head(loaded, args.to, args.expression)
-        videos["interpolation"] = render.interpolation(loaded, head, end, view, args.frames)
+        videos["interpolation"] = render.interpolation(loaded, head, end, view, length)
     if clips is not None:
         videos["driven"], rates["driven"] = render.driven(loaded, head, clips, view), clips.rate
     sheets: dict[str, Any] = {}
@@ -208,7 +211,7 @@ def render(args: argparse.Namespace) -> int:
         sheets[name] = function(loaded, *values)
 
     if args.samples:  # first, because it needs several people
-        draw("samples", render.sample_sheet, head, view, args.samples, args.seed, spread)
+        draw("samples", render.sample_sheet, head, view, args.samples, args.seed or 0, spread)
     if args.views:
         draw("views", render.novel_views, head, view)
     if args.controls:
@@ -441,7 +444,7 @@ def study_make(args: argparse.Namespace) -> int:
     check_results_folder(args.out)
     methods = list(zip(args.names, (args.ours, args.theirs), strict=True))
     study = make_study(
-        args.out, args.reference, methods, args.examples, args.participants, args.seed
+        args.out, args.reference, methods, args.examples, args.participants, args.seed or 0
     )
     say(f"wrote {args.out / 'study.json'}: {len(study['examples'])} examples")
     return OK
@@ -469,11 +472,11 @@ def study_table(args: argparse.Namespace) -> int:
 
 
 def _require(args: argparse.Namespace, needed: str, *options: str) -> None:
-    """Refuse options that mean nothing without another one."""
+    """Refuse options that mean nothing without another one, or one of several."""
     for option in options:
-        if getattr(args, option) is not None and not getattr(args, needed):
-            first, second = (f"--{name.replace('_', '-')}" for name in (option, needed))
-            raise ConfigError(f"{first} needs {second}; give both")
+        if getattr(args, option) is not None and not any(getattr(args, n) for n in needed.split()):
+            first, *others = (f"--{n.replace('_', '-')}" for n in (option, *needed.split()))
+            raise ConfigError(f"{first} needs {' or '.join(others)}; give both")
 
 
 def _metric_settings(args: argparse.Namespace) -> list[str]:

@@ -621,6 +621,8 @@ def test_only_the_first_process_reports(shards, tmp_path, monkeypatch, capsys):
         ["render", "{0}", "pictures", "--drive-cue=smile"],
         ["render", "{0}", "pictures", "--degrees=90"],
         ["render", "{0}", "pictures", "--spread=2"],
+        ["render", "{0}", "pictures", "--seed=0"],
+        ["render", "{0}", "pictures", "--frames=9"],
         ["evaluate", "{0}", "{1}", "out", "--fit-budget=5s"],
     ],
 )
