@@ -13,6 +13,9 @@ from express50.files.calibration import camera_rows, finite_array, parse_cameras
 from express50.files.text import identifier, read_bytes
 from express50.geometry.cameras import Camera, resized
 
+# Stages and 'express50 import' read rigs too, and have no such option.
+NO_SIZE = "does not give the images' size; pass --size WIDTHxHEIGHT to 'express50 cameras'"
+
 
 def camera_from_K(
     camera_id: str,

@@ -43,6 +43,7 @@ from express50.geometry.cameras import Camera, resized
 from express50.geometry.conventions import FLIP_YZ, K_from_opencv
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
 from express50.rigs.camera_builder import (
+    NO_SIZE,
     as_rig,
     camera_from_K,
     checked,
@@ -240,7 +241,7 @@ def read_reality_capture(path: Path, size: tuple[int, int] | None) -> dict[str, 
             OpenCV's model lacks.
     """
     if size is None:
-        raise CalibrationError(f"{path}: does not give the images' size; pass --size WIDTHxHEIGHT")
+        raise CalibrationError(f"{path}: {NO_SIZE}")
     files = sorted(path.glob("*.xmp")) if path.is_dir() else [path]
     named = zip(names_from_files([file.name for file in files]), files, strict=True)
     return as_rig((_sidecar(name, file, size) for name, file in named), path)
@@ -319,7 +320,7 @@ def read_idr(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
         CalibrationError: no size is given, or a matrix is not that of a camera.
     """
     if size is None:
-        raise CalibrationError(f"{path}: does not give the images' size; pass --size WIDTHxHEIGHT")
+        raise CalibrationError(f"{path}: {NO_SIZE}")
     arrays = read_arrays(path, CalibrationError, "the cameras of IDR or NeuS")
     found = []
     for key in sorted(key for key in arrays if re.fullmatch(r"world_mat_\d{1,4}", key)):

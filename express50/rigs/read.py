@@ -19,6 +19,7 @@ from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_from_opencv
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
 from express50.rigs.camera_builder import (
+    NO_SIZE,
     at_size,
     camera_from_K,
     checked,
@@ -127,7 +128,7 @@ def guess_format(path: Path) -> str:
         titles = [known.title for known in FORMATS.values()]
         raise CalibrationError(
             f"{path}: is not a known calibration; expected {', '.join(titles[:-1])} or"
-            f" {titles[-1]}: choose one with --format"
+            f" {titles[-1]}; 'express50 cameras check {path} --format NAME' says why it is not one"
         )
     return found
 
@@ -179,9 +180,7 @@ def read_opencv_yaml(path: Path, size: tuple[int, int] | None) -> dict[str, Came
         if pair is not None:
             shape = size_from([table[side] for side in pair], f"{where} has {' and '.join(pair)}")
         if shape is None:
-            raise CalibrationError(
-                f"{where}: does not give the images' size; pass --size WIDTHxHEIGHT"
-            )
+            raise CalibrationError(f"{where}: {NO_SIZE}")
         pose = make_transform(R, t.ravel())
         if name in found:
             raise CalibrationError(f"{path}: two cameras are called {name}; rename one")
