@@ -146,11 +146,18 @@ def take_early(line: Input, event: events.Key) -> None:
         line.insert_text_at_cursor(event.character)
 
 
+# Otherwise a line of text takes them: to copy, and for nothing.
+LEAVE = [
+    Binding("ctrl+c", "app.quit", show=False, priority=True),
+    Binding("ctrl+z", "app.suspend_process", show=False, priority=True),
+]
+
+
 class FlagDialog(ModalScreen[str | None]):
     """Asks for the reason of a flag: a digit decides at once, ``5`` opens a line of text."""
 
     AUTO_FOCUS = ""  # digits must reach the dialog, not the line of text
-    BINDINGS = [Binding("escape", "dismiss", show=False)]
+    BINDINGS = [*LEAVE, Binding("escape", "dismiss", show=False)]
 
     def compose(self) -> ComposeResult:
         """List the reasons, and a line for another."""
@@ -184,7 +191,7 @@ class FlagDialog(ModalScreen[str | None]):
 class FrameDialog(ModalScreen[int | None]):
     """Asks for a frame by its number."""
 
-    BINDINGS = [Binding("escape", "dismiss", show=False)]
+    BINDINGS = [*LEAVE, Binding("escape", "dismiss", show=False)]
 
     def __init__(self, first: int, last: int) -> None:
         super().__init__()
@@ -213,6 +220,8 @@ class FrameDialog(ModalScreen[int | None]):
 
 class HelpDialog(ModalScreen[None]):
     """Shows every key; arrows scroll if the terminal is low, any other key leaves."""
+
+    BINDINGS = [*LEAVE]
 
     def compose(self) -> ComposeResult:
         """Lay the keys out, side by side if there is room, and explain the strip's symbols."""

@@ -218,6 +218,18 @@ def test_q_and_what_ends_other_programs_quit(suggested, make_app, monkeypatch, k
     assert quits == [app]
 
 
+@pytest.mark.parametrize("keys", [["f"], ["f", "5"], ["g"], ["question_mark"]])
+def test_dialogs_can_be_left_as_other_programs(suggested, make_app, monkeypatch, keys):
+    done = []
+    for action in ("quit", "suspend_process"):
+        kind = app_module.AnnotateApp
+        monkeypatch.setattr(
+            kind, f"action_{action}", lambda app, action=action: done.append(action)
+        )
+    drive(make_app(suggested), *keys, "ctrl+z", "ctrl+c")
+    assert done == ["suspend_process", "quit"]
+
+
 def test_no_picture_waits_for_the_garbage_collection(suggested, make_app):
     gc.set_threshold(700, 10, 10)
     assert drive(make_app(suggested), check=lambda app: gc.get_threshold()[0]) >= 50_000
