@@ -92,26 +92,12 @@ def fit(
     held_out = [i for i in held_out if views.keys[i].expression in state.z_exp]
     keeping = partial(_kept, state, checkpoint, made_from)
     effort = run_stages(state, lambda: _scores(state, held_out), keeping)
-    metrics = _report(state, held_out, judge) | effort | judge.missing()
-    comparison_sheet(out / "given.jpg", views, state.given[:6], state.render)
-    if held_out:
-        comparison_sheet(out / "held_out.jpg", views, held_out[:6], state.render)
-    write_json(out / "metrics.json", metrics)
-    save_fit(state, checkpoint)  # last, because then the fit counts as finished
-    return metrics
-
-
-def _report(
-    state: FitState, held_out: Sequence[int], judge: PerceptualMetrics
-) -> dict[str, object]:
-    """Measure a fit on the held-out views, or on the given ones where none was held out."""
-    keys = state.views.keys
-    rows = evaluate(state.views, held_out or state.given, state.render, judge)
-    return {
-        "subject": keys[state.given[0]].subject,
+    rows = evaluate(views, held_out or state.given, state.render, judge)
+    metrics: dict[str, object] = {
+        "subject": views.keys[state.given[0]].subject,
         "expressions": sorted(state.z_exp),
-        "cameras": sorted({keys[i].camera for i in state.given}),
-        "held_out_cameras": sorted({keys[i].camera for i in held_out}),
+        "cameras": sorted({views.keys[i].camera for i in state.given}),
+        "held_out_cameras": sorted({views.keys[i].camera for i in held_out}),
         "psnr_db": mean(rows, "psnr_db"),
         "psnr_is_of": "held-out views" if held_out else "given views: none was held out",
         "stages": state.done.scores,
@@ -119,6 +105,13 @@ def _report(
         "rmse": mean(rows, "rmse"),
         "fid": judge.fid(),
     }
+    metrics |= effort | judge.missing()
+    comparison_sheet(out / "given.jpg", views, state.given[:6], state.render)
+    if held_out:
+        comparison_sheet(out / "held_out.jpg", views, held_out[:6], state.render)
+    write_json(out / "metrics.json", metrics)
+    save_fit(state, checkpoint)  # last, because then the fit counts as finished
+    return metrics
 
 
 def run_stages(

@@ -57,6 +57,7 @@ class Preview:
         self._head: HeadCodes | None = None
         self._maps: Maps | None = None
         self._colours: Tensor | None = None
+        self._direction: Tensor  # of the camera that the colours are for
         self._colour_seconds = 0.0
 
     @torch.no_grad()
@@ -65,7 +66,13 @@ class Preview:
         model = self.loaded.model
         if head is not self._head:
             self._decode(head)
-        if self._colours is None or self._needs_colours(view, moving):
+        stale = self._colours is None
+        if not stale:  # colours are reused until the camera has turned too far
+            cosine = float((self._direction * view.direction()).sum())
+            turned = cosine < math.cos(math.radians(TURN_DEGREES))
+            quick = self._colour_seconds < SLOW_SECONDS
+            stale = turned and quick if moving else cosine < 1 - 1e-9
+        if stale:
             began = time.perf_counter()
             self._colours = model.appearance(head.z_id, self._state, view)
             self._colour_seconds = time.perf_counter() - began
@@ -91,14 +98,6 @@ class Preview:
         gaussians = model.geometry(head.z_id, head.z_exp, self._state, self._maps)
         self._gaussians = without_neck_end(self.loaded.head, self._state.vertices, gaussians)
         self._head = head
-
-    def _needs_colours(self, view: PinholeView, moving: bool) -> bool:
-        """Return whether the camera has turned too far to reuse the last colours."""
-        cosine = float((self._direction * view.direction()).sum())
-        if not moving:
-            return cosine < 1 - 1e-9
-        turned = cosine < math.cos(math.radians(TURN_DEGREES))
-        return turned and self._colour_seconds < SLOW_SECONDS
 
 
 @dataclass(kw_only=True)
@@ -276,7 +275,13 @@ class Viewer:
                 known = len(principal_directions(getattr(model, code)))
                 for number in range(min(DIRECTIONS, known)):
                     self._slider(f"{code} {number}", (-3.0, 3.0), 0.0, f"{code}.{number}")
-        gui.add_button("reset").on_click(self._reset)
+
+        def reset(event: object) -> None:
+            for slider, rest, _ in self._sliders:
+                slider.value = rest
+            self._head_moved()
+
+        gui.add_button("reset").on_click(reset)
 
     def _slider(self, name: str, reach: tuple[float, float], rest: float, *controls: str) -> Any:
         """Add a slider for these controls; at ``rest`` it changes nothing."""
@@ -293,11 +298,6 @@ class Viewer:
         choice = self.server.gui.add_dropdown(name, options=list(options), initial_value=first)
         choice.on_update(self._head_moved)
         return choice
-
-    def _reset(self, event: object = None) -> None:
-        for slider, rest, _ in self._sliders:
-            slider.value = rest
-        self._head_moved()
 
     def _described(self) -> HeadCodes:
         """Return the head that the controls describe."""

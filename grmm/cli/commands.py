@@ -511,7 +511,16 @@ def _edited_head(loaded: Checkpoint, args: argparse.Namespace) -> HeadCodes:
     if args.z_exp_of:
         donor = trained_head(loaded, loaded.model.subjects[0], args.z_exp_of)
         head = replace(head, z_exp=donor.z_exp)
-    return controlled(loaded, head, dict(_control(text) for text in args.control))
+    controls = {}
+    for text in args.control:
+        name, _, numbers = text.partition("=")
+        try:
+            controls[name.strip()] = tuple(float(number) for number in numbers.split(","))
+        except ValueError:
+            raise ConfigError(
+                f"--control {text!r}: expected NAME=NUMBER or NAME=NUMBER,NUMBER,NUMBER"
+            ) from None
+    return controlled(loaded, head, controls)
 
 
 def _frame_head(loaded: Checkpoint, text: str, expression: str | None = None) -> HeadCodes:
@@ -532,17 +541,6 @@ def _frame(loaded: Checkpoint, subject: str | None, expression: str | None) -> t
         own = [e for s, e in loaded.gallery.frames if s == subject]
         expression = "neutral" if "neutral" in own else (own or list(loaded.model.expressions))[0]
     return subject, expression
-
-
-def _control(text: str) -> tuple[str, tuple[float, ...]]:
-    name, equals, numbers = text.partition("=")
-    try:
-        values = tuple(float(number) for number in numbers.split(","))
-    except ValueError:
-        values = ()
-    if not equals or not values:
-        raise ConfigError(f"--control {text!r}: expected NAME=NUMBER or NAME=NUMBER,NUMBER,NUMBER")
-    return name.strip(), values
 
 
 def _split_names(text: str) -> tuple[str, ...]:

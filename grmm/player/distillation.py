@@ -271,28 +271,26 @@ def _exact_parts(person: Person) -> Avatar:
     if len(tracked.offsets):
         rest = rest + torch.as_tensor(tracked.offsets).to(rest)
     directions = mesh.expression_dirs.permute(2, 0, 1)
-    codes = _codes(person.z_changes)
+    shapes = directions, mesh.pose_dirs.view(36, -1, 3)
+    meshes = torch.cat([rest[None], directions])
+    # Coordinates (E, K) of the residual codes along principal directions, each at most 1.
+    u, s, _ = torch.linalg.svd(person.z_changes, full_matrices=False)
+    kept = min(CODES, int((s > 1e-3 * s.amax()).sum())) if len(s) else 0
+    codes = u[:, :kept] * s[:kept]
+    codes = codes / codes.abs().amax(0) if kept else codes
     maps, opacities = _maps(person, person.pose(tracked))
     changes = [
         _maps(person, AvatarPose(parameters=person.own + change, weights=one))[0] - maps
         for change, one in zip(person.changes, torch.eye(len(codes)).to(rest), strict=True)
     ]
-    blends = maps.new_zeros(codes.shape[1], *maps.shape)
+    blends = maps.new_zeros(kept, *maps.shape)
     if codes.numel():
         blends = torch.linalg.lstsq(codes, torch.stack(changes).flatten(1)).solution.view_as(blends)
     return Avatar(
         rest=rest,
-        shapes=torch.cat(
-            [
-                directions,
-                mesh.pose_dirs.view(36, -1, 3),
-                rest.new_zeros(codes.shape[1], *rest.shape),
-            ]
-        ),
+        shapes=torch.cat([*shapes, rest.new_zeros(kept, *rest.shape)]),
         skinning=mesh.skinning,
-        joints=torch.einsum(
-            "jv,fvc->fjc", mesh.joint_regressor, torch.cat([rest[None], directions])
-        ),
+        joints=torch.einsum("jv,fvc->fjc", mesh.joint_regressor, meshes),
         own=person.own,
         changes=person.changes,
         codes=codes,
@@ -303,14 +301,6 @@ def _exact_parts(person: Person) -> Avatar:
         opacities=opacities,
         colours=_colours(person),
     )
-
-
-def _codes(changes: Tensor) -> Tensor:
-    """Return coordinates (E, K) of codes (E, Z) along principal directions, each at most 1."""
-    u, s, _ = torch.linalg.svd(changes, full_matrices=False)
-    kept = min(CODES, int((s > 1e-3 * s.amax()).sum())) if len(s) else 0
-    codes = u[:, :kept] * s[:kept]
-    return codes / codes.abs().amax(0) if kept else codes
 
 
 def _maps(person: Person, pose: AvatarPose) -> tuple[Tensor, Tensor]:

@@ -97,7 +97,15 @@ class _Rasterize(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         # The kernel reads raw memory, so tensors must be contiguous.
         geometry = [x.contiguous() for x in (means, quats, scales, opacities)]
-        camera = _camera(K, cam_from_world, size, options)
+        (fx, _, cx), (_, fy, cy), _ = K.tolist()
+        pose = cam_from_world.tolist()
+        camera = _Camera(
+            intrinsics=(fx, fy, cx, cy),
+            R=tuple(x for row in pose[:3] for x in row[:3]), t=tuple(row[3] for row in pose[:3]),
+            near=NEAR_M, eps2d=DILATION_PX2, width=size[0], height=size[1],
+            antialiased=options.antialiased, normals=options.normals,
+            threads=torch.get_num_threads(),
+        )  # fmt: skip
         if options.normals:  # three more channels, which the projection fills
             colors = torch.nn.functional.pad(colors, (0, 3))
             background = None if background is None else torch.nn.functional.pad(background, (0, 3))
@@ -168,26 +176,6 @@ def _bin(
     ids = torch.empty(entries, dtype=torch.int32)
     _call("bin", dtype, camera, n, depths, boxes, starts, ids)
     return splats, boxes, starts, ids
-
-
-def _camera(
-    K: Tensor, cam_from_world: Tensor, size: tuple[int, int], options: RenderOptions
-) -> _Camera:
-    """Return the camera as the kernel reads it, in float64."""
-    (fx, _, cx), (_, fy, cy), _ = K.tolist()
-    pose = cam_from_world.tolist()
-    return _Camera(
-        intrinsics=(fx, fy, cx, cy),
-        R=tuple(x for row in pose[:3] for x in row[:3]),
-        t=tuple(row[3] for row in pose[:3]),
-        near=NEAR_M,
-        eps2d=DILATION_PX2,
-        width=size[0],
-        height=size[1],
-        antialiased=options.antialiased,
-        normals=options.normals,
-        threads=torch.get_num_threads(),
-    )
 
 
 def _empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:

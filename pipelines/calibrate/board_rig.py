@@ -92,7 +92,16 @@ def solve_rig(
     rig = _first_rig(lone, views, dropped)
     joined = sorted(rig.cameras)
     rig, kept, errors, timing = _refine(rig, corners, points, model, rounds, dropped)
-    _check_agreement(joined, corners, kept)
+    rows = [corners.cameras.index(name) for name in joined]
+    every, fit = (np.bincount(c.camera, minlength=max(rows) + 1)[rows] for c in (corners, kept))
+    usual = float(np.median(fit / every))
+    if len(joined) > 1 and usual < FITTING:
+        raise CalibrationError(
+            f"{', '.join(joined)} contradict each other: in the median camera only {usual:.0%} of"
+            f" the board's corners fit one rig, expected {FITTING:.0%} or more; synchronise the"
+            " cameras and record the board again, or rename its images so that those of one moment"
+            " have the same name"
+        )
     middles = [pose[:3, :3] @ points.mean(0) + pose[:3, 3] for pose in rig.boards.values()]
     world_from_rig = canonical_from_rig(rig.cameras, np.median(middles, axis=0))
     return BoardSolution(
@@ -230,20 +239,6 @@ def _refine(
     rig, keep = _drop_cameras(rig, corners, keep, dropped)
     timing = {name: found for name, found in timing.items() if name in rig.cameras}
     return rig, corners.select(keep), errors[keep], timing
-
-
-def _check_agreement(names: list[str], found: BoardCorners, kept: BoardCorners) -> None:
-    """Raise CalibrationError if most corners of most cameras contradict the rig."""
-    rows = [found.cameras.index(name) for name in names]
-    every, fit = (np.bincount(c.camera, minlength=max(rows) + 1)[rows] for c in (found, kept))
-    usual = float(np.median(fit / every))
-    if len(names) > 1 and usual < FITTING:
-        raise CalibrationError(
-            f"{', '.join(names)} contradict each other: in the median camera only {usual:.0%} of"
-            f" the board's corners fit one rig, expected {FITTING:.0%} or more; synchronise the"
-            " cameras and record the board again, or rename its images so that those of one moment"
-            " have the same name"
-        )
 
 
 def _simplest_models(

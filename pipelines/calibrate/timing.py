@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipelines.calibrate.adjuster import Normal, eliminate
+from pipelines.calibrate.adjuster import eliminate
 from pipelines.calibrate.board import BoardCorners
 from pipelines.calibrate.board_adjust import BoardRig, corner_errors, derive_corners, rig_covariance
 
@@ -111,8 +111,15 @@ def estimate_timing(
         np.concatenate([by_camera, by_time], axis=2) * root[..., None],
         by_board * root[..., None], errors * root, camera, kept.frame, len(names),
     )  # fmt: skip
-    values, sigma = _solve_time(normal, len(names))
+    each = len(normal.right) // len(names)
+    times = np.add.outer(np.arange(len(names)) * each + each - 2, [0, 1])
+    held = np.zeros_like(normal.cameras)
+    # If all cameras are late, moved boards explain it as well: the cameras' mean is held.
+    held[np.ix_(times[:, 0], times[:, 0])] = max(normal.diagonal[times[:, 0]].max(), 1e-12)
+    inverse = rig_covariance(normal, held)
+    sigma = np.sqrt(np.diag(inverse)[times])
     sigma *= _noise(errors * weight, weight, by_time, camera, kept.frame)
+    values = (inverse @ normal.right)[times]
     values += [(k.late, k.readout) if (k := known.get(n)) else (0.0, 0.0) for n in names]
     pairs = {(c, f) for c, f in zip(camera[moving], kept.frame[moving], strict=True)}
     enough = np.bincount([c for c, _ in pairs], minlength=len(names)) >= LEAST_IMAGES
@@ -120,17 +127,6 @@ def estimate_timing(
     values = np.where(np.abs(values) > SURE * sigma, values, 0.0)
     rows = {n: [*v, *s] for n, v, s in zip(names, values.tolist(), sigma.tolist(), strict=True)}
     return {n: CameraTiming(*rows[n]) for n, ok in zip(names, enough, strict=True) if ok}
-
-
-def _solve_time(normal: Normal, cameras: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times' steps (C, 2) and standard deviations for errors of one pixel (C, 2)."""
-    each = len(normal.right) // cameras
-    times = np.add.outer(np.arange(cameras) * each + each - 2, [0, 1])
-    held = np.zeros_like(normal.cameras)
-    # If all cameras are late, moved boards explain it as well: the cameras' mean is held.
-    held[np.ix_(times[:, 0], times[:, 0])] = max(normal.diagonal[times[:, 0]].max(), 1e-12)
-    inverse = rig_covariance(normal, held)
-    return (inverse @ normal.right)[times], np.sqrt(np.diag(inverse)[times])
 
 
 def _noise(

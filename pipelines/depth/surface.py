@@ -84,23 +84,17 @@ def extract_mesh(grid: LevelSet) -> HeadMesh:
         volume.reshape(mask.shape), 0.0, mask=mask, gradient_direction="descent"
     )
     which = (found // tile).astype(np.int64) @ [tiles * tiles, tiles, 1]
-    index, faces = _welded(found % tile + BLOCK * places[which], faces.astype(np.int64))
-    return HeadMesh(grid.points(index), grid_normals(grid, index), faces)
-
-
-def _welded(index: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weld vertices (V, 3), in voxels, of faces (F, 3), so that a voxel's edge has at most one.
-
-    Vertices within a cube, which marching cubes adds where faces are ambiguous, have no double.
-    """
+    index = found % tile + BLOCK * places[which]
+    # Weld vertices, so that a voxel's edge has at most one. Those within a cube, which marching
+    # cubes adds where faces are ambiguous, have no double.
     whole = np.floor(index).astype(np.int64)
     share = index > whole
-    corner = np.ravel_multi_index(tuple(whole.T), tuple(whole.max(0) + 1))
-    key = 3 * corner + share.argmax(1)
+    key = 3 * np.ravel_multi_index(tuple(whole.T), tuple(whole.max(0) + 1)) + share.argmax(1)
     lone = share.sum(1) > 1
     key[lone] = -1 - np.arange(lone.sum())
     _, first, welded = np.unique(key, return_index=True, return_inverse=True)
-    return index[first], welded[faces]
+    index = index[first]
+    return HeadMesh(grid.points(index), grid_normals(grid, index), welded[faces])
 
 
 def grid_normals(grid: LevelSet, index: np.ndarray) -> np.ndarray:

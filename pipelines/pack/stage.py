@@ -133,7 +133,7 @@ def pack(dataset: Dataset, out: Path, test_subjects: Sequence[str], test_fractio
     # All metas of a large dataset would fill the memory.
     metas = (reader.meta(number) for number in range(len(reader)))
     shown = [{key: meta[key] for key in ON_CARD} for meta in metas]
-    card = write_card(splits, shown, left_out, _statistics(totals), people)
+    card = write_card(splits, shown, left_out, totals, people)
     (out / "card.md").write_text(card, encoding="utf-8")
     by_split = {name: sum(entry.split == name for entry in reader.entries) for name in splits}
     coverage = _write_contact_sheet(out, reader)
@@ -182,19 +182,6 @@ def _totals(out: Path, reader: ShardReader, accounts: Mapping[str, dict]) -> dic
         "bytes": size,
         "bytes_per_sample": round(size / len(reader)),
         **{key: ", ".join(sorted(values)) for key, values in kinds.items()},
-    }
-
-
-def _statistics(totals: Mapping[str, Any]) -> dict[str, str]:
-    """Name the totals as the card shows them."""
-    kept = totals["kept"]
-    return {
-        "picture size": f"{totals['size']} pixels square",
-        "profile": totals["profile"],
-        "labels of parts": f"{totals['with_parts']} of {kept} samples",
-        "torso removed": f"{totals['torso_removed']} of {kept} samples",
-        "registered mesh": f"{totals['registered']} of {kept} samples",
-        "shards": f"{totals['shards']}, {totals['bytes'] / 1e6:.1f} MB",
     }
 
 
@@ -255,13 +242,13 @@ def write_card(
     splits: Mapping[str, Sequence[str]],
     metas: Sequence[Mapping],
     dropped: Sequence[Note],
-    statistics: Mapping[str, object],
+    totals: Mapping[str, Any],
     people: Sequence[Mapping],
 ) -> str:
     """Write the datasheet of the packed samples, of which these are the metas, as Markdown.
 
-    ``dropped`` are samples and subjects that were left out, with reasons, ``statistics`` further
-    named numbers. ``people`` are the facts in capture.toml; they are counted, never quoted.
+    ``dropped`` are samples and subjects that were left out, with reasons; ``totals`` are of all
+    that were encoded. ``people`` are the facts in capture.toml; they are counted, never quoted.
     """
     subjects = sorted({meta["subject"] for meta in metas})
     expressions = sorted({meta["expression"] for meta in metas})
@@ -278,7 +265,12 @@ def write_card(
         "",
         "| | |",
         "|---|---|",
-        *(f"| {name} | {value} |" for name, value in statistics.items()),
+        f"| picture size | {totals['size']} pixels square |",
+        f"| profile | {totals['profile']} |",
+        f"| labels of parts | {totals['with_parts']} of {totals['kept']} samples |",
+        f"| torso removed | {totals['torso_removed']} of {totals['kept']} samples |",
+        f"| registered mesh | {totals['registered']} of {totals['kept']} samples |",
+        f"| shards | {totals['shards']}, {totals['bytes'] / 1e6:.1f} MB |",
         *(
             f"| {split} subjects | {', '.join(names) or 'none'} |"
             for split, names in splits.items()

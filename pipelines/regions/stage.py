@@ -211,7 +211,14 @@ def label_view(
     if depth is not None and depth.shape != alpha.shape:
         depth = cv2.resize(depth, alpha.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
     whole = ViewLabels(np.zeros(alpha.shape, np.uint8), np.zeros(alpha.shape, bool))
-    camera, window = _part(head, camera, alpha)
+    pixels, ahead = project(camera, head.vertices)
+    if (ahead > 0).all():  # only the matte and the head, with a margin, are looked at
+        x, y, width, height = cv2.boundingRect((alpha > 0).astype(np.uint8))
+        matte = np.array([(x, y), (x + width, y + height)])
+        ends = np.concatenate([pixels, matte]) if width else pixels
+        camera, window = cut_about(camera, ends, MARGIN)
+    else:
+        window = np.s_[:, :]
     rgb, alpha = rgb[window], alpha[window]
     depth = None if depth is None else depth[window]
     geometry = head_geometry(head, camera, alpha, depth)
@@ -229,19 +236,6 @@ def label_view(
     whole.labels[window] = np.where(alpha > 0, labels, np.uint8(0))
     whole.mesh[window] = geometry.mesh > 0
     return whole
-
-
-def _part(
-    head: TrackedHead, camera: Camera, alpha: np.ndarray
-) -> tuple[Camera, tuple[slice, slice]]:
-    """Cut a picture to the matte (H, W) and the head, with a margin: see `cut_about`."""
-    x, y, width, height = cv2.boundingRect((alpha > 0).astype(np.uint8))
-    pixels, ahead = project(camera, head.vertices)
-    if not (ahead > 0).all():
-        return camera, np.s_[:, :]
-    matte = np.array([(x, y), (x + width, y + height)])
-    ends = np.concatenate([pixels, matte]) if width else pixels
-    return cut_about(camera, ends, MARGIN)
 
 
 def _write_view(
