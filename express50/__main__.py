@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from express50 import __version__
 from express50.cli import dataset, export, plan, stages, status
-from express50.console import USAGE, Parser, run_handler
+from express50.console import USAGE, Parser, error_line, log, run_handler
 from express50.contract.stage import commands
 from express50.errors import Express50Error
 from express50.twin import record as twin
@@ -48,8 +48,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         args = build_parser(command).parse_args(arguments)
     except SystemExit as stop:  # argparse has said what is wrong
         return stop.code if isinstance(stop.code, int) else USAGE
-    except Express50Error as error:  # nothing is installed, or an extension is broken
-        sys.stderr.write(f"express50: {type(error).__name__}: {error}\n")
+    except (Express50Error, OSError) as error:  # no dataset, or a broken extension
+        log(f"express50: {error_line(error)}")
         return USAGE
     return run_handler("express50", args.handler, args)
 

@@ -33,6 +33,8 @@ REMEDIES = {
     errno.EEXIST: "give another path",
     errno.ENOTDIR: "give another path",
     errno.EISDIR: "give the path of a file",
+    errno.ELOOP: "correct the link, which leads back to itself",
+    errno.ENAMETOOLONG: "give a shorter name",
     errno.EACCES: "check its owner and permissions",
     errno.EPERM: "check its owner and permissions",
     errno.EROFS: "make its disk writable, or use another one",
@@ -43,6 +45,8 @@ REMEDIES = {
 }
 
 LATER = 0.05  # seconds, after which a callback of the garbage collection has ended
+
+LOOP = "Symlink loop from '"  # Path.resolve's RuntimeError, which is no OSError until Python 3.13
 
 # torch's error on a CPU is a RuntimeError that only its words tell apart.
 OUT_OF_MEMORY = re.compile("out of memory|can't allocate memory", re.IGNORECASE)
@@ -153,7 +157,7 @@ def run_handler(
             sys.stdout.flush()
         return code
     except Exception as error:  # noqa: BLE001 (a page of a library's files helps no user)
-        log(f"{program}: {_line_of(error)}")
+        log(f"{program}: {error_line(error)}")
         if os.environ.get(DEBUG):
             traceback.print_exception(error)
         return USAGE if isinstance(error, ConfigError) else FAILED
@@ -191,12 +195,17 @@ def _warnings_on_one_line(program: str) -> Iterator[None]:
         warnings.formatwarning = former
 
 
-def _line_of(error: Exception) -> str:
+def error_line(error: Exception) -> str:
+    """Return one line of what went wrong and what to do, of an error of ours or of any other."""
     name, words = type(error).__name__, " ".join(str(error).split())
     if isinstance(error, Express50Error):
         return f"{name}: {words}"
     if isinstance(error, OSError):  # not a bug: permissions, a missing folder, a full disk
         return system_error_line(error)
+    if words.startswith(LOOP):
+        return system_error_line(
+            OSError(errno.ELOOP, os.strerror(errno.ELOOP), words[len(LOOP) : -1])
+        )
     if isinstance(error, MemoryError) or OUT_OF_MEMORY.search(words):
         wanted = AMOUNT.search(words)
         amount = f" for {wanted[1]}" if wanted else ""

@@ -295,6 +295,16 @@ def test_what_the_system_refuses_is_one_line(run, data, capture):
     assert "/proc/none" in err and "Traceback" not in err
 
 
+@pytest.mark.parametrize("command", [["calibrate"], ["annotate", "status"]])
+def test_a_link_to_itself_and_a_name_that_is_too_long_are_one_line(run, tmp_path, command):
+    loop, long = tmp_path / "loop", tmp_path / ("n" * 300)
+    loop.symlink_to(loop)
+    for path, words in ((loop, "which leads back to itself"), (long, "; give a shorter name")):
+        code, _, err = run(*command, path)
+        assert code in (1, 2) and err.count("\n") == 1 and "unexpected" not in err
+        assert err.rstrip().endswith(words) or "no such dataset" in err
+
+
 def test_a_read_only_disk_is_named_as_before_a_run(run, data, capture, monkeypatch):
     assert run("ingest", data, capture)[0] == 0
     page = data / "report/index.html"
