@@ -36,7 +36,10 @@ from express50.files.digests import files_of, text_digest
 from express50.runner.ledger import Ledger
 from express50.runner.publish import size_of
 
-SIZES = ("subjects", "expressions", "cameras", "frames_per_expression")
+SIZES = {  # options, and their names in `Footage`
+    "subjects": "subjects", "expressions": "expressions", "cameras": "views",
+    "frames_per_expression": "frames_per_expression",
+}  # fmt: skip
 # Campaigns of the papers: EXPRESS-50, and RenderMe-360 as it was used beside it (280 of its people,
 # 12 expressions, 60 cameras). Clips are as long as the measured dataset's.
 TARGETS: dict[str, dict[str, float]] = {
@@ -104,7 +107,11 @@ def add_commands(subparsers: Any) -> None:
 
 def run_plan(args: argparse.Namespace) -> int:
     """Print one row per stage, and the sum."""
-    dataset, sizes = Dataset(args.dataset), _given_sizes(args)
+    dataset = Dataset(args.dataset)
+    given = {key: getattr(args, option) for option, key in SIZES.items()}
+    if args.size is not None:
+        given |= {"pixels": math.prod(args.size), "shape": min(args.size) / max(args.size)}
+    sizes = {key: size for key, size in given.items() if size is not None}
     with stdout_to_stderr():
         known = list(stages().values())
         datasets = [dataset, *map(Dataset, args.also)]
@@ -136,16 +143,6 @@ def run_plan(args: argparse.Namespace) -> int:
             f"the sum leaves out what was not measured: {', '.join(total['not_measured'])}"
         )
     return answer(args, data, *lines)
-
-
-def _given_sizes(args: argparse.Namespace) -> dict[str, float]:
-    sizes = {name: getattr(args, name) for name in SIZES if getattr(args, name) is not None}
-    if "cameras" in sizes:
-        sizes["views"] = sizes.pop("cameras")
-    if args.size is not None:
-        sizes["pixels"] = math.prod(args.size)
-        sizes["shape"] = min(args.size) / max(args.size)
-    return sizes
 
 
 def _table(rows: Sequence[Row], total: Mapping[str, Any], workers: int) -> Iterator[str]:

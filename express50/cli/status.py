@@ -94,8 +94,15 @@ def add_commands(subparsers: Any) -> None:
 
 def show_status(args: argparse.Namespace) -> int:
     """Print or publish the progress of the stages; return exit code 1 if an item failed."""
-    trials = list(_trial_lines(Dataset(args.dataset)))
-    if trials and not Dataset(args.dataset).ledger.is_file():  # the first run still measures
+    dataset = Dataset(args.dataset)
+    trials = [
+        f"running {row.stage}: a trial that measures its settings on a few expressions, for"
+        " 'run --budget' or 'tune'"
+        for ledger in sorted(dataset.pilot_dir.glob("*/ledger.sqlite"))
+        for row in _read(Dataset(ledger.parent))  # a trial is a dataset of its own
+        if row.state == "running"
+    ]
+    if trials and not dataset.ledger.is_file():  # the first run still measures
         answer(args, {}, *trials)
         return OK
     dataset = existing_dataset(args.dataset)
@@ -184,17 +191,6 @@ def _lines(table: list[StageStatus]) -> Iterator[str]:
     failed = (receipt for row in table for receipt in row.failed)
     for line in group_lines((f"{one.stage} {one.item}", one.reason) for one in failed):
         yield f"failed {line}"
-
-
-def _trial_lines(dataset: Dataset) -> Iterator[str]:
-    """Say which stages a pilot is trying; its trials are datasets of their own."""
-    for root in sorted(dataset.pilot_dir.glob("*/ledger.sqlite")):
-        for row in _read(Dataset(root.parent)):
-            if row.state == "running":
-                yield (
-                    f"running {row.stage}: a trial that measures its settings on a few expressions,"
-                    " for 'run --budget' or 'tune'"
-                )
 
 
 def read_status(

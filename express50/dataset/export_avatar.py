@@ -259,45 +259,37 @@ def write_parameters(head: Head, steps: list[str], shift: np.ndarray, out: Path)
     ``steps`` are the expressions in time-step order; ``shift`` (3,), metres, is subtracted from
     world positions.
     """
-    flame, shapes = _is_flame(head.model), head.model.shape_dirs.shape[2]
+    track, model, flame = head.track, head.model, _is_flame(head.model)
+    exact = model.to(dtype=torch.float64)
     for folder in ("flame_param",) if flame else ("flame_param", "meshes"):
         (out / folder).mkdir()
-    offsets = head.track.offsets[: FLAME_VERTICES if flame else None]
-    shape = _padded(head.track.shape, max(shapes, FLAME_SHAPES if flame else 0))
-    shared: dict[str, Any] = {"shape": shape, "static_offset": offsets[None]}
+    shapes = max(model.shape_dirs.shape[2], FLAME_SHAPES if flame else 0)
+    count = max(model.expression_dirs.shape[2], FLAME_EXPRESSIONS if flame else 0)
+    offsets = track.offsets[: FLAME_VERTICES if flame else None]
+    shared: dict[str, Any] = {"shape": _padded(track.shape, shapes), "static_offset": offsets[None]}
     for number, name in enumerate(steps):
-        row = head.track.row(name)
-        arrays: dict[str, Any] = _step_parameters(head, row, shift)
+        row = track.row(name)
+        own = (track.shape, track.expression[row], track.offsets)
+        rest = rest_vertices(exact, *(torch.from_numpy(a.astype(np.float64))[None] for a in own))
+        # FLAME rotates about the root joint.
+        joint, R = (exact.joint_regressor[0] @ rest[0]).numpy(), track.R[row]
+        arrays: dict[str, Any] = {
+            "translation": track.t[row] - shift + R @ joint - joint,
+            "rotation": matrix_to_axis_angle(R),
+            "neck_pose": track.neck[row],
+            "jaw_pose": track.jaw[row],
+            "eyes_pose": track.eyes[row],
+            "expr": _padded(track.expression[row], count),
+        }
+        arrays = {name: array[None].astype(np.float32) for name, array in arrays.items()}
         # NumPy dates all archive members 1980, so equal arrays give equal bytes.
         np.savez(out / "flame_param" / f"{number:05d}.npz", **shared, **arrays)
         if not flame:
             path = out / "meshes" / f"{number:05d}.obj"
-            write_head_obj(path, head.track.vertices[row] - shift, head.model)
+            write_head_obj(path, track.vertices[row] - shift, model)
     still = {name: np.zeros_like(array) for name, array in arrays.items()}
     still["jaw_pose"][0, 0] = CANONICAL_JAW
     np.savez(out / "canonical_flame_param.npz", **shared, **still)
-
-
-def _step_parameters(head: Head, row: int, shift: np.ndarray) -> dict[str, np.ndarray]:
-    """Make the parameters of one row of the track; FLAME rotates about the root joint."""
-    track, model = head.track, head.model
-    exact = model.to(dtype=torch.float64)
-    shape, expression, offsets = (
-        torch.from_numpy(array.astype(np.float64))[None]
-        for array in (track.shape, track.expression[row], track.offsets)
-    )
-    rest = rest_vertices(exact, shape, expression, offsets)[0]
-    joint, R = (exact.joint_regressor[0] @ rest).numpy(), track.R[row]
-    count = max(model.expression_dirs.shape[2], FLAME_EXPRESSIONS if _is_flame(model) else 0)
-    arrays = {
-        "translation": track.t[row] - shift + R @ joint - joint,
-        "rotation": matrix_to_axis_angle(R),
-        "neck_pose": track.neck[row],
-        "jaw_pose": track.jaw[row],
-        "eyes_pose": track.eyes[row],
-        "expr": _padded(track.expression[row], count),
-    }
-    return {name: array[None].astype(np.float32) for name, array in arrays.items()}
 
 
 def _padded(values: np.ndarray, count: int) -> np.ndarray:

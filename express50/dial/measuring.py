@@ -245,7 +245,15 @@ def tune(chain: Chain) -> tuple[dict[str, Any], list[str]]:
     folder = dial_dir(chain.dataset)
     write_json(folder / "front.json", table)
     named = {str(number): point for number, point in enumerate(points)} | presets
-    rows = [_csv_row(name, point) for name, point in named.items()]
+    rows = []
+    for name, point in named.items():
+        errors = {
+            f"{result}_{error.unit}{end}": f"{figure:.5g}"
+            for result, error in point.errors.items()
+            for end, figure in (("", error.value), ("_low", error.low), ("_high", error.high))
+        }
+        row = {"point": name, "seconds": f"{point.seconds:.1f}"}
+        rows.append(row | errors | point.settings)
     write_csv(folder / "front.csv", list(rows[0]), rows)
     shutil.rmtree(chain.dataset.pilot_dir, ignore_errors=True)
     return table, [*_lines(load, points, presets), f"wrote {folder}/front.json and front.csv"]
@@ -262,16 +270,6 @@ def preset_settings(load: Workload, preset: str) -> dict[str, str]:
         tried = labels_of(load, stage.name)
         found[stage.name] = preset if preset in tried else standard_of(dict.fromkeys(tried))
     return found
-
-
-def _csv_row(name: str, point: Point) -> dict[str, str]:
-    """Return the time, the errors with their intervals, and the settings of a point."""
-    errors = {
-        f"{result}_{error.unit}{end}": f"{figure:.5g}"
-        for result, error in point.errors.items()
-        for end, figure in (("", error.value), ("_low", error.low), ("_high", error.high))
-    }
-    return {"point": name, "seconds": f"{point.seconds:.1f}"} | errors | point.settings
 
 
 def _lines(load: Workload, points: list[Point], presets: Mapping[str, Point]) -> list[str]:

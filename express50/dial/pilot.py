@@ -341,7 +341,14 @@ def measure(pilot: Pilot, allowance: Allowance) -> PilotFigures:
         settings, factor = {**base.settings, name: label}, grown.get(name, 1.0)
         pilot.clock.expect(0.0)
         known, limit = pilot.record(settings, TRIAL_EXPRESSIONS).is_file(), allowance.spare(found)
-        if known or _fits(pilot, base, (name, label), factor, found, allowance):
+        likely, worst = (
+            guessed(pilot, base, name, label, factor * f) for f in (LIKELY_RATIO, WORST_RATIO)
+        )
+        # Even at its worst, the trial must leave time for the best choice so far.
+        fits = trial_seconds(pilot, worst, name) <= limit and (
+            trial_seconds(pilot, likely, name) <= allowance.spare(found, likely)
+        )
+        if known or fits:
             trial = pilot.trial(
                 settings, TRIAL_EXPRESSIONS, base, f"measuring {name} {label}", limit
             )
@@ -358,24 +365,6 @@ def measure(pilot: Pilot, allowance: Allowance) -> PilotFigures:
     pilot.clock.expect(0.0)
     pilot.cut = False  # the first trial is whole
     return found
-
-
-def _fits(
-    pilot: Pilot,
-    base: Trial,
-    step: tuple[str, str],
-    factor: float,
-    found: PilotFigures,
-    allowance: Allowance,
-) -> bool:
-    """Return whether there is time for a trial of a step, and for a run with it.
-
-    Even at its worst, the trial must leave time for the best choice so far.
-    """
-    likely, worst = (guessed(pilot, base, *step, factor * f) for f in (LIKELY_RATIO, WORST_RATIO))
-    return trial_seconds(pilot, worst, step[0]) <= allowance.spare(found) and (
-        trial_seconds(pilot, likely, step[0]) <= allowance.spare(found, likely)
-    )
 
 
 def _steps(pilot: Pilot, base: Trial, choices: Sequence[str]) -> list[tuple[str, str]]:

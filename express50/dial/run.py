@@ -129,7 +129,17 @@ def run_within(
     """
     if goal is not None:
         check_unit(chain.kinds, goal)
-    state = _resumed(chain, budget, goal)
+    state = RunState(
+        key=chain.key(), budget=budget.text if budget else "", goal=goal.text if goal else ""
+    )
+    path = run_file(chain.dataset)
+    if path.is_file():
+        try:
+            former = RunState(**read_json_table(path, FormatError, "delete it to choose again"))
+        except TypeError as error:
+            raise FormatError(f"{path}: not a run ({error}); delete it to choose again") from error
+        if (former.key, former.budget, former.goal) == (state.key, state.budget, state.goal):
+            state = former
     again = state.finished  # for captures that were added since: they get the budget anew
     state = replace(state, spent=0.0, finished=False) if again else state
     clock = Clock(budget, spent=state.spent)
@@ -141,7 +151,6 @@ def run_within(
         run.keep()  # the stopped item took time as well
         raise
     except ConfigError:  # measuring does not count again, and an earlier run keeps its choices
-        path = run_file(chain.dataset)
         if path.is_file() and not read_json_table(path, FormatError).get("settings"):
             path.unlink()
         raise
@@ -186,22 +195,6 @@ def _measure_and_run(
     if whole and not run.measured.untried:  # else a larger budget goes on with them
         shutil.rmtree(chain.dataset.pilot_dir, ignore_errors=True)
     return summaries, run.state
-
-
-def _resumed(chain: Chain, budget: Budget | None, goal: Goal | None) -> RunState:
-    """Read the run to continue, or begin a new one if budget or goal differ."""
-    fresh = RunState(
-        key=chain.key(), budget=budget.text if budget else "", goal=goal.text if goal else ""
-    )
-    path = run_file(chain.dataset)
-    if not path.is_file():
-        return fresh
-    try:
-        state = RunState(**read_json_table(path, FormatError, "delete it to choose again"))
-    except TypeError as error:
-        raise FormatError(f"{path}: not a run ({error}); delete it to choose again") from error
-    same = (state.key, state.budget, state.goal) == (fresh.key, fresh.budget, fresh.goal)
-    return state if same else fresh
 
 
 def _first_choice(run: _Run, load: Workload) -> Point:

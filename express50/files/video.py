@@ -130,30 +130,23 @@ def _pixels(
             f"{path}: a frame is {frame.width}x{frame.height} pixels, expected at most"
             f" {PIXEL_LIMIT} in total; encode it smaller"
         )
-    weights = LUMA.get(int(frame.colorspace))
+    whole = frame.format.name == "yuv444p" and frame.color_range == LIMITED
+    weights = LUMA.get(int(frame.colorspace)) if whole else None
     try:
-        if frame.format.name == "yuv444p" and frame.color_range == LIMITED and weights:
-            return _full_chroma(frame, *weights)
-        return frame.to_ndarray(format="rgb24", interpolation=conversion)
+        if weights is None:
+            return frame.to_ndarray(format="rgb24", interpolation=conversion)
+        # FFmpeg takes five to nine times as long for three full planes, as it has no fast path from
+        # them to RGB. Source: ITU-T H.273, equations 28 to 33 and 38 to 42.
+        rows = [np.frombuffer(p, np.uint8).reshape(-1, p.line_size) for p in frame.planes]
+        planes = [plane[: frame.height, : frame.width] for plane in rows]
+        red, blue = weights  # in the luma
+        green, of_red, of_blue = 1 - red - blue, 2 - 2 * red, 2 - 2 * blue
+        chroma = [[0, of_red], [-of_blue * blue / green, -of_red * red / green], [of_blue, 0]]
+        matrix = 255 * np.column_stack([np.full(3, 1 / 219), np.divide(chroma, 224)])
+        offset = -matrix @ (16, 128, 128)
+        return cv2.transform(cv2.merge(planes), np.column_stack([matrix, offset]))
     except DAMAGE as error:
         raise CaptureError(f"{path}: a frame cannot be converted ({reason(error)})") from error
-
-
-def _full_chroma(frame: av.VideoFrame, red: float, blue: float) -> np.ndarray:
-    """Convert a frame of three full planes, given the weights of red and blue in its luma.
-
-    FFmpeg takes five to nine times as long for these, as it has no fast path from them to RGB.
-    Source: ITU-T H.273, equations 28 to 33 and 38 to 42.
-    """
-    planes = [
-        np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: frame.height, : frame.width]
-        for plane in frame.planes
-    ]
-    green, of_red, of_blue = 1 - red - blue, 2 - 2 * red, 2 - 2 * blue
-    chroma = [[0, of_red], [-of_blue * blue / green, -of_red * red / green], [of_blue, 0]]
-    matrix = 255 * np.column_stack([np.full(3, 1 / 219), np.divide(chroma, 224)])
-    offset = -matrix @ (16, 128, 128)
-    return cv2.transform(cv2.merge(planes), np.column_stack([matrix, offset]))
 
 
 def _decode(

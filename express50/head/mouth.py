@@ -157,7 +157,12 @@ def _pouch(model: HeadModel, chart: np.ndarray) -> _Part:
     combined = torch.cat(weights).float()
     steps = np.concatenate([np.arange(size), np.arange(2 * size + 1) + size])
     ids = np.concatenate([loop.numpy(), first + np.arange(2 * size + 1)])
-    faces = _funnel(size)
+    # Three rings and the end vertex, numbered in that order, make a funnel.
+    k, after = np.arange(size), np.roll(np.arange(size), -1)
+    corners = (k, after, size + after), (k, size + after, size + k)
+    sides = [np.stack(three, -1) + ring for ring in (0, size) for three in corners]
+    tip = np.stack([2 * size + k, 2 * size + after, np.full(size, 3 * size)], -1)
+    faces = np.concatenate([*sides, tip])
     # In the chart the rings are concentric circles.
     angle = 2 * np.pi * np.arange(size) / size
     circle = np.stack([np.cos(angle), np.sin(angle)], -1)
@@ -172,18 +177,6 @@ def _pouch(model: HeadModel, chart: np.ndarray) -> _Part:
         uv=torch.from_numpy(middle + half * rings),
         uv_faces=torch.from_numpy(steps[faces]),
     )
-
-
-def _funnel(size: int) -> np.ndarray:
-    """Return the triangles (5 size, 3) of three rings and an end vertex, numbered in that order."""
-    k = np.arange(size)
-    after = (k + 1) % size
-    faces = []
-    for ring in (0, size):
-        a, b, c, d = ring + k, ring + after, ring + size + after, ring + size + k
-        faces += [np.stack([a, b, c], -1), np.stack([a, c, d], -1)]
-    faces.append(np.stack([2 * size + k, 2 * size + after, np.full(size, 3 * size)], -1))
-    return np.concatenate(faces)
 
 
 def mouth_loop(faces: np.ndarray, name: str) -> np.ndarray:

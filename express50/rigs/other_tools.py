@@ -416,7 +416,13 @@ def read_renderme(path: Path) -> dict[str, Camera]:
                 f"{path}: has no Calibration group; use the anno file of the same performance"
                 f" ({path.name.replace('_raw', '_anno')})"
             )
-        size = _smc_size(path, file)
+        pictures = child(file, "Camera")
+        size = np.array((2048, 2448))  # height and width of the release's pictures
+        if isinstance(pictures, h5py.Group):
+            size = attribute(pictures, "resolution", size)
+        if size.shape != (2,) or size.dtype.kind not in "ui":
+            raise CalibrationError(f"{path}: resolution {size.tolist()}, expected height and width")
+        height, width = map(int, size)
         found = {}
         for name in members(group):
             if not name.isdecimal() or len(name) > 4:
@@ -431,19 +437,8 @@ def read_renderme(path: Path) -> dict[str, Camera]:
                 raise CalibrationError(f"{path}: RT of camera {name} cannot be inverted")
             camera_id = f"cam{int(name):02d}"
             found[camera_id] = camera_from_K(
-                camera_id, K_from_opencv(K), dist[:14], size, np.linalg.inv(pose)
+                camera_id, K_from_opencv(K), dist[:14], (width, height), np.linalg.inv(pose)
             )
     except CaptureError as error:
         raise CalibrationError(str(error)) from None
     return checked(found, path)
-
-
-def _smc_size(path: Path, file: h5py.File) -> tuple[int, int]:
-    """Read the size, stored as height and width; return width and height, or the release's size."""
-    group = child(file, "Camera")
-    size = np.array((2048, 2448))
-    if isinstance(group, h5py.Group):
-        size = attribute(group, "resolution", size)
-    if size.shape != (2,) or size.dtype.kind not in "ui":
-        raise CalibrationError(f"{path}: resolution {size.tolist()}, expected height and width")
-    return int(size[1]), int(size[0])

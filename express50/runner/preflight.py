@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from rich.filesize import decimal
 from express50.console import count, not_writable
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
-from express50.errors import ConfigError, Express50Error, FormatError, StageError, few
+from express50.errors import ConfigError, Express50Error, FormatError, few
 from express50.files.atomic import LEAST_FREE, check_folder_writable, free_space, nearest_existing
 from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger
@@ -35,11 +35,13 @@ def problems(
     chosen = [stage for stage, _ in work]
     yield from _folder_problems(dataset, chosen)
     for stage, config in work:
-        try:
-            stage.try_files(config)
-        except Express50Error as error:
-            yield str(error)
-    yield from _worker_problems(work, pool)
+        yield from _refusal(stage.try_files, config)
+    if unreachable := _refusal(pool.reach):
+        yield from unreachable
+    else:
+        for stage, config in work:
+            if stage.needs_gpu(config):
+                yield from _refusal(pool.check_gpu, stage.name)
     needs = []
     with suppress(FormatError):  # a damaged ledger: the first stage reports it
         if dataset.ledger.is_file():
@@ -69,18 +71,13 @@ def _folder_problems(dataset: Dataset, stages: Iterable[Stage]) -> Iterator[str]
         yield not_writable(few(folders), first)
 
 
-def _worker_problems(work: Sequence[tuple[Stage, Any]], pool: Pool) -> Iterator[str]:
+def _refusal(check: Callable[..., object], *args: object) -> list[str]:
+    """Call a check; return the line with which it refuses, if it does."""
     try:
-        pool.reach()
-    except StageError as error:
-        yield str(error)
-        return
-    for stage, config in work:
-        if stage.needs_gpu(config):
-            try:
-                pool.check_gpu(stage.name)
-            except StageError as error:
-                yield str(error)
+        check(*args)
+    except Express50Error as error:
+        return [str(error)]
+    return []
 
 
 def _memory_problems(ledger: Ledger, stages: Iterable[Stage], pool: Pool) -> Iterator[str]:

@@ -187,7 +187,12 @@ def run_stage(
         if not path.is_file() or path.read_bytes() != data:
             write_bytes(path, data)
         if items is None:
-            _set_aside_gone(stage, dataset, chosen, ledger, progress)
+            gone = sorted(set(ledger.read(stage.name)) - set(chosen))
+            aside = [item for item in gone if _retire(dataset, ledger, stage.name, item)]
+            if aside and progress:
+                words = f"{count_of(len(aside), 'item')} ({few(aside)})"
+                write(f"{stage.name}: set aside {words}, which the dataset no longer has")
+            ledger.forget(stage.name, gone)
         with RunLog(dataset.ledger, stage.name, len(chosen)) as log:
             if shortage := expected_shortage(dataset, ledger, stage.name, chosen):
                 raise NotReadyError(shortage)
@@ -201,18 +206,6 @@ def run_stage(
         raise StageError(f"{stage.name}: the outcome of {names} is unknown; run it again")
     seconds = time.perf_counter() - started
     return Summary(stage.name, tuple(outcomes[item] for item in chosen), seconds)
-
-
-def _set_aside_gone(
-    stage: Stage, dataset: Dataset, chosen: list[str], ledger: Ledger, progress: bool
-) -> None:
-    """Set aside the outputs of items that no longer exist, and say so."""
-    gone = sorted(set(ledger.read(stage.name)) - set(chosen))
-    aside = [item for item in gone if _retire(dataset, ledger, stage.name, item)]
-    if aside and progress:
-        items = f"{count_of(len(aside), 'item')} ({few(aside)})"
-        write(f"{stage.name}: set aside {items}, which the dataset no longer has")
-    ledger.forget(stage.name, gone)
 
 
 @dataclass(frozen=True)
@@ -266,16 +259,12 @@ def _sort_items(
         if imported is not None:
             work.again[item] = "its import is gone"
     ledger.keep_digests()
-    _refuse_all_unreadable(stage, work.unreadable, len(chosen))
-    return work
-
-
-def _refuse_all_unreadable(stage: Stage, unreadable: list[Receipt], count: int) -> None:
-    """Raise StageError if one reason keeps all items from being made: former outputs then stay."""
-    reasons = {receipt.reason for receipt in unreadable}
-    made_here = not any(receipt.imported for receipt in unreadable)  # imports have no settings
-    if len(unreadable) == count > 1 and len(reasons) == 1 and made_here:
+    reasons = {receipt.reason for receipt in work.unreadable}
+    made_here = not any(receipt.imported for receipt in work.unreadable)  # imports have no settings
+    if len(work.unreadable) == len(chosen) > 1 and len(reasons) == 1 and made_here:
+        # Former outputs then stay.
         raise StageError(f"{stage.name}: no item can be made: {reasons.pop()}")
+    return work
 
 
 def _compare(task: Task, former: Receipt, made: Made | None, ledger: Ledger, work: _Work) -> None:

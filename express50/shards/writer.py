@@ -125,10 +125,15 @@ class ShardWriter:
             if sample.key in self._keys:
                 raise FormatError(f"key {sample.key} appears twice; rename a subject or expression")
             self._keys.add(sample.key)
-            pieces, members = _tar_members(sample, file.tell())
+            pieces, places, offset = [], {}, file.tell()
+            for name, data in sorted(sample.members.items()):
+                header = tar_header(f"{sample.key}.{name}", len(data))
+                pieces += [header, data, bytes(-len(data) % BLOCK)]
+                places[name] = [offset + BLOCK, len(data), crc32(data)]
+                offset += BLOCK + _padded(len(data))
             self._write(file, b"".join(pieces))
             ids = ("key", "subject", "expression", "camera")
-            row = {name: getattr(sample, name) for name in ids} | {"members": members}
+            row = {name: getattr(sample, name) for name in ids} | {"members": places}
             self._shards[-1]["samples"].append(row)
 
     def close(self) -> None:
@@ -169,17 +174,6 @@ def _write_index(root: Path, shards: Sequence[dict]) -> None:
     index = {"schema": SCHEMA, "shards": shards}
     text = json.dumps(index, separators=(",", ":"), sort_keys=True, allow_nan=False)
     (root / "index.json").write_text(text + "\n", encoding="utf-8")
-
-
-def _tar_members(sample: PackedSample, start: int) -> tuple[list[bytes], dict[str, list[int]]]:
-    """Return a sample's bytes in a tar, from ``start``; and each member's offset, size, CRC-32."""
-    pieces, places, offset = [], {}, start
-    for name, data in sorted(sample.members.items()):
-        header, padding = tar_header(f"{sample.key}.{name}", len(data)), bytes(-len(data) % BLOCK)
-        pieces += [header, data, padding]
-        places[name] = [offset + BLOCK, len(data), crc32(data)]
-        offset += BLOCK + _padded(len(data))
-    return pieces, places
 
 
 def tar_header(name: str, size: int) -> bytes:
@@ -253,7 +247,16 @@ def verify(root: Path) -> list[str]:
     root = Path(root)
     if not root.is_dir():
         return [f"{root}: {no_folder(root)}; name the folder that 'pack' wrote"]
-    faults = _manifest_faults(root)
+    expected, faults = dict[str, str](), list[str]()
+    try:
+        expected = _manifest_digests(root)
+    except FormatError as error:
+        faults.append(str(error))
+    for name, digest in sorted(expected.items()):
+        if not NAME.fullmatch(name) or not (root / name).is_file():
+            faults.append(f"{root / name}: is missing or outside the folder")
+        elif file_sha256(root / name) != digest:
+            faults.append(f"{root / name}: SHA-256 differs from the manifest's {digest[:12]}...")
     try:
         reader = ShardReader(root)
     except FormatError as error:
@@ -294,20 +297,6 @@ def _manifest_digests(root: Path) -> dict[str, str]:
         raise FormatError(f"{path}: malformed ({error}); {AGAIN}") from None
 
 
-def _manifest_faults(root: Path) -> list[str]:
-    try:
-        expected = _manifest_digests(root)
-    except FormatError as error:
-        return [str(error)]
-    faults = []
-    for name, digest in sorted(expected.items()):
-        if not NAME.fullmatch(name) or not (root / name).is_file():
-            faults.append(f"{root / name}: is missing or outside the folder")
-        elif file_sha256(root / name) != digest:
-            faults.append(f"{root / name}: SHA-256 differs from the manifest's {digest[:12]}...")
-    return faults
-
-
 def copy_samples(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> int:
     """Write all samples of several readers into the folder `out`; return how many.
 
@@ -342,7 +331,12 @@ def copy_samples(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> in
             writer.add_group(splits[subject], samples)
         writer.close()
         write_json(aside / "splits.json", names | {"chosen_by": "the shards these are made of"})
-        _write_card(readers, aside)
+        # The sources' cards follow one another, so that consent and licence are kept.
+        cards = [reader.root / "card.md" for reader in readers]
+        texts = [card.read_text("utf-8") if card.is_file() else "(no card)\n" for card in cards]
+        title = f"# {count(samples_in_all, 'sample')} of {count(len(readers), 'folder')} of shards"
+        text = f"{title}\n\nTheir cards, as they were:\n\n" + "\n".join(texts)
+        (aside / "card.md").write_text(text, encoding="utf-8")
         write_manifest(aside, writer.digests)
         if out.exists():
             out.rmdir()  # fails if somebody has filled the folder meanwhile
@@ -396,15 +390,3 @@ def _copy_subject_files(reader: ShardReader, subject: str, out: Path) -> None:
                 " one run"
             )
         shutil.copyfile(source, target)
-
-
-def _write_card(readers: Sequence[ShardReader], out: Path) -> None:
-    """Write the sources' cards one after the other, so that consent and licence are kept."""
-    parts = []
-    for reader in readers:
-        card = reader.root / "card.md"
-        parts.append(card.read_text(encoding="utf-8") if card.is_file() else "(no card)\n")
-    samples = count(len({entry.key for reader in readers for entry in reader.entries}), "sample")
-    folders = count(len(readers), "folder")
-    text = f"# {samples} of {folders} of shards\n\nTheir cards, as they were:\n\n"
-    (out / "card.md").write_text(text + "\n".join(parts), encoding="utf-8")

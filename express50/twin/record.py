@@ -111,8 +111,20 @@ def record(
     Raises:
         CaptureError: ``out`` holds a recording with other settings.
     """
-    select(config.expressions)
-    _check_settings(config, out)
+    script = select(config.expressions)
+    path = out / "twin.json"
+    settings = {k: v for k, v in asdict(config).items() if k not in ("subjects", "first_subject")}
+    now = json.loads(dump_json(settings))
+    # Else nothing was recorded with the stored settings. Captures may have been moved elsewhere.
+    begun = any(path for name in ("captures", "truth") for path in (out / name).glob("*"))
+    former = json.loads(path.read_bytes()) if begun and path.is_file() else now
+    changed = sorted(k for k in now | former if former.get(k) != now.get(k))
+    if changed:
+        raise CaptureError(
+            f"{out}: holds a recording with other settings ({', '.join(changed)} differ);"
+            " record into another folder or delete this one"
+        )
+    write_json(path, now)
     ids = [f"S{config.first_subject + n:03d}" for n in range(config.subjects)]
     missing = [s for s in ids if not (out / "captures" / s).is_dir()]
     if not missing:
@@ -128,7 +140,7 @@ def record(
     if config.board_frames:
         shares = [list(range(k, config.cameras, workers)) for k in range(workers)]
         tasks += [("", share) for share in shares if share]
-    frames = len(select(config.expressions)) * config.frames_per_expression
+    frames = len(script) * config.frames_per_expression
     total = config.cameras * (len(missing) * frames + config.board_frames)
     _run(config, staging, tasks, workers, lambda done: report(done, total) if report else None)
     for subject in missing:
@@ -220,23 +232,6 @@ def _publish(config: TwinConfig, subject: str, staging: Path, out: Path) -> None
         target.mkdir(parents=True, exist_ok=True)
         shutil.rmtree(target / subject, ignore_errors=True)
         source.rename(target / subject)
-
-
-def _check_settings(config: TwinConfig, out: Path) -> None:
-    """Store a recording's settings; raise CaptureError if it was begun with other ones."""
-    path = out / "twin.json"
-    settings = {k: v for k, v in asdict(config).items() if k not in ("subjects", "first_subject")}
-    now = json.loads(dump_json(settings))
-    # Else nothing was recorded with the stored settings. Captures may have been moved elsewhere.
-    begun = any(path for name in ("captures", "truth") for path in (out / name).glob("*"))
-    former = json.loads(path.read_bytes()) if begun and path.is_file() else now
-    changed = sorted(k for k in now | former if former.get(k) != now.get(k))
-    if changed:
-        raise CaptureError(
-            f"{out}: holds a recording with other settings ({', '.join(changed)} differ);"
-            " record into another folder or delete this one"
-        )
-    write_json(path, now)
 
 
 def print_progress() -> Callable[[int, int], None]:

@@ -172,23 +172,17 @@ def _hairiness(
         ends = smoothstep(along, -0.10, 0.02) * smoothstep(along, 1.10, 0.92)
         cover = np.maximum(cover, look.brow_density * body_of_brow * ends)
     if look.stubble > 0:
-        cover = np.maximum(cover, look.stubble * _beard(marks, points, masks, lattices))
+        mouth, chin, nose = marks[[48, 54]].mean(0), marks[8], marks[33]
+        below = smoothstep(points[:, 1], nose[1] - 0.001, nose[1] - 0.012)
+        jaw = smoothstep(points[:, 1], chin[1] - 0.035, chin[1] - 0.005)
+        cheek = np.abs(points[:, 0] - mouth[0]) / 0.06
+        edge = smoothstep(points[:, 1] - (mouth[1] + 0.05 * (cheek - 0.75)), 0.02, -0.004)
+        front = smoothstep(points[:, 2], mouth[2] - 0.10, mouth[2] - 0.06)
+        upper = np.exp(-(((points - (nose + marks[51]) / 2) / (0.022, 0.009, 0.03)) ** 2).sum(1))
+        dots = smoothstep(noise(points / 0.0011, lattices[2]), -0.1, 0.5)
+        area = below * jaw * front * np.maximum(edge, 1.3 * upper) * (1 - masks["lips"])
+        beard = np.clip(area, 0, 1) * (0.30 + 0.35 * dots)
+        cover = np.maximum(cover, look.stubble * beard)
     if look.hair_length_m > 0 and len(body.extras.hair.vertices):
         cover = np.maximum(cover, 0.85 * masks["scalp"])
     return np.clip(cover, 0.0, 1.0)
-
-
-def _beard(
-    marks: np.ndarray, points: np.ndarray, masks: dict[str, np.ndarray], lattices: list[np.ndarray]
-) -> np.ndarray:
-    """Return the density of stubble (N,), as dots."""
-    mouth, chin, nose = marks[[48, 54]].mean(0), marks[8], marks[33]
-    below = smoothstep(points[:, 1], nose[1] - 0.001, nose[1] - 0.012)
-    jaw = smoothstep(points[:, 1], chin[1] - 0.035, chin[1] - 0.005)
-    cheek = np.abs(points[:, 0] - mouth[0]) / 0.06
-    line = smoothstep(points[:, 1] - (mouth[1] + 0.05 * (cheek - 0.75)), 0.02, -0.004)
-    front = smoothstep(points[:, 2], mouth[2] - 0.10, mouth[2] - 0.06)
-    upper = np.exp(-(((points - (nose + marks[51]) / 2) / (0.022, 0.009, 0.03)) ** 2).sum(1))
-    dots = smoothstep(noise(points / 0.0011, lattices[2]), -0.1, 0.5)
-    area = below * jaw * front * np.maximum(line, 1.3 * upper) * (1 - masks["lips"])
-    return np.clip(area, 0, 1) * (0.30 + 0.35 * dots)

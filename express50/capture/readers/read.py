@@ -28,7 +28,6 @@ from express50.capture.readers.selection import Selection, folder_id, parse_sele
 from express50.contract.layout import Dataset, footage_source
 from express50.errors import CalibrationError, CaptureError, Express50Error, check_known, few
 from express50.files.text import check_links
-from express50.geometry.cameras import Camera
 from express50.rigs.world_frame import judge
 
 OURS = "express50"
@@ -147,7 +146,10 @@ def _why_none_fits(path: Path, name: object, part: str | None) -> str:
             " they are people, cameras, expressions or frames; give each folder by itself if it is"
             f" a person, or else write 'layout' into a capture.toml beside them (one of {layouts})"
         )
-    if found := _deeper(path):
+    # The first folder below, up to two deep, that is a rig by itself.
+    rigs = [layout for layout in LAYOUTS if layout.name not in ("photos", "video")]
+    inner = (p for depth in ("*", "*/*") for p in sorted(filter(is_data_folder, path.glob(depth))))
+    if found := next(((p, rig) for p in inner for rig in rigs if rig.fits(p)), None):
         return (
             f"{path}: no known layout, but {found[0]} has one ({found[1].looks}); give that folder,"
             " and others like it"
@@ -158,17 +160,6 @@ def _why_none_fits(path: Path, name: object, part: str | None) -> str:
         f"of: {looks}; {OURS}: capture.toml and cameras/"
         + hint_at_undeveloped([path, *path.glob("*"), *path.glob("*/*")])
     )
-
-
-def _deeper(path: Path) -> tuple[Path, Layout] | None:
-    """Find the first folder below, up to two deep, that is a rig by itself."""
-    rigs = [layout for layout in LAYOUTS if layout.name not in ("photos", "video")]
-    for depth in ("*", "*/*"):
-        for below in sorted(filter(is_data_folder, path.glob(depth))):
-            for layout in rigs:
-                if layout.fits(below):
-                    return below, layout
-    return None
 
 
 def is_capture(path: Path) -> bool:
@@ -229,6 +220,14 @@ def read_any(path: Path) -> RawCapture:
             " own id in [expressions] of capture.toml"
         )
     calibration = {k: c for k, c in (raw.calibration or {}).items() if k in raw.cameras}
+    warnings = dict(raw.warnings)
+    if calibration:
+        verdict = judge(calibration)
+        if verdict.problem:
+            remedy = verdict.remedy or "check the calibration"
+            raise CalibrationError(f"{path}: {verdict.problem}; {remedy}")
+        if verdict.warnings:
+            warnings["cameras"] = "; ".join(verdict.warnings)
     return replace(
         raw,
         subject=subject,
@@ -236,20 +235,8 @@ def read_any(path: Path) -> RawCapture:
         meta=raw.meta | given | described,
         layout=layout.name,
         calibration=calibration or None,
-        warnings=raw.warnings | _check_rig(path, calibration),
+        warnings=warnings,
     )
-
-
-def _check_rig(path: Path, calibration: dict[str, Camera]) -> dict[str, str]:
-    """Return what is odd about the cameras; refuse those that do not look at one place."""
-    if not calibration:
-        return {}
-    verdict = judge(calibration)
-    if verdict.problem:
-        raise CalibrationError(
-            f"{path}: {verdict.problem}; {verdict.remedy or 'check the calibration'}"
-        )
-    return {"cameras": "; ".join(verdict.warnings)} if verdict.warnings else {}
 
 
 def watched(path: Path) -> list[Path]:

@@ -96,9 +96,20 @@ def random_head(
     with torch.no_grad():
         vertices = pose(model, **draw)
     vertices = torch.from_numpy(deform(vertices[0].numpy(), rng))[None]
-    canvas, brows = _move_brows(model, Canvas.of(model), rng)
+    canvas = Canvas.of(model)
+    marks = canvas.marks.copy()
+    # People's brows lie differently on the bone, so the detector must learn to see the hairs.
+    brows = marks[BROWS]
+    outwards = np.sign(brows[:, 0])
+    along = (np.abs(brows[:, 0]) - np.abs(brows[:, 0]).min()) / np.ptp(np.abs(brows[:, 0]))
+    brows[:, 0] += outwards * (rng.normal() * 0.002 + along * rng.normal() * 0.003)
+    brows[:, 1] += rng.normal() * 0.004 + (along - 0.5) * rng.normal() * 0.004
+    brows[:, 1] += outwards * rng.normal() * 0.0007
+    places = closest_places(model, brows)
+    marks[BROWS] = place_points(model, places)
+    canvas = replace(canvas, marks=marks)
     points = landmarks(model, vertices)[0].numpy()
-    points[BROWS] = place_points(model, brows, vertices[0].numpy())
+    points[BROWS] = place_points(model, places, vertices[0].numpy())
     # Inner lips that passed through each other are put where they meet.
     upper, lower = (list(ids) for ids in INNER_LIPS)
     through = (points[upper] - points[lower]) @ (points[27] - points[8]) < 0
@@ -114,23 +125,6 @@ def random_head(
         normals = vertex_normals(vertices, model.faces)
     gloss = float(rng.uniform(0.0, 0.5))
     return RandomHead(vertices[0].numpy(), normals[0].numpy(), skin, points, canvas, look, gloss)
-
-
-def _move_brows(model: HeadModel, canvas: Canvas, rng: Rng) -> tuple[Canvas, Places]:
-    """Move the brows of a canvas; also return the places of their landmarks, on the hairs.
-
-    People's brows lie differently on the bone, so the detector must learn to see the hairs.
-    """
-    brows = canvas.marks[BROWS].copy()
-    outwards = np.sign(brows[:, 0])
-    along = (np.abs(brows[:, 0]) - np.abs(brows[:, 0]).min()) / np.ptp(np.abs(brows[:, 0]))
-    brows[:, 0] += outwards * (rng.normal() * 0.002 + along * rng.normal() * 0.003)
-    brows[:, 1] += rng.normal() * 0.004 + (along - 0.5) * rng.normal() * 0.004
-    brows[:, 1] += outwards * rng.normal() * 0.0007
-    places = closest_places(model, brows)
-    marks = canvas.marks.copy()
-    marks[BROWS] = place_points(model, places)
-    return replace(canvas, marks=marks), places
 
 
 def waves(points: np.ndarray, rng: Rng, count: int, low: float, high: float) -> np.ndarray:
