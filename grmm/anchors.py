@@ -48,8 +48,13 @@ def make_anchors(head: HeadModel, n_g: int, mouth: bool = True) -> Anchors:
     width = size[face, 0]
     column, row = low[face, 0] + offset % width, low[face, 1] + offset // width
     centre = cell_to_corner(torch.stack([column, row], -1).double())
-    weights = _barycentrics(grid[face], centre)
-    inside = (weights >= 0).all(1)
+    a, b, c = grid[face].unbind(1)
+    ab, ac, ap = b - a, c - a, centre - a
+    area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
+    v = (ap[:, 0] * ac[:, 1] - ap[:, 1] * ac[:, 0]) / area
+    w = (ab[:, 0] * ap[:, 1] - ab[:, 1] * ap[:, 0]) / area
+    weights = torch.stack([1 - v - w, v, w], 1)
+    inside = (area.abs() >= NEEDLE_AREA) & (weights >= 0).all(1)
     if not mouth:
         solid = (head.regions["teeth"] | head.regions["tongue"])[head.faces].any(1)
         hollow = head.regions["mouth_interior"][head.faces].all(1)
@@ -66,19 +71,6 @@ def make_anchors(head: HeadModel, n_g: int, mouth: bool = True) -> Anchors:
         faces=face[inside][first],
         barycentrics=weights[inside][first].float(),
     )
-
-
-def _barycentrics(corners: Tensor, points: Tensor) -> Tensor:
-    """Compute barycentrics (M, 3) of points (M, 2) in triangles (M, 3, 2); -1 without area."""
-    a, b, c = corners.unbind(1)
-    ab, ac, ap = b - a, c - a, points - a
-    area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
-    flat = area.abs() < NEEDLE_AREA
-    safe = torch.where(flat, torch.ones_like(area), area)
-    v = (ap[:, 0] * ac[:, 1] - ap[:, 1] * ac[:, 0]) / safe
-    w = (ab[:, 0] * ap[:, 1] - ab[:, 1] * ap[:, 0]) / safe
-    weights = torch.stack([1 - v - w, v, w], 1)
-    return torch.where(flat[:, None], torch.full_like(weights, -1.0), weights)
 
 
 def uv_gradients(head: HeadModel) -> Tensor:

@@ -68,7 +68,13 @@ class Recorded(Generic[Result]):
                 return function(*values)
             recording = known[key]
             if recording is None:
-                recording = known[key] = _recording(function, values)
+                try:
+                    recording = _record(function, values)
+                except RuntimeError as error:  # torch's: too little memory, unsupported operations
+                    why = str(error).splitlines()[0]
+                    log(f"drawing is slower, because the GPU cannot record it: {why}")
+                    recording = PLAIN
+                known[key] = recording
             if recording is PLAIN:
                 return function(*values)
             for mine, value in zip(recording.inputs, values, strict=True):
@@ -87,17 +93,6 @@ class Recorded(Generic[Result]):
 def _can_record(values: Sequence[Tensor | float]) -> bool:
     """Say whether the tensors are on a GPU and no gradient is wanted."""
     return not torch.is_grad_enabled() and all(v.is_cuda for v in values if isinstance(v, Tensor))
-
-
-def _recording(
-    function: Callable[..., Result], values: Sequence[Tensor | float]
-) -> _Recording[Any]:
-    """Record a function, or return PLAIN where the GPU cannot: it costs speed alone."""
-    try:
-        return _record(function, values)
-    except RuntimeError as error:  # torch's, for too little memory and for unsupported operations
-        log(f"drawing is slower, because the GPU cannot record it: {str(error).splitlines()[0]}")
-        return PLAIN
 
 
 def _record(

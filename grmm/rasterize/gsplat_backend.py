@@ -145,38 +145,31 @@ def _tiles(gsplat: Any, splats: Projection, width: int, height: int) -> tuple[Te
 def _median_ray_length(
     gsplat: Any, splats: Projection, tiles: tuple[Tensor, Tensor], width: int, height: int
 ) -> Tensor:
-    """Return each pixel's ray length (H, W) where the transmittance passes one half.
+    """Return each pixel's ray length (H, W) where the transmittance falls through one half.
 
     gsplat's kernels do not report it, but list all pairs of Gaussian and pixel in order.
     """
-    gaussians, pixels = _crossings(gsplat, splats, tiles, width, height)
-    length, slopes = splats.planes[gaussians, 0], splats.planes[gaussians, 1:]
-    length = length + (slopes * pair_offsets(splats, gaussians, pixels, width)).sum(1)
-    empty = length.new_zeros(height * width)
-    return empty.index_put((pixels,), length).reshape(height, width)
-
-
-@torch.no_grad()
-def _crossings(
-    gsplat: Any, splats: Projection, tiles: tuple[Tensor, Tensor], width: int, height: int
-) -> tuple[Tensor, Tensor]:
-    """Find Gaussian and pixel numbers (P,) where the transmittance falls through one half."""
     offsets, ids = tiles
     ends = torch.cat([offsets.flatten()[1:], offsets.new_tensor([len(ids)])])
     batches = -(-int((ends - offsets.flatten()).max()) // TILE**2)
     through = splats.means2d.new_ones(1, height, width)
-    gaussians, pixels, _ = gsplat.rasterize_to_indices_in_range(
-        0, batches, through, splats.means2d[None], splats.conics[None].contiguous(),
-        splats.opacities[None], width, height, TILE, offsets, ids,
-    )  # fmt: skip
-    alphas = pair_alphas(splats, gaussians, pixels, width)
+    with torch.no_grad():
+        gaussians, pixels, _ = gsplat.rasterize_to_indices_in_range(
+            0, batches, through, splats.means2d[None], splats.conics[None].contiguous(),
+            splats.opacities[None], width, height, TILE, offsets, ids,
+        )  # fmt: skip
+        alphas = pair_alphas(splats, gaussians, pixels, width).double()
     # One running sum of logarithms over all pixels; float64 keeps its end as exact as its start.
-    logs = torch.log1p(-alphas.double())
+    logs = torch.log1p(-alphas)
     after = torch.cumsum(logs, 0)
     first = torch.searchsorted(pixels, pixels)
     after = torch.exp(after - (after - logs)[first])
-    before = after / (1.0 - alphas.double())
+    before = after / (1.0 - alphas)
     # Rounding may show two Gaussians at the half; the first of them is the one.
     crosses = ((before > 0.5) & (after <= 0.5)).nonzero()[:, 0]
     crosses = crosses[torch.cat([crosses.new_ones(1), pixels[crosses].diff()])[: len(crosses)] > 0]
-    return gaussians[crosses], pixels[crosses]
+    gaussians, pixels = gaussians[crosses], pixels[crosses]
+    length, slopes = splats.planes[gaussians, 0], splats.planes[gaussians, 1:]
+    length = length + (slopes * pair_offsets(splats, gaussians, pixels, width)).sum(1)
+    empty = length.new_zeros(height * width)
+    return empty.index_put((pixels,), length).reshape(height, width)

@@ -166,10 +166,8 @@ def board_poses(view: BoardView) -> list[np.ndarray]:
         refined = cv2.solvePnPRefineLM(centred, view.ideal, eye, None, rotation, translation)
         pose = make_transform(cv2.Rodrigues(refined[0])[0], refined[1].ravel())
         pose[:3, 3] -= pose[:3, :3] @ middle
-        placed = transform_points(pose, view.points)
-        if np.isfinite(placed).all() and placed[:, 2].min() > 0:
-            error = placed[:, :2] / placed[:, 2:] - view.ideal
-            found.append((float(np.sqrt(np.mean(error**2))), pose))
+        if (errors := _view_errors(pose, view)) is not None:
+            found.append((float(np.sqrt(np.mean(errors**2))), pose))
     found.sort(key=lambda item: item[0])
     limit = 2.5 * max(found[0][0], 1e-6) if found else 0.0
     return [pose for error, pose in found if error <= limit]
@@ -309,20 +307,20 @@ def rig_from_boards(
         rig_from_cam = {name: invert_transform(cam_from_rig[name]) for name in seen}
         lowest = float("inf")
         for candidate in [rig_from_cam[n] @ pose for n in seen for pose in poses[n][frame]]:
-            errors = [
-                _view_error(cam_from_rig[n] @ candidate, views[n][frame]) * cameras[n].K[0, 0]
-                for n in seen
-            ]
+            errors = []
+            for n in seen:
+                misses = _view_errors(cam_from_rig[n] @ candidate, views[n][frame])
+                size = np.inf if misses is None else np.sqrt(np.mean(np.sum(misses**2, axis=1)))
+                errors.append(size * cameras[n].K[0, 0])
             error = float(np.median(errors))  # one bad camera must not choose the pose of all
             if error < lowest:
                 boards[frame], lowest = candidate, error
     return boards
 
 
-def _view_error(cam_from_board: np.ndarray, view: BoardView) -> float:
-    """Return a view's rms error under a pose, normalised; infinite behind the camera."""
+def _view_errors(cam_from_board: np.ndarray, view: BoardView) -> np.ndarray | None:
+    """Return a view's errors (K, 2) under a pose, normalised; None if it is behind the camera."""
     placed = transform_points(cam_from_board, view.points)
-    if placed[:, 2].min() <= 0:
-        return float("inf")
-    error = placed[:, :2] / placed[:, 2:] - view.ideal
-    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+    if not np.isfinite(placed).all() or placed[:, 2].min() <= 0:
+        return None
+    return placed[:, :2] / placed[:, 2:] - view.ideal

@@ -172,19 +172,10 @@ def _judge_faces(
     tracks = join_tracks(cameras, faces, 1.0, verified=False)
     if len(np.unique(tracks.camera)) < 3:
         return cameras, (), ""
-    cameras, pairs = _find_exchanged(cameras, tracks)
-    cameras, size = _judge_size(cameras, tracks)
-    return cameras, pairs, size
-
-
-def _find_exchanged(
-    cameras: dict[str, Camera], tracks: PointTracks
-) -> tuple[dict[str, Camera], tuple[tuple[str, str], ...]]:
-    """Exchange pairs of cameras while that explains most of the error; return cameras and pairs."""
     showing = [tracks.names[i] for i in np.unique(tracks.camera)]
     error, _ = _fit_faces(cameras, tracks)
     pairs: list[tuple[str, str]] = []
-    while error > ODD_FACES:
+    while error > ODD_FACES:  # exchange pairs while that explains most of the error
         tried = {
             (min(a, b), max(a, b)): {
                 **cameras,
@@ -203,7 +194,8 @@ def _find_exchanged(
             break
         cameras, error = tried[best], errors[best]
         pairs.append(best)
-    return cameras, tuple(pairs)
+    cameras, size = _judge_size(cameras, tracks)
+    return cameras, tuple(pairs), size
 
 
 def _judge_size(cameras: dict[str, Camera], tracks: PointTracks) -> tuple[dict[str, Camera], str]:

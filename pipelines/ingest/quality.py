@@ -250,8 +250,8 @@ def _lags_of_clip(
         spread = max(float(np.median(misses)), LEAST_SPREAD)
         gains = {}
         for name in left:
-            path, gain = _likeliest_lags(left[name], rest[name], reach, spread)
-            if _correlation(left[name], rest[name], path) >= ALIKE:
+            path, gain, correlation = _likeliest_lags(left[name], rest[name], reach, spread)
+            if correlation >= ALIKE:
                 alike.add(name)
                 if path.any():
                     gains[name] = gain, path
@@ -267,8 +267,11 @@ def _lags_of_clip(
 
 def _likeliest_lags(
     curve: np.ndarray, rest: np.ndarray, reach: int, spread: float
-) -> tuple[np.ndarray, float]:
-    """Return the likeliest lag (F,) of each frame, and its log likelihood over no lag at all."""
+) -> tuple[np.ndarray, float, float]:
+    """Return the likeliest lag (F,) of each frame, and its log likelihood over no lag at all.
+
+    The correlation of the curve with that of the others along these lags comes third.
+    """
     count = len(curve)
     lags = np.arange(-reach, reach + 1)
     at = np.arange(count)[:, None] + lags
@@ -293,17 +296,11 @@ def _likeliest_lags(
     for t in range(count - 1, -1, -1):
         path[t] = lags[state]
         state = int(came[t, state])
-    return path, gain
-
-
-def _correlation(curve: np.ndarray, rest: np.ndarray, path: np.ndarray) -> float:
-    """Return the correlation of a curve with that of the others along a path of lags."""
-    at = np.arange(len(curve)) + path
-    inside = (at >= 1) & (at < len(curve))
+    at = np.arange(count) + path
+    inside = (at >= 1) & (at < count)
     a, b = curve[inside], rest[at[inside]]
-    if len(a) < FEWEST_FRAMES // 2 or a.std() < 1e-9 or b.std() < 1e-9:
-        return 0.0
-    return float(np.corrcoef(a, b)[0, 1])
+    flat = len(a) < FEWEST_FRAMES // 2 or a.std() < 1e-9 or b.std() < 1e-9
+    return path, gain, 0.0 if flat else float(np.corrcoef(a, b)[0, 1])
 
 
 def describe_steps(steps: Sequence[Step]) -> str:

@@ -209,7 +209,11 @@ def make_photo_capture(
     _write_footage(picture, folder / "cameras" / CAMERA)
     camera = single_camera(CAMERA, width, height, focal.pixels)
     write_bytes(folder / "calibration.json", dump_json(camera_rows({CAMERA: camera})))
-    write_bytes(folder / "cues.csv", _cues(frames, windows).encode())
+    edges = np.unique(np.linspace(0, frames, min(windows, frames) + 1).round().astype(int))
+    names = [f"clip_{n:02d}" for n in range(len(edges) - 1)] if frames > 1 else ["photo"]
+    rows = zip(names, edges[:-1], edges[1:] - 1, strict=True)
+    cues = "".join(f"{name},{first},{last}\n" for name, first, last in rows)
+    write_bytes(folder / "cues.csv", f"expression_id,start_frame,end_frame\n{cues}".encode())
     # A face is found in windows up to three times as large, so it may shrink to a third.
     sides = [face_box(f.points)[1] / max(width, height) for f in faces if f.score >= FOUND_SCORE]
     large = picture.video and bool(sides)
@@ -229,18 +233,6 @@ def _check_folder(folder: Path, picture: Path, digest: str) -> None:
         raise CaptureError(
             f"{picture}: {folder} {other}; name this one with --subject, or remove that folder"
         )
-
-
-def _cues(frames: int, windows: int) -> str:
-    """Return the text of cues.csv: one frame is `photo`, more are cut into windows."""
-    rows = ["expression_id,start_frame,end_frame"]
-    if frames == 1:
-        rows.append("photo,0,0")
-    else:
-        edges = np.unique(np.linspace(0, frames, min(windows, frames) + 1).round().astype(int))
-        pairs = zip(edges[:-1], edges[1:], strict=True)
-        rows += [f"clip_{n:02d},{a},{b - 1}" for n, (a, b) in enumerate(pairs)]
-    return "\n".join(rows) + "\n"
 
 
 def find_faces(path: Path, images: list[np.ndarray], config: TrackConfig) -> list[Detection]:
