@@ -37,7 +37,7 @@ from express50.console import count
 from express50.contract.layout import Dataset
 from express50.errors import AnnotationError, check_known
 from express50.files.atomic import write_bytes
-from express50.files.text import NAME, parse_json, read_text
+from express50.files.text import NAME, csv_table, parse_json, read_text
 
 LARGEST = 2**63
 _FORMULA = re.compile(r"'*[=+\-@\t\r]")  # quotes before it too, so that reading is exact
@@ -65,7 +65,7 @@ def export_labels(labels: Iterable[Label], path: Path, stored: Collection[Label]
     rows = [asdict(label) for label in labels]
     path.parent.mkdir(parents=True, exist_ok=True)
     text = io.StringIO(newline="")
-    if path.suffix == ".json":
+    if path.suffix.lower() == ".json":
         rows = [{k: v for k, v in row.items() if v is not None} for row in rows]
         text.write(json.dumps(rows, indent=1, sort_keys=True) + "\n")
     else:
@@ -108,13 +108,14 @@ def import_labels(dataset: Dataset, path: Path) -> tuple[int, int]:
 def read_table(path: Path) -> list[Label]:
     """Read the events of a CSV or JSON file; AnnotationError if it cannot be read as events."""
     _check_format(path)
+    is_json = path.suffix.lower() == ".json"
     text = read_text(path, AnnotationError)
-    if path.suffix == ".json":
+    if is_json:
         rows = parse_json(text, str(path), AnnotationError)
         if not isinstance(rows, list):
             raise AnnotationError(f"{path}: expected a list of events, got {type(rows).__name__}")
     else:
-        table = csv.DictReader(io.StringIO(text, newline=""))
+        table = csv_table(text)
         rows = (
             {k: v.removeprefix("'") if _FORMULA.match(str(v)) else v for k, v in row.items()}
             for row in table
@@ -123,13 +124,13 @@ def read_table(path: Path) -> list[Label]:
         labels = [_label(row, f"{path}: row {number}") for number, row in enumerate(rows, 1)]
     except csv.Error as error:
         raise AnnotationError(f"{path}: not CSV ({error}); export it again") from None
-    if path.suffix == ".csv" and not labels and set(REQUIRED) - set(table.fieldnames or REQUIRED):
+    if not is_json and not labels and set(REQUIRED) - set(table.fieldnames or REQUIRED):
         raise AnnotationError(f"{path}: not a table of labels, which have {', '.join(REQUIRED)}")
     return labels
 
 
 def _check_format(path: Path) -> None:
-    if path.suffix not in (".csv", ".json"):
+    if path.suffix.lower() not in (".csv", ".json"):
         raise AnnotationError(f"{path}: ends in {path.suffix!r}, expected .csv or .json")
 
 

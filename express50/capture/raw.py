@@ -20,6 +20,7 @@ from express50.files.calibration import read_cameras
 from express50.files.text import (
     ID,
     TOML_LIMIT,
+    csv_table,
     identifier,
     is_given,
     is_number,
@@ -375,14 +376,13 @@ def read_cues(path: Path) -> tuple[Cue, ...]:
     """
     if not is_given(path):
         return ()
-    lines = read_text(path, CaptureError, TOML_LIMIT).splitlines() or [""]
-    # Excel separates by semicolons in countries where a comma separates decimals.
-    reader = csv.DictReader(lines, skipinitialspace=True, delimiter=";" if ";" in lines[0] else ",")
+    text = read_text(path, CaptureError, TOML_LIMIT)
+    reader, head = csv_table(text, skipinitialspace=True), text.partition("\n")[0]
     try:
         missing = [name for name in CUE_COLUMNS if name not in (reader.fieldnames or ())]
         if missing:
             raise CaptureError(
-                f"{path}: no column {', '.join(missing)}; got {lines[0]!r:.100}, expected "
+                f"{path}: no column {', '.join(missing)}; got {head!r:.100}, expected "
                 f"{','.join(CUE_COLUMNS)} in the first line"
             )
         cues = [_read_cue(path, reader.line_num, row) for row in reader]

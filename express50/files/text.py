@@ -7,6 +7,9 @@ grow without bound or name other files are refused.
 
 from __future__ import annotations
 
+import codecs
+import csv
+import io
 import json
 import math
 import re
@@ -117,11 +120,20 @@ def read_text(path: Path, kind: Kind, limit: int = TEXT_LIMIT, fix: str = AGAIN)
     Raises:
         Express50Error: as for `read_bytes`, or the file is not UTF-8.
     """
+    data = read_bytes(path, kind, limit, fix)
     try:
-        text = read_bytes(path, kind, limit, fix).decode("utf-8-sig")
+        text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
+        if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            raise kind(f"{path}: is UTF-16 text; save it as UTF-8") from None
         raise kind(f"{path}: not UTF-8 text ({reason(error)}); {fix}") from None
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def csv_table(text: str, **options: Any) -> csv.DictReader:
+    """Read CSV text with a header; spreadsheets in many countries write semicolons or tabs."""
+    between = max(",;\t", key=text.partition("\n")[0].count)
+    return csv.DictReader(io.StringIO(text, newline=""), delimiter=between, **options)
 
 
 def read_json(path: Path, kind: Kind, fix: str = AGAIN) -> Any:

@@ -1,6 +1,7 @@
 """Every action of ``express50 annotate`` without a screen, through the command line."""
 
 import csv
+import io
 import json
 
 import numpy as np
@@ -145,6 +146,21 @@ def test_export_and_import_round_trip_without_loss_or_duplicates(
         dataset.labels_file(subject).unlink()
     assert annotate("import", str(file))["new"] == 5
     assert {s: dataset.labels_file(s).read_text() for s in before} == before
+
+
+@pytest.mark.parametrize("between", [";", "\t"])
+def test_a_table_that_a_spreadsheet_wrote_is_imported(annotate, dataset, tmp_path, between, capsys):
+    annotate("flag", "S002", "smile", "failed: blinked, twice", "--annotator", "bob")
+    annotate("export", str(tmp_path / "labels.csv"))
+    rows = csv.reader((tmp_path / "labels.csv").read_text().splitlines())
+    text = io.StringIO()
+    csv.writer(text, delimiter=between).writerows(rows)
+    file = tmp_path / "LABELS.CSV"
+    file.write_bytes(text.getvalue().encode("utf-8-sig"))
+    assert annotate("import", str(file)) == {"file": str(file), "new": 0, "known": 1}
+    file.write_bytes(text.getvalue().encode("utf-16"))
+    assert main(["annotate", "import", str(dataset.root), str(file)]) == 1
+    assert "is UTF-16 text; save it as UTF-8" in capsys.readouterr().err
 
 
 def test_export_replaces_no_events_that_are_not_stored(annotate, dataset, tmp_path, capsys):

@@ -210,8 +210,9 @@ def test_cues_may_come_from_a_spreadsheet(tmp_path):
         b"\xef\xbb\xbfexpression_id, start_frame, end_frame, note\r\nsmile, 0, 4, ok\r\n"
     )
     assert read_cues(path) == (Cue("smile", 0, 4),)
-    path.write_text("expression_id;start_frame;end_frame\nsmile;0;4\n")
-    assert read_cues(path) == (Cue("smile", 0, 4),)
+    for between in (";", "\t"):
+        path.write_text("expression_id,start_frame,end_frame\nsmile,0,4\n".replace(",", between))
+        assert read_cues(path) == (Cue("smile", 0, 4),)
     assert read_cues(tmp_path / "absent.csv") == ()
 
 
