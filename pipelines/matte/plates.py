@@ -31,6 +31,7 @@ from express50.geometry.conventions import affine_from_opencv, affine_to_opencv
 LEVELS = np.linspace(16.0, 240.0, 8)  # 8-bit intensities at which noise is tabulated
 MOST_NOISE = 14.0  # 8-bit steps; larger differences are not noise, whatever the camera
 NOISE_FLOOR = 1.0  # least noise assumed, in 8-bit steps
+TILTED = 0.6  # share of the noise that a change of light across the image must leave at most
 LEAST_PLATE = 0.05  # with a smaller share of plate in view, noise and exposure cannot be measured
 # Largest changes of exposure that are tried, natural logarithms: 0.7 stops, then two stops.
 GAINS = (0.51, 1.41)
@@ -275,12 +276,22 @@ def fit_plate(
     slopes = [cv2.Sobel(plate, cv2.CV_16S, x, 1 - x) for x in (1, 0)]
     step = max(1, round(np.sqrt(valid.size / SAMPLES)))
     some = np.s_[step // 2 :: step, step // 2 :: step]
-    error = (frame[some].astype(np.float32) - exposed(plate[some], gain))[valid[some]]
+    there = valid[some]
+    level = exposed(plate[some], gain)[there]
+    error = frame[some][there].astype(np.float32) - level
+    rows, columns = (index[:, None] for index in np.nonzero(there))
+    tilt = _tilt(error, level, rows, columns)
+    if tilt.any():
+        error -= level * _along(tilt, rows, columns)
+        rows, columns = np.ogrid[: len(valid), : valid.shape[1]]
+        rows, columns = ((index - step // 2) / step for index in (rows, columns))
+        across = _along(tilt, rows[window[0], :, None], columns[:, window[1], None])
+        shown = np.clip(shown * (1 + across.astype(np.float32)), 0, 255)
     quiet = _largest(error) < MOST_NOISE
     if quiet.sum() < max(LEAST_PLATE * len(error), 100):
         return PlateModel(shown, np.full_like(shown, NOISE_FLOOR), np.eye(3, dtype=np.float32))
     error, level, x, y = (
-        image[quiet] for image in (error, *(i[some][valid[some]] for i in (plate, *slopes)))
+        image[quiet] for image in (error, *(i[some][there] for i in (plate, *slopes)))
     )
     contrast = np.hypot(x, y, dtype=np.float32) / 8
     table = _noise_table(error, level.astype(np.float32))
@@ -297,6 +308,38 @@ def fit_plate(
     values, vectors = np.linalg.eigh(covariance + 0.1 * np.eye(3))
     whiten = (vectors / np.sqrt(np.maximum(values, 0.1))) @ vectors.T
     return PlateModel(shown, sigma, whiten.astype(np.float32))
+
+
+def _along(tilt: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Return a linear change (..., 3) at rows and columns (..., 1), by coefficients (3, 3)."""
+    change: np.ndarray = tilt[0] + rows * tilt[1] + columns * tilt[2]
+    return change
+
+
+def _tilt(
+    error: np.ndarray, level: np.ndarray, rows: np.ndarray, columns: np.ndarray
+) -> np.ndarray:
+    """Return how the light on the wall changed across the image, as shares of the plate's levels.
+
+    People in the room take light from one side of a wall. Errors and levels are (N, 3), rows and
+    columns (N, 1). The coefficients (3, 3), by `_along`'s terms and channel, are 0 unless they
+    explain much of the error.
+    """
+    quiet = _largest(error) < MOST_NOISE
+    tilt = np.zeros((3, 3))
+    if quiet.sum() < max(LEAST_PLATE * len(error), 100):
+        return tilt
+    before, after = np.zeros((2, 3))
+    for channel in range(3):
+        left = whole = error[quiet, channel]
+        before[channel] = _robust_deviation(np.abs(whole))
+        sides = level[quiet, channel, None] * np.hstack([rows**0, rows, columns])[quiet]
+        for _ in range(ROUNDS):
+            near = np.abs(left) <= 2 * _robust_deviation(np.abs(left))
+            tilt[:, channel] = np.linalg.lstsq(sides[near], whole[near], rcond=None)[0]
+            left = whole - sides @ tilt[:, channel]
+        after[channel] = _robust_deviation(np.abs(left))
+    return tilt if after.mean() < TILTED * before.mean() else np.zeros((3, 3))
 
 
 def _largest(error: np.ndarray) -> np.ndarray:

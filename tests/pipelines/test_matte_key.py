@@ -148,6 +148,19 @@ def test_the_difference_is_one_where_only_noise_differs() -> None:
     assert np.sqrt(np.mean(difference**2)) == pytest.approx(1.0, abs=0.1)
 
 
+def test_a_wall_that_is_darker_on_one_side_is_not_taken_for_noise() -> None:
+    """Somebody in the room takes light from one side of the wall."""
+    scene = make_scene(6, "dark")
+    light = np.linspace(0.9, 1.0, scene.frame.shape[1])[:, None]
+    shaded = replace(scene, frame=np.rint(scene.frame * light).astype(np.uint8))
+    sigma = {
+        other: np.median(fit_plate(one.plate, one.frame, np.ones(one.alpha.shape, bool)).sigma)
+        for other, one in (("even", scene), ("shaded", shaded))
+    }
+    assert sigma["shaded"] < 1.2 * sigma["even"]
+    assert mae(key(shaded), scene) < 1.1 * mae(key(scene), scene)
+
+
 def test_grey_footage_is_keyed_without_a_warning() -> None:
     """Grey pixels equal the plate exactly, and OpenCV's running means went under 0 there."""
     scene = make_scene(6, "dark")
@@ -315,7 +328,8 @@ def test_a_shifted_plate_and_one_in_other_light_are_brought_to_the_frame(
         for plate in (wrong, matched.plate, scene.plate)
     )
     assert matched.share > LEAST_SHARE
-    assert after < 0.6 * before and after < 3 * right
+    assert after < 3 * right
+    assert not pixels or after < 0.6 * before  # keying sees a change of light by itself
 
 
 def test_a_plate_of_another_room_explains_nothing() -> None:
