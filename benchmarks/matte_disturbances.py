@@ -58,6 +58,22 @@ def stand(shots: list[Shot]) -> list[Shot]:
     ]
 
 
+def person(shots: list[Shot]) -> list[Shot]:
+    """Put another person behind the subject in every third camera, with the face to the camera."""
+    front = shots[len(shots) // 2]
+    size = front.true.shape[1::-1]
+    light, rng = srgb_to_linear(front.frame / 255), np.random.default_rng(4)
+
+    def joined(shot: Shot) -> Shot:
+        across = rng.choice([-0.08, 0.48]) + rng.uniform(-0.05, 0.05)
+        motion = np.array([[0.6, 0, across * size[0]], [0, 0.6, 0.4 * size[1]]])
+        return _behind(
+            shot, *(cv2.warpAffine(image, motion, size) for image in (light, front.true))
+        )
+
+    return [joined(shot) if k % 3 == 0 else shot for k, shot in enumerate(shots)]
+
+
 def patch(shots: list[Shot]) -> list[Shot]:
     """Paint a patch of one colour on the skin; two cameras see the same colour behind it."""
     front = shots[len(shots) // 2]
@@ -81,6 +97,7 @@ DISTURBANCES: dict[str, Callable[[list[Shot]], list[Shot]]] = {
     "undisturbed": undisturbed,
     "shadow": shadow,
     "object": stand,
+    "person": person,
     "patch": patch,
     "bumped": bumped,
 }
@@ -164,7 +181,7 @@ def before_wall(shot: Shot, make: Wall, rng: np.random.Generator) -> Shot:
 
 
 def _behind(shot: Shot, light: np.ndarray, cover: np.ndarray) -> Shot:
-    """Return the shot with `light` (3,) over its backdrop by `cover` (H, W), behind the subject."""
+    """Return the shot with `light` (3,) or (H, W, 3) over its backdrop by `cover` (H, W)."""
     plate = srgb_to_linear(shot.plate / 255)
     change = ((1 - shot.true) * cover * shot.valid)[..., None] * (light - plate)
     return replace(shot, frame=srgb8(srgb_to_linear(shot.frame / 255) + change))

@@ -7,6 +7,7 @@ the cameras have agreed, with all cameras and with every third:
 - ``undisturbed``: nothing may get worse (``sad_ratio_to_key`` at most 1.01);
 - ``shadow``: three cameras in eight see a shadow, too deep for the key, on the backdrop;
 - ``object``: a quarter of the cameras see a stand with a cable behind the subject;
+- ``person``: a third of the cameras see another person behind the subject;
 - ``patch``: a patch of the skin has one colour in all views, and two have the same behind it;
 - ``bumped``: one camera was turned after calibration, its matte is right where it now looks.
 
@@ -24,8 +25,9 @@ the right plate, and the share that is ``refused``.
 
 Disturbances are laid on the recorded frames in linear light with the true alpha, and keyed again.
 ``sad`` is the summed absolute error in thousands, ``mae`` its mean, both means over cameras and
-peaks; ``*_key`` is each camera alone. ``named`` counts the cameras that were found wrong;
-``bumped`` has one per peak. ``seconds_per_moment`` is processor time, reading and keying excluded.
+peaks; ``*_key`` is each camera alone, ``*_outvoted`` what the cameras correct in each other while
+nobody else is taken out. ``named`` counts the cameras that were found wrong; ``bumped`` has one per
+peak. ``seconds_per_moment`` is processor time, reading and keying excluded.
 The last line is one JSON object.
 """
 
@@ -35,6 +37,7 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -55,7 +58,7 @@ from benchmarks.matte import errors
 from benchmarks.matte_disturbances import DISTURBANCES, Shot, other_plates, walls
 from express50.contract.layout import Dataset
 from express50.errors import NoFaceError
-from express50.files.images import contact_sheet, write_image
+from express50.files.images import contact_sheet, shrink, write_image
 from express50.geometry.cameras import pinhole
 from express50.geometry.sampling import evenly
 from express50.twin import TwinConfig
@@ -64,8 +67,8 @@ from pipelines.matte import MatteConfig
 from pipelines.matte.cutout import CutView, cut_out, find_head, make_cut_view, region_of
 from pipelines.matte.key import key_alpha
 from pipelines.matte.plates import LEAST_SHARE, match_plate
-from pipelines.matte.stage import corrected, make_view
-from pipelines.matte.visual_hull import ball_of, compare_mattes
+from pipelines.matte.stage import SHOWN, CameraMatte, agree, compared, corrected
+from pipelines.matte.visual_hull import Agreement, ball_of
 from pipelines.matte.wall import MOMENTS, Wall, learn_walls, soft_alpha
 
 RIG = TwinConfig(
@@ -158,23 +161,35 @@ def measure(keyed: list[Keyed], sheet: Path | None) -> Figures:
     ball = ball_of({k.shot.camera.id: k.shot.camera for k in keyed})
     if ball is None:
         sys.exit("the rig looks at no one place; name another --dataset")
-    views = [
-        make_view(k.shot.camera, ball, k.shot.frame, k.alpha, plate=k.shot.plate) for k in keyed
-    ]
-    found = compare_mattes(views)
-    after = [
-        corrected(k.alpha, found.removed.get(k.shot.camera.id), found.filled.get(k.shot.camera.id))
+    shots = {k.shot.camera.id: k.shot for k in keyed}
+    cameras = {name: shot.camera for name, shot in shots.items()}
+    alone = {
+        k.shot.camera.id: CameraMatte(
+            k.alpha, shrink(k.shot.frame, SHOWN), 0.0, plate=shrink(k.shot.plate, SHOWN)
+        )
         for k in keyed
-    ]
+    }
+    read = lambda name: (shots[name].frame, shots[name].valid)  # noqa: E731
+    mattes, _, found = agree(read, cameras, alone, ball)
+    after = after_agreement(mattes, found)
     seconds = time.process_time() - started
     if sheet is not None:
         pictures = [[k.shot.frame, k.alpha, a] for k, a in zip(keyed, after, strict=True)]
         write_sheet(sheet, pictures, [k.shot for k in keyed])
-    before = means([errors(k.alpha / 255, k.shot.true) for k in keyed])
-    later = means([errors(a / 255, k.shot.true) for k, a in zip(keyed, after, strict=True)])
-    row = {name: later[name] for name in ("sad", "mae")}
-    row |= {f"{name}_key": before[name] for name in ("sad", "mae")}
+    outvoted = after_agreement(alone, compared(cameras, alone, ball)[1])
+    row: Figures = {}
+    for kind, alphas in (("", after), ("_key", [k.alpha for k in keyed]), ("_outvoted", outvoted)):
+        found_errors = [errors(a / 255, k.shot.true) for k, a in zip(keyed, alphas, strict=True)]
+        row |= {f"{name}{kind}": means(found_errors)[name] for name in ("sad", "mae")}
     return row | {"named": float(len(found.warnings)), "seconds_per_moment": seconds}
+
+
+def after_agreement(mattes: Mapping[str, CameraMatte], found: Agreement) -> list[np.ndarray]:
+    """Return the alphas (H, W) uint8 that cameras correct in each other."""
+    return [
+        corrected(matte.alpha, found.removed.get(name), found.filled.get(name))
+        for name, matte in mattes.items()
+    ]
 
 
 def write_sheet(path: Path, pictures: list[list[np.ndarray]], shots: list[Shot]) -> None:

@@ -69,6 +69,7 @@ class CutView:
     rgb: np.ndarray  # (h, w, 3) uint8
     valid: np.ndarray  # (h, w) bool, pixels with footage
     known: np.ndarray | None = None  # (h, w) bool, the person's mask if known, as from a plate
+    wall: np.ndarray | None = None  # (h, w) bool, pixels known to show the wall
 
     @property
     def name(self) -> str:
@@ -109,13 +110,13 @@ def make_cut_view(
 
 def cut_out(
     views: Sequence[CutView], ball: Ball | None, place: HeadPlace | None = None,
-    alone: bool = False,
+    others: Mapping[str, Sequence[HeadPlace]] | None = None,
 ) -> dict[str, Cut]:  # fmt: skip
     """Find the person's outline in all cameras of a frame set.
 
     `ball` is the volume that the cameras look at; None if they share none. `place` is from
-    `find_head`, which is called if it is not given. Other people are not searched if the person is
-    said to be `alone`.
+    `find_head`, which is called if it is not given. `others` are other people's heads by camera,
+    from `find_neighbours`, which is called if they are not given.
 
     Raises:
         NoFaceError: no camera shows a face.
@@ -128,9 +129,12 @@ def cut_out(
             # Heads and necks of others are wall but where the person surely is, in front of
             # them; their hair is wall where the person hardly is.
             sure = guess == cv2.GC_FGD
-            for other in () if alone else find_neighbours(view, place):
+            close = find_neighbours(view, place) if others is None else others.get(view.name, ())
+            for other in close:
                 guess[(_guess(reduced, other) == cv2.GC_FGD) & ~sure] = cv2.GC_BGD
                 guess[_head_mask(reduced, other) & (guess == cv2.GC_PR_BGD)] = cv2.GC_BGD
+            if reduced.wall is not None:
+                guess[reduced.wall] = cv2.GC_BGD
     density = [place.density(view.camera) for view in small]
 
     def cut(labels: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -217,7 +221,7 @@ def _at_scale(view: CutView, factor: float) -> CutView:
         resized(view.camera, width, height),
         cv2.resize(view.rgb, (width, height), interpolation=cv2.INTER_AREA),
         mask(view.valid),
-        None if view.known is None else mask(view.known),
+        *(None if values is None else mask(values) for values in (view.known, view.wall)),
     )
 
 

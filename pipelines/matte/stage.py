@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,10 +22,11 @@ from pipelines.matte.cutout import (
     CutView,
     cut_out,
     find_head,
+    find_neighbours,
     make_cut_view,
     region_of,
 )
-from pipelines.matte.key import dilated, key_alpha
+from pipelines.matte.key import dilated, eroded_about, key_alpha, opened
 from pipelines.matte.plates import (
     LEAST_SHARE,
     MOST_WHITE,
@@ -44,6 +45,7 @@ from pipelines.matte.visual_hull import (
     MatteView,
     ball_of,
     compare_mattes,
+    is_thing,
 )
 from pipelines.matte.wall import Wall, read_wall, soft_alpha, valid_pixels
 
@@ -51,7 +53,7 @@ COLUMNS = 6  # of the contact sheet
 TILE = 240
 SHOWN = 192  # longest side of the pictures in the contact sheet, pixels
 RED, GREEN = (235, 50, 40), (50, 220, 80)
-# Share of a side of the image that the subject may cover before it counts as cut off there.
+# Share of a side of the image that a subject's upper half may cover before it counts as cut off.
 MOST_CONTACT = 0.02
 SIDES = ("top", "right", "bottom", "left")  # of an image
 OUTWARD = np.array([[0, -1, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0]])  # of the camera, by side
@@ -59,8 +61,14 @@ UPRIGHT = np.array([0, 0, 0.2, 0])  # share of a side that is as strong a sign a
 RIM = 0.008  # share of the longer side: distance from the outline in which errors are predicted
 RIM_ROWS = 8  # rows of pixels that are judged within that distance, at least
 WINDOW = 5  # pixels, odd: side of the window in which alpha's spread is measured
+# Pictures with other people: least alpha that may be the subject's; radius of the smallest part of
+# somebody else, share of the longer side; and the least share of an image that is taken out.
+SURE_WALL, BESIDE, LEAST_OTHER = 13, 0.006, 1e-3
+SOMETHING_ELSE = "another person or thing is in the picture; its matte leaves it out"
 NEARBY = 0.04  # share of the longer side: width of the neighbourhood that describes an outline
 
+Read = Callable[[str], tuple[np.ndarray, np.ndarray]]
+"""Read a camera's frame (H, W, 3) uint8 and its valid pixels (H, W) bool."""
 MatteFunction = Callable[[np.ndarray, Any, np.ndarray], np.ndarray]
 """Solve opacity (H, W) float32 from a frame (H, W, 3) uint8, a plate or None, and valid pixels."""
 
@@ -89,21 +97,17 @@ def run(
     cv2.setNumThreads(1)  # the runner counts one core per item
     cameras = read_cameras_of(dataset, item.split("/")[0], undistorted=False)
     ball = ball_of(cameras)
-    matte_one = _matte_function(method, weights, tile, shadow)
-    mattes, dropped, odd_plates = camera_mattes(dataset, item, method, matte_one, cameras, ball)
-    if not mattes:
+    shots = Shots(dataset, item, method, _matte_function(method, weights, tile, shadow), cameras)
+    keyed, dropped, odd_plates = camera_mattes(shots, ball)
+    if not keyed:
         raise StageError(f"{item}: {dropped[0].why if dropped else 'no camera is calibrated'}")
-    alphas = {name: matte.alpha for name, matte in mattes.items()}
-    views = []
+    mattes, views, found = agree(shots.read, cameras, keyed, ball if agreeing else None)
+    odd_plates += [Note(n, SOMETHING_ELSE) for n, own in mattes.items() if own is not keyed[n]]
     if not agreeing:
         found = Agreement(unchanged="matte.agree is off")
     elif ball is None:
         found = Agreement(unchanged="the cameras do not look at one place")
-    else:
-        views = [
-            make_view(cameras[n], ball, m.rgb, m.alpha, plate=m.plate) for n, m in mattes.items()
-        ]
-        found = compare_mattes(views)
+    alphas = {name: matte.alpha for name, matte in mattes.items()}
     final = {
         name: corrected(alpha, found.removed.get(name), found.filled.get(name))
         for name, alpha in alphas.items()
@@ -133,16 +137,41 @@ def run(
     return Result(figures, dropped, [*odd_plates, *found.warnings, *odd], expected)
 
 
+def agree(
+    read: Read, cameras: Mapping[str, Camera], mattes: Mapping[str, CameraMatte], ball: Ball | None
+) -> tuple[Mapping[str, CameraMatte], list[MatteView], Agreement]:
+    """Compare the mattes in the `ball`, and again once other people are taken out of them.
+
+    Nothing is compared without a ball. Returns the mattes, and what was compared.
+    """
+    views, found = compared(cameras, mattes, ball)
+    # Shadows are common, and the faces take far longer to find than all this.
+    thing = any(is_thing(v, found.removed[v.name]) for v in views if v.name in found.removed)
+    if ball is None or not (thing or found.warnings):
+        return mattes, views, found
+    alone = without_others(read, cameras, mattes, found.doubted, thing, ball)
+    return alone, *compared(cameras, alone, ball)
+
+
+def compared(
+    cameras: Mapping[str, Camera], mattes: Mapping[str, CameraMatte], ball: Ball | None
+) -> tuple[list[MatteView], Agreement]:
+    """Compare the mattes in the `ball`, if there is one."""
+    if ball is None:
+        return [], Agreement()
+    views = [make_view(cameras[n], ball, m.rgb, m.alpha, plate=m.plate) for n, m in mattes.items()]
+    return views, compare_mattes(views)
+
+
 def camera_mattes(
-    dataset: Dataset, item: str, method: str, matte_one: MatteFunction,
-    cameras: Mapping[str, Camera], ball: Ball | None,
-) -> tuple[dict[str, CameraMatte], list[Note], list[Note]]:  # fmt: skip
+    shots: Shots, ball: Ball | None
+) -> tuple[dict[str, CameraMatte], list[Note], list[Note]]:
     """Matte each camera of a peak; those without a plate are cut out together.
 
     Only one camera's full images are in memory at a time. `ball` is the volume that the cameras
     look at, None if they share none. Also returns the cameras without a matte, and warnings.
     """
-    shots = _Shots(dataset, item, method, matte_one, cameras)
+    cameras = shots.cameras
     found: dict[str, CameraMatte] = {}
     seen: dict[str, CutView] = {}
     dropped: list[Note] = []
@@ -171,7 +200,7 @@ def camera_mattes(
 
 
 @dataclass(frozen=True)
-class _Shots:
+class Shots:
     """The frames of a peak, and how each is matted."""
 
     dataset: Dataset
@@ -213,7 +242,7 @@ def _camera_matte(alpha: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> Ca
 
 
 def _with_other_views(
-    shots: _Shots, found: dict[str, CameraMatte], seen: dict[str, CutView], odd: dict[str, str],
+    shots: Shots, found: dict[str, CameraMatte], seen: dict[str, CutView], odd: dict[str, str],
     ball: Ball | None,
 ) -> dict[str, CameraMatte]:  # fmt: skip
     """Matte the cameras that were only `seen`, knowing where the faces say that the person is.
@@ -245,6 +274,56 @@ def _with_other_views(
         cut = _camera_matte(alpha, frame, valid)
         rest[name] = replace(cut, plated=False)
     return rest
+
+
+def without_others(
+    read: Read, cameras: Mapping[str, Camera], found: Mapping[str, CameraMatte],
+    doubted: Set[str], thing: bool, ball: Ball,
+) -> Mapping[str, CameraMatte]:  # fmt: skip
+    """Take other people out of mattes that were made with plates.
+
+    A plate shows what is in front of the wall, not whose it is. If a camera shows another face, or
+    a `thing` that is not the subject, the subject is cut out of the cameras that show faces, and of
+    the `doubted` ones, whose mattes disagree with others, until no further ones do.
+    """
+    views = {
+        name: make_cut_view(pinhole(cameras[name]), *read(name), own.alpha)
+        for name, own in found.items()
+    }
+    try:
+        place = find_head([*views.values()])
+    except NoFaceError:
+        return found
+    plated = {name for name, own in found.items() if own.plated}
+    others = {
+        n: close for n in views if n in plated and (close := find_neighbours(views[n], place))
+    }
+    if not others and not thing:
+        return found
+    final, done = dict(found), set[str]()
+    while todo := plated & (others.keys() | doubted) - done:
+        done |= todo
+        for name in todo:
+            wall = shrink(found[name].alpha, max(views[name].valid.shape)) < SURE_WALL
+            views[name] = replace(views[name], known=None, wall=wall)
+        cuts = cut_out([*views.values()], ball, place, others)
+        for name in done:
+            alpha = _kept(found[name].alpha, soft_alpha(*read(name), cuts[name]))
+            if _excess(found[name].alpha, alpha) > LEAST_OTHER:
+                final[name] = replace(found[name], alpha=alpha)
+        doubted = compared(cameras, final, ball)[1].doubted
+    return final
+
+
+def _kept(alpha: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Keep of an alpha (H, W) uint8 what is the subject's `own` (H, W) float32, as cut out.
+
+    The alpha is better at the wall, so it only changes beside large parts of other people.
+    """
+    reach = max(1, round(BESIDE * max(alpha.shape)))
+    other = opened((alpha > 127) & (own < INSIDE), reach, eroded_about)
+    near = ~eroded_about(~other, 2 * reach)
+    return np.where(near, np.minimum(alpha, np.rint(255 * own)), alpha).astype(np.uint8)
 
 
 def _plate(
@@ -436,9 +515,10 @@ def body_sides(cameras: Mapping[str, Camera], alphas: dict[str, np.ndarray]) -> 
 
 
 def matte_warnings(alphas: dict[str, np.ndarray], body: Mapping[str, str]) -> list[Note]:
-    """Warn of cameras whose matte is empty, or whose subject is cut off.
+    """Warn of cameras whose matte is empty, or whose subject's upper half is cut off.
 
-    `body` names the side at which the body may leave a camera's image.
+    `body` names the side at which the body may leave a camera's image. Shoulders may leave it
+    beside that.
     """
     notes = []
     for name, alpha in alphas.items():
@@ -446,11 +526,15 @@ def matte_warnings(alphas: dict[str, np.ndarray], body: Mapping[str, str]) -> li
         if share < EMPTY:
             notes.append(Note(name, f"its matte is empty ({share:.2%} of the image)"))
             continue
-        contact = border_contact(alpha)
-        cut = [s for s in SIDES if s != body[name] and contact[s] > MOST_CONTACT]
+        turns = SIDES.index(body[name]) - SIDES.index("bottom")
+        upright = np.rot90(alpha, turns)
+        top = int(np.argmax((upright > 127).any(axis=1)))
+        head = np.where(np.arange(len(upright))[:, None] <= (top + len(upright)) // 2, upright, 0)
+        contact = np.roll([*border_contact(head).values()], turns)
+        cut = [side for side, share in zip(SIDES, contact, strict=True) if share > MOST_CONTACT]
         if cut:
-            most = max(contact[side] for side in cut)
-            sides = " and ".join(cut)
+            sides, whole = " and ".join(cut), border_contact(alpha)
+            most = max(whole[side] for side in cut)
             notes.append(Note(name, f"the subject leaves the image at the {sides} ({most:.0%})"))
     return notes
 

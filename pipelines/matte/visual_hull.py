@@ -189,6 +189,8 @@ WIDEST = 0.2  # cosine of the largest angle to them
 SEARCH = (-0.3, 0.1, 17)  # radii in front of and behind the others' hull where a surface may be
 # Shadows, natural logarithms of light over the plate's: the least depth, and how far one varies.
 DEEP, SAME_SHADE = 0.3, 0.25
+# Share of the image, and share of coloured pixels, from which a removed part is not a shadow.
+LEAST_THING, COLOURED = 0.005, 0.2
 SMALLEST = 5e-4  # share of the image: filled spots are at least this large
 LARGEST = 0.4  # share of the subject: if more lacks, the matte is wrong rather than holed
 
@@ -262,6 +264,15 @@ def ruled_out(view: MatteView, evidence: Evidence) -> np.ndarray:
     bad = doubtful & np.isin(parts, np.unique(parts[wrong]))
     # One pixel more, for the faint pixels around.
     return (cv2.dilate(bad.astype(np.uint8), np.ones((3, 3))) > 0) & ~evidence.likely
+
+
+def is_thing(view: MatteView, removed: np.ndarray) -> bool:
+    """Return whether a removed part (h, w) of a matte is more than a shadow: it has colours."""
+    sure = removed & (view.alpha > INSIDE)
+    if view.plate is None or sure.mean() < LEAST_THING:
+        return False
+    coloured = np.ptp(darkening(view.rgb, view.plate)[sure], axis=1) > GREY
+    return bool(coloured.mean() > COLOURED)
 
 
 def rest_of_shadow(view: MatteView, removed: np.ndarray, solid: np.ndarray) -> np.ndarray:
@@ -413,6 +424,11 @@ class Agreement:
     filled: dict[str, np.ndarray] = field(default_factory=dict)
     warnings: list[Note] = field(default_factory=list)  # cameras with unchanged mattes, and why
     unchanged: str = ""  # why nothing was compared; empty if mattes were compared
+
+    @property
+    def doubted(self) -> set[str]:
+        """Return the cameras whose mattes show what the others rule out."""
+        return {*self.removed, *(note.what for note in self.warnings)}
 
 
 def compare_mattes(views: Sequence[MatteView], cells: int = CELLS) -> Agreement:

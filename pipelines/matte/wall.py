@@ -147,7 +147,7 @@ def cut_moments(moments: Sequence[Sequence[CutView]], ball: Ball | None) -> list
         found: dict[str, Cut] = {}
         with suppress(NoFaceError):
             place = find_head(views if place is None else _facing(views, place))
-            found = cut_out(views, ball, place, alone=True)
+            found = cut_out(views, ball, place, others={})
         cuts.append(found)
     return cuts
 

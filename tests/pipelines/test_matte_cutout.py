@@ -35,7 +35,7 @@ from pipelines.matte.cutout import (
     parts_of_a_person,
 )
 from pipelines.matte.key import key_alpha
-from pipelines.matte.stage import CameraMatte, camera_mattes
+from pipelines.matte.stage import SOMETHING_ELSE, CameraMatte, Shots, camera_mattes
 from pipelines.matte.wall import soft_alpha, valid_pixels
 from pipelines.photo.capture import make_photo_capture, open_picture, single_camera
 from pipelines.track.config import TrackConfig
@@ -255,7 +255,7 @@ def test_plates_of_cameras_on_their_side_are_used(rig, monkeypatch) -> None:
 
     def mattes(cameras: dict[str, Camera]) -> dict[str, CameraMatte]:
         item = f"{subject}/neutral"
-        found, dropped, warnings = camera_mattes(dataset, item, "key", keyed, cameras, None)
+        found, dropped, warnings = camera_mattes(Shots(dataset, item, "key", keyed, cameras), None)
         assert not dropped and not warnings
         return found
 
@@ -270,6 +270,31 @@ def test_plates_of_cameras_on_their_side_are_used(rig, monkeypatch) -> None:
         assert matte.plated, name
         difference = cv2.absdiff(np.ascontiguousarray(np.rot90(matte.alpha, -1)), right[name].alpha)
         assert difference.mean() / 255 < 0.01, name
+
+
+def test_another_person_is_taken_out_of_mattes_with_plates(rig, monkeypatch) -> None:
+    dataset, truth = rig
+    subject = dataset.subjects()[0]
+    assert run_here(MATTE, dataset).ok
+    alone = mean_errors(dataset, truth)
+    name = list(alone)[0]
+    alpha = truth.render_alpha(subject, 0, pinhole(truth.cameras(subject)[name]))
+    read = stage.read_peak_frame
+
+    def joined(dataset: Dataset, subject: str, expression: str, camera: str) -> np.ndarray:
+        frame = read(dataset, subject, expression, camera)
+        if camera != name:
+            return frame
+        behind = frame.copy()
+        behind[60:160, 16:96] = cv2.resize(data.astronaut()[:200, 145:305], (80, 100))
+        share = alpha[..., None]
+        return np.rint(share * frame + (1 - share) * behind).astype(np.uint8)
+
+    monkeypatch.setattr(stage, "read_peak_frame", joined)
+    assert run_here(MATTE, dataset, tile=1024).ok  # another configuration, so it runs again
+    warned = metrics_of(dataset, "matte", f"{subject}/neutral")["warnings"]
+    assert {"what": name, "why": SOMETHING_ELSE} in warned
+    assert mean_errors(dataset, truth)[name] < alone[name] + 0.01
 
 
 def test_a_rig_without_plates_is_matted_from_all_sides(rig, monkeypatch) -> None:

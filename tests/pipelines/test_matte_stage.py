@@ -235,6 +235,16 @@ def test_a_body_may_leave_a_camera_on_its_side_where_the_others_say(lying) -> No
     assert all(f"at the {side} (" in said[name] for name, side in sides.items())
 
 
+@pytest.mark.parametrize("turns", range(4))
+def test_shoulders_may_leave_a_tight_picture(turns: int) -> None:
+    alpha = np.zeros((40, 40), np.uint8)
+    alpha[5:, 15:25] = alpha[30:] = 255
+    body = {"cam00": ("bottom", "right", "top", "left")[turns]}
+    assert not matte_warnings({"cam00": np.rot90(alpha, turns)}, body)
+    (note,) = matte_warnings({"cam00": np.rot90(np.roll(alpha, 15, axis=1), turns)}, body)
+    assert f"at the {('right', 'top', 'left', 'bottom')[turns]} (" in note.why
+
+
 def test_a_single_camera_is_taken_to_be_upright() -> None:
     alpha = np.zeros((40, 40), np.uint8)
     alpha[10:, :30] = 255
