@@ -89,7 +89,7 @@ class Parser(argparse.ArgumentParser):
             words = f"got {empty[0]!r}, expected a value; is a variable of your shell not set?"
             raise argparse.ArgumentError(action, words)
         home = [text for text in arg_strings if text.startswith("~/")]
-        if home and action.type is Path:  # else a folder called ~ would be made
+        if home and action.type is not None:  # else a folder called ~ would be made
             words = f"got {home[0]!r}, whose ~ no shell has replaced; write $HOME instead of ~"
             raise argparse.ArgumentError(action, words)
         return super()._get_values(action, arg_strings)
@@ -110,6 +110,10 @@ class Parser(argparse.ArgumentParser):
         if not args and self._subparsers is not None:
             self.print_help(sys.stderr)
             self.exit(USAGE)
+        for text in args:
+            known = text in self._option_string_actions
+            if re.match("-[^-]", text) and not known and os.access(text, os.F_OK):
+                self.error(f"{text} begins as options do; write ./{text}")
         found, left = super().parse_known_args(args, namespace)
         if left:
             near = nearest(left[0].partition("=")[0], self._option_string_actions)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from express50.contract.config import check_ranges
+from express50.errors import ConfigError
 from express50.head import BUILTIN_NAME, absolute_head
 
 VERSION = 32
@@ -59,6 +60,8 @@ class TrackConfig:
 
         Track and shards name the model by this path, and other commands read it from there.
         """
+        if not self.head.strip():  # its absolute path would be the present folder
+            raise ConfigError("track.head is empty; give a head model, or leave the setting out")
         object.__setattr__(self, "head", absolute_head(self.head))
         check_ranges(
             "track", self, stride=(1, 10_000), cameras=(0, 10_000), search=(0.02, 1),

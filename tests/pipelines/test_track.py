@@ -263,7 +263,13 @@ def test_presets_are_valid_and_bad_values_are_refused() -> None:
 
     for values in STAGE.presets.values():
         build_config(STAGE, values)
-    for name, value in (("stride", 0), ("search", 2.0), ("patch_rounds", -1), ("samples", 5)):
+    for name, value in (
+        ("stride", 0),
+        ("search", 2.0),
+        ("patch_rounds", -1),
+        ("samples", 5),
+        ("head", ""),
+    ):
         with pytest.raises(ConfigError, match=f"track.{name} is"):
             TrackConfig(**{name: value})
 

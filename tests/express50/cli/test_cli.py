@@ -180,6 +180,7 @@ def test_bad_item_gives_exit_code_1_and_is_named(run, data, capture, tmp_path):
         (["run", "DATA", "CAP", "--first", "track", "--last", "ingest"], 2, "comes after"),
         (["run", "DATA", "CAP", "--first", "calibrate"], 2, "read no captures, but"),
         (["prune", ""], 2, "argument DATASET: got '', expected a value; is a variable"),
+        (["annotate", "status", "~/data"], 2, "DATASET: got '~/data', whose ~ no shell has"),
         (["report", "DATA", "--out=~/page"], 2, "--out: got '~/page', whose ~ no shell has"),
         (["run", "DATA", "CAP", "--config", ""], 2, "argument --config: got ''"),
         (["run", "DATA", "CAP", "--preset", ""], 2, "argument --preset: got ''"),
@@ -222,6 +223,13 @@ def test_errors_are_one_line_with_their_exit_code(run, data, capture, arguments,
     assert message in last
     assert last.startswith("express50")
     assert "Traceback" not in err
+
+
+def test_a_file_whose_name_begins_as_an_option_is_named(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("-smile.jpg").touch()
+    for arguments in (["photo", "-smile.jpg", "OUT"], ["head", "preview", "--model", "-smile.jpg"]):
+        assert "-smile.jpg begins as options do; write ./-smile.jpg" in run(*arguments)[2]
 
 
 def test_a_chain_that_cannot_go_on_ends_with_the_cause(run, data, tmp_path):
