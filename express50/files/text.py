@@ -64,6 +64,8 @@ def read_bytes(path: Path, kind: Kind, limit: int = TEXT_LIMIT, fix: str = AGAIN
             raise kind(f"{path}: {status.st_size} bytes, expected at most {limit}; {fix}")
         return path.read_bytes()
     except (OSError, ValueError) as error:  # ValueError: a name with a null byte
+        if isinstance(error, PermissionError):
+            fix = "check its owner and permissions"
         why = not_fetched(path) or f"cannot be read ({reason(error)}); {fix}"
         raise kind(f"{path}: {why}") from None
 

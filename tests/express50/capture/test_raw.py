@@ -1,7 +1,9 @@
 """Raw captures: what is read, and what each kind of damage is answered with."""
 
+import errno
 import json
 import shutil
+from pathlib import Path
 
 import pytest
 
@@ -214,6 +216,15 @@ def test_cues_may_come_from_a_spreadsheet(tmp_path):
         path.write_text("expression_id,start_frame,end_frame\nsmile,0,4\n".replace(",", between))
         assert read_cues(path) == (Cue("smile", 0, 4),)
     assert read_cues(tmp_path / "absent.csv") == ()
+
+
+def test_a_file_that_may_not_be_read_is_not_called_damaged(raw, monkeypatch):
+    def refuse(path):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    with pytest.raises(CaptureError, match=r"\(Permission denied\); check its owner and perm"):
+        read_capture(raw)
 
 
 @pytest.mark.parametrize(
