@@ -240,6 +240,11 @@ def test_a_chain_that_cannot_go_on_ends_with_the_cause(run, data, tmp_path):
     assert "calibrate has nothing to do, because ingest failed" in err.splitlines()[-1]
 
 
+def test_a_stage_of_a_folder_that_is_no_dataset_says_so(run, tmp_path):
+    for pattern in ([], ["--items", "S001/*"]):
+        assert "not a dataset" in run("matte", tmp_path, *pattern)[2]
+
+
 def test_a_dataset_in_the_place_of_a_capture_is_refused(run, data, capture):
     assert run("ingest", data, capture)[0] == 0
     code, _, err = run("ingest", data.parent / "new", data)

@@ -476,7 +476,12 @@ def test_resolved_config_is_saved_and_can_be_given_back(tmp_path):
 
 def test_stage_without_items_and_unmatched_pattern_are_errors(tmp_path):
     dataset = make_dataset(tmp_path / "data", [])
-    with pytest.raises(StageError, match="nothing to do; 'express50 status .*' shows which"):
+    with pytest.raises(ConfigError, match="not a dataset"):
+        run_toy(dataset)
+    with (
+        Ledger(dataset.ledger),
+        pytest.raises(StageError, match="nothing to do; 'express50 status .*' shows which"),
+    ):
         run_toy(dataset)
     dataset = make_dataset(tmp_path / "other", ["S001", "S002"])
     assert select_items(toy.STAGE, dataset, "*2") == ["S002"]
