@@ -147,7 +147,8 @@ def agree(
     views, found = compared(cameras, mattes, ball)
     # Shadows are common, and the faces take far longer to find than all this.
     thing = any(is_thing(v, found.removed[v.name]) for v in views if v.name in found.removed)
-    if ball is None or not (thing or found.warnings):
+    plated = any(own.plated for own in mattes.values())
+    if ball is None or not plated or not (thing or found.warnings):
         return mattes, views, found
     alone = without_others(read, cameras, mattes, found.doubted, thing, ball)
     return alone, *compared(cameras, alone, ball)
