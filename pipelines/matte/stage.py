@@ -17,9 +17,10 @@ from express50.error_model import error_bounds, error_models, expect
 from express50.errors import CaptureError, NoFaceError, StageError
 from express50.files.images import box_about, resize_area, shrink, tile_sheet, write_image
 from express50.geometry.cameras import Camera, pinhole, resized
-from express50.geometry.sampling import local_moments, undistorted_mask
+from express50.geometry.sampling import evenly, local_moments, undistorted_mask
 from pipelines.matte.cutout import (
     CutView,
+    HeadPlace,
     cut_out,
     find_head,
     find_neighbours,
@@ -64,6 +65,7 @@ WINDOW = 5  # pixels, odd: side of the window in which alpha's spread is measure
 # Pictures with other people: least alpha that may be the subject's; radius of the smallest part of
 # somebody else, share of the longer side; and the least share of an image that is taken out.
 SURE_WALL, BESIDE, LEAST_OTHER = 13, 0.006, 1e-3
+ENOUGH_VIEWS = 8  # to place the head by
 SOMETHING_ELSE = "another person or thing is in the picture; its matte leaves it out"
 NEARBY = 0.04  # share of the longer side: width of the neighbourhood that describes an outline
 
@@ -292,15 +294,16 @@ def without_others(
         for name, own in found.items()
     }
     try:
-        place = find_head([*views.values()])
+        place = find_head(evenly([*views.values()], ENOUGH_VIEWS))
     except NoFaceError:
         return found
     plated = {name for name, own in found.items() if own.plated}
-    others = {
-        n: close for n in views if n in plated and (close := find_neighbours(views[n], place))
-    }
-    if not others and not thing:
-        return found
+    others: dict[str, list[HeadPlace]] = {}
+    for group in (plated & doubted, plated - doubted):
+        others |= {name: find_neighbours(views[name], place) for name in group}
+        others = {name: heads for name, heads in others.items() if heads}
+        if not others and not thing:  # a camera has moved
+            return found
     final, done = dict(found), set[str]()
     while todo := plated & (others.keys() | doubted) - done:
         done |= todo
