@@ -284,9 +284,9 @@ def fit_plate(
     if tilt.any():
         error -= level * _along(tilt, rows, columns)
         rows, columns = np.ogrid[: len(valid), : valid.shape[1]]
-        rows, columns = ((index - step // 2) / step for index in (rows, columns))
+        rows, columns = ((np.float32(index) - step // 2) / step for index in (rows, columns))
         across = _along(tilt, rows[window[0], :, None], columns[:, window[1], None])
-        shown = np.clip(shown * (1 + across.astype(np.float32)), 0, 255)
+        shown = np.clip(shown * (1 + across), 0, 255)
     quiet = _largest(error) < MOST_NOISE
     if quiet.sum() < max(LEAST_PLATE * len(error), 100):
         return PlateModel(shown, np.full_like(shown, NOISE_FLOOR), np.eye(3, dtype=np.float32))
@@ -326,7 +326,7 @@ def _tilt(
     explain much of the error.
     """
     quiet = _largest(error) < MOST_NOISE
-    tilt = np.zeros((3, 3))
+    tilt = np.zeros((3, 3), np.float32)
     if quiet.sum() < max(LEAST_PLATE * len(error), 100):
         return tilt
     before, after = np.zeros((2, 3))
@@ -339,7 +339,7 @@ def _tilt(
             tilt[:, channel] = np.linalg.lstsq(sides[near], whole[near], rcond=None)[0]
             left = whole - sides @ tilt[:, channel]
         after[channel] = _robust_deviation(np.abs(left))
-    return tilt if after.mean() < TILTED * before.mean() else np.zeros((3, 3))
+    return tilt if after.mean() < TILTED * before.mean() else np.zeros_like(tilt)
 
 
 def _largest(error: np.ndarray) -> np.ndarray:

@@ -267,7 +267,7 @@ def ruled_out(view: MatteView, evidence: Evidence) -> np.ndarray:
 
 
 def is_thing(view: MatteView, removed: np.ndarray) -> bool:
-    """Return whether a removed part (h, w) of a matte is more than a shadow: it has colours."""
+    """Return whether a removed part (h, w) of a matte has colours, as no shadow has."""
     sure = removed & (view.alpha > INSIDE)
     if view.plate is None or sure.mean() < LEAST_THING:
         return False
@@ -427,7 +427,7 @@ class Agreement:
 
     @property
     def doubted(self) -> set[str]:
-        """Return the cameras whose mattes show what the others rule out."""
+        """Return the cameras whose mattes the others contradict."""
         return {*self.removed, *(note.what for note in self.warnings)}
 
 
