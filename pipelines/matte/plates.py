@@ -321,9 +321,10 @@ def _tilt(
 ) -> np.ndarray:
     """Return how the light on the wall changed across the image, as shares of the plate's levels.
 
-    People in the room take light from one side of a wall. Errors and levels are (N, 3), rows and
-    columns (N, 1). The coefficients (3, 3), by `_along`'s terms and channel, are 0 unless they
-    explain much of the error.
+    People in the room take light from one side of a wall. Larger changes, which make a plate seem
+    another set's, were `_evened` before. Errors and levels are (N, 3), rows and columns (N, 1). The
+    coefficients (3, 3), by `_along`'s terms and channel, are 0 unless they explain much of the
+    error.
     """
     quiet = _largest(error) < MOST_NOISE
     tilt = np.zeros((3, 3), np.float32)

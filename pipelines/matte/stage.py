@@ -153,7 +153,7 @@ def agree(
     if ball is None or not plated or not (thing or found.warnings):
         return mattes, views, found
     alone = without_others(read, cameras, mattes, found.doubted, thing, ball)
-    return alone, *compared(cameras, alone, ball)
+    return (mattes, views, found) if alone is mattes else (alone, *compared(cameras, alone, ball))
 
 
 def compared(
