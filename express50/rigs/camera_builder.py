@@ -110,10 +110,11 @@ def in_metres(cameras: dict[str, Camera], metres_per_unit: float) -> dict[str, C
 
 
 def as_rig(cameras: Iterable[Camera], path: Path) -> dict[str, Camera]:
-    """Return the cameras of a file by name, after checking them with `checked`.
+    """Return the cameras of a file by name, after the checks that our own file must pass.
 
     Raises:
-        CalibrationError: as for `checked`, or two cameras share a name.
+        CalibrationError: there are no cameras, two share a name, or one has an invalid rotation,
+            focal length or number.
     """
     found: dict[str, Camera] = {}
     for camera in cameras:
@@ -121,17 +122,7 @@ def as_rig(cameras: Iterable[Camera], path: Path) -> dict[str, Camera]:
             raise CalibrationError(
                 f"{path}: two cameras are called {camera.id}; give each its own name"
             )
-    return checked(found, path)
-
-
-def checked(cameras: dict[str, Camera], path: Path) -> dict[str, Camera]:
-    """Return the cameras after the checks that our own calibration file must pass.
-
-    Raises:
-        CalibrationError: there are no cameras, or one has an invalid rotation, focal length or
-            number.
-    """
-    return parse_cameras(camera_rows(cameras), str(path))
+    return parse_cameras(camera_rows(found), str(path))
 
 
 def holds(path: Path, word: str) -> bool:

@@ -17,7 +17,7 @@ from express50.errors import CalibrationError
 from express50.files.text import read_bytes, read_text, reason
 from express50.geometry.cameras import Camera
 from express50.geometry.transforms import make_transform, quat_to_matrix
-from express50.rigs.camera_builder import checked, names_from_files
+from express50.rigs.camera_builder import as_rig, names_from_files
 
 # COLMAP's models that our cameras share, by COLMAP's number: name and number of parameters.
 HELD = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5),
@@ -70,7 +70,7 @@ def read_colmap_images(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
             f"{path}: several images share one camera name ({names[0]}, ...); expected one image"
             " per camera: export the model of a single time step"
         )
-    cameras = {}
+    cameras = []
     for name, shot in zip(names, shots, strict=True):
         lens, turn = lenses.get(shot.camera), np.array(shot.pose[:4])
         length = math.hypot(*turn)  # a damaged file's may be huge
@@ -79,8 +79,8 @@ def read_colmap_images(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
                 f"{path}: image {shot.name} has no pose or no camera; export it again"
             )
         pose = make_transform(quat_to_matrix(turn / length), np.array(shot.pose[4:]))
-        cameras[name] = Camera(name, lens.width, lens.height, lens.model, lens.params, pose)
-    return checked(cameras, path), {n: s.name for n, s in zip(names, shots, strict=True)}
+        cameras.append(Camera(name, lens.width, lens.height, lens.model, lens.params, pose))
+    return as_rig(cameras, path), {n: s.name for n, s in zip(names, shots, strict=True)}
 
 
 def _refuse(path: Path, model: str) -> CalibrationError:

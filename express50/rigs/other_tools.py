@@ -22,6 +22,9 @@
   world to camera; OpenCV's axes, pixels and distortion.
 - Panoptic Studio: a list of cameras with ``K``, ``distCoef``, ``R`` and ``t``, world to camera;
   centimetres, OpenCV's axes and distortion.
+
+Every reader raises CalibrationError if there are no cameras, a value is missing or malformed, or a
+lens has a type or terms that OpenCV's model lacks.
 """
 
 from __future__ import annotations
@@ -46,7 +49,6 @@ from express50.rigs.camera_builder import (
     NO_SIZE,
     as_rig,
     camera_from_K,
-    checked,
     names_from_files,
     size_from,
 )
@@ -63,9 +65,6 @@ def read_calibration_toml(path: Path) -> dict[str, Camera]:
     """Read those cameras of caliscope or aniposelib that have a pose, in the file's unit.
 
     caliscope's are called ``cam_0`` and so on, like its videos; aniposelib's have names.
-
-    Raises:
-        CalibrationError: there are no cameras, a value is missing, or a lens is a fisheye.
     """
     table = read_toml(path, CalibrationError)
     rows = table.get("cameras", table)
@@ -97,11 +96,7 @@ def read_calibration_toml(path: Path) -> dict[str, Camera]:
 
 
 def read_kalibr(path: Path) -> dict[str, Camera]:
-    """Read the cameras of a camchain, metres; the world is that of ``cam0``.
-
-    Raises:
-        CalibrationError: the chain has a gap, a value is missing, or a lens is not pinhole-radtan.
-    """
+    """Read the cameras of a camchain, metres; the world is that of ``cam0``."""
     table = read_yaml(path, CalibrationError)
     names = [f"cam{n}" for n in range(len(table))] if isinstance(table, dict) else []
     if not names or not all(isinstance(table.get(name), dict) for name in names):
@@ -130,11 +125,7 @@ def read_kalibr(path: Path) -> dict[str, Camera]:
 
 
 def read_qualisys(path: Path) -> dict[str, Camera]:
-    """Read the active cameras of a calibration exported by QTM, by serial number, metres.
-
-    Raises:
-        CalibrationError: there are no active cameras, or one lacks a value.
-    """
+    """Read the active cameras of a calibration exported by QTM, by serial number, metres."""
     cameras = read_xml(path, CalibrationError).iter("camera")
     kept = [c for c in cameras if c.get("active") != "0" and c.get("calibrated") != "false"]
     return as_rig((_qualisys_camera(path, camera) for camera in kept), path)
@@ -163,12 +154,7 @@ def _qualisys_camera(path: Path, camera: Element) -> Camera:
 
 
 def read_metashape(path: Path) -> dict[str, Camera]:
-    """Read the aligned cameras of a chunk, named after their labels, in the chunk's unit.
-
-    Raises:
-        CalibrationError: it is not one chunk aligned in one component, a value is missing, or a
-            lens has a type or terms that OpenCV's model lacks.
-    """
+    """Read the aligned cameras of a chunk, named after their labels, in the chunk's unit."""
     chunks = list(read_xml(path, CalibrationError).iter("chunk"))
     aligned = [
         c for chunk in chunks for c in chunk.iter("camera") if c.find("transform") is not None
@@ -235,10 +221,6 @@ def read_reality_capture(path: Path, size: tuple[int, int] | None) -> dict[str, 
     """Read an XMP sidecar, or a folder of them, named after the files, in the project's unit.
 
     ``size`` is the width and height of the pictures, which sidecars do not give.
-
-    Raises:
-        CalibrationError: no size is given, a value is missing, or a lens has a model or terms that
-            OpenCV's model lacks.
     """
     if size is None:
         raise CalibrationError(f"{path}: {NO_SIZE}")
@@ -281,9 +263,6 @@ def read_vggt(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
 
     The unit is the network's own. K is scaled to ``size`` if the network saw whole pictures, which
     means that their aspect ratios agree within its rounding.
-
-    Raises:
-        CalibrationError: an array is missing or has the wrong shape.
     """
     names = ("extrinsic", "intrinsic")
     arrays = read_arrays(path, CalibrationError, "VGGT's predictions", names)
@@ -292,19 +271,12 @@ def read_vggt(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
     count = len(np.atleast_1d(poses))
     poses = finite_array(poses, (count, 3, 4), f"{path} has extrinsic")
     matrices = finite_array(matrices, (count, 3, 3), f"{path} has intrinsic")
-    found = as_rig(
-        (
-            camera_from_K(
-                f"cam{number:02d}",
-                K,
-                [],
-                (round(2 * K[0, 2]), round(2 * K[1, 2])),
-                make_transform(pose[:, :3], pose[:, 3]),
-            )
-            for number, (pose, K) in enumerate(zip(poses, matrices, strict=True))
-        ),
-        path,
-    )
+    cameras = []
+    for number, (pose, K) in enumerate(zip(poses, matrices, strict=True)):
+        own = round(2 * K[0, 2]), round(2 * K[1, 2])
+        place = make_transform(pose[:, :3], pose[:, 3])
+        cameras.append(camera_from_K(f"cam{number:02d}", K, [], own, place))
+    found = as_rig(cameras, path)
     if size is None:
         return found
     off = {n: abs(size[1] * c.width / size[0] - c.height) for n, c in found.items()}
@@ -315,9 +287,6 @@ def read_idr(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
     """Read the projections of a ``cameras.npz``, named ``000`` and so on, as its pictures are.
 
     The unit is the file's own; ``size`` is the width and height of the pictures.
-
-    Raises:
-        CalibrationError: no size is given, or a matrix is not that of a camera.
     """
     if size is None:
         raise CalibrationError(f"{path}: {NO_SIZE}")
@@ -338,11 +307,7 @@ def read_idr(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
 
 
 def read_facescape(path: Path) -> dict[str, Camera]:
-    """Read the valid cameras of an expression's ``params.json``, named as its pictures.
-
-    Raises:
-        CalibrationError: no camera is valid, or one lacks a value.
-    """
+    """Read the valid cameras of an expression's ``params.json``, named as its pictures."""
     table = read_json_table(path, CalibrationError)
     found = []
     for name in sorted(key.removesuffix("_valid") for key in table if key.endswith("_valid")):
@@ -359,11 +324,7 @@ def read_facescape(path: Path) -> dict[str, Camera]:
 
 
 def read_panoptic(path: Path) -> dict[str, Camera]:
-    """Read the cameras of CMU's Panoptic Studio, named as its videos, such as ``hd_00_05``.
-
-    Raises:
-        CalibrationError: there are no cameras, or one lacks a value.
-    """
+    """Read the cameras of CMU's Panoptic Studio, named as its videos, such as ``hd_00_05``."""
     rows = read_json_table(path, CalibrationError).get("cameras")
     found = []
     for row in filter(lambda row: isinstance(row, dict), rows if isinstance(rows, list) else []):
@@ -381,11 +342,7 @@ NERSEMBLE_SIZE = (2200, 3208)
 
 
 def read_nersemble(path: Path) -> dict[str, Camera]:
-    """Read cameras by serial number, at the release's full size.
-
-    Raises:
-        CalibrationError: world_2_cam or intrinsics are missing or have the wrong shape.
-    """
+    """Read cameras by serial number, at the release's full size."""
     table = read_json_table(path, CalibrationError)
     poses, intrinsics = table.get("world_2_cam"), table.get("intrinsics")
     if not isinstance(poses, dict) or intrinsics is None:
@@ -393,21 +350,17 @@ def read_nersemble(path: Path) -> dict[str, Camera]:
             f"{path}: expected world_2_cam {{serial: 4 x 4}} and intrinsics (3 x 3, or a table by"
             " serial)"
         )
-    found = {}
+    found = []
     for serial, pose in poses.items():
         own = intrinsics.get(serial) if isinstance(intrinsics, dict) else intrinsics
         what = f"{path}: camera {serial} has an array"
         K, matrix = finite_array(own, (3, 3), what), finite_array(pose, (4, 4), what)
-        found[serial] = camera_from_K(serial, K_from_opencv(K), [], NERSEMBLE_SIZE, matrix)
-    return checked(found, path)
+        found.append(camera_from_K(serial, K_from_opencv(K), [], NERSEMBLE_SIZE, matrix))
+    return as_rig(found, path)
 
 
 def read_renderme(path: Path) -> dict[str, Camera]:
-    """Read the cameras of an SMC with a Calibration group (in full releases the ``_anno`` one).
-
-    Raises:
-        CalibrationError: the file has no calibration, or its resolution or an array is malformed.
-    """
+    """Read the cameras of an SMC with a Calibration group (in full releases the ``_anno`` one)."""
     try:
         file = open_hdf5(path)
         group = child(file, "Calibration")
@@ -423,7 +376,7 @@ def read_renderme(path: Path) -> dict[str, Camera]:
         if size.shape != (2,) or size.dtype.kind not in "ui":
             raise CalibrationError(f"{path}: resolution {size.tolist()}, expected height and width")
         height, width = map(int, size)
-        found = {}
+        found = []
         for name in members(group):
             if not name.isdecimal() or len(name) > 4:
                 raise CalibrationError(f"{path}: camera {name!r}, expected a number such as 07")
@@ -435,10 +388,9 @@ def read_renderme(path: Path) -> dict[str, Camera]:
             dist = np.ravel(read_array(file, rows["D"])) if has_dist else np.zeros(0)
             if np.linalg.matrix_rank(pose) < 4:
                 raise CalibrationError(f"{path}: RT of camera {name} cannot be inverted")
-            camera_id = f"cam{int(name):02d}"
-            found[camera_id] = camera_from_K(
-                camera_id, K_from_opencv(K), dist[:14], (width, height), np.linalg.inv(pose)
-            )
+            pose, number = np.linalg.inv(pose), f"cam{int(name):02d}"
+            lens = K_from_opencv(K), dist[:14], (width, height)
+            found.append(camera_from_K(number, *lens, pose))
     except CaptureError as error:
         raise CalibrationError(str(error)) from None
-    return checked(found, path)
+    return as_rig(found, path)

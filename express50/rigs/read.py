@@ -20,9 +20,9 @@ from express50.geometry.conventions import K_from_opencv
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
 from express50.rigs.camera_builder import (
     NO_SIZE,
+    as_rig,
     at_size,
     camera_from_K,
-    checked,
     holds,
     in_metres,
     size_from,
@@ -162,7 +162,7 @@ def read_opencv_yaml(path: Path, size: tuple[int, int] | None) -> dict[str, Came
     Raises:
         CalibrationError: a matrix is missing or has the wrong shape, or no size is known.
     """
-    found = {}
+    found = []
     for name, where, table in _opencv_cameras(path):
         K, dist = _matrix(table, _K, where), _matrix(table, _DIST, where)
         R, t = _matrix(table, _ROTATION, where), _matrix(table, _TRANSLATION, where)
@@ -182,10 +182,8 @@ def read_opencv_yaml(path: Path, size: tuple[int, int] | None) -> dict[str, Came
         if shape is None:
             raise CalibrationError(f"{where}: {NO_SIZE}")
         pose = make_transform(R, t.ravel())
-        if name in found:
-            raise CalibrationError(f"{path}: two cameras are called {name}; rename one")
-        found[name] = camera_from_K(name, K_from_opencv(K), dist, shape, pose)
-    return checked(found, path)
+        found.append(camera_from_K(name, K_from_opencv(K), dist, shape, pose))
+    return as_rig(found, path)
 
 
 def _opencv_cameras(path: Path) -> list[tuple[str, Path | str, dict]]:

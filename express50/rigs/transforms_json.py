@@ -14,7 +14,7 @@ from express50.errors import CalibrationError
 from express50.files.text import read_json_table
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import cam_from_world_from_opengl
-from express50.rigs.camera_builder import camera_from_K, checked, holds, names_from_files
+from express50.rigs.camera_builder import as_rig, camera_from_K, holds, names_from_files
 
 _HELD = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 
@@ -67,7 +67,7 @@ def read_transforms(path: Path, size: tuple[int, int] | None) -> dict[str, Camer
                 f"{path}: camera {name} moves between frames; expected a fixed rig: give each image"
                 " its own name, or export one time step"
             )
-    return checked(found, path)
+    return as_rig(found.values(), path)
 
 
 def camera_names(frames: list[dict]) -> list[str]:

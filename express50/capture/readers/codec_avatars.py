@@ -28,7 +28,7 @@ from express50.files.containers import WITHIN, open_zip
 from express50.files.text import NAME, check_links, identifier, read_json_table, read_text
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_from_opencv
-from express50.rigs.camera_builder import camera_from_K, checked, in_metres
+from express50.rigs.camera_builder import as_rig, camera_from_K, in_metres
 
 AVA256_CAMERAS = Path("decoder/camera_calibration.json")
 AVA256_SIZE, MULTIFACE_SIZE = (2668, 4096), (1334, 2048)
@@ -148,7 +148,7 @@ def _ava256_cameras(path: Path) -> dict[str, Camera]:
         dist = finite_array(given, (len(given) if isinstance(given, list) else 0,), what)
         pose = np.vstack([T[:3], [0, 0, 0, 1]])
         found[name] = camera_from_K(name, K_from_opencv(K), dist, AVA256_SIZE, pose)
-    return checked(in_metres(found, 1e-3), path)
+    return as_rig(in_metres(found, 1e-3).values(), path)
 
 
 def _ava256_pictures(path: Path, name: str, wanted: list[Moment]) -> dict[Moment, str]:
@@ -183,7 +183,7 @@ def _multiface_cameras(path: Path) -> dict[str, Camera]:
         K = K_from_opencv(np.array(table[:3]))
         camera = identifier(name)
         found[camera] = camera_from_K(camera, K, table[3], MULTIFACE_SIZE, pose)
-    return checked(in_metres(found, 1e-3), path)
+    return as_rig(in_metres(found, 1e-3).values(), path)
 
 
 def _multiface_pictures(path: Path, name: str, wanted: list[Moment]) -> dict[Moment, str]:
