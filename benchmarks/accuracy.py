@@ -17,6 +17,7 @@ import numpy as np
 from benchmarks.calibrate import figures as rig_figures
 from benchmarks.depth_score import cast
 from benchmarks.regions_truth import iou_figures, true_head_alpha, true_labels, view_row
+from benchmarks.truth import Truth, align_worlds
 from express50.capture.expressions import NEUTRAL
 from express50.capture.frames import read_cameras_of, read_recorded_cameras
 from express50.capture.index import read_peaks
@@ -28,7 +29,6 @@ from express50.errors import Express50Error
 from express50.files.images import contact_sheet, read_image, write_image
 from express50.geometry.cameras import Camera, pinhole, transform_camera
 from express50.geometry.transforms import transform_points
-from express50.twin.truth import Truth, align_worlds
 
 VIEWS_PER_PEAK = 2  # views measured of every peak; they walk around the rig from peak to peak
 VIEWS_PER_SUBJECT = 8  # at least: a rig's first cameras may all look at the back of the head

@@ -35,6 +35,7 @@ from benchmarks.common import (
     run_or_stop,
 )
 from benchmarks.replay import measure_steps, replay
+from benchmarks.truth import Truth
 from express50.capture.expressions import NEUTRAL
 from express50.capture.frames import read_proxy
 from express50.capture.index import Cue, read_index
@@ -44,7 +45,6 @@ from express50.files.images import write_image
 from express50.files.text import markdown_table
 from express50.geometry.transforms import transform_points
 from express50.twin import TwinConfig
-from express50.twin.truth import Truth
 from pipelines import ingest
 from pipelines.ingest import add_captures
 

@@ -26,13 +26,13 @@ import numpy as np
 from benchmarks.common import make_parser
 from benchmarks.demo import EXPRESSIONS, record_twin
 from benchmarks.intervals_collect import peak_samples, row_samples
+from benchmarks.truth import Truth
 from express50.contract.config import PRESETS
 from express50.contract.layout import Dataset
 from express50.contract.stage import stages
 from express50.dial.budget import parse_budget
 from express50.dial.results import RESULTS, differences
 from express50.runner.ledger import Ledger
-from express50.twin.truth import Truth
 
 TWIN = {"subjects": 3, "cameras": 8, "width": 320, "height": 320, "frames-per-expression": 6}
 QUICK = {"subjects": 1, "cameras": 8, "width": 320, "height": 320, "frames-per-expression": 6}

@@ -44,6 +44,7 @@ from benchmarks.common import (
     rms,
     rounded,
 )
+from benchmarks.truth import align_worlds
 from express50.capture.index import Index, read_index
 from express50.contract.config import resolve_config
 from express50.files.calibration import read_cameras
@@ -52,7 +53,6 @@ from express50.geometry.transforms import invert_transform
 from express50.rigs.world_frame import meeting_point
 from express50.twin import TwinConfig
 from express50.twin.rig import make_rig, make_sensor
-from express50.twin.truth import align_worlds
 from pipelines.calibrate import STAGE
 from pipelines.calibrate.adjuster import move_pose
 from pipelines.calibrate.board import (

@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import cv2
 import numpy as np
 
+from benchmarks.truth import Truth
 from express50.capture.frames import FrameReader, read_recorded_plate
 from express50.capture.index import read_index
 from express50.contract.config import build_config
@@ -28,7 +29,6 @@ from express50.runner.executor import Pool
 from express50.runner.runner import run_stage
 from express50.twin import TwinConfig
 from express50.twin.record import print_progress, record
-from express50.twin.truth import Truth
 from pipelines import ingest
 
 TITLE = "# Speed against accuracy\n"

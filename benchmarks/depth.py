@@ -37,6 +37,7 @@ from benchmarks.depth_fusion import sweep_and_fuse
 from benchmarks.depth_score import Mesh, score, summary
 from benchmarks.depth_sweep import AXES, sweep
 from benchmarks.track import prepare, twin_config
+from benchmarks.truth import Truth
 from express50.capture.index import read_peaks
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
@@ -45,7 +46,6 @@ from express50.geometry.cameras import Camera, rays
 from express50.geometry.raycast import camera_rays, mesh_scene
 from express50.head.load import load_head
 from express50.runner.worker import peak_memory
-from express50.twin.truth import Truth
 from pipelines import track
 from pipelines.depth import STAGE
 from pipelines.depth.blocks import LevelSet, build

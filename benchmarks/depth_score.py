@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import open3d as o3d
 
+from benchmarks.truth import Truth, align_worlds
 from express50.geometry.cameras import Camera, transform_camera
 from express50.geometry.raycast import camera_rays, mesh_scene
-from express50.twin.truth import Truth, align_worlds
 from pipelines.depth.maps import Picture
 
 SUREST = (0.98, 0.96, 0.9, 0.7)  # shares of the pixels, the most confident ones

@@ -13,12 +13,12 @@ import numpy as np
 
 from benchmarks.common import in_own_process, replace_section
 from benchmarks.depth_score import score
+from benchmarks.truth import Truth
 from express50.capture.index import read_peaks
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
 from express50.files.text import markdown_table
 from express50.geometry.sampling import evenly
-from express50.twin.truth import Truth
 from pipelines.depth import STAGE
 from pipelines.depth.reconstruct import reconstruct
 from pipelines.depth.stage import read_tracked, read_views

@@ -39,13 +39,13 @@ from benchmarks.intervals_collect import (
 )
 from benchmarks.intervals_fit import ause, fit_items, fit_model
 from benchmarks.intervals_rows import ALIGN_NOISE, CONDITIONS, make_peaks, make_row
+from benchmarks.truth import Truth
 from express50.contract.layout import Dataset
 from express50.contract.stage import Unit
 from express50.error_model import FILE, NOMINAL, ErrorModel, error_bounds, error_models, item_error
 from express50.errors import CalibrationError
 from express50.files.atomic import dump_json
 from express50.rigs.world_frame import meeting_point
-from express50.twin.truth import Truth
 from pipelines.calibrate.board_rig import solve_rig
 from pipelines.calibrate.uncertainty import camera_errors, head_points, state_uncertainty
 from tests.pipelines.board_rigs import POINTS, board_motion, make_rig, observe, sizes_of

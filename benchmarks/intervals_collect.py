@@ -17,6 +17,7 @@ import open3d as o3d
 
 from annotations.align.stage import error_figures as peak_figures
 from annotations.suggestions import read_suggestions
+from benchmarks.truth import Truth, align_worlds
 from express50.capture.expressions import NEUTRAL
 from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.capture.index import read_peaks
@@ -28,7 +29,6 @@ from express50.geometry.cameras import Camera, transform_camera
 from express50.geometry.meshes import read_surface
 from express50.geometry.transforms import transform_points
 from express50.head.load import load_head
-from express50.twin.truth import Truth, align_worlds
 from pipelines.depth.maps import picture_of, surface_maps
 from pipelines.depth.prior import close_mesh
 from pipelines.depth.surface import HeadSurface

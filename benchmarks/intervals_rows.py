@@ -20,6 +20,7 @@ from annotations import align, observe
 from benchmarks.common import keep_cameras, run_or_stop, write_peaks
 from benchmarks.matte_disturbances import Shot, before_wall
 from benchmarks.matte_scenes import cluttered
+from benchmarks.truth import Truth
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
 from express50.files.calibration import read_cameras, write_cameras
@@ -29,7 +30,6 @@ from express50.runner.executor import Pool
 from express50.runner.runner import run_stage
 from express50.twin import TwinConfig, rig
 from express50.twin.record import record
-from express50.twin.truth import Truth
 from pipelines import calibrate, depth, frames, ingest, matte, register, track
 from pipelines.ingest import add_captures
 

@@ -32,11 +32,11 @@ import numpy as np
 
 from benchmarks.common import make_parser, means, recorded, rounded, true_pictures
 from benchmarks.matte_scenes import Scene, make_scenes
+from benchmarks.truth import Truth
 from express50.contract.layout import Dataset
 from express50.files.images import srgb_to_linear
 from express50.geometry.sampling import evenly
 from express50.twin import TwinConfig
-from express50.twin.truth import Truth
 from pipelines.matte import MatteConfig
 from pipelines.matte.key import dilated, eroded, key_alpha
 from pipelines.matte.plates import exposed, exposure_gain

@@ -56,13 +56,13 @@ from benchmarks.common import (
 )
 from benchmarks.matte import errors
 from benchmarks.matte_disturbances import DISTURBANCES, Shot, other_plates, walls
+from benchmarks.truth import Truth
 from express50.contract.layout import Dataset
 from express50.errors import NoFaceError
 from express50.files.images import contact_sheet, shrink, write_image
 from express50.geometry.cameras import pinhole
 from express50.geometry.sampling import evenly
 from express50.twin import TwinConfig
-from express50.twin.truth import Truth
 from pipelines.matte import MatteConfig
 from pipelines.matte.cutout import CutView, cut_out, find_head, make_cut_view, region_of
 from pipelines.matte.key import key_alpha

@@ -32,6 +32,7 @@ from benchmarks.common import make_parser, rms, run_or_stop
 from benchmarks.regions_truth import true_labels
 from benchmarks.track import prepare, twin_config
 from benchmarks.track_views import face_of
+from benchmarks.truth import Truth, align_worlds
 from express50.capture.frames import read_cameras_of
 from express50.capture.index import read_peaks
 from express50.contract.layout import Dataset
@@ -42,7 +43,6 @@ from express50.files.images import read_image
 from express50.geometry.raycast import visible_faces
 from express50.geometry.transforms import transform_points
 from express50.twin import TwinConfig
-from express50.twin.truth import Truth, align_worlds
 from pipelines import depth, regions, track
 
 KINDS = {"glasses": ("glasses",), "hand": ("hand",), "beard": ("beard", "moustache"),

@@ -23,6 +23,7 @@ import numpy as np
 from benchmarks.accuracy import true_world_cameras
 from benchmarks.common import make_parser
 from benchmarks.regions_truth import iou_figures, true_head_alpha, true_labels, view_row
+from benchmarks.truth import Truth
 from express50.capture.frames import read_cameras_of
 from express50.capture.index import read_peaks
 from express50.contract.config import resolve_config
@@ -34,7 +35,6 @@ from express50.geometry.cameras import project
 from express50.geometry.sampling import evenly
 from express50.head.load import load_head
 from express50.head.model import landmarks
-from express50.twin.truth import Truth
 from pipelines.regions import STAGE, RegionsConfig
 from pipelines.regions.geometry import head_alpha, head_labels, make_head
 from pipelines.regions.stage import label_view, read_depth_of, read_frame_and_matte, read_head

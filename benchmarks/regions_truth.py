@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from benchmarks.truth import Truth
 from express50.contract.segmentation_labels import LABELS
 from express50.geometry.cameras import Camera, resized
 from express50.twin.surface import Material
-from express50.twin.truth import Truth
 from pipelines.regions.geometry import SCALP, head_labels
 
 _PLAIN = {

@@ -29,6 +29,7 @@ import open3d as o3d
 from benchmarks.common import make_parser, rms, run_or_stop
 from benchmarks.track import EXPRESSIONS, prepare, twin_config
 from benchmarks.track_views import face_of
+from benchmarks.truth import Truth, align_worlds
 from express50.capture.frames import read_cameras_of
 from express50.contract.layout import Dataset
 from express50.dataset.tracks import read_registration, read_track
@@ -37,7 +38,6 @@ from express50.geometry.raycast import join_rays, mesh_scene
 from express50.geometry.transforms import transform_points
 from express50.head.load import load_head
 from express50.head.model import HeadModel
-from express50.twin.truth import Truth, align_worlds
 from pipelines import depth, track
 from pipelines.register import STAGE
 from pipelines.register.lay import GivenSurface, lay, mesh_normals

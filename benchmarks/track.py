@@ -36,6 +36,7 @@ from benchmarks.common import (
 )
 from benchmarks.track_truth import Errors, clip_errors, compare, mean, pooled, summary
 from benchmarks.track_views import held_out_views
+from benchmarks.truth import Truth
 from express50.capture.frames import read_cameras_of
 from express50.capture.index import index_to_json, read_index, read_peaks
 from express50.contract.config import build_config
@@ -44,7 +45,6 @@ from express50.files.calibration import read_cameras, write_cameras
 from express50.head.load import load_head
 from express50.twin import TwinConfig
 from express50.twin.record import record
-from express50.twin.truth import Truth
 from pipelines import calibrate, frames, ingest, matte
 from pipelines.ingest import add_captures
 from pipelines.track import STAGE

@@ -17,11 +17,11 @@ from benchmarks.common import add_twin_options, check_twin_options, make_parser,
 from benchmarks.track import narrowed, prepare, track, twin_config
 from benchmarks.track_truth import summary
 from benchmarks.track_views import held_out_views
+from benchmarks.truth import Truth
 from express50.capture.frames import read_cameras_of
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
 from express50.files.text import markdown_table
-from express50.twin.truth import Truth
 from pipelines.track import STAGE
 
 SECTION = "Settings of tracking"

@@ -15,6 +15,7 @@ import torch
 
 from benchmarks.common import rms
 from benchmarks.track_views import HeldOut, face_of, mask_of, psnr_db
+from benchmarks.truth import Truth, align_worlds
 from express50.capture.frames import read_cameras_of
 from express50.contract.layout import Dataset
 from express50.dataset.export import clip_vertices
@@ -24,7 +25,6 @@ from express50.geometry.cameras import Camera, pinhole, project, transform_camer
 from express50.geometry.transforms import axis_angle_to_matrix, rigid_fit, transform_points
 from express50.head.load import load_head
 from express50.head.model import HeadModel, in_regions, landmarks
-from express50.twin.truth import Truth, align_worlds
 
 NO_SKIN = ("mouth_interior", "teeth", "neck", "boundary")
 

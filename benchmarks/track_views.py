@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.truth import Truth
 from express50.capture.frames import FootageReader, read_cameras_of
 from express50.capture.raw import read_capture
 from express50.contract.layout import Dataset
@@ -26,7 +27,6 @@ from express50.geometry.raycast import visible_faces
 from express50.geometry.sampling import undistort_image
 from express50.geometry.transforms import unit
 from express50.head.model import HeadModel
-from express50.twin.truth import Truth
 from pipelines.track.surface import Visibility, look_up
 
 MIN_COSINE = 0.4  # cosine below which a camera's view of a point is not taken

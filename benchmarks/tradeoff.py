@@ -14,12 +14,12 @@ from pathlib import Path
 
 from benchmarks import accuracy
 from benchmarks.common import make_parser, replace_section
+from benchmarks.truth import Truth
 from express50.contract.config import PRESETS
 from express50.contract.layout import Dataset
 from express50.contract.stage import with_required
 from express50.files.text import markdown_table
 from express50.runner.worker import core_seconds
-from express50.twin.truth import Truth
 from pipelines.stages import STAGES
 
 SECTION = "Presets of the stages"

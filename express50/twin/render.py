@@ -222,30 +222,3 @@ def window_of(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]
     x0, x1 = np.clip((x0, x1), 0, camera.width)
     y0, y1 = np.clip((y0, y1), 0, camera.height)
     return int(x0), int(y0), int(x1), int(y1)
-
-
-def render_alpha(
-    caster: Caster, material: np.ndarray, vertices: np.ndarray, camera: Camera
-) -> np.ndarray:
-    """Render the alpha (H, W) float32 in [0, 1] of geometry in a camera, with 33 rays at edges."""
-    alpha = np.zeros((camera.height, camera.width), np.float32)
-    window = window_of(camera, hull_of(vertices))
-    sampling = Sampling(edge=33, inside=1, sparing=False)
-    for band in bands(camera):
-        done = render_band(caster, material, window, band, sampling, None)
-        if done is not None:
-            _, part, place = done
-            alpha[place] = part
-    return alpha
-
-
-def render_depth(caster: Caster, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Render camera z (H, W) float32, metres, 0 where nothing is hit; and validity (H, W) bool."""
-    depth = np.zeros((camera.height, camera.width), np.float32)
-    for band in bands(camera):
-        part = band.centre[band.rows]
-        # Directions have camera z 1, so the distance along them is camera z.
-        distance, _, _ = caster.cast(band.origin, part.reshape(-1, 3))
-        distance = np.where(np.isfinite(distance), distance, 0.0)
-        depth[band.top : band.bottom] = distance.reshape(part.shape[:2])
-    return depth, depth > 0

@@ -1,22 +1,28 @@
-"""Film a subject through every camera, with plates and board pictures, and write the files."""
+"""Film a subject through every camera, with plates and board pictures; write files and truth.
+
+Of the truth only parameters are stored; benchmarks make meshes, depth and alpha from them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import json
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
 
 from express50.capture.expressions import select
+from express50.files.calibration import write_cameras
 from express50.files.images import encode_png
 from express50.files.video import ImageFootage, VideoFootage
 from express50.geometry.cameras import Camera
+from express50.head import absolute_head
 from express50.head.load import load_head
 from express50.twin import TwinConfig
-from express50.twin.alive import LivingSkin, living_skin
+from express50.twin.alive import living_skin
 from express50.twin.board import board_poses, render_board, studio_bands
 from express50.twin.body import Body, build_body, pose_body, with_hand
 from express50.twin.render import RowBand, Sampling, hull_of, render_band, window_of
@@ -24,11 +30,12 @@ from express50.twin.rig import Sensor, expose, make_rig, make_sensor
 from express50.twin.shade import LitScene, build_scene, find_eyes, make_lighting, shade
 from express50.twin.skin import paint_skin, texture_width
 from express50.twin.subjects import TwinPerformance, make_subject, perform
-from express50.twin.truth import write_truth
 
 # Up to this many pixels, rays and plates are kept between frames (about 50 bytes per pixel);
 # above, every band is made again for every frame.
 _KEEP_PIXELS = 4_000_000
+OF_PLAY = ("strength", "expression", "jaw", "neck", "eyes", "R", "t")
+"""Arrays of a performance that are stored as truth."""
 
 # Loading a head model takes seconds, and a worker films several subjects.
 _head = cache(load_head)
@@ -96,7 +103,10 @@ def film_subject(
             stack.enter_context(films[-1])
         for frame in range(play.frames):
             posed = pose_body(body, play, frame)
-            living = skin_of(config, body, play, frame)
+            living = None
+            if config.personal:
+                who = number, seed, body.subject.look.age
+                living = living_skin(body.model, *who, config.personal, play.expression[frame])
             scene = build_scene(body, texture, eyes, lighting, posed, seed, living)
             hull = hull_of(posed.vertices)
             for view, film in zip(views, films, strict=True):
@@ -112,14 +122,6 @@ def film_subject(
             plate = np.concatenate([plate for _, plate in view.bands()])
             image = expose(view.sensor, plate, chance, config.noise)
             write_png(capture / "plates" / f"{view.camera.id}.png", image)
-
-
-def skin_of(config: TwinConfig, body: Body, play: TwinPerformance, frame: int) -> LivingSkin | None:
-    """Return how the skin looks in a frame; None if `twin.personal` is 0."""
-    if not config.personal:
-        return None
-    who = body.subject.number, config.seed, body.subject.look.age
-    return living_skin(body.model, *who, config.personal, play.expression[frame])
 
 
 def render_view(scene: LitScene, view: StudioView, hull: np.ndarray) -> np.ndarray:
@@ -161,3 +163,34 @@ def write_png(path: Path, image: np.ndarray) -> None:
     """Write a PNG; make its folder if needed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(encode_png(image))
+
+
+def write_truth(
+    folder: Path, head: str, body: Body, play: TwinPerformance, cameras: Mapping[str, Camera]
+) -> None:
+    """Write a subject's truth: cameras.json, peaks.json, subject.json, frames.npz, body.npz.
+
+    If needed, also its own motion in own.npz, and what it wears and holds in worn.npz.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    write_cameras(folder / "cameras.json", cameras)
+    subject = body.subject
+    about = {"id": subject.id, "number": subject.number, "head": absolute_head(head),
+             "look": asdict(subject.look), "cues": play.cues}  # fmt: skip
+    words = json.dumps(about, indent=1, default=np.ndarray.tolist)
+    (folder / "subject.json").write_text(words + "\n")
+    (folder / "peaks.json").write_text(json.dumps(play.peaks, indent=1) + "\n")
+    np.savez_compressed(folder / "frames.npz", **{name: getattr(play, name) for name in OF_PLAY})
+    extras = body.extras
+    if subject.own is not None:
+        np.savez_compressed(folder / "own.npz", own=subject.own)
+    np.savez_compressed(
+        folder / "body.npz",
+        shape=subject.shape, offsets=subject.offsets, scalp=body.scalp, centre=body.centre,
+        hair_vertices=extras.hair.vertices, hair_faces=extras.hair.faces,
+        hair_moves=extras.hair.moves,
+        cloth_vertices=extras.cloth_vertices, cloth_faces=extras.cloth_faces,
+        skull=extras.skull, skull_rest=extras.skull_rest,
+    )  # fmt: skip
+    if len(extras.worn.faces):
+        np.savez_compressed(folder / "worn.npz", hand=extras.hand, **vars(extras.worn))

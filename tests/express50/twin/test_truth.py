@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.truth import Truth, align_worlds
 from express50.errors import CaptureError
 from express50.files.images import read_image
 from express50.geometry.cameras import project, resized, transform_camera
@@ -11,7 +12,6 @@ from express50.geometry.transforms import axis_angle_to_matrix, make_transform
 from express50.head.model import landmarks
 from express50.twin.rig import make_rig
 from express50.twin.surface import Material
-from express50.twin.truth import Truth, align_worlds
 
 
 @pytest.fixture(scope="module")

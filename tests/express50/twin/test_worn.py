@@ -3,6 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from benchmarks.truth import Truth
 from express50.errors import ConfigError
 from express50.geometry.raycast import mesh_scene
 from express50.twin import KINDS, TwinConfig
@@ -13,7 +14,6 @@ from express50.twin.shade import build_scene, find_eyes, make_lighting, shade
 from express50.twin.skin import paint_skin
 from express50.twin.studio import cast_subject
 from express50.twin.surface import Material
-from express50.twin.truth import Truth
 from express50.twin.worn import WITH_HAND
 
 

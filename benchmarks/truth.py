@@ -1,13 +1,12 @@
-"""Write and read the twin's ground truth, for benchmarks, tests and reports.
+"""Read the twin's ground truth: meshes, depth and alpha are made on demand from the parameters.
 
-Only parameters are stored; meshes, depth and alpha are made from them on demand.
+The reader lies outside of the product, so that no stage can open the truth.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -16,56 +15,24 @@ import numpy as np
 
 from express50.errors import CaptureError
 from express50.files.arrays import read_arrays
-from express50.files.calibration import read_cameras, write_cameras
+from express50.files.calibration import read_cameras
 from express50.geometry.cameras import Camera, rays
 from express50.geometry.transforms import make_transform, rigid_fit
-from express50.head import absolute_head
 from express50.head.load import load_head
 from express50.head.model import HeadModel
-from express50.twin import render
 from express50.twin.body import Body, Extras, assemble, head_vertices, pose_body
 from express50.twin.hair import HairMesh
+from express50.twin.render import Sampling, bands, hull_of, render_band, window_of
+from express50.twin.studio import OF_PLAY
 from express50.twin.subjects import PersonLook, TwinPerformance, TwinSubject
 from express50.twin.surface import MISS, Caster
 from express50.twin.worn import WornMesh, bare
 
 SKIN_M = 0.5e-3  # what is this near to the skin counts as skin, as roots of hair do
-_PLAY = ("strength", "expression", "jaw", "neck", "eyes", "R", "t")
-
-
-def write_truth(
-    folder: Path, head: str, body: Body, play: TwinPerformance, cameras: Mapping[str, Camera]
-) -> None:
-    """Write a subject's truth: cameras.json, peaks.json, subject.json, frames.npz, body.npz.
-
-    If needed, also its own motion in own.npz, and what it wears and holds in worn.npz.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    write_cameras(folder / "cameras.json", cameras)
-    subject = body.subject
-    about = {"id": subject.id, "number": subject.number, "head": absolute_head(head),
-             "look": asdict(subject.look), "cues": play.cues}  # fmt: skip
-    words = json.dumps(about, indent=1, default=np.ndarray.tolist)
-    (folder / "subject.json").write_text(words + "\n")
-    (folder / "peaks.json").write_text(json.dumps(play.peaks, indent=1) + "\n")
-    np.savez_compressed(folder / "frames.npz", **{name: getattr(play, name) for name in _PLAY})
-    extras = body.extras
-    if subject.own is not None:
-        np.savez_compressed(folder / "own.npz", own=subject.own)
-    np.savez_compressed(
-        folder / "body.npz",
-        shape=subject.shape, offsets=subject.offsets, scalp=body.scalp, centre=body.centre,
-        hair_vertices=extras.hair.vertices, hair_faces=extras.hair.faces,
-        hair_moves=extras.hair.moves,
-        cloth_vertices=extras.cloth_vertices, cloth_faces=extras.cloth_faces,
-        skull=extras.skull, skull_rest=extras.skull_rest,
-    )  # fmt: skip
-    if len(extras.worn.faces):
-        np.savez_compressed(folder / "worn.npz", hand=extras.hand, **vars(extras.worn))
 
 
 class Truth:
-    """Reads what :func:`write_truth` wrote; everything is in the true world, metres."""
+    """Reads what `write_truth` of the studio wrote; everything is in the true world, metres."""
 
     def __init__(self, root: Path) -> None:
         """Open ``OUT/truth`` of a recording; CaptureError if the folder holds no truth."""
@@ -97,7 +64,7 @@ class Truth:
     def parameters(self, subject: str, frame: int) -> dict[str, np.ndarray]:
         """Return a frame's shape, offsets, expression, jaw, neck, eyes, R, t, strength."""
         body, play = self._play(subject, frame)
-        values = {name: getattr(play, name)[frame] for name in _PLAY}
+        values = {name: getattr(play, name)[frame] for name in OF_PLAY}
         return {"shape": body.subject.shape, "offsets": body.subject.offsets} | values
 
     def vertices(self, subject: str, frame: int) -> np.ndarray:
@@ -117,13 +84,13 @@ class Truth:
 
         Lenses are invisible here, and in `render_alpha` and `skin`.
         """
-        return render.render_depth(self._scene(subject, frame)[0], camera)
+        return render_depth(self._scene(subject, frame)[0], camera)
 
     def skin(self, subject: str, frame: int, camera: Camera) -> np.ndarray:
         """Mark the pixels (H, W) bool where nothing hides the head's own surface."""
         depth, valid = self.render_depth(subject, frame, camera)
         caster = Caster(self.vertices(subject, frame), self.head_model(subject).faces.numpy())
-        bare, there = render.render_depth(caster, camera)
+        bare, there = render_depth(caster, camera)
         return valid & there & (np.abs(bare - depth) < SKIN_M)
 
     def surface(self, subject: str, frame: int, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -154,7 +121,7 @@ class Truth:
     def render_alpha(self, subject: str, frame: int, camera: Camera) -> np.ndarray:
         """Render alpha (H, W) float32 in [0, 1], from 33 rays per pixel at silhouettes."""
         caster, vertices = self._scene(subject, frame)
-        return render.render_alpha(caster, self._subject(subject)[0].material, vertices, camera)
+        return render_alpha(caster, self._subject(subject)[0].material, vertices, camera)
 
     def _compile(self, subject: str, frame: int) -> tuple[Caster, np.ndarray]:
         body, play = self._play(subject, frame)
@@ -183,7 +150,7 @@ class Truth:
                   for path in folder.glob("*.npz")}  # fmt: skip
         play = TwinPerformance(
             cues=tuple((str(e), int(a), int(b)) for e, a, b in about["cues"]), peaks=peaks,
-            **{name: stored["frames"][name] for name in _PLAY},
+            **{name: stored["frames"][name] for name in OF_PLAY},
         )  # fmt: skip
         data, own = stored["body"], stored.get("own", {}).get("own")
         look: dict[str, Any] = about["look"]
@@ -232,3 +199,30 @@ def _frame_points(camera: Camera) -> np.ndarray:
     ends = pose[:3, 3] + pose[:3, :3].T
     # Both ends of every axis, so that the points' mean is the centre.
     return np.concatenate([pose[None, :3, 3], ends, 2 * pose[:3, 3] - ends])
+
+
+def render_alpha(
+    caster: Caster, material: np.ndarray, vertices: np.ndarray, camera: Camera
+) -> np.ndarray:
+    """Render the alpha (H, W) float32 in [0, 1] of geometry in a camera, with 33 rays at edges."""
+    alpha = np.zeros((camera.height, camera.width), np.float32)
+    window = window_of(camera, hull_of(vertices))
+    sampling = Sampling(edge=33, inside=1, sparing=False)
+    for band in bands(camera):
+        done = render_band(caster, material, window, band, sampling, None)
+        if done is not None:
+            _, part, place = done
+            alpha[place] = part
+    return alpha
+
+
+def render_depth(caster: Caster, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Render camera z (H, W) float32, metres, 0 where nothing is hit; and validity (H, W) bool."""
+    depth = np.zeros((camera.height, camera.width), np.float32)
+    for band in bands(camera):
+        part = band.centre[band.rows]
+        # Directions have camera z 1, so the distance along them is camera z.
+        distance, _, _ = caster.cast(band.origin, part.reshape(-1, 3))
+        distance = np.where(np.isfinite(distance), distance, 0.0)
+        depth[band.top : band.bottom] = distance.reshape(part.shape[:2])
+    return depth, depth > 0
