@@ -1,8 +1,8 @@
 """Make the built-in head: a full head in FLAME's layout with the variety of people.
 
 Run `python -m express50.head.generator.head` after a change here: it rewrites `builtin.npz`, with
-the mean and the shape directions of the old file. These are statistics of ICT-FaceKit's people,
-which the code of commit 30fa190 computed (docs/TRACKING.md).
+the mean and the shape directions of the old file. With `--people ict.npz` these are fitted again to
+the people of ICT-FaceKit (`people`), which takes some minutes.
 
 The generator draws a head by rule, with features placed by anthropometry (Farkas 1994). The mean of
 people has the same vertices, and so its mesh, UV map, regions, landmarks and motions. Units are
@@ -25,6 +25,7 @@ from express50.head.generator.eyes import add_eyeball, ball_centre
 from express50.head.generator.field import window
 from express50.head.generator.mesh import HalfMesh, WholeMesh, mirrored, neighbour_mean, pack_uv
 from express50.head.generator.mouth import add_teeth, add_tongue
+from express50.head.generator.people import People, fit_people
 from express50.head.generator.regions import contour_candidates, embed_landmarks, region_masks
 from express50.head.generator.skin import add_skin, set_skin_uv
 from express50.head.load import BUILTIN, load_builtin
@@ -32,6 +33,8 @@ from express50.head.load import BUILTIN, load_builtin
 Array = np.ndarray
 
 ROOT, NECK, JAW, LEFT_EYE, RIGHT_EYE = range(5)
+# Joints of the head drawn by rule, mm: collar, upper neck, jaw hinge.
+JOINTS = np.array([(0, -165, -22), (0, -72, -16), (0, -8, 10)], float)
 
 
 @cache
@@ -47,15 +50,12 @@ def procedural_mesh() -> WholeMesh:
     return mirrored(half)
 
 
-def write_builtin(path: Path) -> None:
+def write_builtin(path: Path, people: People) -> None:
     """Write the head's arrays, in metres, as the .npz file that `express50.head.load` reads."""
-    mesh, stored = procedural_mesh(), load_builtin()
-    template = 1000 * stored.template.double().numpy()
-    directions = 1000 * stored.shape_dirs.double().numpy()
-    mean = replace(mesh, vertices=template)
+    mesh = procedural_mesh()
+    mean = replace(mesh, vertices=people.mean)
     eyes = [ball_centre(mean, side) for side in ("left", "right")]
-    neck_and_jaw = stored.joint_regressor.double().numpy()[:LEFT_EYE] @ template
-    joints = np.concatenate([neck_and_jaw, eyes])
+    joints = np.concatenate([people.joints, eyes])
     regions, contour = region_masks(mesh), contour_candidates(mesh)
     uv, uv_faces = pack_uv(mesh)
     landmark_faces, landmark_bary = embed_landmarks(mesh)
@@ -64,8 +64,8 @@ def write_builtin(path: Path) -> None:
         mesh, mean, regions, weights[:, JAW], joints[JAW]
     )
     arrays = {
-        "template": template / 1000,
-        "shape_dirs": np.round(directions / 1000, 6),
+        "template": people.mean / 1000,
+        "shape_dirs": np.round(people.directions / 1000, 6),
         "expression_dirs": expressions / 1000,
         "pose_dirs": pose_correctives(mesh, regions) / 1000,
         "joint_regressor": joint_regressor(mean, joints),
@@ -73,19 +73,27 @@ def write_builtin(path: Path) -> None:
         "uv": uv,
         "landmark_bary": landmark_bary,
     }
-    content: dict[str, Any] = {name: array.astype(np.float32) for name, array in arrays.items()}
-    content |= {
+    stored: dict[str, Any] = {name: array.astype(np.float32) for name, array in arrays.items()}
+    stored |= {
         "faces": mesh.faces,
         "uv_faces": uv_faces,
         "landmark_faces": landmark_faces,
-        "shape_names": [f"people_{k:02d}" for k in range(directions.shape[2])],
+        "shape_names": [f"people_{k:02d}" for k in range(people.directions.shape[2])],
         "expression_names": expression_names,
         "contour": np.concatenate(contour),
         "contour_counts": [len(line) for line in contour],
         "region_names": list(regions),
         "regions": np.stack(list(regions.values())),
     }
-    np.savez_compressed(path, **content)
+    np.savez_compressed(path, **stored)
+
+
+def stored_people() -> People:
+    """Return the mean and the directions of the stored head."""
+    head = load_builtin()
+    template = 1000 * head.template.double().numpy()
+    joints = head.joint_regressor.double().numpy()[:LEFT_EYE] @ template
+    return People(template, 1000 * head.shape_dirs.double().numpy(), joints)
 
 
 def joint_regressor(mesh: WholeMesh, joints: Array) -> Array:
@@ -187,8 +195,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m express50.head.generator.head", description=__doc__
     )
+    parser.add_argument("--people", type=Path, help="ICT-FaceKit's arrays (.npz) to fit people to")
     parser.add_argument("--out", type=Path, default=BUILTIN)
-    write_builtin(parser.parse_args(arguments).out)
+    options = parser.parse_args(arguments)
+    mesh = procedural_mesh()
+    write_builtin(
+        options.out, fit_people(mesh, JOINTS, options.people) if options.people else stored_people()
+    )
     return 0
 
 

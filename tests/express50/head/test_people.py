@@ -7,7 +7,25 @@ import torch
 
 from benchmarks.head import draw_people, measure
 from express50.head.generator.head import procedural_mesh
+from express50.head.generator.ict_registration import FLIP
+from express50.head.generator.people import KEPT_VARIANCE, principal_directions
 from express50.head.load import load_builtin
+
+
+def test_directions_have_the_covariance_of_people_and_their_mirror_images():
+    rng = np.random.default_rng(0)
+    mirror = np.array([1, 0, 2, 4, 3])
+    moves = rng.normal(size=(5, 3, 4)) * np.array([3.0, 2.0, 1.0, 0.5])
+    other = moves[mirror] * FLIP[:, None]
+    both = np.concatenate([moves, other], axis=2).reshape(15, -1) / np.sqrt(2)
+    found = principal_directions(moves, mirror)
+    flat = found.reshape(15, -1)
+    kept = (flat**2).sum() / (both**2).sum()
+    assert KEPT_VARIANCE <= kept <= 1.0 + 1e-9
+    missing = both @ both.T - flat @ flat.T
+    assert np.linalg.eigvalsh(missing).min() > -1e-9  # it is a part of the covariance
+    signs = (found[mirror] * FLIP[:, None] * found).sum((0, 1)) / (flat**2).sum(0)
+    np.testing.assert_allclose(np.abs(signs), 1.0, atol=1e-9)
 
 
 def test_directions_of_the_stored_head_are_orthogonal_and_ordered():
