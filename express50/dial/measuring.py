@@ -67,7 +67,7 @@ def measured_figures(
 
 @dataclass(frozen=True)
 class _Allowance:
-    """Says how long trials may take; an `Allowance` of the pilot."""
+    """Says how long trials may take, from what was measured so far."""
 
     chain: Chain
     clock: Clock
@@ -163,7 +163,7 @@ def _measure_one(chain: Chain, clock: Clock, allowance: _Allowance) -> PilotFigu
     for subject in subjects:
         try:
             pilot = Pilot(chain, subject, clock)
-            found = measure(pilot, allowance)
+            found = measure(pilot, allowance.spare, allowance.doubtful)
             broken = broken_stage(chain, found.trials[0])
             if pilot.cut:
                 least = clock.now() + front(workload(chain, found, clock.cores, {}))[0].seconds

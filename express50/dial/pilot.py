@@ -17,7 +17,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import mean, median
-from typing import Any, Protocol
+from typing import Any
 
 from express50.capture.index import read_index
 from express50.contract.layout import Dataset
@@ -298,21 +298,14 @@ def _base(pilot: Pilot, settings: dict[str, str], choices: Sequence[str]) -> Tri
         words = f"{broken} made nothing at its cheapest setting; trying {settings[broken]}"
 
 
-class Allowance(Protocol):
-    """Says how long trials may take, from what was measured so far."""
-
-    def spare(self, figures: PilotFigures, guess: Trial | None = None) -> float:
-        """Return the seconds that a run with the best choice so far would leave.
-
-        With a guess of a trial, the run has its setting as well.
-        """
-
-    def doubtful(self, figures: PilotFigures) -> float:
-        """Return by how many seconds of the run a trial of one expression may correct the plan."""
-
-
-def measure(pilot: Pilot, allowance: Allowance) -> PilotFigures:
+def measure(
+    pilot: Pilot, spare: Callable[..., float], doubtful: Callable[[PilotFigures], float]
+) -> PilotFigures:
     """Run trials, the cheapest first, while there is time for them and for a run with the result.
+
+    `spare` returns the seconds that a run with the best choice so far would leave, also with the
+    setting of a guessed trial; `doubtful` those by which a trial of one expression may correct the
+    plan.
 
     The first trial, at the cheapest settings, runs until it or the budget ends. It is the only one
     if a stage makes nothing at any setting.
@@ -329,7 +322,7 @@ def measure(pilot: Pilot, allowance: Allowance) -> PilotFigures:
     found = replace(
         found, losses={name: _losses(pilot, [base], base.settings, name) for name in choices}
     )
-    limit = min(allowance.spare(found), allowance.doubtful(found))
+    limit = min(spare(found), doubtful(found))
     if base.footage.expressions > 1 and (
         pilot.record(base.settings, 1).is_file() or one_peak_seconds(pilot, base) <= limit
     ):
@@ -340,13 +333,13 @@ def measure(pilot: Pilot, allowance: Allowance) -> PilotFigures:
     for name, label in _steps(pilot, base, choices):
         settings, factor = {**base.settings, name: label}, grown.get(name, 1.0)
         pilot.clock.expect(0.0)
-        known, limit = pilot.record(settings, TRIAL_EXPRESSIONS).is_file(), allowance.spare(found)
+        known, limit = pilot.record(settings, TRIAL_EXPRESSIONS).is_file(), spare(found)
         likely, worst = (
             guessed(pilot, base, name, label, factor * f) for f in (LIKELY_RATIO, WORST_RATIO)
         )
         # Even at its worst, the trial must leave time for the best choice so far.
         fits = trial_seconds(pilot, worst, name) <= limit and (
-            trial_seconds(pilot, likely, name) <= allowance.spare(found, likely)
+            trial_seconds(pilot, likely, name) <= spare(found, likely)
         )
         if known or fits:
             trial = pilot.trial(

@@ -63,7 +63,7 @@ def scan_camera(
             pts.append(stamp)
             if image is None:
                 hashes.append(UNKNOWN_HASH)
-                proxies.leave_out()
+                proxies.table.append(None)
                 continue
             size = size or image.shape[:2]
             if image.shape[:2] != size:
@@ -253,17 +253,13 @@ class ProxyWriter:
 
     def __init__(self, path: Path) -> None:
         self._tar = tarfile.open(path, "w", format=tarfile.USTAR_FORMAT)  # noqa: SIM115
-        self.table: list[tuple[int, int] | None] = []
+        self.table: list[tuple[int, int] | None] = []  # by frame; None without a proxy
 
     def __enter__(self) -> ProxyWriter:
         return self
 
     def __exit__(self, *unused: object) -> None:
         self._tar.close()
-
-    def leave_out(self) -> None:
-        """Note that the next frame has no proxy."""
-        self.table.append(None)
 
     def add(self, data: bytes) -> None:
         """Append one JPEG; time and owner are 0, so that equal frames give equal bytes."""

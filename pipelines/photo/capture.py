@@ -120,12 +120,6 @@ def upright_frames(picture: PhotoSource) -> Iterator[np.ndarray]:
         yield upright(image, picture.orientation)
 
 
-def guess_focal(picture: PhotoSource, width: int, height: int, film_mm: float) -> tuple[float, str]:
-    """Guess the focal length in pixels; the source is `exif`, else `guess` by `film_mm`."""
-    mm, source = (picture.film_mm, "exif") if picture.film_mm > 0 else (film_mm, "guess")
-    return focal_of_film(mm, width, height), source
-
-
 @dataclass(frozen=True)
 class Focal:
     """A focal length, pixels, and its evidence.
@@ -187,7 +181,11 @@ def make_photo_capture(
     images = [image for n, image in enumerate(upright_frames(picture)) if n in probes]
     height, width = images[0].shape[:2]
     low, high = (max(width, height) * limit for limit in FOCAL_LIMITS)
-    start = (focal_px, "given") if focal_px else guess_focal(picture, width, height, film_mm)
+    if focal_px:
+        start = focal_px, "given"
+    else:
+        film, source = (picture.film_mm, "exif") if picture.film_mm > 0 else (film_mm, "guess")
+        start = focal_of_film(film, width, height), source
     if not low <= start[0] <= high:
         raise CaptureError(
             f"{picture.path}: its focal length is {start[0]:.4g} px ({start[1]}), expected {low:g}"

@@ -12,7 +12,7 @@ import numpy as np
 
 from express50.contract.segmentation_labels import LABELS, label_mask
 from express50.files.images import resize_area
-from pipelines.networks import Network, Role, load_network
+from pipelines.networks import Network, Role
 
 SAPIENS = Role(setting="regions.segmentation", inputs=("image",))
 HEIGHT, WIDTH = 1024, 768
@@ -24,11 +24,6 @@ _IDS |= {"teeth": (25, 26), "tongue": (27,), "hand": (5, 14), "torso": tuple(ran
 LABEL_OF_CLASS = np.array(
     [LABELS.index(next(name for name in _IDS if k in _IDS[name])) for k in range(CLASSES)], np.uint8
 )
-
-
-def network_labels(segmentation: str, frame: np.ndarray, mesh: np.ndarray) -> np.ndarray:
-    """Label a frame (H, W, 3) by the network in a file, refined by the mesh's labels (H, W)."""
-    return refined(segment(load_network(segmentation, SAPIENS), frame), mesh)
 
 
 def segment(network: Network, frame: np.ndarray) -> np.ndarray:

@@ -249,9 +249,10 @@ def _write_view(
     labels, large = view.labels, enlarged(view.labels)
     mesh = enlarged(view.mesh.astype(np.uint8)) > 0
     if weights:
-        from pipelines.regions.sapiens import network_labels  # torch takes seconds to import
+        from pipelines.networks import load_network  # torch takes seconds to import
+        from pipelines.regions.sapiens import SAPIENS, refined, segment
 
-        labels = large = network_labels(weights, rgb, large)
+        labels = large = refined(segment(load_network(weights, SAPIENS), rgb), large)
     else:
         large = np.where(alpha > 0.5, large, np.uint8(0))
     head = head_alpha(alpha, labels)

@@ -82,7 +82,11 @@ def fit_scan(scan: Scan, head: str, given: np.ndarray | None = None) -> FittedSc
     given = np.full((68, 3), np.nan) if given is None else given
     observation = find_landmarks(scan, template, given)
     check_face(observation.points, template, "the landmarks of the face that is seen")
-    terms = given_terms(basis.model, given)
+    known, anchors = np.flatnonzero(np.isfinite(given[:, 0])), landmark_anchors(basis.model)
+    rows = (known[known > 16], GIVEN_M), (known[known < 17], GIVEN_M / JAW_LINE_WEIGHT)
+    terms = tuple(
+        PointTerm(anchors.some(ids), given[ids], sigma) for ids, sigma in rows if len(ids)
+    )
     # The scan may show any expression: none counts as neutral.
     targets, state, lost = fit_landmarks(basis, [observation], "", terms)
     if lost:
@@ -102,13 +106,6 @@ def fit_scan(scan: Scan, head: str, given: np.ndarray | None = None) -> FittedSc
         trust = skin_trust(model, start, scan.vertices, shades, trust, skin)
     laid = lay(model, start, replace(surface, trust=trust), DETAIL_M)
     return FittedScan(basis, targets, state, start, laid)
-
-
-def given_terms(model: HeadModel, given: np.ndarray) -> tuple[PointTerm, ...]:
-    """Make the terms that pull landmarks to given ones (68, 3), NaN where unknown."""
-    known, anchors = np.flatnonzero(np.isfinite(given[:, 0])), landmark_anchors(model)
-    rows = (known[known > 16], GIVEN_M), (known[known < 17], GIVEN_M / JAW_LINE_WEIGHT)
-    return tuple(PointTerm(anchors.some(ids), given[ids], sigma) for ids, sigma in rows if len(ids))
 
 
 def surface_term(
@@ -137,7 +134,11 @@ def find_landmarks(scan: Scan, template: np.ndarray, given: np.ndarray) -> Obser
     if known.any():
         painter.check_near(given)
         check_face(given, template, "the given landmarks")
-    pose = pose_of_given(given, template) if known.any() else find_face(source, painter)
+        turn, shift = rigid_fit(template[known], given[known])
+        middle = turn @ (template.mean(0) - [0.0, 0.0, HALF_HEAD_M]) + shift
+        pose = middle, turn[:, 1], turn[:, 2]
+    else:
+        pose = find_face(source, painter)
     middle, up, ahead = pose
     if painter.picture(place_camera(middle, ahead, up, SPAN_M))[1] > 0.5:
         raise StageError(INWARDS)
@@ -183,13 +184,6 @@ def find_face(source: Source, painter: ScanPainter) -> FacePose:
     axes = camera.cam_from_world[:3, :3]
     rise = face.points[NOSE_BRIDGE] - face.points[CHIN]
     return painter.middle_of(camera, face.points), rise @ axes[:2] / np.linalg.norm(rise), -axes[2]
-
-
-def pose_of_given(given: np.ndarray, template: np.ndarray) -> FacePose:
-    """Return the pose of a face from given landmarks (68, 3), NaN where unknown."""
-    known = np.isfinite(given).all(1)
-    turn, shift = rigid_fit(template[known], given[known])
-    return turn @ (template.mean(0) - [0.0, 0.0, HALF_HEAD_M]) + shift, turn[:, 1], turn[:, 2]
 
 
 def views_about_face(source: Source, painter: ScanPainter, pose: FacePose) -> list[LandmarkView]:

@@ -67,7 +67,10 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
     track, surface = read_track(path), read_surface(file)
     row, model = track.row(expression), load_head(track.head)
     start = track.mesh(expression, len(model.template), path)
-    agreeing = AGREEING if views_were_compared(dataset, item) else 0.0
+    # Depth does not compare views with one camera, nor if it is imported.
+    made = dataset.item_dir("depth", item) / "metrics.json"
+    compared = made.is_file() and read_json_table(made, FormatError).get("views", 1) > 1
+    agreeing = AGREEING if compared else 0.0
     places, sure = surface.vertices, surface.confidence
     skin = bare_skin(model, start, places)
     trust = skin_trust(model, start, places, surface.colors, sure, skin, agreeing)
@@ -101,13 +104,6 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
         why = "the tracked head has an impossible shape, so no error is stated; see 'track'"
         warnings.append(Note("head shape", why))
     return Result(metrics, (), warnings, expected)
-
-
-def views_were_compared(dataset: Dataset, item: str) -> bool:
-    """Return whether depth compared views; it does not with one camera, nor if it is imported."""
-    path = dataset.item_dir("depth", item) / "metrics.json"
-    figures = read_json_table(path, FormatError) if path.is_file() else {}
-    return figures.get("views", 1) > 1
 
 
 def sigma_along_normals(laid: LaidMesh, cameras: Sequence[Camera], model: HeadModel) -> np.ndarray:

@@ -44,19 +44,15 @@ def minimise(
             seconds = (time.monotonic() - began) / (step + 1 - first)
             recent = np.mean(losses[-KEEP_EVERY:])
             print(f"step {step + 1}: loss {recent:.3f}, {seconds:.2f} s", flush=True)
-            save_state(state, net, optimiser, step + 1)
+            part, content = state.with_suffix(".part"), {"step": step + 1}
+            content |= {"net": net.state_dict(), "optimiser": optimiser.state_dict()}
+            torch.save(content, part)
+            part.replace(state)
     return net.eval()
 
 
-def save_state(path: Path, net: Net, optimiser: torch.optim.Optimizer, step: int) -> None:
-    """Write the state of a run before its step of this number."""
-    part = path.with_suffix(".part")
-    torch.save({"net": net.state_dict(), "optimiser": optimiser.state_dict(), "step": step}, part)
-    part.replace(path)
-
-
 def load_state(path: Path, net: Net, optimiser: torch.optim.Optimizer) -> int:
-    """Read a state of `save_state` if there is one; return the next step."""
+    """Read the state of a stopped run if there is one; return the next step."""
     if not path.exists():
         return 0
     state = read_weights(path, TrainError, str(path), "a training state", "delete it")
