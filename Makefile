@@ -3,8 +3,9 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 DATASET ?= build/dataset
-# Recipes quote DATASET, and a shell expands ~ only outside of quotes.
-override DATASET := $(patsubst ~/%,$(HOME)/%,$(DATASET))
+# A shell expands ~ only outside of quotes. patsubst joins a name with single spaces.
+override DATASET := $(if $(filter ~/%,$(DATASET)),$(HOME)/$(patsubst ~/%,%,$(DATASET)),$(DATASET))
+override DATASET := '$(subst ','\'',$(DATASET))'
 # Folders with spaces in their names need quotes or backslashes: CAPTURES="'my dir' other".
 CAPTURES ?=
 PRESET ?= standard
@@ -55,22 +56,22 @@ tradeoff: $(READY) ## measure speed against accuracy and write docs/TRADEOFFS.md
 	$(BIN)/python -m benchmarks.tradeoff
 
 ingest: $(READY) ## index CAPTURES="dir ..." into DATASET
-	$(BIN)/express50 ingest "$(DATASET)" $(CAPTURES) $(STAGE_FLAGS)
+	$(BIN)/express50 ingest $(DATASET) $(CAPTURES) $(STAGE_FLAGS)
 
 calibrate align frames matte track depth register regions pack: $(READY) ## run one stage on DATASET
-	$(BIN)/express50 $@ "$(DATASET)" $(STAGE_FLAGS)
+	$(BIN)/express50 $@ $(DATASET) $(STAGE_FLAGS)
 
 run: $(READY) ## run every stage on CAPTURES="dir ..." in DATASET, with settings that fit BUDGET=2h
-	$(BIN)/express50 run "$(DATASET)" $(CAPTURES) --budget $(BUDGET) --workers $(WORKERS) $(foreach kv,$(SET),--set $(kv)) $(if $(SLURM),--slurm $(SLURM))
+	$(BIN)/express50 run $(DATASET) $(CAPTURES) --budget $(BUDGET) --workers $(WORKERS) $(foreach kv,$(SET),--set $(kv)) $(if $(SLURM),--slurm $(SLURM))
 
 tune: $(READY) ## measure the error of the whole chain against its time on DATASET
-	$(BIN)/express50 tune "$(DATASET)" $(CAPTURES) --workers $(WORKERS)
+	$(BIN)/express50 tune $(DATASET) $(CAPTURES) --workers $(WORKERS)
 
 train: $(READY) ## train GRMM on DATASET's shards for an hour, or continue; the preset suits the machine
-	$(BIN)/grmm train "$(DATASET)/pack/shards" "$(DATASET)/grmm" $(TRAIN)
+	$(BIN)/grmm train $(DATASET)/pack/shards $(DATASET)/grmm $(TRAIN)
 
 report: $(READY) ## write one HTML page of DATASET's results and pictures
-	$(BIN)/express50 report "$(DATASET)"
+	$(BIN)/express50 report $(DATASET)
 
 clean: ## remove what was built, keep .venv and datasets such as build/dataset
 	@[ -d express50 ] || { echo "$(CURDIR): is not the repository, nothing is removed" >&2; exit 1; }

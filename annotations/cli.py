@@ -53,7 +53,7 @@ from express50.contract.layout import (
     exclusion_reason,
     included_subjects,
 )
-from express50.errors import AnnotationError, ConfigError, UnknownNameError, check_known
+from express50.errors import AnnotationError, ConfigError, UnknownNameError, advised, check_known
 
 _FIGURES = ("clips", "within_1", "within_2", "within_4", "median_frames", "slip_rate", "alpha")
 AROUND = 4  # frames on either side when one subject or expression is shown
@@ -177,8 +177,8 @@ def dataset_folder(text: str) -> Dataset:
     dataset = Dataset(Path(text))
     check_folder(dataset)
     if not dataset.captures_file.is_file():
-        what = "not a dataset (no captures.json)"
-        raise ConfigError(f"{text}: {what}; run 'express50 ingest {text} CAPTURE'")
+        ingest = advised("express50 ingest", dataset.root, "CAPTURE")
+        raise ConfigError(f"{text}: not a dataset (no captures.json); run {ingest}")
     return dataset
 
 
@@ -225,7 +225,7 @@ def run_ui(args: argparse.Namespace) -> int:
     AnnotateApp(session, faces=FaceFinder(dataset), sixel_cell=cell).run()
     done, total = session.done, len(session.tasks)
     words = f"{done} of {total} done by {session.annotator}"
-    after = f"run 'express50 align {dataset.root}' to use the labels"
+    after = f"run {advised('express50 align', dataset.root)} to use the labels"
     return answer(args, {"done": done, "tasks": total}, f"{words}; {after}")
 
 
@@ -266,7 +266,7 @@ def run_suggest(args: argparse.Namespace) -> int:
     ]
     rows.sort(key=lambda row: row["confidence"])
     lines = table(("subject", "expression", "frame", "confidence", "kind"), rows)
-    none = f"no suggestions; run 'express50 align {args.dataset.root}'"
+    none = f"no suggestions; run {advised('express50 align', args.dataset.root)}"
     return answer(args, rows, *(lines if rows else [none]))
 
 
@@ -318,7 +318,7 @@ def run_undo(args: argparse.Namespace) -> int:
 def _keep(args: argparse.Namespace, label: Label, said: str) -> int:
     append_label(args.dataset, label)
     settled = overruling(read_labels(args.dataset, label.subject), label)
-    after = f"run 'express50 align {args.dataset.root}' to use it"
+    after = f"run {advised('express50 align', args.dataset.root)} to use it"
     if settled is not None:
         after = in_spite_of(settled)
     words = f"{label.subject} {label.expression}: {said} by {label.annotator}; {after}"

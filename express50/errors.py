@@ -5,7 +5,9 @@ from __future__ import annotations
 import difflib
 import math
 import re
+import shlex
 from collections.abc import Collection, Iterable, Sequence
+from pathlib import Path
 
 FEW = 8  # names that a message lists before it says how many more there are
 LIKENESS = 0.75  # of a word and a name that is worth suggesting; 'train' and 'twin' have 0.67
@@ -112,6 +114,20 @@ def few(names: Sequence[str], count: int = 3, between: str = ", ") -> str:
     """List the first names, then how many more there are."""
     more = f" and {len(names) - count} more" if len(names) > count else ""
     return between.join(names[:count]) + more
+
+
+def advised(*words: str | Path) -> str:
+    """Return a command in quotation marks, as messages advise it; its paths suit any shell.
+
+    Paths with spaces and the like are quoted, and those that begin as options do get ``./``.
+    """
+    texts = []
+    for word in words:
+        text = f"./{word}" if isinstance(word, Path) and str(word).startswith("-") else str(word)
+        texts.append(shlex.quote(text) if isinstance(word, Path) else text)
+    line = " ".join(texts)
+    mark = '"' if "'" in line else "'"
+    return f"{mark}{line}{mark}"
 
 
 def rounded_down(value: float) -> str:

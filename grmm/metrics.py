@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from express50.errors import ConfigError
 from express50.files.arrays import DAMAGE
+from express50.files.text import no_file
 from grmm.config import MetricsConfig
 from grmm.losses import SSIM_WINDOW, load_features, ssim_map
 
@@ -144,7 +145,8 @@ def load_inception(path: Path) -> torch.jit.ScriptModule:
         ConfigError: no such file, not TorchScript, or a network with another call signature.
     """
     if not path.is_file():
-        raise ConfigError(f"metrics.inception {path}: no such file; leave it empty to do without")
+        why = f"{no_file(path)}; leave it empty to do without"
+        raise ConfigError(f"metrics.inception {path}: {why}")
     try:
         network = torch.jit.load(str(path), map_location="cpu").eval()
         found = network(torch.zeros(1, 3, 64, 64, dtype=torch.uint8), return_features=True)

@@ -19,6 +19,7 @@ import torch
 from express50.errors import ConfigError, StageError
 from express50.files.arrays import DAMAGE
 from express50.files.digests import cached_by_file
+from express50.files.text import expanded, no_file
 
 TORCH_ERRORS = (*DAMAGE, torch.jit.Error)
 
@@ -81,9 +82,9 @@ def load_network(path: str | Path, role: Role) -> Network:
 
 def weights_file(path: str | Path, setting: str) -> Path:
     """Return the path of the weights that a setting names; ConfigError if the file is missing."""
-    path = Path(path).expanduser()
+    path = expanded(path)
     if not path.is_file():
-        raise ConfigError(f"{setting} {path}: no such file; expected TorchScript or .onnx")
+        raise ConfigError(f"{setting} {path}: {no_file(path)}; expected TorchScript or .onnx")
     return path
 
 

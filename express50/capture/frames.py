@@ -27,7 +27,7 @@ from express50.capture.index import (
 )
 from express50.capture.raw import RawCamera
 from express50.contract.layout import Dataset
-from express50.errors import CaptureError, FormatError, StageError, check_known
+from express50.errors import CaptureError, FormatError, StageError, advised, check_known
 from express50.files.calibration import read_cameras
 from express50.files.containers import inside, read_picture, read_srgb
 from express50.files.digests import cached_by_file
@@ -232,8 +232,8 @@ def read_peak_frame(dataset: Dataset, subject: str, expression: str, camera_id: 
     path = dataset.frame_file(subject, expression, camera_id)
     if not path.is_file():
         raise CaptureError(
-            f"{path}: no frame of {camera_id}; run 'express50 frames {dataset.root}', or see "
-            f"'express50 status {dataset.root}' for the reason"
+            f"{path}: no frame of {camera_id}; run {advised('express50 frames', dataset.root)}, or"
+            f" see {advised('express50 status', dataset.root)} for the reason"
         )
     return read_written(path, picture_sizes(dataset, subject).get(camera_id))
 
@@ -332,7 +332,7 @@ def read_recorded_cameras(dataset: Dataset, subject: str) -> dict[str, Camera]:
     except FileNotFoundError as error:
         raise StageError(
             f"{path}: subject {subject!r} is not calibrated; "
-            f"run 'express50 calibrate {dataset.root}'"
+            f"run {advised('express50 calibrate', dataset.root)}"
         ) from error
 
 

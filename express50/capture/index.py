@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from express50.contract.layout import Dataset, footage_root
-from express50.errors import CaptureError, FormatError, StageError
+from express50.errors import CaptureError, FormatError, StageError, advised
 from express50.files.digests import cached_by_file, file_version
 from express50.files.text import NAME, read_json_table
 
@@ -103,7 +103,7 @@ def read_index(dataset: Dataset, subject: str) -> Index:
         known = ", ".join(dataset.subjects()) or "none"
         raise StageError(
             f"{path}: subject {subject!r} is not ingested (subjects: {known}); "
-            f"run 'express50 ingest {dataset.root} CAPTURE'"
+            f"run {advised('express50 ingest', dataset.root, 'CAPTURE')}"
         ) from error
 
 
@@ -113,7 +113,7 @@ def _read_cached(path: Path, dataset: Dataset, subject: str, captures_version: H
     if subject not in captures:
         raise StageError(
             f"{dataset.captures_file}: subject {subject!r} has no capture; "
-            f"run 'express50 ingest {dataset.root} CAPTURE'"
+            f"run {advised('express50 ingest', dataset.root, 'CAPTURE')}"
         )
     root = footage_root(captures[subject])
     try:
@@ -121,7 +121,7 @@ def _read_cached(path: Path, dataset: Dataset, subject: str, captures_version: H
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise FormatError(
             f"{path}: not an index ({type(error).__name__}: {error}); "
-            f"delete its folder and run 'express50 ingest {dataset.root}'"
+            f"delete its folder and run {advised('express50 ingest', dataset.root)}"
         ) from error
 
 
@@ -224,7 +224,8 @@ def read_peak_rows(dataset: Dataset, subject: str) -> dict[str, Peak]:
     path = dataset.peaks_file(subject)
     if not path.is_file():
         raise StageError(
-            f"{path}: subject {subject!r} is not aligned; run 'express50 align {dataset.root}'"
+            f"{path}: subject {subject!r} is not aligned; "
+            f"run {advised('express50 align', dataset.root)}"
         )
     try:
         rows = read_json_table(path, FormatError, "run 'express50 align' again")

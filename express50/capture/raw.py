@@ -25,9 +25,9 @@ from express50.files.text import (
     is_given,
     is_number,
     no_folder,
-    not_fetched,
     read_text,
     read_toml,
+    unreadable,
 )
 from express50.files.video import common_fps
 from express50.geometry.cameras import Camera
@@ -110,15 +110,20 @@ def read_capture(root: Path) -> RawCapture:
     for path in sorted(p for p in folder.iterdir() if not p.name.startswith(".")):
         if not path.is_dir():
             if not path.exists():
-                dropped[path.name] = f"{path}: {not_fetched(path)}"
+                dropped[path.name] = f"{path}: {unreadable(path)}"
             continue
-        if not ID.fullmatch(path.name) and ((path / "frames").is_dir() or _videos(path)):
+        why = unreadable(path)
+        footage = not why and ((path / "frames").is_dir() or _videos(path))
+        if footage and not ID.fullmatch(path.name):
             raise CaptureError(
                 f"{path}: camera id {path.name!r}, expected at most 120 letters, digits, '_' and"
                 f" '-'; call it {identifier(path.name)[:120]!r} here, in plates/, board/ and"
                 " calibration.json"
             )
         if path.name.startswith("@"):  # such as @eaDir, which Synology's disks add everywhere
+            continue
+        if why:
+            dropped[path.name] = f"{path}: {why}"
             continue
         try:
             cameras[path.name] = _read_camera(path)
@@ -242,7 +247,7 @@ def hint_at_undeveloped(files: Iterable[Path]) -> str:
 
 def is_data_folder(path: Path) -> bool:
     """Return whether a path is a folder that is neither hidden nor a disk's own, as @eaDir is."""
-    return path.is_dir() and path.name[0] not in ".@"
+    return path.is_dir() and path.name[0] not in ".@" and path.name != "lost+found"
 
 
 def _videos(folder: Path) -> list[Path]:
@@ -266,6 +271,8 @@ def _read_camera(folder: Path) -> RawCamera:
         raise CaptureError(
             f"{folder}: holds no footage, expected video.mp4 or frames/000000.png{other}"
         )
+    if why := unreadable(frames):
+        raise CaptureError(f"{frames}: {why}")
     files = sorted(image_names(frames), key=lambda name: len(Path(name).stem))  # 9 before 10
     if not files:
         raise CaptureError(f"{frames}: holds no image, expected 000000.png and so on")

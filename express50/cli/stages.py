@@ -23,7 +23,7 @@ from express50.console import (
 from express50.contract.config import PRESETS, config_toml, distinct_settings, resolve_config
 from express50.contract.layout import Dataset, check_folder, check_results_folder
 from express50.contract.stage import Stage, stages, with_required
-from express50.errors import ConfigError, check_known
+from express50.errors import ConfigError, advised, check_known
 
 if TYPE_CHECKING:
     from express50.runner.executor import Pool
@@ -89,7 +89,7 @@ def _add_run_options(parser: argparse.ArgumentParser, captures: bool, preset: bo
     add("--workers", type=number(0), default=2, metavar="N", help=words)
     add("--scheduler", metavar="ADDRESS", help="run on a dask scheduler, tcp://host:port")
     words = "run in SLURM jobs: partition=P,time=4:00:00,memory=16G,cores=4,jobs=8, or a TOML file"
-    add("--slurm", metavar="JOBS", help=words)
+    add("--slurm", type=str, metavar="JOBS", help=words)  # a type: ~ in its value is refused
     parser.set_defaults(print_job=False)
     if preset:
         words = "with --slurm: print the script of a job, and run nothing"
@@ -292,7 +292,7 @@ def _check_places(dataset: Dataset, captures: Sequence[Path], command: str) -> N
     if root.is_dir() and new and is_capture(root):
         raise ConfigError(
             f"the first argument is the dataset, and {root} is a capture; expected "
-            f"'express50 {command} DATASET" + (f" {root}'" if command in ("ingest", "run") else "'")
+            + advised(f"express50 {command} DATASET", *[root] * (command in ("ingest", "run")))
         )
     if new:
         check_results_folder(root)
@@ -343,8 +343,8 @@ def _items(
     else:
         check_folder(dataset)
         if stage.prepare is not None and not stage.items(dataset):
-            call = f"express50 {args.command} {dataset.root} CAPTURE"
-            raise ConfigError(f"{dataset.root}: has no captures yet; run '{call}'")
+            call = advised(f"express50 {args.command}", dataset.root, "CAPTURE")
+            raise ConfigError(f"{dataset.root}: has no captures yet; run {call}")
     if pattern is None:
         return None
     # A stage that runs first in another's command may have other items; take the same subjects'.

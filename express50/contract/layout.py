@@ -9,7 +9,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from express50.errors import AnnotationError, CaptureError, ConfigError, FormatError
+from express50.errors import AnnotationError, CaptureError, ConfigError, FormatError, advised
 from express50.files.atomic import check_folder_writable
 from express50.files.text import NAME, parse_json, read_bytes, read_json_table, read_toml
 
@@ -68,8 +68,11 @@ class Dataset:
         return self.root / stage / item
 
     def subjects(self) -> list[str]:
-        """Return the ingested subjects, sorted."""
-        return sorted(path.parent.name for path in self.stage_dir("ingest").glob("*/index.json"))
+        """Return the ingested subjects, sorted; PermissionError if one must not be read."""
+        # A pattern would pass over such a folder, and the subject would seem to be gone.
+        found = self.stage_dir("ingest")
+        folders = found.iterdir() if found.is_dir() else ()
+        return sorted(path.name for path in folders if (path / "index.json").is_file())
 
     @property
     def captures_file(self) -> Path:
@@ -212,11 +215,12 @@ def existing_dataset(path: Path) -> Dataset:
         if dataset.captures_file.is_file():  # a budgeted run was stopped while it measured
             raise ConfigError(
                 f"{path}: nothing but trials has been made yet; run the command that was stopped"
-                f" again, or 'express50 run {path}'"
+                f" again, or {advised('express50 run', path)}"
             )
         check_folder(dataset)
         raise ConfigError(
-            f"{path}: not a dataset (no ledger.sqlite); run 'express50 ingest {path} CAPTURE'"
+            f"{path}: not a dataset (no ledger.sqlite);"
+            f" run {advised('express50 ingest', path, 'CAPTURE')}"
         )
     return dataset
 
@@ -227,17 +231,20 @@ def check_folder(dataset: Dataset) -> None:
     if root.is_file():
         raise ConfigError(f"{root}: is a file, expected the folder of a dataset")
     if not root.is_dir():
-        raise ConfigError(f"{root}: no such dataset; run 'express50 ingest {root} CAPTURE'")
+        ingest = advised("express50 ingest", root, "CAPTURE")
+        raise ConfigError(f"{root}: no such dataset; run {ingest}")
 
 
 def check_results_folder(folder: Path) -> None:
     """Refuse, before any work, a folder that cannot be written to or whose files stages write.
 
     Raises:
-        ConfigError: it is a dataset, a stage's folder, a folder of shards, or a file.
+        ConfigError: it is a dataset, a stage's folder, a folder of shards, a capture, or a file.
         OSError: the system refuses.
     """
     _refuse_datasets_own(folder)
+    if (folder / "capture.toml").is_file():  # results in it would make its ingest outdated
+        raise ConfigError(f"{folder}: is a capture; name another folder")
     if (folder / "index.json").is_file() and (folder / "manifest.json").is_file():
         raise ConfigError(f"{folder}: holds shards; name another folder")
     check_folder_writable(folder)

@@ -28,7 +28,7 @@ from express50.dataset.withdraw import (
     subject_id_finder,
     withdrawn,
 )
-from express50.errors import AnnotationError, ConfigError, Express50Error, FormatError, few
+from express50.errors import AnnotationError, ConfigError, Express50Error, FormatError, advised, few
 from express50.files.digests import file_sha256, files_of, text_digest
 from express50.runner.imported import AGAIN, import_trouble
 from express50.runner.ledger import FileMark, Ledger, Receipt
@@ -128,7 +128,7 @@ def audit(
         if files:
             result.notes.append(
                 f"{folder.name}: {size / 1e6:.1f} MB ({files} files) of outputs {words};"
-                f" 'express50 prune {dataset.root}' deletes them"
+                f" {advised('express50 prune', dataset.root)} deletes them"
             )
     return result
 
@@ -140,7 +140,8 @@ def _capture_findings(dataset: Dataset) -> Iterator[Finding]:
     except FormatError as error:
         yield Finding(kind="capture", where="captures.json", what=str(error), fix="restore it")
         return
-    fix = f"run 'express50 ingest {dataset.root} CAPTURE' with the capture's current path"
+    ingest = advised("express50 ingest", dataset.root, "CAPTURE")
+    fix = f"run {ingest} with the capture's current path"
     for subject, path in captures.items():
         try:
             what = "" if path.exists() and footage_root(path) else f"its capture {path} is missing"
@@ -170,8 +171,8 @@ def _label_findings(dataset: Dataset, problems: LabelProblems) -> Iterator[Findi
         except Express50Error:  # the index is damaged, which is a finding of its own
             continue
         fix = (
-            f"run 'express50 annotate ui {dataset.root}', undo the label and mark again (the"
-            " audit never changes labels, because people made them)"
+            f"run {advised('express50 annotate ui', dataset.root)}, undo the label and mark again"
+            " (the audit never changes labels, because people made them)"
         )
         for one in found:
             yield Finding(kind="label", where=f"{where} {one.expression}", what=one.what, fix=fix)
@@ -179,7 +180,8 @@ def _label_findings(dataset: Dataset, problems: LabelProblems) -> Iterator[Findi
 
 def _ledger_finding(dataset: Dataset, fix: bool, read_only: bool) -> Finding | None:
     """Find a ledger that is missing or damaged; rename it, so that stages start a new one."""
-    again = f"run 'express50 run {dataset.root}', which makes every item again, with the same bytes"
+    run = advised("express50 run", dataset.root)
+    again = f"run {run}, which makes every item again, with the same bytes"
     what = "is missing; without it, no output is known to come from a run"
     if dataset.ledger.is_file():
         try:
@@ -218,8 +220,8 @@ def _person_findings(dataset: Dataset, checkpoints: Sequence[Path]) -> Iterator[
             kind="person",
             where=str(path.relative_to(dataset.root) if inside else path),
             what="names a person who was withdrawn",
-            fix=f"run 'express50 subject withdraw {dataset.root} ID --yes' again (with --checkpoint"
-            " if it is outside the dataset), or delete it",
+            fix=f"run {advised('express50 subject withdraw', dataset.root, 'ID --yes')} again (with"
+            " --checkpoint if it is outside the dataset), or delete it",
         )
 
 
@@ -369,7 +371,7 @@ class _StageAudit:
         try:
             config = resolve_config(stage, "standard", path, (), [s.name for s in self.stages])
         except ConfigError as error:
-            how = f"run 'express50 {name} {self.dataset.root}' with valid settings"
+            how = f"run {advised(f'express50 {name}', self.dataset.root)} with valid settings"
             self._find("config", f"config/{path.name}", str(error), how)
             return
         unreadable: dict[str, list[str]] = {}
@@ -404,7 +406,8 @@ class _StageAudit:
             self._note(stage, f"outdated {few(items, 1)}: {why}; the next run makes them again")
 
     def _again(self, stage: str) -> str:
-        return f"run 'express50 {stage} {self.dataset.root}' with the same settings as before"
+        again = advised(f"express50 {stage}", self.dataset.root)
+        return f"run {again} with the same settings as before"
 
     def _waits(self, item: str) -> bool:
         subject = item.split("/")[0]

@@ -26,7 +26,7 @@ from express50.dial.choice import (
 )
 from express50.dial.figures import PilotFigures, Trial, dial_dir, footage_of, read_measured
 from express50.dial.pilot import TRIAL_EXPRESSIONS, Chain, Pilot, broken_stage, measure, standard_of
-from express50.errors import ConfigError, StageError
+from express50.errors import ConfigError, StageError, advised
 from express50.files.atomic import write_csv, write_json
 from express50.runner.ledger import Ledger
 
@@ -147,10 +147,11 @@ def _subjects(chain: Chain) -> list[str]:
     root, captures = chain.dataset.root, chain.dataset.captures()
     subjects = [s for s in captures if not exclusion_reason(chain.dataset, s)]
     if captures and not subjects:
-        include = f"express50 annotate include {root} {min(captures)}"
-        raise StageError(f"{root}: every subject is excluded; to include one: '{include}'")
+        include = advised("express50 annotate include", root, min(captures))
+        raise StageError(f"{root}: every subject is excluded; to include one: {include}")
     if not subjects:
-        raise StageError(f"{root}: has no captures yet; run 'express50 run {root} CAPTURE'")
+        run = advised("express50 run", root, "CAPTURE")
+        raise StageError(f"{root}: has no captures yet; run {run}")
     return subjects[:PILOT_SUBJECTS]
 
 

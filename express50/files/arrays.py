@@ -27,8 +27,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from express50.errors import HeadModelError
-from express50.files.text import AGAIN, Kind, reason
+from express50.errors import Express50Error, HeadModelError
+from express50.files.text import AGAIN, Kind, no_file, reason, unreadable
 
 SIZE_LIMIT = 2 << 30  # bytes per unpacked file; 60 expressions of a 26,000-vertex head take 19 MB
 HEADER_LIMIT = 4096  # characters in an array's header
@@ -75,11 +75,19 @@ def read_arrays(
                     data = io.BytesIO(file.read(member.file_size))
                 found[name] = _array(data, member.file_size)
     except DAMAGE as error:
-        raise kind(f"{path}: not {what} ({reason(error)}); {fix}") from None
+        raise _refused(path, kind, what, fix, error) from None
     missing = [name for name in wanted if name not in found]
     if missing:
         raise kind(f"{path}: not {what} (has no {', '.join(missing)}); {fix}")
     return found
+
+
+def _refused(path: Path, kind: Kind, what: str, fix: str, error: Exception) -> Express50Error:
+    """Make the error of a file that is not ``what`` it should be, or not there."""
+    if why := unreadable(path):
+        return kind(f"{path}: {why}")
+    why = f"not {what} ({reason(error)})" if path.is_file() else no_file(path)
+    return kind(f"{path}: {why}; {fix}")
 
 
 def read_npy(path: Path, kind: Kind, what: str, fix: str = AGAIN) -> np.ndarray:
@@ -92,7 +100,7 @@ def read_npy(path: Path, kind: Kind, what: str, fix: str = AGAIN) -> np.ndarray:
         with path.open("rb") as file:
             return _array(file, path.stat().st_size)
     except DAMAGE as error:
-        raise kind(f"{path}: not {what} ({reason(error)}); {fix}") from None
+        raise _refused(path, kind, what, fix, error) from None
 
 
 def read_header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype]:
@@ -366,8 +374,7 @@ def read_weights(path: Path, kind: Kind, where: str, what: str, fix: str = AGAIN
     import torch
 
     if not Path(path).is_file():
-        what_is_there = "is a folder, expected a file" if Path(path).is_dir() else "no such file"
-        raise kind(f"{where}: {what_is_there}; {fix}")
+        raise kind(f"{where}: {no_file(Path(path))}; {fix}")
     try:
         with warnings.catch_warnings(action="ignore"):  # about pickles that are refused
             return torch.load(path, map_location="cpu", weights_only=True)

@@ -63,7 +63,8 @@ def files_of(folder: Path, hidden: bool = False) -> list[Path]:
         # A link to a folder that it lies in would never end.
         folders[:] = [n for n in parts[0] if not here.is_relative_to((here / n).resolve())]
         found += [Path(place, name) for name in parts[1]]
-    return sorted(path for path in found if path.is_file())
+    # Where nothing but names may be seen, a name counts as a file: nothing is passed over.
+    return sorted(p for p in found if not os.access(p.parent, os.X_OK) or p.is_file())
 
 
 def path_digest(path: Path, sha256: Callable[[Path], str] = file_sha256) -> str:
@@ -83,12 +84,18 @@ def path_digest(path: Path, sha256: Callable[[Path], str] = file_sha256) -> str:
 
 
 def stat_digest(path: Path) -> str:
-    """Digest names, sizes and times of a file or a folder's files: cheap even for terabytes."""
+    """Digest names, sizes and times of a file or a folder's files: cheap even for terabytes.
+
+    The digest of a file that cannot be read differs from that of the same file once it can.
+    """
     root, files = (path.parent, [path]) if path.is_file() else (path, files_of(path))
     lines = []
     for file in files:
-        size, time, _ = file_version(file)
-        lines.append(f"{file.relative_to(root).as_posix()} {size} {time}")
+        mark = "unreadable"  # permissions change neither size nor time
+        if os.access(file, os.R_OK):
+            size, time, _ = file_version(file)
+            mark = f"{size} {time}"
+        lines.append(f"{file.relative_to(root).as_posix()} {mark}")
     return text_digest("\n".join(lines))
 
 

@@ -22,7 +22,7 @@ import OpenImageIO as oiio
 
 from express50.errors import FormatError
 from express50.files.atomic import naming_full_disk
-from express50.files.text import not_fetched, reason
+from express50.files.text import reason, unreadable
 from express50.geometry.shapes import PIXEL_LIMIT
 
 DAMAGED = "truncated or damaged"
@@ -146,11 +146,12 @@ def open_image(path: Path) -> oiio.ImageInput:
     """
     straight = oiio.ImageSpec()
     straight.attribute("oiio:UnassociatedAlpha", 1)  # otherwise colours are multiplied by alpha
-    source = oiio.ImageInput.open(str(path), straight) if Path(path).is_file() else None
+    there = os.access(path, os.R_OK) and Path(path).is_file()
+    source = oiio.ImageInput.open(str(path), straight) if there else None
     if source is None:
         why = _error_text(oiio.geterror) or "it cannot be opened"
         fix = "copy it again, or export it in RGB as PNG, JPEG or TIFF"
-        why = not_fetched(Path(path)) or f"cannot be read as an image ({why}); {fix}"
+        why = unreadable(Path(path)) or f"cannot be read as an image ({why}); {fix}"
         raise FormatError(f"{path}: {why}")
     spec = source.spec()
     number = spec.get_int_attribute("tiff:PhotometricInterpretation", 2)

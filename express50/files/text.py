@@ -12,6 +12,7 @@ import csv
 import io
 import json
 import math
+import os
 import re
 import stat
 import tomllib
@@ -34,6 +35,7 @@ ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,119}")
 """Pattern of a subject's or expression's id: a file name without a dot, as shard keys require."""
 KEY_LENGTH = 80  # characters of a sample's key, ``subject_expression_camera``
 AGAIN = "copy or write it again"
+NOT_PERMITTED = "cannot be read (Permission denied); check its owner and permissions"
 POINTERS = (
     (b"version https://git-lfs", "Git LFS", "git lfs pull"),
     (b"/annex/objects/", "git-annex", "git annex get FOLDER"),
@@ -59,15 +61,14 @@ def read_bytes(path: Path, kind: Kind, limit: int = TEXT_LIMIT, fix: str = AGAIN
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            raise kind(f"{path}: is a folder, pipe or device, expected a regular file; {fix}")
+            what = no_file(path) if path.is_dir() else "is a pipe or device, expected a file"
+            raise kind(f"{path}: {what}")
         if status.st_size > limit:
             raise kind(f"{path}: {status.st_size} bytes, expected at most {limit}; {fix}")
         return path.read_bytes()
     except (OSError, ValueError) as error:  # ValueError: a name with a null byte
-        if isinstance(error, PermissionError):
-            fix = "check its owner and permissions"
-        why = not_fetched(path) or f"cannot be read ({reason(error)}); {fix}"
-        raise kind(f"{path}: {why}") from None
+        why = NOT_PERMITTED if isinstance(error, PermissionError) else unreadable(path)
+        raise kind(f"{path}: {why or f'cannot be read ({reason(error)}); {fix}'}") from None
 
 
 def no_folder(path: Path) -> str:
@@ -75,11 +76,24 @@ def no_folder(path: Path) -> str:
     return "is a file, not a folder" if path.exists() else "no such folder"
 
 
-def not_fetched(path: Path) -> str:
-    """Return what to do about a file that lacks its content; "" for any other file.
+def no_file(path: Path) -> str:
+    """Say why a path is not a file: nothing is there, or a folder."""
+    return "is a folder, not a file" if path.is_dir() else "no such file"
 
-    git-annex keeps links to contents that are fetched one by one. It and Git LFS also write small
-    files that only name the content.
+
+def expanded(path: str | Path) -> Path:
+    """Return a path with the home folder in place of ``~``; unchanged if that user is unknown."""
+    try:
+        return Path(path).expanduser()
+    except RuntimeError:
+        return Path(path)
+
+
+def unreadable(path: Path) -> str:
+    """Return why a file or folder that is there cannot be read, and what to do; "" if it can.
+
+    It may need permissions, or a file may lack its content: git-annex keeps links to contents that
+    are fetched one by one. It and Git LFS also write small files that only name the content.
     """
     try:
         if path.is_symlink() and not path.exists():
@@ -87,8 +101,12 @@ def not_fetched(path: Path) -> str:
                 f"is a link to {path.readlink()}, which is not there; fetch it (of git-annex or"
                 " DataLad: 'git annex get FOLDER'), or copy the file itself"
             )
+        if path.is_dir():
+            return "" if os.access(path, os.R_OK | os.X_OK) else NOT_PERMITTED
         with path.open("rb") as file:
             start = file.read(64)
+    except PermissionError:
+        return NOT_PERMITTED
     except (OSError, ValueError):
         return ""
     for mark, name, fetch in POINTERS:
@@ -101,7 +119,7 @@ def check_links(*paths: Path) -> None:
     """Raise CaptureError for broken links, which would pass for optional files that are absent."""
     for path in paths:
         if path.is_symlink() and not path.exists():
-            raise CaptureError(f"{path}: {not_fetched(path)}")
+            raise CaptureError(f"{path}: {unreadable(path)}")
 
 
 def is_given(path: Path) -> bool:
@@ -175,7 +193,7 @@ def read_toml(path: Path, kind: Kind) -> dict[str, Any]:
         Express50Error: as for `read_text`, or the file is not TOML, is nested too deeply, or holds
             a number that is NaN or infinite.
     """
-    text = read_text(path, kind, TOML_LIMIT, "correct it")
+    text = read_text(path, kind, TOML_LIMIT)
     try:
         return tomllib.loads(text, parse_float=_finite)
     except NotFiniteError as error:

@@ -22,7 +22,7 @@ from av.video.reformatter import Interpolation
 
 from express50.errors import CaptureError
 from express50.files.images import encode_jpeg, encode_png
-from express50.files.text import check_links, not_fetched, reason
+from express50.files.text import reason, unreadable
 from express50.geometry.shapes import PIXEL_LIMIT
 
 # An H.264 or H.265 picture may be displayed up to 16 pictures away from its position in the stream,
@@ -62,12 +62,13 @@ def check_whole(path: Path) -> None:
     """Refuse an MP4/MOV file whose boxes go past its end, or that has no index.
 
     Raises:
-        CaptureError: the file is truncated, or a link to nothing.
+        CaptureError: the file is truncated, a link to nothing, or must not be read.
 
     Source: ISO/IEC 14496-12, 4.2: a box is its size (32 bits, or 64 after size 1), its type and
     content; size 0 runs to the end of the file.
     """
-    check_links(path)
+    if why := unreadable(path):
+        raise CaptureError(f"{path}: {why}")
     size = path.stat().st_size
     with path.open("rb") as file:
         offset = count = 0
@@ -106,7 +107,7 @@ def _open(path: Path) -> tuple[av.container.InputContainer, av.VideoStream]:
         container = av.open(str(path), container_options=limits, options=unseen)
     except DAMAGE as error:
         why = f"cannot be opened as a video ({reason(error)}); copy or encode it again"
-        raise CaptureError(f"{path}: {not_fetched(path) or why}") from error
+        raise CaptureError(f"{path}: {unreadable(path) or why}") from error
     if not container.streams.video:
         container.close()
         raise CaptureError(f"{path}: holds no video stream, expected one")

@@ -8,6 +8,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from express50.files.text import expanded
+
 BUILTIN_NAME = "procedural"  # as commands and tracks name it; other head models are named by path
 HEADS = "EXPRESS50_HEADS"  # environment variable: folders of head models, listed as in PATH
 # FLAME's other files, which lie beside its pickle: the first name that is there counts.
@@ -22,7 +24,7 @@ COMPANIONS = {
 def absolute_head(spec: str) -> str:
     """Return a head model's name or path such that it means the same in every folder."""
     # Links stay: a pickle may be one whose companions lie beside the link.
-    return spec if spec == BUILTIN_NAME else os.path.normpath(Path(spec).expanduser().absolute())
+    return spec if spec == BUILTIN_NAME else os.path.normpath(expanded(spec).absolute())
 
 
 def head_path(spec: str | Path) -> Path:
@@ -31,9 +33,9 @@ def head_path(spec: str | Path) -> Path:
     Tracks, shards and checkpoints name a model by its path on the machine that made them. Where
     neither place has it, the path is returned.
     """
-    path = Path(spec).expanduser()
+    path = expanded(spec)
     folders = [path.parent, *map(Path, filter(None, os.environ.get(HEADS, "").split(os.pathsep)))]
-    places = (folder.expanduser() / path.name for folder in folders)
+    places = (expanded(folder) / path.name for folder in folders)
     return next((place for place in places if place.exists()), path)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from express50.console import log
 from express50.errors import HeadModelError
 from express50.files.arrays import read_arrays
+from express50.files.text import expanded
 from express50.head import BUILTIN_NAME, HEADS, head_path
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ def load_head(spec: str | Path) -> HeadModel:
             " and checkpoints name their model by its path: put it back there, or set the variable"
             f" {HEADS} to the folder that holds {path.name}"
         )
-    if path != Path(spec).expanduser():  # only its name is known to be the right one
+    if path != expanded(spec):  # only its name is known to be the right one
         _log_once(f"head model {spec} is not there, using {path}")
     if path.suffix == ".npz" and is_stored(path):
         return load_stored(path, path.stem)

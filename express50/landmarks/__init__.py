@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from express50.files.text import expanded
+
 EMBEDDED, FAN = "embedded", "fan:"  # sources; anything else is the path of a file of points
 WEIGHTS = Path(__file__).with_name(
     "weights.npz"
@@ -15,5 +17,5 @@ def source_files(landmarks: str) -> dict[str, Path]:
     if landmarks == EMBEDDED:
         return {"weights": WEIGHTS}
     if landmarks.startswith(FAN):
-        return {"weights": WEIGHTS, "fan": Path(landmarks.removeprefix(FAN)).expanduser()}
-    return {"landmarks": Path(landmarks).expanduser()}
+        return {"weights": WEIGHTS, "fan": expanded(landmarks.removeprefix(FAN))}
+    return {"landmarks": expanded(landmarks)}

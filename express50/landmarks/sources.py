@@ -19,7 +19,7 @@ import torch
 
 from express50.errors import ConfigError, FormatError
 from express50.files.arrays import DAMAGE, read_arrays
-from express50.files.text import read_json
+from express50.files.text import no_file, read_json
 from express50.geometry.cameras import Camera, normalised
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.transforms import scale_of, transform_points
@@ -52,7 +52,7 @@ def _existing_files(landmarks: str) -> dict[str, Path]:
     for path in files.values():
         if not path.is_file():
             raise ConfigError(
-                f"landmarks {landmarks!r}: no file {path}; expected 'embedded', 'fan:' and the "
+                f"landmarks {landmarks!r}: {no_file(path)}; expected 'embedded', 'fan:' and the "
                 "path of FAN's TorchScript weights, or the path of a file of points"
             )
     return files

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from express50.errors import CalibrationError
+from express50.errors import CalibrationError, advised
 from express50.files.calibration import read_cameras
 from express50.files.text import identifier, read_json, read_yaml, reason
 from express50.geometry.cameras import Camera
@@ -128,7 +128,8 @@ def guess_format(path: Path) -> str:
         titles = [known.title for known in FORMATS.values()]
         raise CalibrationError(
             f"{path}: is not a known calibration; expected {', '.join(titles[:-1])} or"
-            f" {titles[-1]}; 'express50 cameras check {path} --format NAME' says why it is not one"
+            f" {titles[-1]}; {advised('express50 cameras check', path, '--format NAME')} says why"
+            " it is not one"
         )
     return found
 

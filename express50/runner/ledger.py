@@ -14,10 +14,10 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from express50.errors import FormatError
+from express50.errors import FormatError, advised
 from express50.files.atomic import disk_full, free_space
 from express50.files.digests import file_sha256
-from express50.files.text import parse_json
+from express50.files.text import parse_json, reason, unreadable
 
 
 @dataclass(frozen=True)
@@ -176,8 +176,12 @@ class Ledger:
             hidden = code == sqlite3.SQLITE_IOERR and free_space(self._path) < 1e6
             if hidden or code == sqlite3.SQLITE_FULL:
                 raise disk_full(self._path, str(error)) from error
-            if self._read_only:  # a reader must not be advised to delete
-                check = f"run 'express50 check {self._path.parent}'"
+            if why := unreadable(self._path):
+                words = why
+            elif isinstance(error, UnicodeEncodeError):
+                words = f"cannot name a folder that is not UTF-8 ({reason(error)}); rename it"
+            elif self._read_only:  # a reader must not be advised to delete
+                check = f"run {advised('express50 check', self._path.parent)}"
                 words = f"cannot be read as a ledger ({error}); {check}"
             elif code == sqlite3.SQLITE_READONLY:
                 words = "not writable; check its owner and permissions"

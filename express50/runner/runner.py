@@ -17,7 +17,7 @@ from express50.console import log as write
 from express50.contract.config import config_toml
 from express50.contract.layout import Dataset, existing_dataset
 from express50.contract.stage import Note, Stage
-from express50.errors import ConfigError, NotReadyError, StageError, few, nearest
+from express50.errors import ConfigError, NotReadyError, StageError, advised, few, nearest
 from express50.files.atomic import check_space, write_bytes
 from express50.files.digests import file_version, path_digest
 from express50.runner.executor import Pool
@@ -152,7 +152,7 @@ def select_items(stage: Stage, dataset: Dataset, pattern: str) -> list[str]:
 
 def _what_is_missing(dataset: Dataset) -> str:
     existing_dataset(dataset.root)  # raises an error for folders that are none
-    return f"'express50 status {dataset.root}' shows which earlier stage must run first"
+    return f"{advised('express50 status', dataset.root)} shows which earlier stage must run first"
 
 
 def run_stage(

@@ -22,7 +22,14 @@ from express50.console import system_error_line
 from express50.contract.config import config_texts
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
-from express50.errors import CaptureError, DiskError, DiskFullError, Express50Error, StageError
+from express50.errors import (
+    CaptureError,
+    DiskError,
+    DiskFullError,
+    Express50Error,
+    StageError,
+    advised,
+)
 from express50.files.atomic import check_disk, dump_json, naming_full_disk, write_bytes
 from express50.files.digests import files_of, value_digest
 from express50.runner.ledger import FileMark, Made, Receipt, mark_file
@@ -59,8 +66,8 @@ def input_digests(
     for path in found.values():
         if isinstance(path, Path) and not (path.is_relative_to(dataset.root) or path.exists()):
             raise CaptureError(
-                f"{path}: no such file; if the capture has moved, run 'express50 ingest"
-                f" {dataset.root} CAPTURE' with its new path"
+                f"{path}: no such file; if the capture has moved, run"
+                f" {advised('express50 ingest', dataset.root, 'CAPTURE')} with its new path"
             )
     return {name: digest(at) if isinstance(at, Path) else at for name, at in found.items()}
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from express50.capture.index import peak_items, read_index, read_peak_rows
 from express50.contract.layout import PLATES, Dataset
 from express50.contract.stage import Growth, Result, Stage
-from express50.errors import CaptureError, ConfigError
+from express50.errors import CaptureError, ConfigError, advised
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +57,8 @@ def inputs(dataset: Dataset, item: str, config: FramesConfig) -> dict[str, Path 
         index = read_index(dataset, subject)
         if not index.capture.exists():  # or the mattes would be made again, without plates
             raise CaptureError(
-                f"{index.capture}: no such folder; run 'express50 ingest {dataset.root} CAPTURE'"
+                f"{index.capture}: no such folder; run"
+                f" {advised('express50 ingest', dataset.root, 'CAPTURE')}"
                 f" with the folder where {subject}'s capture is now"
             )
         paths = {c: index.capture / name for c, name in index.plates.items()}

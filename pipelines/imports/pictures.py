@@ -20,6 +20,7 @@ from express50.dataset.depth_files import FARTHEST_M as BACKGROUND_M
 from express50.errors import ConfigError, FormatError, StageError
 from express50.files.arrays import read_npy
 from express50.files.images import read_image, resize_area
+from express50.files.text import expanded
 from express50.geometry.cameras import (
     Camera,
     pinhole,
@@ -95,7 +96,7 @@ def fill(pattern: str, subject: str, peak: PeakFrame | None = None, camera: str 
         found = values.get(match[1], match[0])
         return f"{found:0{match[2] or 0}d}" if isinstance(found, int) else str(found)
 
-    return Path(_PLACE.sub(value, pattern)).expanduser()
+    return expanded(_PLACE.sub(value, pattern))
 
 
 def read_mask(path: Path, recorded: Camera, seen: Camera, distorted: bool) -> np.ndarray:

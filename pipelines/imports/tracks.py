@@ -124,8 +124,8 @@ def _read_steps(
                 f"{path}: holds neither transforms.json nor tracked_flame_params_*.npz"
             )
         path = files[-1]
-    if path.suffix != ".npz":
-        found = "is another kind of file" if path.is_file() else "no such file"
+    if path.suffix != ".npz" or not path.exists():
+        found = "is another kind of file" if path.exists() else "no such file"
         raise ConfigError(f"{path}: {found}; expected a folder or {WHAT} (.npz)")
     arrays = read_arrays(path, FormatError, WHAT, ROWS)
     if "focal_length" in arrays and source.cameras is None:

@@ -36,7 +36,7 @@ from express50.console import log
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
 from express50.dataset.withdraw import withdrawn
-from express50.errors import CaptureError, StageError, few, nearest
+from express50.errors import CaptureError, StageError, advised, few, nearest
 from express50.files.atomic import dump_json, write_json
 from express50.files.calibration import write_cameras
 from express50.files.digests import stat_digest, text_digest
@@ -113,12 +113,13 @@ def _capture_of(dataset: Dataset, item: str) -> Path:
     if item not in captures:
         raise StageError(
             f"{dataset.captures_file}: no capture of {item!r}; "
-            f"run 'express50 ingest {dataset.root} CAPTURE'"
+            f"run {advised('express50 ingest', dataset.root, 'CAPTURE')}"
         )
     if not captures[item].exists():
         raise CaptureError(
-            f"{captures[item]}: no such folder; run 'express50 ingest {dataset.root} CAPTURE' "
-            f"with the folder where {item}'s capture is now; if that has another name, write"
+            f"{captures[item]}: no such folder; run"
+            f" {advised('express50 ingest', dataset.root, 'CAPTURE')}"
+            f" with the folder where {item}'s capture is now; if that has another name, write"
             f" subject = {item!r} into a capture.toml in it first"
         )
     return captures[item]

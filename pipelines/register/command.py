@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ def run(args: Any) -> int:
     if args.head != BUILTIN_NAME:
         raise ConfigError(
             f"--head {args.head} is for scans; a dataset's head model is track.head, so run"
-            f" 'express50 track' with --set track.head={args.head}"
+            f" 'express50 track' with --set {shlex.quote(f'track.head={args.head}')}"
         )
     from express50.cli.stages import run_one
 

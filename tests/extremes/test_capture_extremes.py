@@ -1,6 +1,10 @@
 """Hostile and broken captures of other layouts: one clear error, nothing read from elsewhere."""
 
 import json
+import os
+import shutil
+import subprocess
+import sys
 import zipfile
 
 import h5py
@@ -218,3 +222,45 @@ def test_an_empty_folder_and_a_file_without_ending(tmp_path):
         path.mkdir() if path.name == "empty" else path.write_text("x")
         with pytest.raises(CaptureError, match="expected one of"):
             detect(path)
+
+
+def test_a_camera_that_must_not_be_read_is_dropped_until_it_can(tmp_path):
+    # The superuser may read everything, but not without these rights.
+    bound = ["setpriv", "--bounding-set=-dac_override,-dac_read_search"]
+    bound = bound if os.geteuid() == 0 else []
+    if bound and not shutil.which("setpriv"):
+        pytest.skip("the superuser may read everything")
+    for name in ("S001", "S002", "none"):
+        make_capture(tmp_path / name, subject=name, video=name == "S002", calibration=False)
+    for camera in (tmp_path / "S001" / "cameras").iterdir():  # another layout
+        shutil.copytree(camera / "frames", tmp_path / "rig" / camera.name)
+    places = ["S001/cameras/cam01", "S002/cameras/cam01/video.mp4", "rig/cam01"]
+    modes = [0o000, 0o000, 0o644]
+    shut = {tmp_path / place: mode for place, mode in zip(places, modes, strict=True)}
+    shut |= dict.fromkeys((tmp_path / "none/cameras").iterdir(), 0o000)
+
+    def ingest(*captures):
+        words = [sys.executable, "-m", "express50", "ingest", "data", *captures, "--workers", "0"]
+        done = subprocess.run([*bound, *words], cwd=tmp_path, capture_output=True, text=True)
+        return done.stdout
+
+    for path, mode in shut.items():
+        path.chmod(mode)
+    try:
+        said = ingest("S001", "S002", "rig", "none")
+        for place in places:
+            assert f"{tmp_path / place}: cannot be read (Permission denied); check its own" in said
+        assert said.count("dropped camera cam01") == 3
+        assert "none: no usable camera: cam00: " in said and "3 done + 0 skipped + 1 failed" in said
+        assert "0 done + 3 skipped + 1 failed" in ingest()
+    finally:
+        for path in shut:
+            path.chmod(0o755)
+    said = ingest()
+    assert "4 done + 0 skipped + 0 failed" in said and "dropped" not in said
+    for place in ("ledger.sqlite", "ingest/S001"):  # neither damaged nor gone
+        (tmp_path / "data" / place).chmod(0o000)
+        words = [*bound, sys.executable, "-m", "express50", "calibrate", "data", "--workers", "0"]
+        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+        (tmp_path / "data" / place).chmod(0o755)
+        assert "Permission denied" in done.stderr and "check its owner" in done.stderr

@@ -295,7 +295,7 @@ def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
         (["config", "trian"], 2, "'trian'"),
         (["score", "{shards}", "{shards}", "{checkpoint}"], 2, "is a file, expected a folder"),
         (["render", "{out}/absent.pt", "{out}"], 1, "absent.pt: no such file"),
-        (["render", "{shards}", "{out}"], 1, "is a folder, expected a file"),
+        (["render", "{shards}", "{out}"], 1, "is a folder, not a file"),
         (["render", "{checkpoint}", "{out}", "--subject=S9"], 2, "no subject 'S9'"),
         (["render", "{checkpoint}", "{out}", "--samples=3000"], 2,
          "3000 x 2 pictures of 32 x 32 px is larger than 65000 px; lower --size, --samples"),

@@ -208,6 +208,8 @@ def test_missing_frames_and_other_subjects_are_named(original, dataset, avatar, 
     (avatar / "export.json").write_text(json.dumps(meta | {"subject": "S009"}))
     assert take("track", dataset, avatar, f"--head={original[2]}") == 1
     assert "is of subject S009, expected S001" in error_of(capsys)
+    take("track", dataset, avatar / "absent.npz", f"--head={original[2]}")
+    assert "absent.npz: no such file; expected a folder or FLAME parameters" in error_of(capsys)
 
 
 def test_another_head_model_is_refused(dataset, avatar, capsys) -> None:

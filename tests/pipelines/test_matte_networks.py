@@ -197,6 +197,10 @@ def test_missing_and_damaged_files_are_one_line(tmp_path, name: str) -> None:
     path = tmp_path / name
     with pytest.raises(ConfigError, match="no such file"):
         load_network(path, SALIENT)
+    with pytest.raises(ConfigError, match="is a folder, not a file; expected TorchScript"):
+        load_network(tmp_path, SALIENT)
+    with pytest.raises(ConfigError, match="~nobody-here/a.pt: no such file"):
+        load_network("~nobody-here/a.pt", SALIENT)
     for content in (b"", b"not a network", bytes(4096)):
         path.write_bytes(content)
         with pytest.raises(StageError, match=r"matte.weights .*a\.(pt|onnx): ") as caught:

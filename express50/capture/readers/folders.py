@@ -44,7 +44,7 @@ from express50.capture.readers.videos import CLIP, first_fps, fits_video
 from express50.errors import CaptureError, Express50Error
 from express50.files.calibration import read_cameras
 from express50.files.images import ORIENTATION, read_exif
-from express50.files.text import identifier
+from express50.files.text import identifier, unreadable
 from express50.files.video import video_tags
 
 FPS = 24.0  # of pictures, which do not state it
@@ -79,7 +79,7 @@ def footage_folder(path: Path) -> Path:
     """
     if not path.is_dir() or _holds_footage(path):
         return path
-    folders = [inner for inner in path.iterdir() if is_data_folder(inner)]
+    folders = [inner for inner in _listed(path) if is_data_folder(inner)]
     wrappers = [inner for inner in folders if WRAPPER.fullmatch(inner.name)]
     # In our own layout, ``cameras`` holds folders.
     wrappers += [inner for inner in folders if inner.name == "cameras" and _holds_footage(inner)]
@@ -88,7 +88,12 @@ def footage_folder(path: Path) -> Path:
 
 
 def _holds_footage(path: Path) -> bool:
-    return any(fits(file) for file in path.iterdir() for fits in HOLDS.values())
+    return any(fits(file) for file in _listed(path) for fits in HOLDS.values())
+
+
+def _listed(folder: Path) -> list[Path]:
+    """List a folder, sorted; as empty if it must not be read, for its camera is then left out."""
+    return [] if unreadable(folder) else sorted(folder.iterdir())
 
 
 def fits_videos(path: Path) -> bool:
@@ -212,7 +217,14 @@ def read_frame_folders(path: Path, selection: Selection) -> RawCapture:
 def _read_inner(
     path: Path, tree: Tree, selection: Selection, moment_of: Callable[[str, str], Moment]
 ) -> RawCapture:
-    """Read folders that hold all cameras' files; their moments are of the folder and the file."""
+    """Read folders that hold all cameras' files; their moments are of the folder and the file.
+
+    Raises:
+        CaptureError: a folder cannot be read, which all cameras would lose; or as `read_videos`.
+    """
+    for empty in (footage_folder(path) / name for name in tree.empty):
+        if why := unreadable(empty):
+            raise CaptureError(f"{empty}: {why}")
     rows: dict[str, dict[Moment, str]] = {name: {} for name in sorted(tree.inner())}
     for folder, places in tree.places.items():
         for place in places:
@@ -245,10 +257,10 @@ def _tree(path: Path) -> Tree:
 
 def _places(folder: Path, deep: bool, holds: Callable[[Path], bool]) -> list[Path]:
     if not deep:
-        return sorted(filter(holds, folder.iterdir()))
-    inner = [path for path in folder.iterdir() if is_data_folder(path)]
+        return list(filter(holds, _listed(folder)))
+    inner = [path for path in _listed(folder) if is_data_folder(path)]
     inner = [path for path in inner if not BESIDE.fullmatch(path.name)]
-    return sorted(path for path in inner if any(map(holds, footage_folder(path).iterdir())))
+    return [path for path in inner if any(map(holds, _listed(footage_folder(path))))]
 
 
 def _files(root: Path, tree: Tree, place: Path) -> list[str]:
@@ -313,11 +325,15 @@ def _read(
         for name, camera in ids.items()
         if selection.has_camera(camera)
     }
+    names = {camera: name for name, camera in ids.items()}
     turns: dict[str, int] = {}
     lost: dict[str, str] = {}
     for camera, row in wanted.items():
         if not row:
-            lost[camera] = "its folder holds no footage, or none that is selected"
+            folder = footage_folder(path) / names[camera]
+            why = unreadable(folder)
+            nothing = "its folder holds no footage, or none that is selected"
+            lost[camera] = f"{folder}: {why}" if why else nothing
             continue
         first = path / row[min(row)]
         try:

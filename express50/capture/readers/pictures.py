@@ -31,7 +31,7 @@ from express50.capture.readers.selection import (
 from express50.errors import CalibrationError, CaptureError, FormatError
 from express50.files.containers import inside
 from express50.files.images import read_exif
-from express50.files.text import not_fetched, read_json_table
+from express50.files.text import read_json_table, unreadable
 from express50.geometry.cameras import Camera
 from express50.rigs.camera_builder import in_metres
 from express50.rigs.colmap import is_colmap, read_colmap_images
@@ -148,7 +148,7 @@ def _read_posed(
         for name, table in pictures.items()
     }
     without = {
-        ids[name]: not_fetched(root / next(iter(table.values()))) or "its picture is not there"
+        ids[name]: unreadable(root / next(iter(table.values()))) or "its picture is not there"
         for name, table in pictures.items()
         if not there[ids[name]]
     }

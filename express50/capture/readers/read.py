@@ -27,7 +27,7 @@ from express50.capture.readers import codec_avatars, folders, pictures, renderme
 from express50.capture.readers.selection import Selection, folder_id, parse_selection
 from express50.contract.layout import Dataset, footage_source
 from express50.errors import CalibrationError, CaptureError, Express50Error, check_known, few
-from express50.files.text import check_links
+from express50.files.text import unreadable
 from express50.rigs.world_frame import judge
 
 OURS = "express50"
@@ -110,16 +110,20 @@ def detect(path: Path, name: object = None) -> Layout:
     if name is not None:
         names = [OURS, *(layout.name for layout in LAYOUTS)]
         check_known(str(path), "layout", [str(name)], names, CaptureError)
-    whole = path.parents[1] if path.parent.name == "cameras" else path.parent
-    part = f"{path}: part of the capture {whole}; give that folder instead"
-    is_part = (whole / "capture.toml").is_file()
-    if is_part and whole != path.parent:  # a camera's folder would pass for a rig of one camera
-        raise CaptureError(part)
+    part = "{}: part of the capture {}; give that folder instead"
+    for whole in path.parents[1:3]:
+        # A camera's folder would pass for a rig of one camera, and its pictures for one of many.
+        if (whole / "capture.toml").is_file() and path.is_relative_to(whole / "cameras"):
+            raise CaptureError(part.format(path, whole))
+    is_part = (path.parent / "capture.toml").is_file()
     for layout in LAYOUTS:
         if name in (None, layout.name) and ((name and layout.named) or layout.fits(path)):
             return layout
-    check_links(*(path.iterdir() if path.is_dir() else ()))
-    raise CaptureError(_why_none_fits(path, name, part if is_part else None))
+    for inner in path.iterdir() if path.is_dir() else ():
+        if (inner.is_symlink() or is_data_folder(inner)) and (why := unreadable(inner)):
+            raise CaptureError(f"{inner}: {why}")
+    given = part.format(path, path.parent) if is_part else None
+    raise CaptureError(_why_none_fits(path, name, given))
 
 
 def _why_none_fits(path: Path, name: object, part: str | None) -> str:

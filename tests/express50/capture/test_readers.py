@@ -353,7 +353,8 @@ def test_nothing_fits_is_one_error_that_names_the_layouts(tmp_path):
         with pytest.raises(CaptureError, match=f"a folder of captures, .* give {tmp_path}/[*]$"):
             detect(folder)
     (tmp_path / "S001/cameras").mkdir()
-    for part in ("cameras", "capture.toml"):
+    (tmp_path / "S001/cameras/cam00/frames").mkdir(parents=True)
+    for part in ("cameras", "capture.toml", "cameras/cam00", "cameras/cam00/frames"):
         with pytest.raises(CaptureError, match=f"part of the capture {tmp_path / 'S001'}; give"):
             detect(tmp_path / "S001" / part)
     with pytest.raises(CaptureError, match="'avi'.*express50"):

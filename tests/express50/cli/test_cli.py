@@ -6,7 +6,9 @@ import errno
 import gc
 import json
 import os
+import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,6 +21,7 @@ import pytest
 from express50.__main__ import main
 from express50.console import log, run_handler, say
 from express50.contract.stage import Note, Result, stages
+from express50.errors import advised
 from tests.synth import make_capture
 
 COMMANDS = [
@@ -182,6 +185,7 @@ def test_bad_item_gives_exit_code_1_and_is_named(run, data, capture, tmp_path):
         (["prune", ""], 2, "argument DATASET: got '', expected a value; is a variable"),
         (["annotate", "status", "~/data"], 2, "DATASET: got '~/data', whose ~ no shell has"),
         (["report", "DATA", "--out=~/page"], 2, "--out: got '~/page', whose ~ no shell has"),
+        (["ingest", "DATA", "CAP", "--slurm=~/jobs.toml"], 2, "'~/jobs.toml', whose ~ no shell"),
         (["run", "DATA", "CAP", "--config", ""], 2, "argument --config: got ''"),
         (["run", "DATA", "CAP", "--preset", ""], 2, "argument --preset: got ''"),
         (["twin", "record", "DATA", "--expressions", " ,"], 2, "--expressions: got ' ,', expected"),
@@ -245,6 +249,47 @@ def test_a_stage_of_a_folder_that_is_no_dataset_says_so(run, tmp_path):
         assert "not a dataset" in run("matte", tmp_path, *pattern)[2]
 
 
+ADVICE = [
+    ("status", "DATA"),
+    ("report", "DATA"),
+    ("plan", "DATA"),
+    ("run", "DATA", "--first", "track", "--last", "track"),
+    ("matte", "DATA", "--items", "S001/*"),
+    ("annotate", "status", "DATA"),
+    ("cameras", "check", "DATA/a.json"),
+    ("ingest", "CAP"),
+    ("check", "DATA"),
+]
+
+
+@pytest.mark.parametrize("state", ["new", "empty", "ingested", "moved"])
+def test_advised_commands_quote_folders_for_a_shell(run, tmp_path, capture, state):
+    root, footage = tmp_path / "a b'c" / "data", tmp_path / "a b'c" / "S001"
+    footage.parent.mkdir()
+    shutil.copytree(capture, footage)
+    if state != "new":
+        root.mkdir()
+        (root / "a.json").write_text("{}")
+    if state in ("ingested", "moved"):
+        assert run("ingest", root, footage)[0] == 0
+    if state == "moved":
+        footage.rename(footage.parent / "S002")
+    advised = 0
+    places = {"DATA": root, "CAP": footage, "DATA/a.json": root / "a.json"}
+    for arguments in ADVICE:
+        _, out, err = run(*[places.get(word, word) for word in arguments])
+        for place in (root, footage):
+            assert not re.search(rf"express50 [a-z ]+{re.escape(str(place))}", out + err)
+            advised += len(re.findall(rf"express50 .*{re.escape(shlex.quote(str(place)))}", err))
+    assert advised > 1
+
+
+def test_an_advised_folder_is_one_word_and_no_option():
+    command = advised("express50 run", Path("a b'c"), Path("-d"), "--first ingest")
+    assert shlex.split(command[1:-1])[2:] == ["a b'c", "./-d", "--first", "ingest"]
+    assert advised("express50 run", Path("data")) == "'express50 run data'"
+
+
 def test_a_dataset_in_the_place_of_a_capture_is_refused(run, data, capture):
     assert run("ingest", data, capture)[0] == 0
     code, _, err = run("ingest", data.parent / "new", data)
@@ -306,6 +351,11 @@ def test_what_the_system_refuses_is_one_line(run, data, capture):
     code, _, err = run("report", data, "--out", "/proc/none/report.html")
     assert code == 1 and err.count("\n") == 1
     assert "/proc/none" in err and "Traceback" not in err
+
+
+def test_a_dataset_whose_name_is_not_utf_8_keeps_its_ledger(run, tmp_path, capture):
+    code, out, err = run("ingest", tmp_path / "data\udcff", capture)
+    assert code == 1 and "is not UTF-8" in out + err and "delete" not in out + err
 
 
 @pytest.mark.parametrize("command", [["calibrate"], ["annotate", "status"]])
@@ -432,9 +482,9 @@ def made_by(*arguments: str) -> list[str]:
 
 
 @pytest.mark.parametrize("target", ["ingest", "depth", "run", "tune", "train", "report"])
-def test_make_takes_a_dataset_whose_name_has_spaces(target):
-    words = made_by(target, "DATASET=my data", r"CAPTURES='caps/S 1' caps/S\ 2")
-    assert words[2].split("/")[0] == "my data"
+def test_make_takes_a_dataset_of_any_name(target):
+    words = made_by(target, """DATASET=my "dat`a's" """, r"CAPTURES='caps/S 1' caps/S\ 2")
+    assert words[2].split("/")[0] == """my "dat`a's" """
     assert words[3:5] == ["caps/S 1", "caps/S 2"] or target in ("depth", "train", "report")
 
 

@@ -119,6 +119,8 @@ def test_wrong_files_say_what_is_wrong(tmp_path, text, message):
 def test_missing_file_and_unknown_preset(tmp_path):
     with pytest.raises(ConfigError, match="no such file"):
         resolve(file=tmp_path / "absent.toml")
+    with pytest.raises(ConfigError, match="is a folder, not a file$"):
+        resolve(file=tmp_path)
     with pytest.raises(ConfigError, match="unknown preset 'drat' .did you mean 'draft'"):
         resolve(preset="drat")
 

@@ -48,6 +48,9 @@ def test_results_do_not_go_among_a_datasets_own_files(tmp_path, monkeypatch):
     (tmp_path / "shards/manifest.json").touch()
     with pytest.raises(ConfigError, match="holds shards; name another folder"):
         check_results_folder(tmp_path / "shards")
+    (tmp_path / "capture.toml").touch()
+    with pytest.raises(ConfigError, match="is a capture; name another folder"):
+        check_results_folder(tmp_path)
 
 
 def test_shards_do_not_go_among_a_datasets_own_files(tmp_path, capsys):

@@ -57,7 +57,7 @@ def test_size_and_kind_of_a_file_are_looked_at(tmp_path: Path) -> None:
     assert read_text(file, FormatError) == "a\nb\nc"
     with pytest.raises(FormatError, match="9 bytes, expected at most 8"):
         read_text(file, FormatError, limit=8)
-    with pytest.raises(FormatError, match="a folder, pipe or device"):
+    with pytest.raises(FormatError, match="is a folder, not a file"):
         read_text(tmp_path, FormatError)
     with pytest.raises(FormatError, match="No such file"):
         read_text(tmp_path / "b", FormatError)

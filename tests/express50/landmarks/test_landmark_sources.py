@@ -118,7 +118,7 @@ def test_fan_sees_the_whole_face() -> None:
 
 
 def test_wrong_or_absent_weights_are_one_clear_error(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no file"):
+    with pytest.raises(ConfigError, match="no such file"):
         open_source(f"fan:{tmp_path / 'absent.pt'}", {})
     (tmp_path / "text.pt").write_text("no weights")
     with pytest.raises(ConfigError, match="cannot be loaded") as caught:
