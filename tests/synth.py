@@ -8,8 +8,10 @@ from fractions import Fraction
 from pathlib import Path
 
 import av
+import imagecodecs
 import numpy as np
 import OpenImageIO as oiio
+from PIL import Image
 
 from express50.capture.frames import FootageReader, FrameReader
 from express50.capture.index import read_index
@@ -162,6 +164,13 @@ def noise_video_images(count: int, size: int = 64) -> list[np.ndarray]:
     blocks = rng.integers(0, 256, (count, 9, 9, 3), dtype=np.uint8)
     scale = -(-size // 9)
     return [np.kron(b, np.ones((scale, scale, 1), np.uint8))[:size, :size] for b in blocks]
+
+
+def write_in_adobe_rgb(path: Path, image: np.ndarray) -> None:
+    """Write an sRGB image (H, W, 3) uint8 with the colours, and the ICC profile, of Adobe RGB."""
+    ours, theirs = (imagecodecs.cms_profile(name) for name in ("srgb", "adobergb"))
+    stored = imagecodecs.cms_transform(image, ours, theirs, colorspace="rgb", outcolorspace="rgb")
+    Image.fromarray(stored).save(path, icc_profile=theirs, quality=98, subsampling=0, lossless=True)
 
 
 def write_photo(path: Path, image: np.ndarray, **attributes: object) -> Path:

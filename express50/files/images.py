@@ -13,6 +13,7 @@ import os
 import struct
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -37,6 +38,7 @@ PHOTOMETRIC = (0, 1, 2, 3, 6)
 JPEG_SIDE, PNG_SIDE = 65500, 1_000_000  # pixels; encoder and decoder refuse longer sides
 PNG_START = b"\x89PNG\r\n\x1a\n"
 PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
+SRGB_SLACK = 2  # of 255 levels by which profiles of sRGB differ from each other
 UP, PNG_LEVEL = 2, 3  # of PNG's filters the difference from the row above; libdeflate's level
 # Orientation -> quarter turns counter-clockwise after an optional left-right flip (EXIF 2.3).
 TURNS = {1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (1, True), 6: (3, False),
@@ -197,6 +199,50 @@ def read_exif(path: Path) -> tuple[int, float]:
     orientation, film = (value if isinstance(value, int | float) else 0 for value in values)
     usable = math.isfinite(film) and 0 < film < 1e5
     return (int(orientation) if orientation in TURNS else 1), (float(film) if usable else 0.0)
+
+
+@dataclass(frozen=True)
+class ColourProfile:
+    """An ICC profile whose colours are not those of sRGB."""
+
+    name: str
+    data: bytes
+
+    def to_srgb(self, image: np.ndarray) -> np.ndarray:
+        """Convert colours (H, W, 3) uint8 of this profile to sRGB; those outside of it are cut.
+
+        Raises:
+            RuntimeError: the profile cannot be used (imagecodecs.CmsError).
+        """
+        return imagecodecs.cms_transform(
+            np.ascontiguousarray(image), self.data, imagecodecs.cms_profile("srgb"),
+            colorspace="rgb", outcolorspace="rgb",
+        )  # fmt: skip
+
+
+def foreign_profile(path: Path) -> ColourProfile | None:
+    """Read a picture's ICC profile; None without a usable one, and if it means sRGB's colours.
+
+    OpenImageIO calls all pictures of 8 and 16 bits sRGB, whatever their profile is. Profiles of
+    grey pictures do not count, and neither do those of float ones, which hold linear light.
+
+    Raises:
+        FormatError: the file is not an image.
+    """
+    image = open_image(path)
+    spec = image.spec()
+    image.close()
+    data = spec.getattribute("ICCProfile")
+    if data is None or spec.nchannels < 3 or _pixel_kind(spec.format) == "float":
+        return None
+    name = spec.get_string_attribute("ICCProfile:profile_description") or "without a name"
+    profile = ColourProfile(name, bytes(data))
+    levels = np.linspace(0, 255, 9).astype(np.uint8)
+    colours = np.stack(np.meshgrid(levels, levels, levels), axis=-1).reshape(-1, 27, 3)
+    with suppress(imagecodecs.CmsError):  # damaged, or of another number of channels
+        if np.abs(profile.to_srgb(colours).astype(int) - colours).max() > SRGB_SLACK:
+            return profile
+    return None
 
 
 def upright(image: np.ndarray, orientation: int) -> np.ndarray:

@@ -15,11 +15,19 @@ import numpy as np
 from express50.capture.frames import corrected, dhash
 from express50.capture.index import UNKNOWN_HASH, CameraSource
 from express50.capture.raw import RawCamera, RawCapture
-from express50.errors import CaptureError
+from express50.errors import CaptureError, FormatError, few
 from express50.files.atomic import dump_json
 from express50.files.containers import WITHIN, inside, read_picture
 from express50.files.digests import file_sha256, text_digest
-from express50.files.images import ORIENTATION, encode_jpeg, has_alpha, read_exif, shrink, upright
+from express50.files.images import (
+    ORIENTATION,
+    encode_jpeg,
+    foreign_profile,
+    has_alpha,
+    read_exif,
+    shrink,
+    upright,
+)
 from express50.files.video import (
     FPS_SLACK,
     VideoTags,
@@ -176,13 +184,14 @@ def _steps(pts: tuple[int, ...], clips: tuple[int, ...]) -> np.ndarray:
 def odd_footage(
     raw: RawCapture, cameras: Mapping[str, CameraSource], measured: Mapping[str, CameraMeasurements]
 ) -> dict[str, str]:
-    """Return warnings about rate, time stamps, channels and orientation, by camera."""
-    found = {}
+    """Return warnings about rate, time stamps, channels, orientation and profiles, by camera."""
+    found, pictures = {}, [raw.root / name for name in raw.plates.values()]
     for name, source in cameras.items():
         oddities, camera, orientation = [], raw.cameras[name], 1
         if source.kind == "frames":
             path = camera.path / camera.names[0]
             if path.is_file():  # no file: a member of a container
+                pictures.append(path)
                 orientation, _ = read_exif(path)
                 if has_alpha(path):
                     oddities.append("alpha channel left out: a later stage makes mattes")
@@ -203,6 +212,16 @@ def odd_footage(
             )
         if oddities:
             found[f"camera {name}"] = "; ".join(oddities)
+    profiles = {}
+    for path in pictures:
+        with suppress(FormatError):  # a damaged plate
+            if profile := foreign_profile(path):
+                profiles[path.relative_to(raw.root).as_posix()] = profile.name
+    if profiles:  # labels hold hashes of frames, so a conversion would make them wrong
+        found["colours"] = (
+            f"{few(sorted(profiles), 1)}: ICC profile {min(profiles.values())!r}, but taken as"
+            " sRGB; convert all footage and plates to sRGB"
+        )
     return found
 
 

@@ -7,7 +7,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from express50.console import FAILED, OK, add_command, number, say, say_json, stdout_to_stderr
+from express50.console import FAILED, OK, add_command, log, number, say, say_json, stdout_to_stderr
 from express50.contract.layout import Dataset, check_results_folder
 from express50.contract.stage import Command, stages
 from express50.errors import ConfigError
@@ -66,6 +66,8 @@ def run_photo(args: argparse.Namespace) -> int:
     if args.subject is not None and not ID.fullmatch(args.subject):
         raise ConfigError(f"--subject {args.subject!r}: expected letters, digits, '_' and '-'")
     picture = open_picture(args.picture)
+    if picture.profile is not None:
+        log(f"{picture.path}: its colours are converted from {picture.profile.name!r} to sRGB")
     clips, given = ("track.frames=clips",) if picture.video else (), args.set
     args.set = [*PHOTO_SETTINGS, *clips, *given]
     cap_threads(1)

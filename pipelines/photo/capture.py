@@ -30,7 +30,15 @@ from express50.files.atomic import dump_json, write_bytes
 from express50.files.calibration import camera_rows
 from express50.files.containers import read_picture
 from express50.files.digests import file_sha256
-from express50.files.images import ORIENTATION, encode_png, read_exif, upright, write_image
+from express50.files.images import (
+    ORIENTATION,
+    ColourProfile,
+    encode_png,
+    foreign_profile,
+    read_exif,
+    upright,
+    write_image,
+)
 from express50.files.video import VideoFootage, iterate_video, video_fps, video_tags
 from express50.geometry.cameras import Camera, pinhole_camera
 from express50.geometry.conventions import FLIP_YZ
@@ -82,6 +90,7 @@ class PhotoSource:
     video: bool
     orientation: int = 1  # EXIF's, 1 is upright
     film_mm: float = 0.0  # focal length on 35 mm film of the same diagonal angle; 0 if unknown
+    profile: ColourProfile | None = None  # of its colours; None: sRGB
 
 
 def open_picture(path: Path) -> PhotoSource:
@@ -105,16 +114,18 @@ def open_picture(path: Path) -> PhotoSource:
         )
     try:
         orientation, film = read_exif(path)
+        profile = foreign_profile(path)
     except FormatError as error:
         raise CaptureError(str(error)) from error
-    return PhotoSource(path, video=False, orientation=orientation, film_mm=film)
+    return PhotoSource(path, False, orientation, film, profile)
 
 
 def upright_frames(picture: PhotoSource) -> Iterator[np.ndarray]:
     """Decode a photograph or a whole video: frames (H, W, 3) uint8 sRGB, turned upright."""
     if not picture.video:
         path = picture.path.resolve()  # it may be a link to another place
-        yield read_picture(path.parent, path.name, picture.orientation)
+        image = read_picture(path.parent, path.name, picture.orientation)
+        yield image if picture.profile is None else picture.profile.to_srgb(image)
         return
     for _, image in iterate_video(picture.path):
         yield upright(image, picture.orientation)
@@ -276,7 +287,7 @@ def subject_id(path: Path) -> str:
 
 
 def _write_footage(picture: PhotoSource, folder: Path) -> None:
-    """Copy the file; a turned one, or one of a kind that no stage reads, is stored upright."""
+    """Copy the file, or store its pictures as stages need them: upright, and in sRGB."""
     if folder.resolve() in picture.path.resolve().parents:
         return  # made from its own copy, which the next line would delete
     # An earlier picture with another suffix would make the footage ambiguous.
@@ -285,7 +296,8 @@ def _write_footage(picture: PhotoSource, folder: Path) -> None:
     name = f"video{suffix}" if picture.video else f"frames/000000{suffix}"
     target = folder / name
     target.parent.mkdir(parents=True)
-    if picture.orientation == 1 and (picture.video or suffix in IMAGE_SUFFIXES):
+    as_needed = picture.orientation == 1 and picture.profile is None
+    if as_needed and (picture.video or suffix in IMAGE_SUFFIXES):
         try:
             shutil.copyfile(picture.path, target)
         except OSError as error:

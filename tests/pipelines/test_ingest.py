@@ -4,8 +4,10 @@ import json
 import shutil
 from functools import partial
 
+import imagecodecs
 import numpy as np
 import pytest
+from PIL import Image
 
 from annotations.labels import make_mark, shows_labelled_frame
 from express50.__main__ import main
@@ -340,6 +342,27 @@ def test_footage_that_differs_from_its_description_is_a_warning(tmp_path):
     assert "alpha channel left out" in said["camera cam01"]
     assert "variable frame rate" in said["camera cam02"]
     assert "shares frames 8 to 11 with neutral" in said["expression smile"]
+
+
+def test_colour_profiles_of_footage_and_plates_are_named_and_change_no_hash(tmp_path):
+    for name in ("S001", "S002"):
+        make_capture(tmp_path / name, subject=name, cameras=2)
+    profile = imagecodecs.cms_profile("adobergb")
+    for path in [
+        *(tmp_path / "S002").glob("cameras/*/frames/*"),
+        tmp_path / "S002/plates/cam01.png",
+    ]:
+        Image.fromarray(read_image(path)).save(path, icc_profile=profile)
+    dataset = Dataset(tmp_path / "data")
+    ingest.add_captures(dataset, [tmp_path / "S001", tmp_path / "S002"])
+    assert run(dataset).ok
+    said = notes_of(dataset, "ingest", "S002")
+    assert said.keys() - notes_of(dataset, "ingest", "S001").keys() == {"colours"}
+    assert said["colours"].startswith(
+        "cameras/cam00/frames/000000.png and 2 more: ICC profile 'Adobe"
+    )
+    hashes = [read_index(dataset, name).cameras["cam00"].dhash for name in ("S001", "S002")]
+    assert hashes[0] == hashes[1]
 
 
 def test_videos_whose_pictures_are_not_what_they_seem_are_warned_of(tmp_path):

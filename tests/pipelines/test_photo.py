@@ -24,7 +24,7 @@ from express50.head.model import landmarks, pose
 from pipelines.photo import capture
 from pipelines.photo.capture import find_faces, make_photo_capture, open_picture, subject_id
 from pipelines.track.config import TrackConfig
-from tests.synth import turn_video, write_photo, write_video
+from tests.synth import turn_video, write_in_adobe_rgb, write_photo, write_video
 
 data = pytest.importorskip("skimage.data")
 
@@ -196,6 +196,17 @@ def test_photographs_of_kinds_that_no_rig_writes_are_read(
     assert np.abs(stored.astype(int) - astronaut).mean() < 4
 
 
+def test_a_photograph_with_a_colour_profile_is_stored_in_srgb(
+    tmp_path: Path, astronaut: np.ndarray
+) -> None:
+    for name in ("a.jpg", "b.png"):
+        write_in_adobe_rgb(tmp_path / name, astronaut)
+        make_photo_capture(open_picture(tmp_path / name), tmp_path / name[0], "a", TrackConfig())
+        stored = read_picture(tmp_path / name[0] / "cameras/photo/frames", "000000.png")
+        assert np.abs(stored.astype(int) - astronaut).mean() < 2
+        assert open_picture(tmp_path / name[0] / "cameras/photo/frames/000000.png").profile is None
+
+
 def test_a_photograph_on_its_side_is_tracked_as_an_upright_one(
     tmp_path: Path, astronaut: np.ndarray
 ) -> None:
@@ -286,7 +297,8 @@ def test_a_video_is_tracked_where_a_face_half_hidden_gets_no_matte(
 
 
 @pytest.mark.parametrize(
-    "setting", ["head=flame.pkl", "landmarks=points.npz", "landmarks=fan:x.pt"]
+    "setting",
+    ["head=flame.pkl", "head=~nobody-here/x.pkl", "landmarks=points.npz", "landmarks=fan:x.pt"],
 )
 def test_a_missing_file_is_reported_with_the_setting_that_names_it(
     tracked: tuple[Path, dict], tmp_path: Path, setting: str, capsys: pytest.CaptureFixture

@@ -14,6 +14,7 @@ from scipy.ndimage import distance_transform_edt
 from express50.errors import CaptureError, DiskFullError, FormatError
 from express50.files import images
 from express50.files.containers import decode_picture
+from tests.synth import write_in_adobe_rgb
 
 RNG = np.random.default_rng(0)
 
@@ -146,6 +147,23 @@ def test_colours_that_cannot_be_converted_truly_are_refused(tmp_path, ending, mo
             read(path)
     Image.new("YCbCr", (8, 8), (90, 128, 128)).save(tmp_path / "video.tif")
     assert np.ptp(images.read_image(tmp_path / "video.tif").astype(int) - 90) <= 1
+
+
+@pytest.mark.parametrize("ending", ["jpg", "png", "tif", "webp"])
+def test_colours_of_another_profile_become_those_of_srgb(tmp_path, ending):
+    levels = np.linspace(60, 190, 8).astype(np.uint8)  # no colour lies outside of either profile
+    image = np.stack(np.meshgrid(levels, levels, levels), axis=-1).reshape(64, 8, 3)
+    image = np.kron(image, np.ones((8, 8, 1), np.uint8))
+    path = tmp_path / f"a.{ending}"
+    write_in_adobe_rgb(path, image)
+    profile = images.foreign_profile(path)
+    stored = images.read_image(path)
+    assert profile.name == "Adobe RGB (compatible)"
+    assert np.abs(stored.astype(int) - image).max() > 15
+    assert np.abs(profile.to_srgb(stored).astype(int) - image).mean() < 1.5
+    for data in (imagecodecs.cms_profile("srgb"), imagecodecs.cms_profile("gray"), b"damaged"):
+        Image.fromarray(image).save(path, icc_profile=data)
+        assert images.foreign_profile(path) is None
 
 
 def test_srgb_curves_are_inverse():
