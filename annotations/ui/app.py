@@ -464,9 +464,10 @@ class AnnotateApp(App[None]):
         return [theme.UNCOLOURED] if self.no_color else super().get_line_filters()
 
     def on_mount(self) -> None:
-        """Show the desk; when the connection closes, end as by ``q``."""
-        if signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # nohup ignores it
-            asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self.exit)
+        """Show the desk; on SIGHUP, as when the connection closes, and SIGQUIT, end as by ``q``."""
+        for number in (signal.SIGHUP, signal.SIGQUIT):
+            if signal.getsignal(number) == signal.SIG_DFL:  # nohup ignores the first
+                asyncio.get_running_loop().add_signal_handler(number, self.exit)
         # A full pass takes up to a second, since pictures are many objects; they make no cycles.
         gc.set_threshold(GARBAGE)
         self.push_screen(self.desk)

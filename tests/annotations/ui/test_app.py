@@ -664,7 +664,8 @@ def in_terminal(suggested):
     os.close(ours)
 
 
-def test_a_hangup_saves_and_restores_the_terminal(suggested, in_terminal):
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGQUIT, signal.SIGTERM])
+def test_a_signal_saves_and_restores_the_terminal(suggested, in_terminal, number):
     process, terminal = in_terminal
     before = termios.tcgetattr(terminal)
     read_until(terminal, b"0/6")
@@ -672,9 +673,10 @@ def test_a_hangup_saves_and_restores_the_terminal(suggested, in_terminal):
     time.sleep(0.2)  # keys in the same read would be lost with it
     os.write(terminal, b"\r")
     read_until(terminal, b"1/6")
-    process.send_signal(signal.SIGHUP)
-    said = read_until(terminal, b"to use the labels")
+    process.send_signal(number)
+    stopped = number == signal.SIGTERM
+    said = read_until(terminal, b"interrupted" if stopped else b"to use the labels")
     assert b"\x1b[?1049l" in said  # back to the shell's screen
-    assert process.wait(30) == 0
+    assert process.wait(30) == (130 if stopped else 0)
     assert termios.tcgetattr(terminal) == before
     assert len(labels(suggested)) == 1
