@@ -35,8 +35,9 @@ TILTED = 0.6  # share of the noise that a change of light across the image must 
 LEAST_PLATE = 0.05  # with a smaller share of plate in view, noise and exposure cannot be measured
 # Largest changes of exposure that are tried, natural logarithms: 0.7 stops, then two stops.
 GAINS = (0.51, 1.41)
-# A plate that explains less than GOOD_SHARE of a frame's rim is moved and its light is evened.
-RIM, ODD_STEPS, GOOD_SHARE, LEAST_GAIN = 0.06, 12.0, 0.97, 0.01
+# A plate that explains less than GOOD_SHARE of a frame's rim is moved and its light is evened,
+# unless it explains TURNED_SHARE of that of the picture turned.
+RIM, ODD_STEPS, GOOD_SHARE, TURNED_SHARE, LEAST_GAIN = 0.06, 12.0, 0.97, 0.99, 0.01
 WIDE_RIM = 0.15  # width of the rim by which a plate is aligned
 MOST_MOVED = 0.03  # share of the longer side; alignments that move the plate further are rejected
 LEAST_SHARE = 0.9  # a plate that explains less shows another set
@@ -132,8 +133,11 @@ def match_plate(
     most frames below, so their top and upper sides are compared. If the plate does not fit there as
     it is, it is compared beside the `person` as well: where one may be, (h, w) bool of any size.
     """
+    share = open_share(plate, frame, valid)
+    if share > GOOD_SHARE:
+        return MatchedPlate(plate, share, sure=True)
     first = _matched(plate, frame, valid)
-    if first.sure or person is None:
+    if person is None:
         return first
     border = border_of(person.shape, RIM, np.zeros_like(person))
     if (~person[border]).mean() < LEAST_OPEN:
@@ -163,12 +167,15 @@ def _matched(
 
 
 def border_of(
-    shape: tuple[int, ...], share: float = RIM, person: np.ndarray | None = None
+    shape: tuple[int, ...], share: float = RIM, person: np.ndarray | None = None, turns: int = 0
 ) -> np.ndarray:
     """Mark the top and the upper sides (H, W) of an image; `share` of the longer side wide.
 
-    Where a person may be (H, W) bool, if known, is left out instead of the lower part.
+    Where a person may be (H, W) bool, if known, is left out instead of the lower part. `turns` are
+    quarter turns to the left of the camera's picture.
     """
+    if turns:
+        return np.rot90(border_of(shape[::-1] if turns % 2 else shape, share), turns)
     height, width = shape
     edge = max(2, round(share * max(shape)))
     low = round(0.6 * height) if person is None else height
@@ -185,6 +192,20 @@ def white_share(image: np.ndarray, valid: np.ndarray) -> float:
     """Return the share of an image's top and sides that is too bright to compare."""
     rim = valid & border_of(valid.shape)
     return float((image[rim] >= WHITE).any(-1).mean()) if rim.any() else 0.0
+
+
+def open_share(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> float:
+    """Return the share of a frame's top and upper sides that a plate explains.
+
+    Where the body leaves the picture of a camera that lies on its side, the plate explains little
+    of these, but nearly all of what they would be if the picture were turned.
+    """
+    first, *turned = (valid & border_of(valid.shape, turns=turns) for turns in range(4))
+    share = explained_share(plate, frame, first)
+    if share > GOOD_SHARE:
+        return share
+    shares = (explained_share(plate, frame, rim) for rim in turned)
+    return next((other for other in shares if other > TURNED_SHARE), share)
 
 
 def explained_share(plate: np.ndarray, frame: np.ndarray, rim: np.ndarray) -> float:

@@ -31,12 +31,11 @@ from express50.geometry.sampling import undistorted_mask
 from pipelines.matte.cutout import Cut, CutView, HeadPlace, cut_out, find_head, make_cut_view
 from pipelines.matte.plates import (
     LEAST_SHARE,
-    border_of,
-    explained_share,
     exposed,
     exposure_gain,
     local_colours,
     nearest_first,
+    open_share,
     to_light,
 )
 from pipelines.matte.visual_hull import Ball, ball_of
@@ -85,7 +84,7 @@ class Wall:
         """Return whether a frame's top and upper sides show this wall: its camera did not move."""
         wall = self.sized(frame)
         known = valid & (wall.error < UNSEEN)
-        return explained_share(wall.colour, frame, known & border_of(valid.shape)) >= LEAST_SHARE
+        return open_share(wall.colour, frame, known) >= LEAST_SHARE
 
     def before(self, frame: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return colour (H, W, 3) and error (H, W) float32 at a frame's size and exposure."""

@@ -344,9 +344,10 @@ def test_a_plate_of_another_room_explains_nothing() -> None:
 
 
 def test_a_plate_is_compared_beside_a_person_whose_place_is_known() -> None:
-    """Upside down, a body leaves the picture at the top."""
+    """A body may leave a turned camera's picture at two sides."""
     scene = hair_before("dark", "cluttered", 256, np.random.default_rng(0))
-    valid, body = np.ones((256, 256), bool), np.s_[:20, 60:200]
+    valid, body = np.ones((256, 256), bool), np.zeros((256, 256), bool)
+    body[:20, 60:200] = body[60:200, :20] = True
     frame = scene.frame.copy()
     frame[body] = 90
     assert match_plate(scene.plate, frame, valid).share < LEAST_SHARE
@@ -360,12 +361,24 @@ def test_a_plate_is_compared_beside_a_person_whose_place_is_known() -> None:
     assert match_plate(other.plate, frame, valid, person).share < 0.5
 
 
+@pytest.mark.parametrize("turns", range(4))
+def test_a_plate_of_a_camera_on_its_side_fits(turns: int) -> None:
+    """The body leaves its picture at any side."""
+    scene = hair_before("dark", "cluttered", 256, np.random.default_rng(0))
+    frame = scene.frame.copy()
+    frame[-60:, 30:226] = 90  # the shoulders
+    plate, turned = (np.ascontiguousarray(np.rot90(i, turns)) for i in (scene.plate, frame))
+    matched = match_plate(plate, turned, np.ones((256, 256), bool))
+    assert matched.sure and matched.plate is plate
+
+
 @pytest.mark.parametrize(("light", "kept"), [((0.2, 0.2, 0.2), True), ((0.2, 0.5, 0.9), False)])
 def test_a_plate_with_a_hard_shadow_on_its_border_fits(light: tuple, kept: bool) -> None:
     """What is there in another colour does not show the plate."""
     scene = hair_before("dark", "cluttered", 256, np.random.default_rng(0))
     frame = scene.frame.copy()
-    frame[:100, :16] = 255 * linear_to_srgb(srgb_to_linear(frame[:100, :16] / 255) * light)
+    for side in (np.s_[70:130, :16], np.s_[70:130, -16:]):
+        frame[side] = 255 * linear_to_srgb(srgb_to_linear(frame[side] / 255) * light)
     matched = match_plate(scene.plate, frame, np.ones((256, 256), bool))
     assert (matched.share >= LEAST_SHARE) == kept == matched.sure
 

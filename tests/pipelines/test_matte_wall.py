@@ -94,6 +94,13 @@ def test_a_wall_of_another_room_does_not_fit() -> None:
     assert not learned.fits(np.ascontiguousarray(shown[2][::-1, ::-1]), VALID)
 
 
+def test_a_wall_fits_where_the_body_leaves_at_the_top() -> None:
+    shown, cuts, _ = moments()
+    learned, frame = learn_wall(shown, cuts, VALID), shown[2].copy()
+    frame[:30, 20:140] = 90
+    assert learned.fits(frame, VALID)
+
+
 @pytest.mark.parametrize("kind", ["another room", "never seen", "one colour"])
 def test_a_wall_that_says_nothing_does_no_harm(kind: str) -> None:
     shown, cuts, _ = moments()
