@@ -20,6 +20,7 @@ from express50.files.calibration import read_cameras
 from express50.files.text import (
     ID,
     TOML_LIMIT,
+    check_readable,
     csv_table,
     identifier,
     is_given,
@@ -271,8 +272,7 @@ def _read_camera(folder: Path) -> RawCamera:
         raise CaptureError(
             f"{folder}: holds no footage, expected video.mp4 or frames/000000.png{other}"
         )
-    if why := unreadable(frames):
-        raise CaptureError(f"{frames}: {why}")
+    check_readable(frames)
     files = sorted(image_names(frames), key=lambda name: len(Path(name).stem))  # 9 before 10
     if not files:
         raise CaptureError(f"{frames}: holds no image, expected 000000.png and so on")

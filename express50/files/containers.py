@@ -25,7 +25,7 @@ from express50.errors import CaptureError, FormatError
 from express50.files.arrays import DAMAGE as ARRAY_DAMAGE
 from express50.files.digests import cached_by_file
 from express50.files.images import decode_cv, linear_to_srgb, read_image, upright
-from express50.files.text import read_bytes
+from express50.files.text import check_readable, read_bytes
 from express50.geometry.shapes import PIXEL_LIMIT
 
 WITHIN = "!/"
@@ -169,6 +169,7 @@ def _damage_is_one_error(kinds: tuple[type[BaseException], ...], words: str) -> 
 
 def open_zip(path: Path) -> zipfile.ZipFile:
     """Open a zip, the last few stay open; CaptureError if it is missing or not a zip."""
+    check_readable(path)
     with _damage_is_one_error(ARRAY_DAMAGE, f"{path}: not a zip archive"):
         return _open_zip(path)
 
@@ -180,6 +181,7 @@ def open_hdf5(path: Path) -> h5py.File:
     """Open an HDF5 file, the last few stay open; CaptureError if it is missing or damaged."""
     if path.is_dir():
         raise CaptureError(f"{path}: is a folder, expected an HDF5 file such as .smc")
+    check_readable(path)
     with _damage_is_one_error(DAMAGE, f"{path}: cannot be opened as HDF5"):
         return _hdf5_of(path, "r")
 

@@ -103,6 +103,8 @@ def unreadable(path: Path) -> str:
             )
         if path.is_dir():
             return "" if os.access(path, os.R_OK | os.X_OK) else NOT_PERMITTED
+        if not path.is_file():  # a pipe would be waited for
+            return ""
         with path.open("rb") as file:
             start = file.read(64)
     except PermissionError:
@@ -115,20 +117,20 @@ def unreadable(path: Path) -> str:
     return ""
 
 
-def check_links(*paths: Path) -> None:
-    """Raise CaptureError for broken links, which would pass for optional files that are absent."""
+def check_readable(*paths: Path) -> None:
+    """Raise CaptureError for paths that are there, but `unreadable`: they would pass for absent."""
     for path in paths:
-        if path.is_symlink() and not path.exists():
-            raise CaptureError(f"{path}: {unreadable(path)}")
+        if why := unreadable(path):
+            raise CaptureError(f"{path}: {why}")
 
 
 def is_given(path: Path) -> bool:
     """Return whether an optional file is there.
 
     Raises:
-        CaptureError: it is a broken link, or a folder, which would pass for absent.
+        CaptureError: it is unreadable, or a folder, which would pass for absent.
     """
-    check_links(path)
+    check_readable(path)
     if path.is_dir():
         raise CaptureError(f"{path}: is a folder, expected a file; put the file in its place")
     return path.exists()

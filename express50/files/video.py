@@ -22,7 +22,7 @@ from av.video.reformatter import Interpolation
 
 from express50.errors import CaptureError
 from express50.files.images import encode_jpeg, encode_png
-from express50.files.text import reason, unreadable
+from express50.files.text import check_readable, reason, unreadable
 from express50.geometry.shapes import PIXEL_LIMIT
 
 # An H.264 or H.265 picture may be displayed up to 16 pictures away from its position in the stream,
@@ -67,8 +67,7 @@ def check_whole(path: Path) -> None:
     Source: ISO/IEC 14496-12, 4.2: a box is its size (32 bits, or 64 after size 1), its type and
     content; size 0 runs to the end of the file.
     """
-    if why := unreadable(path):
-        raise CaptureError(f"{path}: {why}")
+    check_readable(path)
     size = path.stat().st_size
     with path.open("rb") as file:
         offset = count = 0

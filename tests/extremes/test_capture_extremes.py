@@ -264,3 +264,14 @@ def test_a_camera_that_must_not_be_read_is_dropped_until_it_can(tmp_path):
         done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
         (tmp_path / "data" / place).chmod(0o755)
         assert "Permission denied" in done.stderr and "check its owner" in done.stderr
+
+
+def test_a_cameras_folder_among_those_of_an_expression_is_dropped_alone(tmp_path, monkeypatch):
+    path = layouts.write_multiface(tmp_path)
+    shut = next(path.glob("images/*/400004"))
+    access = os.access
+    monkeypatch.setattr(os, "access", lambda place, mode: place != shut and access(place, mode))
+    raw = read_any(path)
+    assert raw.dropped == {"400004": f"{shut}: cannot be read (Permission denied); check its owner"
+                           " and permissions"}  # fmt: skip
+    assert len(raw.cameras) == 2

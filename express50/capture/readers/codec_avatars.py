@@ -25,7 +25,7 @@ from express50.capture.readers.selection import Moment, Selection, check_selecti
 from express50.errors import CalibrationError, CaptureError
 from express50.files.calibration import finite_array
 from express50.files.containers import WITHIN, open_zip
-from express50.files.text import NAME, check_links, identifier, read_json_table, read_text
+from express50.files.text import NAME, check_readable, identifier, read_json_table, read_text
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_from_opencv
 from express50.rigs.camera_builder import as_rig, camera_from_K, in_metres
@@ -153,7 +153,7 @@ def _ava256_cameras(path: Path) -> dict[str, Camera]:
 
 def _ava256_pictures(path: Path, name: str, wanted: list[Moment]) -> dict[Moment, str]:
     archive = f"decoder/image/{name}.zip"
-    check_links(path / "decoder/image", path / archive)
+    check_readable(path / "decoder/image", path / archive)
     if not (path / archive).is_file():
         raise CaptureError(f"{path / archive}: no such file; download it")
     members = open_zip(path / archive).namelist()
@@ -187,10 +187,15 @@ def _multiface_cameras(path: Path) -> dict[str, Camera]:
 
 
 def _multiface_pictures(path: Path, name: str, wanted: list[Moment]) -> dict[Moment, str]:
-    """Name each wanted picture that a camera has; folders are listed once, for network drives."""
+    """Name each wanted picture that a camera has; folders are listed once, for network drives.
+
+    Raises:
+        CaptureError: a folder of the camera cannot be read.
+    """
     have = {}
     for segment in dict(wanted):
         folder = path / "images" / segment / name
+        check_readable(folder)
         for file in sorted(folder.iterdir()) if folder.is_dir() else []:
             if file.suffix.lower() in (".png", ".jpg"):
                 have[segment, file.stem] = f"images/{segment}/{name}/{file.name}"

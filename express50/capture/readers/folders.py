@@ -44,7 +44,7 @@ from express50.capture.readers.videos import CLIP, first_fps, fits_video
 from express50.errors import CaptureError, Express50Error
 from express50.files.calibration import read_cameras
 from express50.files.images import ORIENTATION, read_exif
-from express50.files.text import identifier, unreadable
+from express50.files.text import check_readable, identifier, unreadable
 from express50.files.video import video_tags
 
 FPS = 24.0  # of pictures, which do not state it
@@ -222,9 +222,7 @@ def _read_inner(
     Raises:
         CaptureError: a folder cannot be read, which all cameras would lose; or as `read_videos`.
     """
-    for empty in (footage_folder(path) / name for name in tree.empty):
-        if why := unreadable(empty):
-            raise CaptureError(f"{empty}: {why}")
+    check_readable(*(footage_folder(path) / name for name in tree.empty))
     rows: dict[str, dict[Moment, str]] = {name: {} for name in sorted(tree.inner())}
     for folder, places in tree.places.items():
         for place in places:

@@ -27,7 +27,7 @@ from express50.capture.readers import codec_avatars, folders, pictures, renderme
 from express50.capture.readers.selection import Selection, folder_id, parse_selection
 from express50.contract.layout import Dataset, footage_source
 from express50.errors import CalibrationError, CaptureError, Express50Error, check_known, few
-from express50.files.text import unreadable
+from express50.files.text import check_readable
 from express50.rigs.world_frame import judge
 
 OURS = "express50"
@@ -119,9 +119,8 @@ def detect(path: Path, name: object = None) -> Layout:
     for layout in LAYOUTS:
         if name in (None, layout.name) and ((name and layout.named) or layout.fits(path)):
             return layout
-    for inner in path.iterdir() if path.is_dir() else ():
-        if (inner.is_symlink() or is_data_folder(inner)) and (why := unreadable(inner)):
-            raise CaptureError(f"{inner}: {why}")
+    inside = path.iterdir() if path.is_dir() else ()
+    check_readable(*(inner for inner in inside if inner.is_symlink() or is_data_folder(inner)))
     given = part.format(path, path.parent) if is_part else None
     raise CaptureError(_why_none_fits(path, name, given))
 

@@ -29,7 +29,7 @@ from express50.capture.readers.selection import (
 )
 from express50.errors import CalibrationError, CaptureError
 from express50.files.images import ORIENTATION
-from express50.files.text import check_links, identifier, read_json_table
+from express50.files.text import check_readable, identifier, read_json_table
 from express50.files.video import video_fps, video_tags
 from express50.rigs.other_tools import read_nersemble
 
@@ -61,7 +61,7 @@ def read_participant(path: Path, selection: Selection) -> RawCapture:
         CalibrationError: cameras or colours are malformed.
     """
     calibration = read_nersemble(path / CAMERAS)
-    check_links(*(path / "sequences").iterdir())
+    check_readable(*(path / "sequences").iterdir())
     sequences = sorted(
         p.name for p in (path / "sequences").iterdir() if is_data_folder(p) and p.name != BACKGROUND
     )
@@ -73,7 +73,7 @@ def read_participant(path: Path, selection: Selection) -> RawCapture:
         names = {s: f"sequences/{s}/images/cam_{serial}.mp4" for s in wanted}
         videos[serial] = {(s, 0): name for s, name in names.items() if (path / name).is_file()}
         try:  # if only a part was not fetched, the timeline says what is missing
-            check_links(*(path / name for name in names.values() if not videos[serial]))
+            check_readable(*(path / name for name in names.values() if not videos[serial]))
         except CaptureError as error:
             dropped[serial] = str(error)
             del videos[serial]

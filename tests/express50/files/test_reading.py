@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import pytest
 
 from express50.errors import CaptureError, FormatError
-from express50.files.text import parse_json, read_json, read_json_table, read_text, read_toml
+from express50.files.text import (
+    is_given,
+    parse_json,
+    read_json,
+    read_json_table,
+    read_text,
+    read_toml,
+)
 
 
 @pytest.mark.parametrize(
@@ -49,6 +57,13 @@ def test_numbers_of_toml_are_finite(tmp_path: Path) -> None:
     file.write_text("\nx = inf")
     with pytest.raises(CaptureError, match="line 2"):
         read_toml(file, CaptureError)
+
+
+def test_a_pipe_is_refused_without_being_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    assert is_given(tmp_path / "pipe")
+    with pytest.raises(FormatError, match="pipe: is a pipe or device, expected a file$"):
+        read_text(tmp_path / "pipe", FormatError)
 
 
 def test_size_and_kind_of_a_file_are_looked_at(tmp_path: Path) -> None:
