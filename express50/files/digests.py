@@ -56,15 +56,16 @@ def file_sha256(path: Path) -> str:
 
 def files_of(folder: Path, hidden: bool = False) -> list[Path]:
     """List every file below a folder, also in linked folders, sorted; hidden names if asked to."""
-    found = []
+    found: list[Path] = []
     for place, folders, names in os.walk(folder, followlinks=True):
         here = Path(place).resolve()
         parts = [[n for n in part if hidden or n[0] != "."] for part in (folders, names)]
         # A link to a folder that it lies in would never end.
         folders[:] = [n for n in parts[0] if not here.is_relative_to((here / n).resolve())]
-        found += [Path(place, name) for name in parts[1]]
-    # Where nothing but names may be seen, a name counts as a file: nothing is passed over.
-    return sorted(p for p in found if not os.access(p.parent, os.X_OK) or p.is_file())
+        paths = [Path(place, name) for name in parts[1]]
+        # Where nothing but names may be seen, a name counts as a file: nothing is passed over.
+        found += filter(Path.is_file, paths) if os.access(place, os.X_OK) else paths
+    return sorted(found)
 
 
 def path_digest(path: Path, sha256: Callable[[Path], str] = file_sha256) -> str:

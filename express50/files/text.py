@@ -61,8 +61,7 @@ def read_bytes(path: Path, kind: Kind, limit: int = TEXT_LIMIT, fix: str = AGAIN
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            what = no_file(path) if path.is_dir() else "is a pipe or device, expected a file"
-            raise kind(f"{path}: {what}")
+            raise kind(f"{path}: {no_file(path)}")
         if status.st_size > limit:
             raise kind(f"{path}: {status.st_size} bytes, expected at most {limit}; {fix}")
         return path.read_bytes()
@@ -77,8 +76,10 @@ def no_folder(path: Path) -> str:
 
 
 def no_file(path: Path) -> str:
-    """Say why a path is not a file: nothing is there, or a folder."""
-    return "is a folder, not a file" if path.is_dir() else "no such file"
+    """Say why a path is not a file: nothing is there, or a folder, a pipe or a device."""
+    if path.is_dir():
+        return "is a folder, not a file"
+    return "is a pipe or device, not a file" if path.exists() else "no such file"
 
 
 def expanded(path: str | Path) -> Path:

@@ -62,7 +62,7 @@ def test_numbers_of_toml_are_finite(tmp_path: Path) -> None:
 def test_a_pipe_is_refused_without_being_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     assert is_given(tmp_path / "pipe")
-    with pytest.raises(FormatError, match="pipe: is a pipe or device, expected a file$"):
+    with pytest.raises(FormatError, match="pipe: is a pipe or device, not a file$"):
         read_text(tmp_path / "pipe", FormatError)
 
 
