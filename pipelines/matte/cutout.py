@@ -324,12 +324,18 @@ def _cut(view: CutView, labels: np.ndarray, guess: np.ndarray, density: float) -
 def _with_own_colours(view: CutView, guess: np.ndarray) -> np.ndarray:
     """Take what has the head's colours, not the wall's, for the person in a guess (h, w).
 
-    GrabCut would learn a ponytail as one more colour of a plain wall.
+    GrabCut would learn a ponytail as one more colour of a plain wall. What leaves the picture at a
+    side where the person hardly does is more likely the floor.
     """
     cells = _cells_of(cv2.GaussianBlur(view.rgb, (0, 0), 1))
     own, wall = (_shares(cells[(guess == v) & view.valid]) for v in (cv2.GC_FGD, cv2.GC_BGD))
-    like = (own > CLEARLY * np.maximum(wall, UNSEEN))[cells]
-    return np.where(like & (guess == cv2.GC_PR_BGD), np.uint8(cv2.GC_PR_FGD), guess)
+    like = (own > CLEARLY * np.maximum(wall, UNSEEN))[cells] & (guess == cv2.GC_PR_BGD)
+    _, parts = cv2.connectedComponents(like.astype(np.uint8), connectivity=4)
+    person = (guess == cv2.GC_FGD) | (guess == cv2.GC_PR_FGD)
+    for side in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
+        if not person[side].any():
+            like &= ~np.isin(parts, parts[side])
+    return np.where(like, np.uint8(cv2.GC_PR_FGD), guess)
 
 
 def _corrected_labels(

@@ -181,6 +181,10 @@ def splat(shape: tuple[int, int], pixels: np.ndarray, spread: int) -> np.ndarray
 VOTES = 2  # other cameras that must see clear background for a place to be empty
 MARGIN = 0.01  # share of the longer side: distance from a silhouette that proves nothing
 COLOUR = 0.1  # share of full scale by which one surface may differ between neighbouring cameras
+LUMA, MOST_TINT = (
+    np.array([[0.299], [0.587], [0.114]], np.float32),
+    2.0,
+)  # of grey pictures, 8-bit steps
 SEEING_SHARE = 0.75  # share of the other views that must see a place for it to be solid
 VIEWS_PER_MISS = 8  # one in this many views may miss the same spot
 THICK = 0.5  # share of a ray's median length in the hull under which it only grazes a corner
@@ -321,7 +325,10 @@ def shows_surface(
     agree = np.zeros(depth.size, np.uint8)
     for other in near:
         x, y, inside = _pixels_of(other, points)
-        alike = np.abs(_smooth(other.rgb)[y, x] - mine).max(axis=1) < 255 * COLOUR
+        off = _smooth(other.rgb)[y, x] - mine
+        if _is_grey(view) or _is_grey(other):
+            off = off @ LUMA
+        alike = np.abs(off).max(axis=1) < 255 * COLOUR
         agree += alike & inside & subject[other.name][y, x]
     found = np.zeros(todo.shape, bool)
     found[rows, columns] = (agree >= 2).reshape(depth.shape).any(axis=0)
@@ -339,6 +346,11 @@ def subject_of(view: MatteView, evidence: Evidence) -> np.ndarray:
 
 def _smooth(rgb: np.ndarray) -> np.ndarray:
     return cv2.blur(rgb, (3, 3)).astype(np.float32)
+
+
+def _is_grey(view: MatteView) -> bool:
+    """Return whether a camera sees no colours."""
+    return float(np.ptp(view.rgb, axis=2).mean()) < MOST_TINT
 
 
 def _cosine(a: MatteView, b: MatteView) -> float:

@@ -82,10 +82,15 @@ def test_hair_at_the_rim_stays_and_a_cable_goes():
     assert gone[: top // 2, column].all() and not gone[views[5].alpha > 0].any()
 
 
-def test_a_hole_is_filled_where_the_camera_shows_the_surface_the_others_see():
-    views = make_views()
+@pytest.mark.parametrize("grey", [False, True])
+def test_a_hole_is_filled_where_the_camera_shows_the_surface_the_others_see(grey):
+    """The camera may see no colours."""
+    views = [replace(view, rgb=view.rgb // np.array([1, 2, 4], np.uint8)) for view in make_views()]
     hole = disc(0.5, 0.5, 0.09)
     holed = with_alpha(views, {5: np.where(hole, 0, views[5].alpha)})
+    if grey:
+        luma = cv2.cvtColor(views[5].rgb, cv2.COLOR_RGB2GRAY)
+        holed[5] = replace(holed[5], rgb=np.repeat(luma[..., None], 3, axis=2))
     found = compare_mattes(holed)
     assert changed(found) == {views[5].name} and not found.removed
     assert found.filled[views[5].name][hole].mean() > 0.95

@@ -28,6 +28,7 @@ from pipelines.matte import MatteConfig, stage
 from pipelines.matte.cutout import (
     CutView,
     HeadPlace,
+    _with_own_colours,
     cut_out,
     find_head,
     find_neighbours,
@@ -140,6 +141,24 @@ def test_a_ponytail_belongs_to_the_person() -> None:
     mask = cut_out([view], None, place)["photo"].mask
     ((x, y),) = place.pixels(np.array([[0, -0.12, -0.17]]), camera) * mask.shape[0] / 360
     assert mask[int(y), int(x)] and mask.mean() < 0.4
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_what_looks_like_the_person_and_leaves_the_picture_beside_them_is_not_a_ponytail(
+    turns: int,
+) -> None:
+    guess = np.full((120, 120), cv2.GC_PR_BGD, np.uint8)
+    guess[:20], guess[80:, 40:80], guess[30:80, 45:75] = cv2.GC_BGD, cv2.GC_PR_FGD, cv2.GC_FGD
+    image = np.full((120, 120, 3), 150, np.uint8)
+    ponytail, floor = np.s_[40:80, 30:42], np.s_[95:, :35]
+    for place in (np.s_[30:80, 45:75], ponytail, floor):
+        image[place] = 110, 60, 30
+    turned, start = (np.ascontiguousarray(np.rot90(i, turns)) for i in (image, guess))
+    camera = single_camera("photo", 120, 120, 200.0)
+    labels = _with_own_colours(CutView(camera, turned, np.ones((120, 120), bool)), start)
+    found = np.rot90(labels, -turns)
+    assert (found[ponytail][2:-2, 2:-2] == cv2.GC_PR_FGD).all()
+    assert (found[floor] == cv2.GC_PR_BGD).all()
 
 
 def test_a_neighbour_is_wall() -> None:
