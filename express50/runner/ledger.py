@@ -123,7 +123,7 @@ KINDS = {"item": str, "fingerprint": str, "status": str, "reason": str, "metrics
 
 
 def _check_schema(database: sqlite3.Connection) -> None:
-    """Refuse a database that holds more than a ledger's tables.
+    """Refuse a database, and close it, that holds more than a ledger's tables.
 
     A file from elsewhere may hold views and triggers, which run as programs whenever a receipt is
     read or written.
@@ -131,10 +131,14 @@ def _check_schema(database: sqlite3.Connection) -> None:
     Raises:
         sqlite3.DatabaseError: it does, or it is not a database.
     """
-    database.execute("PRAGMA trusted_schema=OFF")
-    for kind, name in database.execute("SELECT type, tbl_name FROM sqlite_master").fetchall():
-        if kind not in ("table", "index") or name not in TABLES:
-            raise sqlite3.DatabaseError(f"it has a {kind} {str(name)[:40]!r}")
+    try:
+        database.execute("PRAGMA trusted_schema=OFF")
+        for kind, name in database.execute("SELECT type, tbl_name FROM sqlite_master").fetchall():
+            if kind not in ("table", "index") or name not in TABLES:
+                raise sqlite3.DatabaseError(f"it has a {kind} {str(name)[:40]!r}")
+    except sqlite3.DatabaseError:
+        database.close()
+        raise
 
 
 class Ledger:

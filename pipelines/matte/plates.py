@@ -200,11 +200,15 @@ def open_share(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> float
     Where the body leaves the picture of a camera that lies on its side, the plate explains little
     of these, but nearly all of what they would be if the picture were turned.
     """
-    first, *turned = (valid & border_of(valid.shape, turns=turns) for turns in range(4))
-    share = explained_share(plate, frame, first)
+    first, *turned = (border_of(valid.shape, turns=turns) for turns in range(4))
+    share = explained_share(plate, frame, valid & first)
     if share > GOOD_SHARE:
         return share
-    shares = (explained_share(plate, frame, rim) for rim in turned)
+    shares = (
+        explained_share(plate, frame, valid & rim)
+        for rim in turned
+        if valid[rim].mean() > LEAST_OPEN
+    )
     return next((other for other in shares if other > TURNED_SHARE), share)
 
 

@@ -114,7 +114,7 @@ def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> Result:
 
 ENCODE = Stage(
     name="encode",
-    version=4,
+    version=5,
     config=EncodeConfig,
     presets=ENCODE_PRESETS,
     items=included_subjects,

@@ -268,7 +268,8 @@ def test_training_starts_only_from_files_of_weights(tmp_path, capsys, content) -
     with pytest.raises(SystemExit):
         main(["--cases", str(tmp_path), "--start", str(path)])
     message = capsys.readouterr().err
-    assert "start.npz: not landmark weights" in message and "Traceback" not in message
+    why = "no such file" if content is None else "not landmark weights"
+    assert f"start.npz: {why}" in message and "Traceback" not in message
 
 
 def test_training_lowers_the_loss(cases) -> None:

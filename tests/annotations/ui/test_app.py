@@ -670,7 +670,7 @@ def test_a_signal_saves_and_restores_the_terminal(suggested, in_terminal, number
     before = termios.tcgetattr(terminal)
     read_until(terminal, b"0/6")
     os.write(terminal, b"\xff\xe9")  # not UTF-8, as mice of old terminals send
-    time.sleep(0.2)  # keys in the same read would be lost with it
+    time.sleep(1.0)  # keys in the same read would be lost with it
     os.write(terminal, b"\r")
     read_until(terminal, b"1/6")
     process.send_signal(number)
