@@ -39,7 +39,7 @@ DAMAGE = (
     ValueError, TypeError, EOFError, OSError, KeyError, IndexError, OverflowError, MemoryError,
     NotImplementedError, RuntimeError, SyntaxError, UnicodeError, AttributeError, ImportError,
     AssertionError, LZMAError, zipfile.BadZipFile, zlib.error, TokenError, struct.error,
-    pickle.UnpicklingError,
+    pickle.UnpicklingError, UserWarning,
 )  # fmt: skip
 
 
@@ -71,7 +71,8 @@ def read_arrays(
                 name = member.filename.removesuffix(".npy")
                 if only and name not in wanted:
                     continue
-                with archive.open(member) as file:
+                # Python 3.13 warns of entries that overlap.
+                with warnings.catch_warnings(action="error"), archive.open(member) as file:
                     data = io.BytesIO(file.read(member.file_size))
                 found[name] = _array(data, member.file_size)
     except DAMAGE as error:

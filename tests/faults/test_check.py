@@ -8,6 +8,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -218,7 +219,7 @@ def test_an_unreadable_ledger_is_set_aside_and_outputs_are_made_again(dataset, h
 
 def test_an_output_whose_digests_are_lost_is_made_again(dataset):
     before = toy.tree(dataset.stage_dir("toy"))
-    with sqlite3.connect(dataset.ledger) as database:
+    with closing(sqlite3.connect(dataset.ledger, isolation_level=None)) as database:
         database.execute("DELETE FROM made WHERE item = 'S001'")
     assert set(look(dataset)[0]) == {("unknown", "toy S001"), ("unknown", "after S001")}
     assert look(dataset, fix=True)[1].sound

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -106,7 +107,7 @@ def _write_dataset(root: Path) -> None:
     with Ledger(root / "ledger.sqlite") as ledger:
         for number in range(40):
             ledger.write(Receipt(stage="a", item=f"i{number}", fingerprint="f", status="done"))
-    with sqlite3.connect(root / "ledger.sqlite") as database:
+    with closing(sqlite3.connect(root / "ledger.sqlite")) as database:
         database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
 
 
