@@ -653,8 +653,13 @@ def in_terminal(suggested):
     """The annotator's process in a pseudo-terminal, and our end of it."""
     ours, theirs = os.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("4H", 24, 80, 0, 0))
+    # Tests that run in the background ignore these signals, and so would their processes.
+    start = (
+        "import runpy; from signal import *; signal(SIGHUP, SIG_DFL); signal(SIGQUIT, SIG_DFL);"
+        " runpy.run_module('express50', run_name='__main__')"
+    )
     process = subprocess.Popen(
-        [sys.executable, "-m", "express50", "annotate", "ui", suggested.root, "--annotator", "ann"],
+        [sys.executable, "-c", start, "annotate", "ui", suggested.root, "--annotator", "ann"],
         stdin=theirs, stdout=theirs, stderr=theirs, env=os.environ | {"TERM": "xterm-256color"},
     )  # fmt: skip
     os.close(theirs)
