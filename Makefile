@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 DATASET ?= build/dataset
-# A shell expands ~ only outside of quotes. patsubst joins a name with single spaces.
+# Shells do not expand a quoted ~. Without the test, patsubst would merge spaces within a name.
 override DATASET := $(if $(filter ~/%,$(DATASET)),$(HOME)/$(patsubst ~/%,%,$(DATASET)),$(DATASET))
 override DATASET := '$(subst ','\'',$(DATASET))'
 # Folders with spaces in their names need quotes or backslashes: CAPTURES="'my dir' other".

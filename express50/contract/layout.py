@@ -68,7 +68,7 @@ class Dataset:
         return self.root / stage / item
 
     def subjects(self) -> list[str]:
-        """Return the ingested subjects, sorted; PermissionError if one must not be read."""
+        """Return the ingested subjects, sorted; PermissionError if one may not be read."""
         # A pattern would pass over such a folder, and the subject would seem to be gone.
         found = self.stage_dir("ingest")
         folders = found.iterdir() if found.is_dir() else ()

@@ -62,7 +62,7 @@ def check_whole(path: Path) -> None:
     """Refuse an MP4/MOV file whose boxes go past its end, or that has no index.
 
     Raises:
-        CaptureError: the file is truncated, a link to nothing, or must not be read.
+        CaptureError: the file is truncated, a link to nothing, or without read permission.
 
     Source: ISO/IEC 14496-12, 4.2: a box is its size (32 bits, or 64 after size 1), its type and
     content; size 0 runs to the end of the file.

@@ -324,8 +324,8 @@ def _cut(view: CutView, labels: np.ndarray, guess: np.ndarray, density: float) -
 def _with_own_colours(view: CutView, guess: np.ndarray) -> np.ndarray:
     """Take what has the head's colours, not the wall's, for the person in a guess (h, w).
 
-    GrabCut would learn a ponytail as one more colour of a plain wall. What leaves the picture at a
-    side where the person hardly does is more likely the floor.
+    GrabCut would learn a ponytail as one more colour of a plain wall. But what runs off a side of
+    the picture that the person does not reach is more likely a floor.
     """
     cells = _cells_of(cv2.GaussianBlur(view.rgb, (0, 0), 1))
     own, wall = (_shares(cells[(guess == v) & view.valid]) for v in (cv2.GC_FGD, cv2.GC_BGD))

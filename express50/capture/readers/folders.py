@@ -92,7 +92,7 @@ def _holds_footage(path: Path) -> bool:
 
 
 def _listed(folder: Path) -> list[Path]:
-    """List a folder, sorted; as empty if it must not be read, for its camera is then left out."""
+    """List a folder, sorted; one without read permission as empty: its camera is left out."""
     return [] if unreadable(folder) else sorted(folder.iterdir())
 
 
