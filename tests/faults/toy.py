@@ -56,6 +56,8 @@ def run(dataset: Dataset, item: str, config: ToyConfig, out: Path) -> Result:
         block = hashlib.sha256(f"{config.word}{item}{text}{number}".encode()).digest()
         (out / "deep" / f"{number}.bin").write_bytes(block * 2000)
         time.sleep(config.seconds * float(os.environ.get(SLOWER, "1")))
+    while item.startswith("wait") and not (dataset.root / "go").exists():
+        time.sleep(0.02)
     print("chatter of a library")
     return misbehave(dataset, item, text)
 

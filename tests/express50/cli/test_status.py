@@ -10,6 +10,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -184,10 +185,19 @@ def test_durations():
     assert words == ["1.3 s", "42 s", "1:00 min", "3:05 min", "2:10 h", "3 d 4 h"]
 
 
-def start(dataset, workers, slower=10):
+@contextmanager
+def running_toy(dataset, workers):
+    """A run of the toy in another process, which is killed unless it has ended by then."""
     command = [sys.executable, "-m", "tests.faults.toy", str(dataset.root), str(workers)]
-    environment = os.environ | {"PYTHONPATH": str(REPOSITORY), toy.SLOWER: str(slower)}
-    return subprocess.Popen(command, cwd=REPOSITORY, env=environment, stderr=subprocess.DEVNULL)
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    with subprocess.Popen(
+        command, cwd=REPOSITORY, env=environment, stderr=subprocess.DEVNULL, start_new_session=True
+    ) as process:
+        try:
+            yield process
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
 
 
 def status_of_toy(dataset, now=None):
@@ -210,19 +220,27 @@ def first_with(dataset, seen, patience=60.0):
 
 @pytest.mark.parametrize("workers", [0, 2])
 def test_page_follows_a_run_of_another_process_to_its_end(tmp_path, monkeypatch, workers):
-    monkeypatch.setattr(status_cli, "PAGE_SECONDS", 0.2)
-    names = [*(f"item{n}" for n in range(4)), "bad1"]
+    names = ["bad1", *(f"item{n}" for n in range(4)), "wait"]
     dataset = toy.make_dataset(tmp_path / "data", names)
-    # Slow enough that a busy machine does not miss a run's middle between two looks.
-    process = start(dataset, workers, slower=25)
-    row = first_with(dataset, lambda row: row.state == "running" and row.running and row.done)
-    assert row.done + len(row.failed) + len(row.running) + row.to_do == len(names)
-    page = tmp_path / "page.html"
+    said = []
+
+    def say(line):  # the second line says that the page follows a run, whose last item then ends
+        said.append(line)
+        if len(said) == 2:
+            (dataset.root / "go").touch()
+
+    monkeypatch.setattr(status_cli, "PAGE_SECONDS", 0.2)
+    monkeypatch.setattr(status_cli, "say", say)
     monkeypatch.setattr(status_cli, "stages", lambda: {"toy": toy.STAGE})
-    assert main(["status", str(dataset.root), "--page", str(page)]) == 1
-    assert process.wait(timeout=60) == 1
+    page = tmp_path / "page.html"
+    with running_toy(dataset, workers) as process:
+        row = first_with(dataset, lambda row: row.state == "running" and row.running and row.done)
+        assert row.done + len(row.failed) + len(row.running) + row.to_do == len(names)
+        assert main(["status", str(dataset.root), "--page", str(page)]) == 1
+        assert process.wait(timeout=60) == 1
+    assert said[0] == f"wrote {page}" and "until the run ends" in said[1]
     end = status_of_toy(dataset)
-    assert (end.state, end.done, len(end.failed), end.to_do) == ("failed", 4, 1, 0)
+    assert (end.state, end.done, len(end.failed), end.to_do) == ("failed", 5, 1, 0)
     text = page.read_text()
     assert "bad1" in text and "expected &#39;repaired&#39;" in text
     assert "script" not in parsed(text).seen
@@ -241,11 +259,9 @@ def test_a_worker_whose_clock_is_behind_does_not_stop_the_run(tmp_path, monkeypa
 
 
 def test_a_killed_run_counts_as_stopped(tmp_path):
-    dataset = toy.make_dataset(tmp_path / "data", [f"item{n}" for n in range(40)])
-    process = start(dataset, 0)
-    first_with(dataset, lambda row: row.running)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    dataset = toy.make_dataset(tmp_path / "data", [*(f"item{n}" for n in range(40)), "wait"])
+    with running_toy(dataset, 0):
+        first_with(dataset, lambda row: row.running)
     assert status_of_toy(dataset, time.time() + SILENT_SECONDS).state == "stopped"
     clock_set_back = time.time() - 1e6
     assert status_of_toy(dataset, clock_set_back).state == "stopped"
@@ -253,7 +269,7 @@ def test_a_killed_run_counts_as_stopped(tmp_path):
         soon, locked = time.time() + UNLOCKED_SECONDS, partial(is_running, dataset)
         (row,) = read_status(ledger, ["toy"], soon, locked)
     assert row.state == "stopped"
-    assert row.to_do + row.done == 40 and row.to_do > 0
+    assert row.to_do + row.done == 41 and row.to_do > 0
 
 
 def test_serve_answers_only_on_this_machine(tmp_path):

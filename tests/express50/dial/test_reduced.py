@@ -91,7 +91,8 @@ def test_a_tight_budget_reduces_pictures_and_a_larger_one_makes_them_whole_again
     tmp_path, monkeypatch
 ):
     toy_chain.count_pauses(monkeypatch)
-    captures, root = captures_of(tmp_path, subjects=2), tmp_path / "d"
+    # With plates, since `frames` would otherwise learn the walls, which takes a minute.
+    captures, root = captures_of(tmp_path, subjects=2, plates=True), tmp_path / "d"
     presets = tune(chain_of(root, captures))[0]["presets"]
     reduced, whole = (presets[name]["core_seconds"] for name in SIDES)
     saved = whole - reduced
@@ -111,7 +112,7 @@ def test_a_tight_budget_reduces_pictures_and_a_larger_one_makes_them_whole_again
 
 @pytest.mark.parametrize(("side", "trials"), [(24, 3), (96, 2)])
 def test_pictures_that_are_small_enough_are_not_tried_whole(tmp_path, side, trials):
-    chain = chain_of(tmp_path / "d", captures_of(tmp_path, subjects=1))
+    chain = chain_of(tmp_path / "d", captures_of(tmp_path, subjects=1, plates=True))
     chain.ladders["frames"]["draft"] = FRAMES.config(image_side=side)
     tune(chain)
     assert (

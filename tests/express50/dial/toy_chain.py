@@ -160,12 +160,14 @@ KINDS = (
 STAGES = (ingest.STAGE, ALIGN, SOLVE, MAP)
 
 
-def captures_of(root: Path, subjects: int = 3, expressions: int = 4) -> list[Path]:
+def captures_of(
+    root: Path, subjects: int = 3, expressions: int = 4, plates: bool = False
+) -> list[Path]:
     names = tuple(f"e{number}" for number in range(expressions))
     for number in range(subjects):
         make_capture(
             root / f"S{number}", subject=f"S{number}", cameras=2, frames=4 * expressions, size=48,
-            plates=False, expressions=names,
+            plates=plates, expressions=names,
         )  # fmt: skip
     return [root / f"S{number}" for number in range(subjects)]
 
