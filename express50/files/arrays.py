@@ -28,7 +28,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from express50.errors import Express50Error, HeadModelError
-from express50.files.text import AGAIN, Kind, no_file, reason, unreadable
+from express50.files.text import AGAIN, Kind, no_file, open_file, reason, unreadable
 
 SIZE_LIMIT = 2 << 30  # bytes per unpacked file; 60 expressions of a 26,000-vertex head take 19 MB
 HEADER_LIMIT = 4096  # characters in an array's header
@@ -61,7 +61,7 @@ def read_arrays(
             unpacks to more than ``SIZE_LIMIT``.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_file(path) as whole, zipfile.ZipFile(whole) as archive:
             members = archive.infolist()
             size = sum(member.file_size for member in members)
             if size > SIZE_LIMIT:
@@ -99,7 +99,7 @@ def read_npy(path: Path, kind: Kind, what: str, fix: str = AGAIN) -> np.ndarray:
         Express50Error: of the given kind: the file is missing or damaged.
     """
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             return _array(file, path.stat().st_size)
     except DAMAGE as error:
         raise _refused(path, kind, what, fix, error) from None
@@ -318,7 +318,7 @@ def read_pickle(path: Path) -> Any:  # noqa: ANN401 (whatever the file holds)
         size = path.stat().st_size
         if size > SIZE_LIMIT:
             raise HeadModelError(f"{path}: {size} bytes, expected at most {SIZE_LIMIT}")
-        with path.open("rb") as file:
+        with open_file(path) as file:
             return SafeUnpickler(file, encoding="latin1").load()
     except DAMAGE as error:
         raise HeadModelError(f"{path}: refused or damaged pickle ({reason(error)})") from error
@@ -331,7 +331,7 @@ def read_object_array(path: Path) -> Any:  # noqa: ANN401 (whatever the file hol
         HeadModelError: as for `read_pickle`.
     """
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             shape, dtype = read_header(file)
             if not dtype.hasobject:
                 return read_npy(path, HeadModelError, "an array")

@@ -23,7 +23,7 @@ import OpenImageIO as oiio
 
 from express50.errors import FormatError
 from express50.files.atomic import naming_full_disk
-from express50.files.text import reason, unreadable
+from express50.files.text import open_file, reason, unreadable
 from express50.geometry.shapes import PIXEL_LIMIT
 
 DAMAGED = "truncated or damaged"
@@ -91,7 +91,7 @@ def _plain_png(path: Path) -> np.ndarray | None:
     Raises:
         FormatError: it is damaged. OpenImageIO's decoder would print that as well.
     """
-    with suppress(OSError), path.open("rb") as file:
+    with suppress(OSError), open_file(path) as file:
         head = file.read(26)
         if len(head) < 26 or not head.startswith(PNG_START):
             return None

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import codecs
 import csv
+import errno
 import io
 import json
 import math
@@ -19,7 +20,7 @@ import tomllib
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any, BinaryIO, TypeGuard
 from xml.etree import ElementTree
 
 import yaml
@@ -82,6 +83,18 @@ def no_file(path: Path) -> str:
     return "is a pipe or device, not a file" if path.exists() else "no such file"
 
 
+def open_file(path: Path) -> BinaryIO:
+    """Open a file to read it; a pipe or device in its place could keep its readers waiting.
+
+    Raises:
+        OSError: it is one, or cannot be opened.
+    """
+    path = Path(path)
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise OSError(errno.EINVAL, no_file(path), str(path))
+    return path.open("rb")
+
+
 def expanded(path: str | Path) -> Path:
     """Return a path with the home folder in place of ``~``; unchanged if that user is unknown."""
     try:
@@ -104,8 +117,8 @@ def unreadable(path: Path) -> str:
             )
         if path.is_dir():
             return "" if os.access(path, os.R_OK | os.X_OK) else NOT_PERMITTED
-        if not path.is_file():  # a pipe would be waited for
-            return ""
+        if path.exists() and not path.is_file():
+            return no_file(path)
         with path.open("rb") as file:
             start = file.read(64)
     except PermissionError:
@@ -129,7 +142,7 @@ def is_given(path: Path) -> bool:
     """Return whether an optional file is there.
 
     Raises:
-        CaptureError: it is unreadable, or a folder, which would pass for absent.
+        CaptureError: it is unreadable, a folder or a pipe.
     """
     check_readable(path)
     if path.is_dir():

@@ -22,7 +22,7 @@ from av.video.reformatter import Interpolation
 
 from express50.errors import CaptureError
 from express50.files.images import encode_jpeg, encode_png
-from express50.files.text import check_readable, reason, unreadable
+from express50.files.text import check_readable, reason
 from express50.geometry.shapes import PIXEL_LIMIT
 
 # An H.264 or H.265 picture may be displayed up to 16 pictures away from its position in the stream,
@@ -99,14 +99,16 @@ def check_whole(path: Path) -> None:
 
 
 def _open(path: Path) -> tuple[av.container.InputContainer, av.VideoStream]:
+    check_readable(path)
     limits = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file"}
     # On opening, FFmpeg would decode a picture (0.26 core seconds at 4K); the header is enough.
     unseen = {"skip_frame": "all"}
     try:
         container = av.open(str(path), container_options=limits, options=unseen)
     except DAMAGE as error:
-        why = f"cannot be opened as a video ({reason(error)}); copy or encode it again"
-        raise CaptureError(f"{path}: {unreadable(path) or why}") from error
+        raise CaptureError(
+            f"{path}: cannot be opened as a video ({reason(error)}); copy or encode it again"
+        ) from error
     if not container.streams.video:
         container.close()
         raise CaptureError(f"{path}: holds no video stream, expected one")

@@ -149,21 +149,20 @@ def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
     corners: list[tuple[str, str, str]] = []
     material, materials = "", []
     try:
-        with path.open(encoding="utf-8") as lines:
-            for line in lines:
-                words = line.split()
-                if not words:
-                    continue
-                if words[0] == "v":
-                    vertices.append(words[1:4])
-                elif words[0] == "vt":
-                    uv.append(words[1:3])
-                elif words[0] == "usemtl":
-                    material = words[1]
-                elif words[0] == "f":
-                    for second, third in zip(words[2:-1], words[3:], strict=True):
-                        corners.append((words[1], second, third))
-                        materials.append(material)
+        for line in read_text(path, HeadModelError).split("\n"):
+            words = line.split()
+            if not words:
+                continue
+            if words[0] == "v":
+                vertices.append(words[1:4])
+            elif words[0] == "vt":
+                uv.append(words[1:3])
+            elif words[0] == "usemtl":
+                material = words[1]
+            elif words[0] == "f":
+                for second, third in zip(words[2:-1], words[3:], strict=True):
+                    corners.append((words[1], second, third))
+                    materials.append(material)
         index = np.array(
             [[corner.split("/")[:2] + ["1"] for corner in face] for face in corners], dtype=object
         )

@@ -17,7 +17,7 @@ import numpy as np
 from express50.console import log
 from express50.errors import HeadModelError
 from express50.files.arrays import read_arrays
-from express50.files.text import expanded
+from express50.files.text import expanded, open_file
 from express50.head import BUILTIN_NAME, HEADS, head_path
 
 if TYPE_CHECKING:
@@ -161,6 +161,6 @@ def is_stored(path: Path) -> bool:
 
 
 def _holds(path: Path, array: str) -> bool:
-    with suppress(zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
-        return f"{array}.npy" in archive.namelist()
+    with suppress(zipfile.BadZipFile, OSError), open_file(path) as file:
+        return f"{array}.npy" in zipfile.ZipFile(file).namelist()
     return False

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from express50.errors import CaptureError, FormatError
+from express50.errors import CaptureError, Express50Error, FormatError
+from express50.files.arrays import read_arrays, read_npy, read_object_array, read_pickle
+from express50.files.containers import open_hdf5, open_zip
+from express50.files.images import foreign_profile, read_image
 from express50.files.text import (
     is_given,
     parse_json,
@@ -17,6 +22,9 @@ from express50.files.text import (
     read_text,
     read_toml,
 )
+from express50.files.video import check_whole, video_fps
+from express50.head.ict import read_obj
+from express50.head.load import load_head
 
 
 @pytest.mark.parametrize(
@@ -59,11 +67,41 @@ def test_numbers_of_toml_are_finite(tmp_path: Path) -> None:
         read_toml(file, CaptureError)
 
 
-def test_a_pipe_is_refused_without_being_waited_for(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "read",
+    [
+        is_given,
+        lambda path: read_text(path, FormatError),
+        lambda path: read_arrays(path, FormatError, "arrays"),
+        lambda path: read_npy(path, FormatError, "an array"),
+        read_pickle,
+        read_object_array,
+        read_image,
+        foreign_profile,
+        open_zip,
+        open_hdf5,
+        check_whole,
+        video_fps,
+        read_obj,
+        lambda path: load_head(path.rename(path.with_suffix(".npz"))),
+    ],
+)
+def test_a_pipe_is_refused_without_being_waited_for(
+    tmp_path: Path, read: Callable[[Path], object]
+) -> None:
     os.mkfifo(tmp_path / "pipe")
-    assert is_given(tmp_path / "pipe")
-    with pytest.raises(FormatError, match="pipe: is a pipe or device, not a file$"):
-        read_text(tmp_path / "pipe", FormatError)
+
+    def give_up(*_: object) -> None:
+        raise TimeoutError("waits for the pipe")
+
+    former = signal.signal(signal.SIGALRM, give_up)
+    signal.alarm(60)
+    try:
+        with pytest.raises(Express50Error, match=r"pipe.*: .*is a pipe or device, not a file"):
+            read(tmp_path / "pipe")
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, former)
 
 
 def test_size_and_kind_of_a_file_are_looked_at(tmp_path: Path) -> None:
