@@ -294,11 +294,21 @@ def image_names(folder: Path) -> list[str]:
 
 
 def read_plates(root: Path, cameras: Container[str]) -> dict[str, str]:
-    """Return the background plate of each camera that has one, relative to the capture."""
-    plates = {
-        identifier(Path(name).stem): f"plates/{name}" for name in image_names(root / "plates")
+    """Return the background plates that can be read, by camera and relative to the capture."""
+    shut = _unreadable_plates(root)
+    names = [] if "plates" in shut else image_names(root / "plates")
+    plates = {identifier(Path(name).stem): f"plates/{name}" for name in names}
+    return {
+        camera: plate for camera, plate in plates.items() if camera in cameras and plate not in shut
     }
-    return {camera: plate for camera, plate in plates.items() if camera in cameras}
+
+
+def _unreadable_plates(root: Path) -> dict[str, str]:
+    """Return why the folder of plates, or else some of them, cannot be read, by relative path."""
+    if why := unreadable(root / "plates"):
+        return {"plates": why}
+    plates = [f"plates/{name}" for name in image_names(root / "plates")]
+    return {plate: why for plate in plates if (why := unreadable(root / plate))}
 
 
 def read_board(root: Path, cameras: Iterable[str]) -> dict | None:
@@ -340,15 +350,17 @@ def read_board(root: Path, cameras: Iterable[str]) -> dict | None:
 def unused_files(root: Path, cameras: Iterable[str]) -> dict[str, str]:
     """Return what a capture holds that nothing reads, with what to do: a name may be misspelt.
 
-    These are files of ``plates`` and ``board`` that belong to no camera, pictures and videos in
-    formats that are not read, and tables, settings and calibrations beside those that are read.
+    These are plates that cannot be read, files of ``plates`` and ``board`` that belong to no
+    camera, pictures and videos in formats that are not read, and tables, settings and calibrations
+    beside those that are read.
     """
-    known, found = list(cameras), {}
+    known, shut = list(cameras), _unreadable_plates(root)
+    found = {name: f"{why}; left out" for name, why in shut.items()}
     for part, suffixes in (("plates", IMAGE_SUFFIXES), ("board", VIDEO_SUFFIXES)):
         folder = root / part
         names = [
             path.name
-            for path in (sorted(folder.iterdir()) if folder.is_dir() else ())
+            for path in (sorted(folder.iterdir()) if folder.is_dir() and part not in shut else ())
             if is_shown(path, suffixes) or (part == "board" and path.is_dir())
             if identifier(path.name if path.is_dir() else path.stem) not in known
         ]

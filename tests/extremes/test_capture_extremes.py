@@ -224,7 +224,7 @@ def test_an_empty_folder_and_a_file_without_ending(tmp_path):
             detect(path)
 
 
-def test_a_camera_that_must_not_be_read_is_dropped_until_it_can(tmp_path):
+def test_cameras_and_plates_that_must_not_be_read_are_left_out_until_they_can(tmp_path):
     # The superuser may read everything, but not without these rights.
     bound = ["setpriv", "--bounding-set=-dac_override,-dac_read_search"]
     bound = bound if os.geteuid() == 0 else []
@@ -238,6 +238,8 @@ def test_a_camera_that_must_not_be_read_is_dropped_until_it_can(tmp_path):
     modes = [0o000, 0o000, 0o644]
     shut = {tmp_path / place: mode for place, mode in zip(places, modes, strict=True)}
     shut |= dict.fromkeys((tmp_path / "none/cameras").iterdir(), 0o000)
+    plates = ["S001/plates", "S002/plates/cam00.png"]
+    shut |= dict.fromkeys((tmp_path / plate for plate in plates), 0o000)
 
     def ingest(*captures):
         words = [sys.executable, "-m", "express50", "ingest", "data", *captures, "--workers", "0"]
@@ -251,13 +253,17 @@ def test_a_camera_that_must_not_be_read_is_dropped_until_it_can(tmp_path):
         for place in places:
             assert f"{tmp_path / place}: cannot be read (Permission denied); check its own" in said
         assert said.count("dropped camera cam01") == 3
+        for plate in plates:
+            warned = f"warning {plate.replace('/', ': ', 1)}: cannot be read (Permission denied)"
+            assert warned in said
         assert "none: no usable camera: cam00: " in said and "3 done + 0 skipped + 1 failed" in said
         assert "0 done + 3 skipped + 1 failed" in ingest()
     finally:
         for path in shut:
             path.chmod(0o755)
     said = ingest()
-    assert "4 done + 0 skipped + 0 failed" in said and "dropped" not in said
+    assert "4 done + 0 skipped + 0 failed" in said
+    assert "dropped" not in said and "plates" not in said
     for place in ("ledger.sqlite", "ingest/S001"):  # neither damaged nor gone
         (tmp_path / "data" / place).chmod(0o000)
         words = [*bound, sys.executable, "-m", "express50", "calibrate", "data", "--workers", "0"]
