@@ -21,7 +21,8 @@ from typing import Any
 from express50.capture.expressions import select
 from express50.console import add_command, answer, count, log, number
 from express50.contract.config import field_documents
-from express50.errors import CaptureError
+from express50.contract.layout import check_results_folder
+from express50.errors import CaptureError, ConfigError, few
 from express50.files.atomic import alone_in, dump_json, link_file, write_json
 from express50.runner.worker import cap_threads
 from express50.twin import TwinConfig
@@ -32,6 +33,8 @@ writes build/twin/captures/S001... (for 'express50 ingest') and build/twin/truth
 _NUMBERS = [setting.name for setting in fields(TwinConfig) if setting.type in ("int", "float")]
 # Shorter side: with 160 px no camera sees a corner of the board, with 192 one in four sees enough.
 BOARD_PX = 224
+
+SETTINGS = "twin.json"  # file beside the captures
 
 Task = tuple[str, list[int]]
 _counter: Any = None  # shared count of pictures, set in every worker
@@ -89,12 +92,30 @@ def record_command(args: argparse.Namespace) -> int:
             f"warning: in pictures of {short} px the board is too small to calibrate cameras from;"
             f" use {BOARD_PX} px or more, or --give-calibration"
         )
+    check_out(args.out)
     with alone_in(args.out):
         recorded = record(config, args.out, args.workers, print_progress())
     captures, kept = args.out / "captures", args.subjects - len(recorded)
     rest = f"; {kept} recorded before" if kept else ""
     line = f"{count(len(recorded), 'subject')} recorded in {captures}{rest}"
     return answer(args, {"captures": str(captures), "recorded": recorded}, line)
+
+
+def check_out(out: Path) -> None:
+    """Refuse, before any work, a folder that holds anything but an earlier recording.
+
+    Raises:
+        ConfigError: it holds other files.
+        OSError: the system refuses.
+    """
+    if (out / SETTINGS).is_file():
+        return
+    check_results_folder(out)
+    if held := sorted(p.name for p in out.glob("*") if not p.name.startswith(".")):
+        raise ConfigError(
+            f"{out}: holds {few(held)}, expected an earlier recording or nothing; name another"
+            " folder"
+        )
 
 
 def record(
@@ -112,7 +133,7 @@ def record(
         CaptureError: ``out`` holds a recording with other settings.
     """
     script = select(config.expressions)
-    path = out / "twin.json"
+    path = out / SETTINGS
     settings = {k: v for k, v in asdict(config).items() if k not in ("subjects", "first_subject")}
     now = json.loads(dump_json(settings))
     # Else nothing was recorded with the stored settings. Captures may have been moved elsewhere.

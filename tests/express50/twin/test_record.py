@@ -18,9 +18,10 @@ from express50.errors import CaptureError, ConfigError
 from express50.files.images import read_image
 from express50.files.video import VideoFootage, iterate_video
 from express50.twin import TwinConfig
-from express50.twin.record import print_progress, record
+from express50.twin.record import check_out, print_progress, record
 from express50.twin.studio import film_board, film_subject
 from tests.faults.toy import tree
+from tests.synth import make_capture
 
 
 def test_capture_follows_the_raw_layout(recording, small_config):
@@ -102,6 +103,24 @@ def test_settings_of_which_nothing_was_recorded_do_not_bind(tiny_config, tmp_pat
     assert record(config, tmp_path, workers=1) == ["S001"]
     with pytest.raises(ConfigError, match="twin.seed is -1"):
         dataclasses.replace(config, seed=-1)
+
+
+def test_nothing_is_recorded_among_other_files(tmp_path, capsys):
+    make_capture(tmp_path / "S001")
+    (tmp_path / "data/track").mkdir(parents=True)
+    (tmp_path / "data/ledger.sqlite").touch()
+    refused = {
+        "S001": "S001: is a capture; name another folder",
+        "data": "data: belongs to the dataset",
+        ".": "holds S001, data, expected an earlier recording or nothing; name another folder",
+    }
+    before = tree(tmp_path)
+    for name, words in refused.items():
+        assert main(["twin", "record", str(tmp_path / name)]) == USAGE
+        assert words in capsys.readouterr().err
+    assert tree(tmp_path) == before
+    (tmp_path / "twin.json").touch()
+    check_out(tmp_path)
 
 
 def test_the_same_pictures_make_the_same_video(tmp_path):
