@@ -215,7 +215,7 @@ def run_ui(args: argparse.Namespace) -> int:
         order=args.order,
         blind=args.blind,
     )
-    _check_terminal()
+    _check_terminal(dataset.root)
     cell = None
     if args.pictures == "sixel":
         cell = cell_size()
@@ -229,9 +229,10 @@ def run_ui(args: argparse.Namespace) -> int:
     return answer(args, {"done": done, "tasks": total}, f"{words}; {after}")
 
 
-def _check_terminal() -> None:
+def _check_terminal(root: Path) -> None:
     """Raise AnnotationError unless the terminal can position text and shows Unicode."""
-    without = "use 'express50 annotate mark' here"
+    mark = advised("express50 annotate mark", root, "SUBJECT EXPRESSION FRAME")
+    without = f"use {mark} here"
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise AnnotationError(f"the annotator needs a terminal; {without}")
     name = os.environ.get("TERM", "")

@@ -9,7 +9,7 @@ from typing import Any
 
 from annotations.labels import current_labels, read_labels
 from express50.contract.layout import Dataset, included_subjects
-from express50.errors import AnnotationError, FormatError, StageError, check_known
+from express50.errors import AnnotationError, FormatError, StageError, advised, check_known
 from express50.files.atomic import write_json
 from express50.files.text import read_json_table
 
@@ -41,8 +41,9 @@ def read_suggestions(dataset: Dataset, subject: str) -> dict[str, Suggested]:
     path = dataset.suggestions_file(subject)
     if not path.is_file():
         return {}
+    fix = f"run {advised('express50 align', dataset.root)} again"
     try:
-        rows = read_json_table(path, FormatError, "run 'express50 align' again")
+        rows = read_json_table(path, FormatError, fix)
         found = {expression: Suggested(**row) for expression, row in rows.items()}
         for expression, row in found.items():
             if not all(type(n) is int for n in (row.frame, row.start, *row.candidates)):
@@ -52,9 +53,7 @@ def read_suggestions(dataset: Dataset, subject: str) -> dict[str, Suggested]:
             if not all(map(math.isfinite, [*row.activity, *(row.match or ())])):
                 raise ValueError(f"{expression}: its curves hold NaN or infinity")
     except (ValueError, TypeError, AttributeError, OverflowError) as error:
-        raise FormatError(
-            f"{path}: not a table of suggestions ({error}); run 'express50 align' again"
-        ) from None
+        raise FormatError(f"{path}: not a table of suggestions ({error}); {fix}") from None
     return found
 
 
@@ -82,16 +81,17 @@ def reference_subject(dataset: Dataset) -> str:
     """
     subjects = included_subjects(dataset)
     if not subjects:
-        raise StageError(f"{dataset.root}: no subject; run 'express50 ingest' first")
+        ingest = advised("express50 ingest", dataset.root, "CAPTURE")
+        raise StageError(f"{dataset.root}: no subject; run {ingest} first")
     path = reference_file(dataset)
     if not path.is_file():
         return subjects[0]
-    again = "choose one with 'express50 annotate reference'"
-    chosen = read_json_table(path, AnnotationError, again).get("subject")
+    choose = advised("express50 annotate reference", dataset.root, "SUBJECT")
+    chosen = read_json_table(path, AnnotationError, f"choose one with {choose}").get("subject")
     if chosen not in subjects:
         raise AnnotationError(
             f"{path}: reference {chosen!r} is not ingested or is excluded; choose one of"
-            f" {', '.join(subjects)} with 'express50 annotate reference'"
+            f" {', '.join(subjects)} with {choose}"
         )
     return chosen
 

@@ -30,7 +30,7 @@ from annotations.labels import (
 )
 from express50.capture.index import Index, read_index, same_hash
 from express50.contract.layout import Dataset, included_subjects
-from express50.errors import AnnotationError
+from express50.errors import AnnotationError, advised
 
 FLAG = "flag:"  # prefix of a free-text reason, which might otherwise be a mistyped name
 WITHIN = (1, 2, 4)  # frames
@@ -76,7 +76,9 @@ def problems(dataset: Dataset, subjects: list[str] | None = None) -> list[LabelP
     for row in disagreements(dataset, subjects=chosen):
         if row.spread is None:
             said = ", ".join(f"{who}: {what}" for who, what in row.said.items())
-            what = f"{said}; settle it with 'express50 annotate review --settle'"
+            verdict = f"--settle {row.subject} {row.expression} VERDICT"
+            settle = advised("express50 annotate review", dataset.root, verdict)
+            what = f"{said}; settle it with {settle}"
             found.append(LabelProblem(row.subject, row.expression, "contradiction", what))
     return found
 

@@ -28,7 +28,7 @@ from express50.capture.index import Index, read_index
 from express50.contract.layout import Dataset
 from express50.contract.stage import ExpectedError, Note, Result
 from express50.error_model import error_bounds
-from express50.errors import StageError
+from express50.errors import StageError, advised
 from express50.files.atomic import write_json
 from express50.files.images import contact_sheet, write_image
 
@@ -39,7 +39,7 @@ def run(dataset: Dataset, item: str, out: Path, *, accept: float, match: bool) -
     if not index.cues:
         raise StageError(
             f"{item}: cues.csv names no expression; add rows expression_id,start_frame,end_frame,"
-            " then run 'express50 ingest' again"
+            f" then run {advised('express50 ingest', dataset.root)} again"
         )
     found, dropped = suggest_for(dataset, index, match)
     labels = accept_sure(dataset, index, found, accept)

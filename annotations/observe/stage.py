@@ -21,7 +21,7 @@ from express50.capture.frames import read_proxy
 from express50.capture.index import Cue, Index, nearest_decoded, read_index
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
-from express50.errors import FormatError, StageError, rounded_down
+from express50.errors import FormatError, StageError, advised, rounded_down
 from express50.files.arrays import read_arrays
 from express50.files.images import contact_sheet, write_image
 from express50.geometry.transforms import scale_of, similarity_fit, transform_points
@@ -56,16 +56,17 @@ def read_observations(dataset: Dataset, subject: str) -> FaceObservations:
         FormatError: the file is damaged or of another version.
     """
     path = dataset.observations_file(subject)
+    fix = f"run {advised('express50 align', dataset.root)}"
     if not path.is_file():
-        raise StageError(f"{path}: {subject!r} is not observed; run 'express50 align' on it")
+        raise StageError(f"{path}: {subject!r} is not observed; {fix}")
     try:
-        table = read_arrays(path, FormatError, "observations", fix="run 'express50 align'")
+        table = read_arrays(path, FormatError, "observations", fix=fix)
         if str(table["schema"]) != SCHEMA:
             raise ValueError(f"schema is {table['schema']}, expected {SCHEMA}")
         rest = (table[key] for key in ("frames", "points", "scores", "faces"))
         return FaceObservations(tuple(map(str, table["cameras"])), *rest)
     except (ValueError, KeyError, TypeError) as error:
-        raise FormatError(f"{path}: not observations ({error}); run 'express50 align'") from None
+        raise FormatError(f"{path}: not observations ({error}); {fix}") from None
 
 
 def run(
@@ -88,7 +89,8 @@ def run(
     if not windows:
         raise StageError(
             f"{item}: cues.csv names no expression in the footage; add rows"
-            " expression_id,start_frame,end_frame, then run 'express50 ingest' again"
+            " expression_id,start_frame,end_frame, then run"
+            f" {advised('express50 ingest', dataset.root)} again"
         )
     net = load_network()
     rest = windows.get(NEUTRAL, np.array([frames[0] for frames in windows.values()]))

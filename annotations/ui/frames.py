@@ -13,7 +13,7 @@ import numpy as np
 
 from express50.capture.frames import read_proxy
 from express50.contract.layout import Dataset
-from express50.errors import AnnotationError, Express50Error
+from express50.errors import AnnotationError, Express50Error, advised
 
 if TYPE_CHECKING:
     from express50.landmarks.network import LandmarkNet
@@ -116,7 +116,8 @@ class FrameCache:
             if isinstance(error, FileNotFoundError) or isinstance(
                 error.__cause__, FileNotFoundError
             ):
-                words = f"{where}: its proxies are missing; run 'express50 ingest' again"
+                ingest = advised("express50 ingest", self._dataset.root)
+                words = f"{where}: its proxies are missing; run {ingest} again"
             else:
                 words = f"{where} cannot be read: {error}"
             raise AnnotationError(words) from error

@@ -221,14 +221,11 @@ def read_peak_rows(dataset: Dataset, subject: str) -> dict[str, Peak]:
         StageError: the subject is not aligned.
         FormatError: the file is not a table of peaks.
     """
-    path = dataset.peaks_file(subject)
+    path, align = dataset.peaks_file(subject), advised("express50 align", dataset.root)
     if not path.is_file():
-        raise StageError(
-            f"{path}: subject {subject!r} is not aligned; "
-            f"run {advised('express50 align', dataset.root)}"
-        )
+        raise StageError(f"{path}: subject {subject!r} is not aligned; run {align}")
     try:
-        rows = read_json_table(path, FormatError, "run 'express50 align' again")
+        rows = read_json_table(path, FormatError, f"run {align} again")
         if strange := [name for name in rows if not NAME.fullmatch(name)]:
             raise ValueError(f"expression {strange[0]!r} is not an id")  # it names a folder
         return {

@@ -34,7 +34,7 @@ from express50.contract.layout import (
     existing_dataset,
 )
 from express50.contract.stage import hook, stages
-from express50.errors import FormatError
+from express50.errors import FormatError, advised
 
 
 def add_commands(subparsers: Any) -> None:
@@ -271,10 +271,12 @@ def run_withdraw(args: argparse.Namespace) -> int:
     lines += [f"STILL NAMES {done.subject}: {path}" for path in done.remaining]
     if done.capture:
         lines.append(f"the raw capture {done.capture} is outside the dataset: delete it yourself")
+    run = advised("express50 run", args.dataset)
+    report = advised("express50 report", args.dataset)
     lines.append(
-        "run 'express50 run' with the settings of your last run to make again what was removed, "
-        "then 'express50 report'; train models that saw the person again (their other weights keep "
-        "an influence), and delete exports outside the dataset"
+        f"run {run} with the settings of your last run to make again what was removed, then"
+        f" {report}; train models that saw the person again (their other weights keep an"
+        " influence), and delete exports outside the dataset"
         if lines
         else f"nothing of {done.subject} is left"
     )

@@ -9,7 +9,7 @@ from typing import Any
 
 from express50.console import OK, add_command, answer, count, number, say, say_json
 from express50.contract.layout import check_results_file, check_results_folder, existing_dataset
-from express50.errors import ConfigError, StageError
+from express50.errors import ConfigError, StageError, advised
 from express50.head import BUILTIN_NAME
 
 FORMATS = ("gaussian-avatars", "obj", "ply", "glb")
@@ -143,7 +143,8 @@ def run_report(args: argparse.Namespace) -> int:
 
     dataset = existing_dataset(args.dataset)
     if not dataset.subjects():
-        raise StageError(f"{args.dataset}: nothing is ingested; run 'express50 ingest' first")
+        ingest = advised("express50 ingest", args.dataset, "CAPTURE")
+        raise StageError(f"{args.dataset}: nothing is ingested; run {ingest} first")
     path = (args.out or dataset.report_dir) / "index.html"
     check_results_file(path)
     ours = b":root { --ink:#1d2126;"  # how the style sheet of our pages begins

@@ -87,7 +87,8 @@ class Dataset:
         """
         if not self.captures_file.is_file():
             return {}
-        fix = "delete it and run 'express50 ingest' with every capture again"
+        ingest = advised("express50 ingest", self.root, "CAPTURE...")
+        fix = f"delete it and run {ingest} with every capture"
         table = read_json_table(self.captures_file, FormatError, fix)
         for subject, path in table.items():
             if not NAME.fullmatch(subject) or not isinstance(path, str):  # it names folders

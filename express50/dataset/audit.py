@@ -30,7 +30,7 @@ from express50.dataset.withdraw import (
 )
 from express50.errors import AnnotationError, ConfigError, Express50Error, FormatError, advised, few
 from express50.files.digests import file_sha256, files_of, text_digest
-from express50.runner.imported import AGAIN, import_trouble
+from express50.runner.imported import how_to_renew, import_trouble
 from express50.runner.ledger import FileMark, Ledger, Receipt
 from express50.runner.outdated import BAD_INPUT, differing, published_digest, why_outdated
 from express50.runner.publish import (
@@ -348,7 +348,7 @@ class _StageAudit:
         again, fixed = self._again(stage), False
         receipt = self.receipts[stage].get(fault.item)
         if receipt is not None and receipt.imported:  # no run can make it again
-            how = AGAIN
+            how = how_to_renew(self.dataset, stage)
         elif fault.foreign:
             how = "move files that no run wrote out of the folder, then check again"
         elif not known and fault.kind == "unknown":
@@ -380,7 +380,7 @@ class _StageAudit:
             if receipt.imported:
                 made = self.made[name].get(item)
                 if why := import_trouble(self.dataset, receipt, made, self.digest):
-                    self._find(OUTDATED, f"{name} {item}", why, AGAIN)
+                    self._find(OUTDATED, f"{name} {item}", why, how_to_renew(self.dataset, name))
                 continue
             try:
                 now = input_digests(stage, self.dataset, item, config, self.digest)

@@ -26,7 +26,7 @@ from express50.dataset.tracks import (
     read_track,
     registration_of,
 )
-from express50.errors import FormatError, StageError, check_known
+from express50.errors import FormatError, StageError, advised, check_known
 from express50.files.atomic import dump_json, folder_in_one_step
 from express50.files.digests import file_sha256
 from express50.files.images import encode_png, read_image
@@ -75,7 +75,8 @@ def tracked_subjects(dataset: Dataset, wanted: Sequence[str]) -> list[str]:
         return list(dict.fromkeys(wanted))
     found = [s for s in included_subjects(dataset) if dataset.track_file(s).is_file()]
     if not found:
-        raise StageError(f"{dataset.root}: nothing is tracked; run 'express50 track' first")
+        track = advised("express50 track", dataset.root)
+        raise StageError(f"{dataset.root}: nothing is tracked; run {track} first")
     return found
 
 
@@ -101,7 +102,7 @@ def read_tracked(dataset: Dataset, subject: str, expressions: Sequence[str]) -> 
         if got > there or (name == "vertices" and got != there):
             raise FormatError(
                 f"{path}: {got} {name}, its head model {model.name!r} has {there};"
-                " run 'express50 track' again"
+                f" run {advised('express50 track', dataset.root)} again"
             )
     if expressions:
         names = tuple(name for name in track.expressions if name in expressions)
@@ -140,7 +141,8 @@ def with_clips(dataset: Dataset, head: Head, wanted: Sequence[str]) -> Head:
     clips, track = read_sequence(path), head.track
     if clips.head != track.head or len(clips.shape) != len(track.shape):
         raise FormatError(
-            f"{path}: does not belong to the track beside it; run 'express50 track' again"
+            f"{path}: does not belong to the track beside it; run"
+            f" {advised('express50 track', dataset.root)} again"
         )
     rows = [i for i, cue in enumerate(clips.cues) if not wanted or cue in wanted]
     if not rows:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from express50.contract.layout import Dataset
-from express50.errors import FormatError, HeadModelError, StageError
+from express50.errors import FormatError, HeadModelError, StageError, advised
 from express50.files.arrays import read_arrays
 from express50.files.digests import cached_by_file
 from express50.files.text import ID
@@ -132,7 +132,8 @@ def existing_track(dataset: Dataset, subject: str) -> Path:
     """Return the path of the subject's track; StageError if it is missing."""
     path = dataset.track_file(subject)
     if not path.is_file():
-        raise StageError(f"subject {subject!r} is not tracked; run 'express50 track'")
+        track = advised("express50 track", dataset.root)
+        raise StageError(f"subject {subject!r} is not tracked; run {track}")
     return path
 
 

@@ -15,14 +15,13 @@ from pathlib import Path
 from express50.capture.index import read_peaks
 from express50.contract.layout import Dataset
 from express50.contract.stage import NoSettings, Result, Stage
-from express50.errors import Express50Error
+from express50.errors import Express50Error, advised
 from express50.files.digests import path_digest, value_digest
 from express50.runner.ledger import IMPORTED, Ledger, Made, Receipt
 from express50.runner.publish import record_published, run_folder, set_aside
 from express50.runner.worker import Task, run_task
 
 Digest = Callable[[Path], str]
-AGAIN = "import it again, or remove it with 'express50 import remove'"
 
 
 def import_inputs(dataset: Dataset, item: str, digest: Digest = path_digest) -> dict[str, str]:
@@ -77,12 +76,19 @@ def remove_imports(dataset: Dataset, stage: str, pattern: Callable[[str], bool])
     return chosen
 
 
+def how_to_renew(dataset: Dataset, stage: str) -> str:
+    """Return what to do about an imported item that no longer holds."""
+    remove = advised("express50 import remove", dataset.root, stage)
+    return f"import it again, or remove it with {remove}"
+
+
 def import_trouble(
     dataset: Dataset, receipt: Receipt, made: Made | None, digest: Digest
 ) -> str | None:
     """Say why an imported item no longer holds; None if it does."""
+    again = how_to_renew(dataset, receipt.stage)
     if receipt.status != "done" or made is None:
-        return receipt.reason or f"it was imported, but its receipt is incomplete; {AGAIN}"
+        return receipt.reason or f"it was imported, but its receipt is incomplete; {again}"
     try:
         now: Mapping[str, str] = import_inputs(dataset, receipt.item, digest)
     except Express50Error as error:
@@ -90,5 +96,5 @@ def import_trouble(
     # Peaks that were labelled later were not imported; they do not concern it.
     changed = [name for name, value in made.inputs.items() if now.get(name) != value]
     if changed:
-        return f"imported, but since then these changed: {', '.join(changed[:3])}; {AGAIN}"
+        return f"imported, but since then these changed: {', '.join(changed[:3])}; {again}"
     return None

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from express50.contract.stage import Command
-from express50.errors import ConfigError
+from express50.errors import ConfigError, advised
 from express50.head import BUILTIN_NAME
 
 
@@ -32,9 +32,10 @@ def run(args: Any) -> int:
 
         return run_scans(args)
     if args.head != BUILTIN_NAME:
+        track = advised("express50 track", args.dataset)
         raise ConfigError(
             f"--head {args.head} is for scans; a dataset's head model is track.head, so run"
-            f" 'express50 track' with --set {shlex.quote(f'track.head={args.head}')}"
+            f" {track} with --set {shlex.quote(f'track.head={args.head}')}"
         )
     from express50.cli.stages import run_one
 

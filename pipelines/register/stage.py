@@ -21,7 +21,7 @@ from express50.dataset.tracks import (
     shape_spread,
 )
 from express50.error_model import error_bounds, single_camera_sigma
-from express50.errors import FormatError, StageError, rounded_down
+from express50.errors import FormatError, StageError, advised, rounded_down
 from express50.files.digests import file_sha256
 from express50.files.images import contact_sheet, write_image
 from express50.files.text import read_json_table
@@ -63,7 +63,9 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
     subject, expression = item.split("/")
     path, file = existing_track(dataset, subject), dataset.surface_file(subject, expression)
     if not file.is_file():
-        raise StageError(f"{item}: it has no surface; run 'express50 depth'")
+        raise StageError(
+            f"{item}: it has no surface; run {advised('express50 depth', dataset.root)}"
+        )
     track, surface = read_track(path), read_surface(file)
     row, model = track.row(expression), load_head(track.head)
     start = track.mesh(expression, len(model.template), path)

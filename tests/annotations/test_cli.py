@@ -7,9 +7,15 @@ import json
 import numpy as np
 import pytest
 
+from annotations.observe.stage import read_observations
+from annotations.suggestions import reference_subject
 from annotations.validate import MarkedClip, agreement, interval_alpha
 from express50.__main__ import main
-from express50.contract.layout import included_subjects
+from express50.capture.index import read_peak_rows
+from express50.contract.layout import Dataset, included_subjects
+from express50.dataset.export import tracked_subjects
+from express50.dataset.tracks import existing_track
+from express50.errors import StageError
 
 from .labelled import EXPRESSIONS, make_dataset, suggest
 
@@ -32,6 +38,23 @@ def annotate(dataset, capsys):
 
 def mark(annotate, who, expression, frame, subject="S001"):
     return annotate("mark", subject, expression, str(frame), "--annotator", who)
+
+
+@pytest.mark.parametrize(
+    ("read", "command"),
+    [
+        (reference_subject, "ingest"),
+        (lambda data: read_observations(data, "S001"), "align"),
+        (lambda data: read_peak_rows(data, "S001"), "align"),
+        (lambda data: existing_track(data, "S001"), "track"),
+        (lambda data: tracked_subjects(data, []), "track"),
+    ],
+)
+def test_advised_commands_name_the_dataset(tmp_path, read, command):
+    root = tmp_path / "my data"
+    with pytest.raises(StageError) as caught:
+        read(Dataset(root))
+    assert f"run \"express50 {command} '{root}'" in str(caught.value)
 
 
 def test_suggest_lists_least_sure_first_and_next_follows(annotate):

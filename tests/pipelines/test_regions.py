@@ -409,7 +409,7 @@ def test_items_without_track_or_mattes_fail_in_one_line(tmp_path) -> None:
     with pytest.raises(ConfigError, match=r"regions\.segmentation nowhere"):
         STAGE.inputs(dataset, "S001/smile", RegionsConfig(segmentation="nowhere.pt"))
     dataset.track_file("S001").unlink()
-    with pytest.raises(StageError, match="S001' is not tracked; run 'express50 track'"):
+    with pytest.raises(StageError, match="S001' is not tracked; run 'express50 track /"):
         STAGE.inputs(dataset, "S001/neutral", RegionsConfig())
 
 

@@ -630,10 +630,10 @@ def test_terminals_that_cannot_be_drawn_on_are_refused(
     monkeypatch.setattr(cli, "sys", SimpleNamespace(stdin=terminal, stdout=terminal))
     monkeypatch.setenv("TERM", term)
     with pytest.raises(AnnotationError, match=re.escape(message)):
-        cli._check_terminal()
+        cli._check_terminal(suggested.root)
     monkeypatch.setenv("TERM", "one-of-tomorrow")  # not in this machine's list
     terminal.encoding = "UTF-8"
-    cli._check_terminal()
+    cli._check_terminal(suggested.root)
 
 
 def read_until(terminal, words, seconds=60):

@@ -2,12 +2,14 @@
 
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from annotations.ui import frames
 from annotations.ui.frames import Face, FrameCache, FrameCrop, crop_to, zoom_box
+from express50.contract.layout import Dataset
 from express50.errors import AnnotationError, CaptureError
 
 WHOLE = (0.0, 0.0, 1.0, 1.0)
@@ -42,7 +44,7 @@ def wait_until(true, seconds=5.0):
 def cache(monkeypatch):
     """A cache that paints its pictures."""
     monkeypatch.setattr(frames, "read_shot", painter)
-    cache = FrameCache(None)
+    cache = FrameCache(Dataset(Path("data")))
     yield cache
     cache.close()
 
@@ -92,7 +94,7 @@ def test_wanted_pictures_are_decoded_ahead_by_urgency(cache, monkeypatch):
 @pytest.mark.parametrize(
     ("error", "remedy"),
     [
-        (FileNotFoundError("cam.json"), "express50 ingest"),
+        (FileNotFoundError("cam.json"), "express50 ingest data"),
         (CaptureError("no frame 3 of camera 'cam'"), "no frame 3"),
         (IndexError("list index"), "frame 3"),
     ],

@@ -331,7 +331,7 @@ def test_colour_gains_are_divided_out(dataset, tmp_path) -> None:
     [
         (["--format=fbx"], 2, "unknown 'fbx'; expected "),
         (["--format=obj", "--subject=S9"], 2, "no subject 'S9'; expected one of S001, S002, S003"),
-        (["--format=obj", "--subject=S003"], 1, "'S003' is not tracked; run 'express50 track'"),
+        (["--format=obj", "--subject=S003"], 1, "'S003' is not tracked; run 'express50 track /"),
         (["--format=obj", "--expression=wink"], 2, "no tracked expression 'wink'; expected one"),
         (["--format=glb", "--downscale=2"], 2, "--format glb: --background, --head-only"),
         (["--format=gaussian-avatars", "--validation-camera=x"], 2, "expected one of cam00, cam01"),

@@ -140,7 +140,7 @@ def test_foreign_and_hostile_files_are_refused(arrays, tmp_path, monkeypatch) ->
 def test_an_absent_track_says_what_to_run(tmp_path) -> None:
     with pytest.raises(StageError, match="run 'express50 track'"):
         read_track(tmp_path / "track.npz")
-    with pytest.raises(StageError, match="subject 'S001' is not tracked; run 'express50 track'"):
+    with pytest.raises(StageError, match="subject 'S001' is not tracked; run 'express50 track /"):
         existing_track(Dataset(tmp_path), "S001")
 
 
