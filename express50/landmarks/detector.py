@@ -107,9 +107,12 @@ def detect(
 
 
 def detect_many(
-    net: LandmarkNet, images: Sequence[np.ndarray], refinements: int = 2, smallest: float = SMALLEST
-) -> list[Detection]:
+    net: LandmarkNet, images: Sequence[np.ndarray], refinements: int = 2,
+    smallest: float = SMALLEST, enough: int | None = None,
+) -> list[Detection]:  # fmt: skip
     """Detect as `detect` does in several images, such as a frame set, in less time.
+
+    Smaller windows are not searched once `enough` images show a face; by default, all must.
 
     Raises:
         ValueError: an image of another shape or type.
@@ -132,7 +135,7 @@ def detect_many(
             if one not in best or place.score > best[one].score:
                 best[one] = place
         left = [one for one in left if best[one].score < FOUND_SCORE]
-        if not left:
+        if len(images) - len(left) >= (enough or len(images)):
             break
     faces = [best[one] for one in range(len(images))]
     return [_detection(place) for place in _with_close_ups(net, pyramids, faces)]

@@ -33,10 +33,10 @@ from pipelines.matte.visual_hull import (
 )
 
 FACE_SCORE = 0.3  # heads from behind score up to 0.2, profiles from 0.33 on
+FACES = 4  # place a head well
 NEIGHBOUR_SCORE = 0.5  # other people's faces beside the person score 0.74 or more, walls up to 0.41
 NEIGHBOUR_M, MOST_NEIGHBOURS = 0.2, 4  # how far beside the person's region they are searched
-SIDE = 512  # pixels of the pictures in which faces are searched
-PIXEL_M = 0.0015  # size on the head of a pixel of the pictures that GrabCut sees
+SIDE = 512  # pixels of the pictures in which faces are searched, and that GrabCut sees
 SURE, LIKELY, HAIR = 0.7, 1.3, 1.6  # skull sizes: no wall inside the first, no hair past the last
 LEAST_DEPTH = 0.05  # metres in front of the camera
 HOLE_M2 = 1.5e-3  # larger gaps show the background
@@ -122,38 +122,37 @@ def cut_out(
         NoFaceError: no camera shows a face.
     """
     place = place or find_head(views)
-    small = [_at_scale(view, PIXEL_M * place.density(view.camera)) for view in views]
-    guesses = [_guess(view, place) for view in small]
-    for view, reduced, guess in zip(views, small, guesses, strict=True):
+    guesses = [_guess(view, place) for view in views]
+    for view, guess in zip(views, guesses, strict=True):
         if view.known is None:
             # Heads and necks of others are wall but where the person surely is, in front of
             # them; their hair is wall where the person hardly is.
             sure = guess == cv2.GC_FGD
             close = find_neighbours(view, place) if others is None else others.get(view.name, ())
             for other in close:
-                guess[(_guess(reduced, other) == cv2.GC_FGD) & ~sure] = cv2.GC_BGD
-                guess[_head_mask(reduced, other) & (guess == cv2.GC_PR_BGD)] = cv2.GC_BGD
-            if reduced.wall is not None:
-                guess[reduced.wall] = cv2.GC_BGD
-    density = [place.density(view.camera) for view in small]
+                guess[(_guess(view, other) == cv2.GC_FGD) & ~sure] = cv2.GC_BGD
+                guess[_head_mask(view, other) & (guess == cv2.GC_PR_BGD)] = cv2.GC_BGD
+            if view.wall is not None:
+                guess[view.wall] = cv2.GC_BGD
+    density = [place.density(view.camera) for view in views]
 
     def cut(labels: Sequence[np.ndarray]) -> list[np.ndarray]:
         return [
             _cut(view, own, guess, scale) if view.known is None else view.known
-            for view, own, guess, scale in zip(small, labels, guesses, density, strict=True)
+            for view, own, guess, scale in zip(views, labels, guesses, density, strict=True)
         ]
 
-    masks = cut([_with_own_colours(*pair) for pair in zip(small, guesses, strict=True)])
+    masks = cut([_with_own_colours(*pair) for pair in zip(views, guesses, strict=True)])
     if ball is not None and len(views) >= FEWEST:
         for slack in SLACK_PX:
-            masks = cut(_corrected_labels(small, guesses, masks, ball, slack))
-    bodies = [_guess(view, place, {1: (trunk_of_a_person(),)}) > 0 for view in small]
+            masks = cut(_corrected_labels(views, guesses, masks, ball, slack))
+    bodies = [_guess(view, place, {1: (trunk_of_a_person(),)}) > 0 for view in views]
     cuts = map(Cut, masks, density, bodies)
-    return {view.name: found for view, found in zip(small, cuts, strict=True)}
+    return {view.name: found for view, found in zip(views, cuts, strict=True)}
 
 
 def find_head(views: Sequence[CutView]) -> HeadPlace:
-    """Place the mean head by all faces that are found, or by the best one.
+    """Place the mean head by the faces that are found; backs of heads are not searched at length.
 
     Raises:
         NoFaceError: no camera shows a face.
@@ -163,7 +162,8 @@ def find_head(views: Sequence[CutView]) -> HeadPlace:
     from express50.landmarks.network import load_network
     from pipelines.track.observe import LandmarkView, place_head
 
-    faces = detect_many(load_network(), [view.rgb for view in views], smallest=SMALL)
+    pictures = [view.rgb for view in views]
+    faces = detect_many(load_network(), pictures, smallest=SMALL, enough=FACES)
     place = place_head([
         LandmarkView(view.camera, face.points, face.sigma, face.score)
         for view, face in zip(views, faces, strict=True)
@@ -207,22 +207,6 @@ def _head_mask(view: CutView, place: HeadPlace) -> np.ndarray:
     parts = parts_of_a_person()
     head = (parts[cv2.GC_PR_FGD][0], parts[cv2.GC_FGD][-1])
     return _guess(view, place, {cv2.GC_FGD: head}) == cv2.GC_FGD
-
-
-def _at_scale(view: CutView, factor: float) -> CutView:
-    """Reduce a view by a factor of at most 1."""
-    width, height = (max(8, round(n * min(factor, 1.0))) for n in view.rgb.shape[1::-1])
-
-    def mask(values: np.ndarray) -> np.ndarray:
-        size = (width, height)
-        return cv2.resize(values.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-
-    return CutView(
-        resized(view.camera, width, height),
-        cv2.resize(view.rgb, (width, height), interpolation=cv2.INTER_AREA),
-        mask(view.valid),
-        *(None if values is None else mask(values) for values in (view.known, view.wall)),
-    )
 
 
 @cache

@@ -23,6 +23,7 @@ import numpy as np
 from scipy import ndimage
 
 from express50.contract.stage import Note
+from express50.files.images import is_grey
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import cell_centres, opencv_pixels_to_corner
 from express50.rigs.world_frame import meeting_point
@@ -181,10 +182,7 @@ def splat(shape: tuple[int, int], pixels: np.ndarray, spread: int) -> np.ndarray
 VOTES = 2  # other cameras that must see clear background for a place to be empty
 MARGIN = 0.01  # share of the longer side: distance from a silhouette that proves nothing
 COLOUR = 0.1  # share of full scale by which one surface may differ between neighbouring cameras
-LUMA, MOST_TINT = (
-    np.array([[0.299], [0.587], [0.114]], np.float32),
-    2.0,
-)  # of grey pictures, 8-bit steps
+LUMA = np.array([[0.299], [0.587], [0.114]], np.float32)
 SEEING_SHARE = 0.75  # share of the other views that must see a place for it to be solid
 VIEWS_PER_MISS = 8  # one in this many views may miss the same spot
 THICK = 0.5  # share of a ray's median length in the hull under which it only grazes a corner
@@ -326,7 +324,7 @@ def shows_surface(
     for other in near:
         x, y, inside = _pixels_of(other, points)
         off = _smooth(other.rgb)[y, x] - mine
-        if _is_grey(view) or _is_grey(other):
+        if is_grey(view.rgb) or is_grey(other.rgb):
             off = off @ LUMA
         alike = np.abs(off).max(axis=1) < 255 * COLOUR
         agree += alike & inside & subject[other.name][y, x]
@@ -346,11 +344,6 @@ def subject_of(view: MatteView, evidence: Evidence) -> np.ndarray:
 
 def _smooth(rgb: np.ndarray) -> np.ndarray:
     return cv2.blur(rgb, (3, 3)).astype(np.float32)
-
-
-def _is_grey(view: MatteView) -> bool:
-    """Return whether a camera sees no colours."""
-    return float(np.ptp(view.rgb, axis=2).mean()) < MOST_TINT
 
 
 def _cosine(a: MatteView, b: MatteView) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from express50.contract.segmentation_labels import LABELS, label_mask
-from express50.files.images import LIGHT_OF_LEVEL, disc, edge_distance
+from express50.files.images import LIGHT_OF_LEVEL, disc, edge_distance, is_grey
 from express50.geometry.sampling import robust_moments
 from pipelines.regions.geometry import HAIR, SCALP, TORSO, HeadGeometry
 
@@ -74,13 +74,15 @@ BARE = 0.7  # share of the scalp in the face's colours, over the same of the fac
 
 
 def face_colours(rgb: np.ndarray, alpha: np.ndarray, mesh: np.ndarray) -> np.ndarray | None:
-    """Count (CELLS) the skin's colours in a view of the face; None in other views.
+    """Count (CELLS) the skin's colours in a view of the face; None in grey and other views.
 
     The frame (H, W, 3) is uint8 sRGB, alpha (H, W) in [0, 1], `mesh` (H, W) the mesh's labels.
     """
+    if is_grey(rgb) or not _sees_face(mesh):
+        return None
     solid = alpha > SOLID
     skin = bare_skin(rgb, (mesh == SKIN) & solid, mesh, solid)
-    return _counts(_cells(rgb), skin) if _sees_face(mesh) and skin.sum() >= LEAST else None
+    return _counts(_cells(rgb), skin) if skin.sum() >= LEAST else None
 
 
 def colour_logs(rgb: np.ndarray) -> np.ndarray:
@@ -389,10 +391,13 @@ def _share_near(middle: np.ndarray, ratios: np.ndarray) -> float:
 def scalp_votes(rgb: np.ndarray, labels: np.ndarray, alpha: np.ndarray) -> tuple[int, int]:
     """Count the pixels of a scalp that have the face's colours if it is bare, and those that do.
 
-    The view's own face is taken, because other cameras differ in gain and light. Views without a
-    face or with little of the scalp count none. The frame (H, W, 3) is uint8 sRGB; `labels` (H, W)
-    are the mesh's, SCALP among them; alpha (H, W) is in [0, 1].
+    The view's own face is taken, because other cameras differ in gain and light. Grey views, those
+    without a face, with little of the scalp, or in which hair may hide most of the skin count none.
+    The frame (H, W, 3) is uint8 sRGB; `labels` (H, W) are the mesh's, SCALP among them; alpha
+    (H, W) is in [0, 1].
     """
+    if is_grey(rgb):
+        return 0, 0
     solid = alpha > SOLID
     skin, scalp = ((labels == label) & solid for label in (SKIN, SCALP))
     least = max(LEAST, LEAST_SCALP * skin.sum())
@@ -403,6 +408,8 @@ def scalp_votes(rgb: np.ndarray, labels: np.ndarray, alpha: np.ndarray) -> tuple
     of_skin, of_scalp = (_some_ratios(rgb[mask]) for mask in (sure, scalp))
     usual_colour = np.median(of_skin, axis=0)
     usual, found = (_share_near(usual_colour, ratios) for ratios in (of_skin, of_scalp))
+    if sure is skin and usual < COHERENT:
+        return 0, 0
     return round(len(of_scalp) * usual), round(len(of_scalp) * found)
 
 

@@ -13,13 +13,22 @@ from express50.capture.frames import read_cameras_of
 from express50.contract.layout import Dataset
 from express50.errors import CaptureError
 from express50.files.images import read_alpha, write_image
-from express50.geometry.cameras import pinhole
+from express50.geometry.cameras import pinhole, pinhole_camera
 from express50.twin import TwinConfig
 from express50.twin.record import record
 from pipelines import calibrate, frames
 from pipelines.matte import STAGE as MATTE
-from pipelines.matte.cutout import Cut
-from pipelines.matte.wall import UNSEEN, Wall, learn_wall, read_wall, soft_alpha, valid_pixels
+from pipelines.matte.cutout import Cut, make_cut_view
+from pipelines.matte.wall import (
+    LEAST_SIDE,
+    UNSEEN,
+    Wall,
+    learn_wall,
+    read_wall,
+    reduced_view,
+    soft_alpha,
+    valid_pixels,
+)
 from tests.stages import run_here
 
 SIDE, RADIUS, DENSITY = 160, 40, 400.0  # pixels, and per metre of the head
@@ -74,6 +83,15 @@ def test_a_still_shirt_that_cuts_left_out_is_not_taken_for_the_wall() -> None:
     known = learn_wall(shown, [replace(cut, body=body) for cut in cuts], VALID)
     assert (known.error[140:] == UNSEEN).all()
     assert (known.error[10:30] < 4).all()
+
+
+def test_only_views_with_small_pixels_are_reduced_before_the_wall_is_sought() -> None:
+    camera = pinhole_camera("a", np.diag([400.0, 400.0, 1.0]), SIDE, SIDE, np.eye(4))
+    view = make_cut_view(camera, np.zeros((SIDE, SIDE, 3), np.uint8), VALID)
+    for density, side in ((200.0, SIDE), (500.0, round(SIDE / 1.5)), (1e9, LEAST_SIDE)):
+        small = reduced_view(view, density)
+        assert small.valid.shape == small.rgb.shape[:2] == (side, side)
+        assert small.valid.all() and small.camera.width == side
 
 
 def test_opacity_before_a_known_wall_is_closer() -> None:

@@ -215,6 +215,20 @@ def test_a_fringe_over_most_of_the_face_is_not_taken_for_its_skin() -> None:
     assert not kept[fringe].any() and kept[face & ~fringe].mean() > 0.95
 
 
+def test_views_that_may_not_show_skin_do_not_say_whether_the_scalp_is_bare() -> None:
+    """In grey, skin and hair differ little; hair over most of a face and a scarf leave no skin."""
+    scene = make_scene(0, size=300)
+    mesh = render_head(scene.head, scene.camera)[0]
+    grey = np.repeat(scene.rgb.max(axis=2, keepdims=True), 3, axis=2)
+    assert scalp_votes(grey, mesh, scene.alpha) == (0, 0)
+    assert face_colours(grey, scene.alpha, mesh) is None
+    striped = np.arange(300)[:, None, None] // 8 % 3 > 0
+    hair = np.where(striped | (mesh == SCALP)[..., None], (60, 50, 45), scene.rgb)
+    hair[label_mask(mesh, "neck")] = (60, 60, 120)
+    assert scalp_votes(hair.astype(np.uint8), mesh, scene.alpha) == (0, 0)
+    assert scalp_votes(scene.rgb, mesh, scene.alpha)[0] > 0
+
+
 @pytest.mark.parametrize("scarf", [False, True])
 def test_long_fair_hair_and_a_scarf_are_not_taken_for_skin(scarf: bool) -> None:
     """The hair hides most of the face, in a darker shade of the skin's colour; the scarf is red."""
