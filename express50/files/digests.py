@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from express50.errors import StageError
+from express50.files.text import open_file
 
 T = TypeVar("T")
 
@@ -49,8 +50,8 @@ def file_version(path: Path) -> FileVersion:
 
 
 def file_sha256(path: Path) -> str:
-    """Return the SHA-256 of a file's bytes in hexadecimal."""
-    with Path(path).open("rb") as file:
+    """Return the SHA-256 of a file's bytes in hexadecimal; OSError if it cannot be read."""
+    with open_file(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

@@ -20,7 +20,7 @@ import tomllib
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, TypeGuard
+from typing import Any, TypeGuard
 from xml.etree import ElementTree
 
 import yaml
@@ -83,7 +83,7 @@ def no_file(path: Path) -> str:
     return "is a pipe or device, not a file" if path.exists() else "no such file"
 
 
-def open_file(path: Path) -> BinaryIO:
+def open_file(path: Path) -> io.BufferedReader:
     """Open a file to read it; a pipe or device in its place could keep its readers waiting.
 
     Raises:

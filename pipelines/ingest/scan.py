@@ -28,6 +28,7 @@ from express50.files.images import (
     shrink,
     upright,
 )
+from express50.files.text import reason, unreadable
 from express50.files.video import (
     FPS_SLACK,
     VideoTags,
@@ -257,14 +258,25 @@ def _odd_video(source: CameraSource, tags: VideoTags) -> list[str]:
 
 
 def source_sha256(camera: RawCamera) -> str:
-    """Return the digest of the video, or of the names and digests of all files with frames."""
+    """Return the digest of the video, or of the names and digests of all files with frames.
+
+    Raises:
+        CaptureError: a file cannot be read. Not all frames are decoded before.
+    """
     if camera.kind == "video":
         return file_sha256(camera.path)
     files = dict.fromkeys(name.partition(WITHIN)[0] for name in camera.names)
+    rows = []
+    for name in files:
+        path = inside(camera.path, name)
+        try:
+            rows.append(f"{name} {file_sha256(path)}")
+        except OSError as error:
+            why = unreadable(path) or f"cannot be read ({reason(error)}); copy it again"
+            raise CaptureError(f"{path}: {why}") from None
     if len(files) < len(camera.names):  # containers: the names say which members
-        rows = [f"{n} {file_sha256(inside(camera.path, n))}" for n in files]
-        return text_digest("\n".join([*rows, *camera.names]))
-    return text_digest("\n".join(f"{n} {file_sha256(camera.path / n)}" for n in camera.names))
+        rows += camera.names
+    return text_digest("\n".join(rows))
 
 
 class ProxyWriter:

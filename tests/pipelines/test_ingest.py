@@ -471,3 +471,15 @@ def test_footage_that_changed_after_a_sparse_ingest_is_refused_where_it_was_deco
     shutil.copy(other, folder / names[3])
     with pytest.raises(CaptureError, match="frame 3 has hash"):
         FrameReader(read_index(sparse, "S001"), "cam01").read(3)
+
+
+def test_a_camera_with_an_unreadable_frame_that_is_not_decoded_is_dropped(tmp_path):
+    make_capture(tmp_path / "S001", frames=8)
+    dataset = Dataset(tmp_path / "data")
+    ingest.add_captures(dataset, [tmp_path / "S001"])
+    frame = camera_folder(dataset, "cam01") / "frames/000004.png"
+    frame.unlink()
+    frame.mkdir()
+    assert run(dataset, every=3).ok
+    why = f"{frame}: cannot be read (Is a directory); copy it again"
+    assert metrics(dataset)["dropped"] == [{"what": "camera cam01", "why": why}]
