@@ -170,7 +170,7 @@ def measure(keyed: list[Keyed], sheet: Path | None) -> Figures:
         for k in keyed
     }
     read = lambda name: (shots[name].frame, shots[name].valid)  # noqa: E731
-    mattes, _, found = agree(read, cameras, alone, ball)
+    mattes, _, found, _ = agree(read, cameras, alone, ball)
     after = after_agreement(mattes, found)
     seconds = time.process_time() - started
     if sheet is not None:

@@ -19,6 +19,7 @@ from express50.files.images import box_about, resize_area, shrink, tile_sheet, w
 from express50.geometry.cameras import Camera, pinhole, resized
 from express50.geometry.sampling import evenly, local_moments, undistorted_mask
 from pipelines.matte.cutout import (
+    MANY,
     CutView,
     HeadPlace,
     cut_out,
@@ -66,6 +67,11 @@ WINDOW = 5  # pixels, odd: side of the window in which alpha's spread is measure
 # somebody else, share of the longer side; and the least share of an image that is taken out.
 SURE_WALL, BESIDE, LEAST_OTHER = 13, 0.006, 1e-3
 ENOUGH_VIEWS = 8  # to place the head by
+LIKE_THE_WALL = (
+    "its matte lacked a large part of the subject, which looks like the wall there; the part was"
+    " added as the other cameras see it, so look at its outline, and record with more light or"
+    " another wall"
+)
 SOMETHING_ELSE = "another person or thing is in the picture; its matte leaves it out"
 NEARBY = 0.04  # share of the longer side: width of the neighbourhood that describes an outline
 
@@ -103,8 +109,7 @@ def run(
     keyed, dropped, odd_plates = camera_mattes(shots, ball)
     if not keyed:
         raise StageError(f"{item}: {dropped[0].why if dropped else 'no camera is calibrated'}")
-    mattes, views, found = agree(shots.read, cameras, keyed, ball if agreeing else None)
-    odd_plates += [Note(n, SOMETHING_ELSE) for n, own in mattes.items() if own is not keyed[n]]
+    mattes, views, found, changed = agree(shots.read, cameras, keyed, ball if agreeing else None)
     if not agreeing:
         found = Agreement(unchanged="matte.agree is off")
     elif ball is None:
@@ -136,24 +141,29 @@ def run(
     }
     figures["expected"] = {name: asdict(e) for name, b in bounds.items() if (e := b.expected)}
     expected = expect(error_models()["matte"], np.concatenate([b.typical for b in bounds.values()]))
-    return Result(figures, dropped, [*odd_plates, *found.warnings, *odd], expected)
+    return Result(figures, dropped, [*odd_plates, *changed, *found.warnings, *odd], expected)
 
 
 def agree(
     read: Read, cameras: Mapping[str, Camera], mattes: Mapping[str, CameraMatte], ball: Ball | None
-) -> tuple[Mapping[str, CameraMatte], list[MatteView], Agreement]:
-    """Compare the mattes in the `ball`, and again once other people are taken out of them.
+) -> tuple[Mapping[str, CameraMatte], list[MatteView], Agreement, list[Note]]:
+    """Compare the mattes in the `ball`, after completing them and taking other people out of them.
 
-    Nothing is compared without a ball. Returns the mattes, and what was compared.
+    Nothing is compared without a ball. Returns the mattes, what was compared, the result, and which
+    mattes were cut out again.
     """
-    views, found = compared(cameras, mattes, ball)
+    whole, views, found = completed(read, cameras, mattes, ball)
+    notes = [Note(name, LIKE_THE_WALL) for name, own in whole.items() if own is not mattes[name]]
     # Shadows are common, and the faces take far longer to find than all this.
     thing = any(is_thing(v, found.removed[v.name]) for v in views if v.name in found.removed)
     plated = any(own.plated for own in mattes.values())
     if ball is None or not plated or not (thing or found.warnings):
-        return mattes, views, found
-    alone = without_others(read, cameras, mattes, found.doubted, thing, ball)
-    return (mattes, views, found) if alone is mattes else (alone, *compared(cameras, alone, ball))
+        return whole, views, found, notes
+    alone = without_others(read, cameras, whole, found.doubted, thing, ball)
+    if alone is whole:
+        return whole, views, found, notes
+    notes += [Note(name, SOMETHING_ELSE) for name, own in alone.items() if own is not whole[name]]
+    return alone, *compared(cameras, alone, ball), notes
 
 
 def compared(
@@ -277,6 +287,36 @@ def _with_other_views(
         cut = _camera_matte(alpha, frame, valid)
         rest[name] = replace(cut, plated=False)
     return rest
+
+
+def completed(
+    read: Read, cameras: Mapping[str, Camera], mattes: Mapping[str, CameraMatte], ball: Ball | None
+) -> tuple[Mapping[str, CameraMatte], list[MatteView], Agreement]:
+    """Add to mattes that were made with plates what they lack because it looks like the wall.
+
+    A camera that lacks a large part of the subject which the others see is cut out as without a
+    plate, until none does: with a part added in one, more cameras see what another lacks. Also
+    returns what was compared in the end, and the result.
+    """
+    final, views, place = dict(mattes), dict[str, CutView](), None
+    done = {name for name, own in mattes.items() if not own.plated}
+    while True:
+        seen, found = compared(cameras, final, ball)
+        todo = found.lacking - done
+        if ball is None or not todo or len(final) < MANY:
+            return final, seen, found
+        for name, own in final.items():
+            known = None if name in todo else own.alpha
+            views[name] = make_cut_view(pinhole(cameras[name]), *read(name), known)
+        try:
+            place = place or find_head(evenly([*views.values()], ENOUGH_VIEWS))
+        except NoFaceError:
+            return final, seen, found
+        cuts = cut_out([*views.values()], ball, place)
+        for name in todo:
+            alpha = np.rint(255 * soft_alpha(*read(name), cuts[name])).astype(np.uint8)
+            final[name] = replace(final[name], alpha=np.maximum(final[name].alpha, alpha))
+        done |= todo
 
 
 def without_others(

@@ -411,6 +411,11 @@ class Misfit:
         return max(elsewhere, self.lacking / MOST_LACKING)
 
     @property
+    def lacks(self) -> bool:
+        """Return whether only a large part is missing: there the subject looks like the wall."""
+        return self.stray <= STRAY and self.lacking > LACKING
+
+    @property
     def reason(self) -> str:
         """Describe the misfit for people."""
         return (
@@ -428,6 +433,8 @@ class Agreement:
     removed: dict[str, np.ndarray] = field(default_factory=dict)
     filled: dict[str, np.ndarray] = field(default_factory=dict)
     warnings: list[Note] = field(default_factory=list)  # cameras with unchanged mattes, and why
+    # cameras whose mattes are right except for a large part that they lack
+    lacking: frozenset[str] = frozenset()
     unchanged: str = ""  # why nothing was compared; empty if mattes were compared
 
     @property
@@ -441,15 +448,18 @@ def compare_mattes(views: Sequence[MatteView], cells: int = CELLS) -> Agreement:
     doubted = {view.name: why for view in views if (why := _why_useless(view))}
     # Most of the others must be right; otherwise the wrong ones cannot be identified.
     most = len(doubted) + (len(views) - len(doubted)) // 3
+    lacking: frozenset[str] | None = None
     while True:
         used = [view for view in views if view.name not in doubted]
         if len(used) < FEWEST:
             few = f"{len(used)} usable cameras, expected {FEWEST} or more to overrule one"
             return Agreement(warnings=_named(doubted), unchanged=few)
         removed, filled, misfits = _compare(used, cells)
+        if lacking is None:
+            lacking = frozenset(name for name, misfit in misfits.items() if misfit.lacks)
         worst = max(misfits, key=lambda name: misfits[name].size)
         if misfits[worst].size <= 1 or len(doubted) >= most:
-            return Agreement(removed, filled, _named(doubted))
+            return Agreement(removed, filled, _named(doubted), lacking)
         doubted[worst] = misfits[worst].reason
 
 

@@ -12,7 +12,7 @@ import pytest
 from benchmarks.common import recorded, write_peaks
 from benchmarks.truth import Truth
 from express50.__main__ import main
-from express50.capture.frames import read_cameras_of
+from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.contract.layout import Dataset
 from express50.errors import ConfigError, StageError
 from express50.files.images import read_alpha, write_image
@@ -36,7 +36,13 @@ from pipelines.matte.cutout import (
     parts_of_a_person,
 )
 from pipelines.matte.key import key_alpha
-from pipelines.matte.stage import SOMETHING_ELSE, CameraMatte, Shots, camera_mattes
+from pipelines.matte.stage import (
+    LIKE_THE_WALL,
+    SOMETHING_ELSE,
+    CameraMatte,
+    Shots,
+    camera_mattes,
+)
 from pipelines.matte.wall import soft_alpha, valid_pixels
 from pipelines.photo.capture import make_photo_capture, open_picture, single_camera
 from pipelines.track.config import TrackConfig
@@ -314,6 +320,27 @@ def test_another_person_is_taken_out_of_mattes_with_plates(rig, monkeypatch) -> 
     warned = metrics_of(dataset, "matte", f"{subject}/neutral")["warnings"]
     assert {"what": name, "why": SOMETHING_ELSE} in warned
     assert mean_errors(dataset, truth)[name] < alone[name] + 0.01
+
+
+def test_a_part_that_looks_like_the_wall_is_added_as_other_cameras_see_it(rig, monkeypatch) -> None:
+    dataset, truth = rig
+    subject = dataset.subjects()[0]
+    name = list(read_cameras_of(dataset, subject))[2]
+    alpha = truth.render_alpha(subject, 0, pinhole(truth.cameras(subject)[name]))
+    rows = np.nonzero(alpha.any(1))[0]
+    alike = (alpha > 0) & (np.arange(len(alpha))[:, None] > np.quantile(rows, 0.6))
+    read = stage.read_plate_image
+
+    def like_the_shirt(dataset: Dataset, subject: str, camera: str) -> np.ndarray:
+        plate = read(dataset, subject, camera)
+        frame = read_peak_frame(dataset, subject, "neutral", camera)
+        return np.where(alike[..., None], frame, plate) if camera == name else plate
+
+    monkeypatch.setattr(stage, "read_plate_image", like_the_shirt)
+    assert run_here(MATTE, dataset, tile=960).ok  # another configuration, so it runs again
+    warned = metrics_of(dataset, "matte", f"{subject}/neutral")["warnings"]
+    assert warned == [{"what": name, "why": LIKE_THE_WALL}]
+    assert mean_errors(dataset, truth)[name] < 0.2 * alike.mean()
 
 
 def test_a_rig_without_plates_is_matted_from_all_sides(rig, monkeypatch) -> None:
