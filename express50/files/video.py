@@ -224,7 +224,7 @@ def common_fps(table: Path, videos: Iterable[Path]) -> float:
     if fast > (1 + FPS_SLACK) * slow:
         raise CaptureError(
             f"{table}: no fps, and videos differ: {slowest} says {slow:.4g}, {fastest} says"
-            f" {fast:.4g}; add the rate at which all were recorded, such as 'fps = 24'"
+            f" {fast:.4g}; add the rate of most cameras, such as 'fps = 24', and convert the others"
         )
     return slow
 

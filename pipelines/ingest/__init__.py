@@ -97,7 +97,7 @@ def account(dataset: Dataset, subjects: Sequence[str]) -> Iterator[str]:
 
 STAGE = Stage(
     name="ingest",
-    version=10,
+    version=11,
     config=IngestConfig,
     presets=PRESETS,
     items=items,

@@ -182,9 +182,22 @@ def _steps(pts: tuple[int, ...], clips: tuple[int, ...]) -> np.ndarray:
     return steps[within]
 
 
+def video_rates(raw: RawCapture, cameras: Mapping[str, CameraSource]) -> dict[str, float]:
+    """Return the frame rates that the cameras' first videos state."""
+    rates = {}
+    for name, source in cameras.items():
+        camera = raw.cameras[name]
+        if source.kind != "frames":
+            path = inside(camera.path, camera.names[0]) if camera.names else camera.path
+            with suppress(CaptureError):  # a container without a rate
+                rates[name] = video_fps(path)
+    return rates
+
+
 def odd_footage(
-    raw: RawCapture, cameras: Mapping[str, CameraSource], measured: Mapping[str, CameraMeasurements]
-) -> dict[str, str]:
+    raw: RawCapture, cameras: Mapping[str, CameraSource],
+    measured: Mapping[str, CameraMeasurements], rates: Mapping[str, float],
+) -> dict[str, str]:  # fmt: skip
     """Return warnings about rate, time stamps, channels, orientation and profiles, by camera."""
     found, pictures = {}, [raw.root / name for name in raw.plates.values()]
     for name, source in cameras.items():
@@ -197,14 +210,11 @@ def odd_footage(
                 if has_alpha(path):
                     oddities.append("alpha channel left out: a later stage makes mattes")
         elif tags := measured[name].tags:
-            path = inside(camera.path, camera.names[0]) if camera.names else camera.path
-            orientation = ORIENTATION[tags.turn]
-            with suppress(CaptureError):  # a container without a rate
-                fps = video_fps(path)
-                if abs(fps - raw.fps) > FPS_SLACK * raw.fps:
-                    oddities.append(
-                        f"video at {fps:.4g} fps, the capture says {raw.fps:.4g}; correct fps there"
-                    )
+            orientation, fps = ORIENTATION[tags.turn], rates.get(name, raw.fps)
+            if abs(fps - raw.fps) > FPS_SLACK * raw.fps:
+                oddities.append(
+                    f"video at {fps:.4g} fps, the capture says {raw.fps:.4g}; correct fps there"
+                )
             oddities += _odd_video(source, tags)
         if orientation != 1 and camera.orientation == 1:
             oddities.append(

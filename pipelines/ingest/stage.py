@@ -42,10 +42,18 @@ from express50.files.calibration import write_cameras
 from express50.files.digests import stat_digest, text_digest
 from express50.files.images import contact_sheet, write_image
 from express50.files.text import KEY_LENGTH
+from express50.files.video import FPS_SLACK
 from express50.geometry.cameras import Camera
 from express50.rigs.camera_builder import at_size
 from pipelines.ingest.quality import CameraMeasurements, check_quality
-from pipelines.ingest.scan import odd_footage, remove_proxies, scan_camera, time_gaps, trimmed
+from pipelines.ingest.scan import (
+    odd_footage,
+    remove_proxies,
+    scan_camera,
+    time_gaps,
+    trimmed,
+    video_rates,
+)
 
 QC_CAMERAS, QC_COLUMNS = 24, 6
 BLACK_LIGHT = 1e-3  # linear light, 3 of 255 levels
@@ -155,7 +163,9 @@ def run(
     raw, outside = _with_cues(raw, cameras, measured, dropped, out / "proxies")
     usual = usual_count([camera.frames for camera in cameras.values()])
     cues, beyond = split_cues(raw.cues, usual)
-    for name, reason in (black_cameras(measured) | short_cameras(cameras, cues)).items():
+    rates = video_rates(raw, cameras)
+    unusable = black_cameras(measured) | short_cameras(cameras, cues)
+    for name, reason in (unusable | cameras_of_other_rates(raw, cameras, rates)).items():
         dropped[name] = reason
         del cameras[name]
         remove_proxies(out / "proxies", name)
@@ -171,7 +181,7 @@ def run(
     clips = next(iter(cameras.values())).clips or (index.frames,)
     kept = {name: measured[name] for name in cameras}
     figures, warnings = check_quality(kept, digests, clips, every, sync_frames, blur_ratio)
-    for name, why in odd_footage(raw, cameras, measured).items():
+    for name, why in odd_footage(raw, cameras, measured, rates).items():
         warnings[name] = "; ".join([why, *filter(None, [warnings.get(name)])])
     write_json(out / "checks.json", figures)
     lost = {f"camera {k}": why for k, why in sorted(dropped.items())}
@@ -358,6 +368,33 @@ def short_cameras(cameras: dict[str, CameraSource], cues: tuple[Cue, ...]) -> di
         "it is unknown which frames it lost"
         for name, camera in cameras.items()
         if camera.frames < needed
+    }
+
+
+def cameras_of_other_rates(
+    raw: RawCapture, cameras: Mapping[str, CameraSource], rates: Mapping[str, float]
+) -> dict[str, str]:
+    """Return the cameras that were recorded at another rate than most, with the reason.
+
+    Their frames show other moments, and their number differs as the rates do. If only the statement
+    is wrong, it does not.
+    """
+    stated = {name: rates.get(name, raw.fps) for name in cameras}
+
+    def alike(rate: float) -> list[str]:
+        return [name for name, other in stated.items() if abs(other - rate) <= FPS_SLACK * rate]
+
+    usual = max(
+        stated.values(), key=lambda rate: (len(alike(rate)), -abs(rate - raw.fps)), default=raw.fps
+    )
+    usually = usual_count([cameras[name].frames for name in alike(usual)])
+    return {
+        name: f"was recorded at {stated[name]:.4g} frames per second, most cameras at"
+        f" {usual:.4g}, so its frames show other moments; convert its video, for example with"
+        f" 'ffmpeg -i IN -vf fps={usual:.4g} OUT.mp4'"
+        for name, camera in cameras.items()
+        if name not in alike(usual)
+        and abs(camera.frames - usually * stated[name] / usual) < abs(camera.frames - usually)
     }
 
 

@@ -318,6 +318,25 @@ def test_real_size_captures(shared, tmp_path):
     assert metrics(dataset, item="H900")["dropped"] == []
 
 
+def test_cameras_of_another_rate_are_dropped_unless_only_their_statement_is_wrong(tmp_path):
+    """The second is twice as fast, the third half; the fourth only says that it is slower."""
+    root = tmp_path / "S001"
+    make_capture(root, cameras=6, frames=24, video=True)
+    for name, step, rate in (("cam01", 0.5, 48), ("cam02", 2, 12), ("cam03", 1, 20)):
+        video = root / "cameras" / name / "video.mp4"
+        images = [image for _, image in iterate_video(video)]
+        chosen = np.arange(0, len(images), step).astype(int)
+        write_video(video, [images[n] for n in chosen], rate=rate)
+    dataset = Dataset(tmp_path / "data")
+    ingest.add_captures(dataset, [root])
+    assert run(dataset).ok
+    dropped = {note["what"]: note["why"] for note in metrics(dataset)["dropped"]}
+    assert set(dropped) == {"camera cam01", "camera cam02"}
+    assert "at 48 frames per second, most cameras at 24" in dropped["camera cam01"]
+    assert "at 12 frames per second" in dropped["camera cam02"]
+    assert "video at 20 fps, the capture says 24" in notes(dataset)["camera cam03"]
+
+
 def test_footage_that_differs_from_its_description_is_a_warning(tmp_path):
     root = tmp_path / "S001"
     make_capture(root, cameras=3, frames=24, video=True)
