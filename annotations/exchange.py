@@ -32,7 +32,7 @@ from annotations.labels import (
     read_labels,
 )
 from annotations.validate import footage_problems
-from express50.capture.index import Index, read_index
+from express50.capture.index import UNKNOWN_HASH, Index, read_index
 from express50.console import count
 from express50.contract.layout import Dataset
 from express50.errors import AnnotationError, check_known
@@ -40,7 +40,10 @@ from express50.files.atomic import write_bytes
 from express50.files.text import NAME, csv_table, parse_json, read_text
 
 LARGEST = 2**63
+ROUNDED_S = 0.5  # by which a spreadsheet that shows whole seconds changes a time
 _FORMULA = re.compile(r"'*[=+\-@\t\r]")  # quotes before it too, so that reading is exact
+_HASH = re.compile(f"[0-9a-f]{{16}}|{UNKNOWN_HASH}")
+_AS_TEXT = "; a spreadsheet changed it: export again, and open that column as text"
 _FIELDS = tuple(field.name for field in fields(Label))
 
 
@@ -98,11 +101,30 @@ def import_labels(dataset: Dataset, path: Path) -> tuple[int, int]:
         for kind, what in footage_problems(index, label):
             if kind != "window":
                 raise AnnotationError(f"{where}: {what}; was it made on other footage?")
-    held = {subject: set(read_labels(dataset, subject)) for subject in {x.subject for x in labels}}
-    new = [label for label in dict.fromkeys(labels) if label not in held[label.subject]]
+    held = [label for s in {x.subject for x in labels} for label in read_labels(dataset, s)]
+    new = _unknown(list(dict.fromkeys(labels)), held)
     for label in new:
         append_label(dataset, label)
     return len(new), len(labels) - len(new)
+
+
+def _unknown(labels: list[Label], held: Iterable[Label]) -> list[Label]:
+    """Return the labels that are not held, even with numbers as a spreadsheet rounds them.
+
+    Added again, an old label would come after what its annotator has said since.
+    """
+
+    def words(label: Label) -> Label:
+        return replace(label, time=0.0, confidence=None, seconds=None)
+
+    times: dict[Label, list[float]] = {}
+    for label in held:
+        times.setdefault(words(label), []).append(label.time)
+    return [
+        label
+        for label in labels
+        if all(abs(time - label.time) > ROUNDED_S for time in times.get(words(label), ()))
+    ]
 
 
 def read_table(path: Path) -> list[Label]:
@@ -167,13 +189,17 @@ def _typed(name: str, value: object) -> Any:
     """Convert a cell to its column's type; CSV holds text only."""
     kind, text = KINDS[name], str(value)
     if kind == bool | None:
-        if text not in ("True", "False"):
+        if text.lower() not in ("true", "false"):  # spreadsheets write TRUE
             raise ValueError(f"{name} is {text}, expected True or False")
-        return text == "True"
+        return text.lower() == "true"
+    if name == "dhash" and not _HASH.fullmatch(text):
+        raise ValueError(f"{name} is {text[:40]!r}, expected 16 hexadecimal digits{_AS_TEXT}")
     if kind in (str, str | None):
         return text
+    if name == "time" and "e" in text.lower():  # 1.8E+09 may lie in the future
+        raise ValueError(f"{name} is {text[:40]!r}, expected all of its digits{_AS_TEXT}")
     try:
-        number = int(text) if kind == int | None else float(text)
+        number = int(text) if kind == int | None else float(text.replace(",", "."))
     except ValueError:
         wanted = "whole number" if kind == int | None else "number"
         raise ValueError(f"{name} is {text[:40]!r}, expected a {wanted}") from None

@@ -274,9 +274,12 @@ def last_event(labels: Iterable[Label], expression: str, annotator: str) -> Labe
 
 
 def _stacks(labels: Iterable[Label]) -> dict[tuple[str, str], list[Label]]:
-    """Stack the events that were not undone, by expression and annotator."""
+    """Stack the events that were not undone, by expression and annotator, the latest last.
+
+    An import may have put an older event below newer ones.
+    """
     stacks: dict[tuple[str, str], list[Label]] = {}
-    for label in labels:
+    for label in sorted(labels, key=lambda label: label.time):
         if label.action in EXCLUSION_ACTIONS:
             continue
         stack = stacks.setdefault((label.expression, label.annotator), [])

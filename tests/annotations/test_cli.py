@@ -186,6 +186,34 @@ def test_a_table_that_a_spreadsheet_wrote_is_imported(annotate, dataset, tmp_pat
     assert "is UTF-16 text; save it as UTF-8" in capsys.readouterr().err
 
 
+def test_numbers_that_a_spreadsheet_rounded_do_not_bring_old_labels_back(
+    annotate, dataset, tmp_path, capsys
+):
+    mark(annotate, "ann", "smile", 14)
+    file = tmp_path / "labels.csv"
+    annotate("export", str(file))
+    with file.open() as table:
+        (row,) = csv.DictReader(table)
+    mark(annotate, "ann", "smile", 15)
+
+    def bring(**change):
+        with file.open("w") as table:
+            writer = csv.DictWriter(table, row, delimiter=";")
+            writer.writeheader()
+            writer.writerow(row | change)
+        return main(["annotate", "import", str(dataset.root), str(file)])
+
+    time = row["time"]
+    for saved in (f"{float(time):.15g}", f"{float(time):.0f}", time.replace(".", ",")):
+        assert bring(time=saved, confidence="0,2", shown=row["shown"].upper()) == 0
+        assert "0 new events, 1 known already" in capsys.readouterr().out
+    assert [label["frame"] for label in annotate("labels")] == [15]
+    assert bring(annotator="eve", shown="FALSE") == 0
+    for change in ({"time": "1.8E+09"}, {"dhash": "1.23457E+15"}):
+        assert bring(annotator="zoe", **change) == 1
+        assert "a spreadsheet changed it: export again" in capsys.readouterr().err
+
+
 def test_export_replaces_no_events_that_are_not_stored(annotate, dataset, tmp_path, capsys):
     """Somebody may have typed export for import."""
     mark(annotate, "ann", "smile", 14)

@@ -14,6 +14,8 @@ from annotations.labels import (
     current_labels,
     human_digest,
     labels_of,
+    last_event,
+    latest_labels,
     make_event,
     make_flag,
     make_mark,
@@ -75,6 +77,14 @@ def test_later_person_wins_and_undo_restores_the_earlier_label():
     assert current_labels([*labels, undo])["smile"].frame == 5
     assert current_labels([*labels, undo, undo])["smile"].frame == 3
     assert current_labels([*labels, undo, undo, undo])["smile"].frame == 3
+
+
+def test_an_older_label_that_an_import_put_below_is_not_its_annotators_latest():
+    new, old, undo = _mark(5, "ann", 2.0), _mark(3, "ann", 1.0), _mark(None, "ann", 3.0)
+    assert latest_labels([new, old]) == [new] == [*current_labels([new, old]).values()]
+    assert last_event([new, old], "smile", "ann") == new
+    undone = [new, replace(undo, action="undo"), old]
+    assert labels_of(undone, "ann") == {"smile": old}
 
 
 def test_automatic_labels_do_not_change_the_human_digest(tmp_path):
