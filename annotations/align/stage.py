@@ -44,7 +44,7 @@ def run(dataset: Dataset, item: str, out: Path, *, accept: float, match: bool) -
     found, dropped = suggest_for(dataset, index, match)
     labels = accept_sure(dataset, index, found, accept)
     dropped += _missing_peaks(index, found, labels, accept)
-    peaks = {e: label for e, label in labels.items() if label.frame is not None}
+    peaks = {e: x for e, x in labels.items() if x.frame is not None and not _gone(index, x)}
     if not peaks:
         raise StageError(f"{item}: no expression has a frame ({dropped[0].why})")
     kept = ("frame", "camera", "pts", "dhash", "confidence", "annotator")
@@ -173,9 +173,12 @@ def _missing_peaks(
     notes = []
     for expression in (cue.expression_id for cue in index.cues):
         label, suggested = labels.get(expression), found.get(expression)
-        if label is not None and label.frame is not None:
+        gone = "" if label is None else _gone(index, label)
+        if label is not None and label.frame is not None and not gone:
             continue
-        if label is not None:
+        if gone:
+            why = f"{gone}; label it again with 'express50 annotate'"
+        elif label is not None:
             why = f"flagged: {label.reason or 'no reason given'}"
         elif suggested is None:
             why = "no face was seen in its cue window; label it with 'express50 annotate'"
@@ -186,6 +189,17 @@ def _missing_peaks(
             )
         notes.append(Note(expression, why))
     return notes
+
+
+def _gone(index: Index, label: Label) -> str:
+    """Say why a label's frame is not in the footage; "" if it is, or if the label has none."""
+    if label.frame is None:
+        return ""
+    source, said = index.cameras.get(label.camera or ""), f"labelled by {label.annotator}"
+    if source is None:
+        return f"{said} in camera {label.camera}, which is not in the footage"
+    there = 0 <= label.frame < source.frames
+    return "" if there else f"{said} at frame {label.frame}, but {label.camera} has {source.frames}"
 
 
 def _in_footage(found: Suggestion, features: Features, expression: str, index: Index) -> Suggested:

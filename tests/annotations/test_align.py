@@ -71,6 +71,23 @@ def test_a_damaged_line_of_labels_is_a_warning(watched):
     assert "line 1 of S001" in found["warnings"][0]["why"]
 
 
+def test_a_label_in_a_camera_that_is_gone_costs_only_its_expression(watched):
+    index = read_index(watched, "S001")
+    for expression, frame, change in (
+        ("smile", 21, {"camera": "cam9"}),
+        ("jaw_open", 40, {"frame": 999}),
+    ):
+        mark = make_mark(index, expression, frame, "cam01", "ann")
+        append_label(watched, replace(mark, **change))
+    assert run(watched, ["S001"]).ok
+    dropped = {row["what"]: row["why"] for row in metrics_of(watched, "align", "S001")["dropped"]}
+    assert dropped["smile"].startswith("labelled by ann in camera cam9, which is not in the foot")
+    assert dropped["jaw_open"].startswith(
+        f"labelled by ann at frame 999, but cam01 has {3 * FRAMES_EACH};"
+    )
+    assert "smile" not in peaks(watched, "S001") and "neutral" in peaks(watched, "S001")
+
+
 def test_peaks_are_found_and_other_subjects_match_the_reference(watched):
     assert run(watched).ok
     for subject in ("S001", "S002"):
