@@ -312,6 +312,9 @@ class Desk(Screen[None]):
             self.player.stop()
             self.say("stopped; Enter again marks this frame", theme.ACCENT)
         elif self.scene is not None and self.view is not None:
+            if unseen := self.query_one("#frame", PicturePane).trouble():
+                self.say(f"not marked: {unseen}", theme.RED)
+                return
             scene, view, camera = self.scene, self.view, camera_name(self.scene, self.aim.camera)
             self._decide(lambda: self.session.mark(scene, view, camera))
         elif self.scene is not None:

@@ -64,6 +64,16 @@ class PicturePane(Widget):
         """Return the size of the picture, in cells and pixels."""
         return self._painter.shape(self.size)
 
+    def trouble(self) -> str:
+        """Return why the picture cannot be shown; "" if it can, or if there is no room for it."""
+        if self.look is None or not (self.size.width and self.size.height):
+            return ""
+        try:
+            self._cache.get(shot_of(self.look, self.shape))
+        except AnnotationError as error:
+            return str(error)
+        return ""
+
     def render_lines(self, crop: Region) -> list[Strip]:
         """Return the lines of the picture, past Textual's cache of styled lines.
 

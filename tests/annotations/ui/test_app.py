@@ -492,6 +492,8 @@ def test_missing_proxies_and_footage_are_reported(suggested, make_app, footage):
         return " ".join(" ".join(strip.text for strip in strips).split())
 
     assert "proxies are missing" in drive(make_app(suggested), check=picture_words)
+    said = drive(make_app(suggested), "enter", check=lambda app: line(app, "message"))
+    assert "not marked: S001 cam01 frame 4" in said and labels(suggested) == []
     app = make_app(suggested)
     index = json.loads((ingest / "S001" / "index.json").read_text())
     index["cues"] = index["cues"][1:]
