@@ -281,7 +281,8 @@ class _StageAudit:
         self.broken |= {item.split("/")[0] for item in wrong | failed | to_do}
         if to_do and receipts:
             words = f"{len(to_do)} of {count(len(known or ()), 'item')} to do"
-            self._note(stage, f"{words}; run 'express50 {stage.name}'")
+            run = advised(f"express50 {stage.name}", self.dataset.root)
+            self._note(stage, f"{words}; run {run}")
         if failures := sum(bool(receipt.reason) for receipt in receipts.values()):
             self._note(stage, f"{count(failures, 'item')} failed; see status")
 
