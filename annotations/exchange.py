@@ -143,7 +143,11 @@ def read_table(path: Path) -> list[Label]:
             for row in table
         )
     try:
-        labels = [_label(row, f"{path}: row {number}") for number, row in enumerate(rows, 1)]
+        labels = [
+            _label(row, f"{path}: row {number}")
+            for number, row in enumerate(rows, 1)
+            if is_json or any(row.values())  # spreadsheets write rows of empty cells
+        ]
     except csv.Error as error:
         raise AnnotationError(f"{path}: not CSV ({error}); export it again") from None
     if not is_json and not labels and set(REQUIRED) - set(table.fieldnames or REQUIRED):

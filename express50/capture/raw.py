@@ -404,7 +404,8 @@ def read_cues(path: Path) -> tuple[Cue, ...]:
                 f"{path}: no column {', '.join(missing)}; got {head!r:.100}, expected "
                 f"{','.join(CUE_COLUMNS)} in the first line"
             )
-        cues = [_read_cue(path, reader.line_num, row) for row in reader]
+        # Spreadsheets write rows of empty cells below a table that was once longer.
+        cues = [_read_cue(path, reader.line_num, row) for row in reader if any(row.values())]
     except csv.Error as error:
         raise CaptureError(f"{path}: not CSV ({error}); write it again") from error
     seen: set[str] = set()

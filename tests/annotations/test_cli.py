@@ -177,7 +177,7 @@ def test_a_table_that_a_spreadsheet_wrote_is_imported(annotate, dataset, tmp_pat
     annotate("export", str(tmp_path / "labels.csv"))
     rows = csv.reader((tmp_path / "labels.csv").read_text().splitlines())
     text = io.StringIO()
-    csv.writer(text, delimiter=between).writerows(rows)
+    csv.writer(text, delimiter=between).writerows([*rows, 18 * [""]])
     file = tmp_path / "LABELS.CSV"
     file.write_bytes(text.getvalue().encode("utf-8-sig"))
     assert annotate("import", str(file)) == {"file": str(file), "new": 0, "known": 1}

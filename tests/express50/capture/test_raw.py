@@ -213,7 +213,8 @@ def test_cues_may_come_from_a_spreadsheet(tmp_path):
     )
     assert read_cues(path) == (Cue("smile", 0, 4),)
     for between in (";", "\t"):
-        path.write_text("expression_id,start_frame,end_frame\nsmile,0,4\n".replace(",", between))
+        table = "expression_id,start_frame,end_frame\nsmile,0,4\n,,\n,,\n"
+        path.write_text(table.replace(",", between))
         assert read_cues(path) == (Cue("smile", 0, 4),)
     assert read_cues(tmp_path / "absent.csv") == ()
 
