@@ -71,8 +71,9 @@ def add_captures(dataset: Dataset, captures: list[Path], replace: bool = False) 
     A subject's other capture that still exists is only replaced if ``replace`` is true.
 
     Raises:
-        CaptureError: a folder is not a capture, two captures claim one subject, or the subject
-            was withdrawn, has another capture already, or differs from another only in letter case.
+        CaptureError: a folder is not a capture, two captures claim one subject, the dataset has a
+            capture under another subject, or the subject was withdrawn, has another capture
+            already, or differs from another only in letter case.
     """
     table = {subject: str(path) for subject, path in dataset.captures().items()}
     added: dict[str, str] = {}
@@ -104,9 +105,23 @@ def add_captures(dataset: Dataset, captures: list[Path], replace: bool = False) 
                     " many disks ignore; give it another id (subject in capture.toml)"
                 )
         added[subject] = str(root)
+    for former, place in (table | added).items():
+        for subject, folder in added.items():
+            if folder == place and subject != former:
+                raise CaptureError(f"{folder}: {_renamed(dataset, former, subject)}")
     if not added.items() <= table.items():
         write_json(dataset.captures_file, table | added)
     return list(added)
+
+
+def _renamed(dataset: Dataset, former: str, now: str) -> str:
+    """Say what to do about a capture that a dataset has under another subject."""
+    withdraw = advised("express50 subject withdraw", dataset.root, former)
+    return (
+        f"subject is {now!r}, but the dataset has this capture as {former!r}; set that id again in"
+        f" capture.toml, or take {former} out ({withdraw}) and ingest the capture again; if"
+        f" {former}'s capture lies elsewhere now, ingest it from there first"
+    )
 
 
 def inputs(dataset: Dataset, item: str) -> dict[str, Path | str]:
@@ -151,10 +166,7 @@ def run(
     """
     raw = read_any(_capture_of(dataset, item))
     if raw.subject != item:
-        raise CaptureError(
-            f"{raw.root / 'capture.toml'}: subject is {raw.subject!r}, registered as {item!r}; "
-            "ingest the capture again"
-        )
+        raise CaptureError(f"{raw.root / 'capture.toml'}: {_renamed(dataset, item, raw.subject)}")
     check_focals(raw.root / "capture.toml", raw.meta.get("focal_px", {}))
     check_sample_names(raw)
     (out / "proxies").mkdir()

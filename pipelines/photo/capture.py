@@ -39,6 +39,7 @@ from express50.files.images import (
     upright,
     write_image,
 )
+from express50.files.text import no_file
 from express50.files.video import VideoFootage, iterate_video, video_fps, video_tags
 from express50.geometry.cameras import Camera, pinhole_camera
 from express50.geometry.conventions import FLIP_YZ
@@ -102,7 +103,7 @@ def open_picture(path: Path) -> PhotoSource:
             "cameras are read by 'express50 ingest'"
         )
     if not path.is_file():
-        raise CaptureError(f"{path}: no such file; expected a photograph or a video")
+        raise CaptureError(f"{path}: {no_file(path)}; expected a photograph or a video")
     suffix = path.suffix.lower()
     if suffix in VIDEO_SUFFIXES:
         orientation = ORIENTATION[video_tags(path).turn]

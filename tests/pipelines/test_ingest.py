@@ -287,7 +287,12 @@ def test_another_capture_of_a_known_subject_is_refused_unless_it_replaces_the_fi
 
 def test_a_moved_capture_or_a_changed_subject_fails_its_item_only(dataset, tmp_path):
     (tmp_path / "S001" / "capture.toml").write_text('subject = "S009"\nfps = 24\n')
-    assert "registered as 'S001'" in run(dataset).outcomes[0].reason
+    advice = f"take S001 out ('express50 subject withdraw {dataset.root} S001')"
+    assert advice in run(dataset).outcomes[0].reason
+    before = dataset.captures()
+    with pytest.raises(CaptureError, match="'S009', but the dataset has this capture as 'S001'"):
+        ingest.add_captures(dataset, [tmp_path / "S001"])  # one person under two ids
+    assert dataset.captures() == before
     (tmp_path / "S001").rename(tmp_path / "elsewhere")
     assert "no such folder; run 'express50 ingest" in run(dataset).outcomes[0].reason
     with pytest.raises(StageError, match="no capture of 'S009'"):
