@@ -66,7 +66,9 @@ def run(dataset: Dataset, item: str, out: Path, *, accept: float, match: bool) -
         Note("labels", f"line {number} of {name} cannot be read; label its expression again")
         for number in unreadable_lines(dataset, index.subject)
     ]
-    return Result(metrics, dropped, warnings, expected_error=expected_error(taken))
+    return Result(
+        metrics, dropped, warnings + _outside(index, peaks), expected_error=expected_error(taken)
+    )
 
 
 def expected_error(taken: Sequence[Suggested]) -> ExpectedError | None:
@@ -200,6 +202,20 @@ def _gone(index: Index, label: Label) -> str:
         return f"{said} in camera {label.camera}, which is not in the footage"
     there = 0 <= label.frame < source.frames
     return "" if there else f"{said} at frame {label.frame}, but {label.camera} has {source.frames}"
+
+
+def _outside(index: Index, peaks: Mapping[str, Label]) -> list[Note]:
+    """Warn of peaks outside their cue windows: they may show another expression."""
+    return [
+        Note(
+            cue.expression_id,
+            f"labelled by {label.annotator} at frame {label.frame}, outside its cue window"
+            f" {cue.start_frame} to {cue.end_frame}; label it again if cues.csv has changed",
+        )
+        for cue in index.cues
+        if (label := peaks.get(cue.expression_id)) is not None
+        if not cue.start_frame <= (label.frame or 0) <= cue.end_frame
+    ]
 
 
 def _in_footage(found: Suggestion, features: Features, expression: str, index: Index) -> Suggested:

@@ -88,6 +88,16 @@ def test_a_label_in_a_camera_that_is_gone_costs_only_its_expression(watched):
     assert "smile" not in peaks(watched, "S001") and "neutral" in peaks(watched, "S001")
 
 
+def test_a_label_outside_its_cue_window_is_warned_of(watched):
+    """After cues.csv was corrected, it may show another expression."""
+    mark = make_mark(read_index(watched, "S001"), "smile", 21, "cam01", "ann")
+    append_label(watched, replace(mark, expression="jaw_open"))
+    assert run(watched, ["S001"]).ok
+    (warning,) = metrics_of(watched, "align", "S001")["warnings"]
+    assert warning["what"] == "jaw_open"
+    assert warning["why"].startswith("labelled by ann at frame 21, outside its cue window 3")
+
+
 def test_peaks_are_found_and_other_subjects_match_the_reference(watched):
     assert run(watched).ok
     for subject in ("S001", "S002"):
