@@ -282,8 +282,13 @@ def label_by_colour(
         hair, beyond = covered, 0.0
     counts = [_counts(cells, mask) for mask in (hair, skin, torso)]
     if skin_colours is not None and not bare and hidden:
-        # Half of each, because the back of a neck may be darker than any face.
-        own, others = (c / np.float32(max(c.sum(), 1.0)) for c in (counts[1], skin_colours))
+        # Half of each, because the back of a neck may be darker than any face; or hair covers it.
+        of_hair, own, others = (
+            gaussian_filter(c, SMOOTH) / np.float32(max(c.sum(), 1.0))
+            for c in (counts[0], counts[1], skin_colours)
+        )
+        if np.minimum(own, of_hair).sum() > np.minimum(own, others).sum():
+            own = others
         counts[1] = SHARED * (own + others)
     # Log-likelihoods (3, H, W) of hair, skin and torso.
     likely = np.full((3, *cells[0].shape), np.log(UNSEEN_CLASS_SHARE), np.float32)

@@ -247,6 +247,21 @@ def test_long_fair_hair_and_a_scarf_are_not_taken_for_skin(scarf: bool) -> None:
     assert not kept[hair].any() and kept[skin & ~hair].mean() > 0.95
 
 
+@pytest.mark.parametrize("covered", [True, False])
+def test_hair_over_the_back_of_a_neck_does_not_teach_what_skin_looks_like(covered: bool) -> None:
+    """A bare neck in the shade does, although it is darker than the face."""
+    face, behind = make_scene(0), make_scene(180)
+    colours = face_colours(face.rgb, face.alpha, render_head(face.head, face.camera)[0])
+    neck = label_mask(behind.labels, "neck", "ears")
+    hair = behind.rgb[label_mask(behind.labels, "hair")]
+    some = hair[np.random.default_rng(0).integers(len(hair), size=neck.sum())]
+    rgb = behind.rgb.copy()
+    rgb[neck] = (0.8 * some if covered else 0.6 * rgb[neck]).astype(np.uint8)
+    pictures = rgb, behind.alpha, behind.depth
+    labels = label_view(behind.head, behind.camera, *pictures, False, SIDE, colours).labels
+    assert label_mask(labels, *(("hair",) if covered else ("neck", "ears")))[neck].mean() > 0.9
+
+
 def test_a_face_in_red_light_from_one_side_and_blue_from_the_other_is_skin() -> None:
     scene = make_scene(20, size=300)
     mesh = render_head(scene.head, scene.camera)[0]
