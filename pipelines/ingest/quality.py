@@ -138,8 +138,8 @@ def check_quality(
         faults += describe_dark(measured[name].cells)
         if name in grey and len(grey) < len(measured):
             faults.append(
-                "shows no colours, unlike other cameras: mattes separate people from walls"
-                " by colour, so check them, or leave the camera out"
+                "no colours, unlike other cameras: look at its mattes, because people and walls"
+                " are separated by brightness alone"
             )
         faults += describe_drift(drifts[name])
         faults += [blurred[name]] if name in blurred else []
