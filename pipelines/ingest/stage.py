@@ -401,8 +401,8 @@ def cameras_of_other_rates(
     )
     usually = usual_count([cameras[name].frames for name in alike(usual)])
     return {
-        name: f"was recorded at {stated[name]:.4g} frames per second, most cameras at"
-        f" {usual:.4g}, so its frames show other moments; convert its video, for example with"
+        name: f"recorded at {stated[name]:.4g} frames per second, most cameras at {usual:.4g}, so"
+        " frame numbers show other moments here; convert the video, for example with"
         f" 'ffmpeg -i IN -vf fps={usual:.4g} OUT.mp4'"
         for name, camera in cameras.items()
         if name not in alike(usual)

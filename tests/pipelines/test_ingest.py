@@ -418,7 +418,9 @@ def test_a_camera_without_colours_among_others_is_warned_of(dataset):
         if grey == "cam01":
             assert run(dataset).ok
             said = notes(dataset)
-            assert "no colours, unlike other cameras" in said["camera cam01"] and list(said) == ["camera cam01"]
+            assert "no colours, unlike other cameras" in said["camera cam01"] and list(said) == [
+                "camera cam01"
+            ]
     assert run(dataset).ok
     assert not notes(dataset), "a rig of grey cameras knows that it is"
 
