@@ -18,7 +18,7 @@ from express50.head.load import load_head
 from express50.runner.executor import Pool
 from express50.runner.runner import run_stage
 from pipelines import frames, ingest
-from tests.pipelines.bump_head import render, ring
+from tests.pipelines.bump_head import BACKGROUND, render, ring
 from tests.stages import run_here
 
 EXPRESSIONS = ("neutral", "smile")
@@ -27,7 +27,10 @@ EXPRESSIONS = ("neutral", "smile")
 def make_dataset(
     root: Path, subjects: tuple[str, ...] = ("S001",), cameras: int = 6, size: int = 96
 ) -> Dataset:
-    """Write captures, ingest them, and put down what the stages up to track would write."""
+    """Write captures, ingest them, and put down what the stages up to track would write.
+
+    They have plates: without, `frames` would take half a minute to look for walls.
+    """
     dataset = Dataset(root / "data")
     rig = ring(cameras, size)
     shots = {camera.id: render(camera) for camera in rig}
@@ -56,6 +59,9 @@ def _write_capture(capture: Path, subject: str, rig: list[Camera], shots: dict) 
         folder.mkdir(parents=True)
         for k in range(len(EXPRESSIONS)):
             write_image(folder / f"{k:06d}.png", rgb)
+        plate = np.broadcast_to(np.rint(255 * BACKGROUND).astype(np.uint8), rgb.shape)
+        (capture / "plates").mkdir(exist_ok=True)
+        write_image(capture / "plates" / f"{name}.png", plate)
 
 
 def write_given(dataset: Dataset, subject: str, rig: list[Camera], shots: dict) -> None:

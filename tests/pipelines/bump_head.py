@@ -13,6 +13,8 @@ from express50.geometry.transforms import look_at
 
 RADII = np.array([0.075, 0.105, 0.09])
 
+BACKGROUND = np.array([0.3, 0.5, 0.4])
+
 
 def distance(points: np.ndarray) -> np.ndarray:
     """Approximate signed distance (N,), metres, of points (N, 3)."""
@@ -78,7 +80,7 @@ def render(camera: Camera, offset=(0.0, 0.0, 0.0), supersample: int = 2):
     fine = pinhole_camera("fine", K, width * n, height * n, camera.cam_from_world)
     depth, points, normals = _cast(scene, fine)
     hit = depth > 0
-    shade = np.zeros((*depth.shape, 3)) + [0.3, 0.5, 0.4]
+    shade = np.zeros((*depth.shape, 3)) + BACKGROUND
     light = 0.4 + 0.6 * np.clip(normals @ np.array([0.4, 0.6, 0.69]), 0, 1)
     skin = np.array([0.8, 0.6, 0.5]) * (paint(points - offset) * light)[:, None]
     shade[hit] = np.clip(skin, 0, 1)
