@@ -30,7 +30,7 @@ from express50.rigs.world_frame import meeting_point
 from pipelines.matte.plates import GREY, darkening
 
 CUBE = 1.6  # half side of the cube, in radii of the ball
-BODY = 0.8  # radii that the subject may extend beyond where it leaves the ball
+BODY = 0.5  # radii that the subject may extend beyond where it leaves the ball
 FAINT = 0.03  # alpha below this is clear background
 STRAND = 0.03  # share of the longer side that hair may extend beyond the other cameras' hull
 INSIDE = 0.5  # alpha from which a pixel shows the subject
