@@ -158,8 +158,8 @@ def shape_warnings(shape: np.ndarray) -> list[Note]:
 def single_view_warnings(peaks: Sequence[Observation], cameras: Mapping[str, Camera]) -> list[Note]:
     """Warn of peaks whose face only one of several cameras sees."""
     why = (
-        "only {1} of {0} cameras shows the face, so its shape and its distance from that camera are"
-        " guesses; choose a peak in which more cameras see the face, or check the calibration"
+        "landmarks were found in {1} alone of {0} cameras, so the face's distance from it is less"
+        " sure; something may cover the face, as a mask does, or it turns away from the others"
     )
     return [
         Note(peak.expression, why.format(len(cameras), peak.views[0].camera_id))

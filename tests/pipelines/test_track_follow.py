@@ -112,7 +112,7 @@ def test_a_face_that_one_of_several_cameras_shows_is_warned_of() -> None:
     (view,) = search_all_views(str, CAMERAS, 7, [search], None)
     alone, _ = triangulate_views("smile", 7, [view])
     (note,) = single_view_warnings([alone], CAMERAS)
-    assert note.what == "smile" and f"only cam-0.50 of {len(CAMERAS)} cameras shows" in note.why
+    assert note.what == "smile" and f"in cam-0.50 alone of {len(CAMERAS)} cameras" in note.why
     assert single_view_warnings([alone], {"cam-0.50": CAMERAS["cam-0.50"]}) == []
 
 
