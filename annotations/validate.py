@@ -30,7 +30,7 @@ from annotations.labels import (
 )
 from express50.capture.index import Index, read_index, same_hash
 from express50.contract.layout import Dataset, included_subjects
-from express50.errors import AnnotationError, advised
+from express50.errors import AnnotationError, UnknownNameError, advised
 
 FLAG = "flag:"  # prefix of a free-text reason, which might otherwise be a mistyped name
 WITHIN = (1, 2, 4)  # frames
@@ -65,7 +65,10 @@ def problems(dataset: Dataset, subjects: list[str] | None = None) -> list[LabelP
         for number in unreadable_lines(dataset, subject):
             what = f"line {number} of {dataset.labels_file(subject)} cannot be read; label it again"
             found.append(LabelProblem(subject, "", "unreadable", what))
+        named = {cue.expression_id for cue in index.cues}
         for label in latest_labels(labels):  # a newer label replaces a wrong one
+            if label.expression not in named:  # taken out of cues.csv: nothing uses it
+                continue
             for kind, what in footage_problems(index, label):
                 words = f"{label.annotator}: {what}"
                 found.append(LabelProblem(subject, label.expression, kind, words))
@@ -89,7 +92,7 @@ def footage_problems(index: Index, label: Label) -> Iterator[tuple[str, str]]:
         return
     try:
         cue = find_cue(index, label.expression)
-    except AnnotationError as error:
+    except UnknownNameError as error:  # cues.csv no longer names it
         yield "unknown", str(error)
         return
     if label.frame is None:

@@ -291,6 +291,15 @@ def test_validate_finds_a_frame_that_is_not_the_one_labelled(annotate, dataset):
     assert found["counts"]["identity"] == 1
 
 
+def test_validate_passes_over_labels_of_expressions_that_the_cues_no_longer_name(annotate, dataset):
+    mark(annotate, "ann", "smile", 14)
+    path = dataset.index_file("S001")
+    index = json.loads(path.read_text())
+    index["cues"] = [cue for cue in index["cues"] if "smile" not in str(cue)]
+    path.write_text(json.dumps(index))
+    assert annotate("validate")["ok"] is True
+
+
 def test_validate_counts_unreadable_lines(annotate, dataset):
     mark(annotate, "ann", "smile", 14)
     path = dataset.labels_file("S001")
