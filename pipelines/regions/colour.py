@@ -413,8 +413,10 @@ def scalp_votes(rgb: np.ndarray, labels: np.ndarray, alpha: np.ndarray) -> tuple
     of_skin, of_scalp = (_some_ratios(rgb[mask]) for mask in (sure, scalp))
     usual_colour = np.median(of_skin, axis=0)
     usual, found = (_share_near(usual_colour, ratios) for ratios in (of_skin, of_scalp))
-    if sure is skin and usual < COHERENT:
-        return 0, 0
+    if sure is skin:  # unless noise alone spreads its colours, it may be hair
+        even = _some_ratios(cv2.blur(rgb, (5, 5))[skin])
+        if _share_near(np.median(even, axis=0), even) < COHERENT:
+            return 0, 0
     return round(len(of_scalp) * usual), round(len(of_scalp) * found)
 
 
