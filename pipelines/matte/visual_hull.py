@@ -45,6 +45,7 @@ EMPTY, FULL = 0.003, 0.98  # shares of the image that a useful matte covers
 # The entire matte is wrong if over STRAY of it lies off the others' subject and it lacks over
 # LACKING of that subject, or if it lacks over MOST_LACKING.
 STRAY, LACKING, MOST_LACKING = 0.03, 0.07, 0.3
+TURN = 0.1  # share of the longer side by which a camera that has turned may shift its picture
 
 
 @dataclass(frozen=True)
@@ -397,12 +398,23 @@ def missed(
     return grown & (solid | (view.alpha >= INSIDE)), left
 
 
+def lacking_if_moved(opaque: np.ndarray, solid: np.ndarray) -> float:
+    """Return the least share of the others' solid (h, w) that a matte (h, w) lacks when shifted."""
+    if not solid.any():
+        return 0.0
+    reach = round(TURN * max(solid.shape))
+    padded = cv2.copyMakeBorder(opaque.astype(np.float32), *(4 * [reach]), cv2.BORDER_REPLICATE)
+    shared = cv2.matchTemplate(padded, solid.astype(np.float32), cv2.TM_CCORR)
+    return max(0.0, 1 - float(shared.max()) / int(solid.sum()))
+
+
 @dataclass(frozen=True)
 class Misfit:
     """Shares of a matte outside the others' hull, and of their solid subject that it lacks."""
 
     stray: float
     lacking: float
+    moved: float  # what it would lack if its camera had turned as far as suits it best
 
     @property
     def size(self) -> float:
@@ -413,7 +425,8 @@ class Misfit:
     @property
     def lacks(self) -> bool:
         """Return whether only a large part is missing: there the subject looks like the wall."""
-        return self.stray <= STRAY and self.lacking > LACKING
+        lost = self.lacking > LACKING and self.moved > self.lacking / 2
+        return self.stray <= STRAY and lost
 
     @property
     def reason(self) -> str:
@@ -496,7 +509,7 @@ def _compare(
         spots, lacking = missed(view, mine, views, subject)
         opaque = view.alpha > INSIDE
         stray = float((opaque & ~mine.likely).sum()) / int(opaque.sum())
-        misfits[view.name] = Misfit(stray, lacking)
+        misfits[view.name] = Misfit(stray, lacking, lacking_if_moved(opaque, mine.solid))
         if bad.any():
             removed[view.name] = bad
         if spots.any():

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from express50.files.images import shrink
 from express50.geometry.cameras import Camera
 from pipelines.matte.stage import SHOWN, corrected, make_view
-from pipelines.matte.visual_hull import Ball, compare_mattes
+from pipelines.matte.visual_hull import Ball, compare_mattes, lacking_if_moved
 from tests.pipelines.matte_rig import SIZE, disc, make_views, with_alpha
 
 BACKDROP = np.array([77, 128, 102], np.uint8)
@@ -184,3 +184,13 @@ def test_pictures_of_the_contact_sheet_and_mattes_are_reduced_to_one_size(size):
     ball = Ball(np.array([0, 0, 2.0]), 0.3)
     view = make_view(camera, ball, shown, np.full((height, width), 255, np.uint8))
     assert view.alpha.shape == view.valid.shape and view.alpha[view.valid].min() == 1
+
+
+def test_a_camera_that_has_turned_is_known_from_one_that_lacks_a_part() -> None:
+    y, x = np.mgrid[:128, :128]
+    solid = np.hypot(x - 64, y - 64) < 40
+    assert lacking_if_moved(solid, solid) == 0
+    assert lacking_if_moved(np.roll(solid, (8, -6), (0, 1)), solid) == 0
+    hollow = solid & (np.hypot(x - 64, y - 64) > 15)
+    assert lacking_if_moved(hollow, solid) > 0.6 * (solid & ~hollow).sum() / solid.sum()
+    assert lacking_if_moved(solid, solid & False) == 0
