@@ -283,11 +283,10 @@ def label_by_colour(
     counts = [_counts(cells, mask) for mask in (hair, skin, torso)]
     if skin_colours is not None and not bare and hidden:
         # Half of each, because the back of a neck may be darker than any face; or hair covers it.
-        of_hair, own, others = (
-            gaussian_filter(c, SMOOTH) / np.float32(max(c.sum(), 1.0))
-            for c in (counts[0], counts[1], skin_colours)
-        )
-        if np.minimum(own, of_hair).sum() > np.minimum(own, others).sum():
+        shares = [c / np.float32(max(c.sum(), 1.0)) for c in (*counts[:2], skin_colours)]
+        by_hair, by_skin, by_others = (gaussian_filter(c, SMOOTH) for c in shares)
+        _, own, others = shares
+        if np.minimum(by_skin, by_hair).sum() > np.minimum(by_skin, by_others).sum():
             own = others
         counts[1] = SHARED * (own + others)
     # Log-likelihoods (3, H, W) of hair, skin and torso.
