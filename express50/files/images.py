@@ -38,7 +38,7 @@ PHOTOMETRIC = (0, 1, 2, 3, 6)
 JPEG_SIDE, PNG_SIDE = 65500, 1_000_000  # pixels; encoder and decoder refuse longer sides
 PNG_START = b"\x89PNG\r\n\x1a\n"
 PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
-GREY = 0.02  # mean difference of a grey picture's channels, as a share of its brightness
+TINT = 0.02  # mean difference of a grey picture's channels, as a share of its brightness
 SRGB_SLACK = 2  # of 255 levels by which profiles of sRGB differ from each other
 UP, PNG_LEVEL = 2, 3  # of PNG's filters the difference from the row above; libdeflate's level
 # Orientation -> quarter turns counter-clockwise after an optional left-right flip (EXIF 2.3).
@@ -530,7 +530,7 @@ def scaled_levels(gain: np.ndarray) -> np.ndarray:
 
 def is_grey(rgb: np.ndarray) -> bool:
     """Return whether a picture (H, W, 3) shows no colours, as that of a monochrome camera."""
-    return bool(np.ptp(rgb, axis=2).mean() <= GREY * rgb.max(axis=2).mean())
+    return bool(np.ptp(rgb, axis=2).mean() <= TINT * rgb.max(axis=2).mean())
 
 
 def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -33,7 +33,7 @@ from pipelines.matte.visual_hull import (
 )
 
 FACE_SCORE = 0.3  # heads from behind score up to 0.2, profiles from 0.33 on
-FACES = 4  # place a head well
+FACES = 4  # this many place a head well
 NEIGHBOUR_SCORE = 0.5  # other people's faces beside the person score 0.74 or more, walls up to 0.41
 NEIGHBOUR_M, MOST_NEIGHBOURS = 0.2, 4  # how far beside the person's region they are searched
 SIDE = 512  # pixels of the pictures in which faces are searched, and that GrabCut sees

@@ -431,10 +431,11 @@ class Misfit:
     @property
     def reason(self) -> str:
         """Describe the misfit for people."""
+        cause = "the subject looks like the wall there" if self.lacks else "the camera moved"
         return (
             f"its matte misses {self.lacking:.0%} of the subject that the other cameras see, and"
-            f" {self.stray:.0%} of it lies outside; check whether the camera moved. The matte was"
-            " not changed"
+            f" {self.stray:.0%} of it lies outside; check whether {cause}. The"
+            " matte was not changed"
         )
 
 
@@ -461,15 +462,15 @@ def compare_mattes(views: Sequence[MatteView], cells: int = CELLS) -> Agreement:
     doubted = {view.name: why for view in views if (why := _why_useless(view))}
     # Most of the others must be right; otherwise the wrong ones cannot be identified.
     most = len(doubted) + (len(views) - len(doubted)) // 3
-    lacking: frozenset[str] | None = None
+    lacking = frozenset[str]()
     while True:
         used = [view for view in views if view.name not in doubted]
         if len(used) < FEWEST:
             few = f"{len(used)} usable cameras, expected {FEWEST} or more to overrule one"
             return Agreement(warnings=_named(doubted), unchanged=few)
         removed, filled, misfits = _compare(used, cells)
-        if lacking is None:
-            lacking = frozenset(name for name, misfit in misfits.items() if misfit.lacks)
+        # Cameras that wrong ones make look incomplete too can wait until these are completed.
+        lacking = lacking or frozenset(name for name, one in misfits.items() if one.lacks)
         worst = max(misfits, key=lambda name: misfits[name].size)
         if misfits[worst].size <= 1 or len(doubted) >= most:
             return Agreement(removed, filled, _named(doubted), lacking)
@@ -509,7 +510,8 @@ def _compare(
         spots, lacking = missed(view, mine, views, subject)
         opaque = view.alpha > INSIDE
         stray = float((opaque & ~mine.likely).sum()) / int(opaque.sum())
-        misfits[view.name] = Misfit(stray, lacking, lacking_if_moved(opaque, mine.solid))
+        moved = lacking_if_moved(opaque, mine.solid) if lacking > LACKING else lacking
+        misfits[view.name] = Misfit(stray, lacking, moved)
         if bad.any():
             removed[view.name] = bad
         if spots.any():

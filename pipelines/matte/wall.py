@@ -28,7 +28,15 @@ from express50.files.images import (
 )
 from express50.geometry.cameras import Camera, pinhole, resized
 from express50.geometry.sampling import undistorted_mask
-from pipelines.matte.cutout import Cut, CutView, HeadPlace, cut_out, find_head, make_cut_view
+from pipelines.matte.cutout import (
+    FACES,
+    Cut,
+    CutView,
+    HeadPlace,
+    cut_out,
+    find_head,
+    make_cut_view,
+)
 from pipelines.matte.plates import (
     LEAST_SHARE,
     exposed,
@@ -53,7 +61,6 @@ MIXED, ODD = 0.2, 0.02  # probability of a soft pixel on the outline, of a wrong
 
 WALL_SIDE = 1920  # pixels, longer side of a wall; at 4K it would take five times as long
 MOMENTS = 8  # at which the wall is looked for
-FACING = 4  # cameras that find the head at all moments but the first
 # Size on the head of a pixel of the pictures that are cut, and their least longer side, pixels:
 # these outlines need not be exact, and smaller pictures take a quarter of the time.
 PIXEL_M, LEAST_SIDE = 0.003, 64
@@ -165,13 +172,13 @@ def reduced_view(view: CutView, density: float) -> CutView:
 
 
 def _facing(views: Sequence[CutView], place: HeadPlace) -> list[CutView]:
-    """Return the views that a head faces most."""
+    """Return the views that a head faces most, which find it at all moments but the first."""
 
     def turned_away(view: CutView) -> float:
         way = view.camera.center - place.shift
         return -float(way @ place.rotation[:, 2]) / max(float(np.linalg.norm(way)), 1e-9)
 
-    return sorted(views, key=turned_away)[:FACING]
+    return sorted(views, key=turned_away)[:FACES]
 
 
 def learn_wall(frames: Sequence[np.ndarray], cuts: Sequence[Cut], valid: np.ndarray) -> Wall:
