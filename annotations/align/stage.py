@@ -194,7 +194,7 @@ def _missing_peaks(
 
 
 def _gone(index: Index, label: Label) -> str:
-    """Say why a label's frame is not in the footage; "" if it is, or if the label has none."""
+    """Return why a label's frame is not in the footage; an empty text if it is, or has none."""
     if label.frame is None:
         return ""
     source, said = index.cameras.get(label.camera or ""), f"labelled by {label.annotator}"

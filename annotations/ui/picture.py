@@ -65,7 +65,7 @@ class PicturePane(Widget):
         return self._painter.shape(self.size)
 
     def trouble(self) -> str:
-        """Return why the picture cannot be shown; "" if it can, or if there is no room for it."""
+        """Return why the picture cannot be read; an empty text if it can, or if none is shown."""
         if self.look is None or not (self.size.width and self.size.height):
             return ""
         try:
