@@ -5,6 +5,8 @@ RenderMe-360 are recorded so that the performer holds the target at the end of t
 dataset's users take the last frame (RenderMe-360's processing tools). Its releases end at different
 frames, so ingest stores which release was read and the number of its last frame, and a label
 repeats them. A rule's label ranks below any person's and above a suggestion.
+
+Tables that do not fit raise AnnotationError; nothing of them is imported.
 """
 
 from __future__ import annotations
@@ -50,9 +52,7 @@ _FIELDS = tuple(field.name for field in fields(Label))
 def export_labels(labels: Iterable[Label], path: Path, stored: Collection[Label] = ()) -> None:
     """Write events as CSV or JSON, by the file's ending.
 
-    Raises:
-        AnnotationError: another ending; or the file exists and holds anything but ``stored``
-            events, such as those that somebody meant to import.
+    A file that is there may hold ``stored`` events alone, and none that somebody meant to import.
     """
     _check_format(path)
     if path.exists():
@@ -84,10 +84,6 @@ def import_labels(dataset: Dataset, path: Path) -> tuple[int, int]:
     """Append the events of a file that the store does not hold yet; return (new, known).
 
     Everything is checked before anything is written.
-
-    Raises:
-        AnnotationError: a row is not an event, or names an unknown subject, or a frame that the
-            footage does not have or that shows another picture.
     """
     labels = read_table(path)
     for number, label in enumerate(labels, 1):
@@ -223,9 +219,6 @@ def last_frame_marks(
 
     Without given expressions the rule covers RenderMe-360's: those that ingest read out of its
     files, else those with ids e0 (or e00) to e11.
-
-    Raises:
-        AnnotationError: a clip's last frame is not the last of the performance.
     """
     facts = index.meta.get("renderme360", {})
     if expressions is None:

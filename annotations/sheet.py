@@ -88,10 +88,6 @@ def make_sheet(
 
     The reference is always shown. `camera` is shown wherever a subject has it; by default it is the
     one in which the reference's frame was chosen. Suggestions less sure than `sure` are doubtful.
-
-    Raises:
-        AnnotationError: an unknown subject, expression or camera; StageError where nothing is
-            ingested.
     """
     reference = reference_subject(dataset)
     where, included = str(dataset.root), included_subjects(dataset)

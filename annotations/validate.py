@@ -171,10 +171,6 @@ def settlement(
 
     The verdict is a frame's number, an annotator whose label is right, or a reason: one of
     `FLAG_REASONS`, or any after ``flag:``.
-
-    Raises:
-        AnnotationError: nobody labelled the expression, the frame is outside its window, or the
-            verdict is none of these.
     """
     where = f"{index.subject} {expression}"
     said = voices(read_labels(dataset, index.subject)).get(expression)

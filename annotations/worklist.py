@@ -54,9 +54,6 @@ def worklist(
     with `everything`; the labels of others do not count. The `order` is ``doubt`` (least sure
     first), ``expression`` (one across all subjects, then the next, in the order of the cues) or
     ``subject``.
-
-    Raises:
-        AnnotationError: a subject is not in the dataset, or is excluded.
     """
     known = included_subjects(dataset)
     check_known(str(dataset.root), "included subject", subjects or (), known)

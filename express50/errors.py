@@ -92,11 +92,7 @@ def check_known(
     known: Collection[str],
     kind: type[Express50Error] = UnknownNameError,
 ) -> None:
-    """Refuse names that are not known.
-
-    Raises:
-        UnknownNameError: a name is unknown (or an error of another ``kind``); lists known names.
-    """
+    """Raise UnknownNameError, or an error of another ``kind``, for names that are not known."""
     for name in wanted:
         if name not in known:
             near = nearest(name, known) if len(known) > FEW else ""

@@ -80,9 +80,6 @@ def measure(observations: FaceObservations, windows: dict[str, np.ndarray]) -> F
 
     `windows` are rows of the observations by expression, see `Features`; none is empty. Without the
     neutral expression, the windows' first frames are taken for rest.
-
-    Raises:
-        ValueError: no window is given, a window is empty, or a landmark is not finite.
     """
     if not windows or not all(map(len, windows.values())):
         raise ValueError(f"windows are {sorted(windows)}, expected one or more, none of them empty")

@@ -116,9 +116,6 @@ def suggest(values: np.ndarray, groups: np.ndarray, canonical: Canonical | None)
 
     `values` (T, N) are those of ``expression_values``, 0 at rest. Features of one of the `groups`
     (N,) go to the same half when halves are drawn. `canonical` is None for the reference itself.
-
-    Raises:
-        ValueError: the clip is empty or not finite.
     """
     _check(values)
     own = strongest_event(values)
@@ -146,9 +143,6 @@ def suggest_rest(values: np.ndarray, groups: np.ndarray, typical: float) -> Sugg
 
     `values` (T, N) are 0 at the middle of the clip; `groups` are as for :func:`suggest`. `typical`
     is the activity of other expressions at their apex, in the same units.
-
-    Raises:
-        ValueError: the clip is empty or not finite.
     """
     _check(values)
     level = distance_from_rest(values)

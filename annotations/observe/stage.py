@@ -49,12 +49,7 @@ class FaceObservations:
 
 
 def read_observations(dataset: Dataset, subject: str) -> FaceObservations:
-    """Read a subject's observations.
-
-    Raises:
-        StageError: the subject was not observed.
-        FormatError: the file is damaged or of another version.
-    """
+    """Read a subject's observations; StageError without any, FormatError if they are damaged."""
     path = dataset.observations_file(subject)
     fix = f"run {advised('express50 align', dataset.root)}"
     if not path.is_file():
@@ -148,10 +143,8 @@ def choose_cameras(
     """Find the first attempt that shows a face, and rank the cameras that see it best.
 
     An attempt is the size of the smallest windows to search, and a frame; `score` rates the face
-    that a camera shows. Returns the size that was enough, the frame and the cameras.
-
-    Raises:
-        StageError: no camera sees a face in any attempt.
+    that a camera shows. Returns the size that was enough, the frame and the cameras; StageError if
+    no attempt shows a face.
     """
     best = 0.0
     for smallest, frame in attempts:

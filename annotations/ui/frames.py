@@ -51,11 +51,7 @@ class FrameCache:
         self._thread: threading.Thread | None = None
 
     def get(self, shot: FrameCrop) -> np.ndarray:
-        """Return the picture (height, width, 3) uint8; do not write to it.
-
-        Raises:
-            AnnotationError: the frame cannot be read, in plain words.
-        """
+        """Return the picture (height, width, 3) uint8, read-only; AnnotationError says why not."""
         with self._wake:
             found = self._pictures.get(shot)
             if found is not None:

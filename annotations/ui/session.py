@@ -134,11 +134,7 @@ class Session:
         self._last_key = self._clock()
 
     def mark(self, scene: TaskScene, view: CueView, camera: str) -> Label:
-        """Mark the frame under the cursor; it is on disk when this returns.
-
-        Raises:
-            AnnotationError: the task has no footage, or the plateau leaves the frame out.
-        """
+        """Mark the frame under the cursor; it is on disk when this returns."""
         if scene.index is None:
             raise AnnotationError(scene.problem or "this task has no footage")
         label = make_mark(
@@ -152,11 +148,7 @@ class Session:
         return self._save(replace(label, shown=shown))
 
     def flag(self, scene: TaskScene, reason: str) -> Label:
-        """Flag the open task as having no usable peak; the flag is on disk when this returns.
-
-        Raises:
-            AnnotationError: the task has no footage, or the reason is empty.
-        """
+        """Flag the open task as having no usable peak; the flag is on disk when this returns."""
         if scene.index is None:
             raise AnnotationError(scene.problem or "this task has no footage")
         return self._save(make_flag(scene.index, scene.task.expression, reason, self.annotator))

@@ -5,6 +5,9 @@ Stages after ``frames`` read the peak frames and plates that it wrote (``read_pe
 
 Pictures are what the ``frames`` stage makes of recorded frames: undistorted, and reduced if its
 settings say so. ``make_picture`` and ``read_cameras_of`` are where pictures and cameras meet.
+
+Footage and pictures that cannot be read, or changed, raise CaptureError; malformed tables raise
+FormatError; what an earlier stage must make first raises StageError.
 """
 
 from __future__ import annotations
@@ -95,9 +98,6 @@ class FrameReader:
         """Read an image (H, W, 3) uint8 sRGB by decode index, colours corrected, not undistorted.
 
         `exact` colours of a video take longer to make (`VideoReader.read_exactly`).
-
-        Raises:
-            CaptureError: there is no such frame, or the footage changed since it was ingested.
         """
         if not 0 <= frame < self.source.frames:
             raise CaptureError(
@@ -170,12 +170,7 @@ class FootageReader:
         self._readers: dict[str, FrameReader] = {}
 
     def read(self, camera_id: str, frame: int) -> np.ndarray:
-        """Make the picture (H, W, 3) uint8 sRGB of a frame, given by its decode index.
-
-        Raises:
-            CaptureError: the camera or the frame does not exist, or the footage has changed.
-            StageError: the camera is not calibrated.
-        """
+        """Make the picture (H, W, 3) uint8 sRGB of a frame, given by its decode index."""
         if camera_id not in self._readers:
             self._readers[camera_id] = FrameReader(self._index, camera_id)
         image = self._readers[camera_id].read(frame)
@@ -193,11 +188,7 @@ class FootageReader:
 
 
 def read_recorded_plate(index: Index, camera_id: str) -> np.ndarray:
-    """Read a clean plate (H, W, 3) uint8 sRGB as recorded: colours corrected, not undistorted.
-
-    Raises:
-        CaptureError: it cannot be read, or its size differs from the footage's.
-    """
+    """Read a clean plate (H, W, 3) uint8 sRGB as recorded: colours corrected, not undistorted."""
     path = index.capture / index.plates[camera_id]
     image = read_srgb(path)
     source = index.cameras[camera_id]
@@ -223,12 +214,7 @@ def write_frame(path: Path, image: np.ndarray) -> None:
 
 
 def read_peak_frame(dataset: Dataset, subject: str, expression: str, camera_id: str) -> np.ndarray:
-    """Read a peak frame (H, W, 3) uint8 sRGB, as the pinhole camera of ``read_cameras_of`` sees it.
-
-    Raises:
-        CaptureError: the frames stage has not written it, its size differs from the subject's other
-            pictures, or it cannot be read.
-    """
+    """Read a peak frame (H, W, 3) uint8 sRGB, as the pinhole of ``read_cameras_of`` sees it."""
     path = dataset.frame_file(subject, expression, camera_id)
     if not path.is_file():
         raise CaptureError(
@@ -241,10 +227,7 @@ def read_peak_frame(dataset: Dataset, subject: str, expression: str, camera_id: 
 def read_matted_frame(dataset: Dataset, item: str, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Read a camera's peak frame (H, W, 3) uint8 of `subject/expression`, and its matte (H, W).
 
-    Raises:
-        StageError: the frame has no matte.
-        FormatError: the matte is not an 8-bit grey image of the camera's size.
-        CaptureError: the frame cannot be read.
+    StageError without a matte.
     """
     subject, expression = item.split("/")
     path = dataset.matte_file(subject, expression, camera.id)
@@ -266,22 +249,14 @@ def read_matte(path: Path, camera: Camera, stage: str) -> np.ndarray:
 
 
 def read_plate_image(dataset: Dataset, subject: str, camera_id: str) -> np.ndarray | None:
-    """Read a clean plate (H, W, 3) uint8 sRGB, undistorted and corrected; None if there is none.
-
-    Raises:
-        CaptureError: it cannot be read.
-    """
+    """Read a clean plate (H, W, 3) uint8 sRGB, undistorted and corrected; None if there is none."""
     path = dataset.plate_file(subject, camera_id)
     size = picture_sizes(dataset, subject).get(camera_id)
     return read_written(path, size) if path.is_file() else None
 
 
 def read_written(path: Path, size: tuple[int, int] | None, channels: int = 3) -> np.ndarray:
-    """Read a picture (H, W, channels) uint8 that the frames stage wrote, of a size if one is given.
-
-    Raises:
-        CaptureError: it is damaged, or another picture.
-    """
+    """Read a picture (H, W, channels) uint8 that the frames stage wrote, of a size if given."""
     fix = "delete its folder and run 'express50 frames' again"
     try:
         image = read_image(path)
@@ -307,14 +282,11 @@ def frame_inputs(dataset: Dataset, subject: str, expression: str) -> dict[str, P
 
 
 def read_cameras_of(dataset: Dataset, subject: str, undistorted: bool = True) -> dict[str, Camera]:
-    """Read the cameras of a subject's pictures, sorted by id.
+    """Read the cameras of a subject's pictures, sorted by id; StageError before calibrate.
 
     They are the calibrated cameras, scaled to the size to which the frames stage reduced the
     pictures; before it has run, to the recorded size. Pictures are undistorted, so the cameras are
     pinholes unless ``undistorted`` is false.
-
-    Raises:
-        StageError: the subject is not calibrated.
     """
     sizes = picture_sizes(dataset, subject)
     cameras = {
@@ -360,11 +332,7 @@ def reduced(
 
 
 def picture_sizes(dataset: Dataset, subject: str) -> dict[str, tuple[int, int]]:
-    """Read width and height of a subject's pictures by camera; empty before the frames stage.
-
-    Raises:
-        FormatError: the file is not {camera: [width, height]} with positive integers.
-    """
+    """Read width and height of a subject's pictures by camera; empty before the frames stage."""
     path = dataset.picture_sizes_file(subject)
     return _sizes_cached(path) if path.is_file() else {}
 
@@ -390,11 +358,7 @@ _read_cameras = cached_by_file(64)(read_cameras)
 
 
 def read_gains(dataset: Dataset, subject: str) -> dict[str, np.ndarray]:
-    """Read each camera's linear light (3,) relative to the rig's mean; empty if not known.
-
-    Raises:
-        FormatError: the file is not {camera: [red, green, blue]} with positive numbers.
-    """
+    """Read each camera's linear light (3,) relative to the rig's mean; empty if not known."""
     path = dataset.gains_file(subject)
     if not path.is_file():
         return {}
@@ -417,10 +381,6 @@ def read_proxy(dataset: Dataset, subject: str, camera_id: str, frame: int) -> np
 
     The copy of a frame that ingest did not decode is made from the footage, together with those of
     the frames around it. At 4K this takes a tenth of a second per frame.
-
-    Raises:
-        StageError: the subject is not ingested.
-        CaptureError: the camera or the frame does not exist, or the footage has changed.
     """
     folder = dataset.proxies_dir(subject)
     index = read_index(dataset, subject)

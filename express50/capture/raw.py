@@ -3,6 +3,8 @@
 Layout: capture.toml, cameras/<id>/video.mp4 or cameras/<id>/frames/000000.png..., and optionally
 calibration.json, plates/<id>.png, board/<id>.mp4 or board/<id>/*.png with board/board.toml, and
 cues.csv.
+
+What makes all of a capture unusable is a CaptureError, or CalibrationError for its cameras.
 """
 
 from __future__ import annotations
@@ -95,12 +97,7 @@ class RawCapture:
 
 
 def read_capture(root: Path) -> RawCapture:
-    """Read and check a raw capture.
-
-    Raises:
-        CaptureError: a missing or malformed file makes the whole capture unusable.
-        CalibrationError: calibration.json exists but is malformed.
-    """
+    """Read and check a raw capture."""
     meta = read_meta(root)
     folder = root / "cameras"
     if not folder.is_dir():
@@ -152,11 +149,7 @@ def read_capture(root: Path) -> RawCapture:
 def read_calibration(
     root: Path, cameras: dict[str, RawCamera], dropped: dict[str, str]
 ) -> dict[str, Camera] | None:
-    """Read calibration.json, if it is there, and drop cameras that only one side knows.
-
-    Raises:
-        CalibrationError: it is malformed.
-    """
+    """Read calibration.json, if it is there, and drop cameras that only one side knows."""
     given = root / "calibration.json"
     if not is_given(given):
         return None
@@ -187,11 +180,7 @@ def read_meta(root: Path) -> dict:
 
 
 def read_capture_toml(root: Path) -> dict:
-    """Read a capture.toml, dates as text, without checking its content; empty if there is none.
-
-    Raises:
-        CaptureError: it cannot be read or is not TOML.
-    """
+    """Read a capture.toml, dates as text, without checking its content; empty if there is none."""
     path = root / "capture.toml"
     table = read_toml(path, CaptureError) if is_given(path) else {}
     return {key: dates_as_text(value) for key, value in table.items()}
@@ -315,9 +304,6 @@ def read_board(root: Path, cameras: Iterable[str]) -> dict | None:
     """Return the content of board.toml and each camera's files, relative to the capture, or None.
 
     The files are images of the board, or one video.
-
-    Raises:
-        CaptureError: board.toml is missing, or a camera has several videos, or images and a video.
     """
     folder = root / "board"
     if not folder.is_dir():
@@ -387,12 +373,7 @@ def unused_files(root: Path, cameras: Iterable[str]) -> dict[str, str]:
 
 
 def read_cues(path: Path) -> tuple[Cue, ...]:
-    """Read ``expression_id,start_frame,end_frame`` rows; no file means no cues.
-
-    Raises:
-        CaptureError: a column is missing, a value is not a frame number, a cue ends before it
-            starts, or an expression appears twice.
-    """
+    """Read ``expression_id,start_frame,end_frame`` rows; no file means no cues."""
     if not is_given(path):
         return ()
     text = read_text(path, CaptureError, TOML_LIMIT)
@@ -441,8 +422,7 @@ def _read_cue(path: Path, line: int, row: dict[str, str]) -> Cue:
 def check_calibrated_sizes(raw: RawCapture, sizes: dict[str, tuple[int, int]]) -> None:
     """Refuse cameras whose calibrated (width, height) differs from their footage's.
 
-    Raises:
-        CalibrationError: a size differs; a guessed scale would give wrong depths.
+    A guessed scale would give wrong depths.
     """
     for name, (width, height) in sizes.items():
         camera = (raw.calibration or {}).get(name)

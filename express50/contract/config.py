@@ -1,4 +1,8 @@
-"""Resolve a stage's configuration: ``--set`` over TOML over preset, typed, checked, saved."""
+"""Resolve a stage's configuration: ``--set`` over TOML over preset, typed, checked, saved.
+
+What is unknown, of a wrong type or out of range is a ConfigError, which names the nearest known
+name.
+"""
 
 from __future__ import annotations
 
@@ -34,10 +38,6 @@ def resolve_config(
 
     `preset` is ``draft``, ``standard`` or ``reference``. The TOML `file` has one table per stage;
     `assignments` are ``stage.key=value`` strings. Those of other `known_stages` are left alone.
-
-    Raises:
-        ConfigError: unknown preset, table or key (the nearest known one is named), wrong type,
-            or a value that the dataclass refuses.
     """
     if preset not in PRESETS:
         raise ConfigError(
@@ -101,12 +101,7 @@ def build_config(stage: Stage, values: Mapping[str, object]) -> Any:
 
 
 def build_dataclass(table: str, kind: type, values: Mapping[str, object], hint: str = "") -> Any:
-    """Make a config dataclass from the plain values of one table, checking names and types.
-
-    Raises:
-        ConfigError: unknown key (the nearest known one is named), wrong type, or a value that the
-            dataclass refuses.
-    """
+    """Make a config dataclass from the plain values of one table, checking names and types."""
     hints = typing.get_type_hints(kind)
     fields = {field.name: hints[field.name] for field in dataclasses.fields(kind)}
     checked = {}
@@ -121,11 +116,7 @@ def build_dataclass(table: str, kind: type, values: Mapping[str, object], hint: 
 
 
 def check_ranges(table: str, config: object, **ranges: tuple[float, float]) -> None:
-    """Refuse fields of a config that lie outside their ranges; both ends belong to a range.
-
-    Raises:
-        ConfigError: a field lies outside, or is not finite.
-    """
+    """Refuse fields of a config that lie outside their ranges; both ends belong to a range."""
     for name, (low, high) in ranges.items():
         value = getattr(config, name)
         if not (low <= value <= high and abs(value) < math.inf):
@@ -134,11 +125,7 @@ def check_ranges(table: str, config: object, **ranges: tuple[float, float]) -> N
 
 
 def parse_assignment(text: str) -> tuple[str, str, object]:
-    """Split ``stage.key=value``; the value is TOML, a bare word is a string.
-
-    Raises:
-        ConfigError: the text does not have that form.
-    """
+    """Split ``stage.key=value``; the value is TOML, a bare word is a string."""
     name, equals, raw = text.partition("=")
     table, dot, key = name.strip().partition(".")
     if not (equals and dot and table and key):

@@ -1,4 +1,7 @@
-"""Name the paths of a dataset folder that several parts use, and the subjects it excludes."""
+"""Name the paths of a dataset folder that several parts use, and the subjects it excludes.
+
+Folders that may not be written to are refused by ConfigError or OSError.
+"""
 
 from __future__ import annotations
 
@@ -19,20 +22,13 @@ def footage_root(capture: Path) -> Path:
 
     It is the capture's folder, a file's folder, or what ``source`` in capture.toml names: a capture
     may consist of capture.toml alone, which points to a read-only dataset.
-
-    Raises:
-        CaptureError: capture.toml is not TOML, or its source does not exist.
     """
     source = footage_source(Path(capture))
     return source.parent if source.is_file() else source
 
 
 def footage_source(capture: Path) -> Path:
-    """Return the path that ``source`` in capture.toml names; without it, the capture itself.
-
-    Raises:
-        CaptureError: capture.toml is not TOML, or its source does not exist.
-    """
+    """Return the path that ``source`` in capture.toml names; without it, the capture itself."""
     path = capture / "capture.toml"
     if not path.is_file():
         return capture
@@ -80,11 +76,7 @@ class Dataset:
         return self.root / "captures.json"
 
     def captures(self) -> dict[str, Path]:
-        """Return the registered raw captures by subject, sorted; empty before the first ingest.
-
-        Raises:
-            FormatError: the table is not a JSON object of strings.
-        """
+        """Return the registered raw captures by subject, sorted; empty before the first ingest."""
         if not self.captures_file.is_file():
             return {}
         ingest = advised("express50 ingest", self.root, "CAPTURE...")
@@ -237,12 +229,7 @@ def check_folder(dataset: Dataset) -> None:
 
 
 def check_results_folder(folder: Path) -> None:
-    """Refuse, before any work, a folder that cannot be written to or whose files stages write.
-
-    Raises:
-        ConfigError: it is a dataset, a stage's folder, a folder of shards, a capture, or a file.
-        OSError: the system refuses.
-    """
+    """Refuse, before any work, a folder that cannot be written to or whose files stages write."""
     _refuse_datasets_own(folder)
     if (folder / "capture.toml").is_file():  # results in it would make its ingest outdated
         raise ConfigError(f"{folder}: is a capture; name another folder")
@@ -252,12 +239,7 @@ def check_results_folder(folder: Path) -> None:
 
 
 def check_results_file(path: Path) -> None:
-    """Refuse, before any work, a file that cannot be written, or in a folder that stages write.
-
-    Raises:
-        ConfigError: it lies in a stage's folder, among labels or settings, or below a file.
-        OSError: it is a folder, or the system refuses.
-    """
+    """Refuse, before any work, a file that cannot be written, or in a folder that stages write."""
     _refuse_datasets_own(path)
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
@@ -265,11 +247,7 @@ def check_results_file(path: Path) -> None:
 
 
 def check_page_file(path: Path) -> None:
-    """Refuse a file that cannot be written as `check_results_file` does, or is not an HTML page.
-
-    Raises:
-        ConfigError: its name does not end in .html, so it may hold something else.
-    """
+    """Refuse what `check_results_file` does, and other files than pages, which end in .html."""
     check_results_file(path)
     if path.suffix.lower() not in (".html", ".htm"):
         raise ConfigError(f"{path}: expected the name of a page, which ends in .html")

@@ -196,12 +196,7 @@ def _load(point: EntryPoint) -> Any:
 
 @functools.cache
 def stages() -> dict[str, Stage]:
-    """Return every installed stage by name, in the order in which they run.
-
-    Raises:
-        StageError: none is installed.
-        ConfigError: two stages have one name.
-    """
+    """Return every installed stage by name, in the order in which they run."""
     found: dict[str, Stage] = {}
     points = entry_points(group="express50.stages")
     for point in sorted(points, key=lambda p: (p.name != OWN, p.name)):
@@ -248,9 +243,6 @@ def hook(name: str) -> Callable[..., Any]:
     ``label_problems(dataset, subjects)`` checks labels against their footage;
     ``read_checkpoint(path)`` reads a trained model or refuses it; ``redact_checkpoint(path,
     subject)`` takes a person out of one.
-
-    Raises:
-        StageError: no package brings it.
     """
     for point in entry_points(group="express50.hooks", name=name):
         return _load(point)

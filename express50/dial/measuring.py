@@ -40,12 +40,8 @@ def measured_figures(
     """Read what was measured of a chain's dataset, or measure it.
 
     Settings that there was no time to try are tried by the next run, unless its settings are
-    ``chosen`` already. Trials that are still there are not run again.
-
-    Raises:
-        ConfigError: the budget ended before any footage was ingested, or no stage states an error
-            in the goal's unit.
-        StageError: no footage can be measured.
+    ``chosen`` already. Trials that are still there are not run again. ConfigError if the budget
+    ended before any footage was ingested, StageError if no footage can be measured.
     """
     path = dial_dir(chain.dataset) / "measured.json"
     found = read_measured(path, chain.key())
@@ -156,10 +152,7 @@ def _subjects(chain: Chain) -> list[str]:
 
 
 def _measure_one(chain: Chain, clock: Clock, allowance: _Allowance) -> PilotFigures:
-    """Measure the first subject whose footage every stage can work on.
-
-    Raises as `measured_figures` does.
-    """
+    """Measure the first subject whose footage every stage can work on."""
     subjects = _subjects(chain)
     for subject in subjects:
         try:
@@ -228,9 +221,6 @@ def tune(chain: Chain) -> tuple[dict[str, Any], list[str]]:
     """Measure every setting on a few items; write ``dial/front.json`` and ``dial/front.csv``.
 
     Returns the table and lines for people.
-
-    Raises:
-        StageError: no footage can be measured.
     """
     measured = measured_figures(chain, Clock(None))
     load = replace(workload(chain, measured, False, {}), done=())

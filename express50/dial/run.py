@@ -120,12 +120,8 @@ def run_within(
     """Run the chain within a budget, or to a goal.
 
     Without a budget, the run takes as long as the goal takes; without a goal, it looks for the
-    least error in the time. `ended` is called with each stage's account.
-
-    Raises:
-        ConfigError: the budget does not cover the cheapest settings, or no setting reaches the
-            goal; the sentence says what would.
-        StageError: nothing can be measured.
+    least error in the time. `ended` is called with each stage's account. ConfigError if the budget
+    or the goal cannot be met; the sentence says what would do.
     """
     if goal is not None:
         check_unit(chain.kinds, goal)

@@ -42,9 +42,7 @@ FORMER = ".former"  # suffix of a folder that was moved out of the way
 def dump_json(value: object) -> bytes:
     """Encode as deterministic JSON with sorted keys.
 
-    Raises:
-        ValueError: a number is not finite.
-        FormatError: a text is not Unicode, as names of files may be.
+    FormatError for texts that are not Unicode, as names of files may be; ValueError for NaN.
     """
     text = json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False)
     try:
@@ -104,12 +102,7 @@ def nearest_existing(path: Path) -> Path:
 
 
 def check_folder_writable(folder: Path) -> None:
-    """Refuse, before any work, a folder that cannot be made or written to; nothing is left in it.
-
-    Raises:
-        ConfigError: it is a file, or lies below one.
-        OSError: the system refuses.
-    """
+    """Refuse, before any work, a folder that cannot be made or written to; leave nothing in it."""
     place = nearest_existing(folder)
     if not place.is_dir():
         raise ConfigError(f"{place}: is a file, expected a folder to write to; name another")
@@ -124,9 +117,6 @@ def check_disk(folder: Path, name: Path) -> None:
     """Refuse a disk that broke, or became read-only, after a run began; nothing is left on it.
 
     A folder that is gone is not the disk's fault. ``name`` is what the error names.
-
-    Raises:
-        DiskError: the disk of the folder refuses to be written to.
     """
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
@@ -157,13 +147,9 @@ def check_space(folder: Path) -> None:
 
 @contextmanager
 def naming_full_disk(path: Path, aside: Path | None = None) -> Iterator[None]:
-    """Turn any error caused by a full disk, even in a library, into one that names the path.
+    """Turn any error caused by a full disk, even in a library, into a DiskFullError with the path.
 
     ``aside`` is where the files lie until they are complete; errors name ``path`` instead of it.
-
-    Raises:
-        DiskFullError: the body raised such an error.
-        OSError: the body raised one of a file that became too large, which then names the path.
     """
     try:
         yield
@@ -299,10 +285,7 @@ def alone_in(folder: Path) -> Iterator[None]:
     """Make a folder, and hold it so that no other command writes results into it meanwhile.
 
     The system releases it however the process ends. File systems without locks hold nothing. What
-    a killed command was writing is removed.
-
-    Raises:
-        NotReadyError: another process holds it.
+    a killed command was writing is removed. NotReadyError if another process holds it.
     """
     made = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)

@@ -21,9 +21,6 @@ def cached_by_file(size: int) -> Callable[[Callable[..., T]], Callable[..., T]]:
 
     The function's first argument must be a path, or have a method `__fspath__`; all arguments must
     be hashable. A file counts as changed if its size, modification time or inode differs.
-
-    Raises:
-        OSError: on a call of the function, if the path cannot be examined.
     """
 
     def decorate(function: Callable[..., T]) -> Callable[..., T]:
@@ -70,12 +67,9 @@ def files_of(folder: Path, hidden: bool = False) -> list[Path]:
 
 
 def path_digest(path: Path, sha256: Callable[[Path], str] = file_sha256) -> str:
-    """Digest a file's content, or the names and contents of a folder's files.
+    """Digest a file's content, or names and contents of a folder's files; StageError if missing.
 
     ``sha256`` digests one file; the ledger passes a function that caches digests.
-
-    Raises:
-        StageError: the path does not exist.
     """
     if path.is_file():
         return sha256(path)

@@ -3,6 +3,8 @@
 OpenImageIO reads files with 8 and 16 bits, half and single floats, and encodes TIFF and EXR;
 imagecodecs reads PNG twice as fast; OpenCV decodes bytes in memory and encodes JPEG. Images are RGB
 (H, W, 3); files hold sRGB unless a name says linear.
+
+Files and arrays that cannot be read or written raise FormatError.
 """
 
 from __future__ import annotations
@@ -49,14 +51,7 @@ ORIENTATION = {turns: number for number, (turns, flipped) in TURNS.items() if no
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Read an image as (H, W) or (H, W, C) RGB in the file's own type.
-
-    Returns:
-        A uint8, uint16 or float32 array (half floats are widened).
-
-    Raises:
-        FormatError: the file is missing, truncated, not a flat image, or over the pixel limit.
-    """
+    """Read an image as (H, W) or (H, W, C) RGB in the file's own type, uint8, uint16 or float32."""
     if (plain := _plain_png(Path(path))) is not None:
         return plain
     source = open_image(path)
@@ -87,10 +82,8 @@ def read_image(path: Path) -> np.ndarray:
 def _plain_png(path: Path) -> np.ndarray | None:
     """Read a PNG of 8 or 16 bits without a palette, in half of OpenImageIO's time.
 
-    None for any other file, and for one that OpenImageIO has to refuse.
-
-    Raises:
-        FormatError: it is damaged. OpenImageIO's decoder would print that as well.
+    None for any other file, and for one that OpenImageIO has to refuse. It refuses damaged ones
+    itself, because OpenImageIO's decoder would print that as well.
     """
     with suppress(OSError), open_file(path) as file:
         head = file.read(26)
@@ -142,11 +135,7 @@ def _intact(chunk: bytes) -> bool:
 
 
 def open_image(path: Path) -> oiio.ImageInput:
-    """Open an image file and read its header; the caller closes it.
-
-    Raises:
-        FormatError: it is missing, not an image, or holds no grey or RGB, such as CMYK.
-    """
+    """Open an image file of grey or RGB and read its header; the caller closes it."""
     straight = oiio.ImageSpec()
     straight.attribute("oiio:UnassociatedAlpha", 1)  # otherwise colours are multiplied by alpha
     there = os.access(path, os.R_OK) and Path(path).is_file()
@@ -185,9 +174,6 @@ def read_exif(path: Path) -> tuple[int, float]:
     have no calibration: they are rotated upright first, so that width, height and principal point
     are those of the upright picture. A 35 mm equivalent focal length refers to the diagonal, which
     rotation does not change.
-
-    Raises:
-        FormatError: the file is not an image.
     """
     image = open_image(path)
     try:
@@ -210,11 +196,7 @@ class ColourProfile:
     data: bytes
 
     def to_srgb(self, image: np.ndarray) -> np.ndarray:
-        """Convert colours (H, W, 3) uint8 of this profile to sRGB; those outside of it are cut.
-
-        Raises:
-            RuntimeError: the profile cannot be used (imagecodecs.CmsError).
-        """
+        """Convert colours (H, W, 3) uint8 to sRGB, cut outside of it; CmsError if unusable."""
         return imagecodecs.cms_transform(
             np.ascontiguousarray(image), self.data, imagecodecs.cms_profile("srgb"),
             colorspace="rgb", outcolorspace="rgb",
@@ -226,9 +208,6 @@ def foreign_profile(path: Path) -> ColourProfile | None:
 
     OpenImageIO calls all pictures of 8 and 16 bits sRGB, whatever their profile is. Profiles of
     grey pictures do not count, and neither do those of float ones, which hold linear light.
-
-    Raises:
-        FormatError: the file is not an image.
     """
     image = open_image(path)
     spec = image.spec()
@@ -266,10 +245,6 @@ def write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:
     """Write (H, W) or (H, W, C) RGB, uint8, uint16 or float32, as .png, .jpg, .tif or .exr.
 
     JPEG's ``quality`` is 1 to 100; from 95 upwards chroma is not subsampled (4:4:4).
-
-    Raises:
-        FormatError: the file cannot be written.
-        DiskFullError: the disk is full.
     """
     image = np.ascontiguousarray(image)
     if image.dtype == np.float64:
@@ -293,9 +268,6 @@ def _encode_in_memory(path: Path, image: np.ndarray) -> bytes:
 
     OpenImageIO must not write to disk itself: on a full one, it leaves out the end of a file
     without an error, or ends the process. Needs Linux.
-
-    Raises:
-        FormatError: the format cannot hold such an image.
     """
     target = _make_output(path)
     channels = 1 if image.ndim == 2 else image.shape[2]
@@ -331,11 +303,7 @@ def _make_output(path: Path) -> oiio.ImageOutput:
 
 
 def encode_jpeg(image: np.ndarray, quality: int = 95) -> bytes:
-    """Encode an RGB (H, W, 3) or grey (H, W) uint8 image as JPEG; 4:4:4 from quality 95 upwards.
-
-    Raises:
-        FormatError: a side is empty or longer than the format allows, or it is another image.
-    """
+    """Encode an RGB (H, W, 3) or grey (H, W) uint8 image as JPEG; 4:4:4 from quality 95 upwards."""
     _check_sides("JPEG", image, JPEG_SIDE)
     if image.dtype != np.uint8 or image.shape[2:] not in ((), (1,), (3,)):
         kind = f"{image.dtype} {image.shape}"
@@ -351,9 +319,6 @@ def encode_png(image: np.ndarray) -> bytes:
 
     Each row is stored as its difference from the one above and compressed by libdeflate. Libpng
     takes three to five times as long for as many bytes (docs/LOG.md).
-
-    Raises:
-        FormatError: a side is empty, or longer than OpenCV reads.
 
     Source: PNG 1.2, 4 (chunks), 6.4 (filter type Up).
     """
@@ -391,11 +356,7 @@ def has_alpha(path: Path) -> bool:
 
 
 def decode_image(data: bytes, name: str = "image") -> np.ndarray:
-    """Decode JPEG or PNG bytes to RGB (H, W, 3) or grey (H, W), keeping 8 or 16 bits.
-
-    Raises:
-        FormatError: the bytes are not an image, or the image is over the pixel limit.
-    """
+    """Decode JPEG or PNG bytes to RGB (H, W, 3) or grey (H, W), keeping 8 or 16 bits."""
     width, height = image_size(data, name)
     if width * height > PIXEL_LIMIT:
         raise FormatError(f"{name}: {width}x{height} pixels, expected at most {PIXEL_LIMIT}")
@@ -403,11 +364,7 @@ def decode_image(data: bytes, name: str = "image") -> np.ndarray:
 
 
 def decode_cv(data: bytes, flags: int, name: str) -> np.ndarray:
-    """Decode bytes with OpenCV, refusing a truncated JPEG; callers check the image's size first.
-
-    Raises:
-        FormatError: the bytes are damaged or truncated.
-    """
+    """Decode bytes with OpenCV, refusing a truncated JPEG; callers check the image's size first."""
     if is_cut_short(data):
         raise FormatError(f"{name}: {CUT}")
     try:
@@ -421,9 +378,6 @@ def decode_cv(data: bytes, flags: int, name: str) -> np.ndarray:
 
 def image_size(data: bytes, where: str) -> tuple[int, int]:
     """Read width and height from a PNG's or JPEG's header, without decoding pixels.
-
-    Raises:
-        FormatError: the bytes are neither PNG nor JPEG.
 
     Source: PNG 1.2, 11.2.2 (IHDR).
     """
@@ -475,11 +429,7 @@ def _swap(image: np.ndarray) -> np.ndarray:
 
 
 def depth_to_uint16(depth: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Quantise a depth map (H, W), metres, to 16-bit steps; 0 where not valid.
-
-    Raises:
-        ValueError: a valid depth is not finite, not positive or over 3.27 m.
-    """
+    """Quantise a depth map (H, W), metres, to 16-bit steps; 0 where not valid."""
     inside = depth[valid]
     if inside.size and not (
         np.isfinite(inside).all() and inside.min() > 0 and inside.max() < DEPTH_LIMIT_M
@@ -534,11 +484,7 @@ def is_grey(rgb: np.ndarray) -> bool:
 
 
 def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Resize an image (H, W[, C]): average areas to shrink it, interpolate to enlarge it.
-
-    Raises:
-        ValueError: the image or its new size is empty.
-    """
+    """Resize an image (H, W[, C]): average areas to shrink it, interpolate to enlarge it."""
     if 0 in image.shape or min(width, height) < 1:
         had = f"{image.shape[1]}x{image.shape[0]}"
         raise ValueError(f"resize of {had} to {width}x{height} pixels, expected 1x1 or more")

@@ -2,6 +2,8 @@
 
 Frames are counted by decoding and found by their time stamp, because edit lists and broken muxers
 make a container's own frame count wrong. Writing the same pictures gives the same bytes.
+
+Whatever is wrong with a video is a CaptureError.
 """
 
 from __future__ import annotations
@@ -60,9 +62,6 @@ DAMAGE = (av.FFmpegError, OSError, ValueError, MemoryError, OverflowError)
 
 def check_whole(path: Path) -> None:
     """Refuse an MP4/MOV file whose boxes go past its end, or that has no index.
-
-    Raises:
-        CaptureError: the file is truncated, a link to nothing, or without read permission.
 
     Source: ISO/IEC 14496-12, 4.2: a box is its size (32 bits, or 64 after size 1), its type and
     content; size 0 runs to the end of the file.
@@ -205,11 +204,7 @@ def video_fps(path: Path) -> float:
 
 
 def common_fps(table: Path, videos: Iterable[Path]) -> float:
-    """Return the frame rate that videos state, except those that cannot be opened.
-
-    Raises:
-        CaptureError: they differ or state none; it asks for a rate in the `table`.
-    """
+    """Return the frame rate that videos state, except those that cannot be opened."""
     stated, unread = [], ""
     for path in videos:
         try:
@@ -234,9 +229,6 @@ def frame_times(path: Path) -> tuple[int, ...]:
 
     Frames of AVI files are decoded, unless all stand alone: what such a file says of their order
     may be wrong.
-
-    Raises:
-        CaptureError: the file is not a video, is truncated, or its frames have no time stamps.
     """
     check_whole(path)
     container, stream = _open(path)
@@ -313,9 +305,6 @@ def iterate_video(
 
     Yields:
         Time stamp (in the stream's own unit) and (H, W, 3) uint8 sRGB image.
-
-    Raises:
-        CaptureError: the file is not a video, is truncated or damaged, or holds no frame.
     """
     check_whole(path)
     container, stream = _open(path)
@@ -389,11 +378,7 @@ class VideoReader:
         self._last: av.VideoFrame | None = None
 
     def read(self, frame: int) -> np.ndarray:
-        """Read the image (H, W, 3) uint8 sRGB at a decode index.
-
-        Raises:
-            CaptureError: there is no such frame, or time stamps differ from the index.
-        """
+        """Read the image (H, W, 3) uint8 sRGB at a decode index."""
         return _pixels(self.path, self._frame(frame))
 
     def read_exactly(self, frame: int) -> np.ndarray:

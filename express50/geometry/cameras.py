@@ -102,11 +102,7 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
 
 
 def scale_camera(camera: Camera, sx: float, sy: float) -> Camera:
-    """Return the camera of the image scaled by (sx, sy); with a corner origin, K only scales.
-
-    Raises:
-        ValueError: no pixel would be left.
-    """
+    """Return the camera of the image scaled by (sx, sy); with a corner origin, K only scales."""
     width, height = round(camera.width * sx), round(camera.height * sy)
     if min(width, height) < 1:
         raise ValueError(f"{camera.id}: scaled to {width}x{height}, expected at least 1x1")
@@ -249,9 +245,6 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     Returns:
         Pixels (N, 2) as (x, y), NaN if depth <= 0 or where the lens folds, and depth (N,), camera
         z in metres. Both are NaN if a point is not finite.
-
-    Raises:
-        ValueError: points are not (N, 3).
 
     Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., ch. 6.
     """

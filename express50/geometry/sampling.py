@@ -67,11 +67,7 @@ def _pictured(camera: Camera, across: np.ndarray, down: np.ndarray) -> np.ndarra
 
 
 def undistort_image(image: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return image (H, W[, C]) as the pinhole camera ``pinhole(camera)`` would see it; 0 outside.
-
-    Raises:
-        ValueError: the image's size is not the camera's.
-    """
+    """Return image (H, W[, C]) as ``pinhole(camera)`` would see it; 0 outside."""
     if image.shape[:2] != (camera.height, camera.width):
         raise ValueError(
             f"camera {camera.id}: image is {image.shape[1]}x{image.shape[0]},"

@@ -30,9 +30,6 @@ def load_flame(path: str | Path) -> HeadModel:
 
     `path` is the model pickle (generic_model.pkl, flame2023.pkl, ...); landmark embedding, masks
     and template must be beside it.
-
-    Raises:
-        HeadModelError: a file is missing, damaged, unsafe or has another layout.
     """
     model = read_flame(Path(path))
     return check_head(add_mouth(model)) if len(model.template) == FLAME_VERTICES else model

@@ -70,11 +70,7 @@ class IctArrays:
 
 
 def load_ict(path: str | Path) -> HeadModel:
-    """Load ICT-FaceKit from a checkout (or its FaceXModel folder) or from an .npz of its arrays.
-
-    Raises:
-        HeadModelError: a file is missing or damaged, or the model has another topology.
-    """
+    """Load ICT-FaceKit from a checkout (or its FaceXModel folder) or from an .npz of its arrays."""
     path = Path(path)
     arrays = read_ict_npz(path) if path.suffix == ".npz" else read_ict_checkout(path)
     if arrays.template.shape != (VERTEX_COUNT, 3):

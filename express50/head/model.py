@@ -171,9 +171,6 @@ def pose(
 
     Returns:
         (B, V, 3) vertices, metres.
-
-    Raises:
-        ValueError: a tensor's shape does not fit.
     """
     rest = rest_vertices(model, shape, expression, offsets)
     joints = torch.einsum("jv,bvc->bjc", model.joint_regressor, rest)

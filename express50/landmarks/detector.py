@@ -99,9 +99,6 @@ def detect(
     them mirrored. `smallest` is the side of the smallest windows searched, as a share of the
     image's longer side. A face is found in windows of up to three times its width. If there is no
     face, each smaller size costs about three times as much as the one before.
-
-    Raises:
-        ValueError: another shape or type.
     """
     return detect_many(net, [image], refinements, smallest)[0]
 
@@ -113,9 +110,6 @@ def detect_many(
     """Detect as `detect` does in several images, such as a frame set, in less time.
 
     Smaller windows are not searched once `enough` images show a face; by default, all must.
-
-    Raises:
-        ValueError: an image of another shape or type.
     """
     for image in images:
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or 0 in image.shape:

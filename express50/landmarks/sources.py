@@ -74,16 +74,12 @@ def open_source(
     smallest: float = SMALLEST,
     pictures: Mapping[str, Camera] | None = None,
 ) -> Source:
-    """Return a source that is ready to be called.
+    """Return a source that is ready to be called; ConfigError if its file is missing or unfit.
 
     `landmarks` are `embedded`, `fan:PATH` (TorchScript weights) or the path of a file of points
     (.npz or .json, see docs/FORMAT.md), which are undistorted with the `cameras`, as recorded.
     `refinements` and `smallest` are those of `detect`. `pictures` are the pinhole cameras of the
     images; by default they have the recorded size.
-
-    Raises:
-        ConfigError: the file is missing, or is not of the expected kind.
-        FormatError: the file of points is malformed.
     """
     files = _existing_files(landmarks)
     if "landmarks" in files:
@@ -151,10 +147,6 @@ def read_points(
     `cameras` are as recorded; others of the file are left out. `pictures` are the pinhole cameras
     of the undistorted images; by default they have the recorded size. Rows (68 or 70, 3) are x, y
     in pixels of the undistorted image, NaN where a point is unknown, and confidence 0..1.
-
-    Raises:
-        FormatError: another format, shape, an infinite number, a confidence out of range, or points
-            far outside the image.
     """
     path = Path(path)
     raw = _read_raw(path)

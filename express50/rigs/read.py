@@ -2,6 +2,8 @@
 
 Most formats have modules of their own. OpenCV's YAML is read here, a file per camera or EasyMocap's
 two files; its pixel origin is the first pixel's centre, so K is shifted.
+
+Every reader raises CalibrationError if a file does not fit its format.
 """
 
 from __future__ import annotations
@@ -144,9 +146,6 @@ def read_rig(
 
     ``kind`` is one of FORMATS, or None to detect it; K is scaled to ``size``, the footage's width
     and height; the file's unit is ``metres_per_unit`` long.
-
-    Raises:
-        CalibrationError: no format fits, or the content does not fit the format.
     """
     known = FORMATS[kind or guess_format(path)]
     found = known.read(path, size) if known.sized else known.read(path)
@@ -159,9 +158,6 @@ def read_opencv_yaml(path: Path, size: tuple[int, int] | None) -> dict[str, Came
     """Read the cameras of a folder of ``<camera>.yml`` files, of one such file, or of EasyMocap.
 
     ``size`` is the width and height of the images, used if the files do not give them.
-
-    Raises:
-        CalibrationError: a matrix is missing or has the wrong shape, or no size is known.
     """
     found = []
     for name, where, table in _opencv_cameras(path):

@@ -102,12 +102,7 @@ def record_command(args: argparse.Namespace) -> int:
 
 
 def check_out(out: Path) -> None:
-    """Refuse, before any work, a folder that holds anything but an earlier recording.
-
-    Raises:
-        ConfigError: it holds other files.
-        OSError: the system refuses.
-    """
+    """Refuse, before any work, a folder that holds anything but an earlier recording."""
     if (out / SETTINGS).is_file():
         return
     check_results_folder(out)
@@ -128,9 +123,6 @@ def record(
 
     Writes ``out/captures/<subject>`` (raw capture layout) and ``out/truth/<subject>``. `report` is
     called regularly with the number of pictures done and of all pictures.
-
-    Raises:
-        CaptureError: ``out`` holds a recording with other settings.
     """
     script = select(config.expressions)
     path = out / SETTINGS

@@ -58,12 +58,7 @@ def subject_of(path: Path) -> str:
 
 
 def read_ava256(path: Path, selection: Selection) -> RawCapture:
-    """Read a capture's segments.
-
-    Raises:
-        CaptureError: a list or an archive is malformed, or no picture can be found.
-        CalibrationError: the cameras are malformed.
-    """
+    """Read a capture's segments."""
     file = path / "decoder/frame_list.csv"
     try:
         table = csv.DictReader(read_text(file, CaptureError).splitlines())
@@ -78,12 +73,7 @@ def read_ava256(path: Path, selection: Selection) -> RawCapture:
 
 
 def read_multiface(path: Path, selection: Selection) -> RawCapture:
-    """Read a capture's segments.
-
-    Raises:
-        CaptureError: no picture can be found, or the list of frames is malformed.
-        CalibrationError: ``KRT`` is malformed.
-    """
+    """Read a capture's segments."""
     file, listed = path / "frame_list.txt", []
     for number, line in enumerate(read_text(file, CaptureError).split("\n"), 1):
         words = line.split()  # such as E001_Neutral_Eyes_Open 000123
@@ -187,11 +177,7 @@ def _multiface_cameras(path: Path) -> dict[str, Camera]:
 
 
 def _multiface_pictures(path: Path, name: str, wanted: list[Moment]) -> dict[Moment, str]:
-    """Name each wanted picture that a camera has; folders are listed once, for network drives.
-
-    Raises:
-        CaptureError: a folder of the camera cannot be read.
-    """
+    """Name each wanted picture that a camera has; folders are listed once, for network drives."""
     have = {}
     for segment in dict(wanted):
         folder = path / "images" / segment / name

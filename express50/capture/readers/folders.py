@@ -163,11 +163,6 @@ def read_videos(path: Path, selection: Selection) -> RawCapture:
 
     A file that cannot be read as a video, such as a sound recording, is dropped. Without cues, the
     whole footage is one clip.
-
-    Raises:
-        CaptureError: the cameras share no footage, two names become one camera id, a picture lacks
-            its number, or cues or the board's files are malformed.
-        CalibrationError: calibration.json is malformed.
     """
     names = _videos(path, footage_folder(path))
     ids = unique_ids(path, names, lambda name: Path(name).stem)
@@ -178,8 +173,6 @@ def read_camera_folders(path: Path, selection: Selection) -> RawCapture:
     """Read a folder per camera: its pictures, its only video, or a video or folder per expression.
 
     A camera's name before that of an expression is left out.
-
-    Raises as `read_videos` does.
     """
     tree = _tree(path)
     one_clip = not tree.deep and (
@@ -197,20 +190,14 @@ def read_camera_folders(path: Path, selection: Selection) -> RawCapture:
 
 
 def read_expression_folders(path: Path, selection: Selection) -> RawCapture:
-    """Read a folder per expression, with a video, a picture or a folder of each camera.
-
-    Raises as `read_videos` does.
-    """
+    """Read a folder per expression, with a video, a picture or a folder of each camera."""
     tree = _tree(path)
     many = tree.deep and tree.kind == "frames"
     return _read_inner(path, tree, selection, lambda f, name: (f, _number(name) if many else 0))
 
 
 def read_frame_folders(path: Path, selection: Selection) -> RawCapture:
-    """Read a folder per frame, which has a picture of each camera.
-
-    Raises as `read_videos` does.
-    """
+    """Read a folder per frame, which has a picture of each camera."""
     return _read_inner(path, _tree(path), selection, lambda folder, _: (CLIP, _number(folder)))
 
 
@@ -219,8 +206,7 @@ def _read_inner(
 ) -> RawCapture:
     """Read folders that hold all cameras' files; their moments are of the folder and the file.
 
-    Raises:
-        CaptureError: a folder cannot be read, which all cameras would lose; or as `read_videos`.
+    A folder that cannot be read is refused: all cameras would lose it.
     """
     check_readable(*(footage_folder(path) / name for name in tree.empty))
     rows: dict[str, dict[Moment, str]] = {name: {} for name in sorted(tree.inner())}

@@ -52,10 +52,6 @@ def read_photos(path: Path, selection: Selection) -> RawCapture:
 
     Cameras are those of calibration.json; without it, calibrate solves them. A photograph whose
     EXIF says that it lies on its side is read upright.
-
-    Raises:
-        CaptureError: two names become one camera id, or no photograph can be used.
-        CalibrationError: calibration.json is malformed.
     """
     names = pictures_in(path, footage_folder(path))
     ids = unique_ids(path, names, lambda name: Path(name).stem)
@@ -94,12 +90,7 @@ def _model(path: Path) -> Path | None:
 
 
 def read_colmap_folder(path: Path, selection: Selection) -> RawCapture:
-    """Read every posed picture as a camera of one moment.
-
-    Raises:
-        CaptureError: no picture can be found.
-        CalibrationError: the model cannot be read, or has a lens that ours lack.
-    """
+    """Read every posed picture as a camera of one moment."""
     cameras, files = read_colmap_images(_model(path) or path)
     pictures = {name: {(MOMENT, 0): f"images/{file}"} for name, file in files.items()}
     return _read_posed(path, "colmap", cameras, pictures, selection)
@@ -113,12 +104,7 @@ def fits_transforms(path: Path) -> bool:
 
 
 def read_transforms_folder(path: Path, selection: Selection) -> RawCapture:
-    """Read cameras and time steps of a transforms.json.
-
-    Raises:
-        CaptureError: no picture can be found.
-        CalibrationError: the cameras are malformed, or move between time steps.
-    """
+    """Read cameras and time steps of a transforms.json."""
     file = path / "transforms.json" if path.is_dir() else path
     cameras = read_transforms(file, None)
     frames = read_json_table(file, CalibrationError)["frames"]

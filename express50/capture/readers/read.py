@@ -4,6 +4,9 @@ A layout is a row of a plain table: its name, what it looks like, a test, the su
 reader that turns it into a `RawCapture`. Nothing is copied or unpacked. A folder with capture.toml
 may name where the footage lies (``source``), which layout it is (``layout``) and which parts to
 take. So read-only datasets need no file of ours beside them.
+
+Every reader raises CaptureError if nothing of a capture can be used, and CalibrationError if its
+cameras are malformed.
 """
 
 from __future__ import annotations
@@ -100,11 +103,7 @@ LAYOUTS = (
 
 
 def detect(path: Path, name: object = None) -> Layout:
-    """Find the layout of a file or folder: the named one, else the first that fits.
-
-    Raises:
-        CaptureError: it does not exist, no layout has the name, or none fits.
-    """
+    """Find the layout of a file or folder: the named one, else the first that fits."""
     if not path.exists():
         raise CaptureError(f"{path}: no such folder or file; expected a capture")
     if name is not None:
@@ -183,11 +182,7 @@ def is_ours(path: Path) -> bool:
 
 
 def subject_of(path: Path) -> str:
-    """Find the subject of a capture of any layout without reading its footage.
-
-    Raises:
-        CaptureError: it is not a capture, or its subject cannot be an id.
-    """
+    """Find the subject of a capture of any layout without reading its footage."""
     if is_ours(path):
         return read_meta(path)["subject"]
     meta, source = read_capture_toml(path), footage_source(path)
@@ -200,12 +195,7 @@ def subject_of(path: Path) -> str:
 
 
 def read_any(path: Path) -> RawCapture:
-    """Read a capture of any layout.
-
-    Raises:
-        CaptureError: it is not a capture, or nothing of it can be used.
-        CalibrationError: its cameras are malformed or do not fit together.
-    """
+    """Read a capture of any layout."""
     if is_ours(path):
         return read_capture(path)
     meta, source = read_capture_toml(path), footage_source(path)

@@ -105,11 +105,7 @@ def _patterns(meta: Mapping[str, Any], key: str, where: Path) -> tuple[str, ...]
 
 
 def check_selection(selection: Selection, sequences: Sequence[str], cameras: Sequence[str]) -> None:
-    """Refuse patterns that match nothing: a typing error would look like missing data.
-
-    Raises:
-        CaptureError: a pattern matches nothing of the layout.
-    """
+    """Refuse patterns that match nothing: a typing error would look like missing data."""
     for what, patterns, known in (
         ("sequences", selection.sequences, sequences),
         ("[expressions]", tuple(selection.expressions), sequences),
@@ -153,9 +149,6 @@ def common_timeline(
         listed: moments that the layout's own list names, though no camera may have them.
         required: moments that must not be lost, so that a camera without them is dropped.
         dropped: cameras that are left out already, with the reason.
-
-    Raises:
-        CaptureError: the cameras share no moment.
     """
     counts = Counter(moment for table in pictures.values() for moment in table)
     present = sum(map(bool, pictures.values()))
