@@ -81,10 +81,7 @@ def export_labels(labels: Iterable[Label], path: Path, stored: Collection[Label]
 
 
 def import_labels(dataset: Dataset, path: Path) -> tuple[int, int]:
-    """Append the events of a file that the store does not hold yet; return (new, known).
-
-    Everything is checked before anything is written.
-    """
+    """Append a file's new events, once all of them are checked; return (new, known)."""
     labels = read_table(path)
     for number, label in enumerate(labels, 1):
         where = f"{path}: row {number}"

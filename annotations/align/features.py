@@ -62,10 +62,7 @@ class Features:
 
 
 def measure_features(index: Index, observations: FaceObservations) -> Features:
-    """Measure the features of a subject by cue window.
-
-    Expressions whose window holds no observed frame that shows a face are left out.
-    """
+    """Measure a subject's features by cue window; windows that show no face are left out."""
     windows = {}
     shown = observations.scores.max(axis=0) >= SEEN_SCORE
     for cue in index.cues:

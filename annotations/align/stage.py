@@ -94,10 +94,7 @@ def error_figures(suggested: Suggested) -> dict[str, float]:
 def suggest_for(
     dataset: Dataset, index: Index, match: bool
 ) -> tuple[dict[str, Suggested], list[Note]]:
-    """Suggest a frame for every expression, and note missing inputs.
-
-    Without observations nothing is suggested: only people's labels count then.
-    """
+    """Suggest a frame for every expression, none without observations; note missing inputs."""
     if not dataset.observations_file(index.subject).is_file():
         why = f"{index.subject} is not observed: run 'express50 observe' to see why"
         return {}, [Note("suggestions", why)]

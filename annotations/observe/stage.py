@@ -278,10 +278,7 @@ def face_side(neutral: np.ndarray) -> float:
 
 
 def similarity_2d(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Fit the similarity (2, 3) that takes points (N, 2) onto others.
-
-    Points that all coincide are moved, not scaled.
-    """
+    """Fit the similarity (2, 3) of points (N, 2) to others; points that coincide are only moved."""
     if np.ptp(source, axis=0).max() < LEAST_SIDE:
         return np.concatenate([np.eye(2), (target.mean(0) - source.mean(0))[:, None]], axis=1)
     lift = np.zeros((len(source), 1))

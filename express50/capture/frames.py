@@ -225,10 +225,7 @@ def read_peak_frame(dataset: Dataset, subject: str, expression: str, camera_id: 
 
 
 def read_matted_frame(dataset: Dataset, item: str, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Read a camera's peak frame (H, W, 3) uint8 of `subject/expression`, and its matte (H, W).
-
-    StageError without a matte.
-    """
+    """Read a camera's peak frame (H, W, 3) uint8 of `subject/expression`, and its matte (H, W)."""
     subject, expression = item.split("/")
     path = dataset.matte_file(subject, expression, camera.id)
     if not path.is_file():
@@ -321,10 +318,7 @@ def make_picture(image: np.ndarray, camera: Camera, size: tuple[int, int]) -> np
 def reduced(
     camera: Camera, rgb: np.ndarray, alpha: np.ndarray, side: int
 ) -> tuple[Camera, np.ndarray, np.ndarray]:
-    """Average a picture (H, W, 3) and its matte (H, W) down to at most ``side`` pixels.
-
-    The camera follows.
-    """
+    """Average a picture (H, W, 3), its matte and its camera down to at most ``side`` pixels."""
     small = shrink(rgb, side)
     if small is rgb:
         return camera, rgb, alpha

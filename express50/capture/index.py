@@ -89,10 +89,7 @@ def calibration_file(dataset: Dataset, index: Index) -> Path | None:
 
 
 def read_index(dataset: Dataset, subject: str) -> Index:
-    """Read a subject's index (cached until it or the table of captures changes).
-
-    StageError without an index or a registered capture, FormatError if it is malformed.
-    """
+    """Read a subject's index, cached until it or the table of captures changes."""
     path = dataset.index_file(subject)
     table = dataset.captures_file  # says where the footage lies
     try:

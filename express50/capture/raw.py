@@ -301,10 +301,7 @@ def _unreadable_plates(root: Path) -> dict[str, str]:
 
 
 def read_board(root: Path, cameras: Iterable[str]) -> dict | None:
-    """Return the content of board.toml and each camera's files, relative to the capture, or None.
-
-    The files are images of the board, or one video.
-    """
+    """Return board.toml's content and each camera's images, or one video, of the board; or None."""
     folder = root / "board"
     if not folder.is_dir():
         return None

@@ -218,10 +218,7 @@ def workload(
 
 
 def tune(chain: Chain) -> tuple[dict[str, Any], list[str]]:
-    """Measure every setting on a few items; write ``dial/front.json`` and ``dial/front.csv``.
-
-    Returns the table and lines for people.
-    """
+    """Measure every setting on a few items; write ``dial/front.json`` and ``dial/front.csv``."""
     measured = measured_figures(chain, Clock(None))
     load = replace(workload(chain, measured, False, {}), done=())
     points = front(load)

@@ -604,10 +604,7 @@ def _write_texts(
 def tile_sheet(
     pictures: Mapping[str, np.ndarray], columns: int, side: int, alarming: Collection[str] = ()
 ) -> np.ndarray:
-    """Lay out named pictures in rows of square tiles, each with its name above it.
-
-    Names that are ``alarming`` are red.
-    """
+    """Lay out named pictures in rows of square tiles, names above, ``alarming`` names in red."""
     names = list(pictures)
     rows = [names[k : k + columns] for k in range(0, len(names), columns)]
     tiles = [[pictures[name] for name in row] for row in rows]

@@ -96,10 +96,7 @@ def is_rigid(T: np.ndarray) -> bool:
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 1.0, 0.0)) -> np.ndarray:
-    """Return ``cam_from_world`` (4, 4), OpenCV axes, at ``eye`` (3,) looking at ``target``.
-
-    By default, +y is up.
-    """
+    """Return ``cam_from_world`` (4, 4), OpenCV axes, at ``eye`` (3,) looking at ``target``."""
     forward = np.asarray(target, dtype=np.float64) - np.asarray(eye, dtype=np.float64)
     right = np.cross(forward, np.asarray(up, dtype=np.float64))
     if np.linalg.norm(right) < 1e-12 * max(1.0, float(np.linalg.norm(forward))):

@@ -49,10 +49,7 @@ COUNTERS = "num_batches_tracked"  # suffix of batch normalisation's buffers that
 
 
 def as_input(crops: np.ndarray) -> torch.Tensor:
-    """Make a network's input (B, 3, H, W), 0 to 1, of crops (B, H, W, 3) uint8.
-
-    It is in channels-last memory format, as the crops are.
-    """
+    """Make a network's input (B, 3, H, W), 0 to 1, channels last, of crops (B, H, W, 3) uint8."""
     return torch.from_numpy(crops).permute(0, 3, 1, 2).float() / 255.0
 
 
@@ -288,10 +285,7 @@ def save_network(net: LandmarkNet, path: Path) -> None:
 
 @lru_cache(maxsize=2)  # landmarks in pictures, and on the face UV map
 def load_network(path: Path = WEIGHTS) -> LandmarkNet:
-    """Read weights written by `save_network`, for evaluation only. Callers share the network.
-
-    Batch normalisations are folded into the convolutions before them.
-    """
+    """Read weights of `save_network` to evaluate and share; batch normalisations are folded."""
     net = trainable_network(path).eval()
     fold(net)
     return net.to(memory_format=torch.channels_last)

@@ -77,10 +77,7 @@ def camera_names(frames: list[dict]) -> list[str]:
 
 
 def frame_camera(where: str, name: str, row: dict, size: tuple[int, int] | None) -> Camera:
-    """Make the camera of one frame's row; ``size`` is used if the row gives no image size.
-
-    A value of the wrong type raises what NumPy and Python make of it.
-    """
+    """Make the camera of one frame's row; ``size`` is used if the row gives no image size."""
     model = str(row.get("camera_model", "OPENCV"))
     if model not in _HELD:
         raise CalibrationError(

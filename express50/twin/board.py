@@ -76,10 +76,7 @@ def board_pattern() -> np.ndarray:
 
 
 def render_board(world_from_board: np.ndarray, camera: Camera, seed: int) -> np.ndarray:
-    """Render the board in the studio as a linear picture (H, W, 3) float32.
-
-    Every pixel averages the pattern over several rays.
-    """
+    """Render the board in the studio, linear (H, W, 3) float32, with several rays per pixel."""
     image = np.empty((camera.height, camera.width, 3), np.float32)
     normal = -world_from_board[:3, 2]
     faces_camera = normal @ (camera.center - world_from_board[:3, 3]) > 0

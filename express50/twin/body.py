@@ -53,10 +53,7 @@ def build_body(
     hair_detail: float = 1.0,
     kinds: tuple[str, ...] = (),
 ) -> Body:
-    """Build the geometry of a subject, and what it wears of the `config.KINDS`.
-
-    With a hair detail of 0 the scalp is bald.
-    """
+    """Build a subject's body and what it wears of `KINDS`; a hair detail of 0 leaves it bald."""
     template = model.template.double().numpy()
     faces = model.faces.numpy().astype(np.int32)
     centre = head_centre(model)

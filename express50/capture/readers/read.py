@@ -240,11 +240,7 @@ def watched(path: Path) -> list[Path]:
 
 
 def read_people(dataset: Dataset, subjects: Iterable[str]) -> list[dict]:
-    """Read gender and age of subjects, in order, from their captures.
-
-    They are read for counts and kept nowhere; an entry is empty where the capture is gone or says
-    nothing.
-    """
+    """Read gender and age of subjects from their captures, for counts; empty if they are gone."""
     captures = dataset.captures()
     people = []
     for subject in subjects:

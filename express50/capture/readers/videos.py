@@ -213,10 +213,7 @@ def video_id(path: Path) -> str:
 
 
 def read_video(path: Path, selection: Selection) -> RawCapture:
-    """Read a video as one camera and one clip, named ``clip`` unless the selection names it.
-
-    A video that a phone stored on its side is read upright.
-    """
+    """Read a video as one camera and one clip, ``clip`` unless the selection names it."""
     check_selection(selection, [CLIP], ["video"])
     turn = ORIENTATION[video_tags(path).turn]
     camera = RawCamera(

@@ -77,9 +77,6 @@ def laplace_loss(
 def place_loss(
     found: torch.Tensor, log_scale: torch.Tensor, heat: torch.Tensor, points: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return losses and distances (B, N) of found points (B, N, 2), in pixels of the crop.
-
-    The loss sums distance, likelihood and cross entropy.
-    """
+    """Return losses (distance, likelihood, cross entropy) and distances (B, N) of found points."""
     loss, distance = laplace_loss(found, log_scale, points)
     return loss + heat_loss(heat, points), distance
