@@ -52,7 +52,7 @@ _FIELDS = tuple(field.name for field in fields(Label))
 def export_labels(labels: Iterable[Label], path: Path, stored: Collection[Label] = ()) -> None:
     """Write events as CSV or JSON, by the file's ending.
 
-    A file that is there may hold ``stored`` events alone, and none that somebody meant to import.
+    An existing file is replaced if it holds ``stored`` events alone: others may wait for import.
     """
     _check_format(path)
     if path.exists():

@@ -102,10 +102,7 @@ class Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, words)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse a command's arguments; refuse those left over here, where its options are known.
-
-        Print the whole help if there are none and a sub-command is expected.
-        """
+        """Parse a command's arguments; refuse those left over here, where its options are known."""
         args = sys.argv[1:] if args is None else args
         if not args and self._subparsers is not None:
             self.print_help(sys.stderr)

@@ -278,10 +278,7 @@ def _event_about(values: np.ndarray, weights: np.ndarray, row: int) -> Event:
 
 
 def candidate_rows(row: int, others: list[int], curve: np.ndarray) -> list[int]:
-    """List rows worth a look, best first: the suggestion, other events, the curve's maxima.
-
-    At most CANDIDATES, at least CANDIDATE_GAP frames apart.
-    """
+    """List rows worth a look, best first: the suggestion, other events, the curve's maxima."""
     padded = np.pad(curve, 1, constant_values=-np.inf)
     peaks = np.flatnonzero((curve >= padded[:-2]) & (curve >= padded[2:]))
     ranked = [*others, *(int(k) for k in peaks[np.argsort(-curve[peaks], kind="stable")])]

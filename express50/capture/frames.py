@@ -6,8 +6,8 @@ Stages after ``frames`` read the peak frames and plates that it wrote (``read_pe
 Pictures are what the ``frames`` stage makes of recorded frames: undistorted, and reduced if its
 settings say so. ``make_picture`` and ``read_cameras_of`` are where pictures and cameras meet.
 
-Footage and pictures that cannot be read, or changed, raise CaptureError; malformed tables raise
-FormatError; what an earlier stage must make first raises StageError.
+Footage and pictures that are missing, damaged or changed raise CaptureError, malformed tables
+FormatError, and subjects that are not ingested or calibrated StageError.
 """
 
 from __future__ import annotations

@@ -413,7 +413,10 @@ def goal_result(load: Workload, goal: Goal) -> str:
 
 
 def choose(points: Sequence[Point], seconds: float, goal: tuple[str, float] | None) -> Point:
-    """Return the best point in the time, the quickest that reaches a goal, or the quickest."""
+    """Return the best point within the time; with a goal, the quickest that reaches it.
+
+    If no point fits, return the quickest.
+    """
     fitting = [point for point in points if point.seconds <= seconds] or [points[0]]
     if goal is not None:
         name, value = goal

@@ -242,10 +242,7 @@ def read_alpha(path: Path) -> np.ndarray:
 
 
 def write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:
-    """Write (H, W) or (H, W, C) RGB, uint8, uint16 or float32, as .png, .jpg, .tif or .exr.
-
-    JPEG's ``quality`` is 1 to 100; from 95 upwards chroma is not subsampled (4:4:4).
-    """
+    """Write (H, W) or (H, W, C) RGB, uint8, uint16 or float32, as .png, .jpg, .tif or .exr."""
     image = np.ascontiguousarray(image)
     if image.dtype == np.float64:
         image = image.astype(np.float32)

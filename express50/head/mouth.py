@@ -179,7 +179,10 @@ def _pouch(model: HeadModel, chart: np.ndarray) -> _Part:
 
 
 def mouth_loop(faces: np.ndarray, name: str) -> np.ndarray:
-    """Return the open loop (32,) behind the lips from CORNERS[0] on, in new faces' direction."""
+    """Return the ids (32,) of the open loop behind the lips, in the order of new faces along it.
+
+    It starts at the first of CORNERS.
+    """
     # The face on the other side of an edge runs along it in the opposite direction.
     following = {int(b): int(a) for a, b in open_edges(faces)}
     loop = [CORNERS[0]]

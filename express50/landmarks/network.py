@@ -285,7 +285,10 @@ def save_network(net: LandmarkNet, path: Path) -> None:
 
 @lru_cache(maxsize=2)  # landmarks in pictures, and on the face UV map
 def load_network(path: Path = WEIGHTS) -> LandmarkNet:
-    """Read weights of `save_network` to evaluate and share; batch normalisations are folded."""
+    """Read weights written by `save_network`, for evaluation only. Callers share the network.
+
+    Batch normalisations are folded into the convolutions before them.
+    """
     net = trainable_network(path).eval()
     fold(net)
     return net.to(memory_format=torch.channels_last)
