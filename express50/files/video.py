@@ -519,14 +519,8 @@ class ImageFootage:
         self._suffix = suffix
         self._count = 0
 
-    def __enter__(self) -> ImageFootage:
-        return self
-
     def write(self, image: np.ndarray) -> None:
         """Append a picture (H, W, 3) uint8 sRGB."""
         data = encode_png(image) if self._suffix == "png" else encode_jpeg(image, 97)
         (self._folder / f"{self._count:06d}.{self._suffix}").write_bytes(data)
         self._count += 1
-
-    def __exit__(self, *unused: object) -> None:
-        """Do nothing: no file is open between pictures."""

@@ -97,10 +97,10 @@ def film_subject(
         for view in views:
             folder, size = capture / "cameras" / view.camera.id, (config.width, config.height)
             if config.footage == "video":
-                films.append(VideoFootage(folder, *size, config.fps, config.crf))
+                video = VideoFootage(folder, *size, config.fps, config.crf)
+                films.append(stack.enter_context(video))
             else:
                 films.append(ImageFootage(folder, config.footage))
-            stack.enter_context(films[-1])
         for frame in range(play.frames):
             posed = pose_body(body, play, frame)
             living = None
