@@ -81,14 +81,11 @@ def make_sheet(
     dataset: Dataset,
     subjects: Collection[str] | None = None,
     expressions: Collection[str] | None = None,
+    # shown wherever a subject has it; by default the one in which the reference's was chosen
     camera: str | None = None,
-    sure: float = 0.5,
+    sure: float = 0.5,  # suggestions below it are doubtful
 ) -> Sheet:
-    """Make the sheet of some subjects and expressions; excluded subjects are left out.
-
-    The reference is always shown. `camera` is shown wherever a subject has it; by default it is the
-    one in which the reference's frame was chosen. Suggestions less sure than `sure` are doubtful.
-    """
+    """Make the sheet of some subjects and expressions, always of the reference, too."""
     reference = reference_subject(dataset)
     where, included = str(dataset.root), included_subjects(dataset)
     check_known(where, "included subject", subjects or (), included)

@@ -45,15 +45,14 @@ def worklist(
     annotator: str,
     subjects: Collection[str] | None = None,
     expressions: Collection[str] | None = None,
+    # ``doubt`` (least sure first), ``expression`` (one across all subjects, in the cues' order)
+    # or ``subject``
     order: str = "doubt",
-    everything: bool = False,
+    everything: bool = False,  # lists what this annotator has labelled, too
 ) -> list[LabelTask]:
     """List the tasks of an annotator, the reference's first in every order.
 
-    Excluded subjects have no tasks. What this annotator has labelled is done, and is listed only
-    with `everything`; the labels of others do not count. The `order` is ``doubt`` (least sure
-    first), ``expression`` (one across all subjects, then the next, in the order of the cues) or
-    ``subject``.
+    Excluded subjects have no tasks. The labels of others do not count.
     """
     known = included_subjects(dataset)
     check_known(str(dataset.root), "included subject", subjects or (), known)

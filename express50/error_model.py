@@ -68,15 +68,13 @@ def error_models() -> dict[str, ErrorModel]:
 
 def error_bounds(
     stage: str,
-    figures: Mapping[str, np.ndarray | float],
+    figures: Mapping[str, np.ndarray | float],  # each (N,) or one for all
+    # standard deviation of an additional error that all elements have in common, such as that of
+    # the distance from a single camera
     shared: np.ndarray | float = 0.0,
     model: ErrorModel | None = None,
 ) -> Bounds:
-    """Return the bounds of N elements from their figures, each (N,) or one for all.
-
-    `shared` is the standard deviation of an additional error that all elements have in common, such
-    as that of the distance from a single camera. `expected` is None if N is 0.
-    """
+    """Return the bounds of N elements from their figures; `expected` is None if N is 0."""
     model = model or error_models()[stage]
     score = scores_of(model, figures)
     # Extrapolate with slope 1 beyond the table: scores are logarithms of errors.

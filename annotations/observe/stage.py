@@ -136,15 +136,13 @@ def frames_to_try(rest: np.ndarray, frames: np.ndarray) -> list[int]:
 
 def choose_cameras(
     index: Index,
-    score: Callable[[str, int, float], float],
-    attempts: Sequence[tuple[float, int]],
+    score: Callable[[str, int, float], float],  # rates the face that a camera shows in a frame
+    attempts: Sequence[tuple[float, int]],  # size of the smallest windows to search, and frame
     min_score: float,
 ) -> tuple[float, int, list[str]]:
     """Find the first attempt that shows a face, and rank the cameras that see it best.
 
-    An attempt is the size of the smallest windows to search, and a frame; `score` rates the face
-    that a camera shows. Returns the size that was enough, the frame and the cameras; StageError if
-    no attempt shows a face.
+    Returns the size that was enough, the frame and the cameras; StageError if no attempt does.
     """
     best = 0.0
     for smallest, frame in attempts:

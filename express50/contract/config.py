@@ -29,16 +29,12 @@ _KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: 
 
 def resolve_config(
     stage: Stage,
-    preset: str = "standard",
-    file: Path | None = None,
-    assignments: Sequence[str] = (),
-    known_stages: Iterable[str] = (),
+    preset: str = "standard",  # one of PRESETS
+    file: Path | None = None,  # TOML, one table per stage
+    assignments: Sequence[str] = (),  # ``stage.key=value``
+    known_stages: Iterable[str] = (),  # whose settings are left alone
 ) -> Any:
-    """Build the configuration of one stage, an instance of ``stage.config``.
-
-    `preset` is ``draft``, ``standard`` or ``reference``. The TOML `file` has one table per stage;
-    `assignments` are ``stage.key=value`` strings. Those of other `known_stages` are left alone.
-    """
+    """Build the configuration of one stage, an instance of ``stage.config``."""
     if preset not in PRESETS:
         raise ConfigError(
             f"{stage.name}: unknown preset {preset!r}{nearest(preset, PRESETS)}; "

@@ -90,17 +90,13 @@ class Pilot:
 
     def trial(
         self,
-        settings: Mapping[str, str],
+        settings: Mapping[str, str],  # by stage
         peaks: int,
-        source: Trial | None,
-        words: str = "",
-        limit: float = math.inf,
+        source: Trial | None,  # the trial to start from
+        words: str = "",  # for people, before it runs
+        limit: float = math.inf,  # seconds after which none of its items begins
     ) -> Trial:
-        """Run one trial, or read it if it ran before.
-
-        `settings` are named by stage; `source` is the trial to start from. `words` tell people what
-        is measured before it runs. After `limit` seconds none of its items begins.
-        """
+        """Run one trial, or read it if it ran before."""
         chain, record = self.chain, self.record(settings, peaks)
         self.cut = False
         if record.is_file():

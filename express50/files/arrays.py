@@ -48,16 +48,12 @@ DAMAGE = (
 def read_arrays(
     path: Path,
     kind: Kind,
-    what: str,
+    what: str,  # the file should be, for messages, such as "a track"
     wanted: Collection[str] = (),
-    fix: str = AGAIN,
-    only: bool = False,
+    fix: str = AGAIN,  # what to do about another file
+    only: bool = False,  # read no other arrays than the wanted ones
 ) -> dict[str, np.ndarray]:
-    """Read the arrays of an ``.npz`` file by name; refuse arrays of objects.
-
-    Messages say ``what`` the file should be, such as "a track", and how to ``fix`` it. With
-    ``only``, no other arrays than the ``wanted`` ones are read.
-    """
+    """Read the arrays of an ``.npz`` file by name; refuse arrays of objects."""
     try:
         with open_file(path) as whole, zipfile.ZipFile(whole) as archive:
             members = archive.infolist()

@@ -560,16 +560,12 @@ WHITE, ALARM = (255, 255, 255), (255, 120, 90)
 
 def contact_sheet(
     rows: Sequence[Sequence[np.ndarray]],
-    labels: Sequence[str | Sequence[str]] = (),
+    labels: Sequence[str | Sequence[str]] = (),  # per row one text, or one per image
     tile: tuple[int, int] = (160, 160),
-    captions: Sequence[str] = (),
-    alarming: Collection[str] = (),
+    captions: Sequence[str] = (),  # above the columns
+    alarming: Collection[str] = (),  # labels that are red
 ) -> np.ndarray:
-    """Lay out rows of images as one picture (H, W, 3) uint8.
-
-    A row's label is one text, or one per image; ``captions`` stand above the columns. Labels that
-    are ``alarming`` are red.
-    """
+    """Lay out rows of images as one picture (H, W, 3) uint8."""
     columns = max((len(row) for row in rows), default=1)
     blank = np.full((*tile, 3), 24, np.uint8)
     lines = []

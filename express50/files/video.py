@@ -154,14 +154,11 @@ def _decode(
     path: Path,
     container: av.container.InputContainer,
     stream: av.VideoStream,
+    # frames that may be left out, if no other needs them
     unneeded: Callable[[int], bool] | None = None,
-    packets: Iterable[av.Packet] | None = None,
+    packets: Iterable[av.Packet] | None = None,  # all that follow
 ) -> Iterator[av.VideoFrame]:
-    """Yield frames in display order from the current position; raise CaptureError on damage.
-
-    Frames whose time stamps are `unneeded` may be left out, if no other frame refers to them.
-    `packets` are those to decode, by default all that follow.
-    """
+    """Yield frames in display order from the current position; raise CaptureError on damage."""
     context = stream.codec_context
     try:
         for packet in packets or container.demux(stream):

@@ -93,17 +93,13 @@ def check_faces(faces: np.ndarray, count: int) -> None:
 
 def write_obj(
     path: Path,
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    uv: np.ndarray,
-    uv_faces: np.ndarray,
-    texture: str | None,
+    vertices: np.ndarray,  # (V, 3)
+    faces: np.ndarray,  # (F, 3)
+    uv: np.ndarray,  # (T, 2)
+    uv_faces: np.ndarray,  # (F, 3)
+    texture: str | None,  # name of a picture beside the OBJ, for an .mtl file with the OBJ's name
 ) -> None:
-    """Write an OBJ file of vertices (V, 3) and faces (F, 3) with texture coordinates.
-
-    The coordinates are ``uv`` (T, 2) and ``uv_faces`` (F, 3). ``texture`` may be the file
-    name of a picture beside the OBJ; an .mtl file with the OBJ's name then refers to it.
-    """
+    """Write an OBJ file with texture coordinates."""
     lines = []
     if texture is not None:
         material = path.with_suffix(".mtl")
@@ -131,20 +127,15 @@ def split_seams(
 
 def encode_glb(
     name: str,
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    vertices: np.ndarray,  # (V, 3)
+    faces: np.ndarray,  # (F, 3)
     *,
-    normals: np.ndarray | None = None,
-    colours: np.ndarray | None = None,
-    uv: np.ndarray | None = None,
-    **material: Any,
+    normals: np.ndarray | None = None,  # (V, 3) unit
+    colours: np.ndarray | None = None,  # (V, 4) uint8, linear (glTF 2.0, 3.9.2)
+    uv: np.ndarray | None = None,  # (V, 2)
+    **material: Any,  # more of trimesh's PBRMaterial, such as its texture
 ) -> bytes:
-    """Encode as binary glTF one rough, non-metallic mesh: vertices (V, 3) and faces (F, 3).
-
-    Normals (V, 3) have unit length; colours (V, 4) are uint8, linear light, as glTF 2.0 (3.9.2)
-    defines COLOR_0; ``uv`` is (V, 2). ``material`` holds further properties of trimesh's
-    PBRMaterial, such as its texture.
-    """
+    """Encode as binary glTF one rough, non-metallic mesh."""
     import trimesh
 
     material = {"metallicFactor": 0.0, "roughnessFactor": 0.8} | material

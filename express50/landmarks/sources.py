@@ -68,19 +68,14 @@ def try_source(landmarks: str) -> None:
 
 
 def open_source(
-    landmarks: str,
-    cameras: Mapping[str, Camera],
-    refinements: int = 3,
+    landmarks: str,  # `embedded`, `fan:PATH` (TorchScript), or a file of points (docs/FORMAT.md)
+    cameras: Mapping[str, Camera],  # as recorded, to undistort given points
+    refinements: int = 3,  # of `detect`, as is the next
     smallest: float = SMALLEST,
+    # the images' pinhole cameras; or the recorded size
     pictures: Mapping[str, Camera] | None = None,
 ) -> Source:
-    """Return a source that is ready to be called; ConfigError if its file is missing or unfit.
-
-    `landmarks` are `embedded`, `fan:PATH` (TorchScript weights) or the path of a file of points
-    (.npz or .json, see docs/FORMAT.md), which are undistorted with the `cameras`, as recorded.
-    `refinements` and `smallest` are those of `detect`. `pictures` are the pinhole cameras of the
-    images; by default they have the recorded size.
-    """
+    """Return a source that is ready to be called; ConfigError if its file is missing or unfit."""
     files = _existing_files(landmarks)
     if "landmarks" in files:
         table = read_points(files["landmarks"], cameras, pictures)

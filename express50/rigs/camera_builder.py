@@ -22,16 +22,12 @@ NO_SIZE = "does not give the images' size; pass --size WIDTHxHEIGHT to 'express5
 
 def camera_from_K(
     camera_id: str,
-    K: np.ndarray,
-    dist: Sequence[float] | np.ndarray,
-    size: tuple[int, int],
-    cam_from_world: np.ndarray,
+    K: np.ndarray,  # (3, 3) pixels, corner origin
+    dist: Sequence[float] | np.ndarray,  # OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 or the first of them
+    size: tuple[int, int],  # width and height
+    cam_from_world: np.ndarray,  # (4, 4) OpenCV axes
 ) -> Camera:
-    """Return a camera of the smallest COLMAP model that holds the distortion.
-
-    `K` (3, 3) has pixels with a corner origin; `dist` has OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6,
-    and missing terms are 0; `size` is width and height; `cam_from_world` (4, 4) has OpenCV axes.
-    """
+    """Return a camera of the smallest COLMAP model that holds the distortion."""
     K, d = np.asarray(K, dtype=np.float64), np.zeros(14)
     given = np.asarray(dist, dtype=np.float64).ravel()
     if given.size > d.size:

@@ -138,15 +138,11 @@ def guess_format(path: Path) -> str:
 
 def read_rig(
     path: Path,
-    kind: str | None = None,
-    size: tuple[int, int] | None = None,
-    metres_per_unit: float = 1.0,
+    kind: str | None = None,  # one of FORMATS, or None to detect it
+    size: tuple[int, int] | None = None,  # the footage's width and height, for K
+    metres_per_unit: float = 1.0,  # of the file
 ) -> dict[str, Camera]:
-    """Read the cameras of a calibration file or folder that another tool wrote.
-
-    ``kind`` is one of FORMATS, or None to detect it; K is scaled to ``size``, the footage's width
-    and height; the file's unit is ``metres_per_unit`` long.
-    """
+    """Read the cameras of a calibration file or folder that another tool wrote."""
     known = FORMATS[kind or guess_format(path)]
     found = known.read(path, size) if known.sized else known.read(path)
     if size is not None:

@@ -117,12 +117,11 @@ def record(
     config: TwinConfig,
     out: Path,
     workers: int = 2,
-    report: Callable[[int, int], None] | None = None,
+    report: Callable[[int, int], None] | None = None,  # takes pictures done and in all
 ) -> list[str]:
     """Record the subjects that do not exist yet, and return their ids; others are kept.
 
-    Writes ``out/captures/<subject>`` (raw capture layout) and ``out/truth/<subject>``. `report` is
-    called regularly with the number of pictures done and of all pictures.
+    Writes ``out/captures/<subject>`` (raw capture layout) and ``out/truth/<subject>``.
     """
     script = select(config.expressions)
     path = out / SETTINGS

@@ -68,16 +68,15 @@ def bands(camera: Camera) -> Iterator[RowBand]:
 def render_band(
     caster: Caster,
     material: np.ndarray,
-    window: tuple[int, int, int, int],
+    window: tuple[int, int, int, int],  # x0, y0, x1, y1 of where the subject may be
     band: RowBand,
     sampling: Sampling,
-    shade: Shade | None,
+    shade: Shade | None,  # None: black
 ) -> tuple[np.ndarray, np.ndarray, tuple[slice, slice]] | None:
-    """Render premultiplied colour and alpha of the part of a band where the subject may be.
+    """Render premultiplied colour and alpha of the part of a band inside a window of the image.
 
-    That is inside ``window``: columns and rows x0, y0, x1, y1 of the image. Returns colour (h, w,
-    3), alpha (h, w) float32, and their rows and columns in the image; None if the band does not
-    meet the window. Without ``shade``, colours are 0.
+    Returns colour (h, w, 3), alpha (h, w) float32, and their rows and columns in the image; None
+    if the band does not meet the window.
     """
     x0, x1 = window[0], window[2]
     y0, y1 = max(band.top, window[1]), min(band.bottom, window[3])
@@ -137,17 +136,13 @@ def _detail(
 def _refined(
     caster: Caster,
     origin: np.ndarray,
-    grid: np.ndarray,
-    samples: tuple[np.ndarray, np.ndarray],
+    grid: np.ndarray,  # (3, N, 3)
+    samples: tuple[np.ndarray, np.ndarray],  # those of the pixels' centres
     count: int,
-    sparing: bool,
+    sparing: bool,  # no more than a third of the rays if these all hit or all miss
     shade: Shade | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return colour (N, 3) and alpha (N,) of pixels (3, N, 3) as means of ``count`` samples.
-
-    ``samples`` are those of their centres. If ``sparing``, pixels get a third of the rays first,
-    and no more if these all hit or all miss.
-    """
+    """Return colour (N, 3) and alpha (N,) of pixels as means of ``count`` samples."""
     places = np.stack(ray_pattern(count), axis=1)
     others = np.delete(np.arange(count), count // 2)
     first = others[:: len(others) // 2] if sparing and len(others) > 4 else others

@@ -75,16 +75,12 @@ def make_view(camera: Camera, index: int, seed: int, keep: bool) -> StudioView:
 def film_subject(
     config: TwinConfig,
     subject_id: str,
-    camera_indices: list[int],
+    camera_indices: list[int],  # that with camera 0 writes the truth
     capture: Path,
     truth: Path,
-    tick: Callable[[], None],
+    tick: Callable[[], None],  # called after every picture
 ) -> None:
-    """Record all frames of one subject in some cameras, and their plates.
-
-    Other processes may film the other cameras; the one with camera 0 writes the truth. ``tick`` is
-    called after every picture.
-    """
+    """Record all frames of one subject in some cameras, and their plates."""
     body, play = cast_subject(config, subject_id)
     number, seed = body.subject.number, config.seed
     rig = list(make_rig(config.cameras, config.width, config.height, seed).values())

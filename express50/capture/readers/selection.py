@@ -131,25 +131,17 @@ class Timeline:
 
 
 def common_timeline(
-    root: Path,
+    root: Path,  # the folder that the names are relative to
+    # name of each picture or video by moment, by camera
     pictures: Mapping[str, Mapping[Moment, str]],
-    order: Sequence[str],
-    kind: str = "frames",
+    order: Sequence[str],  # sequences in the order they are to have
+    kind: str = "frames",  # ``frames``, or ``videos`` of one moment each
+    # moments that the layout's own list names, though no camera may have them
     listed: Collection[Moment] = (),
-    required: Collection[Moment] = (),
-    dropped: Mapping[str, str] | None = None,
+    required: Collection[Moment] = (),  # moments that must not be lost: a camera without is dropped
+    dropped: Mapping[str, str] | None = None,  # cameras that are left out already, with the reason
 ) -> Timeline:
-    """Find the moments that all cameras share.
-
-    Args:
-        root: the folder that the names are relative to.
-        pictures: name of each picture or video by moment, by camera.
-        order: sequences in the order they are to have.
-        kind: ``frames``, or ``videos`` of one moment each.
-        listed: moments that the layout's own list names, though no camera may have them.
-        required: moments that must not be lost, so that a camera without them is dropped.
-        dropped: cameras that are left out already, with the reason.
-    """
+    """Find the moments that all cameras share."""
     counts = Counter(moment for table in pictures.values() for moment in table)
     present = sum(map(bool, pictures.values()))
     common = {moment for moment, count in counts.items() if 2 * count >= present}
