@@ -102,10 +102,7 @@ def import_labels(dataset: Dataset, path: Path) -> tuple[int, int]:
 
 
 def _unknown(labels: list[Label], held: Iterable[Label]) -> list[Label]:
-    """Return the labels that are not held, even with numbers as a spreadsheet rounds them.
-
-    Added again, an old label would come after what its annotator has said since.
-    """
+    """Return the labels that are not held, even with numbers as a spreadsheet rounds them."""
 
     def words(label: Label) -> Label:
         return replace(label, time=0.0, confidence=None, seconds=None)
@@ -113,6 +110,7 @@ def _unknown(labels: list[Label], held: Iterable[Label]) -> list[Label]:
     times: dict[Label, list[float]] = {}
     for label in held:
         times.setdefault(words(label), []).append(label.time)
+    # Added again, an old label would come after what its annotator has said since.
     return [
         label
         for label in labels

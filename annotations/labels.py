@@ -253,12 +253,9 @@ def last_event(labels: Iterable[Label], expression: str, annotator: str) -> Labe
 
 
 def _stacks(labels: Iterable[Label]) -> dict[tuple[str, str], list[Label]]:
-    """Stack the events that were not undone, by expression and annotator, the latest last.
-
-    An import may have put an older event below newer ones.
-    """
+    """Stack the events that were not undone, by expression and annotator, the latest last."""
     stacks: dict[tuple[str, str], list[Label]] = {}
-    for label in sorted(labels, key=lambda label: label.time):
+    for label in sorted(labels, key=lambda label: label.time):  # an import mixes them
         if label.action in EXCLUSION_ACTIONS:
             continue
         stack = stacks.setdefault((label.expression, label.annotator), [])

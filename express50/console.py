@@ -171,10 +171,8 @@ def run_handler(
 
 
 def _open_standard_streams() -> None:
-    """Give this process the standard streams that it was started without (``>&-``).
-
-    Otherwise, a file of ours would get their number, and libraries' messages.
-    """
+    """Give this process the standard streams that it was started without (``>&-``)."""
+    # Otherwise, a file of ours would get their number, and libraries' messages.
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
@@ -247,10 +245,7 @@ def add_command(
     example: str | None = None,
     **options: Any,
 ) -> argparse.ArgumentParser:
-    """Add a command's parser, for most commands with the arguments DATASET and --json.
-
-    Its description, unless given, is its ``help`` as a sentence.
-    """
+    """Add a command's parser, for most commands with the arguments DATASET and --json."""
     options.setdefault("description", help and f"{help[0].upper()}{help[1:]}.")
     if example is not None:
         options |= {"epilog": f"example:\n  {example}"}
@@ -276,14 +271,12 @@ def ignoring_closed_pipe(stream: IO[str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _stop_on_sigterm() -> Iterator[None]:
-    """Handle SIGTERM, which batch systems send, like Ctrl-C.
-
-    Python ignores exceptions in callbacks of its garbage collection: there, both are sent again.
-    """
+    """Handle SIGTERM, which batch systems send, like Ctrl-C."""
 
     def stop(number: int, frame: object) -> None:
         raise KeyboardInterrupt
 
+    # Python ignores exceptions in callbacks of its garbage collection: there, both are sent again.
     def report(ignored: Any) -> None:
         if ignored.exc_type is KeyboardInterrupt:
             Timer(LATER, interrupt_main, [signal.SIGTERM]).start()
@@ -331,12 +324,10 @@ def log(line: str) -> None:
 
 
 def printable(text: str) -> str:
-    """Return text with control characters escaped, as in names from foreign files.
-
-    They could move a terminal's cursor, change its title or hide a line.
-    """
+    """Return text with control characters escaped, as in names from foreign files."""
     if text.isprintable():
         return text
+    # Others could move a terminal's cursor, change its title or hide a line.
     shown = ("\n", "\t")
     return "".join(c if c.isprintable() or c in shown else ascii(c)[1:-1] for c in text)
 

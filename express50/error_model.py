@@ -89,11 +89,8 @@ def error_bounds(
 
 
 def single_camera_sigma(cameras: Sequence[Camera], places: np.ndarray) -> np.ndarray:
-    """Return the depth uncertainty (N,) in millimetres of points (N, 3) in metres.
-
-    A single camera cannot distinguish a large head from a near one. With several cameras it is 0.
-    """
-    if len(cameras) != 1:
+    """Return the depth uncertainty (N,) in millimetres of points (N, 3) in metres."""
+    if len(cameras) != 1:  # only one cannot tell a large head from a near one
         return np.zeros(len(places))
     return 1e3 * HEAD_SIZE_SPREAD * np.linalg.norm(places - cameras[0].center, axis=1)
 
@@ -129,8 +126,6 @@ def expect(
 
 
 def item_error(errors: np.ndarray, unit: Unit) -> float:
-    """Return the error of an item from its elements' errors (N,): the median, for opacity the mean.
-
-    Most pixels of a matte's rim are exactly right, so their median would be 0.
-    """
+    """Return the error of an item from its elements' (N,): their median, for opacity their mean."""
+    # Most pixels of a matte's rim are exactly right, so their median would be 0.
     return float(np.mean(errors) if unit == "alpha" else np.median(errors))

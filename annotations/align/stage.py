@@ -129,10 +129,7 @@ def suggest_for(
 def accept_sure(
     dataset: Dataset, index: Index, found: Mapping[str, Suggested], threshold: float
 ) -> dict[str, Label]:
-    """Append an automatic mark for each new sure suggestion; return the labels in force.
-
-    Automatic marks that no suggestion supports any more are undone. A rerun appends nothing.
-    """
+    """Append an automatic mark for each new sure suggestion; return the labels in force."""
     labels = read_labels(dataset, index.subject)
 
     def write(label: Label) -> None:
@@ -144,7 +141,7 @@ def accept_sure(
         expression = cue.expression_id
         suggested = found.get(expression)
         if suggested is None or suggested.confidence < threshold:
-            while expression in _automatic(labels):
+            while expression in _automatic(labels):  # nothing supports it any more
                 write(make_event(index, expression, "undo", AUTOMATIC))
             continue
         frame, camera, sure = suggested.frame, suggested.camera, suggested.confidence

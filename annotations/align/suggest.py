@@ -220,15 +220,13 @@ def choose_event(values: np.ndarray, own: Event, canonical: Canonical | None) ->
 
 
 def matching_row(event: Event, canonical: Canonical | None) -> int:
-    """Find the matching row: the apex, or the same share of it as in the canonical frame.
-
-    The row lies on the canonical frame's side of the apex if both sides offer one.
-    """
+    """Find the matching row: the apex, or the same share of it as in the canonical frame."""
     if canonical is None or canonical.side == 0:
         return event.apex
     share = share_of_apex(event)
     rows = np.concatenate([_slope(share, event.apex, -1), _slope(share, event.apex, 1)])
     away = np.abs(share[rows] - canonical.level)
+    # On the canonical frame's side of the apex if both sides offer one.
     away += OTHER_SIDE * (np.sign(rows - event.apex) == -canonical.side)
     return int(rows[np.argmin(away)])
 

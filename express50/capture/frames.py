@@ -201,11 +201,9 @@ def read_recorded_plate(index: Index, camera_id: str) -> np.ndarray:
 
 
 def write_frame(path: Path, image: np.ndarray) -> None:
-    """Write an image (H, W, 3) uint8 losslessly as TIFF; equal images give equal bytes.
-
-    Frames are read about nine times: this format is decoded six times as fast as JPEG XL, for up to
-    a quarter more bytes (docs/LOG.md).
-    """
+    """Write an image (H, W, 3) uint8 losslessly as TIFF; equal images give equal bytes."""
+    # Frames are read about nine times: this is decoded six times as fast as JPEG XL, for up to a
+    # quarter more bytes (docs/LOG.md).
     tifffile.imwrite(
         path, np.ascontiguousarray(image), photometric="rgb", predictor=True, rowsperstrip=STRIP,
         compression="deflate", compressionargs={"level": 1}, maxworkers=1, metadata=None,

@@ -417,14 +417,11 @@ def _read_cue(path: Path, line: int, row: dict[str, str]) -> Cue:
 
 
 def check_calibrated_sizes(raw: RawCapture, sizes: dict[str, tuple[int, int]]) -> None:
-    """Refuse cameras whose calibrated (width, height) differs from their footage's.
-
-    A guessed scale would give wrong depths.
-    """
+    """Refuse cameras whose calibrated (width, height) differs from their footage's."""
     for name, (width, height) in sizes.items():
         camera = (raw.calibration or {}).get(name)
         if camera is not None and (camera.width, camera.height) != (width, height):
-            raise CalibrationError(
+            raise CalibrationError(  # a guessed scale would give wrong depths
                 f"{raw.root / 'calibration.json'}: camera {name} is calibrated for "
                 f"{camera.width}x{camera.height}, its footage is {width}x{height}; "
                 "calibrate at the footage's size or scale the intrinsics"

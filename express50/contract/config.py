@@ -177,13 +177,11 @@ def config_toml(name: str, config: Any) -> str:
 
 
 def made_with(path: Path, stage: Stage, known: Mapping[str, Any]) -> str | None:
-    """Return which of the ``known`` configurations a stage's file holds; None if it is another one.
-
-    Comments are ignored: the settings' documentation may be that of another version.
-    """
+    """Return which of the ``known`` configurations a stage's file holds; None for another one."""
     text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
 
     def values(text: str) -> list[str]:
+        # Comments are the settings' documentation, maybe of another version.
         return [line for line in text.splitlines() if not line.startswith("#")]
 
     found = values(text)

@@ -266,10 +266,7 @@ def _refuse_datasets_own(path: Path) -> None:
 
 
 def exclusion_reason(dataset: Dataset, subject: str) -> str | None:
-    """Return why a subject is excluded (``express50 annotate exclude``), or None if it is not.
-
-    The latest event counts: an import may have put an older one below it.
-    """
+    """Return why a subject is excluded (``express50 annotate exclude``), or None if it is not."""
     path = dataset.labels_file(subject)
     reason, latest = None, -math.inf
     data = read_bytes(path, AnnotationError) if path.is_file() else b""
@@ -277,6 +274,7 @@ def exclusion_reason(dataset: Dataset, subject: str) -> str | None:
         with contextlib.suppress(AnnotationError, AttributeError, TypeError):  # a torn line
             row = parse_json(line, str(path), AnnotationError)
             when = row.get("time", 0)
+            # An import may have put an older event below the latest.
             if row.get("action") in ("exclude", "include") and when >= latest:
                 latest = when
                 reason = row.get("reason") if row["action"] == "exclude" else None

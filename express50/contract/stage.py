@@ -220,15 +220,12 @@ def with_required(names: Iterable[str]) -> list[Stage]:
 
 
 def commands() -> dict[str, Command]:
-    """Return the commands that other packages add, by name.
-
-    A command that does not load raises its ConfigError only when it is called.
-    """
+    """Return the commands that other packages add, by name."""
     found = {}
     for point in sorted(entry_points(group="express50.commands")):
         try:
             found[point.name] = _load(point)
-        except ConfigError as error:
+        except ConfigError as error:  # raised when it is called
             found[point.name] = Command("does not load", functools.partial(_raise, error))
     return found
 

@@ -162,10 +162,7 @@ class Pilot:
     def _run(
         self, stage: Stage, dataset: Dataset, config: Any, anew: bool
     ) -> tuple[Cost | None, str]:
-        """Run a stage; returns what an item cost, if any was made, and why all failed.
-
-        Only items that are made in this run count, if ``anew``: others are of another trial.
-        """
+        """Run a stage; returns what an item cost, if any was made, and why all failed."""
         if not stage.items(dataset):
             return None, "an earlier stage made nothing for it"
         pool = self.chain.pool
@@ -173,7 +170,7 @@ class Pilot:
             stage, dataset, config, pool=pool, progress=not anew, monitor=self.clock
         )
         self.cut = summary.count("left") > 0
-        counted = ("done",) if anew else ("done", "skipped")
+        counted = ("done",) if anew else ("done", "skipped")  # others are of another trial
         made = {o.item for o in summary.outcomes if o.status in counted}
         failures = [o.reason for o in summary.outcomes if o.status == "failed"]
         with Ledger(dataset.ledger, read_only=True) as ledger:
@@ -201,11 +198,7 @@ def cost_of(dataset: Dataset, stage: str, receipts: Sequence[Receipt], extra: fl
 
 
 def keep_for_run(dataset: Dataset, settings: Mapping[str, str]) -> None:
-    """Put copies of what trials made at chosen settings into the store of replaced outputs.
-
-    The run takes an output from there where it would make the same. Trials that share the settings
-    of more stages come first: what a stage makes depends on the stages before it as well.
-    """
+    """Put copies of what trials made at chosen settings where the run takes outputs from."""
     kept: set[tuple[str, str]] = set()
 
     def alike(trial: Trial) -> int:
@@ -216,6 +209,7 @@ def keep_for_run(dataset: Dataset, settings: Mapping[str, str]) -> None:
         (trial_of(json.loads(record.read_text("utf-8"))), Dataset(record.parent))
         for record in sorted(dataset.pilot_dir.glob("*/trial.json"))
     ]
+    # What a stage makes depends on the stages before it as well.
     for trial, folder in sorted(trials, key=lambda pair: -alike(pair[0])):
         for name in (n for n, label in settings.items() if trial.settings.get(n) == label):
             with Ledger(folder.ledger, read_only=True) as ledger:
@@ -357,15 +351,12 @@ def measure(
 
 
 def _steps(pilot: Pilot, base: Trial, choices: Sequence[str]) -> list[tuple[str, str]]:
-    """List settings above the cheapest ones: first one step up, as a second one gains less.
-
-    Those whose trials are quicker come first. Larger pictures than were recorded change nothing.
-    """
+    """List settings above the cheapest ones: first one step up, as a second one gains less."""
     steps, reduces = [], {stage.name: stage.growth.reduces for stage in pilot.chain.stages}
     for name in choices:
         configs = pilot.chain.ladders[name]
         higher = list(configs)[list(configs).index(base.settings[name]) + 1 :]
-        if key := reduces[name]:
+        if key := reduces[name]:  # larger pictures than recorded change nothing
             seen = {one: replace(base.footage, side=getattr(configs[one], key)) for one in higher}
             higher = [one for one in higher if seen[one].picture > base.footage.picture]
         seconds = trial_seconds(pilot, base, name)
@@ -389,16 +380,14 @@ def _charged(pilot: Pilot, cost: Cost) -> float:
 
 
 def guessed(pilot: Pilot, base: Trial, name: str, label: str, factor: float) -> Trial:
-    """Guess the figures of a trial with a higher setting of a stage, `factor` times as slow.
-
-    Later stages take as long as before, but longer where the setting makes their pictures larger.
-    """
+    """Guess the figures of a trial with a higher setting of a stage, `factor` times as slow."""
     stages = pilot.chain.stages[pilot.chain.names.index(name) :]
     reduces, footage, costs = stages[0].growth.reduces, base.footage, dict(base.costs)
     if reduces:
         side = getattr(pilot.chain.ladders[name][label], reduces)
         footage = replace(footage, side=float(side))
     for stage in (one for one in stages if one.name in costs):
+        # A later stage takes longer only where its pictures become larger.
         more = footage.time(stage.growth) / base.footage.time(stage.growth)
         more, cost = factor if stage.name == name else more, costs[stage.name]
         costs[stage.name] = replace(

@@ -65,15 +65,12 @@ def _peak_frames(dataset: Dataset, subject: str) -> dict[str, int]:
 def differences(
     a: Dataset, b: Dataset, subject: str, kinds: Sequence[ResultKind]
 ) -> dict[str, float]:
-    """Return the mean difference of each result of a subject that both datasets hold, by name.
-
-    Where the peaks of an expression differ, its other results are of different frames, and are
-    left out.
-    """
+    """Return the mean difference of each result of a subject that both datasets hold, by name."""
     one, two = (_peak_frames(dataset, subject) for dataset in (a, b))
     same = sorted(e for e in one.keys() & two.keys() if one[e] == two[e])
     found = {}
     for kind in kinds:
+        # Other results of other peaks are of different frames.
         names = sorted(one.keys() & two.keys()) if kind.apart is _frames_apart else same
         with suppress(Express50Error):  # a stage before it made nothing
             if values := list(kind.apart(a, b, subject, names)):

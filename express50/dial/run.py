@@ -299,12 +299,9 @@ def _run_ready(run: _Run, stage: Stage, chosen: list[str] | None) -> Summary:
 
 
 def reserved(own: float, rest: float, left: float, budget: float) -> float:
-    """Return the seconds that a stage must leave to those after it.
-
-    If its own seconds and the rest exceed the time left by at most a tenth of the budget, the run
-    continues and ends late, rather than with nothing made.
-    """
+    """Return the seconds that a stage must leave to those after it."""
     short = own + rest - left
+    # Rather late by up to a tenth of the budget than with nothing made.
     return rest - short if 0 < short <= GRACE * budget else rest
 
 

@@ -114,17 +114,14 @@ def check_folder_writable(folder: Path) -> None:
 
 
 def check_disk(folder: Path, name: Path) -> None:
-    """Refuse a disk that broke, or became read-only, after a run began; nothing is left on it.
-
-    A folder that is gone is not the disk's fault. ``name`` is what the error names.
-    """
+    """Refuse a disk that broke or became read-only since a run began; the error has ``name``."""
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(b"1")
             file.flush()
             os.fsync(file.fileno())
     except OSError as error:
-        if error.errno in BROKEN:
+        if error.errno in BROKEN:  # a folder that is gone is not the disk's fault
             raise DiskError(
                 f"{name}: its disk cannot be written to ({error.strerror}); repair that and run the"
                 " same command again; finished work is kept"
@@ -228,10 +225,8 @@ def put_back(former: Path, target: Path) -> None:
 
 
 def _replace(aside: Path, target: Path, former: Path) -> None:
-    """Rename a folder to a target that others may make, replace or move away at the same time.
-
-    Checking first and then renaming would fail if another process came in between.
-    """
+    """Rename a folder to a target that others may make, replace or move away at the same time."""
+    # Checking first and then renaming would fail if another process came in between.
     met = False
     while True:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -254,10 +249,8 @@ def _replace(aside: Path, target: Path, former: Path) -> None:
 
 
 def _swap(one: Path, other: Path) -> bool:
-    """Exchange two folders in one step; return False if the system cannot.
-
-    Source: renameat2(2), RENAME_EXCHANGE, which Python's standard library lacks.
-    """
+    """Exchange two folders in one step; return False if the system cannot."""
+    # renameat2(2), RENAME_EXCHANGE, which Python's standard library lacks
     exchange = getattr(ctypes.CDLL(None), "renameat2", None)  # glibc 2.28 and later
     return exchange is not None and not exchange(
         AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other), RENAME_EXCHANGE

@@ -173,17 +173,14 @@ _hdf5_of = cached_by_file(OPEN_FILES)(h5py.File)
 
 
 def child(file: h5py.File, name: str) -> Any:
-    """Return the group or dataset at a path in an HDF5 file, or None.
-
-    Links are refused: an external link could read any file on the machine.
-    """
+    """Return the group or dataset at a path in an HDF5 file, or None."""
     node: Any = file
     with _damage_is_one_error(DAMAGE, f"{file.filename}: {name} is damaged"):
         for part in name.split("/"):
             link = node.get(part, getlink=True) if isinstance(node, h5py.Group) else None
             if link is None:
                 return None
-            if not isinstance(link, h5py.HardLink):
+            if not isinstance(link, h5py.HardLink):  # an external one could read any file
                 raise CaptureError(
                     f"{file.filename}: {name} is a link, expected data in the file itself"
                 )

@@ -80,10 +80,7 @@ def path_digest(path: Path, sha256: Callable[[Path], str] = file_sha256) -> str:
 
 
 def stat_digest(path: Path) -> str:
-    """Digest names, sizes and times of a file or a folder's files: cheap even for terabytes.
-
-    The digest of a file that cannot be read differs from that of the same file once it can.
-    """
+    """Digest names, sizes and times of a file or a folder's files: cheap even for terabytes."""
     root, files = (path.parent, [path]) if path.is_file() else (path, files_of(path))
     lines = []
     for file in files:

@@ -82,8 +82,7 @@ def read_image(path: Path) -> np.ndarray:
 def _plain_png(path: Path) -> np.ndarray | None:
     """Read a PNG of 8 or 16 bits without a palette, in half of OpenImageIO's time.
 
-    None for any other file, and for one that OpenImageIO has to refuse. It refuses damaged ones
-    itself, because OpenImageIO's decoder would print that as well.
+    None for any other file, and for one that OpenImageIO has to refuse.
     """
     with suppress(OSError), open_file(path) as file:
         head = file.read(26)
@@ -98,6 +97,7 @@ def _plain_png(path: Path) -> np.ndarray | None:
         try:
             pixels = imagecodecs.png_decode(data)
         except imagecodecs.PngError as error:
+            # OpenImageIO's decoder would print the message as well.
             raise FormatError(f"{path}: {DAMAGED} ({error}); {REPAIR}") from error
         return pixels if channels is not None and pixels.shape[2:] == channels else None
     return None
@@ -261,11 +261,7 @@ def write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:
 
 
 def _encode_in_memory(path: Path, image: np.ndarray) -> bytes:
-    """Encode an image with OpenImageIO in the format that its file's name says.
-
-    OpenImageIO must not write to disk itself: on a full one, it leaves out the end of a file
-    without an error, or ends the process. Needs Linux.
-    """
+    """Encode an image with OpenImageIO in the format that its file's name says."""
     target = _make_output(path)
     channels = 1 if image.ndim == 2 else image.shape[2]
     spec = oiio.ImageSpec(image.shape[1], image.shape[0], channels, _pixel_kind(image.dtype))
@@ -273,6 +269,8 @@ def _encode_in_memory(path: Path, image: np.ndarray) -> bytes:
     spec.attribute("oiio:UnassociatedAlpha", 1)
     if Path(path).suffix.lower() == ".exr":  # otherwise its header would hold the time of writing
         spec.attribute("DateTime", "1970:01:01 00:00:00")
+    # OpenImageIO must not write to disk itself: on a full one, it leaves out the end of a file
+    # without an error, or ends the process. Needs Linux.
     file = os.memfd_create("image")
     try:
         name = f"/proc/self/fd/{file}"
@@ -312,13 +310,8 @@ def encode_jpeg(image: np.ndarray, quality: int = 95) -> bytes:
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """Encode a grey or RGB image (H, W[, C]) uint8 or uint16, with alpha or without, as PNG.
-
-    Each row is stored as its difference from the one above and compressed by libdeflate. Libpng
-    takes three to five times as long for as many bytes (docs/LOG.md).
-
-    Source: PNG 1.2, 4 (chunks), 6.4 (filter type Up).
-    """
+    """Encode a grey or RGB image (H, W[, C]) uint8 or uint16, with alpha or without, as PNG."""
+    # PNG 1.2, 4 (chunks), 6.4 (filter type Up: the difference from the row above)
     _check_sides("PNG", image, PNG_SIDE)
     (height, width), channels = image.shape[:2], math.prod(image.shape[2:])
     rows = np.ascontiguousarray(image.astype(image.dtype.newbyteorder(">"), copy=False))
@@ -329,6 +322,7 @@ def encode_png(image: np.ndarray) -> bytes:
     np.subtract(rows[1:], rows[:-1], out=filtered[1:, 1:])
     colour = {1: 0, 2: 4, 3: 2, 4: 6}[channels]
     header = struct.pack(">IIBBBBB", width, height, 8 * image.itemsize, colour, 0, 0, 0)
+    # Libpng takes three to five times as long for as many bytes (docs/LOG.md).
     pixels = imagecodecs.deflate_encode(body, level=PNG_LEVEL)
     chunks = ((b"IHDR", header), (b"IDAT", pixels), (b"IEND", b""))
     return PNG_START + b"".join(
@@ -374,12 +368,9 @@ def decode_cv(data: bytes, flags: int, name: str) -> np.ndarray:
 
 
 def image_size(data: bytes, where: str) -> tuple[int, int]:
-    """Read width and height from a PNG's or JPEG's header, without decoding pixels.
-
-    Source: PNG 1.2, 11.2.2 (IHDR).
-    """
+    """Read width and height from a PNG's or JPEG's header, without decoding pixels."""
     if data[:8] == PNG_START and len(data) >= 24:
-        return struct.unpack(">II", data[16:24])
+        return struct.unpack(">II", data[16:24])  # PNG 1.2, 11.2.2 (IHDR)
     size, _ = _jpeg_header(data)
     if size is None:
         raise FormatError(f"{where}: {len(data)} bytes are not a PNG or JPEG image")
@@ -387,24 +378,19 @@ def image_size(data: bytes, where: str) -> tuple[int, int]:
 
 
 def is_cut_short(data: bytes | mmap.mmap) -> bool:
-    """Return True if a JPEG stops before its end marker; False for other bytes.
-
-    Decoders fill what is missing with grey and do not report it. Thumbnails in the header have end
-    markers of their own, so the search starts after the first scan's header. Some cameras write
-    more data after the picture's end marker. In a scan, 0xFF is always followed by a byte that says
-    what it is (ITU-T T.81, B.1.1.5), so no other data looks like an end marker.
-    """
+    """Return True if a JPEG stops before its end marker, which decoders do not report."""
     if data[:2] != b"\xff\xd8":
         return False
+    # Thumbnails in the header have end markers of their own. Some cameras write more data after the
+    # end marker. In a scan, 0xFF is always followed by a byte that says what it is (ITU-T T.81,
+    # B.1.1.5), so no other data looks like an end marker.
     _, scan = _jpeg_header(data)
     return scan is None or data.find(b"\xff\xd9", scan) < 0
 
 
 def _jpeg_header(data: bytes | mmap.mmap) -> tuple[tuple[int, int] | None, int | None]:
-    """Return a JPEG's (width, height) and the offset of its first scan; None if not found.
-
-    Source: ITU-T T.81, B.1.1.2 to B.2.2 (markers, frame header).
-    """
+    """Return a JPEG's (width, height) and the offset of its first scan; None if not found."""
+    # ITU-T T.81, B.1.1.2 to B.2.2 (markers, frame header)
     size, position = None, 2 if data[:2] == b"\xff\xd8" else len(data)
     while position + 4 <= len(data) and data[position] == 0xFF:
         marker, length = data[position + 1], int.from_bytes(data[position + 2 : position + 4])
@@ -512,10 +498,8 @@ def shrink(image: np.ndarray, side: int) -> np.ndarray:
 
 
 def reduce_light(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Average an image (H, W, 3) uint8 sRGB to a smaller size in linear light.
-
-    A pixel at an outline then mixes subject and background by their areas, as keying assumes.
-    """
+    """Average an image (H, W, 3) uint8 sRGB to a smaller size in linear light."""
+    # A pixel at an outline then mixes subject and background by areas, as keying assumes.
     light = cv2.LUT(np.ascontiguousarray(image), DEEP_LIGHT_OF_LEVEL)
     return LEVEL_OF_DEEP_LIGHT[resize_area(light, width, height)]
 

@@ -212,12 +212,9 @@ def read_yaml(path: Path, kind: Kind) -> Any:
 
 
 def read_xml(path: Path, kind: Kind) -> ElementTree.Element:
-    """Read the root of an XML file without a document type.
-
-    The type's entities could grow without bound or name other files.
-    """
+    """Read the root of an XML file without a document type."""
     text = read_text(path, kind)
-    if "<!DOCTYPE" in text:
+    if "<!DOCTYPE" in text:  # entities may grow without bound or name files
         raise kind(f"{path}: declares a document type (<!DOCTYPE), expected none; {AGAIN}")
     try:
         return ElementTree.fromstring(text)

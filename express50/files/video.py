@@ -61,14 +61,12 @@ DAMAGE = (av.FFmpegError, OSError, ValueError, MemoryError, OverflowError)
 
 
 def check_whole(path: Path) -> None:
-    """Refuse an MP4/MOV file whose boxes go past its end, or that has no index.
-
-    Source: ISO/IEC 14496-12, 4.2: a box is its size (32 bits, or 64 after size 1), its type and
-    content; size 0 runs to the end of the file.
-    """
+    """Refuse an MP4/MOV file whose boxes go past its end, or that has no index."""
     check_readable(path)
     size = path.stat().st_size
     with path.open("rb") as file:
+        # ISO/IEC 14496-12, 4.2: a box is its size (32 bits, or 64 after size 1), its type and
+        # content; size 0 runs to the end of the file.
         offset = count = 0
         kinds: set[bytes] = set()
         while offset + 8 <= size and count < BOXES:
@@ -222,11 +220,7 @@ def common_fps(table: Path, videos: Iterable[Path]) -> float:
 
 
 def frame_times(path: Path) -> tuple[int, ...]:
-    """List the time stamps of a video's frames in display order, without decoding a frame.
-
-    Frames of AVI files are decoded, unless all stand alone: what such a file says of their order
-    may be wrong.
-    """
+    """List the time stamps of a video's frames in display order, without decoding a frame."""
     check_whole(path)
     container, stream = _open(path)
     with container:
@@ -240,7 +234,7 @@ def frame_times(path: Path) -> tuple[int, ...]:
             raise CaptureError(
                 f"{path}: cannot be read ({reason(error)}); copy it again"
             ) from error
-        if container.format.name == "avi" and not alone:
+        if container.format.name == "avi" and not alone:  # its times may be out of order
             container.seek(0)
             return tuple(f.pts for f in _in_order(path, _decode(path, container, stream)))
     if None in stamps:

@@ -147,13 +147,11 @@ def transform_camera(camera: Camera, new_from_old: np.ndarray) -> Camera:
 
 
 def distort(camera: Camera, xy: np.ndarray) -> np.ndarray:
-    """Return distorted normalised coordinates (N, 2) of ideal ones (N, 2), even beyond a fold.
-
-    Source: OpenCV's rational model, of which COLMAP's OPENCV and RADIAL are special cases.
-    """
+    """Return distorted normalised coordinates (N, 2) of ideal ones (N, 2), even beyond a fold."""
     p1, p2 = camera.dist[2:4]
     x, y = xy[:, 0], xy[:, 1]
     r2 = x * x + y * y
+    # OpenCV's rational model, of which COLMAP's OPENCV and RADIAL are special cases.
     radial, _ = _radial_part(camera.dist, r2)
     dx = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
@@ -161,16 +159,11 @@ def distort(camera: Camera, xy: np.ndarray) -> np.ndarray:
 
 
 def undistort(camera: Camera, xy: np.ndarray) -> np.ndarray:
-    """Return ideal normalised coordinates (N, 2) of distorted ones (N, 2).
-
-    They are NaN where the lens forms no such image point, because its distortion folds there.
-
-    Source: Newton's method, started from a table of the radial part, which is monotonic in its
-    field.
-    """
+    """Return ideal normalised coordinates (N, 2) of distorted ones, NaN where the lens folds."""
     xy = np.asarray(xy, dtype=np.float64)
     if not camera.dist.any():
         return xy
+    # Newton's method, from a table of the radial part, which is monotonic in its field.
     radii = np.linspace(0.0, _field(camera.dist.tobytes()), TABLE_SIZE)
     radial, _ = _radial_part(camera.dist, radii**2)
     size = np.linalg.norm(xy, axis=1)
@@ -222,13 +215,10 @@ def _radial_part(dist: np.ndarray, r2: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 @lru_cache(maxsize=256)
 def _field(dist: bytes) -> float:
-    """Return the radius of the radial part's first fold or pole, at most `WIDEST`.
-
-    The derivative of r N / D by r, with N and D polynomials of u = r^2, has the numerator
-    N D + 2 u (N' D - N D').
-    """
+    """Return the radius of the radial part's first fold or pole, at most `WIDEST`."""
     k1, k2, _, _, k3, k4, k5, k6 = np.frombuffer(dist)
     above, below = Polynomial([1.0, k1, k2, k3]), Polynomial([1.0, k4, k5, k6])
+    # The numerator of the derivative of r N / D by r, with N and D polynomials of u = r^2.
     slope = above * below + Polynomial([0, 2]) * (above.deriv() * below - above * below.deriv())
     ends = [WIDEST**2]
     for part in (slope, below):

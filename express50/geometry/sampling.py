@@ -132,19 +132,16 @@ def local_moments(image: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def robust_moments(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return median and deviation (...) of values (N, ...); few outliers change neither much.
-
-    The deviation is the median distance from the median, scaled to that of normal errors.
-    """
+    """Return median and deviation (...) of values (N, ...); few outliers change neither much."""
     middle = np.median(values, axis=0)
+    # 1.4826: of normal errors, the result is the standard deviation
     return middle, 1.4826 * np.median(np.abs(values - middle), axis=0)
 
 
 def edge_width(image: np.ndarray) -> float | None:
-    """Measure the width of the sharpest edges of an image (H, W, 3) uint8; None with too few.
+    """Measure how blurred the sharpest edges of an image (H, W, 3) uint8 are; None with too few.
 
-    The width is the standard deviation, pixels, of the Gaussian that would blur a step as much: a
-    step of height h, blurred by s, rises by at most h / (s sqrt(2 pi)) per pixel.
+    The width is the standard deviation, pixels, of the Gaussian that would blur a step as much.
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     grey = cv2.GaussianBlur(grey, (0, 0), SMOOTH)
@@ -156,6 +153,7 @@ def edge_width(image: np.ndarray) -> float | None:
     edges = steepest & (height > LEAST_HEIGHT) & (slope > 0)
     if edges.sum() < FEWEST_EDGES:
         return None
+    # A step of height h, blurred by s, rises by at most h / (s sqrt(2 pi)) per pixel.
     widths = height[edges] / (slope[edges] * math.sqrt(2 * math.pi))
     width = float(np.percentile(widths, SHARPEST))
     return math.sqrt(max(width**2 - SMOOTH**2, 0.0))

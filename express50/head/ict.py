@@ -274,14 +274,9 @@ def _rig(
 def _jaw_rig(
     template: np.ndarray, opened: np.ndarray, lower_teeth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the jaw's hinge (3,) and weights (V,) that reproduce the jawOpen shape.
-
-    The lower teeth are rigid, so their motion in the y-z plane is a rotation about a fixed point c:
-    d = (R - I)(p - c). A vertex's weight is its motion over that of a rigid jaw at its place.
-
-    Raises:
-        ValueError: the shape does not turn the lower teeth.
-    """
+    """Return the jaw's hinge (3,) and weights (V,) that reproduce the jawOpen shape."""
+    # The lower teeth are rigid, so their motion in the y-z plane is a rotation about a point c:
+    # d = (R - I)(p - c).
     points, motion = template[lower_teeth][:, 1:], opened[lower_teeth][:, 1:]
     centred = points - points.mean(0)
     moved = centred + motion - motion.mean(0)
@@ -292,6 +287,7 @@ def _jaw_rig(
         raise ValueError("jawOpen does not turn the lower teeth, so the jaw's hinge is unknown")
     rotation = np.array([[np.cos(angle) - 1, -np.sin(angle)], [np.sin(angle), np.cos(angle) - 1]])
     hinge = points.mean(0) - np.linalg.solve(rotation, motion.mean(0))
+    # A weight is the motion over that of a rigid jaw at the same place.
     rigid = np.linalg.norm((template[:, 1:] - hinge) @ rotation.T, axis=1)
     weight = np.linalg.norm(opened[:, 1:], axis=1) / np.maximum(rigid, 1e-3)
     below = smoothstep((hinge[0] + 0.03 - template[:, 1]) / 0.03, 0.0, 1.0)
@@ -365,11 +361,9 @@ def ict_regions(
 def _tongue(
     template: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray, gums: np.ndarray
 ) -> np.ndarray:
-    """Find the tongue (V,) bool: the two large texture islands within 2 cm of the middle.
-
-    Gums and tongue are connected in the mesh, but not in the texture map.
-    """
+    """Find the tongue (V,) bool: the two large texture islands within 2 cm of the middle."""
     inside = gums[faces].all(1)
+    # Gums and tongue are connected in the mesh, but not in the texture map.
     corners = uv_faces[inside]
     islands = mesh_parts(corners, uv_faces.max() + 1)[corners[:, 0]]
     mask = np.zeros(template.shape[0], dtype=bool)

@@ -250,10 +250,8 @@ def expectation(heat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def heat_loss(heat: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-    """Return the cross entropy (B, P) of heat maps and points (B, P, 2) spread over four cells.
-
-    Its gradient is strong from the first step on, unlike that of the expectation.
-    """
+    """Return the cross entropy (B, P) of heat maps and points (B, P, 2) spread over four cells."""
+    # Its gradient is strong from the first step on, unlike that of the expectation.
     size = heat.shape[-1]
     cells = corner_to_cell(((points / CROP - 0.5) / STRETCH + 0.5) * size)
     cells = cells.clamp(0.0, size - 1.001)

@@ -105,17 +105,15 @@ def open_source(
 
 
 def given_detection(rows: np.ndarray) -> Detection:
-    """Make a detection from rows (68, 3): pixels x, y, NaN where unknown, and confidence 0..1.
-
-    Unknown points are put at the mean of the known ones, with an infinite sigma. The sigma of a
-    point of confidence c is 0.6 % of the face's size over c.
-    """
+    """Make a detection from rows (68, 3): pixels x, y, NaN where unknown, and confidence 0..1."""
     known = np.isfinite(rows[:, :2]).all(1) & (rows[:, 2] > 0)
     if not known.any():
         return Detection(np.zeros((POINTS, 2)), np.full(POINTS, np.inf), np.zeros(POINTS), 0.0)
+    # Unknown points are put at the mean of the known ones, with an infinite sigma.
     points = np.where(known[:, None], rows[:, :2], rows[known, :2].mean(0))
     confidence = np.where(known, rows[:, 2], 0.0)
     size = max(float(np.ptp(rows[known, :2], axis=0).max()), 1.0)
+    # 0.6 % of the face's size over the confidence
     sigma = np.where(known, 0.006 * size / np.maximum(confidence, UNSURE), np.inf)
     return Detection(points, sigma, confidence, float(confidence[known].mean()))
 

@@ -126,11 +126,7 @@ def judge(cameras: Mapping[str, Camera]) -> RigVerdict:
 
 
 def _misreading(cameras: Mapping[str, Camera]) -> tuple[str, str]:
-    """Return what is wrong with a rig, and the convention that explains it; "" where unknown.
-
-    Several conventions may put the common point in front of all cameras; the right one is that in
-    which their axes meet best.
-    """
+    """Return what is wrong with a rig, and the convention that explains it; "" where unknown."""
     problem, spread = "", _scatter(cameras)
     if behind := depths_behind(cameras):
         shown = few([f"{name} (z = {depth:.3g} m)" for name, depth in behind.items()], 4)
@@ -150,6 +146,7 @@ def _misreading(cameras: Mapping[str, Camera]) -> tuple[str, str]:
         }
         if meeting_point(other) is not None and not depths_behind(other):
             found[words] = _scatter(other)
+    # Several may put the point in front of all cameras; in the right one, axes meet best.
     best = min(found, key=lambda words: found[words], default="")
     if not problem and found.get(best, np.inf) < MEETING:
         problem = (

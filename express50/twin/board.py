@@ -46,15 +46,13 @@ def charuco_board() -> cv2.aruco.CharucoBoard:
 
 
 def board_poses(count: int, seed: int) -> list[np.ndarray]:
-    """Return ``world_from_board`` (4, 4) of every synchronised frame.
-
-    The board turns through the rig's arc in golden-section order, so that for any count every
-    camera sees it several times, and neighbours see it together.
-    """
+    """Return ``world_from_board`` (4, 4) of every synchronised frame."""
     rng = np.random.default_rng([seed, 401])
     middle = np.array([*SQUARES, 0.0]) * 0.5 * SQUARE_M
     poses = []
     for k in range(count):
+        # In golden-section order through the arc every camera sees it several times for any count,
+        # and neighbours see it together.
         place = ((k + 0.5) * 0.61803399) % 1.0
         azimuth = math.radians(SPAN_DEG) * (place - 0.5)
         tilt, roll = rng.uniform(-0.45, 0.35), rng.uniform(-0.5, 0.5)

@@ -47,10 +47,8 @@ def fits_multiface(path: Path) -> bool:
 
 
 def subject_of(path: Path) -> str:
-    """Return the subject in the folder's name, or the whole name where it has none.
-
-    Names are ``<date>--<time>--<subject>`` or ``m--<date>--<time>--<subject>--GHS``.
-    """
+    """Return the subject in the folder's name, or the whole name where it has none."""
+    # <date>--<time>--<subject>, or m--<date>--<time>--<subject>--GHS
     parts = path.name.split("--")
     if parts[0] == "m" and parts[-1] == "GHS":
         parts = parts[1:-1]

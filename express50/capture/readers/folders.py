@@ -73,10 +73,7 @@ HOLDS = {"videos": fits_video, "frames": lambda file: is_shown(file, IMAGE_SUFFI
 
 
 def footage_folder(path: Path) -> Path:
-    """Return the folder that holds a rig's footage: the path, or such as ``images`` in it.
-
-    It is the path where footage lies beside that folder, as one cannot tell which is meant.
-    """
+    """Return the folder that holds a rig's footage: the path, or such as ``images`` in it."""
     if not path.is_dir() or _holds_footage(path):
         return path
     folders = [inner for inner in _listed(path) if is_data_folder(inner)]
@@ -84,6 +81,7 @@ def footage_folder(path: Path) -> Path:
     # In our own layout, ``cameras`` holds folders.
     wrappers += [inner for inner in folders if inner.name == "cameras" and _holds_footage(inner)]
     others = {f for f in folders if not BESIDE.fullmatch(f.name)} - set(wrappers)
+    # Of footage here and there, one cannot tell which is meant.
     return wrappers[0] if len(wrappers) == 1 and not any(map(_holds_footage, others)) else path
 
 
@@ -170,10 +168,7 @@ def read_videos(path: Path, selection: Selection) -> RawCapture:
 
 
 def read_camera_folders(path: Path, selection: Selection) -> RawCapture:
-    """Read a folder per camera: its pictures, its only video, or a video or folder per expression.
-
-    A camera's name before that of an expression is left out.
-    """
+    """Read a folder per camera: pictures, an only video, or a video or folder per expression."""
     tree = _tree(path)
     one_clip = not tree.deep and (
         tree.kind == "frames" or all(len(row) == 1 for row in tree.places.values())
@@ -183,6 +178,7 @@ def read_camera_folders(path: Path, selection: Selection) -> RawCapture:
     for folder, places in tree.places.items():
         for place in places:
             name = tree.name(place)
+            # A camera's name before that of an expression is left out.
             sequence = CLIP if one_clip else name.removeprefix(folder).strip("_- ") or name
             for file in _files(path, tree, place):
                 _add(rows[folder], (sequence, _number(file) if tree.kind == "frames" else 0), file)
@@ -204,10 +200,8 @@ def read_frame_folders(path: Path, selection: Selection) -> RawCapture:
 def _read_inner(
     path: Path, tree: Tree, selection: Selection, moment_of: Callable[[str, str], Moment]
 ) -> RawCapture:
-    """Read folders that hold all cameras' files; their moments are of the folder and the file.
-
-    A folder that cannot be read is refused: all cameras would lose it.
-    """
+    """Read folders that hold all cameras' files; their moments are of the folder and the file."""
+    # What cannot be read would be missing for all cameras, without a message.
     check_readable(*(footage_folder(path) / name for name in tree.empty))
     rows: dict[str, dict[Moment, str]] = {name: {} for name in sorted(tree.inner())}
     for folder, places in tree.places.items():
@@ -218,10 +212,7 @@ def _read_inner(
 
 
 def _tree(path: Path) -> Tree:
-    """Find the videos, or else the pictures, in the folders of a folder, or one level below them.
-
-    Under two folders with footage are none: a folder of folders was meant.
-    """
+    """Find the videos, or else the pictures, in the folders of a folder, or a level below them."""
     nothing = Tree("frames", False, {})
     if not path.is_dir() or (path.parent / "capture.toml").is_file():  # a part of our own layout
         return nothing
@@ -235,6 +226,7 @@ def _tree(path: Path) -> Tree:
         if any(found.values()):
             held = {name: places for name, places in found.items() if places}
             empty = tuple(name for name, places in found.items() if not places)
+            # Under two folders with footage: a folder of folders was meant.
             return Tree(kind, deep, held, empty) if len(held) > 1 else nothing
     return nothing
 
