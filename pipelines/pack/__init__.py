@@ -6,13 +6,17 @@ subjects, so adding or removing a subject does not re-encode the others.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from express50.console import count
 from express50.contract.config import check_ranges
 from express50.contract.layout import Dataset, exclusion_reason, included_subjects
 from express50.contract.stage import Growth, Result, Stage
+from express50.errors import FormatError, few
+from express50.files.text import read_json_table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,6 +116,16 @@ def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> Result:
     return pack(dataset, out, config.test_subjects, config.test_fraction)
 
 
+def account(dataset: Dataset, items: Sequence[str]) -> Iterator[str]:
+    """Yield a line per split for people: who is kept out of training is easily overlooked."""
+    for folder in (dataset.item_dir("pack", item) for item in items):
+        splits = read_json_table(folder / "splits.json", FormatError, "pack again")
+        metrics = read_json_table(folder / "metrics.json", FormatError, "pack again")
+        for split in ("train", "test"):
+            who = f" of {few(splits[split])}" if splits[split] else ""
+            yield f"  {split}: {count(metrics['samples_by_split'][split], 'sample')}{who}"
+
+
 ENCODE = Stage(
     name="encode",
     version=5,
@@ -132,7 +146,7 @@ ENCODE = Stage(
 
 STAGE = Stage(
     name="pack",
-    version=13,
+    version=14,
     config=PackConfig,
     presets={"draft": {}, "standard": {}, "reference": {}},
     items=items,
@@ -141,5 +155,6 @@ STAGE = Stage(
     help="gather all samples into shards with splits and a dataset card",
     purpose="Samples packed into shards.",
     runs_first=(ENCODE.name,),
+    account=account,
     growth=Growth(items=(), time=("subjects", "expressions", "views"), disk=("subjects",)),
 )

@@ -255,13 +255,13 @@ def write_card(
     cameras = sorted({meta["camera"] for meta in metas})
     counts = Counter((meta["subject"], meta["expression"]) for meta in metas)
     by_annotator = Counter(str(meta["label"].get("annotator", "unknown")) for meta in metas)
-    labellers = [f"{name} ({count} samples)" for name, count in sorted(by_annotator.items())]
+    labellers = [f"{name} ({count(n, 'sample')})" for name, n in sorted(by_annotator.items())]
     lines = [
         "# Dataset card",
         "",
-        f"{len(metas)} samples of {len(subjects)} subjects x {len(expressions)} expressions x"
-        f" {len(cameras)} cameras: colour, matte, depth, camera and head-model parameters of one"
-        " peak frame per expression.",
+        f"{count(len(metas), 'sample')} of {count(len(subjects), 'subject')} x"
+        f" {count(len(expressions), 'expression')} x {count(len(cameras), 'camera')}: colour,"
+        " matte, depth, camera and head-model parameters of one peak frame per expression.",
         "",
         "| | |",
         "|---|---|",
@@ -291,7 +291,7 @@ def write_card(
     lines += ["", "## People", "", *people_lines(people)]
     lines += ["", f"## Left out: {len(dropped)}", ""]
     reasons = Counter(note.why for note in dropped)
-    lines += [f"- {count} x {why}" for why, count in sorted(reasons.items())] or ["Nothing."]
+    lines += [f"- {n} x {why}" for why, n in sorted(reasons.items())] or ["Nothing."]
     lines += [
         "",
         "## Reading",

@@ -185,6 +185,11 @@ def test_every_view_is_packed_and_the_account_balances(packed):
     assert "CC0-1.0" in card and "C-S001" in card and "| smile | 6 | 6 |" in card
 
 
+def test_people_are_told_who_is_kept_out_of_training(dataset, packed):
+    wanted = ["  train: 12 samples of S001", "  test: 12 samples of S002"]
+    assert list(PACK.account(dataset, ["shards"])) == wanted
+
+
 def test_gender_and_age_of_a_few_people_stay_out_of_card_and_shards(packed):
     root, _ = packed
     assert "only for groups of 5 people or more" in (root / "card.md").read_text()
@@ -382,6 +387,7 @@ def test_an_excluded_subject_is_left_out_with_its_reason(dataset, tmp_path):
     assert [note.what for note in result.dropped] == ["S002"]
     assert "heavy makeup" in result.dropped[0].why
     assert {e.subject for e in ShardReader(tmp_path).entries} == {"S001"}
+    assert "12 samples of 1 subject x 2 expressions" in (tmp_path / "card.md").read_text()
 
 
 def cut_regions(
