@@ -111,15 +111,33 @@ def frontal(loaded: Checkpoint) -> PinholeView:
 
 
 def camera_of(loaded: Checkpoint, name: str | None, size: int = 0) -> PinholeView:
-    """Look up a camera of the checkpoint by id, by default the frontal one; ``size`` 0: its own.
+    """Look up a camera of the checkpoint by id; ``size`` 0: its own.
+
+    By default it is the frontal one, widened so that the head stays in the picture as it turns.
 
     Raises:
         ConfigError: the checkpoint has no such camera.
     """
     cameras = loaded.gallery.cameras
     check_known("the checkpoint", "camera", [] if name is None else [name], cameras)
-    view = frontal(loaded) if name is None else cameras[name]
+    view = with_room(frontal(loaded), loaded) if name is None else cameras[name]
     return resized(view, size) if size else view
+
+
+def with_room(view: PinholeView, loaded: Checkpoint) -> PinholeView:
+    """Widen a picture until it shows the head model's template turned to any side.
+
+    Photographs often end beside the ears, where a turned head has its nose.
+    """
+    centre = loaded.model.head_centre.double()
+    reach = (loaded.head.template.to(centre) - centre)[:, [0, 2]].norm(dim=1).max()
+    x, _, ahead = view.cam_from_head[:3, :3].double() @ centre + view.cam_from_head[:3, 3].double()
+    middle = float(view.K[0, 2] + view.K[0, 0] * x / ahead)
+    half = float(view.K[0, 0] * reach / ahead)
+    left, right = (max(0, math.ceil(half - room)) for room in (middle, view.width - middle))
+    K = view.K.clone()
+    K[0, 2] += left
+    return replace(view, K=K, width=left + view.width + right)
 
 
 def picture(loaded: Checkpoint, head: HeadCodes, view: PinholeView) -> np.ndarray:

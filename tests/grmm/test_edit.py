@@ -1,4 +1,5 @@
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from grmm.render import (
     residual_sheet,
     resized,
     sample_sheet,
+    with_room,
 )
 from grmm.train import train
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
@@ -170,7 +172,28 @@ def test_orbit_keeps_its_distance_and_sees_from_above(loaded):
 def test_a_camera_that_the_checkpoint_lacks_is_refused(loaded, name):
     with pytest.raises(UnknownNameError, match="cam00"):
         camera_of(loaded, name)
-    assert camera_of(loaded, None) is frontal(loaded)
+    assert torch.equal(camera_of(loaded, None).cam_from_head, frontal(loaded).cam_from_head)
+
+
+def test_a_picture_that_ends_beside_the_ears_is_widened_for_turned_heads(loaded):
+    view, centre = frontal(loaded), loaded.model.head_centre.double()
+    K = view.K.clone()
+    K[0, 2] -= 2 * view.width // 5
+    tight = replace(view, K=K, width=view.width // 5)
+    wide = with_room(tight, loaded)
+    for yaw in (-60, 0, 60):
+        (first, last), (cut, _) = (ends(loaded, orbit(v, yaw, centre)) for v in (wide, tight))
+        assert first > -1 and last < wide.width + 1 and cut < -1
+    again = with_room(wide, loaded)
+    assert again.width == wide.width and torch.equal(again.K, wide.K)
+
+
+def ends(loaded, view):
+    """The first and the last column of the head's template in a view."""
+    pose, places = view.cam_from_head.double(), loaded.head.template.double()
+    seen = (places @ pose[:3, :3].T + pose[:3, 3]) @ view.K.double().T
+    columns = seen[:, 0] / seen[:, 2]
+    return float(columns.min()), float(columns.max())
 
 
 def test_pictures_of_another_size_show_the_same(loaded):
