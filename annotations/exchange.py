@@ -50,14 +50,11 @@ _FIELDS = tuple(field.name for field in fields(Label))
 
 
 def export_labels(labels: Iterable[Label], path: Path, stored: Collection[Label] = ()) -> None:
-    """Write events as CSV or JSON, by the file's ending.
-
-    An existing file is replaced if it holds ``stored`` events alone: others may wait for import.
-    """
+    """Write events as CSV or JSON, by the file's ending."""
     _check_format(path)
     if path.exists():
         try:
-            new = set(read_table(path)) - set(stored)
+            new = set(read_table(path)) - set(stored)  # others may wait for import
         except AnnotationError:
             raise AnnotationError(f"{path}: is not a table of labels; name another file") from None
         if new:

@@ -187,10 +187,7 @@ class Pictures:
 def render_sheet(
     dataset: Dataset, sheet: Sheet, *, faces: FaceFinder | None = None, around: int = 0
 ) -> str:
-    """Render the page as text, with ``around`` frames before and after each label.
-
-    Pictures are cropped to the faces; without a face finder they show full frames.
-    """
+    """Render the page as text, with ``around`` frames before and after each label."""
     pictures = {
         (tile.subject, tile.expression): take_pictures(dataset, tile, faces, around)
         for tile in sheet.tiles

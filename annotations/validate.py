@@ -257,16 +257,12 @@ def clip_times(clip: MarkedClip) -> np.ndarray:
 
 
 def interval_alpha(units: Sequence[np.ndarray]) -> float | None:
-    """Compute Krippendorff's alpha with the interval metric from two or more values of each unit.
-
-    None if it is undefined: all values are the same, or there is one unit alone, whose spread is
-    also the expected one.
-
-    The mean squared difference of all pairs of values is twice their variance, which gives a closed
-    form without the coincidence matrix (K. Krippendorff, Content Analysis, 2004, chapter 11).
-    """
+    """Compute Krippendorff's alpha, interval metric, of two or more values per unit, if defined."""
     values = np.concatenate(units)
+    # The mean squared difference of all pairs of values is twice their variance, so that the
+    # coincidence matrix is not needed (K. Krippendorff, Content Analysis, 2004, chapter 11).
     expected = 2.0 * values.var(ddof=1)
+    # A single unit has all of the spread, so that none is expected.
     if len(units) < 2 or expected < _NO_SPREAD:
         return None
     observed = sum(len(unit) * 2.0 * unit.var(ddof=1) for unit in units) / len(values)

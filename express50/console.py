@@ -146,10 +146,7 @@ def picture_size(text: str) -> tuple[int, int]:
 def run_handler(
     program: str, handler: Callable[[argparse.Namespace], int], args: argparse.Namespace
 ) -> int:
-    """Call a command's handler and return its exit code, also when it fails or is stopped.
-
-    Any error becomes one line on standard error; with EXPRESS50_DEBUG=1 the traceback follows.
-    """
+    """Call a command's handler and return its exit code, also when it fails or is stopped."""
     _open_standard_streams()
     try:
         with _stop_on_sigterm(), _warnings_on_one_line(program):

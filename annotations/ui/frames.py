@@ -60,14 +60,11 @@ class FrameCache:
         return self._read(shot)
 
     def want(self, shots: Sequence[FrameCrop], *, later: bool = False) -> None:
-        """Decode these in the background, in this order; earlier requests of the kind are dropped.
-
-        Requests for ``later`` wait until no other is left.
-        """
+        """Decode these in the background, in this order; drop earlier requests of the kind."""
         with self._wake:
             wanted = [s for s in reversed(shots) if s not in self._pictures]
             if later:
-                self._later = wanted
+                self._later = wanted  # these wait until no other is left
             else:
                 self._wanted = wanted
             if self._thread is None and self._open and wanted:

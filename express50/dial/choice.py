@@ -337,11 +337,7 @@ def front(load: Workload) -> list[Point]:
 
 
 def scales(load: Workload) -> dict[str, float]:
-    """Return the unit that a result's error is counted in: the error at the best settings.
-
-    If that is 0, as for peaks that are right to the frame, it is the largest difference. Results
-    that no setting changes are left out.
-    """
+    """Return the unit that a result's error is counted in: the error at the best settings."""
     found = {}
     for kind in load.kinds:
         changes = [
@@ -349,8 +345,9 @@ def scales(load: Workload) -> dict[str, float]:
             for row in ladder.values()
         ]  # fmt: skip
         rest = remaining_error(load, kind.name)
+        # Peaks that are right to the frame have no error: the unit is then the largest difference.
         size = math.sqrt(rest[0]) if rest and rest[0] else max(changes, default=0.0)
-        if any(changes):
+        if any(changes):  # others are left out
             found[kind.name] = max(size, 1e-12)
     return found
 
@@ -402,11 +399,8 @@ def goal_result(load: Workload, goal: Goal) -> str:
 
 
 def choose(points: Sequence[Point], seconds: float, goal: tuple[str, float] | None) -> Point:
-    """Return the best point within the time; with a goal, the quickest that reaches it.
-
-    If no point fits, return the quickest.
-    """
-    fitting = [point for point in points if point.seconds <= seconds] or [points[0]]
+    """Return the best point within the time; with a goal, the quickest that reaches it."""
+    fitting = [point for point in points if point.seconds <= seconds] or [points[0]]  # the quickest
     if goal is not None:
         name, value = goal
         reaching = [p for p in fitting if p.errors[name].value <= value]
@@ -422,10 +416,7 @@ def error_text(name: str, error: Expected) -> str:
 
 
 def choice_lines(load: Workload, point: Point, asked: str, spent: float) -> Iterator[str]:
-    """Yield what is expected of a choice, and why each setting was chosen.
-
-    `asked` is the budget and the goal, for people.
-    """
+    """Yield what is expected of a choice, and why each setting was chosen."""
     kind = "core time" if load.cores else count(load.width, "worker")
     yield f"{asked}, {kind}: {format_seconds(spent)} spent on measuring"
     others = "difference from the most expensive settings (no stage states these errors)"

@@ -58,10 +58,7 @@ def to_srgb(image: np.ndarray) -> np.ndarray:
 
 
 def inside(root: Path, name: str) -> Path:
-    """Return the path of a name relative to a folder, and refuse one that leads out of it.
-
-    Links may lead out of it, as those of git-annex do.
-    """
+    """Return the path of a name relative to a folder, and refuse one that leads out of it."""
     pure = PurePosixPath(name)
     if not name.isprintable():
         raise CaptureError(f"{root}: {name!r} has characters that cannot be shown; rename it")
@@ -71,7 +68,7 @@ def inside(root: Path, name: str) -> Path:
         )
     if pure.is_absolute() or ".." in pure.parts:
         raise CaptureError(f"{root}: {name!r} leads out of this folder; expected a name inside it")
-    return root / name
+    return root / name  # links in it may lead out, as those of git-annex do
 
 
 def read_picture(root: Path, name: str, orientation: int = 1) -> np.ndarray:

@@ -204,15 +204,13 @@ class ColourProfile:
 
 
 def foreign_profile(path: Path) -> ColourProfile | None:
-    """Read a picture's ICC profile; None without a usable one, and if it means sRGB's colours.
-
-    OpenImageIO calls all pictures of 8 and 16 bits sRGB, whatever their profile is. Profiles of
-    grey pictures do not count, and neither do those of float ones, which hold linear light.
-    """
+    """Read a picture's ICC profile; None without a usable one, and if it means sRGB's colours."""
     image = open_image(path)
     spec = image.spec()
     image.close()
     data = spec.getattribute("ICCProfile")
+    # Grey pictures have no colours, and float ones hold linear light. All others count as sRGB for
+    # OpenImageIO, whatever their profile is.
     if data is None or spec.nchannels < 3 or _pixel_kind(spec.format) == "float":
         return None
     name = spec.get_string_attribute("ICCProfile:profile_description") or "without a name"
@@ -505,14 +503,11 @@ def reduce_light(image: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def edge_distance(mask: np.ndarray) -> np.ndarray:
-    """Measure the distance (H, W) float32 of each pixel of a mask (H, W) to the nearest outside it.
-
-    Distances are in pixels, zero outside; the mask must have an outside. The last bit of OpenCV's
-    square roots depends on where the mask lies in memory. Squared distances are integers, so
-    rounding them gives the same bytes everywhere, up to 1,400 pixels from the edge, beyond which
-    float32 cannot distinguish them.
-    """
+    """Measure distances (H, W) float32, pixels, of a mask (H, W) to its outside; 0 there."""
     rough = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    # The last bit of OpenCV's square roots depends on where the mask lies in memory. Squared
+    # distances are integers, so that rounding them gives the same bytes everywhere, up to 1,400
+    # pixels from the edge: float32 cannot distinguish them further away.
     return np.sqrt(np.rint(np.square(rough)))
 
 

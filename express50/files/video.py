@@ -290,20 +290,14 @@ def _tags(frame: av.VideoFrame, stream: av.VideoStream) -> VideoTags:
 def iterate_video(
     path: Path, tell: Callable[[VideoTags], None] | None = None
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Decode a whole video in display order.
-
-    `tell` is called with what `video_tags` returns, before the first frame.
-
-    Yields:
-        Time stamp (in the stream's own unit) and (H, W, 3) uint8 sRGB image.
-    """
+    """Decode a video in display order: time stamps in its own unit, and sRGB (H, W, 3) uint8."""
     check_whole(path)
     container, stream = _open(path)
     with container:
         count = 0
         for frame in _in_order(path, _decode(path, container, stream)):
             if tell and not count:
-                tell(_tags(frame, stream))
+                tell(_tags(frame, stream))  # before the first frame
             count += 1
             yield int(frame.pts), _pixels(path, frame)
     if count == 0:
@@ -313,13 +307,10 @@ def iterate_video(
 def iterate_sparsely(
     path: Path, every: int, tell: Callable[[VideoTags], None]
 ) -> Iterator[tuple[int, np.ndarray | None]]:
-    """List a video's frames in display order, and decode a few that need no other frame.
+    """List a video's frames as `iterate_video` does, but decode a few that need no other frame.
 
-    One key frame is decoded in `every` frames, or all key frames if they are further apart.
-    Arguments and errors are those of `iterate_video`.
-
-    Yields:
-        Time stamp and (H, W, 3) uint8 sRGB image; None for a frame that is not decoded.
+    One key frame is decoded in `every` frames, or all key frames if they are further apart. The
+    others come without an image.
     """
     stamps = frame_times(path)
     container, stream = _open(path)
@@ -464,12 +455,7 @@ class VideoReader:
 
 
 class VideoFootage:
-    """Writes ``video.mp4``: H.264, 4:4:4, BT.709.
-
-    It uses one thread, no B-frames and no lookahead, because otherwise the same pictures give
-    different bytes from run to run: libx264 reads stale memory. On one thread it placed B-frames in
-    six different ways in 40 runs, and without them weighted predictions in two ways in 3,000 runs.
-    """
+    """Writes ``video.mp4``: H.264, 4:4:4, BT.709; the same pictures give the same bytes."""
 
     def __init__(self, folder: Path, width: int, height: int, fps: float, crf: int) -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -477,6 +463,9 @@ class VideoFootage:
         rate = Fraction(fps).limit_denominator(1001)
         stream = self._container.add_stream("libx264", rate=rate)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv444p"
+        # One thread, no B-frames, no lookahead: libx264 reads stale memory, so that the bytes would
+        # differ from run to run. On one thread it placed B-frames in six different ways in 40 runs,
+        # and without them weighted predictions in two ways in 3,000 runs.
         stream.options = {
             "crf": str(crf), "preset": "veryfast", "bf": "0", "rc-lookahead": "0", "weightp": "0"
         }  # fmt: skip

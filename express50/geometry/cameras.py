@@ -230,12 +230,9 @@ def _field(dist: bytes) -> float:
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Project world points (N, 3), metres, into a camera, including distortion.
+    """Project world points (N, 3), metres, to pixels (N, 2) and camera z (N,), with distortion.
 
-    Returns:
-        Pixels (N, 2) as (x, y), NaN if depth <= 0 or where the lens folds, and depth (N,), camera
-        z in metres. Both are NaN if a point is not finite.
-
+    Pixels are NaN if z <= 0 or where the lens folds; both are NaN if a point is not finite.
     Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., ch. 6.
     """
     points = np.asarray(points, dtype=np.float64)
@@ -283,8 +280,6 @@ def triangulate(
 
     A pixel is NaN where a camera does not see a point; `weights` (C, N) are ones by default. A
     point is NaN if fewer than two cameras see it, or it lies behind all.
-
-    Source: linear triangulation (Hartley and Zisserman, 12.2), then Gauss-Newton on pixels.
     """
     pixels = np.asarray(pixels, dtype=np.float64)
     check_shape("pixels", pixels, (len(cameras), None, 2))
@@ -293,6 +288,7 @@ def triangulate(
     w = np.where(seen, 1.0 if weights is None else np.asarray(weights, dtype=np.float64), 0.0)
     P = np.stack([c.cam_from_world[:3] for c in cameras])  # (C, 3, 4)
     focal = np.array([camera.focal for camera in cameras])
+    # Linear triangulation (Hartley and Zisserman, 12.2), then Gauss-Newton on pixels.
     points = np.full((pixels.shape[1], 3), np.nan)
     enough = (w > 0).sum(0) >= 2
     for n in np.flatnonzero(enough):

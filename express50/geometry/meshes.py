@@ -151,11 +151,7 @@ def encode_glb(
 def cotangent_laplacian(
     vertices: np.ndarray, faces: np.ndarray
 ) -> tuple[sparse.csr_matrix, np.ndarray]:
-    """Return cotangent stiffness (V, V) and lumped mass (V,) of a mesh (V, 3), (F, 3).
-
-    Source: Pinkall and Polthier 1993. Only positive edge weights are kept, so that slivers do no
-    harm and the matrix is positive semi-definite.
-    """
+    """Return the stiffness (V, V) and lumped mass (V,) of a mesh (Pinkall and Polthier 1993)."""
     count = len(vertices)
     values: list[np.ndarray] = []
     mass = np.full(count, 1e-12)
@@ -167,6 +163,7 @@ def cotangent_laplacian(
         np.add.at(mass, i, area / 6.0)
     edges = (faces.T.ravel(), faces[:, [1, 2, 0]].T.ravel())
     half = sparse.csr_matrix((np.concatenate(values), edges), shape=(count, count))
+    # Without negative weights, slivers do no harm and the matrix is positive semi-definite.
     weights = (half + half.T).maximum(0.0).minimum(20.0)
     return sparse.diags(np.asarray(weights.sum(1)).ravel()) - weights, mass
 

@@ -29,11 +29,8 @@ SHARPEST = 20  # percentile of the widths: lashes and hair are sharp, a face is 
 
 
 def undistort_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return maps (H, W) of x and y, float32, for ``cv2.remap`` from a camera to its pinhole.
-
-    Where the lens folds, the map points outside the image. In large images it is computed once per
-    block of pixels and interpolated: at most 0.004 px off for a lens of 80 degrees.
-    """
+    """Return maps (H, W) of x and y, float32, for ``cv2.remap`` from a camera to its pinhole."""
+    # Once per block of pixels, then interpolated: at most 0.004 px off for a lens of 80 degrees.
     step = max(1, max(camera.width, camera.height) // MAPPED)
     columns, rows = (-(-side // step) + 2 for side in (camera.width, camera.height))
     size = step * columns, step * rows  # a block more on each side
@@ -44,7 +41,7 @@ def undistort_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     )
     window = np.s_[step : step + camera.height, step : step + camera.width]
     x, y = (cv2.resize(values, size, interpolation=cv2.INTER_LINEAR)[window] for values in maps)
-    if pictured_share(camera) < 1:
+    if pictured_share(camera) < 1:  # where the lens folds
         across, down = cell_centres(camera.width), cell_centres(camera.height)
         x[~_pictured(camera, across, down)] = OUTSIDE
     return x, y

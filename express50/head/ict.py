@@ -136,10 +136,7 @@ def read_ict_checkout(path: Path) -> IctArrays:
 
 
 def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Read vertices (V,3), texture coordinates (T,2), faces (F,3), their uv (F,3), material (F,).
-
-    Polygons are split into fans. Faces without texture coordinates get coordinate 0.
-    """
+    """Read vertices (V,3), texture places (T,2), faces (F,3), their uv (F,3), material (F,)."""
     vertices: list[list[str]] = []
     uv: list[list[str]] = []
     corners: list[tuple[str, str, str]] = []
@@ -156,13 +153,14 @@ def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
             elif words[0] == "usemtl":
                 material = words[1]
             elif words[0] == "f":
-                for second, third in zip(words[2:-1], words[3:], strict=True):
+                for second, third in zip(words[2:-1], words[3:], strict=True):  # a fan
                     corners.append((words[1], second, third))
                     materials.append(material)
         index = np.array(
             [[corner.split("/")[:2] + ["1"] for corner in face] for face in corners], dtype=object
         )
         faces = index[:, :, 0].astype(np.int64) - 1
+        # the first where there is none
         uv_faces = np.where(index[:, :, 1] == "", "1", index[:, :, 1]).astype(np.int64) - 1
         points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
         coordinates = np.array(uv or [["0", "0"]], dtype=np.float64).reshape(-1, 2)

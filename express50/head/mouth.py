@@ -179,10 +179,7 @@ def _pouch(model: HeadModel, chart: np.ndarray) -> _Part:
 
 
 def mouth_loop(faces: np.ndarray, name: str) -> np.ndarray:
-    """Return the ids (32,) of the open loop behind the lips, in the order of new faces along it.
-
-    It starts at the first of CORNERS.
-    """
+    """Return the ids (32,) of the open loop behind the lips, from the first of CORNERS on."""
     # The face on the other side of an edge runs along it in the opposite direction.
     following = {int(b): int(a) for a, b in open_edges(faces)}
     loop = [CORNERS[0]]

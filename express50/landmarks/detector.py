@@ -150,12 +150,7 @@ def _detection(place: _Place) -> Detection:
 
 
 def _searches(width: int, height: int, smallest: float) -> Iterator[list[np.ndarray]]:
-    """Yield windows to look in: the whole frame, then turned and smaller ones, then smaller yet.
-
-    Frames of any size have the same number of rounds. If smaller windows than usual are allowed,
-    turned ones of the second size come last, because a photograph may lie on its side; for a
-    rig's footage this is known.
-    """
+    """Yield windows to look in: the whole frame, then turned and smaller ones, then smaller yet."""
     longer = float(max(width, height))
     turned = [np.pi / 2, np.pi, 1.5 * np.pi]
     yield _windows(width, height, longer, 0.0)
@@ -163,8 +158,9 @@ def _searches(width: int, height: int, smallest: float) -> Iterator[list[np.ndar
         window for turn in turned for window in _windows(width, height, longer, turn)
     ]
     side = SHRINK
-    while (side := side * SHRINK) >= smallest:
+    while (side := side * SHRINK) >= smallest:  # as often in frames of any size
         yield _windows(width, height, side * longer, 0.0)
+    # Photographs may lie on their side; for a rig's footage this is known.
     if smallest < SMALLEST:
         yield [w for turn in turned for w in _windows(width, height, SHRINK * longer, turn)]
 

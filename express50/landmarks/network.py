@@ -283,12 +283,9 @@ def save_network(net: LandmarkNet, path: Path) -> None:
 
 @lru_cache(maxsize=2)  # landmarks in pictures, and on the face UV map
 def load_network(path: Path = WEIGHTS) -> LandmarkNet:
-    """Read weights written by `save_network`, for evaluation only. Callers share the network.
-
-    Batch normalisations are folded into the convolutions before them.
-    """
+    """Read weights written by `save_network`, for evaluation only. Callers share the network."""
     net = trainable_network(path).eval()
-    fold(net)
+    fold(net)  # batch normalisations, into the convolutions before them
     return net.to(memory_format=torch.channels_last)
 
 

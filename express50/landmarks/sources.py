@@ -249,11 +249,7 @@ def load_fan(path: Path) -> torch.jit.ScriptModule:
 
 
 def find_with_fan(fan: torch.jit.ScriptModule, image: np.ndarray, face: Detection) -> Detection:
-    """Find the points of a detected face with FAN; the face keeps its score.
-
-    A point's confidence is its heat map's peak times the score; sigma comes from the peak's spread.
-    The image is (H, W, 3) uint8 RGB.
-    """
+    """Find a detected face's points with FAN in (H, W, 3) uint8 RGB; the face keeps its score."""
     window = fan_window(face.points)
     crop = cut_crop(image, window, FAN_CROP)
     with torch.inference_mode():

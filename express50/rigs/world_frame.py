@@ -49,11 +49,7 @@ def meeting_point(cameras: Mapping[str, Camera]) -> np.ndarray | None:
 
 
 def depths_behind(cameras: Mapping[str, Camera]) -> dict[str, float]:
-    """Return the depths, metres, of the cameras that have the rig's meeting point behind them.
-
-    Inverted matrices (camera to world) and a wrong axis convention show up here. Empty if the axes
-    do not meet.
-    """
+    """Return depths, metres, of the cameras that have the meeting point of all axes behind them."""
     point = meeting_point(cameras)
     if point is None:
         return {}
@@ -62,6 +58,7 @@ def depths_behind(cameras: Mapping[str, Camera]) -> dict[str, float]:
         name: float((c.cam_from_world[:3, :3] @ point + c.cam_from_world[:3, 3])[2])
         for name, c in sorted(cameras.items())
     }
+    # Their axes are of another convention, or their matrices inverted (camera to world).
     return {name: depth for name, depth in depths.items() if depth <= 0.01 * extent}
 
 

@@ -182,13 +182,11 @@ def _split(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def ray_pattern(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return places x and y (count,) in a pixel, from -0.5 up, evenly spread.
-
-    They are a rank-1 lattice: every row and column of a count x count grid holds one ray. Number
-    ``count // 2`` is the centre.
-    """
+    """Return places x and y (count,) in a pixel, from -0.5 up, evenly spread."""
     half = count // 2
     k = np.arange(count)
+    # A rank-1 lattice: every row and column of a count x count grid holds one ray. Number
+    # ``count // 2`` is the centre.
     stride = max(1, round(count * 0.618034))
     while np.gcd(stride, count) != 1:
         stride += 1

@@ -164,10 +164,7 @@ def write_png(path: Path, image: np.ndarray) -> None:
 def write_truth(
     folder: Path, head: str, body: Body, play: TwinPerformance, cameras: Mapping[str, Camera]
 ) -> None:
-    """Write a subject's truth: cameras.json, peaks.json, subject.json, frames.npz, body.npz.
-
-    If needed, also its own motion in own.npz, and what it wears and holds in worn.npz.
-    """
+    """Write a subject's truth: cameras.json, peaks.json, subject.json, frames.npz, body.npz."""
     folder.mkdir(parents=True, exist_ok=True)
     write_cameras(folder / "cameras.json", cameras)
     subject = body.subject

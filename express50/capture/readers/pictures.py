@@ -48,11 +48,7 @@ def fits_photos(path: Path) -> bool:
 
 
 def read_photos(path: Path, selection: Selection) -> RawCapture:
-    """Read each photograph as a camera of one moment.
-
-    Cameras are those of calibration.json; without it, calibrate solves them. A photograph whose
-    EXIF says that it lies on its side is read upright.
-    """
+    """Read each photograph as a camera of one moment."""
     names = pictures_in(path, footage_folder(path))
     ids = unique_ids(path, names, lambda name: Path(name).stem)
     check_selection(selection, [MOMENT], sorted(ids.values()))
@@ -62,7 +58,7 @@ def read_photos(path: Path, selection: Selection) -> RawCapture:
         if not selection.has_camera(camera):
             continue
         try:
-            turn, _ = read_exif(path / name)
+            turn, _ = read_exif(path / name)  # some lie on their side
         except FormatError as error:
             dropped[camera] = str(error)
             continue
@@ -72,7 +68,7 @@ def read_photos(path: Path, selection: Selection) -> RawCapture:
     if not cameras:
         reasons = "; ".join(f"{k}: {v}" for k, v in dropped.items())
         raise CaptureError(f"{path}: no photograph can be used: {reasons}")
-    calibration = read_calibration(path, cameras, dropped)
+    calibration = read_calibration(path, cameras, dropped)  # without it, calibrate solves them
     return RawCapture(
         root=path, subject=folder_id(path), fps=FPS, meta={}, cameras=cameras, dropped=dropped,
         calibration=calibration, plates=read_plates(path, cameras),
