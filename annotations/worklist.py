@@ -50,10 +50,7 @@ def worklist(
     order: str = "doubt",
     everything: bool = False,  # lists what this annotator has labelled, too
 ) -> list[LabelTask]:
-    """List the tasks of an annotator, the reference's first in every order.
-
-    Excluded subjects have no tasks. The labels of others do not count.
-    """
+    """List the tasks of an annotator, the reference's first in every order."""
     known = included_subjects(dataset)
     check_known(str(dataset.root), "included subject", subjects or (), known)
     if not known:
@@ -62,6 +59,7 @@ def worklist(
     chosen = sorted(subjects or known, key=lambda s: (s != reference, s))
     tasks, places = [], dict[str, int]()  # places of expressions: subjects may lack some
     for subject in chosen:
+        # Labels of others do not count.
         done = {} if everything else labels_of(read_labels(dataset, subject), annotator)
         suggestions = read_suggestions(dataset, subject)
         doubts = {name: 1.0 - found.confidence for name, found in suggestions.items()}
@@ -80,10 +78,8 @@ def worklist(
 def coverage(dataset: Dataset) -> dict[str, dict]:
     """Compute the coverage of the subjects that are not excluded.
 
-    Returns:
-        ``cells`` (subject -> expression -> ``person``, ``rule``, ``auto``, ``flagged`` or
-        ``missing``), ``missing`` (subject -> expressions), ``excluded`` (subject -> reason),
-        ``gender`` and ``age`` counts of five or more people, where captures state them.
+    The states in ``cells`` (subject -> expression) are ``person``, ``rule``, ``auto``, ``flagged``
+    and ``missing``; ``gender`` and ``age`` count five or more people, where captures state them.
     """
     cells = {}
     for subject in included_subjects(dataset):

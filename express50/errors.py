@@ -113,10 +113,7 @@ def few(names: Sequence[str], count: int = 3, between: str = ", ") -> str:
 
 
 def advised(*words: str | Path) -> str:
-    """Return a command in quotation marks, as messages advise it; its paths suit any shell.
-
-    Paths with spaces and the like are quoted, and those that begin as options do get ``./``.
-    """
+    """Return a command in quotation marks, as messages advise it; its paths suit any shell."""
     texts = []
     for word in words:
         text = f"./{word}" if isinstance(word, Path) and str(word).startswith("-") else str(word)

@@ -203,10 +203,7 @@ def most_similar_event(values: np.ndarray, direction: np.ndarray) -> tuple[Event
 
 
 def choose_event(values: np.ndarray, own: Event, canonical: Canonical | None) -> tuple[Event, bool]:
-    """Choose the strongest event, unless another is clearly more like the reference's.
-
-    The second value is False where the two differ.
-    """
+    """Choose the strongest event, or one clearly more like the reference's; say if they agree."""
     if canonical is None or not canonical.direction.any():
         return own, True
     other, likeness = most_similar_event(values, canonical.direction)

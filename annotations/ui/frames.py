@@ -103,7 +103,8 @@ class FrameCache:
 
     def _read(self, shot: FrameCrop) -> np.ndarray:
         try:
-            picture = read_shot(self._dataset, shot)
+            image = read_proxy(self._dataset, shot.subject, shot.camera, shot.frame)
+            picture = crop_to(image, shot.box, shot.width, shot.height)
         except (Express50Error, OSError, IndexError, ValueError, cv2.error) as error:
             where = f"{shot.subject} {shot.camera} frame {shot.frame}"
             if isinstance(error, FileNotFoundError) or isinstance(
@@ -122,12 +123,6 @@ class FrameCache:
             while self._bytes > LIMIT_BYTES:
                 self._bytes -= self._pictures.popitem(last=False)[1].nbytes
         return picture
-
-
-def read_shot(dataset: Dataset, shot: FrameCrop) -> np.ndarray:
-    """Read a frame's proxy and bring the part that is asked for to display size."""
-    image = read_proxy(dataset, shot.subject, shot.camera, shot.frame)
-    return crop_to(image, shot.box, shot.width, shot.height)
 
 
 def crop_to(image: np.ndarray, box: Box, width: int, height: int) -> np.ndarray:
@@ -167,10 +162,7 @@ class Face:
 
 
 def zoom_box(face: Face | None, zoom: str, pane_aspect: float, image_aspect: float) -> Box:
-    """Find the part of a picture that a zoom shows in a pane of that height over width.
-
-    Without a face, or for the zoom ``frame``, it is the full picture.
-    """
+    """Find the part of a picture that a zoom shows in a pane of that height over width."""
     if face is None or zoom == "frame":
         height = max(image_aspect, pane_aspect)
         width = height / pane_aspect

@@ -39,10 +39,7 @@ class Effort:
 
 
 class Session:
-    """Tasks in order, the one that is open, decisions and their cost.
-
-    A session begins with the first task that the annotator has not decided.
-    """
+    """Tasks in order, the one that is open, decisions and their cost."""
 
     def __init__(
         self,

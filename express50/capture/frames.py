@@ -304,11 +304,7 @@ def read_recorded_cameras(dataset: Dataset, subject: str) -> dict[str, Camera]:
 
 
 def make_picture(image: np.ndarray, camera: Camera, size: tuple[int, int]) -> np.ndarray:
-    """Make the picture of a recorded image (H, W, 3) uint8: undistort it, then reduce it.
-
-    `camera` has the recorded size, `size` is the width and height of the picture. Areas are
-    averaged in linear light, as a sensor with larger pixels would do.
-    """
+    """Make a recorded image's (H, W, 3) uint8 picture: undistort it, then reduce it to a size."""
     undistorted = undistort_image(image, camera)
     return undistorted if size == _size_of(camera) else reduce_light(undistorted, *size)
 

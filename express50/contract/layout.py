@@ -18,11 +18,7 @@ from express50.files.text import NAME, parse_json, read_bytes, read_json_table, 
 
 
 def footage_root(capture: Path) -> Path:
-    """Return the folder that a registered capture's footage is relative to.
-
-    It is the capture's folder, a file's folder, or what ``source`` in capture.toml names: a capture
-    may consist of capture.toml alone, which points to a read-only dataset.
-    """
+    """Return the folder that a capture's footage is relative to: its own, or ``source``'s."""
     source = footage_source(Path(capture))
     return source.parent if source.is_file() else source
 

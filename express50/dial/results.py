@@ -127,13 +127,12 @@ def _medians_apart(
 ) -> list[float]:
     """Return the median distance of vertices of E pairs of meshes (V, 3), millimetres.
 
-    With `faces` (F, 3) only what lies along the second mesh's normals counts. One rigid motion is
-    taken out before: solved rigs have worlds of their own.
+    With `faces` (F, 3) only what lies along the second mesh's normals counts.
     """
     if not meshes[0] or meshes[0][0].shape != meshes[1][0].shape:
         return []
     one, two = (np.stack(list(some)).astype(np.float64) for some in meshes)
-    R, t = rigid_fit(one.reshape(-1, 3), two.reshape(-1, 3))
+    R, t = rigid_fit(one.reshape(-1, 3), two.reshape(-1, 3))  # rigs have worlds of their own
     off = one @ R.T + t - two
     apart = np.linalg.norm(off, axis=2)
     if faces is not None:

@@ -80,10 +80,7 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def _plain_png(path: Path) -> np.ndarray | None:
-    """Read a PNG of 8 or 16 bits without a palette, in half of OpenImageIO's time.
-
-    None for any other file, and for one that OpenImageIO has to refuse.
-    """
+    """Read a plain PNG of 8 or 16 bits in half of OpenImageIO's time; None for any other file."""
     with suppress(OSError), open_file(path) as file:
         head = file.read(26)
         if len(head) < 26 or not head.startswith(PNG_START):
@@ -104,10 +101,7 @@ def _plain_png(path: Path) -> np.ndarray | None:
 
 
 def _own_png(data: bytes, shape: tuple[int, ...]) -> np.ndarray | None:
-    """Decode a PNG as `encode_png` makes them, in a third of libpng's time.
-
-    None if another program wrote it, or if it is damaged: libpng then says how.
-    """
+    """Decode a PNG as `encode_png` makes them, in a third of libpng's time; None for any other."""
     kind, end = np.dtype(f">u{data[24] // 8}"), len(data) - len(PNG_END)
     length = math.prod(shape[1:]) * kind.itemsize + 1  # of a row, with its filter type
     header, body = data[12:33], data[37:end]

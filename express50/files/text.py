@@ -97,13 +97,9 @@ def expanded(path: str | Path) -> Path:
 
 
 def unreadable(path: Path) -> str:
-    """Return why a file or folder that is there cannot be read, and what to do; "" if it can.
-
-    It may need permissions, or a file may lack its content: git-annex keeps links to contents that
-    are fetched one by one. It and Git LFS also write small files that only name the content.
-    """
+    """Return why a file or folder that is there cannot be read, and what to do; "" if it can."""
     try:
-        if path.is_symlink() and not path.exists():
+        if path.is_symlink() and not path.exists():  # git-annex fetches contents one by one
             return (
                 f"is a link to {path.readlink()}, which is not there; fetch it (of git-annex or"
                 " DataLad: 'git annex get FOLDER'), or copy the file itself"

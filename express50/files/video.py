@@ -364,11 +364,9 @@ class VideoReader:
         return _pixels(self.path, self._frame(frame))
 
     def read_exactly(self, frame: int) -> np.ndarray:
-        """Read as `read` does, with the colours that the file states.
-
-        What `read` returns is a level darker where chroma is reduced. Hashes are made from it, and
-        labels hold hashes, so it has to stay as it is.
-        """
+        """Read as `read` does, with the colours that the file states."""
+        # What `read` returns is a level darker where chroma is reduced. Hashes are made from it,
+        # and labels hold hashes, so it has to stay as it is.
         return _pixels(self.path, self._frame(frame), EXACT)
 
     def _frame(self, frame: int) -> av.VideoFrame:

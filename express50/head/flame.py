@@ -26,11 +26,7 @@ _REQUIRED = ("v_template", "f", "shapedirs", "posedirs", "J_regressor", "weights
 
 
 def load_flame(path: str | Path) -> HeadModel:
-    """Load FLAME; add teeth and the inside of the mouth if it has FLAME's number of vertices.
-
-    `path` is the model pickle (generic_model.pkl, flame2023.pkl, ...); landmark embedding, masks
-    and template must be beside it.
-    """
+    """Load FLAME by its pickle; add teeth and a mouth if it has FLAME's number of vertices."""
     model = read_flame(Path(path))
     return check_head(add_mouth(model)) if len(model.template) == FLAME_VERTICES else model
 

@@ -74,10 +74,7 @@ def names_from_files(files: Sequence[str]) -> list[str]:
 
 
 def at_size(camera: Camera, size: tuple[int, int]) -> Camera:
-    """Return the camera with K scaled to the footage's size (width, height).
-
-    Other aspect ratios are refused: the images were cropped, not scaled.
-    """
+    """Return the camera with K scaled to the footage's size (width, height) of the same aspect."""
     sx, sy = size[0] / camera.width, size[1] / camera.height
     if abs(sx / sy - 1) > 0.01:
         raise CalibrationError(

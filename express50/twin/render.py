@@ -201,10 +201,7 @@ def hull_of(vertices: np.ndarray) -> np.ndarray:
 
 
 def window_of(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]:
-    """Return columns and rows x0, y0, x1, y1 that contain all vertices (N, 3), with a margin.
-
-    The corners of the convex hull (:func:`hull_of`) are enough.
-    """
+    """Return columns and rows x0, y0, x1, y1 that contain all vertices (N, 3), with a margin."""
     pixels, depth = project(camera, vertices)
     if not (depth > 0.05).all():
         return 0, 0, camera.width, camera.height

@@ -157,13 +157,10 @@ def holds_folders(path: Path) -> bool:
 
 
 def read_videos(path: Path, selection: Selection) -> RawCapture:
-    """Read each video of a folder as a camera; frame 17 of all shows the same moment.
-
-    A file that cannot be read as a video, such as a sound recording, is dropped. Without cues, the
-    whole footage is one clip.
-    """
+    """Read each video of a folder as a camera; frame 17 of all shows the same moment."""
     names = _videos(path, footage_folder(path))
     ids = unique_ids(path, names, lambda name: Path(name).stem)
+    # Files that are no videos, such as sound recordings, are dropped.
     return _read(path, "videos", {ids[name]: {(CLIP, 0): name} for name in names}, selection)
 
 
