@@ -103,8 +103,7 @@ class FrameCache:
 
     def _read(self, shot: FrameCrop) -> np.ndarray:
         try:
-            image = read_proxy(self._dataset, shot.subject, shot.camera, shot.frame)
-            picture = crop_to(image, shot.box, shot.width, shot.height)
+            picture = read_shot(self._dataset, shot)
         except (Express50Error, OSError, IndexError, ValueError, cv2.error) as error:
             where = f"{shot.subject} {shot.camera} frame {shot.frame}"
             if isinstance(error, FileNotFoundError) or isinstance(
@@ -123,6 +122,12 @@ class FrameCache:
             while self._bytes > LIMIT_BYTES:
                 self._bytes -= self._pictures.popitem(last=False)[1].nbytes
         return picture
+
+
+def read_shot(dataset: Dataset, shot: FrameCrop) -> np.ndarray:
+    """Read a frame's proxy and bring the part that is asked for to display size."""
+    image = read_proxy(dataset, shot.subject, shot.camera, shot.frame)
+    return crop_to(image, shot.box, shot.width, shot.height)
 
 
 def crop_to(image: np.ndarray, box: Box, width: int, height: int) -> np.ndarray:
