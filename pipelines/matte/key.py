@@ -3,7 +3,8 @@
 Large parts that differ from the plate by more than noise are the subject's region. Its solid inside
 is found by shape and has alpha 1. Around it, alpha is solved from the plate and the subject's
 colours nearby (`pipelines.matte.plates`), so that a strand of fair hair over a fair plate is as
-opaque as a dark one. benchmarks/matte.py compares it with plain keys and textbook matting.
+opaque as a dark one. A shirt of the wall's colour is found by the texture of the wall, which it
+hides. benchmarks/matte.py compares all this with plain keys and textbook matting.
 """
 
 from __future__ import annotations
@@ -17,10 +18,14 @@ import numpy as np
 
 from express50.files.images import LIGHT_OF_LEVEL, box_about, shrink
 from pipelines.matte.plates import (
+    ODD_STEPS,
     PlateModel,
     block_means,
     blurred,
+    border_of,
     enlarged,
+    exposed,
+    exposure_gain,
     fit_plate,
     light_noise,
     local_colours,
@@ -50,6 +55,13 @@ BLACK, WHITE = 24, 250  # grey levels beyond which two surfaces may look the sam
 FILL = 0.012  # distance from the solid's edge from which its spots and gaps are filled
 WIDE = 0.01  # radius of a disc that is wider than strands and soft edges
 WINDOW_SIDE = 960  # longer side, pixels, of the picture in which the subject is looked for first
+# The wall's texture is compared in pictures of TEXTURE_SIDE pixels: what is finer than FINE, in
+# windows of deviation WINDOW. A wall shows at least VISIBLE of it in spite of noise, in three
+# quarters of the LEAST_WALL pixels or more that are as strongly textured.
+TEXTURE_SIDE, FINE, WINDOW, VISIBLE, LEAST_WALL = 512, 3.0, 5.0, 0.45, 500
+LEAST_LOST = 0.005  # share of the picture; beside smaller parts lies texture that the head hides
+SEAM = 3  # pixels between parts found by colour and by texture
+MOST_ODD = 0.02  # share of a rim of plate that may lack its texture; compression takes more
 
 Erode = Callable[[np.ndarray, int], np.ndarray]
 """`eroded` or `eroded_about`."""
@@ -63,12 +75,21 @@ class Support:
     near: np.ndarray
 
 
-def key_alpha(
-    frame: np.ndarray, plate: np.ndarray, valid: np.ndarray, shadow: float, softened: int = 0
-) -> np.ndarray:
+def key_alpha(frame: np.ndarray, plate: np.ndarray, valid: np.ndarray, shadow: float) -> np.ndarray:
     """Return the opacity (H, W) float32 in [0, 1] of a frame (H, W, 3) uint8 against its plate.
 
     Pixels outside `valid` (H, W) get 0. Darkening of the plate by up to `shadow` is a shadow.
+    """
+    alpha = _keyed(frame, plate, valid, shadow)
+    part = part_like_the_wall(alpha, frame, plate, valid)
+    return np.maximum(alpha, part, where=valid, out=alpha) if part.any() else alpha
+
+
+def _keyed(
+    frame: np.ndarray, plate: np.ndarray, valid: np.ndarray, shadow: float, softened: int = 0
+) -> np.ndarray:
+    """Key a frame by its colours.
+
     Pictures in which parts of the subject hardly exceed the noise are blurred and keyed again;
     `softened` counts how often.
     """
@@ -82,7 +103,7 @@ def key_alpha(
     strength = _strength(difference, np.where(valid[whole], unshaded, 0.0), valid.size)
     if softened < SOFTENINGS and not (strength.size and np.quantile(strength, FAINT) > PLAIN):
         frame, plate = (cv2.GaussianBlur(image, (0, 0), 2.0**softened) for image in given)
-        return key_alpha(frame, plate, valid, shadow, softened + 1)
+        return _keyed(frame, plate, valid, shadow, softened + 1)
     region = subject_region(difference, valid.size)
     if not region.any():
         return alpha
@@ -103,6 +124,55 @@ def key_alpha(
     alpha[whole][window] = _opacity(frame, difference, dark, support, part, length)
     alpha[~valid] = 0.0
     return alpha
+
+
+def part_like_the_wall(
+    alpha: np.ndarray, frame: np.ndarray, plate: np.ndarray, valid: np.ndarray
+) -> np.ndarray:
+    """Return the opacity (H, W) float32 of the parts beside the subject that look like the wall.
+
+    They have its colours, but hide its texture, which a shadow keeps. There are none if the wall
+    has no texture, or if it is missing elsewhere too, as after compression or if a curtain moved.
+    """
+    opaque = np.rint(255 * alpha), 255 * valid
+    solid, known = (shrink(v.astype(np.uint8), TEXTURE_SIDE) > 240 for v in opaque)
+    frame, plate = (shrink(image, TEXTURE_SIDE) for image in (frame, plate))
+    seen, held = frame.astype(np.float32), exposed(plate, exposure_gain(frame, plate))
+    alike = known & (np.abs(cv2.blur(seen - held, (5, 5))).max(-1) < ODD_STEPS)
+    hidden = alike & texture_hidden(seen, held, alike)
+    rim = known & border_of(hidden.shape)
+    if not hidden.any() or (hidden & rim).sum() > MOST_ODD * rim.sum():
+        return np.zeros(alpha.shape, np.float32)
+    body = opened(eroded(solid | hidden, 2), _pixels(CORE, max(hidden.shape))) | solid
+    _, labels = cv2.connectedComponents(dilated(body, SEAM).astype(np.uint8))
+    part = body & ~solid & np.isin(labels, np.unique(labels[solid]))
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(part.astype(np.uint8))
+    part &= (stats[:, cv2.CC_STAT_AREA] > LEAST_LOST * part.size)[labels]
+    # Between the two, colours and texture are mixed.
+    part |= eroded(dilated(part | solid, SEAM), SEAM) & dilated(part, SEAM)
+    return cv2.resize(part.astype(np.float32), alpha.shape[::-1])
+
+
+def texture_hidden(seen: np.ndarray, held: np.ndarray, alike: np.ndarray) -> np.ndarray:
+    """Return where (H, W) bool a frame lacks the texture that is `held` by its plate.
+
+    Both are (H, W, 3) float32. In most of the pixels that are `alike` (H, W) the wall shows. They
+    tell how much of a texture noise leaves visible; a texture that it hides proves nothing.
+    """
+    greys = [cv2.transform(image, np.full((1, 3), 1 / 3)) for image in (seen, held)]
+    seen, held = (grey - cv2.GaussianBlur(grey, (0, 0), FINE) for grey in greys)
+    power = cv2.GaussianBlur(held * held, (0, 0), WINDOW) + 1e-4
+    limit = 2 * np.sqrt(power)  # the subject's own edges may be far stronger
+    shown = cv2.GaussianBlur(np.clip(seen, -limit, limit) * held, (0, 0), WINDOW) / power
+    octave = np.rint(np.log2(power))
+    hidden = np.zeros(alike.shape, bool)
+    for strength in np.unique(octave[alike]):
+        similar = octave == strength
+        wall = shown[similar & alike]
+        usual = np.quantile(wall, 0.75)
+        if len(wall) >= LEAST_WALL and usual > VISIBLE:
+            hidden |= similar & (shown < usual / 2)
+    return hidden
 
 
 def _strength(difference: np.ndarray, unshaded: np.ndarray, size: int) -> np.ndarray:

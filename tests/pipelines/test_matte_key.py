@@ -428,3 +428,41 @@ def test_a_gap_in_a_shirt_shows_a_wall_of_another_colour() -> None:
     scene = shirt_before(wall=(96, 112, 140), gap=True)
     assert mae(key(scene), scene) < 0.006
     assert key(scene)[216:, 122:136].max() < 0.1
+
+
+def man_in_black(texture: float, shade: float = 1.0, moved: int = 0) -> Scene:
+    """Return a head above a shirt that has the colour of a wall, but not its `texture` (levels).
+
+    The left half of the wall is `shade` times as bright in the frame as in the plate, and its
+    texture lies `moved` pixels to the side.
+    """
+    rng, size = np.random.default_rng(8), 320
+    weave = cv2.GaussianBlur(rng.normal(0, 1, (size, size)), (0, 0), 1.2)
+    weave = (texture * weave / weave.std())[..., None]
+    alpha = np.zeros((size, size), np.float32)
+    cv2.ellipse(alpha, (160, 320), (120, 130), 0, 180, 360, 1.0, -1)
+    cv2.circle(alpha, (160, 130), 62, 1.0, -1)
+    subject = np.full((size, size, 3), 31.0)
+    cv2.circle(subject, (160, 130), 62, (205, 160, 138), -1)
+    wall = 30 + np.roll(weave, moved, axis=1) + np.zeros(3)
+    wall[:, :160] *= shade
+    images = np.where(alpha[..., None] > 0, subject, wall), 30 + weave + np.zeros(3)
+    frame, plate = (
+        np.clip(image + rng.normal(0, 1.5, image.shape), 0, 255).round().astype(np.uint8)
+        for image in images
+    )
+    return Scene(frame=frame, plate=plate, alpha=alpha)
+
+
+def test_a_shirt_of_the_walls_colour_hides_its_texture() -> None:
+    scene = man_in_black(texture=2.5)
+    assert mae(key(scene), scene) < 0.015
+    assert key(scene)[scene.alpha == 0].mean() < 0.003
+    smooth = man_in_black(texture=0)  # nothing tells the two apart, and nothing is made up
+    assert mae(key(smooth), smooth) > 0.15
+
+
+@pytest.mark.parametrize("change", [{"shade": 0.7}, {"moved": 3}])
+def test_a_wall_in_shadow_or_another_texture_is_not_a_shirt(change: dict) -> None:
+    scene = man_in_black(texture=2.5, **change)
+    assert key(scene)[scene.alpha == 0].mean() < 0.01
