@@ -56,9 +56,10 @@ FILL = 0.012  # distance from the solid's edge from which its spots and gaps are
 WIDE = 0.01  # radius of a disc that is wider than strands and soft edges
 WINDOW_SIDE = 960  # longer side, pixels, of the picture in which the subject is looked for first
 # The wall's texture is compared in pictures of TEXTURE_SIDE pixels: what is finer than FINE, in
-# windows of deviation WINDOW. A wall shows at least VISIBLE of it in spite of noise, in three
-# quarters of the LEAST_WALL pixels or more that are as strongly textured.
-TEXTURE_SIDE, FINE, WINDOW, VISIBLE, LEAST_WALL = 512, 3.0, 5.0, 0.45, 500
+# windows of deviation WINDOW. Of all pixels that are as strongly textured, at least LEAST_WALL, the
+# quantile USUAL shows what noise leaves of it; that must be VISIBLE.
+TEXTURE_SIDE, FINE, WINDOW, USUAL, VISIBLE, LEAST_WALL = 512, 3.0, 5.0, 0.6, 0.4, 500
+HIDDEN = 0.5  # share of the usual texture under which the wall is hidden; half of it on average
 LEAST_LOST = 0.005  # share of the picture; beside smaller parts lies texture that the head hides
 SEAM = 3  # pixels between parts found by colour and by texture
 MOST_ODD = 0.02  # share of a rim of plate that may lack its texture; compression takes more
@@ -139,7 +140,8 @@ def part_like_the_wall(
     frame, plate = (shrink(image, TEXTURE_SIDE) for image in (frame, plate))
     seen, held = frame.astype(np.float32), exposed(plate, exposure_gain(frame, plate))
     alike = known & (np.abs(cv2.blur(seen - held, (5, 5))).max(-1) < ODD_STEPS)
-    hidden = alike & texture_hidden(seen, held, alike)
+    shown = texture_shown(seen, held, alike)
+    hidden = alike & (shown < HIDDEN)
     rim = known & border_of(hidden.shape)
     if not hidden.any() or (hidden & rim).sum() > MOST_ODD * rim.sum():
         return np.zeros(alpha.shape, np.float32)
@@ -147,32 +149,35 @@ def part_like_the_wall(
     _, labels = cv2.connectedComponents(dilated(body, SEAM).astype(np.uint8))
     part = body & ~solid & np.isin(labels, np.unique(labels[solid]))
     _, labels, stats, _ = cv2.connectedComponentsWithStats(part.astype(np.uint8))
-    part &= (stats[:, cv2.CC_STAT_AREA] > LEAST_LOST * part.size)[labels]
+    area = stats[:, cv2.CC_STAT_AREA]
+    mean = np.bincount(labels.ravel(), shown.ravel()) / np.maximum(area, 1)
+    part &= ((area > LEAST_LOST * part.size) & (mean < HIDDEN / 2))[labels]
     # Between the two, colours and texture are mixed.
     part |= eroded(dilated(part | solid, SEAM), SEAM) & dilated(part, SEAM)
     return cv2.resize(part.astype(np.float32), alpha.shape[::-1])
 
 
-def texture_hidden(seen: np.ndarray, held: np.ndarray, alike: np.ndarray) -> np.ndarray:
-    """Return where (H, W) bool a frame lacks the texture that is `held` by its plate.
+def texture_shown(seen: np.ndarray, held: np.ndarray, alike: np.ndarray) -> np.ndarray:
+    """Return how much (H, W) of the texture that a plate has its frame shows: 1 if all, 0 if none.
 
-    Both are (H, W, 3) float32. In most of the pixels that are `alike` (H, W) the wall shows. They
-    tell how much of a texture noise leaves visible; a texture that it hides proves nothing.
+    The texture that is `held` by the plate (H, W, 3) and the one that is `seen` in the frame are
+    compared. Noise weakens both: how much is left where the wall shows is measured in the pixels
+    that are `alike` (H, W), most of which show it. Texture that noise hides counts as shown.
     """
     greys = [cv2.transform(image, np.full((1, 3), 1 / 3)) for image in (seen, held)]
     seen, held = (grey - cv2.GaussianBlur(grey, (0, 0), FINE) for grey in greys)
     power = cv2.GaussianBlur(held * held, (0, 0), WINDOW) + 1e-4
     limit = 2 * np.sqrt(power)  # the subject's own edges may be far stronger
-    shown = cv2.GaussianBlur(np.clip(seen, -limit, limit) * held, (0, 0), WINDOW) / power
+    common = cv2.GaussianBlur(np.clip(seen, -limit, limit) * held, (0, 0), WINDOW) / power
     octave = np.rint(np.log2(power))
-    hidden = np.zeros(alike.shape, bool)
+    shown = np.ones(alike.shape, np.float32)
     for strength in np.unique(octave[alike]):
         similar = octave == strength
-        wall = shown[similar & alike]
-        usual = np.quantile(wall, 0.75)
+        wall = common[similar & alike]
+        usual = np.quantile(wall, USUAL)
         if len(wall) >= LEAST_WALL and usual > VISIBLE:
-            hidden |= similar & (shown < usual / 2)
-    return hidden
+            shown[similar] = common[similar] / usual
+    return shown
 
 
 def _strength(difference: np.ndarray, unshaded: np.ndarray, size: int) -> np.ndarray:
