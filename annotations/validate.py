@@ -224,12 +224,7 @@ def marked_clips(dataset: Dataset, subjects: Iterable[str] | None = None) -> lis
 
 
 def agreement(clips: Sequence[MarkedClip]) -> dict[str, object]:
-    """Compute figures over clips; each pair of annotators of a clip counts once.
-
-    They are ``clips``, ``pairs``, ``within_1``, ``within_2``, ``within_4``, ``median_frames``,
-    ``slip_rate``, ``alpha`` and ``alpha_interval`` (95 %, bootstrap over clips), None if there
-    is nothing to compare.
-    """
+    """Compute figures over clips; each pair of annotators of a clip counts once."""
     clips = [clip for clip in clips if len(clip.frames) > 1]
     pairs = [pair for clip in clips for pair in combinations(clip.frames.values(), 2)]
     distances = np.abs(np.diff(np.array(pairs).reshape(-1, 2), axis=1))

@@ -55,11 +55,7 @@ _READING = Lock()  # one thread at a time reads footage for `read_proxy`
 
 
 def dhash(image: np.ndarray) -> str:
-    """Compute the 64-bit difference hash of an image (H, W, 3) uint8 as 16 hexadecimal digits.
-
-    The image is averaged to 8 rows of 9 grey cells; each bit says whether a cell is darker than
-    its right neighbour. Source: N. Krawetz, "Kind of like that", 2013.
-    """
+    """Compute the 64-bit difference hash of an image (H, W, 3) uint8 as 16 hexadecimal digits."""
     grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
     height, width = grey.shape
     if height % 8 == 0 and width >= 9:
@@ -74,6 +70,8 @@ def dhash(image: np.ndarray) -> str:
         sure = most[:, :-1] < least[:, 1:]
         if (sure == (least[:, :-1] < most[:, 1:])).all():
             return np.packbits(sure).tobytes().hex()
+    # Each bit says whether a cell is darker than its right neighbour (N. Krawetz, "Kind of like
+    # that", 2013).
     cells = cv2.resize(grey, (9, 8), interpolation=cv2.INTER_AREA)
     return np.packbits(cells[:, :-1] < cells[:, 1:]).tobytes().hex()
 
@@ -365,11 +363,7 @@ def read_gains(dataset: Dataset, subject: str) -> dict[str, np.ndarray]:
 
 
 def read_proxy(dataset: Dataset, subject: str, camera_id: str, frame: int) -> np.ndarray:
-    """Read the small JPEG copy (h, w, 3) uint8 sRGB of a frame, which takes milliseconds.
-
-    The copy of a frame that ingest did not decode is made from the footage, together with those of
-    the frames around it. At 4K this takes a tenth of a second per frame.
-    """
+    """Read the small JPEG copy (h, w, 3) uint8 sRGB of a frame, which takes milliseconds."""
     folder = dataset.proxies_dir(subject)
     index = read_index(dataset, subject)
     if camera_id not in index.cameras or not 0 <= frame < index.cameras[camera_id].frames:
@@ -377,6 +371,8 @@ def read_proxy(dataset: Dataset, subject: str, camera_id: str, frame: int) -> np
     source = index.cameras[camera_id]
     if source.dhash[frame] != UNKNOWN_HASH:
         return decode_proxy(folder, camera_id, frame)
+    # A frame that ingest did not decode is read from the footage with those around it, at 4K in a
+    # tenth of a second each.
     several = 1 if source.kind == "frames" else BLOCK
     block, number = divmod(frame, several)
     path, key = dataset.index_file(subject), (dataset, subject, camera_id, index.capture)

@@ -277,8 +277,7 @@ def lock_file(file: BinaryIO | IO[str] | int, path: Path, kind: int = fcntl.LOCK
 def alone_in(folder: Path) -> Iterator[None]:
     """Make a folder, and hold it so that no other command writes results into it meanwhile.
 
-    The system releases it however the process ends. File systems without locks hold nothing. What
-    a killed command was writing is removed. NotReadyError if another process holds it.
+    The system releases it however the process ends. NotReadyError if another process holds it.
     """
     made = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)

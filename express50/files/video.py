@@ -244,11 +244,7 @@ def frame_times(path: Path) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class VideoTags:
-    """What a video says of its pictures.
-
-    They are read as stored, also if a phone stored upright footage lying on its side: a calibration
-    refers to stored pixels.
-    """
+    """What a video says of its pictures as stored: a calibration refers to stored pixels."""
 
     turn: int  # quarter turns counter-clockwise, 0 to 3, that it asks players for
     hdr: str  # name of its transfer curve if that is one for high dynamic range, else empty

@@ -110,10 +110,7 @@ class HeadModel:
 
 
 def check_head(model: HeadModel) -> HeadModel:
-    """Return the model if its values are usable, else raise HeadModelError.
-
-    Arrays must be finite, indices in range, and rows of skinning and regressor sum to one.
-    """
+    """Return the model if its values are usable, else raise HeadModelError."""
     where = f"head model {model.name!r}"
     for item in fields(model):
         value = getattr(model, item.name)

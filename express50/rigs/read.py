@@ -180,11 +180,9 @@ def read_opencv_yaml(path: Path, size: tuple[int, int] | None) -> dict[str, Came
 
 
 def _opencv_cameras(path: Path) -> list[tuple[str, Path | str, dict]]:
-    """Return name, place and values of each camera.
-
-    EasyMocap has all cameras in ``intri.yml`` and ``extri.yml``, where values are named ``K_01``,
-    ``dist_01``, ``R_01``, ``Rot_01``, ``T_01``, after the camera. Others have a file per camera.
-    """
+    """Return name, place and values of each camera."""
+    # EasyMocap has all cameras in two files, where values are named K_01, dist_01, R_01, Rot_01,
+    # T_01, after the camera. Others have a file per camera.
     folder = path if path.is_dir() else path.parent
     both = [folder / "intri.yml", folder / "extri.yml"]
     files = both if path in (folder, *both) and all(file.is_file() for file in both) else []

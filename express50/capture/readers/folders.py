@@ -131,10 +131,7 @@ def fits_camera_folders(path: Path) -> bool:
 
 
 def fits_expression_folders(path: Path) -> bool:
-    """Return whether a folder holds a folder per expression, with the footage of each camera.
-
-    That is a video, a picture or a folder of each.
-    """
+    """Return whether a folder's folders are expressions: a video, picture or folder per camera."""
     tree = _tree(path)
     if tree.deep:  # people's rigs look the same
         known = (path / "calibration.json").is_file() or any(map(EXPRESSION.match, tree.places))
