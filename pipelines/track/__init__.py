@@ -18,13 +18,15 @@ def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path |
     from express50.capture.frames import frame_inputs
     from express50.capture.index import read_peaks
 
+    peaks = read_peaks(dataset, item)
     found: dict[str, Path | str] = {
         "index": dataset.index_file(item),
         "cameras": dataset.cameras_file(item),
-        "peaks": dataset.peaks_file(item),
+        # Who chose a frame and how sure that was, which the file holds too, changes no track.
+        "peaks": repr(peaks),
         **_setting_files(config),
     }
-    for expression in read_peaks(dataset, item):
+    for expression in peaks:
         found |= frame_inputs(dataset, item, expression)
     mattes = dataset.item_dir("matte", item)
     if mattes.is_dir():  # texture and UV map read them even without rounds of outlines and patches

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +15,14 @@ from hypothesis import strategies as st
 from express50.contract.config import build_config
 from express50.dataset.tracks import shape_spread
 from express50.errors import CaptureError, ConfigError, StageError
+from express50.files.digests import path_digest
 from express50.geometry.cameras import Camera, project, project_with_slope
 from express50.geometry.transforms import axis_angle_to_matrix, look_at
 from express50.head.model import landmarks_of, pose
 from express50.landmarks.detector import Detection
 from express50.landmarks.irises import Irises
 from express50.landmarks.sources import Marked
+from express50.runner.worker import input_digests
 from pipelines.track.basis import Basis, Points, make_basis
 from pipelines.track.config import TrackConfig
 from pipelines.track.fit import consistent_sigma, fit
@@ -311,6 +314,21 @@ def test_mattes_are_an_input_whatever_the_rounds(tracked_dataset) -> None:
     for rounds in (0, 1):
         config = TrackConfig(outline_rounds=rounds, patch_rounds=rounds)
         assert STAGE.inputs(dataset, "S001", config)["mattes"] == mattes
+
+
+def test_who_chose_a_peak_and_how_surely_makes_no_track_again(tracked_dataset) -> None:
+    from pipelines.track import STAGE
+
+    dataset, _ = tracked_dataset
+    path = dataset.peaks_file("S001")
+    rows = json.loads(path.read_text())
+
+    def found(**changed: object) -> dict[str, str]:
+        path.write_text(json.dumps({name: row | changed for name, row in rows.items()}))
+        return input_digests(STAGE, dataset, "S001", TrackConfig(), path_digest)
+
+    first = found()
+    assert found(annotator="ann", confidence=1.0) == first != found(frame=2)
 
 
 def test_stage_writes_the_contracted_file(tracked_dataset, tmp_path: Path) -> None:
