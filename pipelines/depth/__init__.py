@@ -67,7 +67,7 @@ def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> Result:
 
 STAGE = Stage(
     name="depth",
-    version=23,
+    version=24,
     config=DepthConfig,
     presets=PRESETS,
     items=peak_items,

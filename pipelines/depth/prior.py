@@ -31,6 +31,8 @@ from pipelines.regions.things import NEAR_M, FaceView
 REACH = 0.015  # metres that the hull may lie above a mesh that is trusted; beyond is hair or cloth
 BORDER = 0.03  # metres from the mesh's open border, where collars are, over which trust grows
 BODY = 0.5  # metres that the body continues below the neck, and widens; shoulders are nearer
+SHOULDERS = 0.04  # metres that shoulders may stand out from this body, if more views than these
+FEW_VIEWS = 4  # limit what is behind and before it
 EYES_M = 0.03  # metres from glasses within which the head is trusted, whatever the hull
 WORN_M = 0.004  # radius about a place on glasses that shows glasses, or what is behind them
 OUTLINE_SIDE = 512  # longest side, pixels, of the body's outlines: they count at the first level
@@ -84,7 +86,7 @@ class TrackedSolid:
 
         Where the hull of the body's own `outlines` lies far above the body, no silhouette shows the
         surface. There it may lie no further in front of or behind the body than the mattes extend
-        to its sides.
+        to its sides; below the neck, where the body is a guess, by up to `SHOULDERS` further.
         """
         within = hull < reach
         points, own = points[within], hull[within]
@@ -96,6 +98,8 @@ class TrackedSolid:
         apart, beside = signed_distance(self.body, points), hull_distance(outlines, points)
         known = 1 - np.clip((apart - beside) / REACH - 1, 0, 1)
         limit = apart - np.maximum(beside, 0) - known * REACH
+        if len(outlines) > FEW_VIEWS:
+            limit -= np.clip(3 * (distance - apart), 0, SHOULDERS)  # 0 at the head
         merged[within] = np.maximum(merged[within], limit)
         return merged
 

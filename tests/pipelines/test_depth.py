@@ -14,7 +14,13 @@ from express50.geometry.raycast import mesh_scene
 from express50.head.load import HeadTopology
 from pipelines.depth.blocks import build
 from pipelines.depth.maps import cast_maps, picture_of, surface_maps
-from pipelines.depth.prior import bare_triangles, boundary_loops, close_mesh, matte_agreement
+from pipelines.depth.prior import (
+    bare_triangles,
+    boundary_loops,
+    close_mesh,
+    matte_agreement,
+    signed_distance,
+)
 from pipelines.depth.reconstruct import reconstruct
 from pipelines.depth.stage import write_meshes
 from pipelines.depth.surface import advance, extract_mesh
@@ -145,6 +151,22 @@ def test_prior_is_weaker_where_the_hull_rises_far_above_it(shots):
     merged = prior.merge(cube, near, outlines, 0.02)
     np.testing.assert_allclose(merged[near < 0.02], own[near < 0.02], atol=1e-6)
     np.testing.assert_array_equal(merged[near >= 0.02], near[near >= 0.02])
+
+
+@pytest.mark.parametrize(("count", "shoulders"), [(4, 0.0), (5, 0.04)])
+def test_shoulders_may_stand_out_from_the_tracked_body_but_nothing_from_the_face(count, shoulders):
+    """Cameras in front do not show how far forward either reaches."""
+    vertices, faces = mesh()
+    prior = close_mesh(vertices, faces[(vertices[faces][:, :, 1] > -0.06).all(1)])
+    outlines = prior.outlines([make_view(c, *render(c)[:2], 1024) for c in ring(count, 160, 30.0)])
+
+    def reach(height: float) -> float:
+        before = np.array([[0, height, z] for z in np.arange(0.0, 0.3, 0.001)])
+        kept = prior.merge(before, np.full(len(before), -0.05, np.float32), outlines, 0.0) < 0
+        return float(signed_distance(prior.body, before)[kept.argmin()])
+
+    assert reach(0.0) < 0.01
+    assert shoulders - 0.005 < reach(-0.14) < shoulders + 0.01
 
 
 def test_what_glasses_hide_is_not_compared_and_the_head_is_kept_behind_them(shots):
