@@ -5,8 +5,6 @@ RenderMe-360 are recorded so that the performer holds the target at the end of t
 dataset's users take the last frame (RenderMe-360's processing tools). Its releases end at different
 frames, so ingest stores which release was read and the number of its last frame, and a label
 repeats them. A rule's label ranks below any person's and above a suggestion.
-
-Tables that do not fit raise AnnotationError; nothing of them is imported.
 """
 
 from __future__ import annotations
@@ -50,11 +48,16 @@ _FIELDS = tuple(field.name for field in fields(Label))
 
 
 def export_labels(labels: Iterable[Label], path: Path, stored: Collection[Label] = ()) -> None:
-    """Write events as CSV or JSON, by the file's ending."""
+    """Write events as CSV or JSON, by the file's ending.
+
+    Raises:
+        AnnotationError: another ending; or the file exists and holds anything but ``stored``
+            events, such as those that somebody meant to import.
+    """
     _check_format(path)
     if path.exists():
         try:
-            new = set(read_table(path)) - set(stored)  # others may wait for import
+            new = set(read_table(path)) - set(stored)
         except AnnotationError:
             raise AnnotationError(f"{path}: is not a table of labels; name another file") from None
         if new:
@@ -78,7 +81,14 @@ def export_labels(labels: Iterable[Label], path: Path, stored: Collection[Label]
 
 
 def import_labels(dataset: Dataset, path: Path) -> tuple[int, int]:
-    """Append a file's new events, once all of them are checked; return (new, known)."""
+    """Append the events of a file that the store does not hold yet; return (new, known).
+
+    Everything is checked before anything is written.
+
+    Raises:
+        AnnotationError: a row is not an event, or names an unknown subject, or a frame that the
+            footage does not have or that shows another picture.
+    """
     labels = read_table(path)
     for number, label in enumerate(labels, 1):
         where = f"{path}: row {number}"
@@ -99,7 +109,10 @@ def import_labels(dataset: Dataset, path: Path) -> tuple[int, int]:
 
 
 def _unknown(labels: list[Label], held: Iterable[Label]) -> list[Label]:
-    """Return the labels that are not held, even with numbers as a spreadsheet rounds them."""
+    """Return the labels that are not held, even with numbers as a spreadsheet rounds them.
+
+    Added again, an old label would come after what its annotator has said since.
+    """
 
     def words(label: Label) -> Label:
         return replace(label, time=0.0, confidence=None, seconds=None)
@@ -107,7 +120,6 @@ def _unknown(labels: list[Label], held: Iterable[Label]) -> list[Label]:
     times: dict[Label, list[float]] = {}
     for label in held:
         times.setdefault(words(label), []).append(label.time)
-    # Added again, an old label would come after what its annotator has said since.
     return [
         label
         for label in labels
@@ -211,6 +223,9 @@ def last_frame_marks(
 
     Without given expressions the rule covers RenderMe-360's: those that ingest read out of its
     files, else those with ids e0 (or e00) to e11.
+
+    Raises:
+        AnnotationError: a clip's last frame is not the last of the performance.
     """
     facts = index.meta.get("renderme360", {})
     if expressions is None:

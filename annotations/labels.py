@@ -3,8 +3,6 @@
 A label names a camera, a decode index, its pts and a perceptual hash, so that it can never point
 at another frame unnoticed. An adjudication ranks highest, then people's labels, then a rule's, then
 an automatically accepted suggestion. Nothing is ever rewritten: undo is an event of its own.
-
-Labels that do not fit the footage, and malformed files, raise AnnotationError.
 """
 
 from __future__ import annotations
@@ -74,7 +72,12 @@ def make_mark(
     first: int | None = None,
     last: int | None = None,
 ) -> Label:
-    """Make a mark with the frame's full identity and, where given, ends of its plateau."""
+    """Make a mark with the frame's full identity and, where given, ends of its plateau.
+
+    Raises:
+        AnnotationError: the expression is not in the cues, the camera not in the capture, a frame
+            outside the expression's cue window, or the frame outside its plateau.
+    """
     cue = find_cue(index, expression)
     check_known(index.subject, "camera", [camera], index.cameras)
     source = index.cameras[camera]
@@ -107,7 +110,11 @@ def make_mark(
 
 
 def make_flag(index: Index, expression: str, reason: str, annotator: str) -> Label:
-    """Make a flag: the expression has no peak, for a reason such as those of ``FLAG_REASONS``."""
+    """Make a flag: the expression has no peak, for a reason such as those of ``FLAG_REASONS``.
+
+    Raises:
+        AnnotationError: the expression is not in the cues, or the reason is empty.
+    """
     if not reason.strip():
         raise AnnotationError(
             f"{index.subject} {expression}: a flag needs a reason: {', '.join(FLAG_REASONS)}, ..."
@@ -116,7 +123,11 @@ def make_flag(index: Index, expression: str, reason: str, annotator: str) -> Lab
 
 
 def make_event(index: Index, expression: str, action: str, annotator: str) -> Label:
-    """Make an event that names no frame, such as an undo."""
+    """Make an event that names no frame, such as an undo.
+
+    Raises:
+        UnknownNameError: the expression is not in the cues.
+    """
     find_cue(index, expression)
     return Label(
         subject=index.subject,
@@ -143,7 +154,11 @@ def shows_labelled_frame(index: Index, label: Label) -> bool:
 
 
 def check_texts(label: Label) -> None:
-    """Refuse texts that would break tables or control the terminal."""
+    """Refuse texts that would break tables or control the terminal.
+
+    Raises:
+        AnnotationError: the annotator's name or the reason is not one line of text.
+    """
     for name in ("annotator", "reason"):
         if not (getattr(label, name) or "").isprintable():
             raise AnnotationError(
@@ -155,7 +170,9 @@ def check_texts(label: Label) -> None:
 def append_label(dataset: Dataset, label: Label) -> None:
     """Append one event and sync it to disk; several annotators at once lose nothing.
 
-    OSError leaves it missing, or as a torn line that readers skip.
+    Raises:
+        AnnotationError: a text is not one line.
+        OSError: it could not be written; it is then missing, or a torn line that readers skip.
     """
     check_texts(label)
     path = dataset.labels_file(label.subject)
@@ -178,7 +195,11 @@ def append_label(dataset: Dataset, label: Label) -> None:
 
 
 def read_labels(dataset: Dataset, subject: str) -> list[Label]:
-    """Read all events of a subject in the order they were written; torn last lines are left out."""
+    """Read all events of a subject in the order they were written; torn last lines are left out.
+
+    Raises:
+        AnnotationError: a whole line is not an event.
+    """
     return [label for _, label in _lines(dataset, subject) if label is not None]
 
 
@@ -253,9 +274,12 @@ def last_event(labels: Iterable[Label], expression: str, annotator: str) -> Labe
 
 
 def _stacks(labels: Iterable[Label]) -> dict[tuple[str, str], list[Label]]:
-    """Stack the events that were not undone, by expression and annotator, the latest last."""
+    """Stack the events that were not undone, by expression and annotator, the latest last.
+
+    An import may have put an older event below newer ones.
+    """
     stacks: dict[tuple[str, str], list[Label]] = {}
-    for label in sorted(labels, key=lambda label: label.time):  # an import mixes them
+    for label in sorted(labels, key=lambda label: label.time):
         if label.action in EXCLUSION_ACTIONS:
             continue
         stack = stacks.setdefault((label.expression, label.annotator), [])

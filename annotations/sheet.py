@@ -81,11 +81,18 @@ def make_sheet(
     dataset: Dataset,
     subjects: Collection[str] | None = None,
     expressions: Collection[str] | None = None,
-    # shown wherever a subject has it; by default the one in which the reference's was chosen
     camera: str | None = None,
-    sure: float = 0.5,  # suggestions below it are doubtful
+    sure: float = 0.5,
 ) -> Sheet:
-    """Make the sheet of some subjects and expressions, always of the reference, too."""
+    """Make the sheet of some subjects and expressions; excluded subjects are left out.
+
+    The reference is always shown. `camera` is shown wherever a subject has it; by default it is the
+    one in which the reference's frame was chosen. Suggestions less sure than `sure` are doubtful.
+
+    Raises:
+        AnnotationError: an unknown subject, expression or camera; StageError where nothing is
+            ingested.
+    """
     reference = reference_subject(dataset)
     where, included = str(dataset.root), included_subjects(dataset)
     check_known(where, "included subject", subjects or (), included)
@@ -187,7 +194,10 @@ class Pictures:
 def render_sheet(
     dataset: Dataset, sheet: Sheet, *, faces: FaceFinder | None = None, around: int = 0
 ) -> str:
-    """Render the page as text, with ``around`` frames before and after each label."""
+    """Render the page as text, with ``around`` frames before and after each label.
+
+    Pictures are cropped to the faces; without a face finder they show full frames.
+    """
     pictures = {
         (tile.subject, tile.expression): take_pictures(dataset, tile, faces, around)
         for tile in sheet.tiles

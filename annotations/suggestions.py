@@ -33,7 +33,11 @@ class Suggested:
 
 
 def read_suggestions(dataset: Dataset, subject: str) -> dict[str, Suggested]:
-    """Read the suggestions by expression, none before the align stage; FormatError if malformed."""
+    """Read the suggestions by expression; none when the align stage has not run.
+
+    Raises:
+        FormatError: the file is not a table of suggestions, or a figure in it is not a number.
+    """
     path = dataset.suggestions_file(subject)
     if not path.is_file():
         return {}
@@ -71,7 +75,9 @@ def reference_file(dataset: Dataset) -> Path:
 def reference_subject(dataset: Dataset) -> str:
     """Find the reference identity: the one that was chosen, else the first that is not excluded.
 
-    StageError without any subject, AnnotationError if the chosen one is gone or excluded.
+    Raises:
+        StageError: nothing is ingested, or everybody is excluded.
+        AnnotationError: the chosen subject is no longer in the dataset, or is excluded.
     """
     subjects = included_subjects(dataset)
     if not subjects:

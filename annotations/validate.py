@@ -171,6 +171,10 @@ def settlement(
 
     The verdict is a frame's number, an annotator whose label is right, or a reason: one of
     `FLAG_REASONS`, or any after ``flag:``.
+
+    Raises:
+        AnnotationError: nobody labelled the expression, the frame is outside its window, or the
+            verdict is none of these.
     """
     where = f"{index.subject} {expression}"
     said = voices(read_labels(dataset, index.subject)).get(expression)
@@ -224,7 +228,12 @@ def marked_clips(dataset: Dataset, subjects: Iterable[str] | None = None) -> lis
 
 
 def agreement(clips: Sequence[MarkedClip]) -> dict[str, object]:
-    """Compute figures over clips; each pair of annotators of a clip counts once."""
+    """Compute figures over clips; each pair of annotators of a clip counts once.
+
+    They are ``clips``, ``pairs``, ``within_1``, ``within_2``, ``within_4``, ``median_frames``,
+    ``slip_rate``, ``alpha`` and ``alpha_interval`` (95 %, bootstrap over clips), None if there
+    is nothing to compare.
+    """
     clips = [clip for clip in clips if len(clip.frames) > 1]
     pairs = [pair for clip in clips for pair in combinations(clip.frames.values(), 2)]
     distances = np.abs(np.diff(np.array(pairs).reshape(-1, 2), axis=1))
@@ -252,12 +261,16 @@ def clip_times(clip: MarkedClip) -> np.ndarray:
 
 
 def interval_alpha(units: Sequence[np.ndarray]) -> float | None:
-    """Compute Krippendorff's alpha, interval metric, of two or more values per unit, if defined."""
+    """Compute Krippendorff's alpha with the interval metric from two or more values of each unit.
+
+    None if it is undefined: all values are the same, or there is one unit alone, whose spread is
+    also the expected one.
+
+    The mean squared difference of all pairs of values is twice their variance, which gives a closed
+    form without the coincidence matrix (K. Krippendorff, Content Analysis, 2004, chapter 11).
+    """
     values = np.concatenate(units)
-    # The mean squared difference of all pairs of values is twice their variance, so that the
-    # coincidence matrix is not needed (K. Krippendorff, Content Analysis, 2004, chapter 11).
     expected = 2.0 * values.var(ddof=1)
-    # A single unit has all of the spread, so that none is expected.
     if len(units) < 2 or expected < _NO_SPREAD:
         return None
     observed = sum(len(unit) * 2.0 * unit.var(ddof=1) for unit in units) / len(values)

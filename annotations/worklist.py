@@ -45,12 +45,19 @@ def worklist(
     annotator: str,
     subjects: Collection[str] | None = None,
     expressions: Collection[str] | None = None,
-    # ``doubt`` (least sure first), ``expression`` (one across all subjects, in the cues' order)
-    # or ``subject``
     order: str = "doubt",
-    everything: bool = False,  # lists what this annotator has labelled, too
+    everything: bool = False,
 ) -> list[LabelTask]:
-    """List the tasks of an annotator, the reference's first in every order."""
+    """List the tasks of an annotator, the reference's first in every order.
+
+    Excluded subjects have no tasks. What this annotator has labelled is done, and is listed only
+    with `everything`; the labels of others do not count. The `order` is ``doubt`` (least sure
+    first), ``expression`` (one across all subjects, then the next, in the order of the cues) or
+    ``subject``.
+
+    Raises:
+        AnnotationError: a subject is not in the dataset, or is excluded.
+    """
     known = included_subjects(dataset)
     check_known(str(dataset.root), "included subject", subjects or (), known)
     if not known:
@@ -59,7 +66,6 @@ def worklist(
     chosen = sorted(subjects or known, key=lambda s: (s != reference, s))
     tasks, places = [], dict[str, int]()  # places of expressions: subjects may lack some
     for subject in chosen:
-        # Labels of others do not count.
         done = {} if everything else labels_of(read_labels(dataset, subject), annotator)
         suggestions = read_suggestions(dataset, subject)
         doubts = {name: 1.0 - found.confidence for name, found in suggestions.items()}
@@ -78,8 +84,10 @@ def worklist(
 def coverage(dataset: Dataset) -> dict[str, dict]:
     """Compute the coverage of the subjects that are not excluded.
 
-    The states in ``cells`` (subject -> expression) are ``person``, ``rule``, ``auto``, ``flagged``
-    and ``missing``; ``gender`` and ``age`` count five or more people, where captures state them.
+    Returns:
+        ``cells`` (subject -> expression -> ``person``, ``rule``, ``auto``, ``flagged`` or
+        ``missing``), ``missing`` (subject -> expressions), ``excluded`` (subject -> reason),
+        ``gender`` and ``age`` counts of five or more people, where captures state them.
     """
     cells = {}
     for subject in included_subjects(dataset):

@@ -22,7 +22,10 @@ something that a run needs is missing (nothing was started)"""
 
 
 def build_parser(command: str | None = None) -> argparse.ArgumentParser:
-    """Build the parser of all commands."""
+    """Build the parser of all commands.
+
+    A command of another package is loaded only when it is called; otherwise it is just listed.
+    """
     parser = Parser(prog="express50", description=DESCRIPTION, epilog=EPILOG)
     parser.add_argument("--version", action="version", version=f"express50 {__version__}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
@@ -30,7 +33,7 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
         module.add_commands(subparsers)
     for name, other in commands().items():
         known = subparsers.choices.get(name)
-        if name == command:  # others are listed, not loaded
+        if name == command:
             other.add(known or subparsers)
         elif known is None:
             subparsers.add_parser(name, help=other.help)

@@ -102,7 +102,10 @@ class Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, words)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse a command's arguments; refuse those left over here, where its options are known."""
+        """Parse a command's arguments; refuse those left over here, where its options are known.
+
+        Print the whole help if there are none and a sub-command is expected.
+        """
         args = sys.argv[1:] if args is None else args
         if not args and self._subparsers is not None:
             self.print_help(sys.stderr)
@@ -146,7 +149,10 @@ def picture_size(text: str) -> tuple[int, int]:
 def run_handler(
     program: str, handler: Callable[[argparse.Namespace], int], args: argparse.Namespace
 ) -> int:
-    """Call a command's handler and return its exit code, also when it fails or is stopped."""
+    """Call a command's handler and return its exit code, also when it fails or is stopped.
+
+    Any error becomes one line on standard error; with EXPRESS50_DEBUG=1 the traceback follows.
+    """
     _open_standard_streams()
     try:
         with _stop_on_sigterm(), _warnings_on_one_line(program):
@@ -168,8 +174,10 @@ def run_handler(
 
 
 def _open_standard_streams() -> None:
-    """Give this process the standard streams that it was started without (``>&-``)."""
-    # Otherwise, a file of ours would get their number, and libraries' messages.
+    """Give this process the standard streams that it was started without (``>&-``).
+
+    Otherwise, a file of ours would get their number, and libraries' messages.
+    """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
@@ -242,7 +250,10 @@ def add_command(
     example: str | None = None,
     **options: Any,
 ) -> argparse.ArgumentParser:
-    """Add a command's parser, for most commands with the arguments DATASET and --json."""
+    """Add a command's parser, for most commands with the arguments DATASET and --json.
+
+    Its description, unless given, is its ``help`` as a sentence.
+    """
     options.setdefault("description", help and f"{help[0].upper()}{help[1:]}.")
     if example is not None:
         options |= {"epilog": f"example:\n  {example}"}
@@ -268,12 +279,14 @@ def ignoring_closed_pipe(stream: IO[str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _stop_on_sigterm() -> Iterator[None]:
-    """Handle SIGTERM, which batch systems send, like Ctrl-C."""
+    """Handle SIGTERM, which batch systems send, like Ctrl-C.
+
+    Python ignores exceptions in callbacks of its garbage collection: there, both are sent again.
+    """
 
     def stop(number: int, frame: object) -> None:
         raise KeyboardInterrupt
 
-    # Python ignores exceptions in callbacks of its garbage collection: there, both are sent again.
     def report(ignored: Any) -> None:
         if ignored.exc_type is KeyboardInterrupt:
             Timer(LATER, interrupt_main, [signal.SIGTERM]).start()
@@ -321,10 +334,12 @@ def log(line: str) -> None:
 
 
 def printable(text: str) -> str:
-    """Return text with control characters escaped, as in names from foreign files."""
+    """Return text with control characters escaped, as in names from foreign files.
+
+    They could move a terminal's cursor, change its title or hide a line.
+    """
     if text.isprintable():
         return text
-    # Others could move a terminal's cursor, change its title or hide a line.
     shown = ("\n", "\t")
     return "".join(c if c.isprintable() or c in shown else ascii(c)[1:-1] for c in text)
 

@@ -68,13 +68,15 @@ def error_models() -> dict[str, ErrorModel]:
 
 def error_bounds(
     stage: str,
-    figures: Mapping[str, np.ndarray | float],  # each (N,) or one for all
-    # standard deviation of an additional error that all elements have in common, such as that of
-    # the distance from a single camera
+    figures: Mapping[str, np.ndarray | float],
     shared: np.ndarray | float = 0.0,
     model: ErrorModel | None = None,
 ) -> Bounds:
-    """Return the bounds of N elements from their figures; `expected` is None if N is 0."""
+    """Return the bounds of N elements from their figures, each (N,) or one for all.
+
+    `shared` is the standard deviation of an additional error that all elements have in common, such
+    as that of the distance from a single camera. `expected` is None if N is 0.
+    """
     model = model or error_models()[stage]
     score = scores_of(model, figures)
     # Extrapolate with slope 1 beyond the table: scores are logarithms of errors.
@@ -89,8 +91,11 @@ def error_bounds(
 
 
 def single_camera_sigma(cameras: Sequence[Camera], places: np.ndarray) -> np.ndarray:
-    """Return the depth uncertainty (N,) in millimetres of points (N, 3) in metres."""
-    if len(cameras) != 1:  # only one cannot tell a large head from a near one
+    """Return the depth uncertainty (N,) in millimetres of points (N, 3) in metres.
+
+    A single camera cannot distinguish a large head from a near one. With several cameras it is 0.
+    """
+    if len(cameras) != 1:
         return np.zeros(len(places))
     return 1e3 * HEAD_SIZE_SPREAD * np.linalg.norm(places - cameras[0].center, axis=1)
 
@@ -126,6 +131,8 @@ def expect(
 
 
 def item_error(errors: np.ndarray, unit: Unit) -> float:
-    """Return the error of an item from its elements' (N,): their median, for opacity their mean."""
-    # Most pixels of a matte's rim are exactly right, so their median would be 0.
+    """Return the error of an item from its elements' errors (N,): the median, for opacity the mean.
+
+    Most pixels of a matte's rim are exactly right, so their median would be 0.
+    """
     return float(np.mean(errors) if unit == "alpha" else np.median(errors))

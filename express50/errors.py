@@ -92,7 +92,11 @@ def check_known(
     known: Collection[str],
     kind: type[Express50Error] = UnknownNameError,
 ) -> None:
-    """Raise UnknownNameError, or an error of another ``kind``, for names that are not known."""
+    """Refuse names that are not known.
+
+    Raises:
+        UnknownNameError: a name is unknown (or an error of another ``kind``); lists known names.
+    """
     for name in wanted:
         if name not in known:
             near = nearest(name, known) if len(known) > FEW else ""
@@ -113,7 +117,10 @@ def few(names: Sequence[str], count: int = 3, between: str = ", ") -> str:
 
 
 def advised(*words: str | Path) -> str:
-    """Return a command in quotation marks, as messages advise it; its paths suit any shell."""
+    """Return a command in quotation marks, as messages advise it; its paths suit any shell.
+
+    Paths with spaces and the like are quoted, and those that begin as options do get ``./``.
+    """
     texts = []
     for word in words:
         text = f"./{word}" if isinstance(word, Path) and str(word).startswith("-") else str(word)

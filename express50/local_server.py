@@ -70,7 +70,11 @@ class RequestGuard:
 
 
 def check_address(host: str, port: int) -> None:
-    """Raise ConfigError unless a server can listen on this address and port."""
+    """Check that a server can listen on this address and port.
+
+    Raises:
+        ConfigError: the address is not this machine's, or the port is taken or not allowed.
+    """
     if not 0 <= port <= 65535:
         raise ConfigError(f"port {port}: expected 0 to 65535 (0: any free port)")
     own = "expected an address of this machine, such as 127.0.0.1, or 0.0.0.0 for all of its"

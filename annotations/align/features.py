@@ -62,7 +62,10 @@ class Features:
 
 
 def measure_features(index: Index, observations: FaceObservations) -> Features:
-    """Measure a subject's features by cue window; windows that show no face are left out."""
+    """Measure the features of a subject by cue window.
+
+    Expressions whose window holds no observed frame that shows a face are left out.
+    """
     windows = {}
     shown = observations.scores.max(axis=0) >= SEEN_SCORE
     for cue in index.cues:
@@ -77,6 +80,9 @@ def measure(observations: FaceObservations, windows: dict[str, np.ndarray]) -> F
 
     `windows` are rows of the observations by expression, see `Features`; none is empty. Without the
     neutral expression, the windows' first frames are taken for rest.
+
+    Raises:
+        ValueError: no window is given, a window is empty, or a landmark is not finite.
     """
     if not windows or not all(map(len, windows.values())):
         raise ValueError(f"windows are {sorted(windows)}, expected one or more, none of them empty")
@@ -132,12 +138,15 @@ def displacements(
 
 
 def local_contrast(faces: np.ndarray, neutral: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Measure local contrast (F, N) of aligned faces (F, S, S) uint8; name each cell's landmark."""
+    """Measure local contrast (F, N) of aligned faces (F, S, S) uint8; name each cell's landmark.
+
+    Contrast with the surroundings is independent of light and exposure, unlike brightness. Cells
+    that show no face are 0.
+    """
     cells = np.empty((len(faces), CELLS * CELLS), np.float32)
     wide = faces.shape[1] / 8
     for cell, face in zip(cells, faces, strict=True):
         grey = face.astype(np.float32) / 255.0
-        # Contrast with the surroundings is independent of light and exposure, unlike brightness.
         flat = grey - cv2.GaussianBlur(grey, (0, 0), wide)
         spread = np.sqrt(cv2.GaussianBlur(flat**2, (0, 0), wide)) + 0.02  # a local deviation
         fine = cv2.GaussianBlur(flat / spread, (0, 0), 0.8)
@@ -152,14 +161,16 @@ def local_contrast(faces: np.ndarray, neutral: np.ndarray) -> tuple[np.ndarray, 
 
 
 def in_noise(values: np.ndarray, windows: dict[str, np.ndarray]) -> np.ndarray:
-    """Divide features (F, N) by their noise, which second differences in time show."""
-    # Motion is smooth, so a second difference is mostly noise, of six times the variance.
+    """Divide features (F, N) by their noise, which second differences in time show.
+
+    Motion is smooth from frame to frame, so a second difference is mostly noise, with six times the
+    variance of a frame's noise. Adding the median feature's noise keeps scales above zero.
+    """
     bends = [np.diff(values[rows], n=2, axis=0) for rows in windows.values() if len(rows) > 2]
     if not bends:
         return values / max(float(np.abs(values).mean()), LEAST_NOISE)
     noise = np.median(np.abs(np.concatenate(bends)), axis=0) / (0.6745 * np.sqrt(6.0))
     floor = float(np.median(noise[noise > 0])) if (noise > 0).any() else 1.0
-    # The median feature's noise keeps scales above zero.
     return values / np.maximum(noise + floor, LEAST_NOISE)
 
 

@@ -94,7 +94,10 @@ def error_figures(suggested: Suggested) -> dict[str, float]:
 def suggest_for(
     dataset: Dataset, index: Index, match: bool
 ) -> tuple[dict[str, Suggested], list[Note]]:
-    """Suggest a frame for every expression, none without observations; note missing inputs."""
+    """Suggest a frame for every expression, and note missing inputs.
+
+    Without observations nothing is suggested: only people's labels count then.
+    """
     if not dataset.observations_file(index.subject).is_file():
         why = f"{index.subject} is not observed: run 'express50 observe' to see why"
         return {}, [Note("suggestions", why)]
@@ -129,7 +132,10 @@ def suggest_for(
 def accept_sure(
     dataset: Dataset, index: Index, found: Mapping[str, Suggested], threshold: float
 ) -> dict[str, Label]:
-    """Append an automatic mark for each new sure suggestion; return the labels in force."""
+    """Append an automatic mark for each new sure suggestion; return the labels in force.
+
+    Automatic marks that no suggestion supports any more are undone. A rerun appends nothing.
+    """
     labels = read_labels(dataset, index.subject)
 
     def write(label: Label) -> None:
@@ -141,7 +147,7 @@ def accept_sure(
         expression = cue.expression_id
         suggested = found.get(expression)
         if suggested is None or suggested.confidence < threshold:
-            while expression in _automatic(labels):  # nothing supports it any more
+            while expression in _automatic(labels):
                 write(make_event(index, expression, "undo", AUTOMATIC))
             continue
         frame, camera, sure = suggested.frame, suggested.camera, suggested.confidence

@@ -116,6 +116,9 @@ def suggest(values: np.ndarray, groups: np.ndarray, canonical: Canonical | None)
 
     `values` (T, N) are those of ``expression_values``, 0 at rest. Features of one of the `groups`
     (N,) go to the same half when halves are drawn. `canonical` is None for the reference itself.
+
+    Raises:
+        ValueError: the clip is empty or not finite.
     """
     _check(values)
     own = strongest_event(values)
@@ -143,6 +146,9 @@ def suggest_rest(values: np.ndarray, groups: np.ndarray, typical: float) -> Sugg
 
     `values` (T, N) are 0 at the middle of the clip; `groups` are as for :func:`suggest`. `typical`
     is the activity of other expressions at their apex, in the same units.
+
+    Raises:
+        ValueError: the clip is empty or not finite.
     """
     _check(values)
     level = distance_from_rest(values)
@@ -203,7 +209,10 @@ def most_similar_event(values: np.ndarray, direction: np.ndarray) -> tuple[Event
 
 
 def choose_event(values: np.ndarray, own: Event, canonical: Canonical | None) -> tuple[Event, bool]:
-    """Choose the strongest event, or one clearly more like the reference's; say if they agree."""
+    """Choose the strongest event, unless another is clearly more like the reference's.
+
+    The second value is False where the two differ.
+    """
     if canonical is None or not canonical.direction.any():
         return own, True
     other, likeness = most_similar_event(values, canonical.direction)
@@ -217,13 +226,15 @@ def choose_event(values: np.ndarray, own: Event, canonical: Canonical | None) ->
 
 
 def matching_row(event: Event, canonical: Canonical | None) -> int:
-    """Find the matching row: the apex, or the same share of it as in the canonical frame."""
+    """Find the matching row: the apex, or the same share of it as in the canonical frame.
+
+    The row lies on the canonical frame's side of the apex if both sides offer one.
+    """
     if canonical is None or canonical.side == 0:
         return event.apex
     share = share_of_apex(event)
     rows = np.concatenate([_slope(share, event.apex, -1), _slope(share, event.apex, 1)])
     away = np.abs(share[rows] - canonical.level)
-    # On the canonical frame's side of the apex if both sides offer one.
     away += OTHER_SIDE * (np.sign(rows - event.apex) == -canonical.side)
     return int(rows[np.argmin(away)])
 
@@ -273,7 +284,10 @@ def _event_about(values: np.ndarray, weights: np.ndarray, row: int) -> Event:
 
 
 def candidate_rows(row: int, others: list[int], curve: np.ndarray) -> list[int]:
-    """List rows worth a look, best first: the suggestion, other events, the curve's maxima."""
+    """List rows worth a look, best first: the suggestion, other events, the curve's maxima.
+
+    At most CANDIDATES, at least CANDIDATE_GAP frames apart.
+    """
     padded = np.pad(curve, 1, constant_values=-np.inf)
     peaks = np.flatnonzero((curve >= padded[:-2]) & (curve >= padded[2:]))
     ranked = [*others, *(int(k) for k in peaks[np.argsort(-curve[peaks], kind="stable")])]

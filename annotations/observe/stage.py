@@ -49,7 +49,12 @@ class FaceObservations:
 
 
 def read_observations(dataset: Dataset, subject: str) -> FaceObservations:
-    """Read a subject's observations; StageError without any, FormatError if they are damaged."""
+    """Read a subject's observations.
+
+    Raises:
+        StageError: the subject was not observed.
+        FormatError: the file is damaged or of another version.
+    """
     path = dataset.observations_file(subject)
     fix = f"run {advised('express50 align', dataset.root)}"
     if not path.is_file():
@@ -136,13 +141,17 @@ def frames_to_try(rest: np.ndarray, frames: np.ndarray) -> list[int]:
 
 def choose_cameras(
     index: Index,
-    score: Callable[[str, int, float], float],  # rates the face that a camera shows in a frame
-    attempts: Sequence[tuple[float, int]],  # size of the smallest windows to search, and frame
+    score: Callable[[str, int, float], float],
+    attempts: Sequence[tuple[float, int]],
     min_score: float,
 ) -> tuple[float, int, list[str]]:
     """Find the first attempt that shows a face, and rank the cameras that see it best.
 
-    Returns the size that was enough, the frame and the cameras; StageError if no attempt does.
+    An attempt is the size of the smallest windows to search, and a frame; `score` rates the face
+    that a camera shows. Returns the size that was enough, the frame and the cameras.
+
+    Raises:
+        StageError: no camera sees a face in any attempt.
     """
     best = 0.0
     for smallest, frame in attempts:
@@ -276,7 +285,10 @@ def face_side(neutral: np.ndarray) -> float:
 
 
 def similarity_2d(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Fit the similarity (2, 3) of points (N, 2) to others; points that coincide are only moved."""
+    """Fit the similarity (2, 3) that takes points (N, 2) onto others.
+
+    Points that all coincide are moved, not scaled.
+    """
     if np.ptp(source, axis=0).max() < LEAST_SIDE:
         return np.concatenate([np.eye(2), (target.mean(0) - source.mean(0))[:, None]], axis=1)
     lift = np.zeros((len(source), 1))

@@ -51,7 +51,11 @@ class FrameCache:
         self._thread: threading.Thread | None = None
 
     def get(self, shot: FrameCrop) -> np.ndarray:
-        """Return the picture (height, width, 3) uint8, read-only; AnnotationError says why not."""
+        """Return the picture (height, width, 3) uint8; do not write to it.
+
+        Raises:
+            AnnotationError: the frame cannot be read, in plain words.
+        """
         with self._wake:
             found = self._pictures.get(shot)
             if found is not None:
@@ -60,11 +64,14 @@ class FrameCache:
         return self._read(shot)
 
     def want(self, shots: Sequence[FrameCrop], *, later: bool = False) -> None:
-        """Decode these in the background, in this order; drop earlier requests of the kind."""
+        """Decode these in the background, in this order; earlier requests of the kind are dropped.
+
+        Requests for ``later`` wait until no other is left.
+        """
         with self._wake:
             wanted = [s for s in reversed(shots) if s not in self._pictures]
             if later:
-                self._later = wanted  # these wait until no other is left
+                self._later = wanted
             else:
                 self._wanted = wanted
             if self._thread is None and self._open and wanted:
@@ -167,7 +174,10 @@ class Face:
 
 
 def zoom_box(face: Face | None, zoom: str, pane_aspect: float, image_aspect: float) -> Box:
-    """Find the part of a picture that a zoom shows in a pane of that height over width."""
+    """Find the part of a picture that a zoom shows in a pane of that height over width.
+
+    Without a face, or for the zoom ``frame``, it is the full picture.
+    """
     if face is None or zoom == "frame":
         height = max(image_aspect, pane_aspect)
         width = height / pane_aspect

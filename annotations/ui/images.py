@@ -73,7 +73,10 @@ def cell_size() -> Size:
 
 
 class Painter:
-    """Paints pictures as large as a pane allows, and keeps the last ones as lines."""
+    """Paints pictures as large as a pane allows, and keeps the last ones as lines.
+
+    Pictures are block characters in two colours, which any terminal in UTF-8 has.
+    """
 
     def __init__(self) -> None:
         # The lines that show a crop in a pane of that size; ``read`` gives the crop's pixels.

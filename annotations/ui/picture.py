@@ -75,9 +75,11 @@ class PicturePane(Widget):
         return ""
 
     def render_lines(self, crop: Region) -> list[Strip]:
-        """Return the lines of the picture, past Textual's cache."""
-        # Textual's cache of styled lines rewrites the style of every segment, which costs more than
-        # all the rest: a picture has thousands, and no border or padding that would need it.
+        """Return the lines of the picture, past Textual's cache of styled lines.
+
+        That cache rewrites the style of every segment, which costs more than all the rest. A
+        picture has thousands of them, and no border or padding that would need it.
+        """
         if self.look is None:
             lines = self._written(self._words)
         else:

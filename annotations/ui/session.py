@@ -39,7 +39,10 @@ class Effort:
 
 
 class Session:
-    """Tasks in order, the one that is open, decisions and their cost."""
+    """Tasks in order, the one that is open, decisions and their cost.
+
+    A session begins with the first task that the annotator has not decided.
+    """
 
     def __init__(
         self,
@@ -131,7 +134,11 @@ class Session:
         self._last_key = self._clock()
 
     def mark(self, scene: TaskScene, view: CueView, camera: str) -> Label:
-        """Mark the frame under the cursor; it is on disk when this returns."""
+        """Mark the frame under the cursor; it is on disk when this returns.
+
+        Raises:
+            AnnotationError: the task has no footage, or the plateau leaves the frame out.
+        """
         if scene.index is None:
             raise AnnotationError(scene.problem or "this task has no footage")
         label = make_mark(
@@ -145,7 +152,11 @@ class Session:
         return self._save(replace(label, shown=shown))
 
     def flag(self, scene: TaskScene, reason: str) -> Label:
-        """Flag the open task as having no usable peak; the flag is on disk when this returns."""
+        """Flag the open task as having no usable peak; the flag is on disk when this returns.
+
+        Raises:
+            AnnotationError: the task has no footage, or the reason is empty.
+        """
         if scene.index is None:
             raise AnnotationError(scene.problem or "this task has no footage")
         return self._save(make_flag(scene.index, scene.task.expression, reason, self.annotator))

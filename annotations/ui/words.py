@@ -104,13 +104,16 @@ def reference_title(scene: TaskScene, look: FrameLook | None, width: int) -> Tex
 
 @lru_cache(maxsize=8)
 def hint_line(width: int, matches: bool) -> Text:
-    """List as many keys as fit, the most used first; help and quit, the last, always do."""
+    """List as many keys as fit, the most used first; help and quit, the last, always do.
+
+    In wide terminals the first says what to look for: a frame that matches the reference's.
+    """
     goal = "match the reference" if matches else "find the clearest"
     text = Text(" ")
     room = width - cell_len("? help  q quit")
     for keys, words in HINTS:
         if width >= WIDE and keys == HINTS[0][0]:
-            words = goal  # what to look for
+            words = goal
         piece = cell_len(keys) + cell_len(words) + 3
         if keys in ("?", "q") or text.cell_len + piece <= room:
             text.append(keys, f"bold {theme.ACCENT}")

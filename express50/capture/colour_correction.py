@@ -31,7 +31,11 @@ STRIPE = 256  # rows at a time: the terms of a whole 4K frame would take a gigab
 
 
 def check_matrix(matrix: object, where: str) -> tuple[tuple[float, ...], ...]:
-    """Return a correction matrix (3, T) as rows; CalibrationError unless T is one of TERMS."""
+    """Check a correction matrix (3, T), where T is a number of terms in TERMS; return its rows.
+
+    Raises:
+        CalibrationError: it has the wrong shape, or holds NaN or infinity.
+    """
     try:
         array = np.asarray(matrix, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):

@@ -31,10 +31,13 @@ def public_meta(meta: Mapping) -> dict:
 
 
 def shown_counts(counts: Mapping[str, int]) -> dict[str, int]:
-    """Keep counts of at least LEAST_PEOPLE; count smaller groups under OTHERS. May be empty."""
+    """Keep counts of at least LEAST_PEOPLE; count smaller groups under OTHERS.
+
+    The smallest groups join OTHERS until it is large enough too, since a single small group could
+    be inferred from the total. Empty if no group is large enough.
+    """
     left = sorted((n, name) for name, n in counts.items() if name != "not given")
     others = counts.get("not given", 0)
-    # OTHERS must be large as well: a single small group could be inferred from the total.
     while left and (left[0][0] < LEAST_PEOPLE or 0 < others < LEAST_PEOPLE):
         others += left.pop(0)[0]
     if not left:

@@ -51,7 +51,11 @@ def load_script() -> tuple[Expression, ...]:
 
 
 def select(ids: list[str] | tuple[str, ...] | None = None) -> tuple[Expression, ...]:
-    """Return the script's entries with these ids, in their order; all of them for None."""
+    """Return the script's entries with these ids, in their order; all of them for None.
+
+    Raises:
+        FormatError: an id is not in the script; the message suggests a similar one.
+    """
     script = {expression.id: expression for expression in load_script()}
     if ids is None:
         return tuple(script.values())

@@ -5,9 +5,6 @@ Stages after ``frames`` read the peak frames and plates that it wrote (``read_pe
 
 Pictures are what the ``frames`` stage makes of recorded frames: undistorted, and reduced if its
 settings say so. ``make_picture`` and ``read_cameras_of`` are where pictures and cameras meet.
-
-Footage and pictures that are missing, damaged or changed raise CaptureError, malformed tables
-FormatError, and subjects that are not ingested or calibrated StageError.
 """
 
 from __future__ import annotations
@@ -55,7 +52,11 @@ _READING = Lock()  # one thread at a time reads footage for `read_proxy`
 
 
 def dhash(image: np.ndarray) -> str:
-    """Compute the 64-bit difference hash of an image (H, W, 3) uint8 as 16 hexadecimal digits."""
+    """Compute the 64-bit difference hash of an image (H, W, 3) uint8 as 16 hexadecimal digits.
+
+    The image is averaged to 8 rows of 9 grey cells; each bit says whether a cell is darker than
+    its right neighbour. Source: N. Krawetz, "Kind of like that", 2013.
+    """
     grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
     height, width = grey.shape
     if height % 8 == 0 and width >= 9:
@@ -70,8 +71,6 @@ def dhash(image: np.ndarray) -> str:
         sure = most[:, :-1] < least[:, 1:]
         if (sure == (least[:, :-1] < most[:, 1:])).all():
             return np.packbits(sure).tobytes().hex()
-    # Each bit says whether a cell is darker than its right neighbour (N. Krawetz, "Kind of like
-    # that", 2013).
     cells = cv2.resize(grey, (9, 8), interpolation=cv2.INTER_AREA)
     return np.packbits(cells[:, :-1] < cells[:, 1:]).tobytes().hex()
 
@@ -96,6 +95,9 @@ class FrameReader:
         """Read an image (H, W, 3) uint8 sRGB by decode index, colours corrected, not undistorted.
 
         `exact` colours of a video take longer to make (`VideoReader.read_exactly`).
+
+        Raises:
+            CaptureError: there is no such frame, or the footage changed since it was ingested.
         """
         if not 0 <= frame < self.source.frames:
             raise CaptureError(
@@ -168,7 +170,12 @@ class FootageReader:
         self._readers: dict[str, FrameReader] = {}
 
     def read(self, camera_id: str, frame: int) -> np.ndarray:
-        """Make the picture (H, W, 3) uint8 sRGB of a frame, given by its decode index."""
+        """Make the picture (H, W, 3) uint8 sRGB of a frame, given by its decode index.
+
+        Raises:
+            CaptureError: the camera or the frame does not exist, or the footage has changed.
+            StageError: the camera is not calibrated.
+        """
         if camera_id not in self._readers:
             self._readers[camera_id] = FrameReader(self._index, camera_id)
         image = self._readers[camera_id].read(frame)
@@ -186,7 +193,11 @@ class FootageReader:
 
 
 def read_recorded_plate(index: Index, camera_id: str) -> np.ndarray:
-    """Read a clean plate (H, W, 3) uint8 sRGB as recorded: colours corrected, not undistorted."""
+    """Read a clean plate (H, W, 3) uint8 sRGB as recorded: colours corrected, not undistorted.
+
+    Raises:
+        CaptureError: it cannot be read, or its size differs from the footage's.
+    """
     path = index.capture / index.plates[camera_id]
     image = read_srgb(path)
     source = index.cameras[camera_id]
@@ -199,9 +210,11 @@ def read_recorded_plate(index: Index, camera_id: str) -> np.ndarray:
 
 
 def write_frame(path: Path, image: np.ndarray) -> None:
-    """Write an image (H, W, 3) uint8 losslessly as TIFF; equal images give equal bytes."""
-    # Frames are read about nine times: this is decoded six times as fast as JPEG XL, for up to a
-    # quarter more bytes (docs/LOG.md).
+    """Write an image (H, W, 3) uint8 losslessly as TIFF; equal images give equal bytes.
+
+    Frames are read about nine times: this format is decoded six times as fast as JPEG XL, for up to
+    a quarter more bytes (docs/LOG.md).
+    """
     tifffile.imwrite(
         path, np.ascontiguousarray(image), photometric="rgb", predictor=True, rowsperstrip=STRIP,
         compression="deflate", compressionargs={"level": 1}, maxworkers=1, metadata=None,
@@ -210,7 +223,12 @@ def write_frame(path: Path, image: np.ndarray) -> None:
 
 
 def read_peak_frame(dataset: Dataset, subject: str, expression: str, camera_id: str) -> np.ndarray:
-    """Read a peak frame (H, W, 3) uint8 sRGB, as the pinhole of ``read_cameras_of`` sees it."""
+    """Read a peak frame (H, W, 3) uint8 sRGB, as the pinhole camera of ``read_cameras_of`` sees it.
+
+    Raises:
+        CaptureError: the frames stage has not written it, its size differs from the subject's other
+            pictures, or it cannot be read.
+    """
     path = dataset.frame_file(subject, expression, camera_id)
     if not path.is_file():
         raise CaptureError(
@@ -221,7 +239,13 @@ def read_peak_frame(dataset: Dataset, subject: str, expression: str, camera_id: 
 
 
 def read_matted_frame(dataset: Dataset, item: str, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Read a camera's peak frame (H, W, 3) uint8 of `subject/expression`, and its matte (H, W)."""
+    """Read a camera's peak frame (H, W, 3) uint8 of `subject/expression`, and its matte (H, W).
+
+    Raises:
+        StageError: the frame has no matte.
+        FormatError: the matte is not an 8-bit grey image of the camera's size.
+        CaptureError: the frame cannot be read.
+    """
     subject, expression = item.split("/")
     path = dataset.matte_file(subject, expression, camera.id)
     if not path.is_file():
@@ -242,14 +266,22 @@ def read_matte(path: Path, camera: Camera, stage: str) -> np.ndarray:
 
 
 def read_plate_image(dataset: Dataset, subject: str, camera_id: str) -> np.ndarray | None:
-    """Read a clean plate (H, W, 3) uint8 sRGB, undistorted and corrected; None if there is none."""
+    """Read a clean plate (H, W, 3) uint8 sRGB, undistorted and corrected; None if there is none.
+
+    Raises:
+        CaptureError: it cannot be read.
+    """
     path = dataset.plate_file(subject, camera_id)
     size = picture_sizes(dataset, subject).get(camera_id)
     return read_written(path, size) if path.is_file() else None
 
 
 def read_written(path: Path, size: tuple[int, int] | None, channels: int = 3) -> np.ndarray:
-    """Read a picture (H, W, channels) uint8 that the frames stage wrote, of a size if given."""
+    """Read a picture (H, W, channels) uint8 that the frames stage wrote, of a size if one is given.
+
+    Raises:
+        CaptureError: it is damaged, or another picture.
+    """
     fix = "delete its folder and run 'express50 frames' again"
     try:
         image = read_image(path)
@@ -275,11 +307,14 @@ def frame_inputs(dataset: Dataset, subject: str, expression: str) -> dict[str, P
 
 
 def read_cameras_of(dataset: Dataset, subject: str, undistorted: bool = True) -> dict[str, Camera]:
-    """Read the cameras of a subject's pictures, sorted by id; StageError before calibrate.
+    """Read the cameras of a subject's pictures, sorted by id.
 
     They are the calibrated cameras, scaled to the size to which the frames stage reduced the
     pictures; before it has run, to the recorded size. Pictures are undistorted, so the cameras are
     pinholes unless ``undistorted`` is false.
+
+    Raises:
+        StageError: the subject is not calibrated.
     """
     sizes = picture_sizes(dataset, subject)
     cameras = {
@@ -302,7 +337,11 @@ def read_recorded_cameras(dataset: Dataset, subject: str) -> dict[str, Camera]:
 
 
 def make_picture(image: np.ndarray, camera: Camera, size: tuple[int, int]) -> np.ndarray:
-    """Make a recorded image's (H, W, 3) uint8 picture: undistort it, then reduce it to a size."""
+    """Make the picture of a recorded image (H, W, 3) uint8: undistort it, then reduce it.
+
+    `camera` has the recorded size, `size` is the width and height of the picture. Areas are
+    averaged in linear light, as a sensor with larger pixels would do.
+    """
     undistorted = undistort_image(image, camera)
     return undistorted if size == _size_of(camera) else reduce_light(undistorted, *size)
 
@@ -310,7 +349,10 @@ def make_picture(image: np.ndarray, camera: Camera, size: tuple[int, int]) -> np
 def reduced(
     camera: Camera, rgb: np.ndarray, alpha: np.ndarray, side: int
 ) -> tuple[Camera, np.ndarray, np.ndarray]:
-    """Average a picture (H, W, 3), its matte and its camera down to at most ``side`` pixels."""
+    """Average a picture (H, W, 3) and its matte (H, W) down to at most ``side`` pixels.
+
+    The camera follows.
+    """
     small = shrink(rgb, side)
     if small is rgb:
         return camera, rgb, alpha
@@ -318,7 +360,11 @@ def reduced(
 
 
 def picture_sizes(dataset: Dataset, subject: str) -> dict[str, tuple[int, int]]:
-    """Read width and height of a subject's pictures by camera; empty before the frames stage."""
+    """Read width and height of a subject's pictures by camera; empty before the frames stage.
+
+    Raises:
+        FormatError: the file is not {camera: [width, height]} with positive integers.
+    """
     path = dataset.picture_sizes_file(subject)
     return _sizes_cached(path) if path.is_file() else {}
 
@@ -344,7 +390,11 @@ _read_cameras = cached_by_file(64)(read_cameras)
 
 
 def read_gains(dataset: Dataset, subject: str) -> dict[str, np.ndarray]:
-    """Read each camera's linear light (3,) relative to the rig's mean; empty if not known."""
+    """Read each camera's linear light (3,) relative to the rig's mean; empty if not known.
+
+    Raises:
+        FormatError: the file is not {camera: [red, green, blue]} with positive numbers.
+    """
     path = dataset.gains_file(subject)
     if not path.is_file():
         return {}
@@ -363,7 +413,15 @@ def read_gains(dataset: Dataset, subject: str) -> dict[str, np.ndarray]:
 
 
 def read_proxy(dataset: Dataset, subject: str, camera_id: str, frame: int) -> np.ndarray:
-    """Read the small JPEG copy (h, w, 3) uint8 sRGB of a frame, which takes milliseconds."""
+    """Read the small JPEG copy (h, w, 3) uint8 sRGB of a frame, which takes milliseconds.
+
+    The copy of a frame that ingest did not decode is made from the footage, together with those of
+    the frames around it. At 4K this takes a tenth of a second per frame.
+
+    Raises:
+        StageError: the subject is not ingested.
+        CaptureError: the camera or the frame does not exist, or the footage has changed.
+    """
     folder = dataset.proxies_dir(subject)
     index = read_index(dataset, subject)
     if camera_id not in index.cameras or not 0 <= frame < index.cameras[camera_id].frames:
@@ -371,8 +429,6 @@ def read_proxy(dataset: Dataset, subject: str, camera_id: str, frame: int) -> np
     source = index.cameras[camera_id]
     if source.dhash[frame] != UNKNOWN_HASH:
         return decode_proxy(folder, camera_id, frame)
-    # A frame that ingest did not decode is read from the footage with those around it, at 4K in a
-    # tenth of a second each.
     several = 1 if source.kind == "frames" else BLOCK
     block, number = divmod(frame, several)
     path, key = dataset.index_file(subject), (dataset, subject, camera_id, index.capture)

@@ -89,7 +89,12 @@ def calibration_file(dataset: Dataset, index: Index) -> Path | None:
 
 
 def read_index(dataset: Dataset, subject: str) -> Index:
-    """Read a subject's index, cached until it or the table of captures changes."""
+    """Read a subject's index (cached until it or the table of captures changes).
+
+    Raises:
+        StageError: the subject is not ingested, or its capture is no longer registered.
+        FormatError: the file does not follow its schema.
+    """
     path = dataset.index_file(subject)
     table = dataset.captures_file  # says where the footage lies
     try:
@@ -210,7 +215,12 @@ def read_peaks(dataset: Dataset, subject: str) -> dict[str, int]:
 
 
 def read_peak_rows(dataset: Dataset, subject: str) -> dict[str, Peak]:
-    """Read the peak of each expression; StageError before align, FormatError if malformed."""
+    """Read the peak of each expression.
+
+    Raises:
+        StageError: the subject is not aligned.
+        FormatError: the file is not a table of peaks.
+    """
     path, align = dataset.peaks_file(subject), advised("express50 align", dataset.root)
     if not path.is_file():
         raise StageError(f"{path}: subject {subject!r} is not aligned; run {align}")

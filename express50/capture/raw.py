@@ -3,8 +3,6 @@
 Layout: capture.toml, cameras/<id>/video.mp4 or cameras/<id>/frames/000000.png..., and optionally
 calibration.json, plates/<id>.png, board/<id>.mp4 or board/<id>/*.png with board/board.toml, and
 cues.csv.
-
-What makes all of a capture unusable is a CaptureError, or CalibrationError for its cameras.
 """
 
 from __future__ import annotations
@@ -97,7 +95,12 @@ class RawCapture:
 
 
 def read_capture(root: Path) -> RawCapture:
-    """Read and check a raw capture."""
+    """Read and check a raw capture.
+
+    Raises:
+        CaptureError: a missing or malformed file makes the whole capture unusable.
+        CalibrationError: calibration.json exists but is malformed.
+    """
     meta = read_meta(root)
     folder = root / "cameras"
     if not folder.is_dir():
@@ -149,7 +152,11 @@ def read_capture(root: Path) -> RawCapture:
 def read_calibration(
     root: Path, cameras: dict[str, RawCamera], dropped: dict[str, str]
 ) -> dict[str, Camera] | None:
-    """Read calibration.json, if it is there, and drop cameras that only one side knows."""
+    """Read calibration.json, if it is there, and drop cameras that only one side knows.
+
+    Raises:
+        CalibrationError: it is malformed.
+    """
     given = root / "calibration.json"
     if not is_given(given):
         return None
@@ -180,7 +187,11 @@ def read_meta(root: Path) -> dict:
 
 
 def read_capture_toml(root: Path) -> dict:
-    """Read a capture.toml, dates as text, without checking its content; empty if there is none."""
+    """Read a capture.toml, dates as text, without checking its content; empty if there is none.
+
+    Raises:
+        CaptureError: it cannot be read or is not TOML.
+    """
     path = root / "capture.toml"
     table = read_toml(path, CaptureError) if is_given(path) else {}
     return {key: dates_as_text(value) for key, value in table.items()}
@@ -301,7 +312,13 @@ def _unreadable_plates(root: Path) -> dict[str, str]:
 
 
 def read_board(root: Path, cameras: Iterable[str]) -> dict | None:
-    """Return board.toml's content and each camera's images, or one video, of the board; or None."""
+    """Return the content of board.toml and each camera's files, relative to the capture, or None.
+
+    The files are images of the board, or one video.
+
+    Raises:
+        CaptureError: board.toml is missing, or a camera has several videos, or images and a video.
+    """
     folder = root / "board"
     if not folder.is_dir():
         return None
@@ -370,7 +387,12 @@ def unused_files(root: Path, cameras: Iterable[str]) -> dict[str, str]:
 
 
 def read_cues(path: Path) -> tuple[Cue, ...]:
-    """Read ``expression_id,start_frame,end_frame`` rows; no file means no cues."""
+    """Read ``expression_id,start_frame,end_frame`` rows; no file means no cues.
+
+    Raises:
+        CaptureError: a column is missing, a value is not a frame number, a cue ends before it
+            starts, or an expression appears twice.
+    """
     if not is_given(path):
         return ()
     text = read_text(path, CaptureError, TOML_LIMIT)
@@ -417,11 +439,15 @@ def _read_cue(path: Path, line: int, row: dict[str, str]) -> Cue:
 
 
 def check_calibrated_sizes(raw: RawCapture, sizes: dict[str, tuple[int, int]]) -> None:
-    """Refuse cameras whose calibrated (width, height) differs from their footage's."""
+    """Refuse cameras whose calibrated (width, height) differs from their footage's.
+
+    Raises:
+        CalibrationError: a size differs; a guessed scale would give wrong depths.
+    """
     for name, (width, height) in sizes.items():
         camera = (raw.calibration or {}).get(name)
         if camera is not None and (camera.width, camera.height) != (width, height):
-            raise CalibrationError(  # a guessed scale would give wrong depths
+            raise CalibrationError(
                 f"{raw.root / 'calibration.json'}: camera {name} is calibrated for "
                 f"{camera.width}x{camera.height}, its footage is {width}x{height}; "
                 "calibrate at the footage's size or scale the intrinsics"

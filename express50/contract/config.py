@@ -1,8 +1,4 @@
-"""Resolve a stage's configuration: ``--set`` over TOML over preset, typed, checked, saved.
-
-What is unknown, of a wrong type or out of range is a ConfigError, which names the nearest known
-name.
-"""
+"""Resolve a stage's configuration: ``--set`` over TOML over preset, typed, checked, saved."""
 
 from __future__ import annotations
 
@@ -29,12 +25,20 @@ _KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: 
 
 def resolve_config(
     stage: Stage,
-    preset: str = "standard",  # one of PRESETS
-    file: Path | None = None,  # TOML, one table per stage
-    assignments: Sequence[str] = (),  # ``stage.key=value``
-    known_stages: Iterable[str] = (),  # whose settings are left alone
+    preset: str = "standard",
+    file: Path | None = None,
+    assignments: Sequence[str] = (),
+    known_stages: Iterable[str] = (),
 ) -> Any:
-    """Build the configuration of one stage, an instance of ``stage.config``."""
+    """Build the configuration of one stage, an instance of ``stage.config``.
+
+    `preset` is ``draft``, ``standard`` or ``reference``. The TOML `file` has one table per stage;
+    `assignments` are ``stage.key=value`` strings. Those of other `known_stages` are left alone.
+
+    Raises:
+        ConfigError: unknown preset, table or key (the nearest known one is named), wrong type,
+            or a value that the dataclass refuses.
+    """
     if preset not in PRESETS:
         raise ConfigError(
             f"{stage.name}: unknown preset {preset!r}{nearest(preset, PRESETS)}; "
@@ -97,7 +101,12 @@ def build_config(stage: Stage, values: Mapping[str, object]) -> Any:
 
 
 def build_dataclass(table: str, kind: type, values: Mapping[str, object], hint: str = "") -> Any:
-    """Make a config dataclass from the plain values of one table, checking names and types."""
+    """Make a config dataclass from the plain values of one table, checking names and types.
+
+    Raises:
+        ConfigError: unknown key (the nearest known one is named), wrong type, or a value that the
+            dataclass refuses.
+    """
     hints = typing.get_type_hints(kind)
     fields = {field.name: hints[field.name] for field in dataclasses.fields(kind)}
     checked = {}
@@ -112,7 +121,11 @@ def build_dataclass(table: str, kind: type, values: Mapping[str, object], hint: 
 
 
 def check_ranges(table: str, config: object, **ranges: tuple[float, float]) -> None:
-    """Refuse fields of a config that lie outside their ranges; both ends belong to a range."""
+    """Refuse fields of a config that lie outside their ranges; both ends belong to a range.
+
+    Raises:
+        ConfigError: a field lies outside, or is not finite.
+    """
     for name, (low, high) in ranges.items():
         value = getattr(config, name)
         if not (low <= value <= high and abs(value) < math.inf):
@@ -121,7 +134,11 @@ def check_ranges(table: str, config: object, **ranges: tuple[float, float]) -> N
 
 
 def parse_assignment(text: str) -> tuple[str, str, object]:
-    """Split ``stage.key=value``; the value is TOML, a bare word is a string."""
+    """Split ``stage.key=value``; the value is TOML, a bare word is a string.
+
+    Raises:
+        ConfigError: the text does not have that form.
+    """
     name, equals, raw = text.partition("=")
     table, dot, key = name.strip().partition(".")
     if not (equals and dot and table and key):
@@ -177,11 +194,13 @@ def config_toml(name: str, config: Any) -> str:
 
 
 def made_with(path: Path, stage: Stage, known: Mapping[str, Any]) -> str | None:
-    """Return which of the ``known`` configurations a stage's file holds; None for another one."""
+    """Return which of the ``known`` configurations a stage's file holds; None if it is another one.
+
+    Comments are ignored: the settings' documentation may be that of another version.
+    """
     text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
 
     def values(text: str) -> list[str]:
-        # Comments are the settings' documentation, maybe of another version.
         return [line for line in text.splitlines() if not line.startswith("#")]
 
     found = values(text)

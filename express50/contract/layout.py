@@ -1,7 +1,4 @@
-"""Name the paths of a dataset folder that several parts use, and the subjects it excludes.
-
-Folders that may not be written to are refused by ConfigError or OSError.
-"""
+"""Name the paths of a dataset folder that several parts use, and the subjects it excludes."""
 
 from __future__ import annotations
 
@@ -18,13 +15,24 @@ from express50.files.text import NAME, parse_json, read_bytes, read_json_table, 
 
 
 def footage_root(capture: Path) -> Path:
-    """Return the folder that a capture's footage is relative to: its own, or ``source``'s."""
+    """Return the folder that a registered capture's footage is relative to.
+
+    It is the capture's folder, a file's folder, or what ``source`` in capture.toml names: a capture
+    may consist of capture.toml alone, which points to a read-only dataset.
+
+    Raises:
+        CaptureError: capture.toml is not TOML, or its source does not exist.
+    """
     source = footage_source(Path(capture))
     return source.parent if source.is_file() else source
 
 
 def footage_source(capture: Path) -> Path:
-    """Return the path that ``source`` in capture.toml names; without it, the capture itself."""
+    """Return the path that ``source`` in capture.toml names; without it, the capture itself.
+
+    Raises:
+        CaptureError: capture.toml is not TOML, or its source does not exist.
+    """
     path = capture / "capture.toml"
     if not path.is_file():
         return capture
@@ -72,7 +80,11 @@ class Dataset:
         return self.root / "captures.json"
 
     def captures(self) -> dict[str, Path]:
-        """Return the registered raw captures by subject, sorted; empty before the first ingest."""
+        """Return the registered raw captures by subject, sorted; empty before the first ingest.
+
+        Raises:
+            FormatError: the table is not a JSON object of strings.
+        """
         if not self.captures_file.is_file():
             return {}
         ingest = advised("express50 ingest", self.root, "CAPTURE...")
@@ -225,7 +237,12 @@ def check_folder(dataset: Dataset) -> None:
 
 
 def check_results_folder(folder: Path) -> None:
-    """Refuse, before any work, a folder that cannot be written to or whose files stages write."""
+    """Refuse, before any work, a folder that cannot be written to or whose files stages write.
+
+    Raises:
+        ConfigError: it is a dataset, a stage's folder, a folder of shards, a capture, or a file.
+        OSError: the system refuses.
+    """
     _refuse_datasets_own(folder)
     if (folder / "capture.toml").is_file():  # results in it would make its ingest outdated
         raise ConfigError(f"{folder}: is a capture; name another folder")
@@ -235,7 +252,12 @@ def check_results_folder(folder: Path) -> None:
 
 
 def check_results_file(path: Path) -> None:
-    """Refuse, before any work, a file that cannot be written, or in a folder that stages write."""
+    """Refuse, before any work, a file that cannot be written, or in a folder that stages write.
+
+    Raises:
+        ConfigError: it lies in a stage's folder, among labels or settings, or below a file.
+        OSError: it is a folder, or the system refuses.
+    """
     _refuse_datasets_own(path)
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
@@ -243,7 +265,11 @@ def check_results_file(path: Path) -> None:
 
 
 def check_page_file(path: Path) -> None:
-    """Refuse what `check_results_file` does, and other files than pages, which end in .html."""
+    """Refuse a file that cannot be written as `check_results_file` does, or is not an HTML page.
+
+    Raises:
+        ConfigError: its name does not end in .html, so it may hold something else.
+    """
     check_results_file(path)
     if path.suffix.lower() not in (".html", ".htm"):
         raise ConfigError(f"{path}: expected the name of a page, which ends in .html")
@@ -262,7 +288,10 @@ def _refuse_datasets_own(path: Path) -> None:
 
 
 def exclusion_reason(dataset: Dataset, subject: str) -> str | None:
-    """Return why a subject is excluded (``express50 annotate exclude``), or None if it is not."""
+    """Return why a subject is excluded (``express50 annotate exclude``), or None if it is not.
+
+    The latest event counts: an import may have put an older one below it.
+    """
     path = dataset.labels_file(subject)
     reason, latest = None, -math.inf
     data = read_bytes(path, AnnotationError) if path.is_file() else b""
@@ -270,7 +299,6 @@ def exclusion_reason(dataset: Dataset, subject: str) -> str | None:
         with contextlib.suppress(AnnotationError, AttributeError, TypeError):  # a torn line
             row = parse_json(line, str(path), AnnotationError)
             when = row.get("time", 0)
-            # An import may have put an older event below the latest.
             if row.get("action") in ("exclude", "include") and when >= latest:
                 latest = when
                 reason = row.get("reason") if row["action"] == "exclude" else None

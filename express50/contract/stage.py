@@ -196,7 +196,12 @@ def _load(point: EntryPoint) -> Any:
 
 @functools.cache
 def stages() -> dict[str, Stage]:
-    """Return every installed stage by name, in the order in which they run."""
+    """Return every installed stage by name, in the order in which they run.
+
+    Raises:
+        StageError: none is installed.
+        ConfigError: two stages have one name.
+    """
     found: dict[str, Stage] = {}
     points = entry_points(group="express50.stages")
     for point in sorted(points, key=lambda p: (p.name != OWN, p.name)):
@@ -220,12 +225,15 @@ def with_required(names: Iterable[str]) -> list[Stage]:
 
 
 def commands() -> dict[str, Command]:
-    """Return the commands that other packages add, by name."""
+    """Return the commands that other packages add, by name.
+
+    A command that does not load raises its ConfigError only when it is called.
+    """
     found = {}
     for point in sorted(entry_points(group="express50.commands")):
         try:
             found[point.name] = _load(point)
-        except ConfigError as error:  # raised when it is called
+        except ConfigError as error:
             found[point.name] = Command("does not load", functools.partial(_raise, error))
     return found
 
@@ -240,6 +248,9 @@ def hook(name: str) -> Callable[..., Any]:
     ``label_problems(dataset, subjects)`` checks labels against their footage;
     ``read_checkpoint(path)`` reads a trained model or refuses it; ``redact_checkpoint(path,
     subject)`` takes a person out of one.
+
+    Raises:
+        StageError: no package brings it.
     """
     for point in entry_points(group="express50.hooks", name=name):
         return _load(point)

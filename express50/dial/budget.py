@@ -37,7 +37,11 @@ class Goal:
 
 
 def parse_budget(text: str) -> Budget:
-    """Read a budget: ``90s``, ``45m``, ``2h``, ``1h30m``, ``1d``; ``40ch`` are core hours."""
+    """Read a budget: ``90s``, ``45m``, ``2h``, ``1h30m``, ``1d``; ``40ch`` are core hours.
+
+    Raises:
+        ConfigError: the text is not such a time, or is 0.
+    """
     parts = PART.findall(text)
     seconds = sum(float(number) * SECONDS[unit] for number, unit in parts)
     cores = any(unit == "ch" for _, unit in parts)

@@ -95,8 +95,10 @@ def _weighed(samples: Sequence[MeasuredSize]) -> tuple[np.ndarray, np.ndarray, n
 def _law(
     works: np.ndarray, seconds: np.ndarray, errors: np.ndarray, at: float, bounded: bool = True
 ) -> float:
-    """Fit constant and slope, neither below 0 if bounded, by weighted least squares."""
-    # Few stages follow the law exactly, so distant sizes count less.
+    """Fit constant and slope, neither below 0 if bounded, by weighted least squares.
+
+    Errors count as larger with the distance from `at`, because few stages follow the law exactly.
+    """
     weights = 1 / (errors * (1 + np.log(works / at) ** 2))
     rows = np.stack([np.ones_like(works), works / works.max()], 1)
     constant, slope = 0.0, float((weights**2 * rows[:, 1] * seconds).sum())
@@ -192,10 +194,13 @@ def item_seconds(load: Workload, stage: Stage, label: str) -> tuple[int, float]:
 
 
 def taken_over(load: Workload, trial: Trial) -> dict[str, tuple[str, float]]:
-    """Return, by stage, a trial's setting and the share of the items that a run takes from it."""
+    """Return, by stage, a trial's setting and the share of the items that a run takes from it.
+
+    If the trial had fewer expressions than the script, an item that covers all of them differs, and
+    so does everything after it.
+    """
     found, whole = {}, trial.footage.expressions >= trial.scripted
     for stage in load.stages:
-        # An item that covers all expressions differs, and so does everything after it.
         if stage.name in trial.failed or (not whole and "expressions" in stage.growth.time):
             break
         if stage.name in trial.costs:
@@ -216,7 +221,10 @@ def sizes_of(measured: PilotFigures, stage: Stage) -> list[MeasuredSize]:
 
 
 def size_factor(load: Workload, stage: Stage, settings: Mapping[str, str]) -> float:
-    """Return how many times as long a stage takes on pictures of the size that settings choose."""
+    """Return how many times as long a stage takes on pictures of the size that settings choose.
+
+    The base is the first trial. Trials of the stages that reduce pictures measured it.
+    """
     base, factor = load.measured.trials[0], 1.0
     for earlier in load.stages:
         label = settings.get(earlier.name, base.settings[earlier.name])
@@ -224,7 +232,6 @@ def size_factor(load: Workload, stage: Stage, settings: Mapping[str, str]) -> fl
             break
         if not earlier.growth.reduces or label == base.settings[earlier.name]:
             continue
-        # Trials of the stages that reduce pictures measured it.
         found = cost_at(load, earlier.name, label)
         costs = [trial.costs.get(stage.name) for trial in (found[1], base)] if found else []
         seconds = [cost.core_seconds for cost in costs if cost is not None]
@@ -263,13 +270,15 @@ def remaining_error(load: Workload, result: str) -> tuple[float, float, float] |
 
 
 def remaining_square(stated: np.ndarray, lost: np.ndarray) -> float:
-    """Return the squared error where nothing is lost, from the squares of N trials (N,)."""
+    """Return the squared error where nothing is lost, from the squares of N trials (N,).
+
+    Two settings may differ by as much as both are wrong, and be equally wrong. Therefore `lost`
+    counts only as far as the stated errors fall with it.
+    """
     away = lost - lost.mean()
     if not away.any():
         return float(np.median(stated))
     slope = away @ stated / (away @ away)
-    # Two settings may differ by as much as both are wrong, and be equally wrong. So `lost` counts
-    # only as far as the stated errors fall with it.
     share = max(0.0, min(1.0, slope, (stated[lost > 0] / lost[lost > 0]).min()))
     return float(np.median(stated - share * lost))
 
@@ -337,7 +346,11 @@ def front(load: Workload) -> list[Point]:
 
 
 def scales(load: Workload) -> dict[str, float]:
-    """Return the unit that a result's error is counted in: the error at the best settings."""
+    """Return the unit that a result's error is counted in: the error at the best settings.
+
+    If that is 0, as for peaks that are right to the frame, it is the largest difference. Results
+    that no setting changes are left out.
+    """
     found = {}
     for kind in load.kinds:
         changes = [
@@ -345,9 +358,8 @@ def scales(load: Workload) -> dict[str, float]:
             for row in ladder.values()
         ]  # fmt: skip
         rest = remaining_error(load, kind.name)
-        # Peaks that are right to the frame have no error: the unit is then the largest difference.
         size = math.sqrt(rest[0]) if rest and rest[0] else max(changes, default=0.0)
-        if any(changes):  # others are left out
+        if any(changes):
             found[kind.name] = max(size, 1e-12)
     return found
 
@@ -355,14 +367,16 @@ def scales(load: Workload) -> dict[str, float]:
 def _best(
     states: list[_State], scale: Mapping[str, float], reducing: Sequence[str]
 ) -> list[_State]:
-    """Drop partial choices that another one beats in time and in every result."""
+    """Drop partial choices that another one beats in time and in every result.
+
+    Only choices of one size of pictures are compared: smaller ones save time in later stages.
+    """
     states.sort(key=lambda s: (sum(s.each.values()), sum(s.lost[r] / scale[r] ** 2 for r in scale)))
     kept: list[_State] = []
     for state in states:
         beaten = any(
             other.kept >= state.kept
             and all(other.lost[r] <= state.lost[r] for r in scale)
-            # Smaller pictures save time in later stages, which `each` does not show.
             and all(other.settings.get(n) == state.settings.get(n) for n in reducing)
             for other in kept
         )
@@ -399,8 +413,11 @@ def goal_result(load: Workload, goal: Goal) -> str:
 
 
 def choose(points: Sequence[Point], seconds: float, goal: tuple[str, float] | None) -> Point:
-    """Return the best point within the time; with a goal, the quickest that reaches it."""
-    fitting = [point for point in points if point.seconds <= seconds] or [points[0]]  # the quickest
+    """Return the best point within the time; with a goal, the quickest that reaches it.
+
+    If no point fits, return the quickest.
+    """
+    fitting = [point for point in points if point.seconds <= seconds] or [points[0]]
     if goal is not None:
         name, value = goal
         reaching = [p for p in fitting if p.errors[name].value <= value]
@@ -416,7 +433,10 @@ def error_text(name: str, error: Expected) -> str:
 
 
 def choice_lines(load: Workload, point: Point, asked: str, spent: float) -> Iterator[str]:
-    """Yield what is expected of a choice, and why each setting was chosen."""
+    """Yield what is expected of a choice, and why each setting was chosen.
+
+    `asked` is the budget and the goal, for people.
+    """
     kind = "core time" if load.cores else count(load.width, "worker")
     yield f"{asked}, {kind}: {format_seconds(spent)} spent on measuring"
     others = "difference from the most expensive settings (no stage states these errors)"

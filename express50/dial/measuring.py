@@ -40,8 +40,12 @@ def measured_figures(
     """Read what was measured of a chain's dataset, or measure it.
 
     Settings that there was no time to try are tried by the next run, unless its settings are
-    ``chosen`` already. Trials that are still there are not run again. ConfigError if the budget
-    ended before any footage was ingested, StageError if no footage can be measured.
+    ``chosen`` already. Trials that are still there are not run again.
+
+    Raises:
+        ConfigError: the budget ended before any footage was ingested, or no stage states an error
+            in the goal's unit.
+        StageError: no footage can be measured.
     """
     path = dial_dir(chain.dataset) / "measured.json"
     found = read_measured(path, chain.key())
@@ -152,7 +156,10 @@ def _subjects(chain: Chain) -> list[str]:
 
 
 def _measure_one(chain: Chain, clock: Clock, allowance: _Allowance) -> PilotFigures:
-    """Measure the first subject whose footage every stage can work on."""
+    """Measure the first subject whose footage every stage can work on.
+
+    Raises as `measured_figures` does.
+    """
     subjects = _subjects(chain)
     for subject in subjects:
         try:
@@ -218,7 +225,13 @@ def workload(
 
 
 def tune(chain: Chain) -> tuple[dict[str, Any], list[str]]:
-    """Measure every setting on a few items; write ``dial/front.json`` and ``dial/front.csv``."""
+    """Measure every setting on a few items; write ``dial/front.json`` and ``dial/front.csv``.
+
+    Returns the table and lines for people.
+
+    Raises:
+        StageError: no footage can be measured.
+    """
     measured = measured_figures(chain, Clock(None))
     load = replace(workload(chain, measured, False, {}), done=())
     points = front(load)

@@ -90,13 +90,17 @@ class Pilot:
 
     def trial(
         self,
-        settings: Mapping[str, str],  # by stage
+        settings: Mapping[str, str],
         peaks: int,
-        source: Trial | None,  # the trial to start from
-        words: str = "",  # for people, before it runs
-        limit: float = math.inf,  # seconds after which none of its items begins
+        source: Trial | None,
+        words: str = "",
+        limit: float = math.inf,
     ) -> Trial:
-        """Run one trial, or read it if it ran before."""
+        """Run one trial, or read it if it ran before.
+
+        `settings` are named by stage; `source` is the trial to start from. `words` tell people what
+        is measured before it runs. After `limit` seconds none of its items begins.
+        """
         chain, record = self.chain, self.record(settings, peaks)
         self.cut = False
         if record.is_file():
@@ -162,7 +166,10 @@ class Pilot:
     def _run(
         self, stage: Stage, dataset: Dataset, config: Any, anew: bool
     ) -> tuple[Cost | None, str]:
-        """Run a stage; returns what an item cost, if any was made, and why all failed."""
+        """Run a stage; returns what an item cost, if any was made, and why all failed.
+
+        Only items that are made in this run count, if ``anew``: others are of another trial.
+        """
         if not stage.items(dataset):
             return None, "an earlier stage made nothing for it"
         pool = self.chain.pool
@@ -170,7 +177,7 @@ class Pilot:
             stage, dataset, config, pool=pool, progress=not anew, monitor=self.clock
         )
         self.cut = summary.count("left") > 0
-        counted = ("done",) if anew else ("done", "skipped")  # others are of another trial
+        counted = ("done",) if anew else ("done", "skipped")
         made = {o.item for o in summary.outcomes if o.status in counted}
         failures = [o.reason for o in summary.outcomes if o.status == "failed"]
         with Ledger(dataset.ledger, read_only=True) as ledger:
@@ -198,7 +205,11 @@ def cost_of(dataset: Dataset, stage: str, receipts: Sequence[Receipt], extra: fl
 
 
 def keep_for_run(dataset: Dataset, settings: Mapping[str, str]) -> None:
-    """Put copies of what trials made at chosen settings where the run takes outputs from."""
+    """Put copies of what trials made at chosen settings into the store of replaced outputs.
+
+    The run takes an output from there where it would make the same. Trials that share the settings
+    of more stages come first: what a stage makes depends on the stages before it as well.
+    """
     kept: set[tuple[str, str]] = set()
 
     def alike(trial: Trial) -> int:
@@ -209,7 +220,6 @@ def keep_for_run(dataset: Dataset, settings: Mapping[str, str]) -> None:
         (trial_of(json.loads(record.read_text("utf-8"))), Dataset(record.parent))
         for record in sorted(dataset.pilot_dir.glob("*/trial.json"))
     ]
-    # What a stage makes depends on the stages before it as well.
     for trial, folder in sorted(trials, key=lambda pair: -alike(pair[0])):
         for name in (n for n, label in settings.items() if trial.settings.get(n) == label):
             with Ledger(folder.ledger, read_only=True) as ledger:
@@ -351,12 +361,15 @@ def measure(
 
 
 def _steps(pilot: Pilot, base: Trial, choices: Sequence[str]) -> list[tuple[str, str]]:
-    """List settings above the cheapest ones: first one step up, as a second one gains less."""
+    """List settings above the cheapest ones: first one step up, as a second one gains less.
+
+    Those whose trials are quicker come first. Larger pictures than were recorded change nothing.
+    """
     steps, reduces = [], {stage.name: stage.growth.reduces for stage in pilot.chain.stages}
     for name in choices:
         configs = pilot.chain.ladders[name]
         higher = list(configs)[list(configs).index(base.settings[name]) + 1 :]
-        if key := reduces[name]:  # larger pictures than recorded change nothing
+        if key := reduces[name]:
             seen = {one: replace(base.footage, side=getattr(configs[one], key)) for one in higher}
             higher = [one for one in higher if seen[one].picture > base.footage.picture]
         seconds = trial_seconds(pilot, base, name)
@@ -380,14 +393,16 @@ def _charged(pilot: Pilot, cost: Cost) -> float:
 
 
 def guessed(pilot: Pilot, base: Trial, name: str, label: str, factor: float) -> Trial:
-    """Guess the figures of a trial with a higher setting of a stage, `factor` times as slow."""
+    """Guess the figures of a trial with a higher setting of a stage, `factor` times as slow.
+
+    Later stages take as long as before, but longer where the setting makes their pictures larger.
+    """
     stages = pilot.chain.stages[pilot.chain.names.index(name) :]
     reduces, footage, costs = stages[0].growth.reduces, base.footage, dict(base.costs)
     if reduces:
         side = getattr(pilot.chain.ladders[name][label], reduces)
         footage = replace(footage, side=float(side))
     for stage in (one for one in stages if one.name in costs):
-        # A later stage takes longer only where its pictures become larger.
         more = footage.time(stage.growth) / base.footage.time(stage.growth)
         more, cost = factor if stage.name == name else more, costs[stage.name]
         costs[stage.name] = replace(

@@ -65,12 +65,15 @@ def _peak_frames(dataset: Dataset, subject: str) -> dict[str, int]:
 def differences(
     a: Dataset, b: Dataset, subject: str, kinds: Sequence[ResultKind]
 ) -> dict[str, float]:
-    """Return the mean difference of each result of a subject that both datasets hold, by name."""
+    """Return the mean difference of each result of a subject that both datasets hold, by name.
+
+    Where the peaks of an expression differ, its other results are of different frames, and are
+    left out.
+    """
     one, two = (_peak_frames(dataset, subject) for dataset in (a, b))
     same = sorted(e for e in one.keys() & two.keys() if one[e] == two[e])
     found = {}
     for kind in kinds:
-        # Other results of other peaks are of different frames.
         names = sorted(one.keys() & two.keys()) if kind.apart is _frames_apart else same
         with suppress(Express50Error):  # a stage before it made nothing
             if values := list(kind.apart(a, b, subject, names)):
@@ -127,12 +130,13 @@ def _medians_apart(
 ) -> list[float]:
     """Return the median distance of vertices of E pairs of meshes (V, 3), millimetres.
 
-    With `faces` (F, 3) only what lies along the second mesh's normals counts.
+    With `faces` (F, 3) only what lies along the second mesh's normals counts. One rigid motion is
+    taken out before: solved rigs have worlds of their own.
     """
     if not meshes[0] or meshes[0][0].shape != meshes[1][0].shape:
         return []
     one, two = (np.stack(list(some)).astype(np.float64) for some in meshes)
-    R, t = rigid_fit(one.reshape(-1, 3), two.reshape(-1, 3))  # rigs have worlds of their own
+    R, t = rigid_fit(one.reshape(-1, 3), two.reshape(-1, 3))
     off = one @ R.T + t - two
     apart = np.linalg.norm(off, axis=2)
     if faces is not None:

@@ -120,8 +120,12 @@ def run_within(
     """Run the chain within a budget, or to a goal.
 
     Without a budget, the run takes as long as the goal takes; without a goal, it looks for the
-    least error in the time. `ended` is called with each stage's account. ConfigError if the budget
-    or the goal cannot be met; the sentence says what would do.
+    least error in the time. `ended` is called with each stage's account.
+
+    Raises:
+        ConfigError: the budget does not cover the cheapest settings, or no setting reaches the
+            goal; the sentence says what would.
+        StageError: nothing can be measured.
     """
     if goal is not None:
         check_unit(chain.kinds, goal)
@@ -299,9 +303,12 @@ def _run_ready(run: _Run, stage: Stage, chosen: list[str] | None) -> Summary:
 
 
 def reserved(own: float, rest: float, left: float, budget: float) -> float:
-    """Return the seconds that a stage must leave to those after it."""
+    """Return the seconds that a stage must leave to those after it.
+
+    If its own seconds and the rest exceed the time left by at most a tenth of the budget, the run
+    continues and ends late, rather than with nothing made.
+    """
     short = own + rest - left
-    # Rather late by up to a tenth of the budget than with nothing made.
     return rest - short if 0 < short <= GRACE * budget else rest
 
 

@@ -6,8 +6,6 @@ name chumpy and scipy classes; landmark embeddings hold torch tensors. Every cla
 short allow list, and those of chumpy and scipy are replaced by records that only keep their state.
 A pickle that names anything else is refused before anything is called. Torch's own files, and
 storages inside a pickle, are read with ``weights_only``.
-
-Readers raise an error of the ``kind`` they are given, and HeadModelError for pickles.
 """
 
 from __future__ import annotations
@@ -48,12 +46,20 @@ DAMAGE = (
 def read_arrays(
     path: Path,
     kind: Kind,
-    what: str,  # the file should be, for messages, such as "a track"
+    what: str,
     wanted: Collection[str] = (),
-    fix: str = AGAIN,  # what to do about another file
-    only: bool = False,  # read no other arrays than the wanted ones
+    fix: str = AGAIN,
+    only: bool = False,
 ) -> dict[str, np.ndarray]:
-    """Read the arrays of an ``.npz`` file by name; refuse arrays of objects."""
+    """Read the arrays of an ``.npz`` file by name; refuse arrays of objects.
+
+    Messages say ``what`` the file should be, such as "a track", and how to ``fix`` it. With
+    ``only``, no other arrays than the ``wanted`` ones are read.
+
+    Raises:
+        Express50Error: of the given kind: the file is missing, damaged, lacks a wanted array, or
+            unpacks to more than ``SIZE_LIMIT``.
+    """
     try:
         with open_file(path) as whole, zipfile.ZipFile(whole) as archive:
             members = archive.infolist()
@@ -87,7 +93,11 @@ def _refused(path: Path, kind: Kind, what: str, fix: str, error: Exception) -> E
 
 
 def read_npy(path: Path, kind: Kind, what: str, fix: str = AGAIN) -> np.ndarray:
-    """Read the array of an ``.npy`` file; refuse an array of objects."""
+    """Read the array of an ``.npy`` file; refuse an array of objects.
+
+    Raises:
+        Express50Error: of the given kind: the file is missing or damaged.
+    """
     try:
         with open_file(path) as file:
             return _array(file, path.stat().st_size)
@@ -96,7 +106,11 @@ def read_npy(path: Path, kind: Kind, what: str, fix: str = AGAIN) -> np.ndarray:
 
 
 def read_header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype]:
-    """Read shape and type from an array's header, leaving the file position just after it."""
+    """Read shape and type from an array's header, leaving the file position just after it.
+
+    Raises:
+        ValueError: the header is damaged or has an unknown version.
+    """
     version = np.lib.format.read_magic(file)
     readers = {
         (1, 0): np.lib.format.read_array_header_1_0,
@@ -294,7 +308,12 @@ class SafeUnpickler(pickle.Unpickler):
 
 
 def read_pickle(path: Path) -> Any:  # noqa: ANN401 (whatever the file holds)
-    """Read a pickle without executing anything."""
+    """Read a pickle without executing anything.
+
+    Raises:
+        HeadModelError: the file is unreadable, damaged, or names a class that is not on the allow
+            list.
+    """
     try:
         size = path.stat().st_size
         if size > SIZE_LIMIT:
@@ -306,7 +325,11 @@ def read_pickle(path: Path) -> Any:  # noqa: ANN401 (whatever the file holds)
 
 
 def read_object_array(path: Path) -> Any:  # noqa: ANN401 (whatever the file holds)
-    """Read an `.npy` file, even one that holds a pickled object, without executing anything."""
+    """Read an `.npy` file, even one that holds a pickled object, without executing anything.
+
+    Raises:
+        HeadModelError: as for `read_pickle`.
+    """
     try:
         with open_file(path) as file:
             shape, dtype = read_header(file)
@@ -319,7 +342,11 @@ def read_object_array(path: Path) -> Any:  # noqa: ANN401 (whatever the file hol
 
 
 def to_array(value: object, name: str, where: str) -> np.ndarray:
-    """Convert what a pickle held (array, chumpy, sparse matrix or list) to a dense array."""
+    """Convert what a pickle held (array, chumpy, sparse matrix or list) to a dense array.
+
+    Raises:
+        HeadModelError: it is not numeric, is too large, or holds NaN or Inf.
+    """
     for _ in range(8):  # they may be nested; the limit ends a cycle
         if isinstance(value, ChumpyArray):
             value = next((value.state[key] for key in ("x", "a", "v") if key in value.state), None)
@@ -341,6 +368,10 @@ def read_weights(path: Path, kind: Kind, where: str, what: str, fix: str = AGAIN
 
     Messages say ``where`` the file is, ``what`` it should be, such as "a torch state dict", and how
     to ``fix`` it.
+
+    Raises:
+        Express50Error: of the given kind: the file is missing, damaged, or names something that
+            ``weights_only`` does not allow.
     """
     import torch
 

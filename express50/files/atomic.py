@@ -42,7 +42,9 @@ FORMER = ".former"  # suffix of a folder that was moved out of the way
 def dump_json(value: object) -> bytes:
     """Encode as deterministic JSON with sorted keys.
 
-    FormatError for texts that are not Unicode, as names of files may be; ValueError for NaN.
+    Raises:
+        ValueError: a number is not finite.
+        FormatError: a text is not Unicode, as names of files may be.
     """
     text = json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False)
     try:
@@ -102,7 +104,12 @@ def nearest_existing(path: Path) -> Path:
 
 
 def check_folder_writable(folder: Path) -> None:
-    """Refuse, before any work, a folder that cannot be made or written to; leave nothing in it."""
+    """Refuse, before any work, a folder that cannot be made or written to; nothing is left in it.
+
+    Raises:
+        ConfigError: it is a file, or lies below one.
+        OSError: the system refuses.
+    """
     place = nearest_existing(folder)
     if not place.is_dir():
         raise ConfigError(f"{place}: is a file, expected a folder to write to; name another")
@@ -114,14 +121,20 @@ def check_folder_writable(folder: Path) -> None:
 
 
 def check_disk(folder: Path, name: Path) -> None:
-    """Refuse a disk that broke or became read-only since a run began; the error has ``name``."""
+    """Refuse a disk that broke, or became read-only, after a run began; nothing is left on it.
+
+    A folder that is gone is not the disk's fault. ``name`` is what the error names.
+
+    Raises:
+        DiskError: the disk of the folder refuses to be written to.
+    """
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(b"1")
             file.flush()
             os.fsync(file.fileno())
     except OSError as error:
-        if error.errno in BROKEN:  # a folder that is gone is not the disk's fault
+        if error.errno in BROKEN:
             raise DiskError(
                 f"{name}: its disk cannot be written to ({error.strerror}); repair that and run the"
                 " same command again; finished work is kept"
@@ -144,9 +157,13 @@ def check_space(folder: Path) -> None:
 
 @contextmanager
 def naming_full_disk(path: Path, aside: Path | None = None) -> Iterator[None]:
-    """Turn any error caused by a full disk, even in a library, into a DiskFullError with the path.
+    """Turn any error caused by a full disk, even in a library, into one that names the path.
 
     ``aside`` is where the files lie until they are complete; errors name ``path`` instead of it.
+
+    Raises:
+        DiskFullError: the body raised such an error.
+        OSError: the body raised one of a file that became too large, which then names the path.
     """
     try:
         yield
@@ -225,8 +242,10 @@ def put_back(former: Path, target: Path) -> None:
 
 
 def _replace(aside: Path, target: Path, former: Path) -> None:
-    """Rename a folder to a target that others may make, replace or move away at the same time."""
-    # Checking first and then renaming would fail if another process came in between.
+    """Rename a folder to a target that others may make, replace or move away at the same time.
+
+    Checking first and then renaming would fail if another process came in between.
+    """
     met = False
     while True:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -249,8 +268,10 @@ def _replace(aside: Path, target: Path, former: Path) -> None:
 
 
 def _swap(one: Path, other: Path) -> bool:
-    """Exchange two folders in one step; return False if the system cannot."""
-    # renameat2(2), RENAME_EXCHANGE, which Python's standard library lacks
+    """Exchange two folders in one step; return False if the system cannot.
+
+    Source: renameat2(2), RENAME_EXCHANGE, which Python's standard library lacks.
+    """
     exchange = getattr(ctypes.CDLL(None), "renameat2", None)  # glibc 2.28 and later
     return exchange is not None and not exchange(
         AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other), RENAME_EXCHANGE
@@ -277,7 +298,11 @@ def lock_file(file: BinaryIO | IO[str] | int, path: Path, kind: int = fcntl.LOCK
 def alone_in(folder: Path) -> Iterator[None]:
     """Make a folder, and hold it so that no other command writes results into it meanwhile.
 
-    The system releases it however the process ends. NotReadyError if another process holds it.
+    The system releases it however the process ends. File systems without locks hold nothing. What
+    a killed command was writing is removed.
+
+    Raises:
+        NotReadyError: another process holds it.
     """
     made = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,4 @@
-"""Read and write calibration files: cameras by id as JSON, with every value checked.
-
-Malformed cameras raise CalibrationError.
-"""
+"""Read and write calibration files: cameras by id as JSON, with every value checked."""
 
 from __future__ import annotations
 
@@ -22,7 +19,11 @@ LARGEST = 1e12  # absolute value in parameters (pixels) and poses (metres)
 
 
 def read_cameras(path: Path) -> dict[str, Camera]:
-    """Read a calibration file: ``{id: {model, width, height, params, world_to_camera}}``."""
+    """Read a calibration file: ``{id: {model, width, height, params, world_to_camera}}``.
+
+    Raises:
+        CalibrationError: the file is missing, or a camera has a field of the wrong shape or value.
+    """
     if not Path(path).exists():
         raise CalibrationError(f"{path}: the file is missing; run 'express50 calibrate'")
     return parse_cameras(read_json(path, CalibrationError, "write it again"), str(path))
@@ -76,7 +77,11 @@ def _parse_camera(path: str, camera_id: str, row: object) -> Camera:
 
 
 def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Convert a value to a float array of the given shape, with numbers of less than LARGEST."""
+    """Convert a value to a float array of the given shape, with numbers of less than LARGEST.
+
+    Raises:
+        CalibrationError: it is not such an array; the message begins with ``what``.
+    """
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):

@@ -4,8 +4,6 @@
 ``0026_e0_raw.smc!/Camera/03/color/0`` an array of encoded bytes in an HDF5 file. Nothing is
 unpacked to disk, names that lead out of the footage's folder are refused, and sizes are checked
 before anything is read.
-
-Whatever is wrong with a file or a name is a CaptureError.
 """
 
 from __future__ import annotations
@@ -40,7 +38,11 @@ DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError,
 
 
 def to_srgb(image: np.ndarray) -> np.ndarray:
-    """Convert an image (H, W[, C]), linear float or 8- or 16-bit sRGB, to (H, W, 3) uint8 sRGB."""
+    """Convert an image (H, W[, C]), linear float or 8- or 16-bit sRGB, to (H, W, 3) uint8 sRGB.
+
+    Raises:
+        ValueError: the image holds NaN or infinity, or values on another scale than 0 to 1.
+    """
     image = image[..., None] if image.ndim == 2 else image
     # Grey is repeated, alpha is dropped.
     image = np.repeat(image[..., :1], 3, axis=2) if image.shape[2] < 3 else image[..., :3]
@@ -58,7 +60,12 @@ def to_srgb(image: np.ndarray) -> np.ndarray:
 
 
 def inside(root: Path, name: str) -> Path:
-    """Return the path of a name relative to a folder, and refuse one that leads out of it."""
+    """Return the path of a name relative to a folder.
+
+    Raises:
+        CaptureError: the name is absolute, cannot be shown, or leads out of the folder. Links may
+            lead out of it, as those of git-annex do.
+    """
     pure = PurePosixPath(name)
     if not name.isprintable():
         raise CaptureError(f"{root}: {name!r} has characters that cannot be shown; rename it")
@@ -68,11 +75,15 @@ def inside(root: Path, name: str) -> Path:
         )
     if pure.is_absolute() or ".." in pure.parts:
         raise CaptureError(f"{root}: {name!r} leads out of this folder; expected a name inside it")
-    return root / name  # links in it may lead out, as those of git-annex do
+    return root / name
 
 
 def read_picture(root: Path, name: str, orientation: int = 1) -> np.ndarray:
-    """Read an image (H, W, 3) uint8 sRGB by its name below a folder, rotated by an orientation."""
+    """Read an image (H, W, 3) uint8 sRGB by its name below a folder, rotated by an orientation.
+
+    Raises:
+        CaptureError: it is missing, damaged, too large, or its name leads out of the folder.
+    """
     container, within, member = name.partition(WITHIN)
     path = inside(root, container)
     if within:
@@ -95,7 +106,11 @@ def read_srgb(path: Path) -> np.ndarray:
 
 
 def decode_picture(data: bytes, where: str) -> np.ndarray:
-    """Decode JPEG, PNG or AVIF bytes to (H, W, 3) uint8 sRGB, after checking the header's size."""
+    """Decode JPEG, PNG or AVIF bytes to (H, W, 3) uint8 sRGB, after checking the header's size.
+
+    Raises:
+        CaptureError: the bytes are not such an image, or the image has too many pixels.
+    """
     try:
         with (
             warnings.catch_warnings(action="ignore"),  # Pillow's limit is lower than ours
@@ -115,7 +130,12 @@ def decode_picture(data: bytes, where: str) -> np.ndarray:
 
 
 def member_bytes(path: Path, member: str) -> bytes:
-    """Read a member of a container, which is a zip or otherwise an HDF5 file."""
+    """Read a member of a container, which is a zip or otherwise an HDF5 file.
+
+    Raises:
+        CaptureError: the container is damaged, or the member is missing, too large or of the wrong
+            type.
+    """
     where = f"{path}{WITHIN}{member}"
     if path.suffix.lower() != ".zip":
         array = read_array(open_hdf5(path), member)
@@ -170,14 +190,20 @@ _hdf5_of = cached_by_file(OPEN_FILES)(h5py.File)
 
 
 def child(file: h5py.File, name: str) -> Any:
-    """Return the group or dataset at a path in an HDF5 file, or None."""
+    """Return the group or dataset at a path in an HDF5 file, or None.
+
+    Links are refused: an external link could read any file on the machine.
+
+    Raises:
+        CaptureError: a part of the path is a link, or the file is damaged.
+    """
     node: Any = file
     with _damage_is_one_error(DAMAGE, f"{file.filename}: {name} is damaged"):
         for part in name.split("/"):
             link = node.get(part, getlink=True) if isinstance(node, h5py.Group) else None
             if link is None:
                 return None
-            if not isinstance(link, h5py.HardLink):  # an external one could read any file
+            if not isinstance(link, h5py.HardLink):
                 raise CaptureError(
                     f"{file.filename}: {name} is a link, expected data in the file itself"
                 )
@@ -198,7 +224,11 @@ def attribute(group: h5py.Group, name: str, default: object) -> np.ndarray:
 
 
 def read_array(file: h5py.File, name: str) -> np.ndarray:
-    """Read a dataset's array after checking its type and size."""
+    """Read a dataset's array after checking its type and size.
+
+    Raises:
+        CaptureError: it is missing, not plain numbers, too large, or stored in another file.
+    """
     node, where = child(file, name), file.filename
     if not isinstance(node, h5py.Dataset):
         raise CaptureError(f"{where}: has no array {name}; copy the file again")

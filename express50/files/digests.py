@@ -21,6 +21,9 @@ def cached_by_file(size: int) -> Callable[[Callable[..., T]], Callable[..., T]]:
 
     The function's first argument must be a path, or have a method `__fspath__`; all arguments must
     be hashable. A file counts as changed if its size, modification time or inode differs.
+
+    Raises:
+        OSError: on a call of the function, if the path cannot be examined.
     """
 
     def decorate(function: Callable[..., T]) -> Callable[..., T]:
@@ -67,9 +70,12 @@ def files_of(folder: Path, hidden: bool = False) -> list[Path]:
 
 
 def path_digest(path: Path, sha256: Callable[[Path], str] = file_sha256) -> str:
-    """Digest a file's content, or names and contents of a folder's files; StageError if missing.
+    """Digest a file's content, or the names and contents of a folder's files.
 
     ``sha256`` digests one file; the ledger passes a function that caches digests.
+
+    Raises:
+        StageError: the path does not exist.
     """
     if path.is_file():
         return sha256(path)
@@ -80,7 +86,10 @@ def path_digest(path: Path, sha256: Callable[[Path], str] = file_sha256) -> str:
 
 
 def stat_digest(path: Path) -> str:
-    """Digest names, sizes and times of a file or a folder's files: cheap even for terabytes."""
+    """Digest names, sizes and times of a file or a folder's files: cheap even for terabytes.
+
+    The digest of a file that cannot be read differs from that of the same file once it can.
+    """
     root, files = (path.parent, [path]) if path.is_file() else (path, files_of(path))
     lines = []
     for file in files:

@@ -3,8 +3,6 @@
 OpenImageIO reads files with 8 and 16 bits, half and single floats, and encodes TIFF and EXR;
 imagecodecs reads PNG twice as fast; OpenCV decodes bytes in memory and encodes JPEG. Images are RGB
 (H, W, 3); files hold sRGB unless a name says linear.
-
-Files and arrays that cannot be read or written raise FormatError.
 """
 
 from __future__ import annotations
@@ -51,7 +49,14 @@ ORIENTATION = {turns: number for number, (turns, flipped) in TURNS.items() if no
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Read an image as (H, W) or (H, W, C) RGB in the file's own type, uint8, uint16 or float32."""
+    """Read an image as (H, W) or (H, W, C) RGB in the file's own type.
+
+    Returns:
+        A uint8, uint16 or float32 array (half floats are widened).
+
+    Raises:
+        FormatError: the file is missing, truncated, not a flat image, or over the pixel limit.
+    """
     if (plain := _plain_png(Path(path))) is not None:
         return plain
     source = open_image(path)
@@ -80,7 +85,13 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def _plain_png(path: Path) -> np.ndarray | None:
-    """Read a plain PNG of 8 or 16 bits in half of OpenImageIO's time; None for any other file."""
+    """Read a PNG of 8 or 16 bits without a palette, in half of OpenImageIO's time.
+
+    None for any other file, and for one that OpenImageIO has to refuse.
+
+    Raises:
+        FormatError: it is damaged. OpenImageIO's decoder would print that as well.
+    """
     with suppress(OSError), open_file(path) as file:
         head = file.read(26)
         if len(head) < 26 or not head.startswith(PNG_START):
@@ -94,14 +105,16 @@ def _plain_png(path: Path) -> np.ndarray | None:
         try:
             pixels = imagecodecs.png_decode(data)
         except imagecodecs.PngError as error:
-            # OpenImageIO's decoder would print the message as well.
             raise FormatError(f"{path}: {DAMAGED} ({error}); {REPAIR}") from error
         return pixels if channels is not None and pixels.shape[2:] == channels else None
     return None
 
 
 def _own_png(data: bytes, shape: tuple[int, ...]) -> np.ndarray | None:
-    """Decode a PNG as `encode_png` makes them, in a third of libpng's time; None for any other."""
+    """Decode a PNG as `encode_png` makes them, in a third of libpng's time.
+
+    None if another program wrote it, or if it is damaged: libpng then says how.
+    """
     kind, end = np.dtype(f">u{data[24] // 8}"), len(data) - len(PNG_END)
     length = math.prod(shape[1:]) * kind.itemsize + 1  # of a row, with its filter type
     header, body = data[12:33], data[37:end]
@@ -129,7 +142,11 @@ def _intact(chunk: bytes) -> bool:
 
 
 def open_image(path: Path) -> oiio.ImageInput:
-    """Open an image file of grey or RGB and read its header; the caller closes it."""
+    """Open an image file and read its header; the caller closes it.
+
+    Raises:
+        FormatError: it is missing, not an image, or holds no grey or RGB, such as CMYK.
+    """
     straight = oiio.ImageSpec()
     straight.attribute("oiio:UnassociatedAlpha", 1)  # otherwise colours are multiplied by alpha
     there = os.access(path, os.R_OK) and Path(path).is_file()
@@ -168,6 +185,9 @@ def read_exif(path: Path) -> tuple[int, float]:
     have no calibration: they are rotated upright first, so that width, height and principal point
     are those of the upright picture. A 35 mm equivalent focal length refers to the diagonal, which
     rotation does not change.
+
+    Raises:
+        FormatError: the file is not an image.
     """
     image = open_image(path)
     try:
@@ -190,7 +210,11 @@ class ColourProfile:
     data: bytes
 
     def to_srgb(self, image: np.ndarray) -> np.ndarray:
-        """Convert colours (H, W, 3) uint8 to sRGB, cut outside of it; CmsError if unusable."""
+        """Convert colours (H, W, 3) uint8 of this profile to sRGB; those outside of it are cut.
+
+        Raises:
+            RuntimeError: the profile cannot be used (imagecodecs.CmsError).
+        """
         return imagecodecs.cms_transform(
             np.ascontiguousarray(image), self.data, imagecodecs.cms_profile("srgb"),
             colorspace="rgb", outcolorspace="rgb",
@@ -198,13 +222,18 @@ class ColourProfile:
 
 
 def foreign_profile(path: Path) -> ColourProfile | None:
-    """Read a picture's ICC profile; None without a usable one, and if it means sRGB's colours."""
+    """Read a picture's ICC profile; None without a usable one, and if it means sRGB's colours.
+
+    OpenImageIO calls all pictures of 8 and 16 bits sRGB, whatever their profile is. Profiles of
+    grey pictures do not count, and neither do those of float ones, which hold linear light.
+
+    Raises:
+        FormatError: the file is not an image.
+    """
     image = open_image(path)
     spec = image.spec()
     image.close()
     data = spec.getattribute("ICCProfile")
-    # Grey pictures have no colours, and float ones hold linear light. All others count as sRGB for
-    # OpenImageIO, whatever their profile is.
     if data is None or spec.nchannels < 3 or _pixel_kind(spec.format) == "float":
         return None
     name = spec.get_string_attribute("ICCProfile:profile_description") or "without a name"
@@ -234,7 +263,14 @@ def read_alpha(path: Path) -> np.ndarray:
 
 
 def write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:
-    """Write (H, W) or (H, W, C) RGB, uint8, uint16 or float32, as .png, .jpg, .tif or .exr."""
+    """Write (H, W) or (H, W, C) RGB, uint8, uint16 or float32, as .png, .jpg, .tif or .exr.
+
+    JPEG's ``quality`` is 1 to 100; from 95 upwards chroma is not subsampled (4:4:4).
+
+    Raises:
+        FormatError: the file cannot be written.
+        DiskFullError: the disk is full.
+    """
     image = np.ascontiguousarray(image)
     if image.dtype == np.float64:
         image = image.astype(np.float32)
@@ -253,7 +289,14 @@ def write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:
 
 
 def _encode_in_memory(path: Path, image: np.ndarray) -> bytes:
-    """Encode an image with OpenImageIO in the format that its file's name says."""
+    """Encode an image with OpenImageIO in the format that its file's name says.
+
+    OpenImageIO must not write to disk itself: on a full one, it leaves out the end of a file
+    without an error, or ends the process. Needs Linux.
+
+    Raises:
+        FormatError: the format cannot hold such an image.
+    """
     target = _make_output(path)
     channels = 1 if image.ndim == 2 else image.shape[2]
     spec = oiio.ImageSpec(image.shape[1], image.shape[0], channels, _pixel_kind(image.dtype))
@@ -261,8 +304,6 @@ def _encode_in_memory(path: Path, image: np.ndarray) -> bytes:
     spec.attribute("oiio:UnassociatedAlpha", 1)
     if Path(path).suffix.lower() == ".exr":  # otherwise its header would hold the time of writing
         spec.attribute("DateTime", "1970:01:01 00:00:00")
-    # OpenImageIO must not write to disk itself: on a full one, it leaves out the end of a file
-    # without an error, or ends the process. Needs Linux.
     file = os.memfd_create("image")
     try:
         name = f"/proc/self/fd/{file}"
@@ -290,7 +331,11 @@ def _make_output(path: Path) -> oiio.ImageOutput:
 
 
 def encode_jpeg(image: np.ndarray, quality: int = 95) -> bytes:
-    """Encode an RGB (H, W, 3) or grey (H, W) uint8 image as JPEG; 4:4:4 from quality 95 upwards."""
+    """Encode an RGB (H, W, 3) or grey (H, W) uint8 image as JPEG; 4:4:4 from quality 95 upwards.
+
+    Raises:
+        FormatError: a side is empty or longer than the format allows, or it is another image.
+    """
     _check_sides("JPEG", image, JPEG_SIDE)
     if image.dtype != np.uint8 or image.shape[2:] not in ((), (1,), (3,)):
         kind = f"{image.dtype} {image.shape}"
@@ -302,8 +347,16 @@ def encode_jpeg(image: np.ndarray, quality: int = 95) -> bytes:
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """Encode a grey or RGB image (H, W[, C]) uint8 or uint16, with alpha or without, as PNG."""
-    # PNG 1.2, 4 (chunks), 6.4 (filter type Up: the difference from the row above)
+    """Encode a grey or RGB image (H, W[, C]) uint8 or uint16, with alpha or without, as PNG.
+
+    Each row is stored as its difference from the one above and compressed by libdeflate. Libpng
+    takes three to five times as long for as many bytes (docs/LOG.md).
+
+    Raises:
+        FormatError: a side is empty, or longer than OpenCV reads.
+
+    Source: PNG 1.2, 4 (chunks), 6.4 (filter type Up).
+    """
     _check_sides("PNG", image, PNG_SIDE)
     (height, width), channels = image.shape[:2], math.prod(image.shape[2:])
     rows = np.ascontiguousarray(image.astype(image.dtype.newbyteorder(">"), copy=False))
@@ -314,7 +367,6 @@ def encode_png(image: np.ndarray) -> bytes:
     np.subtract(rows[1:], rows[:-1], out=filtered[1:, 1:])
     colour = {1: 0, 2: 4, 3: 2, 4: 6}[channels]
     header = struct.pack(">IIBBBBB", width, height, 8 * image.itemsize, colour, 0, 0, 0)
-    # Libpng takes three to five times as long for as many bytes (docs/LOG.md).
     pixels = imagecodecs.deflate_encode(body, level=PNG_LEVEL)
     chunks = ((b"IHDR", header), (b"IDAT", pixels), (b"IEND", b""))
     return PNG_START + b"".join(
@@ -339,7 +391,11 @@ def has_alpha(path: Path) -> bool:
 
 
 def decode_image(data: bytes, name: str = "image") -> np.ndarray:
-    """Decode JPEG or PNG bytes to RGB (H, W, 3) or grey (H, W), keeping 8 or 16 bits."""
+    """Decode JPEG or PNG bytes to RGB (H, W, 3) or grey (H, W), keeping 8 or 16 bits.
+
+    Raises:
+        FormatError: the bytes are not an image, or the image is over the pixel limit.
+    """
     width, height = image_size(data, name)
     if width * height > PIXEL_LIMIT:
         raise FormatError(f"{name}: {width}x{height} pixels, expected at most {PIXEL_LIMIT}")
@@ -347,7 +403,11 @@ def decode_image(data: bytes, name: str = "image") -> np.ndarray:
 
 
 def decode_cv(data: bytes, flags: int, name: str) -> np.ndarray:
-    """Decode bytes with OpenCV, refusing a truncated JPEG; callers check the image's size first."""
+    """Decode bytes with OpenCV, refusing a truncated JPEG; callers check the image's size first.
+
+    Raises:
+        FormatError: the bytes are damaged or truncated.
+    """
     if is_cut_short(data):
         raise FormatError(f"{name}: {CUT}")
     try:
@@ -360,9 +420,15 @@ def decode_cv(data: bytes, flags: int, name: str) -> np.ndarray:
 
 
 def image_size(data: bytes, where: str) -> tuple[int, int]:
-    """Read width and height from a PNG's or JPEG's header, without decoding pixels."""
+    """Read width and height from a PNG's or JPEG's header, without decoding pixels.
+
+    Raises:
+        FormatError: the bytes are neither PNG nor JPEG.
+
+    Source: PNG 1.2, 11.2.2 (IHDR).
+    """
     if data[:8] == PNG_START and len(data) >= 24:
-        return struct.unpack(">II", data[16:24])  # PNG 1.2, 11.2.2 (IHDR)
+        return struct.unpack(">II", data[16:24])
     size, _ = _jpeg_header(data)
     if size is None:
         raise FormatError(f"{where}: {len(data)} bytes are not a PNG or JPEG image")
@@ -370,19 +436,24 @@ def image_size(data: bytes, where: str) -> tuple[int, int]:
 
 
 def is_cut_short(data: bytes | mmap.mmap) -> bool:
-    """Return True if a JPEG stops before its end marker, which decoders do not report."""
+    """Return True if a JPEG stops before its end marker; False for other bytes.
+
+    Decoders fill what is missing with grey and do not report it. Thumbnails in the header have end
+    markers of their own, so the search starts after the first scan's header. Some cameras write
+    more data after the picture's end marker. In a scan, 0xFF is always followed by a byte that says
+    what it is (ITU-T T.81, B.1.1.5), so no other data looks like an end marker.
+    """
     if data[:2] != b"\xff\xd8":
         return False
-    # Thumbnails in the header have end markers of their own. Some cameras write more data after the
-    # end marker. In a scan, 0xFF is always followed by a byte that says what it is (ITU-T T.81,
-    # B.1.1.5), so no other data looks like an end marker.
     _, scan = _jpeg_header(data)
     return scan is None or data.find(b"\xff\xd9", scan) < 0
 
 
 def _jpeg_header(data: bytes | mmap.mmap) -> tuple[tuple[int, int] | None, int | None]:
-    """Return a JPEG's (width, height) and the offset of its first scan; None if not found."""
-    # ITU-T T.81, B.1.1.2 to B.2.2 (markers, frame header)
+    """Return a JPEG's (width, height) and the offset of its first scan; None if not found.
+
+    Source: ITU-T T.81, B.1.1.2 to B.2.2 (markers, frame header).
+    """
     size, position = None, 2 if data[:2] == b"\xff\xd8" else len(data)
     while position + 4 <= len(data) and data[position] == 0xFF:
         marker, length = data[position + 1], int.from_bytes(data[position + 2 : position + 4])
@@ -404,7 +475,11 @@ def _swap(image: np.ndarray) -> np.ndarray:
 
 
 def depth_to_uint16(depth: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Quantise a depth map (H, W), metres, to 16-bit steps; 0 where not valid."""
+    """Quantise a depth map (H, W), metres, to 16-bit steps; 0 where not valid.
+
+    Raises:
+        ValueError: a valid depth is not finite, not positive or over 3.27 m.
+    """
     inside = depth[valid]
     if inside.size and not (
         np.isfinite(inside).all() and inside.min() > 0 and inside.max() < DEPTH_LIMIT_M
@@ -459,7 +534,11 @@ def is_grey(rgb: np.ndarray) -> bool:
 
 
 def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Resize an image (H, W[, C]): average areas to shrink it, interpolate to enlarge it."""
+    """Resize an image (H, W[, C]): average areas to shrink it, interpolate to enlarge it.
+
+    Raises:
+        ValueError: the image or its new size is empty.
+    """
     if 0 in image.shape or min(width, height) < 1:
         had = f"{image.shape[1]}x{image.shape[0]}"
         raise ValueError(f"resize of {had} to {width}x{height} pixels, expected 1x1 or more")
@@ -490,18 +569,23 @@ def shrink(image: np.ndarray, side: int) -> np.ndarray:
 
 
 def reduce_light(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Average an image (H, W, 3) uint8 sRGB to a smaller size in linear light."""
-    # A pixel at an outline then mixes subject and background by areas, as keying assumes.
+    """Average an image (H, W, 3) uint8 sRGB to a smaller size in linear light.
+
+    A pixel at an outline then mixes subject and background by their areas, as keying assumes.
+    """
     light = cv2.LUT(np.ascontiguousarray(image), DEEP_LIGHT_OF_LEVEL)
     return LEVEL_OF_DEEP_LIGHT[resize_area(light, width, height)]
 
 
 def edge_distance(mask: np.ndarray) -> np.ndarray:
-    """Measure distances (H, W) float32, pixels, of a mask (H, W) to its outside; 0 there."""
+    """Measure the distance (H, W) float32 of each pixel of a mask (H, W) to the nearest outside it.
+
+    Distances are in pixels, zero outside; the mask must have an outside. The last bit of OpenCV's
+    square roots depends on where the mask lies in memory. Squared distances are integers, so
+    rounding them gives the same bytes everywhere, up to 1,400 pixels from the edge, beyond which
+    float32 cannot distinguish them.
+    """
     rough = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    # The last bit of OpenCV's square roots depends on where the mask lies in memory. Squared
-    # distances are integers, so that rounding them gives the same bytes everywhere, up to 1,400
-    # pixels from the edge: float32 cannot distinguish them further away.
     return np.sqrt(np.rint(np.square(rough)))
 
 
@@ -533,12 +617,16 @@ WHITE, ALARM = (255, 255, 255), (255, 120, 90)
 
 def contact_sheet(
     rows: Sequence[Sequence[np.ndarray]],
-    labels: Sequence[str | Sequence[str]] = (),  # per row one text, or one per image
+    labels: Sequence[str | Sequence[str]] = (),
     tile: tuple[int, int] = (160, 160),
-    captions: Sequence[str] = (),  # above the columns
-    alarming: Collection[str] = (),  # labels that are red
+    captions: Sequence[str] = (),
+    alarming: Collection[str] = (),
 ) -> np.ndarray:
-    """Lay out rows of images as one picture (H, W, 3) uint8."""
+    """Lay out rows of images as one picture (H, W, 3) uint8.
+
+    A row's label is one text, or one per image; ``captions`` stand above the columns. Labels that
+    are ``alarming`` are red.
+    """
     columns = max((len(row) for row in rows), default=1)
     blank = np.full((*tile, 3), 24, np.uint8)
     lines = []
@@ -570,7 +658,10 @@ def _write_texts(
 def tile_sheet(
     pictures: Mapping[str, np.ndarray], columns: int, side: int, alarming: Collection[str] = ()
 ) -> np.ndarray:
-    """Lay out named pictures in rows of square tiles, names above, ``alarming`` names in red."""
+    """Lay out named pictures in rows of square tiles, each with its name above it.
+
+    Names that are ``alarming`` are red.
+    """
     names = list(pictures)
     rows = [names[k : k + columns] for k in range(0, len(names), columns)]
     tiles = [[pictures[name] for name in row] for row in rows]

@@ -3,8 +3,6 @@
 Files must be regular and have at most ``TEXT_LIMIT`` bytes. In JSON and TOML, repeated keys and
 numbers that are not finite are refused; YAML and XML values stay text, and references that could
 grow without bound or name other files are refused.
-
-Readers raise an error of the ``kind`` they are given.
 """
 
 from __future__ import annotations
@@ -54,7 +52,12 @@ def identifier(text: str, other: str = "_-") -> str:
 
 
 def read_bytes(path: Path, kind: Kind, limit: int = TEXT_LIMIT, fix: str = AGAIN) -> bytes:
-    """Read the bytes of a regular file of at most ``limit`` bytes."""
+    """Read the bytes of a regular file.
+
+    Raises:
+        Express50Error: of the given kind: the file is missing, not regular, unreadable, or larger
+            than ``limit``.
+    """
     path = Path(path)
     try:
         status = path.stat()
@@ -81,7 +84,11 @@ def no_file(path: Path) -> str:
 
 
 def open_file(path: Path) -> io.BufferedReader:
-    """Open a file to read it; OSError for a pipe or device, which could keep readers waiting."""
+    """Open a file to read it; a pipe or device in its place could keep its readers waiting.
+
+    Raises:
+        OSError: it is one, or cannot be opened.
+    """
     path = Path(path)
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise OSError(errno.EINVAL, no_file(path), str(path))
@@ -97,9 +104,13 @@ def expanded(path: str | Path) -> Path:
 
 
 def unreadable(path: Path) -> str:
-    """Return why a file or folder that is there cannot be read, and what to do; "" if it can."""
+    """Return why a file or folder that is there cannot be read, and what to do; "" if it can.
+
+    It may need permissions, or a file may lack its content: git-annex keeps links to contents that
+    are fetched one by one. It and Git LFS also write small files that only name the content.
+    """
     try:
-        if path.is_symlink() and not path.exists():  # git-annex fetches contents one by one
+        if path.is_symlink() and not path.exists():
             return (
                 f"is a link to {path.readlink()}, which is not there; fetch it (of git-annex or"
                 " DataLad: 'git annex get FOLDER'), or copy the file itself"
@@ -128,7 +139,11 @@ def check_readable(*paths: Path) -> None:
 
 
 def is_given(path: Path) -> bool:
-    """Return whether an optional file is there; CaptureError if it is not a file to read."""
+    """Return whether an optional file is there.
+
+    Raises:
+        CaptureError: it is unreadable, a folder or a pipe.
+    """
     check_readable(path)
     if path.is_dir():
         raise CaptureError(f"{path}: is a folder, expected a file; put the file in its place")
@@ -136,7 +151,11 @@ def is_given(path: Path) -> bool:
 
 
 def read_text(path: Path, kind: Kind, limit: int = TEXT_LIMIT, fix: str = AGAIN) -> str:
-    """Read a file as UTF-8, dropping a byte order mark; line ends become newlines."""
+    """Read a file as UTF-8, dropping a byte order mark; line ends become newlines.
+
+    Raises:
+        Express50Error: as for `read_bytes`, or the file is not UTF-8.
+    """
     data = read_bytes(path, kind, limit, fix)
     try:
         text = data.decode("utf-8-sig")
@@ -167,7 +186,12 @@ def read_json_table(path: Path, kind: Kind, fix: str = AGAIN) -> dict[str, Any]:
 
 
 def parse_json(text: str | bytes, where: str, kind: Kind, fix: str = AGAIN) -> Any:
-    """Parse JSON text; repeated keys, NaN, infinity and endless numbers are refused."""
+    """Parse JSON text.
+
+    Raises:
+        Express50Error: it is not JSON, is nested too deeply, repeats a key, or has a number that is
+            NaN, infinite or thousands of digits long.
+    """
     try:
         return json.loads(
             text, parse_constant=_finite, parse_float=_finite, object_pairs_hook=_once
@@ -179,7 +203,12 @@ def parse_json(text: str | bytes, where: str, kind: Kind, fix: str = AGAIN) -> A
 
 
 def read_toml(path: Path, kind: Kind) -> dict[str, Any]:
-    """Read a TOML file."""
+    """Read a TOML file.
+
+    Raises:
+        Express50Error: as for `read_text`, or the file is not TOML, is nested too deeply, or holds
+            a number that is NaN or infinite.
+    """
     text = read_text(path, kind, TOML_LIMIT)
     try:
         return tomllib.loads(text, parse_float=_finite)
@@ -190,7 +219,12 @@ def read_toml(path: Path, kind: Kind) -> dict[str, Any]:
 
 
 def read_yaml(path: Path, kind: Kind) -> Any:
-    """Read a YAML file whose scalars stay text; aliases could expand a small file without bound."""
+    """Read a YAML file whose scalars stay text.
+
+    Raises:
+        Express50Error: as for `read_text`, or the file is not YAML, is nested too deeply, or has
+            aliases, with which a small file could expand without bound.
+    """
     text, level = read_text(path, kind, YAML_LIMIT), 0
     text = text.replace("%YAML:1.0", "%YAML 1.0", 1)  # as OpenCV writes it
     try:
@@ -208,9 +242,14 @@ def read_yaml(path: Path, kind: Kind) -> Any:
 
 
 def read_xml(path: Path, kind: Kind) -> ElementTree.Element:
-    """Read the root of an XML file without a document type."""
+    """Read the root of an XML file.
+
+    Raises:
+        Express50Error: as for `read_text`, or the file is not XML or declares a document type,
+            whose entities could grow without bound or name other files.
+    """
     text = read_text(path, kind)
-    if "<!DOCTYPE" in text:  # entities may grow without bound or name files
+    if "<!DOCTYPE" in text:
         raise kind(f"{path}: declares a document type (<!DOCTYPE), expected none; {AGAIN}")
     try:
         return ElementTree.fromstring(text)

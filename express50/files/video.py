@@ -2,8 +2,6 @@
 
 Frames are counted by decoding and found by their time stamp, because edit lists and broken muxers
 make a container's own frame count wrong. Writing the same pictures gives the same bytes.
-
-Whatever is wrong with a video is a CaptureError.
 """
 
 from __future__ import annotations
@@ -61,12 +59,17 @@ DAMAGE = (av.FFmpegError, OSError, ValueError, MemoryError, OverflowError)
 
 
 def check_whole(path: Path) -> None:
-    """Refuse an MP4/MOV file whose boxes go past its end, or that has no index."""
+    """Refuse an MP4/MOV file whose boxes go past its end, or that has no index.
+
+    Raises:
+        CaptureError: the file is truncated, a link to nothing, or without read permission.
+
+    Source: ISO/IEC 14496-12, 4.2: a box is its size (32 bits, or 64 after size 1), its type and
+    content; size 0 runs to the end of the file.
+    """
     check_readable(path)
     size = path.stat().st_size
     with path.open("rb") as file:
-        # ISO/IEC 14496-12, 4.2: a box is its size (32 bits, or 64 after size 1), its type and
-        # content; size 0 runs to the end of the file.
         offset = count = 0
         kinds: set[bytes] = set()
         while offset + 8 <= size and count < BOXES:
@@ -152,11 +155,14 @@ def _decode(
     path: Path,
     container: av.container.InputContainer,
     stream: av.VideoStream,
-    # frames that may be left out, if no other needs them
     unneeded: Callable[[int], bool] | None = None,
-    packets: Iterable[av.Packet] | None = None,  # all that follow
+    packets: Iterable[av.Packet] | None = None,
 ) -> Iterator[av.VideoFrame]:
-    """Yield frames in display order from the current position; raise CaptureError on damage."""
+    """Yield frames in display order from the current position; raise CaptureError on damage.
+
+    Frames whose time stamps are `unneeded` may be left out, if no other frame refers to them.
+    `packets` are those to decode, by default all that follow.
+    """
     context = stream.codec_context
     try:
         for packet in packets or container.demux(stream):
@@ -199,7 +205,11 @@ def video_fps(path: Path) -> float:
 
 
 def common_fps(table: Path, videos: Iterable[Path]) -> float:
-    """Return the frame rate that videos state, except those that cannot be opened."""
+    """Return the frame rate that videos state, except those that cannot be opened.
+
+    Raises:
+        CaptureError: they differ or state none; it asks for a rate in the `table`.
+    """
     stated, unread = [], ""
     for path in videos:
         try:
@@ -220,7 +230,14 @@ def common_fps(table: Path, videos: Iterable[Path]) -> float:
 
 
 def frame_times(path: Path) -> tuple[int, ...]:
-    """List the time stamps of a video's frames in display order, without decoding a frame."""
+    """List the time stamps of a video's frames in display order, without decoding a frame.
+
+    Frames of AVI files are decoded, unless all stand alone: what such a file says of their order
+    may be wrong.
+
+    Raises:
+        CaptureError: the file is not a video, is truncated, or its frames have no time stamps.
+    """
     check_whole(path)
     container, stream = _open(path)
     with container:
@@ -234,7 +251,7 @@ def frame_times(path: Path) -> tuple[int, ...]:
             raise CaptureError(
                 f"{path}: cannot be read ({reason(error)}); copy it again"
             ) from error
-        if container.format.name == "avi" and not alone:  # its times may be out of order
+        if container.format.name == "avi" and not alone:
             container.seek(0)
             return tuple(f.pts for f in _in_order(path, _decode(path, container, stream)))
     if None in stamps:
@@ -244,7 +261,11 @@ def frame_times(path: Path) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class VideoTags:
-    """What a video says of its pictures as stored: a calibration refers to stored pixels."""
+    """What a video says of its pictures.
+
+    They are read as stored, also if a phone stored upright footage lying on its side: a calibration
+    refers to stored pixels.
+    """
 
     turn: int  # quarter turns counter-clockwise, 0 to 3, that it asks players for
     hdr: str  # name of its transfer curve if that is one for high dynamic range, else empty
@@ -286,14 +307,23 @@ def _tags(frame: av.VideoFrame, stream: av.VideoStream) -> VideoTags:
 def iterate_video(
     path: Path, tell: Callable[[VideoTags], None] | None = None
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Decode a video in display order: time stamps in its own unit, and sRGB (H, W, 3) uint8."""
+    """Decode a whole video in display order.
+
+    `tell` is called with what `video_tags` returns, before the first frame.
+
+    Yields:
+        Time stamp (in the stream's own unit) and (H, W, 3) uint8 sRGB image.
+
+    Raises:
+        CaptureError: the file is not a video, is truncated or damaged, or holds no frame.
+    """
     check_whole(path)
     container, stream = _open(path)
     with container:
         count = 0
         for frame in _in_order(path, _decode(path, container, stream)):
             if tell and not count:
-                tell(_tags(frame, stream))  # before the first frame
+                tell(_tags(frame, stream))
             count += 1
             yield int(frame.pts), _pixels(path, frame)
     if count == 0:
@@ -303,10 +333,13 @@ def iterate_video(
 def iterate_sparsely(
     path: Path, every: int, tell: Callable[[VideoTags], None]
 ) -> Iterator[tuple[int, np.ndarray | None]]:
-    """List a video's frames as `iterate_video` does, but decode a few that need no other frame.
+    """List a video's frames in display order, and decode a few that need no other frame.
 
-    One key frame is decoded in `every` frames, or all key frames if they are further apart. The
-    others come without an image.
+    One key frame is decoded in `every` frames, or all key frames if they are further apart.
+    Arguments and errors are those of `iterate_video`.
+
+    Yields:
+        Time stamp and (H, W, 3) uint8 sRGB image; None for a frame that is not decoded.
     """
     stamps = frame_times(path)
     container, stream = _open(path)
@@ -356,13 +389,19 @@ class VideoReader:
         self._last: av.VideoFrame | None = None
 
     def read(self, frame: int) -> np.ndarray:
-        """Read the image (H, W, 3) uint8 sRGB at a decode index."""
+        """Read the image (H, W, 3) uint8 sRGB at a decode index.
+
+        Raises:
+            CaptureError: there is no such frame, or time stamps differ from the index.
+        """
         return _pixels(self.path, self._frame(frame))
 
     def read_exactly(self, frame: int) -> np.ndarray:
-        """Read as `read` does, with the colours that the file states."""
-        # What `read` returns is a level darker where chroma is reduced. Hashes are made from it,
-        # and labels hold hashes, so it has to stay as it is.
+        """Read as `read` does, with the colours that the file states.
+
+        What `read` returns is a level darker where chroma is reduced. Hashes are made from it, and
+        labels hold hashes, so it has to stay as it is.
+        """
         return _pixels(self.path, self._frame(frame), EXACT)
 
     def _frame(self, frame: int) -> av.VideoFrame:
@@ -449,7 +488,12 @@ class VideoReader:
 
 
 class VideoFootage:
-    """Writes ``video.mp4``: H.264, 4:4:4, BT.709; the same pictures give the same bytes."""
+    """Writes ``video.mp4``: H.264, 4:4:4, BT.709.
+
+    It uses one thread, no B-frames and no lookahead, because otherwise the same pictures give
+    different bytes from run to run: libx264 reads stale memory. On one thread it placed B-frames in
+    six different ways in 40 runs, and without them weighted predictions in two ways in 3,000 runs.
+    """
 
     def __init__(self, folder: Path, width: int, height: int, fps: float, crf: int) -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -457,9 +501,6 @@ class VideoFootage:
         rate = Fraction(fps).limit_denominator(1001)
         stream = self._container.add_stream("libx264", rate=rate)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv444p"
-        # One thread, no B-frames, no lookahead: libx264 reads stale memory, so that the bytes would
-        # differ from run to run. On one thread it placed B-frames in six different ways in 40 runs,
-        # and without them weighted predictions in two ways in 3,000 runs.
         stream.options = {
             "crf": str(crf), "preset": "veryfast", "bf": "0", "rc-lookahead": "0", "weightp": "0"
         }  # fmt: skip

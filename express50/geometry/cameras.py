@@ -102,7 +102,11 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
 
 
 def scale_camera(camera: Camera, sx: float, sy: float) -> Camera:
-    """Return the camera of the image scaled by (sx, sy); with a corner origin, K only scales."""
+    """Return the camera of the image scaled by (sx, sy); with a corner origin, K only scales.
+
+    Raises:
+        ValueError: no pixel would be left.
+    """
     width, height = round(camera.width * sx), round(camera.height * sy)
     if min(width, height) < 1:
         raise ValueError(f"{camera.id}: scaled to {width}x{height}, expected at least 1x1")
@@ -147,11 +151,13 @@ def transform_camera(camera: Camera, new_from_old: np.ndarray) -> Camera:
 
 
 def distort(camera: Camera, xy: np.ndarray) -> np.ndarray:
-    """Return distorted normalised coordinates (N, 2) of ideal ones (N, 2), even beyond a fold."""
+    """Return distorted normalised coordinates (N, 2) of ideal ones (N, 2), even beyond a fold.
+
+    Source: OpenCV's rational model, of which COLMAP's OPENCV and RADIAL are special cases.
+    """
     p1, p2 = camera.dist[2:4]
     x, y = xy[:, 0], xy[:, 1]
     r2 = x * x + y * y
-    # OpenCV's rational model, of which COLMAP's OPENCV and RADIAL are special cases.
     radial, _ = _radial_part(camera.dist, r2)
     dx = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
@@ -159,11 +165,16 @@ def distort(camera: Camera, xy: np.ndarray) -> np.ndarray:
 
 
 def undistort(camera: Camera, xy: np.ndarray) -> np.ndarray:
-    """Return ideal normalised coordinates (N, 2) of distorted ones, NaN where the lens folds."""
+    """Return ideal normalised coordinates (N, 2) of distorted ones (N, 2).
+
+    They are NaN where the lens forms no such image point, because its distortion folds there.
+
+    Source: Newton's method, started from a table of the radial part, which is monotonic in its
+    field.
+    """
     xy = np.asarray(xy, dtype=np.float64)
     if not camera.dist.any():
         return xy
-    # Newton's method, from a table of the radial part, which is monotonic in its field.
     radii = np.linspace(0.0, _field(camera.dist.tobytes()), TABLE_SIZE)
     radial, _ = _radial_part(camera.dist, radii**2)
     size = np.linalg.norm(xy, axis=1)
@@ -215,10 +226,13 @@ def _radial_part(dist: np.ndarray, r2: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 @lru_cache(maxsize=256)
 def _field(dist: bytes) -> float:
-    """Return the radius of the radial part's first fold or pole, at most `WIDEST`."""
+    """Return the radius of the radial part's first fold or pole, at most `WIDEST`.
+
+    The derivative of r N / D by r, with N and D polynomials of u = r^2, has the numerator
+    N D + 2 u (N' D - N D').
+    """
     k1, k2, _, _, k3, k4, k5, k6 = np.frombuffer(dist)
     above, below = Polynomial([1.0, k1, k2, k3]), Polynomial([1.0, k4, k5, k6])
-    # The numerator of the derivative of r N / D by r, with N and D polynomials of u = r^2.
     slope = above * below + Polynomial([0, 2]) * (above.deriv() * below - above * below.deriv())
     ends = [WIDEST**2]
     for part in (slope, below):
@@ -230,9 +244,15 @@ def _field(dist: bytes) -> float:
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Project world points (N, 3), metres, to pixels (N, 2) and camera z (N,), with distortion.
+    """Project world points (N, 3), metres, into a camera, including distortion.
 
-    Pixels are NaN if z <= 0 or where the lens folds; both are NaN if a point is not finite.
+    Returns:
+        Pixels (N, 2) as (x, y), NaN if depth <= 0 or where the lens folds, and depth (N,), camera
+        z in metres. Both are NaN if a point is not finite.
+
+    Raises:
+        ValueError: points are not (N, 3).
+
     Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., ch. 6.
     """
     points = np.asarray(points, dtype=np.float64)
@@ -280,6 +300,8 @@ def triangulate(
 
     A pixel is NaN where a camera does not see a point; `weights` (C, N) are ones by default. A
     point is NaN if fewer than two cameras see it, or it lies behind all.
+
+    Source: linear triangulation (Hartley and Zisserman, 12.2), then Gauss-Newton on pixels.
     """
     pixels = np.asarray(pixels, dtype=np.float64)
     check_shape("pixels", pixels, (len(cameras), None, 2))
@@ -288,7 +310,6 @@ def triangulate(
     w = np.where(seen, 1.0 if weights is None else np.asarray(weights, dtype=np.float64), 0.0)
     P = np.stack([c.cam_from_world[:3] for c in cameras])  # (C, 3, 4)
     focal = np.array([camera.focal for camera in cameras])
-    # Linear triangulation (Hartley and Zisserman, 12.2), then Gauss-Newton on pixels.
     points = np.full((pixels.shape[1], 3), np.nan)
     enough = (w > 0).sum(0) >= 2
     for n in np.flatnonzero(enough):

@@ -51,7 +51,10 @@ def K_from_opencv(K: np.ndarray) -> np.ndarray:
 
 
 def affine_to_opencv(matrix: np.ndarray) -> np.ndarray:
-    """Return the affine (2, 3) between corner-origin pixels as ``cv2.warpAffine`` expects it."""
+    """Return the affine (2, 3) between centre-origin pixels, as ``cv2.warpAffine`` expects it.
+
+    ``matrix`` (2, 3) is the same map between corner-origin pixels.
+    """
     shifted = np.array(matrix, dtype=np.float64)
     shifted[:, 2] += shifted[:, :2] @ [0.5, 0.5] - 0.5
     return shifted
@@ -65,7 +68,10 @@ def affine_from_opencv(matrix: np.ndarray) -> np.ndarray:
 
 
 def corner_to_cell(places: Places) -> Places:
-    """Return fractional indices of corner-origin positions, for interpolation; cell 0 is [0, 1]."""
+    """Return fractional indices of corner-origin positions, for interpolation; cell 0 is [0, 1].
+
+    Takes and returns an array or a tensor of any shape.
+    """
     return places - 0.5  # type: ignore[operator,return-value]
 
 

@@ -93,13 +93,17 @@ def check_faces(faces: np.ndarray, count: int) -> None:
 
 def write_obj(
     path: Path,
-    vertices: np.ndarray,  # (V, 3)
-    faces: np.ndarray,  # (F, 3)
-    uv: np.ndarray,  # (T, 2)
-    uv_faces: np.ndarray,  # (F, 3)
-    texture: str | None,  # name of a picture beside the OBJ, for an .mtl file with the OBJ's name
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    uv: np.ndarray,
+    uv_faces: np.ndarray,
+    texture: str | None,
 ) -> None:
-    """Write an OBJ file with texture coordinates."""
+    """Write an OBJ file of vertices (V, 3) and faces (F, 3) with texture coordinates.
+
+    The coordinates are ``uv`` (T, 2) and ``uv_faces`` (F, 3). ``texture`` may be the file
+    name of a picture beside the OBJ; an .mtl file with the OBJ's name then refers to it.
+    """
     lines = []
     if texture is not None:
         material = path.with_suffix(".mtl")
@@ -127,15 +131,20 @@ def split_seams(
 
 def encode_glb(
     name: str,
-    vertices: np.ndarray,  # (V, 3)
-    faces: np.ndarray,  # (F, 3)
+    vertices: np.ndarray,
+    faces: np.ndarray,
     *,
-    normals: np.ndarray | None = None,  # (V, 3) unit
-    colours: np.ndarray | None = None,  # (V, 4) uint8, linear (glTF 2.0, 3.9.2)
-    uv: np.ndarray | None = None,  # (V, 2)
-    **material: Any,  # more of trimesh's PBRMaterial, such as its texture
+    normals: np.ndarray | None = None,
+    colours: np.ndarray | None = None,
+    uv: np.ndarray | None = None,
+    **material: Any,
 ) -> bytes:
-    """Encode as binary glTF one rough, non-metallic mesh."""
+    """Encode as binary glTF one rough, non-metallic mesh: vertices (V, 3) and faces (F, 3).
+
+    Normals (V, 3) have unit length; colours (V, 4) are uint8, linear light, as glTF 2.0 (3.9.2)
+    defines COLOR_0; ``uv`` is (V, 2). ``material`` holds further properties of trimesh's
+    PBRMaterial, such as its texture.
+    """
     import trimesh
 
     material = {"metallicFactor": 0.0, "roughnessFactor": 0.8} | material
@@ -151,7 +160,11 @@ def encode_glb(
 def cotangent_laplacian(
     vertices: np.ndarray, faces: np.ndarray
 ) -> tuple[sparse.csr_matrix, np.ndarray]:
-    """Return the stiffness (V, V) and lumped mass (V,) of a mesh (Pinkall and Polthier 1993)."""
+    """Return cotangent stiffness (V, V) and lumped mass (V,) of a mesh (V, 3), (F, 3).
+
+    Source: Pinkall and Polthier 1993. Only positive edge weights are kept, so that slivers do no
+    harm and the matrix is positive semi-definite.
+    """
     count = len(vertices)
     values: list[np.ndarray] = []
     mass = np.full(count, 1e-12)
@@ -163,7 +176,6 @@ def cotangent_laplacian(
         np.add.at(mass, i, area / 6.0)
     edges = (faces.T.ravel(), faces[:, [1, 2, 0]].T.ravel())
     half = sparse.csr_matrix((np.concatenate(values), edges), shape=(count, count))
-    # Without negative weights, slivers do no harm and the matrix is positive semi-definite.
     weights = (half + half.T).maximum(0.0).minimum(20.0)
     return sparse.diags(np.asarray(weights.sum(1)).ravel()) - weights, mass
 

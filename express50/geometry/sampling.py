@@ -29,8 +29,11 @@ SHARPEST = 20  # percentile of the widths: lashes and hair are sharp, a face is 
 
 
 def undistort_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return maps (H, W) of x and y, float32, for ``cv2.remap`` from a camera to its pinhole."""
-    # Once per block of pixels, then interpolated: at most 0.004 px off for a lens of 80 degrees.
+    """Return maps (H, W) of x and y, float32, for ``cv2.remap`` from a camera to its pinhole.
+
+    Where the lens folds, the map points outside the image. In large images it is computed once per
+    block of pixels and interpolated: at most 0.004 px off for a lens of 80 degrees.
+    """
     step = max(1, max(camera.width, camera.height) // MAPPED)
     columns, rows = (-(-side // step) + 2 for side in (camera.width, camera.height))
     size = step * columns, step * rows  # a block more on each side
@@ -41,7 +44,7 @@ def undistort_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     )
     window = np.s_[step : step + camera.height, step : step + camera.width]
     x, y = (cv2.resize(values, size, interpolation=cv2.INTER_LINEAR)[window] for values in maps)
-    if pictured_share(camera) < 1:  # where the lens folds
+    if pictured_share(camera) < 1:
         across, down = cell_centres(camera.width), cell_centres(camera.height)
         x[~_pictured(camera, across, down)] = OUTSIDE
     return x, y
@@ -64,7 +67,11 @@ def _pictured(camera: Camera, across: np.ndarray, down: np.ndarray) -> np.ndarra
 
 
 def undistort_image(image: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return image (H, W[, C]) as ``pinhole(camera)`` would see it; 0 outside."""
+    """Return image (H, W[, C]) as the pinhole camera ``pinhole(camera)`` would see it; 0 outside.
+
+    Raises:
+        ValueError: the image's size is not the camera's.
+    """
     if image.shape[:2] != (camera.height, camera.width):
         raise ValueError(
             f"camera {camera.id}: image is {image.shape[1]}x{image.shape[0]},"
@@ -129,16 +136,19 @@ def local_moments(image: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def robust_moments(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return median and deviation (...) of values (N, ...); few outliers change neither much."""
+    """Return median and deviation (...) of values (N, ...); few outliers change neither much.
+
+    The deviation is the median distance from the median, scaled to that of normal errors.
+    """
     middle = np.median(values, axis=0)
-    # 1.4826: of normal errors, the result is the standard deviation
     return middle, 1.4826 * np.median(np.abs(values - middle), axis=0)
 
 
 def edge_width(image: np.ndarray) -> float | None:
-    """Measure how blurred the sharpest edges of an image (H, W, 3) uint8 are; None with too few.
+    """Measure the width of the sharpest edges of an image (H, W, 3) uint8; None with too few.
 
-    The width is the standard deviation, pixels, of the Gaussian that would blur a step as much.
+    The width is the standard deviation, pixels, of the Gaussian that would blur a step as much: a
+    step of height h, blurred by s, rises by at most h / (s sqrt(2 pi)) per pixel.
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     grey = cv2.GaussianBlur(grey, (0, 0), SMOOTH)
@@ -150,7 +160,6 @@ def edge_width(image: np.ndarray) -> float | None:
     edges = steepest & (height > LEAST_HEIGHT) & (slope > 0)
     if edges.sum() < FEWEST_EDGES:
         return None
-    # A step of height h, blurred by s, rises by at most h / (s sqrt(2 pi)) per pixel.
     widths = height[edges] / (slope[edges] * math.sqrt(2 * math.pi))
     width = float(np.percentile(widths, SHARPEST))
     return math.sqrt(max(width**2 - SMOOTH**2, 0.0))

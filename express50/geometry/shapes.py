@@ -12,7 +12,11 @@ PIXEL_LIMIT = 200_000_000  # per image, six times an 8K frame; stops decompressi
 def check_shape(
     name: str, array: np.ndarray, expected: Sequence[int | None], where: str = ""
 ) -> None:
-    """Raise ValueError unless ``array`` has the expected shape (``None``: any length)."""
+    """Raise unless ``array`` has the expected shape (``None`` stands for any length).
+
+    Raises:
+        ValueError: the shape differs; the message names the argument and both shapes.
+    """
     shape = tuple(array.shape)
     fits = len(shape) == len(expected) and all(
         want is None or want == got for got, want in zip(shape, expected, strict=True)

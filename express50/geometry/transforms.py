@@ -23,7 +23,11 @@ def _rotations() -> Any:
 
 
 def axis_angle_to_matrix(axis_angle: np.ndarray) -> np.ndarray:
-    """Return rotation matrices (..., 3, 3) of axis-angle vectors (..., 3), radians."""
+    """Return rotation matrices (..., 3, 3) of axis-angle vectors (..., 3), radians.
+
+    Raises:
+        ValueError: an angle is infinite, or too large for float64 to resolve a fraction of a turn.
+    """
     largest = np.abs(axis_angle).max(initial=0.0)
     if largest > LARGEST_ANGLE:
         raise ValueError(f"axis-angle holds {largest:.3g}, expected at most {LARGEST_ANGLE:g} rad")
@@ -31,7 +35,11 @@ def axis_angle_to_matrix(axis_angle: np.ndarray) -> np.ndarray:
 
 
 def quat_to_matrix(quats: np.ndarray) -> np.ndarray:
-    """Return rotation matrices (..., 3, 3) of quaternions (..., 4), wxyz, normalised here."""
+    """Return rotation matrices (..., 3, 3) of quaternions (..., 4), wxyz, normalised here.
+
+    Raises:
+        ValueError: a quaternion has zero length.
+    """
     quats = np.asarray(quats, dtype=np.float64)
     largest = np.abs(quats).max(-1, keepdims=True)  # squares of tiny or huge ones would be lost
     scaled = quats / np.where(largest > 0, largest, 1.0)
@@ -96,7 +104,13 @@ def is_rigid(T: np.ndarray) -> bool:
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 1.0, 0.0)) -> np.ndarray:
-    """Return ``cam_from_world`` (4, 4), OpenCV axes, at ``eye`` (3,) looking at ``target``."""
+    """Return ``cam_from_world`` (4, 4), OpenCV axes, at ``eye`` (3,) looking at ``target``.
+
+    By default, +y is up.
+
+    Raises:
+        ValueError: the eye is at the target, or ``up`` is parallel to the viewing direction.
+    """
     forward = np.asarray(target, dtype=np.float64) - np.asarray(eye, dtype=np.float64)
     right = np.cross(forward, np.asarray(up, dtype=np.float64))
     if np.linalg.norm(right) < 1e-12 * max(1.0, float(np.linalg.norm(forward))):

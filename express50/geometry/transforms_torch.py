@@ -10,10 +10,12 @@ from torch import Tensor
 
 
 def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
-    """Return rotation matrices (..., 3, 3) of axis-angle vectors (..., 3), radians."""
+    """Return rotation matrices (..., 3, 3) of axis-angle vectors (..., 3), radians.
+
+    Source: Rodrigues' formula; series below 1e-3 rad keep value and gradient smooth through zero.
+    """
     # rsub(x, a, alpha=b) is a - b x; forward differentiation of x * b would load torch's compiler,
     # which takes 1 s.
-    # Rodrigues' formula; series below 1e-3 rad keep value and gradient smooth through zero.
     theta2 = (axis_angle * axis_angle).sum(-1)
     small = theta2 < 1e-6
     safe = torch.where(small, torch.ones_like(theta2), theta2).sqrt()
@@ -52,11 +54,13 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
 
 
 def matrix_to_quat(R: Tensor) -> Tensor:
-    """Return unit quaternions (..., 4), wxyz with w >= 0, of rotation matrices (..., 3, 3)."""
+    """Return unit quaternions (..., 4), wxyz with w >= 0, of rotation matrices (..., 3, 3).
+
+    It takes the best conditioned of four branches (Shepperd 1978). The NumPy twin refuses
+    reflections; here they are not checked, because each training step would wait for the GPU.
+    """
     m = R
     d0, d1, d2 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
-    # The best conditioned of four branches (Shepperd 1978). Reflections are not checked, because
-    # each training step would wait for the GPU.
     squares = torch.stack(
         [1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2], -1
     )

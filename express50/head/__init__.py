@@ -40,12 +40,14 @@ def head_path(spec: str | Path) -> Path:
 
 
 def head_files(spec: str) -> dict[str, Path]:
-    """Return the files and folders that a head model is read from; none of the built-in head."""
+    """Return the files and folders that a head model is read from; none of the built-in head.
+
+    The model's own path may not exist, its companions do.
+    """
     if spec == BUILTIN_NAME:
         return {}
     path = head_path(spec)
     beside = companions(path) if path.suffix == ".pkl" else {}
-    # The path may not exist; companions do.
     return {"head": path, **{f"head {kind}": file for kind, file in beside.items()}}
 
 

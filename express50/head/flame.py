@@ -26,7 +26,14 @@ _REQUIRED = ("v_template", "f", "shapedirs", "posedirs", "J_regressor", "weights
 
 
 def load_flame(path: str | Path) -> HeadModel:
-    """Load FLAME by its pickle; add teeth and a mouth if it has FLAME's number of vertices."""
+    """Load FLAME; add teeth and the inside of the mouth if it has FLAME's number of vertices.
+
+    `path` is the model pickle (generic_model.pkl, flame2023.pkl, ...); landmark embedding, masks
+    and template must be beside it.
+
+    Raises:
+        HeadModelError: a file is missing, damaged, unsafe or has another layout.
+    """
     model = read_flame(Path(path))
     return check_head(add_mouth(model)) if len(model.template) == FLAME_VERTICES else model
 

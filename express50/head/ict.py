@@ -70,7 +70,11 @@ class IctArrays:
 
 
 def load_ict(path: str | Path) -> HeadModel:
-    """Load ICT-FaceKit from a checkout (or its FaceXModel folder) or from an .npz of its arrays."""
+    """Load ICT-FaceKit from a checkout (or its FaceXModel folder) or from an .npz of its arrays.
+
+    Raises:
+        HeadModelError: a file is missing or damaged, or the model has another topology.
+    """
     path = Path(path)
     arrays = read_ict_npz(path) if path.suffix == ".npz" else read_ict_checkout(path)
     if arrays.template.shape != (VERTEX_COUNT, 3):
@@ -136,7 +140,10 @@ def read_ict_checkout(path: Path) -> IctArrays:
 
 
 def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Read vertices (V,3), texture places (T,2), faces (F,3), their uv (F,3), material (F,)."""
+    """Read vertices (V,3), texture coordinates (T,2), faces (F,3), their uv (F,3), material (F,).
+
+    Polygons are split into fans. Faces without texture coordinates get coordinate 0.
+    """
     vertices: list[list[str]] = []
     uv: list[list[str]] = []
     corners: list[tuple[str, str, str]] = []
@@ -153,14 +160,13 @@ def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
             elif words[0] == "usemtl":
                 material = words[1]
             elif words[0] == "f":
-                for second, third in zip(words[2:-1], words[3:], strict=True):  # a fan
+                for second, third in zip(words[2:-1], words[3:], strict=True):
                     corners.append((words[1], second, third))
                     materials.append(material)
         index = np.array(
             [[corner.split("/")[:2] + ["1"] for corner in face] for face in corners], dtype=object
         )
         faces = index[:, :, 0].astype(np.int64) - 1
-        # the first where there is none
         uv_faces = np.where(index[:, :, 1] == "", "1", index[:, :, 1]).astype(np.int64) - 1
         points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
         coordinates = np.array(uv or [["0", "0"]], dtype=np.float64).reshape(-1, 2)
@@ -272,9 +278,14 @@ def _rig(
 def _jaw_rig(
     template: np.ndarray, opened: np.ndarray, lower_teeth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the jaw's hinge (3,) and weights (V,) that reproduce the jawOpen shape."""
-    # The lower teeth are rigid, so their motion in the y-z plane is a rotation about a point c:
-    # d = (R - I)(p - c).
+    """Return the jaw's hinge (3,) and weights (V,) that reproduce the jawOpen shape.
+
+    The lower teeth are rigid, so their motion in the y-z plane is a rotation about a fixed point c:
+    d = (R - I)(p - c). A vertex's weight is its motion over that of a rigid jaw at its place.
+
+    Raises:
+        ValueError: the shape does not turn the lower teeth.
+    """
     points, motion = template[lower_teeth][:, 1:], opened[lower_teeth][:, 1:]
     centred = points - points.mean(0)
     moved = centred + motion - motion.mean(0)
@@ -285,7 +296,6 @@ def _jaw_rig(
         raise ValueError("jawOpen does not turn the lower teeth, so the jaw's hinge is unknown")
     rotation = np.array([[np.cos(angle) - 1, -np.sin(angle)], [np.sin(angle), np.cos(angle) - 1]])
     hinge = points.mean(0) - np.linalg.solve(rotation, motion.mean(0))
-    # A weight is the motion over that of a rigid jaw at the same place.
     rigid = np.linalg.norm((template[:, 1:] - hinge) @ rotation.T, axis=1)
     weight = np.linalg.norm(opened[:, 1:], axis=1) / np.maximum(rigid, 1e-3)
     below = smoothstep((hinge[0] + 0.03 - template[:, 1]) / 0.03, 0.0, 1.0)
@@ -359,9 +369,11 @@ def ict_regions(
 def _tongue(
     template: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray, gums: np.ndarray
 ) -> np.ndarray:
-    """Find the tongue (V,) bool: the two large texture islands within 2 cm of the middle."""
+    """Find the tongue (V,) bool: the two large texture islands within 2 cm of the middle.
+
+    Gums and tongue are connected in the mesh, but not in the texture map.
+    """
     inside = gums[faces].all(1)
-    # Gums and tongue are connected in the mesh, but not in the texture map.
     corners = uv_faces[inside]
     islands = mesh_parts(corners, uv_faces.max() + 1)[corners[:, 0]]
     mask = np.zeros(template.shape[0], dtype=bool)

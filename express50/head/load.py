@@ -1,8 +1,6 @@
 """Load a head model by name or path, or its faces and regions alone, for which torch is not needed.
 
 Importing torch takes 0.8 core seconds and 200 MB, so that it is imported with the first model.
-
-Heads that are unknown, missing or damaged raise HeadModelError.
 """
 
 from __future__ import annotations
@@ -52,7 +50,11 @@ class HeadTopology:
 
 
 def load_topology(spec: str | Path) -> HeadTopology:
-    """Load faces and regions of a head model; torch is imported for FLAME and ICT-FaceKit only."""
+    """Load faces and regions of a head model; torch is imported for FLAME and ICT-FaceKit only.
+
+    Raises:
+        HeadModelError: as `load_head`.
+    """
     path = BUILTIN if str(spec) == BUILTIN_NAME else head_path(spec)
     if path.suffix == ".npz" and path.is_file() and is_stored(path):
         arrays = read_arrays(path, HeadModelError, "a stored head model", FIELDS)
@@ -70,6 +72,9 @@ def load_head(spec: str | Path) -> HeadModel:
     folders of ``EXPRESS50_HEADS``. Of paths, `*.pkl` is the user's FLAME model (with its other
     files beside it), a folder is a checkout of ICT-FaceKit, and `*.npz` holds ICT-FaceKit's arrays
     or a head model of your own (docs/RECIPES.md).
+
+    Raises:
+        HeadModelError: the name is unknown, or a file is missing or damaged.
     """
     if str(spec) == BUILTIN_NAME:
         return load_builtin()
@@ -112,6 +117,9 @@ def load_stored(path: Path, name: str) -> HeadModel:
     It holds the arrays of `FIELDS`. Optional are `regions` (R, V) bool with `region_names` (R,);
     the 17 lists of jaw line candidates, concatenated in `contour`, with their lengths in
     `contour_counts`; and `unit_expressions`, False if coefficients are standard deviations.
+
+    Raises:
+        HeadModelError: the file is damaged, lacks an array, or its arrays do not fit each other.
     """
     import torch
 

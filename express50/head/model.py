@@ -110,7 +110,10 @@ class HeadModel:
 
 
 def check_head(model: HeadModel) -> HeadModel:
-    """Return the model if its values are usable, else raise HeadModelError."""
+    """Return the model if its values are usable, else raise HeadModelError.
+
+    Arrays must be finite, indices in range, and rows of skinning and regressor sum to one.
+    """
     where = f"head model {model.name!r}"
     for item in fields(model):
         value = getattr(model, item.name)
@@ -144,17 +147,34 @@ def check_head(model: HeadModel) -> HeadModel:
 
 def pose(
     model: HeadModel,
-    shape: torch.Tensor,  # (B, <= S)
-    expression: torch.Tensor,  # (B, <= X)
-    neck: torch.Tensor | None = None,  # (B, 3) axis-angle, radians
-    jaw: torch.Tensor | None = None,  # (B, 3) axis-angle; opening is +x
-    eyes: torch.Tensor | None = None,  # (B, 6) left, then right
-    root: torch.Tensor | None = None,  # (B, 3) about the root joint, not the origin as in FLAME
-    translation: torch.Tensor | None = None,  # (B, 3) metres, added last
-    # (B or 1, V, 3) metres, added to the rest shape: joints move
+    shape: torch.Tensor,
+    expression: torch.Tensor,
+    neck: torch.Tensor | None = None,
+    jaw: torch.Tensor | None = None,
+    eyes: torch.Tensor | None = None,
+    root: torch.Tensor | None = None,
+    translation: torch.Tensor | None = None,
     offsets: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Return the posed vertices (B, V, 3), metres. Missing arguments and coefficients are zero."""
+    """Pose the head. Missing arguments and coefficients are zero.
+
+    Args:
+        model: The head model.
+        shape: (B, <= S).
+        expression: (B, <= X).
+        neck: (B, 3) axis-angle, radians.
+        jaw: (B, 3) axis-angle; opening is +x.
+        eyes: (B, 6) axis-angle of the left, then the right eye.
+        root: (B, 3) axis-angle about the root joint (not about the origin, as in FLAME).
+        translation: (B, 3) metres, added last.
+        offsets: (B, V, 3) or (1, V, 3) metres, added to the rest shape, which also moves joints.
+
+    Returns:
+        (B, V, 3) vertices, metres.
+
+    Raises:
+        ValueError: a tensor's shape does not fit.
+    """
     rest = rest_vertices(model, shape, expression, offsets)
     joints = torch.einsum("jv,bvc->bjc", model.joint_regressor, rest)
     angles = joint_angles(rest, root, neck, jaw, eyes)
@@ -221,15 +241,25 @@ def joint_angles(
 
 
 def skin(
-    rest: torch.Tensor,  # (B, N, 3) shaped vertices
-    joints: torch.Tensor,  # (B, J, 3) at rest
-    rotations: torch.Tensor,  # (B, J, 3, 3), each relative to its parent
-    skinning: torch.Tensor,  # (N, J)
-    pose_dirs: torch.Tensor,  # (9 * (J - 1), N * 3)
+    rest: torch.Tensor,
+    joints: torch.Tensor,
+    rotations: torch.Tensor,
+    skinning: torch.Tensor,
+    pose_dirs: torch.Tensor,
 ) -> torch.Tensor:
     """Apply linear blend skinning and pose correctives (SMPL, Loper et al. 2015, equations 2 to 4).
 
-    Returns (B, N, 3). N may be any subset of vertices, such as those that a landmark fit needs.
+    Works on any subset of vertices, so that a landmark fit poses only those it needs.
+
+    Args:
+        rest: (B, N, 3) shaped vertices.
+        joints: (B, J, 3) rest joints.
+        rotations: (B, J, 3, 3), each relative to its parent.
+        skinning: (N, J).
+        pose_dirs: (9 * (J - 1), N * 3).
+
+    Returns:
+        (B, N, 3).
     """
     identity = torch.eye(3, dtype=rest.dtype, device=rest.device)
     feature = (rotations[:, 1:] - identity).flatten(1)

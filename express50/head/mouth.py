@@ -5,8 +5,6 @@ of 32 vertices at the back of the lips. The 120 tooth vertices have the order an
 and GaussianAvatars use, so that their parameters and ours give the same first 5143 vertices.
 Triangles, texture map and the pouch that closes the loop behind the teeth (65 more vertices) are
 our own. GRMM's supplement asks for teeth and pouch, each with its own part of the texture map.
-
-Other topologies, and maps without room, raise HeadModelError.
 """
 
 from __future__ import annotations
@@ -64,6 +62,9 @@ def add_mouth(model: HeadModel) -> HeadModel:
 
     Upper teeth follow the neck joint, lower teeth the jaw. Both do not move in expressions, and
     change with the identity as the lips in front do. The pouch follows the loop it hangs on.
+
+    Raises:
+        HeadModelError: the model's lips are not FLAME's, or its texture map has no room.
     """
     charts = place_charts(model.uv.numpy(), model.uv_faces.numpy(), _CHARTS, model.name)
     teeth = _teeth(model, charts[1:])
@@ -179,7 +180,13 @@ def _pouch(model: HeadModel, chart: np.ndarray) -> _Part:
 
 
 def mouth_loop(faces: np.ndarray, name: str) -> np.ndarray:
-    """Return the ids (32,) of the open loop behind the lips, from the first of CORNERS on."""
+    """Return the ids (32,) of the open loop behind the lips, in the order of new faces along it.
+
+    It starts at the first of CORNERS.
+
+    Raises:
+        HeadModelError: the faces (F, 3) have no such loop.
+    """
     # The face on the other side of an edge runs along it in the opposite direction.
     following = {int(b): int(a) for a, b in open_edges(faces)}
     loop = [CORNERS[0]]
@@ -238,6 +245,9 @@ def place_charts(
 
     Earlier ones get more room. Each is shrunk until it fits, and takes the first free place from
     the top of the map, which is ``uv`` (T, 2), v up, of ``uv_faces`` (F, 3).
+
+    Raises:
+        HeadModelError: a chart does not fit even at LEAST of its size.
     """
     # Cells that triangles touch; the first row is at v = 1.
     cells = np.zeros((GRID, GRID), np.uint8)

@@ -46,7 +46,11 @@ POSES: dict[str, tuple[dict[str, float], float]] = {
 
 
 def expression_vector(model: HeadModel, controls: Mapping[str, float]) -> torch.Tensor:
-    """Return the coefficients (1,X) of named controls; a name without _L or _R sets both sides."""
+    """Return the coefficients (1,X) of named controls; a name without _L or _R sets both sides.
+
+    Raises:
+        HeadModelError: the model does not have a name.
+    """
     index = {name: i for i, name in enumerate(model.expression_names)}
     vector = torch.zeros(1, len(index), dtype=model.dtype)
     for name, value in controls.items():

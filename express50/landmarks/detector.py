@@ -99,6 +99,9 @@ def detect(
     them mirrored. `smallest` is the side of the smallest windows searched, as a share of the
     image's longer side. A face is found in windows of up to three times its width. If there is no
     face, each smaller size costs about three times as much as the one before.
+
+    Raises:
+        ValueError: another shape or type.
     """
     return detect_many(net, [image], refinements, smallest)[0]
 
@@ -110,6 +113,9 @@ def detect_many(
     """Detect as `detect` does in several images, such as a frame set, in less time.
 
     Smaller windows are not searched once `enough` images show a face; by default, all must.
+
+    Raises:
+        ValueError: an image of another shape or type.
     """
     for image in images:
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or 0 in image.shape:
@@ -150,7 +156,12 @@ def _detection(place: _Place) -> Detection:
 
 
 def _searches(width: int, height: int, smallest: float) -> Iterator[list[np.ndarray]]:
-    """Yield windows to look in: the whole frame, then turned and smaller ones, then smaller yet."""
+    """Yield windows to look in: the whole frame, then turned and smaller ones, then smaller yet.
+
+    Frames of any size have the same number of rounds. If smaller windows than usual are allowed,
+    turned ones of the second size come last, because a photograph may lie on its side; for a
+    rig's footage this is known.
+    """
     longer = float(max(width, height))
     turned = [np.pi / 2, np.pi, 1.5 * np.pi]
     yield _windows(width, height, longer, 0.0)
@@ -158,9 +169,8 @@ def _searches(width: int, height: int, smallest: float) -> Iterator[list[np.ndar
         window for turn in turned for window in _windows(width, height, longer, turn)
     ]
     side = SHRINK
-    while (side := side * SHRINK) >= smallest:  # as often in frames of any size
+    while (side := side * SHRINK) >= smallest:
         yield _windows(width, height, side * longer, 0.0)
-    # Photographs may lie on their side; for a rig's footage this is known.
     if smallest < SMALLEST:
         yield [w for turn in turned for w in _windows(width, height, SHRINK * longer, turn)]
 

@@ -49,7 +49,10 @@ COUNTERS = "num_batches_tracked"  # suffix of batch normalisation's buffers that
 
 
 def as_input(crops: np.ndarray) -> torch.Tensor:
-    """Make a network's input (B, 3, H, W), 0 to 1, channels last, of crops (B, H, W, 3) uint8."""
+    """Make a network's input (B, 3, H, W), 0 to 1, of crops (B, H, W, 3) uint8.
+
+    It is in channels-last memory format, as the crops are.
+    """
     return torch.from_numpy(crops).permute(0, 3, 1, 2).float() / 255.0
 
 
@@ -250,8 +253,10 @@ def expectation(heat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def heat_loss(heat: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-    """Return the cross entropy (B, P) of heat maps and points (B, P, 2) spread over four cells."""
-    # Its gradient is strong from the first step on, unlike that of the expectation.
+    """Return the cross entropy (B, P) of heat maps and points (B, P, 2) spread over four cells.
+
+    Its gradient is strong from the first step on, unlike that of the expectation.
+    """
     size = heat.shape[-1]
     cells = corner_to_cell(((points / CROP - 0.5) / STRETCH + 0.5) * size)
     cells = cells.clamp(0.0, size - 1.001)
@@ -283,9 +288,12 @@ def save_network(net: LandmarkNet, path: Path) -> None:
 
 @lru_cache(maxsize=2)  # landmarks in pictures, and on the face UV map
 def load_network(path: Path = WEIGHTS) -> LandmarkNet:
-    """Read weights written by `save_network`, for evaluation only. Callers share the network."""
+    """Read weights written by `save_network`, for evaluation only. Callers share the network.
+
+    Batch normalisations are folded into the convolutions before them.
+    """
     net = trainable_network(path).eval()
-    fold(net)  # batch normalisations, into the convolutions before them
+    fold(net)
     return net.to(memory_format=torch.channels_last)
 
 

@@ -68,14 +68,23 @@ def try_source(landmarks: str) -> None:
 
 
 def open_source(
-    landmarks: str,  # `embedded`, `fan:PATH` (TorchScript), or a file of points (docs/FORMAT.md)
-    cameras: Mapping[str, Camera],  # as recorded, to undistort given points
-    refinements: int = 3,  # of `detect`, as is the next
+    landmarks: str,
+    cameras: Mapping[str, Camera],
+    refinements: int = 3,
     smallest: float = SMALLEST,
-    # the images' pinhole cameras; or the recorded size
     pictures: Mapping[str, Camera] | None = None,
 ) -> Source:
-    """Return a source that is ready to be called; ConfigError if its file is missing or unfit."""
+    """Return a source that is ready to be called.
+
+    `landmarks` are `embedded`, `fan:PATH` (TorchScript weights) or the path of a file of points
+    (.npz or .json, see docs/FORMAT.md), which are undistorted with the `cameras`, as recorded.
+    `refinements` and `smallest` are those of `detect`. `pictures` are the pinhole cameras of the
+    images; by default they have the recorded size.
+
+    Raises:
+        ConfigError: the file is missing, or is not of the expected kind.
+        FormatError: the file of points is malformed.
+    """
     files = _existing_files(landmarks)
     if "landmarks" in files:
         table = read_points(files["landmarks"], cameras, pictures)
@@ -105,15 +114,17 @@ def open_source(
 
 
 def given_detection(rows: np.ndarray) -> Detection:
-    """Make a detection from rows (68, 3): pixels x, y, NaN where unknown, and confidence 0..1."""
+    """Make a detection from rows (68, 3): pixels x, y, NaN where unknown, and confidence 0..1.
+
+    Unknown points are put at the mean of the known ones, with an infinite sigma. The sigma of a
+    point of confidence c is 0.6 % of the face's size over c.
+    """
     known = np.isfinite(rows[:, :2]).all(1) & (rows[:, 2] > 0)
     if not known.any():
         return Detection(np.zeros((POINTS, 2)), np.full(POINTS, np.inf), np.zeros(POINTS), 0.0)
-    # Unknown points are put at the mean of the known ones, with an infinite sigma.
     points = np.where(known[:, None], rows[:, :2], rows[known, :2].mean(0))
     confidence = np.where(known, rows[:, 2], 0.0)
     size = max(float(np.ptp(rows[known, :2], axis=0).max()), 1.0)
-    # 0.6 % of the face's size over the confidence
     sigma = np.where(known, 0.006 * size / np.maximum(confidence, UNSURE), np.inf)
     return Detection(points, sigma, confidence, float(confidence[known].mean()))
 
@@ -140,6 +151,10 @@ def read_points(
     `cameras` are as recorded; others of the file are left out. `pictures` are the pinhole cameras
     of the undistorted images; by default they have the recorded size. Rows (68 or 70, 3) are x, y
     in pixels of the undistorted image, NaN where a point is unknown, and confidence 0..1.
+
+    Raises:
+        FormatError: another format, shape, an infinite number, a confidence out of range, or points
+            far outside the image.
     """
     path = Path(path)
     raw = _read_raw(path)
@@ -249,7 +264,11 @@ def load_fan(path: Path) -> torch.jit.ScriptModule:
 
 
 def find_with_fan(fan: torch.jit.ScriptModule, image: np.ndarray, face: Detection) -> Detection:
-    """Find a detected face's points with FAN in (H, W, 3) uint8 RGB; the face keeps its score."""
+    """Find the points of a detected face with FAN; the face keeps its score.
+
+    A point's confidence is its heat map's peak times the score; sigma comes from the peak's spread.
+    The image is (H, W, 3) uint8 RGB.
+    """
     window = fan_window(face.points)
     crop = cut_crop(image, window, FAN_CROP)
     with torch.inference_mode():

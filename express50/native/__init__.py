@@ -29,7 +29,11 @@ def why_missing() -> str:
 
 @cache
 def load(variant: str | None = None) -> ctypes.CDLL:
-    """Return the library of ``variant``, or the best that was built and this processor can run."""
+    """Return the library of ``variant``, or the best that was built and this processor can run.
+
+    Raises:
+        NativeLibraryError: it was not built, is older than its source or does not load.
+    """
     from express50.native.build import VARIANTS, library_file
 
     if variant is not None:

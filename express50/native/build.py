@@ -68,7 +68,11 @@ def compiler() -> str:
 
 
 def compile_variant(variant: str, target: Path) -> None:
-    """Compile one variant to ``target``, with OpenMP where the compiler has it."""
+    """Compile one variant to ``target``, with OpenMP where the compiler has it.
+
+    Raises:
+        BuildError: the compiler is missing or refuses the source.
+    """
     command = [compiler(), *FLAGS, *VARIANTS[variant], f'-DEXPRESS50_DIGEST="{source_digest()}"']
     target.parent.mkdir(parents=True, exist_ok=True)
     # Written aside and renamed, so that a process that has the old one open keeps all of it.

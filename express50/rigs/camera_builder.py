@@ -1,7 +1,4 @@
-"""Build cameras for every importer from K and distortion, names, sizes and scale.
-
-Cameras that ours cannot express, or that are malformed, raise CalibrationError.
-"""
+"""Build cameras for every importer from K and distortion, names, sizes and scale."""
 
 from __future__ import annotations
 
@@ -22,12 +19,19 @@ NO_SIZE = "does not give the images' size; pass --size WIDTHxHEIGHT to 'express5
 
 def camera_from_K(
     camera_id: str,
-    K: np.ndarray,  # (3, 3) pixels, corner origin
-    dist: Sequence[float] | np.ndarray,  # OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 or the first of them
-    size: tuple[int, int],  # width and height
-    cam_from_world: np.ndarray,  # (4, 4) OpenCV axes
+    K: np.ndarray,
+    dist: Sequence[float] | np.ndarray,
+    size: tuple[int, int],
+    cam_from_world: np.ndarray,
 ) -> Camera:
-    """Return a camera of the smallest COLMAP model that holds the distortion."""
+    """Return a camera of the smallest COLMAP model that holds the distortion.
+
+    `K` (3, 3) has pixels with a corner origin; `dist` has OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6,
+    and missing terms are 0; `size` is width and height; `cam_from_world` (4, 4) has OpenCV axes.
+
+    Raises:
+        CalibrationError: K has skew, or no model holds the distortion (thin prism, tilt).
+    """
     K, d = np.asarray(K, dtype=np.float64), np.zeros(14)
     given = np.asarray(dist, dtype=np.float64).ravel()
     if given.size > d.size:
@@ -51,7 +55,11 @@ def camera_from_K(
 
 
 def size_from(value: object, what: str) -> tuple[int, int]:
-    """Return width and height of pictures, pixels, that a file states."""
+    """Return width and height of pictures, pixels, that a file states.
+
+    Raises:
+        CalibrationError: they are not two numbers; the message begins with ``what``.
+    """
     width, height = finite_array(value, (2,), what)
     return int(width), int(height)
 
@@ -74,7 +82,11 @@ def names_from_files(files: Sequence[str]) -> list[str]:
 
 
 def at_size(camera: Camera, size: tuple[int, int]) -> Camera:
-    """Return the camera with K scaled to the footage's size (width, height) of the same aspect."""
+    """Return the camera with K scaled to the footage's size (width, height).
+
+    Raises:
+        CalibrationError: the aspect ratio differs, so the images were cropped, not scaled.
+    """
     sx, sy = size[0] / camera.width, size[1] / camera.height
     if abs(sx / sy - 1) > 0.01:
         raise CalibrationError(
@@ -98,7 +110,12 @@ def in_metres(cameras: dict[str, Camera], metres_per_unit: float) -> dict[str, C
 
 
 def as_rig(cameras: Iterable[Camera], path: Path) -> dict[str, Camera]:
-    """Return the cameras of a file by name, after the checks that our own file must pass."""
+    """Return the cameras of a file by name, after the checks that our own file must pass.
+
+    Raises:
+        CalibrationError: there are no cameras, two share a name, or one has an invalid rotation,
+            focal length or number.
+    """
     found: dict[str, Camera] = {}
     for camera in cameras:
         if found.setdefault(camera.id, camera) is not camera:

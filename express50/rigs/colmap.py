@@ -48,7 +48,13 @@ def is_colmap(path: Path) -> bool:
 
 
 def read_colmap_images(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
-    """Return every posed image as a camera, in the model's unit, and the files by camera."""
+    """Return every posed image as a camera, and the image files by camera.
+
+    World and unit are the model's own.
+
+    Raises:
+        CalibrationError: the model cannot be read, or has an unsupported camera model.
+    """
     binary = (path / "images.bin").is_file()
     try:
         lenses, shots = _read_binary(path) if binary else _read_text(path)

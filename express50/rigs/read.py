@@ -2,8 +2,6 @@
 
 Most formats have modules of their own. OpenCV's YAML is read here, a file per camera or EasyMocap's
 two files; its pixel origin is the first pixel's centre, so K is shifted.
-
-Every reader raises CalibrationError if a file does not fit its format.
 """
 
 from __future__ import annotations
@@ -138,11 +136,18 @@ def guess_format(path: Path) -> str:
 
 def read_rig(
     path: Path,
-    kind: str | None = None,  # one of FORMATS, or None to detect it
-    size: tuple[int, int] | None = None,  # the footage's width and height, for K
-    metres_per_unit: float = 1.0,  # of the file
+    kind: str | None = None,
+    size: tuple[int, int] | None = None,
+    metres_per_unit: float = 1.0,
 ) -> dict[str, Camera]:
-    """Read the cameras of a calibration file or folder that another tool wrote."""
+    """Read the cameras of a calibration file or folder that another tool wrote.
+
+    ``kind`` is one of FORMATS, or None to detect it; K is scaled to ``size``, the footage's width
+    and height; the file's unit is ``metres_per_unit`` long.
+
+    Raises:
+        CalibrationError: no format fits, or the content does not fit the format.
+    """
     known = FORMATS[kind or guess_format(path)]
     found = known.read(path, size) if known.sized else known.read(path)
     if size is not None:
@@ -154,6 +159,9 @@ def read_opencv_yaml(path: Path, size: tuple[int, int] | None) -> dict[str, Came
     """Read the cameras of a folder of ``<camera>.yml`` files, of one such file, or of EasyMocap.
 
     ``size`` is the width and height of the images, used if the files do not give them.
+
+    Raises:
+        CalibrationError: a matrix is missing or has the wrong shape, or no size is known.
     """
     found = []
     for name, where, table in _opencv_cameras(path):
@@ -180,9 +188,11 @@ def read_opencv_yaml(path: Path, size: tuple[int, int] | None) -> dict[str, Came
 
 
 def _opencv_cameras(path: Path) -> list[tuple[str, Path | str, dict]]:
-    """Return name, place and values of each camera."""
-    # EasyMocap has all cameras in two files, where values are named K_01, dist_01, R_01, Rot_01,
-    # T_01, after the camera. Others have a file per camera.
+    """Return name, place and values of each camera.
+
+    EasyMocap has all cameras in ``intri.yml`` and ``extri.yml``, where values are named ``K_01``,
+    ``dist_01``, ``R_01``, ``Rot_01``, ``T_01``, after the camera. Others have a file per camera.
+    """
     folder = path if path.is_dir() else path.parent
     both = [folder / "intri.yml", folder / "extri.yml"]
     files = both if path in (folder, *both) and all(file.is_file() for file in both) else []

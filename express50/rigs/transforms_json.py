@@ -34,6 +34,9 @@ def read_transforms(path: Path, size: tuple[int, int] | None) -> dict[str, Camer
 
     The path may be the folder of transforms.json; ``size`` is the width and height to use if the
     file gives none.
+
+    Raises:
+        CalibrationError: a frame lacks what a camera needs, or a camera moves between frames.
     """
     path = _file(path)
     table = read_json_table(path, CalibrationError)
@@ -77,7 +80,12 @@ def camera_names(frames: list[dict]) -> list[str]:
 
 
 def frame_camera(where: str, name: str, row: dict, size: tuple[int, int] | None) -> Camera:
-    """Make the camera of one frame's row; ``size`` is used if the row gives no image size."""
+    """Make the camera of one frame's row; ``size`` is used if the row gives no image size.
+
+    Raises:
+        CalibrationError: the row lacks what a camera needs.
+        TypeError, ValueError, OverflowError, ZeroDivisionError: a value has the wrong type.
+    """
     model = str(row.get("camera_model", "OPENCV"))
     if model not in _HELD:
         raise CalibrationError(

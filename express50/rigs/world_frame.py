@@ -49,7 +49,11 @@ def meeting_point(cameras: Mapping[str, Camera]) -> np.ndarray | None:
 
 
 def depths_behind(cameras: Mapping[str, Camera]) -> dict[str, float]:
-    """Return depths, metres, of the cameras that have the meeting point of all axes behind them."""
+    """Return the depths, metres, of the cameras that have the rig's meeting point behind them.
+
+    Inverted matrices (camera to world) and a wrong axis convention show up here. Empty if the axes
+    do not meet.
+    """
     point = meeting_point(cameras)
     if point is None:
         return {}
@@ -58,7 +62,6 @@ def depths_behind(cameras: Mapping[str, Camera]) -> dict[str, float]:
         name: float((c.cam_from_world[:3, :3] @ point + c.cam_from_world[:3, 3])[2])
         for name, c in sorted(cameras.items())
     }
-    # Their axes are of another convention, or their matrices inverted (camera to world).
     return {name: depth for name, depth in depths.items() if depth <= 0.01 * extent}
 
 
@@ -123,7 +126,11 @@ def judge(cameras: Mapping[str, Camera]) -> RigVerdict:
 
 
 def _misreading(cameras: Mapping[str, Camera]) -> tuple[str, str]:
-    """Return what is wrong with a rig, and the convention that explains it; "" where unknown."""
+    """Return what is wrong with a rig, and the convention that explains it; "" where unknown.
+
+    Several conventions may put the common point in front of all cameras; the right one is that in
+    which their axes meet best.
+    """
     problem, spread = "", _scatter(cameras)
     if behind := depths_behind(cameras):
         shown = few([f"{name} (z = {depth:.3g} m)" for name, depth in behind.items()], 4)
@@ -143,7 +150,6 @@ def _misreading(cameras: Mapping[str, Camera]) -> tuple[str, str]:
         }
         if meeting_point(other) is not None and not depths_behind(other):
             found[words] = _scatter(other)
-    # Several may put the point in front of all cameras; in the right one, axes meet best.
     best = min(found, key=lambda words: found[words], default="")
     if not problem and found.get(best, np.inf) < MEETING:
         problem = (

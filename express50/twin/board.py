@@ -46,13 +46,15 @@ def charuco_board() -> cv2.aruco.CharucoBoard:
 
 
 def board_poses(count: int, seed: int) -> list[np.ndarray]:
-    """Return ``world_from_board`` (4, 4) of every synchronised frame."""
+    """Return ``world_from_board`` (4, 4) of every synchronised frame.
+
+    The board turns through the rig's arc in golden-section order, so that for any count every
+    camera sees it several times, and neighbours see it together.
+    """
     rng = np.random.default_rng([seed, 401])
     middle = np.array([*SQUARES, 0.0]) * 0.5 * SQUARE_M
     poses = []
     for k in range(count):
-        # In golden-section order through the arc every camera sees it several times for any count,
-        # and neighbours see it together.
         place = ((k + 0.5) * 0.61803399) % 1.0
         azimuth = math.radians(SPAN_DEG) * (place - 0.5)
         tilt, roll = rng.uniform(-0.45, 0.35), rng.uniform(-0.5, 0.5)
@@ -74,7 +76,10 @@ def board_pattern() -> np.ndarray:
 
 
 def render_board(world_from_board: np.ndarray, camera: Camera, seed: int) -> np.ndarray:
-    """Render the board in the studio, linear (H, W, 3) float32, with several rays per pixel."""
+    """Render the board in the studio as a linear picture (H, W, 3) float32.
+
+    Every pixel averages the pattern over several rays.
+    """
     image = np.empty((camera.height, camera.width, 3), np.float32)
     normal = -world_from_board[:3, 2]
     faces_camera = normal @ (camera.center - world_from_board[:3, 3]) > 0

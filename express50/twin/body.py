@@ -53,7 +53,10 @@ def build_body(
     hair_detail: float = 1.0,
     kinds: tuple[str, ...] = (),
 ) -> Body:
-    """Build a subject's body and what it wears of `KINDS`; a hair detail of 0 leaves it bald."""
+    """Build the geometry of a subject, and what it wears of the `config.KINDS`.
+
+    With a hair detail of 0 the scalp is bald.
+    """
     template = model.template.double().numpy()
     faces = model.faces.numpy().astype(np.int32)
     centre = head_centre(model)

@@ -69,15 +69,20 @@ def join_hair(meshes: list[HairMesh]) -> HairMesh:
 
 def grow_hair(
     rng: np.random.Generator,
-    vertices: np.ndarray,  # (V, 3) of a neutral head
-    faces: np.ndarray,  # (F, 3)
-    scalp: np.ndarray,  # (V,) density of roots, 0 to 1
-    star: StarMap,  # outer surface of the head
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    scalp: np.ndarray,
+    star: StarMap,
     look: PersonLook,
-    detail: float,  # over 1 more and thinner strands, under 1 fewer and thicker ones, 0 none
-    on_skull: bool = True,  # else strands move with the skin at their roots
+    detail: float,
+    on_skull: bool = True,
 ) -> HairMesh:
-    """Grow the hair of a head, in rest head space."""
+    """Grow the hair of a neutral head with vertices (V, 3) and faces (F, 3), rest head space.
+
+    `scalp` (V,) is the density of roots, 0 to 1; `star` is the outer surface of the head. A
+    `detail` over 1 gives more and thinner strands, under 1 fewer and thicker ones, 0 none. Strands
+    move with the skull if `on_skull`, else with the skin at their roots.
+    """
     style = _STYLES[look.hair_style]
     # Roots are spread evenly over the scalp's area.
     a, b, c = (vertices[faces[:, k]] for k in range(3))

@@ -102,7 +102,12 @@ def record_command(args: argparse.Namespace) -> int:
 
 
 def check_out(out: Path) -> None:
-    """Refuse, before any work, a folder that holds anything but an earlier recording."""
+    """Refuse, before any work, a folder that holds anything but an earlier recording.
+
+    Raises:
+        ConfigError: it holds other files.
+        OSError: the system refuses.
+    """
     if (out / SETTINGS).is_file():
         return
     check_results_folder(out)
@@ -117,11 +122,15 @@ def record(
     config: TwinConfig,
     out: Path,
     workers: int = 2,
-    report: Callable[[int, int], None] | None = None,  # takes pictures done and in all
+    report: Callable[[int, int], None] | None = None,
 ) -> list[str]:
     """Record the subjects that do not exist yet, and return their ids; others are kept.
 
-    Writes ``out/captures/<subject>`` (raw capture layout) and ``out/truth/<subject>``.
+    Writes ``out/captures/<subject>`` (raw capture layout) and ``out/truth/<subject>``. `report` is
+    called regularly with the number of pictures done and of all pictures.
+
+    Raises:
+        CaptureError: ``out`` holds a recording with other settings.
     """
     script = select(config.expressions)
     path = out / SETTINGS

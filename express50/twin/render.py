@@ -68,15 +68,16 @@ def bands(camera: Camera) -> Iterator[RowBand]:
 def render_band(
     caster: Caster,
     material: np.ndarray,
-    window: tuple[int, int, int, int],  # x0, y0, x1, y1 of where the subject may be
+    window: tuple[int, int, int, int],
     band: RowBand,
     sampling: Sampling,
-    shade: Shade | None,  # None: black
+    shade: Shade | None,
 ) -> tuple[np.ndarray, np.ndarray, tuple[slice, slice]] | None:
-    """Render premultiplied colour and alpha of the part of a band inside a window of the image.
+    """Render premultiplied colour and alpha of the part of a band where the subject may be.
 
-    Returns colour (h, w, 3), alpha (h, w) float32, and their rows and columns in the image; None
-    if the band does not meet the window.
+    That is inside ``window``: columns and rows x0, y0, x1, y1 of the image. Returns colour (h, w,
+    3), alpha (h, w) float32, and their rows and columns in the image; None if the band does not
+    meet the window. Without ``shade``, colours are 0.
     """
     x0, x1 = window[0], window[2]
     y0, y1 = max(band.top, window[1]), min(band.bottom, window[3])
@@ -136,13 +137,17 @@ def _detail(
 def _refined(
     caster: Caster,
     origin: np.ndarray,
-    grid: np.ndarray,  # (3, N, 3)
-    samples: tuple[np.ndarray, np.ndarray],  # those of the pixels' centres
+    grid: np.ndarray,
+    samples: tuple[np.ndarray, np.ndarray],
     count: int,
-    sparing: bool,  # no more than a third of the rays if these all hit or all miss
+    sparing: bool,
     shade: Shade | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return colour (N, 3) and alpha (N,) of pixels as means of ``count`` samples."""
+    """Return colour (N, 3) and alpha (N,) of pixels (3, N, 3) as means of ``count`` samples.
+
+    ``samples`` are those of their centres. If ``sparing``, pixels get a third of the rays first,
+    and no more if these all hit or all miss.
+    """
     places = np.stack(ray_pattern(count), axis=1)
     others = np.delete(np.arange(count), count // 2)
     first = others[:: len(others) // 2] if sparing and len(others) > 4 else others
@@ -182,11 +187,13 @@ def _split(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def ray_pattern(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return places x and y (count,) in a pixel, from -0.5 up, evenly spread."""
+    """Return places x and y (count,) in a pixel, from -0.5 up, evenly spread.
+
+    They are a rank-1 lattice: every row and column of a count x count grid holds one ray. Number
+    ``count // 2`` is the centre.
+    """
     half = count // 2
     k = np.arange(count)
-    # A rank-1 lattice: every row and column of a count x count grid holds one ray. Number
-    # ``count // 2`` is the centre.
     stride = max(1, round(count * 0.618034))
     while np.gcd(stride, count) != 1:
         stride += 1
@@ -201,7 +208,10 @@ def hull_of(vertices: np.ndarray) -> np.ndarray:
 
 
 def window_of(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]:
-    """Return columns and rows x0, y0, x1, y1 that contain all vertices (N, 3), with a margin."""
+    """Return columns and rows x0, y0, x1, y1 that contain all vertices (N, 3), with a margin.
+
+    The corners of the convex hull (:func:`hull_of`) are enough.
+    """
     pixels, depth = project(camera, vertices)
     if not (depth > 0.05).all():
         return 0, 0, camera.width, camera.height

@@ -25,9 +25,10 @@ _RINGS_DEG = (4.0, 21.0, -13.0, 11.0, 28.0, -4.0)
 def make_rig(count: int, width: int, height: int, seed: int) -> dict[str, Camera]:
     """Draw cameras cam00... by id, distorted (COLMAP's OPENCV model), in the true world.
 
-    Camera 0 is leftmost as the subject sees it; the world's y is up and subjects look along +z.
+    The rig depends on the seed alone: the same cameras record every subject. Camera 0 is leftmost
+    as the subject sees it; the world's y is up and subjects look along +z.
     """
-    rng = np.random.default_rng([seed, 101])  # the same cameras for every subject
+    rng = np.random.default_rng([seed, 101])
     cameras, short = {}, min(width, height)
     for index in range(count):
         camera_id = f"cam{index:02d}"

@@ -75,12 +75,16 @@ def make_view(camera: Camera, index: int, seed: int, keep: bool) -> StudioView:
 def film_subject(
     config: TwinConfig,
     subject_id: str,
-    camera_indices: list[int],  # that with camera 0 writes the truth
+    camera_indices: list[int],
     capture: Path,
     truth: Path,
-    tick: Callable[[], None],  # called after every picture
+    tick: Callable[[], None],
 ) -> None:
-    """Record all frames of one subject in some cameras, and their plates."""
+    """Record all frames of one subject in some cameras, and their plates.
+
+    Other processes may film the other cameras; the one with camera 0 writes the truth. ``tick`` is
+    called after every picture.
+    """
     body, play = cast_subject(config, subject_id)
     number, seed = body.subject.number, config.seed
     rig = list(make_rig(config.cameras, config.width, config.height, seed).values())
@@ -164,7 +168,10 @@ def write_png(path: Path, image: np.ndarray) -> None:
 def write_truth(
     folder: Path, head: str, body: Body, play: TwinPerformance, cameras: Mapping[str, Camera]
 ) -> None:
-    """Write a subject's truth: cameras.json, peaks.json, subject.json, frames.npz, body.npz."""
+    """Write a subject's truth: cameras.json, peaks.json, subject.json, frames.npz, body.npz.
+
+    If needed, also its own motion in own.npz, and what it wears and holds in worn.npz.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     write_cameras(folder / "cameras.json", cameras)
     subject = body.subject

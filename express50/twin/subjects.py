@@ -189,7 +189,11 @@ def perform(
     number: int,
     seed: int,
 ) -> TwinPerformance:
-    """Perform a script once; a cue window has rest, onset, a peak near its middle, offset, rest."""
+    """Perform a script once; each cue window has rest, onset, a peak near its middle, offset, rest.
+
+    Raises:
+        HeadModelError: the head model does not name the script's expression directions.
+    """
     names = {name: column for column, name in enumerate(model.expression_names)}
     wanted = {name for entry in script for name in entry.controls}
     if len(wanted & set(names)) < 0.6 * len(wanted):

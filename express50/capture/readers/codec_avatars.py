@@ -47,8 +47,10 @@ def fits_multiface(path: Path) -> bool:
 
 
 def subject_of(path: Path) -> str:
-    """Return the subject in the folder's name, or the whole name where it has none."""
-    # <date>--<time>--<subject>, or m--<date>--<time>--<subject>--GHS
+    """Return the subject in the folder's name, or the whole name where it has none.
+
+    Names are ``<date>--<time>--<subject>`` or ``m--<date>--<time>--<subject>--GHS``.
+    """
     parts = path.name.split("--")
     if parts[0] == "m" and parts[-1] == "GHS":
         parts = parts[1:-1]
@@ -56,7 +58,12 @@ def subject_of(path: Path) -> str:
 
 
 def read_ava256(path: Path, selection: Selection) -> RawCapture:
-    """Read a capture's segments."""
+    """Read a capture's segments.
+
+    Raises:
+        CaptureError: a list or an archive is malformed, or no picture can be found.
+        CalibrationError: the cameras are malformed.
+    """
     file = path / "decoder/frame_list.csv"
     try:
         table = csv.DictReader(read_text(file, CaptureError).splitlines())
@@ -71,7 +78,12 @@ def read_ava256(path: Path, selection: Selection) -> RawCapture:
 
 
 def read_multiface(path: Path, selection: Selection) -> RawCapture:
-    """Read a capture's segments."""
+    """Read a capture's segments.
+
+    Raises:
+        CaptureError: no picture can be found, or the list of frames is malformed.
+        CalibrationError: ``KRT`` is malformed.
+    """
     file, listed = path / "frame_list.txt", []
     for number, line in enumerate(read_text(file, CaptureError).split("\n"), 1):
         words = line.split()  # such as E001_Neutral_Eyes_Open 000123
@@ -175,7 +187,11 @@ def _multiface_cameras(path: Path) -> dict[str, Camera]:
 
 
 def _multiface_pictures(path: Path, name: str, wanted: list[Moment]) -> dict[Moment, str]:
-    """Name each wanted picture that a camera has; folders are listed once, for network drives."""
+    """Name each wanted picture that a camera has; folders are listed once, for network drives.
+
+    Raises:
+        CaptureError: a folder of the camera cannot be read.
+    """
     have = {}
     for segment in dict(wanted):
         folder = path / "images" / segment / name

@@ -73,7 +73,10 @@ HOLDS = {"videos": fits_video, "frames": lambda file: is_shown(file, IMAGE_SUFFI
 
 
 def footage_folder(path: Path) -> Path:
-    """Return the folder that holds a rig's footage: the path, or such as ``images`` in it."""
+    """Return the folder that holds a rig's footage: the path, or such as ``images`` in it.
+
+    It is the path where footage lies beside that folder, as one cannot tell which is meant.
+    """
     if not path.is_dir() or _holds_footage(path):
         return path
     folders = [inner for inner in _listed(path) if is_data_folder(inner)]
@@ -81,7 +84,6 @@ def footage_folder(path: Path) -> Path:
     # In our own layout, ``cameras`` holds folders.
     wrappers += [inner for inner in folders if inner.name == "cameras" and _holds_footage(inner)]
     others = {f for f in folders if not BESIDE.fullmatch(f.name)} - set(wrappers)
-    # Of footage here and there, one cannot tell which is meant.
     return wrappers[0] if len(wrappers) == 1 and not any(map(_holds_footage, others)) else path
 
 
@@ -131,7 +133,10 @@ def fits_camera_folders(path: Path) -> bool:
 
 
 def fits_expression_folders(path: Path) -> bool:
-    """Return whether a folder's folders are expressions: a video, picture or folder per camera."""
+    """Return whether a folder holds a folder per expression, with the footage of each camera.
+
+    That is a video, a picture or a folder of each.
+    """
     tree = _tree(path)
     if tree.deep:  # people's rigs look the same
         known = (path / "calibration.json").is_file() or any(map(EXPRESSION.match, tree.places))
@@ -154,15 +159,28 @@ def holds_folders(path: Path) -> bool:
 
 
 def read_videos(path: Path, selection: Selection) -> RawCapture:
-    """Read each video of a folder as a camera; frame 17 of all shows the same moment."""
+    """Read each video of a folder as a camera; frame 17 of all shows the same moment.
+
+    A file that cannot be read as a video, such as a sound recording, is dropped. Without cues, the
+    whole footage is one clip.
+
+    Raises:
+        CaptureError: the cameras share no footage, two names become one camera id, a picture lacks
+            its number, or cues or the board's files are malformed.
+        CalibrationError: calibration.json is malformed.
+    """
     names = _videos(path, footage_folder(path))
     ids = unique_ids(path, names, lambda name: Path(name).stem)
-    # Files that are no videos, such as sound recordings, are dropped.
     return _read(path, "videos", {ids[name]: {(CLIP, 0): name} for name in names}, selection)
 
 
 def read_camera_folders(path: Path, selection: Selection) -> RawCapture:
-    """Read a folder per camera: pictures, an only video, or a video or folder per expression."""
+    """Read a folder per camera: its pictures, its only video, or a video or folder per expression.
+
+    A camera's name before that of an expression is left out.
+
+    Raises as `read_videos` does.
+    """
     tree = _tree(path)
     one_clip = not tree.deep and (
         tree.kind == "frames" or all(len(row) == 1 for row in tree.places.values())
@@ -172,7 +190,6 @@ def read_camera_folders(path: Path, selection: Selection) -> RawCapture:
     for folder, places in tree.places.items():
         for place in places:
             name = tree.name(place)
-            # A camera's name before that of an expression is left out.
             sequence = CLIP if one_clip else name.removeprefix(folder).strip("_- ") or name
             for file in _files(path, tree, place):
                 _add(rows[folder], (sequence, _number(file) if tree.kind == "frames" else 0), file)
@@ -180,22 +197,31 @@ def read_camera_folders(path: Path, selection: Selection) -> RawCapture:
 
 
 def read_expression_folders(path: Path, selection: Selection) -> RawCapture:
-    """Read a folder per expression, with a video, a picture or a folder of each camera."""
+    """Read a folder per expression, with a video, a picture or a folder of each camera.
+
+    Raises as `read_videos` does.
+    """
     tree = _tree(path)
     many = tree.deep and tree.kind == "frames"
     return _read_inner(path, tree, selection, lambda f, name: (f, _number(name) if many else 0))
 
 
 def read_frame_folders(path: Path, selection: Selection) -> RawCapture:
-    """Read a folder per frame, which has a picture of each camera."""
+    """Read a folder per frame, which has a picture of each camera.
+
+    Raises as `read_videos` does.
+    """
     return _read_inner(path, _tree(path), selection, lambda folder, _: (CLIP, _number(folder)))
 
 
 def _read_inner(
     path: Path, tree: Tree, selection: Selection, moment_of: Callable[[str, str], Moment]
 ) -> RawCapture:
-    """Read folders that hold all cameras' files; their moments are of the folder and the file."""
-    # What cannot be read would be missing for all cameras, without a message.
+    """Read folders that hold all cameras' files; their moments are of the folder and the file.
+
+    Raises:
+        CaptureError: a folder cannot be read, which all cameras would lose; or as `read_videos`.
+    """
     check_readable(*(footage_folder(path) / name for name in tree.empty))
     rows: dict[str, dict[Moment, str]] = {name: {} for name in sorted(tree.inner())}
     for folder, places in tree.places.items():
@@ -206,7 +232,10 @@ def _read_inner(
 
 
 def _tree(path: Path) -> Tree:
-    """Find the videos, or else the pictures, in the folders of a folder, or a level below them."""
+    """Find the videos, or else the pictures, in the folders of a folder, or one level below them.
+
+    Under two folders with footage are none: a folder of folders was meant.
+    """
     nothing = Tree("frames", False, {})
     if not path.is_dir() or (path.parent / "capture.toml").is_file():  # a part of our own layout
         return nothing
@@ -220,7 +249,6 @@ def _tree(path: Path) -> Tree:
         if any(found.values()):
             held = {name: places for name, places in found.items() if places}
             empty = tuple(name for name, places in found.items() if not places)
-            # Under two folders with footage: a folder of folders was meant.
             return Tree(kind, deep, held, empty) if len(held) > 1 else nothing
     return nothing
 

@@ -48,7 +48,15 @@ def fits_photos(path: Path) -> bool:
 
 
 def read_photos(path: Path, selection: Selection) -> RawCapture:
-    """Read each photograph as a camera of one moment."""
+    """Read each photograph as a camera of one moment.
+
+    Cameras are those of calibration.json; without it, calibrate solves them. A photograph whose
+    EXIF says that it lies on its side is read upright.
+
+    Raises:
+        CaptureError: two names become one camera id, or no photograph can be used.
+        CalibrationError: calibration.json is malformed.
+    """
     names = pictures_in(path, footage_folder(path))
     ids = unique_ids(path, names, lambda name: Path(name).stem)
     check_selection(selection, [MOMENT], sorted(ids.values()))
@@ -58,7 +66,7 @@ def read_photos(path: Path, selection: Selection) -> RawCapture:
         if not selection.has_camera(camera):
             continue
         try:
-            turn, _ = read_exif(path / name)  # some lie on their side
+            turn, _ = read_exif(path / name)
         except FormatError as error:
             dropped[camera] = str(error)
             continue
@@ -68,7 +76,7 @@ def read_photos(path: Path, selection: Selection) -> RawCapture:
     if not cameras:
         reasons = "; ".join(f"{k}: {v}" for k, v in dropped.items())
         raise CaptureError(f"{path}: no photograph can be used: {reasons}")
-    calibration = read_calibration(path, cameras, dropped)  # without it, calibrate solves them
+    calibration = read_calibration(path, cameras, dropped)
     return RawCapture(
         root=path, subject=folder_id(path), fps=FPS, meta={}, cameras=cameras, dropped=dropped,
         calibration=calibration, plates=read_plates(path, cameras),
@@ -86,7 +94,12 @@ def _model(path: Path) -> Path | None:
 
 
 def read_colmap_folder(path: Path, selection: Selection) -> RawCapture:
-    """Read every posed picture as a camera of one moment."""
+    """Read every posed picture as a camera of one moment.
+
+    Raises:
+        CaptureError: no picture can be found.
+        CalibrationError: the model cannot be read, or has a lens that ours lack.
+    """
     cameras, files = read_colmap_images(_model(path) or path)
     pictures = {name: {(MOMENT, 0): f"images/{file}"} for name, file in files.items()}
     return _read_posed(path, "colmap", cameras, pictures, selection)
@@ -100,7 +113,12 @@ def fits_transforms(path: Path) -> bool:
 
 
 def read_transforms_folder(path: Path, selection: Selection) -> RawCapture:
-    """Read cameras and time steps of a transforms.json."""
+    """Read cameras and time steps of a transforms.json.
+
+    Raises:
+        CaptureError: no picture can be found.
+        CalibrationError: the cameras are malformed, or move between time steps.
+    """
     file = path / "transforms.json" if path.is_dir() else path
     cameras = read_transforms(file, None)
     frames = read_json_table(file, CalibrationError)["frames"]

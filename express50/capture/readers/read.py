@@ -4,9 +4,6 @@ A layout is a row of a plain table: its name, what it looks like, a test, the su
 reader that turns it into a `RawCapture`. Nothing is copied or unpacked. A folder with capture.toml
 may name where the footage lies (``source``), which layout it is (``layout``) and which parts to
 take. So read-only datasets need no file of ours beside them.
-
-Every reader raises CaptureError if nothing of a capture can be used, and CalibrationError if its
-cameras are malformed.
 """
 
 from __future__ import annotations
@@ -103,7 +100,11 @@ LAYOUTS = (
 
 
 def detect(path: Path, name: object = None) -> Layout:
-    """Find the layout of a file or folder: the named one, else the first that fits."""
+    """Find the layout of a file or folder: the named one, else the first that fits.
+
+    Raises:
+        CaptureError: it does not exist, no layout has the name, or none fits.
+    """
     if not path.exists():
         raise CaptureError(f"{path}: no such folder or file; expected a capture")
     if name is not None:
@@ -182,7 +183,11 @@ def is_ours(path: Path) -> bool:
 
 
 def subject_of(path: Path) -> str:
-    """Find the subject of a capture of any layout without reading its footage."""
+    """Find the subject of a capture of any layout without reading its footage.
+
+    Raises:
+        CaptureError: it is not a capture, or its subject cannot be an id.
+    """
     if is_ours(path):
         return read_meta(path)["subject"]
     meta, source = read_capture_toml(path), footage_source(path)
@@ -195,7 +200,12 @@ def subject_of(path: Path) -> str:
 
 
 def read_any(path: Path) -> RawCapture:
-    """Read a capture of any layout."""
+    """Read a capture of any layout.
+
+    Raises:
+        CaptureError: it is not a capture, or nothing of it can be used.
+        CalibrationError: its cameras are malformed or do not fit together.
+    """
     if is_ours(path):
         return read_capture(path)
     meta, source = read_capture_toml(path), footage_source(path)
@@ -240,7 +250,11 @@ def watched(path: Path) -> list[Path]:
 
 
 def read_people(dataset: Dataset, subjects: Iterable[str]) -> list[dict]:
-    """Read gender and age of subjects from their captures, for counts; empty if they are gone."""
+    """Read gender and age of subjects, in order, from their captures.
+
+    They are read for counts and kept nowhere; an entry is empty where the capture is gone or says
+    nothing.
+    """
     captures = dataset.captures()
     people = []
     for subject in subjects:

@@ -81,7 +81,11 @@ def companions(path: Path) -> list[Path]:
 
 
 def performances(path: Path) -> dict[str, Performance]:
-    """Find the performances of a folder in their order: e0 to e11, then the others."""
+    """Find the performances of a folder in their order: e0 to e11, then the others.
+
+    Raises:
+        CaptureError: there are annotations only.
+    """
     found = {}
     for file in _files(path):
         actor, part, kind = _parts(file)
@@ -104,7 +108,12 @@ def performances(path: Path) -> dict[str, Performance]:
 
 
 def read(path: Path, selection: Selection) -> RawCapture:
-    """Read an actor's performances."""
+    """Read an actor's performances.
+
+    Raises:
+        CaptureError: a file is damaged, or none can be used.
+        CalibrationError: the cameras are malformed.
+    """
     known, root = performances(path), path if path.is_dir() else path.parent
     clips, skipped = _selected_clips(path, known, selection)
     if not clips:
@@ -183,7 +192,11 @@ def _selected_clips(
 
 
 def _read_clip(performance: Performance) -> PerformanceClip:
-    """Read a performance's frame numbers; a scripted clip needs its end, where its peak is."""
+    """Read a performance's frame numbers.
+
+    Raises:
+        CaptureError: the file is damaged, or a scripted clip lacks its end, where its peak is.
+    """
     file = open_hdf5(performance.raw)
     group = child(file, "Camera")
     if not isinstance(group, h5py.Group):

@@ -105,7 +105,11 @@ def _patterns(meta: Mapping[str, Any], key: str, where: Path) -> tuple[str, ...]
 
 
 def check_selection(selection: Selection, sequences: Sequence[str], cameras: Sequence[str]) -> None:
-    """Refuse patterns that match nothing: a typing error would look like missing data."""
+    """Refuse patterns that match nothing: a typing error would look like missing data.
+
+    Raises:
+        CaptureError: a pattern matches nothing of the layout.
+    """
     for what, patterns, known in (
         ("sequences", selection.sequences, sequences),
         ("[expressions]", tuple(selection.expressions), sequences),
@@ -131,17 +135,28 @@ class Timeline:
 
 
 def common_timeline(
-    root: Path,  # the folder that the names are relative to
-    # name of each picture or video by moment, by camera
+    root: Path,
     pictures: Mapping[str, Mapping[Moment, str]],
-    order: Sequence[str],  # sequences in the order they are to have
-    kind: str = "frames",  # ``frames``, or ``videos`` of one moment each
-    # moments that the layout's own list names, though no camera may have them
+    order: Sequence[str],
+    kind: str = "frames",
     listed: Collection[Moment] = (),
-    required: Collection[Moment] = (),  # moments that must not be lost: a camera without is dropped
-    dropped: Mapping[str, str] | None = None,  # cameras that are left out already, with the reason
+    required: Collection[Moment] = (),
+    dropped: Mapping[str, str] | None = None,
 ) -> Timeline:
-    """Find the moments that all cameras share."""
+    """Find the moments that all cameras share.
+
+    Args:
+        root: the folder that the names are relative to.
+        pictures: name of each picture or video by moment, by camera.
+        order: sequences in the order they are to have.
+        kind: ``frames``, or ``videos`` of one moment each.
+        listed: moments that the layout's own list names, though no camera may have them.
+        required: moments that must not be lost, so that a camera without them is dropped.
+        dropped: cameras that are left out already, with the reason.
+
+    Raises:
+        CaptureError: the cameras share no moment.
+    """
     counts = Counter(moment for table in pictures.values() for moment in table)
     present = sum(map(bool, pictures.values()))
     common = {moment for moment, count in counts.items() if 2 * count >= present}

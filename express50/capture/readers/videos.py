@@ -54,7 +54,12 @@ def fits_nersemble(path: Path) -> bool:
 
 
 def read_participant(path: Path, selection: Selection) -> RawCapture:
-    """Read the sequences of a participant of NeRSemble."""
+    """Read the sequences of a participant of NeRSemble.
+
+    Raises:
+        CaptureError: no video can be found.
+        CalibrationError: cameras or colours are malformed.
+    """
     calibration = read_nersemble(path / CAMERAS)
     check_readable(*(path / "sequences").iterdir())
     sequences = sorted(
@@ -165,7 +170,11 @@ def actor_of(path: Path) -> str:
 
 
 def read_actor(path: Path, selection: Selection) -> RawCapture:
-    """Read an actor's clips; a clip with sound is preferred to the same clip without."""
+    """Read an actor's clips; a clip with sound is preferred to the same clip without.
+
+    Raises:
+        CaptureError: no clip can be used.
+    """
     clips = _clips(path)
     check_selection(selection, [clip.sequence for clip in clips.values() if clip], ["front"])
     skipped: dict[str, str] = {}
@@ -213,7 +222,13 @@ def video_id(path: Path) -> str:
 
 
 def read_video(path: Path, selection: Selection) -> RawCapture:
-    """Read a video as one camera and one clip, ``clip`` unless the selection names it."""
+    """Read a video as one camera and one clip, named ``clip`` unless the selection names it.
+
+    A video that a phone stored on its side is read upright.
+
+    Raises:
+        CaptureError: it is not a video.
+    """
     check_selection(selection, [CLIP], ["video"])
     turn = ORIENTATION[video_tags(path).turn]
     camera = RawCamera(

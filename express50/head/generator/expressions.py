@@ -60,7 +60,10 @@ SHUT_SHARE = (1.0, 0.7, 0.3)
 
 
 def part_lips(mesh: WholeMesh, motion: Array) -> Array:
-    """Return the motion (V, 3) with shut lips moving together where they would overlap."""
+    """Return the motion (V, 3) with shut lips moving together where they would overlap.
+
+    Then no sum of motions pushes shut lips through each other.
+    """
     result = motion.copy()
     for k, share in enumerate(SHUT_SHARE):
         for side in ("left", "right"):

@@ -104,10 +104,11 @@ _STILL = 5  # the lid loop that does not move; loops inside it share the margin'
 def lid_motion(mesh: WholeMesh, upper: float, lower: float) -> Array:
     """Return the displacement (V,3), mm, that moves the left lid margins by shares of the opening.
 
-    `upper` is the share that the upper margin moves down, `lower` what the lower one moves up.
+    Loops between the margin and the still loop are spread evenly over the stretched lid, as they
+    turn about the eyeball's centre, and the upper lid's fold is smoothed onto the lid's sphere.
+    `upper` is the share of the opening that the upper margin moves down, `lower` the share that the
+    lower one moves up.
     """
-    # Loops between the margin and the still loop are spread evenly over the stretched lid, as they
-    # turn about the eyeball's centre, and the upper lid's fold is smoothed onto the lid's sphere.
     center = ball_centre(mesh, "left")
     rings = [mesh.tag(f"lid{k}", "left") for k in range(_STILL + 1)]
     loops = mesh.vertices[np.stack(rings)] - center

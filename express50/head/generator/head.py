@@ -165,7 +165,11 @@ def skinning_weights(mesh: WholeMesh, regions: dict[str, Array]) -> Array:
 
 
 def pose_correctives(mesh: WholeMesh, regions: dict[str, Array]) -> Array:
-    """Return correctives (36,V*3) in mm per unit of R - I, for the jaw's opening alone."""
+    """Return correctives (36,V*3) in mm per unit of R - I, for the jaw's opening alone.
+
+    Opening by an angle a sets R[2,1] of the jaw to sin a. Then the corners of the mouth move in and
+    the upper lip moves up a little, which skinning cannot express.
+    """
     hard = regions["teeth"] | regions["gums"] | regions["tongue"]
     p, sign = mesh.vertices, np.sign(mesh.vertices[:, 0])
     folded = np.stack([np.abs(p[:, 0]), p[:, 1], p[:, 2]], 1)
@@ -177,8 +181,6 @@ def pose_correctives(mesh: WholeMesh, regions: dict[str, Array]) -> Array:
             ((42, -42, 62), (18, 24, 26)),
         )
     )
-    # Opening by an angle a sets R[2,1] of the jaw to sin a. Then the corners of the mouth move in
-    # and the upper lip moves up a little, which skinning cannot express.
     motion = np.zeros_like(p)
     motion[:, 0] = -sign * (12.0 * corner + 6.0 * cheek)
     motion[:, 1] = 5.0 * upper * (1 - jaw_weight(mesh))

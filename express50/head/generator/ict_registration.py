@@ -136,7 +136,10 @@ def _slit(mesh: WholeMesh, skin: IctSkin) -> Array:
 
 
 def _ear_rim(mesh: WholeMesh, skin: IctSkin) -> tuple[Array, Array]:
-    """Return vertices of the left ear's rim, and their goals."""
+    """Return vertices of the left ear's rim, and their goals.
+
+    Along the front edge, where the ear meets the cheek, the rows from foot to rim have goals too.
+    """
     ear = mesh.tag("ear", "left")
     rows = [mesh.tag("ear_foot", "left"), *ear[: 4 * RIM_POINTS].reshape(4, RIM_POINTS)]
     places = cKDTree(mesh.vertices[rows[-1]][:, 1:]).query(OWN_EAR)[1].astype(float)
@@ -149,7 +152,6 @@ def _ear_rim(mesh: WholeMesh, skin: IctSkin) -> tuple[Array, Array]:
     steps = np.arange(places[0], places[-1] + 1)
     columns = steps.astype(int) % RIM_POINTS
     along = np.column_stack([np.interp(steps, places, goals[:, k]) for k in range(3)])
-    # Where the ear meets the cheek, the rows from foot to rim have goals too.
     front = steps > places[LOBE + 2]
     ids, found = [rows[-1][columns]], [along]
     for row, ahead in zip(rows[:-1], (2.0, 1.4, 0.8, 0.3), strict=True):

@@ -78,7 +78,10 @@ class WholeMesh:
     left_tags: dict[str, Array]
 
     def tag(self, name: str, side: str = "both") -> Array:
-        """Return a tag's indices on the left (x >= 0), the right (mirrored, same order) or both."""
+        """Return indices of a tag.
+
+        The side is "left" (x >= 0), "right" (mirrored, same order) or "both".
+        """
         left = self.left_tags[name]
         if side == "left":
             return left

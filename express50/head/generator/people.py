@@ -59,6 +59,9 @@ def fit_people(mesh: WholeMesh, joints: Array, ict: Path) -> People:
     """Fit the mean head and its directions to ICT-FaceKit's people, an .npz of its arrays.
 
     `joints` (3, 3) are those of the generator's mesh.
+
+    Raises:
+        HeadModelError: the file is damaged or holds something else.
     """
     arrays = read_ict_npz(ict)
     skin = ict_skin(arrays)

@@ -23,8 +23,11 @@ Net = TypeVar("Net", bound=torch.nn.Module)
 def minimise(
     net: Net, steps: int, rate: float, state: Path, loss_at: Callable[[int], torch.Tensor]
 ) -> Net:
-    """Minimise the loss of every step; an interrupted run continues from the file `state`."""
-    trained = [part for part in net.parameters() if part.requires_grad]  # others stay
+    """Minimise the loss of every step; an interrupted run continues from the file `state`.
+
+    Parameters that require no gradient do not change.
+    """
+    trained = [part for part in net.parameters() if part.requires_grad]
     optimiser = torch.optim.AdamW(trained, lr=rate, weight_decay=1e-3)
     first = load_state(state, net, optimiser)
     began, losses = time.monotonic(), []
@@ -62,16 +65,21 @@ def load_state(path: Path, net: Net, optimiser: torch.optim.Optimizer) -> int:
 def laplace_loss(
     found: torch.Tensor, log_scale: torch.Tensor, points: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return losses and distances (B, N) of found points (B, N, 2), pixels."""
+    """Return losses and distances (B, N) of found points (B, N, 2), pixels.
+
+    The loss sums the distance and the negative log-likelihood of a Laplace distribution.
+    """
     # The added 0.01 px^2 bounds the slope at zero distance.
     distance = ((found - points).square().sum(-1) + 0.01).sqrt()
-    # Distance, and the negative log-likelihood of a Laplace distribution.
     return 0.2 * distance + (2 * log_scale + distance * torch.exp(-log_scale)), distance
 
 
 def place_loss(
     found: torch.Tensor, log_scale: torch.Tensor, heat: torch.Tensor, points: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return losses (distance, likelihood, cross entropy) and distances (B, N) of found points."""
+    """Return losses and distances (B, N) of found points (B, N, 2), in pixels of the crop.
+
+    The loss sums distance, likelihood and cross entropy.
+    """
     loss, distance = laplace_loss(found, log_scale, points)
     return loss + heat_loss(heat, points), distance

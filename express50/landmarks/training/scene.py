@@ -229,9 +229,11 @@ class HeadScene:
 def glasses_lines(
     marks: np.ndarray, size: np.ndarray, square: float, lift: float
 ) -> tuple[list[np.ndarray], np.ndarray, list[np.ndarray]]:
-    """Place glasses, ``lift`` metres off the eyes of landmarks (68, 3): rims, bridge and temples.
+    """Place glasses in front of landmarks (68, 3), ``lift`` metres off the eyes.
 
-    Rims (RING, 3) have half-axes ``size`` (2,), metres, and corners, sharper for less ``square``.
+    Returns:
+        rings (RING, 3) around the lenses, with half-axes ``size`` (2,), metres, and sharper corners
+        for a smaller ``square``; the bridge (3, 3); the temples (12, 3).
     """
     across = unit(marks[45] - marks[36])
     up = unit(marks[27] - marks[8] - across * (across @ (marks[27] - marks[8])))
