@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from express50.console import figure_label, format_table
+from express50.console import count, figure_label, format_seconds, format_table, log
 from express50.contract.segmentation_labels import label_mask
 from express50.errors import ConfigError, DivergedError, FormatError, few
 from express50.files.atomic import naming_full_disk, write_csv, write_json
@@ -29,6 +30,7 @@ from grmm.config import MetricsConfig
 from grmm.data import HeadView, HeadViews, SampleKey
 from grmm.metrics import PerceptualMetrics, psnr_db, rmse, ssim_score
 from grmm.model import GRMM, Rendering
+from grmm.train_state import SAY_SECONDS
 
 Render = Callable[[HeadView], Rendering]
 Row = dict[str, str | float]
@@ -97,7 +99,7 @@ def evaluate(
     unless the ``judge`` needs all pictures, for FID.
     """
     rows, known = [], {} if judge.inception else journal_rows(journal)
-    for index in indices:
+    for index in _with_progress(indices):
         key = views.keys[index]
         if held := known.get((*vars(key).values(), kind(key))):
             rows.append(held)
@@ -117,6 +119,18 @@ def evaluate(
             with naming_full_disk(journal.path), journal.path.open("a", encoding="utf-8") as file:
                 file.write(f"\n{line}")  # the break first: it ends a line that was cut short
     return rows
+
+
+def _with_progress(indices: Collection[int]) -> Iterator[int]:
+    """Yield indices of images to measure, and say from time to time how many were."""
+    began = said = time.perf_counter()
+    for number, index in enumerate(indices):
+        now = time.perf_counter()
+        if number and now - said >= SAY_SECONDS:
+            said = now
+            left = format_seconds((now - began) / number * (len(indices) - number))
+            log(f"measured {number} of {count(len(indices), 'image')}, {left} left")
+        yield index
 
 
 def journal_rows(journal: Journal | None) -> dict[tuple[str | float, ...], Row]:
@@ -234,7 +248,8 @@ def score(
             + ("" if partial else f"; {part} --cameras")
         )
     rows, wrong = [], []
-    for index, path in paths.items():
+    for index in _with_progress(paths):
+        path = paths[index]
         rows_seen, columns_seen, size = window(index)
         try:
             pixels = _read_picture(path, size)[rows_seen, columns_seen]

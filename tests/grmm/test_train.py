@@ -408,6 +408,13 @@ def test_held_out_expressions_are_not_trained_on():
         split_samples(keys, wrong)
 
 
+def test_a_long_evaluation_shows_its_progress(views, monkeypatch, capsys):
+    monkeypatch.setattr("grmm.evaluate.SAY_SECONDS", 0.0)
+    evaluate(views, [0, 1, 4], training_render(prepare(views, tiny_config()).model, views))
+    said = capsys.readouterr().err
+    assert "measured 1 of 3 images, " in said and "measured 2 of 3 images, " in said
+
+
 def test_an_evaluation_names_the_full_disk(views, monkeypatch):
     monkeypatch.setattr("grmm.evaluate.journal_rows", lambda journal: {})
     run = prepare(views, tiny_config())
