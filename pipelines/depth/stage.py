@@ -10,12 +10,13 @@ import cv2
 import numpy as np
 
 from express50.capture.frames import read_cameras_of, read_matted_frame
+from express50.console import count
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
 from express50.dataset.depth_files import encode_depth, encode_normals, write_depth
 from express50.dataset.tracks import read_track
 from express50.error_model import error_models, expect, single_camera_sigma
-from express50.errors import CaptureError, FormatError, StageError
+from express50.errors import CaptureError, FormatError, StageError, advised
 from express50.files.images import contact_sheet, shrink, srgb_to_linear, write_image
 from express50.geometry.meshes import encode_glb, write_surface
 from express50.geometry.sampling import evenly
@@ -58,10 +59,11 @@ def run(
     views, pictures, dropped = read_views(dataset, item, side)
     # One camera of which nothing was dropped is a photograph, or a video.
     if not views or (len(views) == 1 and dropped):
-        why = "; ".join(map(str, dropped))
+        why, least = "; ".join(map(str, dropped)), 1 if len(dropped) == 1 and not views else 2
         raise StageError(
-            f"{item}: {len(views)} usable cameras, expected at least 2 with a"
-            f" matte of the head ({why or 'no others are calibrated'}); run 'express50 matte'"
+            f"{item}: {count(len(views), 'camera')} with a matte of the head, expected at least"
+            f" {least} ({why or 'no others are calibrated'}); run"
+            f" {advised('express50 matte', dataset.root)}"
         )
     views, solid, track = read_tracked(dataset, item, views)
     if len(views) > 1:
@@ -71,7 +73,8 @@ def run(
     else:
         raise StageError(
             f"{item}: with one camera, depth is that of the tracked head, which was not used"
-            f" ({track['why']}); run 'express50 track' and look at its overlays"
+            f" ({track['why']}); run {advised('express50 track', dataset.root)} and look at its"
+            " overlays"
         )
     write_meshes(out, surface)
     rows, photo, typical = write_views(out, surface, pictures, solid)

@@ -17,7 +17,7 @@ from express50.capture.readers.read import read_people
 from express50.console import count
 from express50.contract.layout import Dataset, exclusion_reason
 from express50.contract.stage import Note, Result
-from express50.errors import CaptureError, FormatError, StageError, few
+from express50.errors import CaptureError, FormatError, StageError, advised, few
 from express50.files.atomic import write_json
 from express50.files.images import contact_sheet, write_image
 from express50.files.text import read_json_table
@@ -165,7 +165,8 @@ def _read_accounts(dataset: Dataset) -> tuple[dict[str, dict], list[Note]]:
         if (reason := exclusion_reason(dataset, name)) is not None:
             dropped.append(Note(name, f"excluded: {reason}"))
         elif not metrics.is_file():
-            dropped.append(Note(name, "not encoded; run 'express50 encode' to see why"))
+            run_encode = advised("express50 encode", dataset.root)
+            dropped.append(Note(name, f"not encoded; run {run_encode} to see why"))
         else:
             accounts[name] = read_json_table(metrics, FormatError)
     return accounts, dropped

@@ -15,7 +15,7 @@ from express50.contract.segmentation_labels import COLOURS, LABELS
 from express50.contract.stage import Note, Result
 from express50.dataset.depth_files import depth_file, read_depth
 from express50.dataset.tracks import existing_track, read_track
-from express50.errors import CaptureError, FormatError, StageError
+from express50.errors import CaptureError, FormatError, StageError, advised
 from express50.files.images import box_about, contact_sheet, fit_into, write_image
 from express50.geometry.cameras import Camera, cut_about, project
 from express50.geometry.sampling import evenly
@@ -97,7 +97,8 @@ def run(
         figures[name], rows[name] = _write_view(out, name, rgb, alpha, view, weights)
     if not figures:
         why = "; ".join(map(str, dropped[:3]))
-        raise StageError(f"{item}: no camera has a matte to label ({why}); run 'express50 matte'")
+        run_matte = advised("express50 matte", dataset.root)
+        raise StageError(f"{item}: no camera has a matte to label ({why}); run {run_matte}")
     write_picture(out, rows, figures)
     doubts = {name: view_warning(row) for name, row in figures.items()}
     warnings = [Note(name, why) for name, why in doubts.items() if why]
@@ -158,7 +159,7 @@ def read_depth_of(dataset: Dataset, item: str, camera: Camera) -> np.ndarray | N
     if depth.shape != (camera.height, camera.width):
         raise FormatError(
             f"{path}: {depth.shape}, expected the camera's {camera.width}x{camera.height}; run"
-            " 'express50 depth' again"
+            f" {advised('express50 depth', dataset.root)} again"
         )
     return depth
 

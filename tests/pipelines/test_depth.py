@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from express50.contract.layout import Dataset
 from express50.contract.segmentation_labels import label_mask
+from express50.contract.stage import Note
 from express50.errors import StageError
 from express50.geometry.cameras import rays, unproject
 from express50.geometry.raycast import mesh_scene
@@ -22,7 +25,7 @@ from pipelines.depth.prior import (
     signed_distance,
 )
 from pipelines.depth.reconstruct import reconstruct
-from pipelines.depth.stage import write_meshes
+from pipelines.depth.stage import run, write_meshes
 from pipelines.depth.surface import advance, extract_mesh
 from pipelines.depth.views import (
     head_box,
@@ -244,6 +247,15 @@ def test_what_a_matte_lacks_of_the_tracked_face_is_added():
         assert (found.alpha[face] == 1).all() == added
         assert np.array_equal(found.silhouette_px, silhouette_distance(found.alpha))
     assert with_face(whole, head) is whole
+
+
+@pytest.mark.parametrize(("lacking", "least"), [(("photo",), 1), (("cam00", "cam01"), 2)])
+def test_a_photograph_without_a_matte_is_not_asked_for_two_cameras(lacking, least, monkeypatch):
+    notes = [Note(name, "it has no matte") for name in lacking]
+    monkeypatch.setattr("pipelines.depth.stage.read_views", lambda *given: ([], [], notes))
+    words = f"0 cameras with a matte of the head, expected at least {least} .*'express50 matte d'"
+    with pytest.raises(StageError, match=words):
+        run(Dataset(Path("d")), "S001/photo", Path("out"), side=64, fineness=(4, 1, 1))
 
 
 def test_unusable_mattes_are_refused(shots):
