@@ -99,7 +99,8 @@ def suggest_for(
     Without observations nothing is suggested: only people's labels count then.
     """
     if not dataset.observations_file(index.subject).is_file():
-        why = f"{index.subject} is not observed: run 'express50 observe' to see why"
+        again = advised("express50 observe", dataset.root)
+        why = f"{index.subject} is not observed: run {again} to see why"
         return {}, [Note("suggestions", why)]
     other = reference_subject(dataset) if match else index.subject
     reference, dropped = None, []
