@@ -83,7 +83,7 @@ def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> Result
 
 STAGE = Stage(
     name="regions",
-    version=19,
+    version=20,
     config=RegionsConfig,
     items=peak_items,
     inputs=inputs,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import binary_fill_holes, gaussian_filter
 
 from express50.contract.segmentation_labels import LABELS, label_mask
 from express50.files.images import LIGHT_OF_LEVEL, disc, edge_distance, is_grey
@@ -69,6 +69,13 @@ TWO_COLOURED = 0.77
 # The redder group's share of a side of the face is less than this in less red light, and more than
 # the rest in redder light.
 OTHER_LIGHT = 0.4
+# Masks: least difference from the skin about the eyes in redness; ratios of colours below which
+# nothing is skin or hair; more brightness than skin's, of white ones; least share of the lips and
+# of the skin below them that has one colour. Distance between eyes and lips is 1 of LOWER_FACE.
+UNLIKE_SKIN, COLD, WHITE, ONE_COLOUR = 0.18, -0.05, 0.1, 0.5
+UPPER_FACE, LOWER_FACE = (-0.6, 0.45), (0.6, 1.4)
+PLEATS = np.array([0.6, 0.12, 0.12])  # most by which a mask's pixels differ from its usual colour
+MASK_REACH_M = 0.08  # from the lips
 COHERENT = 0.75  # share of a face near its middle colour below which a fringe may cover it
 BARE = 0.7  # share of the scalp in the face's colours, over the same of the face, of bare scalps
 
@@ -183,6 +190,55 @@ def bare_skin(rgb: np.ndarray, skin: np.ndarray, mesh: np.ndarray, solid: np.nda
     kept = skin.copy()
     kept[skin] = alike
     return kept
+
+
+def mask_colour(rgb: np.ndarray, alpha: np.ndarray, mesh: np.ndarray) -> np.ndarray | None:
+    """Return the colour (3,), ratios, of a mask over mouth and chin, NaN without one.
+
+    Lips are redder than skin. Beards, which hide them too, have colours that hair has: none is blue
+    or green, and white ones are rare where the scalp's hair is not white. The result is None in
+    grey views and those that do not show the mouth. Arguments are those of `face_colours`.
+    """
+    eyes, lips = (label_mask(mesh, name) & (alpha > SOLID) for name in ("eyes", "lips"))
+    if is_grey(rgb) or min(eyes.sum(), lips.sum()) < LEAST:
+        return None
+    (top, left), (bottom, right) = (np.argwhere(part).mean(0) for part in (eyes, lips))
+    down, across = bottom - top, right - left
+    row, column = np.ogrid[: mesh.shape[0], : mesh.shape[1]]
+    along = ((row - top) * down + (column - left) * across) / max(down**2 + across**2, 1.0)
+    skin = (mesh == SKIN) & (alpha > SOLID)
+    upper, lower = (skin & (along > a) & (along < b) for a, b in (UPPER_FACE, LOWER_FACE))
+    if min(upper.sum(), lower.sum()) < LEAST:
+        return None
+    above, mouth, below = (_some_ratios(rgb[part]) for part in (upper, lips, lower))
+    usual, own = np.median(above, axis=0), np.median(np.concatenate([mouth, below]), axis=0)
+    one = min(_share_near(own, mouth), _share_near(own, below)) > ONE_COLOUR
+    scalp = rgb[(mesh == SCALP) & (alpha > SOLID)]
+    as_hair = len(scalp) >= LEAST and _share_near(own, _some_ratios(scalp)) > 1 - COHERENT
+    white = own[0] > usual[0] + WHITE and len(scalp) >= LEAST
+    masked = one and usual[1] - own[1] > UNLIKE_SKIN and not as_hair
+    return own if masked and (own[1:].min() < COLD or white) else np.full(3, np.nan)
+
+
+def worn_mask(
+    rgb: np.ndarray, alpha: np.ndarray, mesh: np.ndarray, colour: np.ndarray, metre_px: float
+) -> np.ndarray:
+    """Find the pixels (H, W) bool of a mask of a colour (3,) of `mask_colour`, about the lips.
+
+    ``metre_px`` is the number of pixels that a metre spans at the head.
+    """
+    alike, lips = np.zeros(mesh.shape, bool), label_mask(mesh, "lips")
+    if not lips.any():
+        return alike
+    around = (edge_distance(~lips) < MASK_REACH_M * metre_px) & (alpha > 0.5)
+    alike[around] = (np.abs(_ratios(colour_logs(rgb[around])) - colour) < PLEATS).all(1)
+    # Shadows of pleats and a microphone belong to it, specks do not.
+    wide, narrow = (disc(max(1, round(k * STRAND_M * metre_px))) for k in (1, 0.5))
+    whole = cv2.morphologyEx(alike.astype(np.uint8), cv2.MORPH_CLOSE, wide)
+    whole = cv2.morphologyEx(whole, cv2.MORPH_OPEN, narrow)
+    _, part, stats, _ = cv2.connectedComponentsWithStats(whole, connectivity=8)
+    large = stats[:, cv2.CC_STAT_AREA] > COVERED * whole.sum()
+    return binary_fill_holes((whole > 0) & large[part])
 
 
 def left_of_middle(mesh: np.ndarray) -> np.ndarray:

@@ -104,6 +104,10 @@ class TrackedHead:
         """Return whether a camera stands in front of the face, not behind the head."""
         return bool((camera.center - self.center) @ self.R[:, 2] > 0)
 
+    def metre_px(self, camera: Camera) -> float:
+        """Return the number of pixels that a metre spans at the head in a camera."""
+        return float(camera.K[0, 0] / np.linalg.norm(self.center - camera.center))
+
 
 def make_head(vertices: np.ndarray, R: np.ndarray, labels: HeadLabels) -> TrackedHead:
     """Make a head of tracked vertices (V, 3), world, and its rotation (3, 3), world from head."""

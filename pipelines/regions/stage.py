@@ -27,7 +27,9 @@ from pipelines.regions.colour import (
     face_colours,
     judge_scalp,
     label_by_colour,
+    mask_colour,
     scalp_votes,
+    worn_mask,
 )
 from pipelines.regions.geometry import (
     FACE,
@@ -78,7 +80,7 @@ def run(
     cv2.setNumThreads(1)  # the runner counts one core per item
     subject, expression = item.split("/")
     head, glasses = read_head(dataset, subject, expression)
-    scalp, skin, frames = judge_scalp_and_skin(dataset, item, head)
+    scalp, skin, mask, frames = judge_colours(dataset, item, head)
     if glasses is None:
         glasses = find_glasses(head, face_pictures(dataset, item, head))
     if scalp_is != "auto":
@@ -93,7 +95,8 @@ def run(
         except UNREADABLE as error:
             dropped.append(Note(name, str(error)))
             continue
-        view = label_view(head, camera, rgb, alpha, depth, scalp.is_skin, side, skin, glasses)
+        worn = glasses, mask
+        view = label_view(head, camera, rgb, alpha, depth, scalp.is_skin, side, skin, *worn)
         figures[name], rows[name] = _write_view(out, name, rgb, alpha, view, weights)
     if not figures:
         why = "; ".join(map(str, dropped[:3]))
@@ -164,21 +167,32 @@ def read_depth_of(dataset: Dataset, item: str, camera: Camera) -> np.ndarray | N
     return depth
 
 
-def judge_scalp_and_skin(
+def judge_colours(
     dataset: Dataset, item: str, head: TrackedHead
-) -> tuple[Scalp, np.ndarray | None, Frames]:
-    """Judge the scalp and count the skin's colours in a few cameras; return their frames too."""
+) -> tuple[Scalp, np.ndarray | None, np.ndarray | None, Frames]:
+    """Judge scalp, skin and mask in a few cameras; return their frames too.
+
+    The skin's colours are counted. A mask's colour (3,) is that of `mask_colour`; None without one.
+    """
     cameras = read_cameras_of(dataset, item.split("/")[0]).values()
     seeing = [camera for camera in cameras if head.faces_camera(camera)]
-    votes, colours, frames = [], [], Frames()
+    studied, frames = [], Frames()
     for camera in evenly(seeing, STUDIED_CAMERAS):
         with contextlib.suppress(*UNREADABLE):  # the stage names them
             rgb, alpha = frames[camera.id] = read_frame_and_matte(dataset, item, camera)
             camera, rgb, alpha = reduced(camera, rgb, alpha, STUDIED_SIDE)
-            mesh, _ = render_head(head, camera)
-            votes.append(scalp_votes(rgb, mesh, alpha))
-            colours += [c for c in (face_colours(rgb, alpha, mesh),) if c is not None]
-    return judge_scalp(votes), sum(colours[1:], colours[0]) if colours else None, frames
+            studied.append((rgb, alpha, render_head(head, camera)[0], head.metre_px(camera)))
+    said = [c for c in (mask_colour(*pictured[:3]) for pictured in studied) if c is not None]
+    masked = [colour for colour in said if np.isfinite(colour).all()]
+    mask = np.median(masked, axis=0) if 2 * len(masked) > len(said) else None
+    votes, colours = [], []
+    for rgb, alpha, mesh, metre_px in studied:
+        if mask is not None:
+            alpha = np.where(worn_mask(rgb, alpha, mesh, mask, metre_px), np.float32(0), alpha)
+        votes.append(scalp_votes(rgb, mesh, alpha))
+        colours += [c for c in (face_colours(rgb, alpha, mesh),) if c is not None]
+    skin = sum(colours[1:], colours[0]) if colours else None
+    return judge_scalp(votes), skin, mask, frames
 
 
 def face_pictures(dataset: Dataset, item: str, head: TrackedHead) -> list[Picture]:
@@ -202,11 +216,13 @@ def label_view(
     side: int,
     skin_colours: np.ndarray | None = None,
     glasses: np.ndarray | None = None,
+    mask: np.ndarray | None = None,
 ) -> ViewLabels:
     """Label a frame (H, W, 3) uint8 with alpha (H, W), reduced to at most `side` pixels.
 
     `depth` (H, W) is in metres, 0 where unknown; `bare` says that the scalp is skin;
-    `skin_colours` are those of `face_colours`, `glasses` the places (n, 3) of `find_glasses`.
+    `skin_colours` are those of `face_colours`, `glasses` the places (n, 3) of `find_glasses`,
+    `mask` the colour (3,) of `mask_colour`.
     """
     camera, rgb, alpha = reduced(camera, rgb, alpha, side)
     if depth is not None and depth.shape != alpha.shape:
@@ -223,8 +239,12 @@ def label_view(
     rgb, alpha = rgb[window], alpha[window]
     depth = None if depth is None else depth[window]
     geometry = head_geometry(head, camera, alpha, depth)
-    metre_px = camera.K[0, 0] / np.linalg.norm(head.center - camera.center)
-    labels = label_by_colour(rgb, alpha, geometry, bare, skin_colours, metre_px)
+    metre_px = head.metre_px(camera)
+    masked = np.zeros(alpha.shape, bool)
+    if mask is not None:  # it teaches no colours
+        masked = worn_mask(rgb, alpha, geometry.mesh, mask, metre_px)
+    taught = np.where(masked, np.float32(0), alpha)
+    labels = label_by_colour(rgb, taught, geometry, bare, skin_colours, metre_px)
     labels = np.where(labels == SCALP, SKIN if bare else HAIR, labels)
     if glasses is not None and len(glasses):
         # Hair covers the temples of glasses, so nothing on scalp and ears is labelled.
@@ -234,6 +254,7 @@ def label_view(
     if depth is not None:
         hand = find_hands(geometry, labels, metre_px)
         labels = np.where(hand, np.uint8(LABELS.index("hand")), labels)
+    labels = np.where(masked, np.uint8(LABELS.index("apparel")), labels)
     whole.labels[window] = np.where(alpha > 0, labels, np.uint8(0))
     whole.mesh[window] = geometry.mesh > 0
     return whole

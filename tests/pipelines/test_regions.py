@@ -22,6 +22,7 @@ from pipelines.regions.colour import (
     face_colours,
     judge_scalp,
     left_of_middle,
+    mask_colour,
     scalp_votes,
 )
 from pipelines.regions.geometry import (
@@ -279,6 +280,39 @@ def test_a_face_in_red_light_from_one_side_and_blue_from_the_other_is_skin() -> 
         worn = np.where(hair[..., None], grey, scene.rgb).astype(np.uint8)
         kept = bare_skin(worn, skin, mesh, solid)
         assert not kept[hair & skin].any() and kept[skin & ~hair].mean() > 0.95
+
+
+def over_the_mouth(scene: RegionScene, colour: tuple[int, int, int]) -> tuple[RegionScene, ...]:
+    """Cover mouth and chin in a colour; returns the scene and where (H, W) bool it is covered."""
+    lips = np.nonzero(label_mask(scene.labels, "lips"))[0]
+    row = np.arange(len(scene.rgb))[:, None]
+    cloth = label_mask(scene.labels, "skin", "lips") & (row > 2 * lips.min() - lips.max())
+    noise = np.random.default_rng(4).normal(0, 4, scene.rgb.shape)
+    pleats = np.where(row % 8 < 3, 0.8, 1.0)[..., None]
+    shown = np.clip(pleats * np.array(colour) + noise, 0, 255)
+    return replace(scene, rgb=np.where(cloth[..., None], shown, scene.rgb).astype(np.uint8)), cloth
+
+
+@pytest.mark.parametrize("colour", [(120, 180, 215), (110, 170, 130), (245, 245, 240)])
+def test_a_mask_over_the_mouth_is_apparel(colour: tuple[int, int, int]) -> None:
+    front, cloth = over_the_mouth(make_scene(0, size=300), colour)
+    mesh = render_head(front.head, front.camera)[0]
+    found = mask_colour(front.rgb, front.alpha, mesh)
+    pictures = front.rgb, front.alpha, front.depth
+    view = label_view(front.head, front.camera, *pictures, False, SIDE, mask=found)
+    apparel, skin = (label_mask(view.labels, name) for name in ("apparel", "skin"))
+    assert apparel[cloth].mean() > 0.95 and apparel[~cloth].mean() < 0.005
+    assert skin[label_mask(front.labels, "skin") & ~cloth].mean() > 0.9
+    assert not label_mask(view.labels, "lips", "mouth", "teeth").any()
+
+
+@pytest.mark.parametrize("colour", [(60, 40, 30), (130, 128, 125), (200, 150, 110)])
+def test_a_beard_or_a_bare_face_is_not_a_mask(colour: tuple[int, int, int]) -> None:
+    bearded, _ = over_the_mouth(make_scene(0, size=300), colour)
+    mesh = render_head(bearded.head, bearded.camera)[0]
+    assert np.isnan(mask_colour(bearded.rgb, bearded.alpha, mesh)).all()
+    grey = np.repeat(bearded.rgb.max(axis=2, keepdims=True), 3, axis=2)
+    assert mask_colour(grey, bearded.alpha, mesh) is None
 
 
 @pytest.mark.parametrize("shown", [0.0, 0.1])
