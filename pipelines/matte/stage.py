@@ -577,7 +577,8 @@ def matte_warnings(alphas: dict[str, np.ndarray], body: Mapping[str, str]) -> li
         contact = np.roll([*border_contact(head).values()], turns)
         cut = [side for side, share in zip(SIDES, contact, strict=True) if share > MOST_CONTACT]
         if cut:
-            sides, whole = " and ".join(cut), border_contact(alpha)
+            several = [", ".join(cut[:-1]), cut[-1]] if len(cut) > 1 else cut
+            sides, whole = " and ".join(several), border_contact(alpha)
             most = max(whole[side] for side in cut)
             notes.append(Note(name, f"the subject leaves the image at the {sides} ({most:.0%})"))
     return notes
