@@ -220,6 +220,19 @@ def mask_colour(rgb: np.ndarray, alpha: np.ndarray, mesh: np.ndarray) -> np.ndar
     return own if masked and (own[1:].min() < COLD or white) else np.full(3, np.nan)
 
 
+def agreed_mask(said: Sequence[np.ndarray | None], bald: bool) -> np.ndarray | None:
+    """Return the mask's colour (3,) by most views' `mask_colour`; None without a mask.
+
+    A white one of a `bald` head may be a beard: no hair on the scalp shows whether that is white.
+    """
+    known = [colour for colour in said if colour is not None]
+    masked = [colour for colour in known if np.isfinite(colour).all()]
+    if 2 * len(masked) <= len(known):
+        return None
+    mask: np.ndarray = np.median(masked, axis=0)
+    return None if bald and mask[1:].min() >= COLD else mask
+
+
 def worn_mask(
     rgb: np.ndarray, alpha: np.ndarray, mesh: np.ndarray, colour: np.ndarray, metre_px: float
 ) -> np.ndarray:

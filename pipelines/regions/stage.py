@@ -24,6 +24,7 @@ from pipelines.regions.colour import (
     EARS,
     SKIN,
     Scalp,
+    agreed_mask,
     face_colours,
     judge_scalp,
     label_by_colour,
@@ -182,15 +183,17 @@ def judge_colours(
             rgb, alpha = frames[camera.id] = read_frame_and_matte(dataset, item, camera)
             camera, rgb, alpha = reduced(camera, rgb, alpha, STUDIED_SIDE)
             studied.append((rgb, alpha, render_head(head, camera)[0], head.metre_px(camera)))
-    said = [c for c in (mask_colour(*pictured[:3]) for pictured in studied) if c is not None]
-    masked = [colour for colour in said if np.isfinite(colour).all()]
-    mask = np.median(masked, axis=0) if 2 * len(masked) > len(said) else None
-    votes, colours = [], []
-    for rgb, alpha, mesh, metre_px in studied:
-        if mask is not None:
-            alpha = np.where(worn_mask(rgb, alpha, mesh, mask, metre_px), np.float32(0), alpha)
-        votes.append(scalp_votes(rgb, mesh, alpha))
-        colours += [c for c in (face_colours(rgb, alpha, mesh),) if c is not None]
+    votes = [scalp_votes(rgb, mesh, alpha) for rgb, alpha, mesh, _ in studied]
+    said = [mask_colour(rgb, alpha, mesh) for rgb, alpha, mesh, _ in studied]
+    mask = agreed_mask(said, judge_scalp(votes).is_skin)
+    if mask is not None:
+        studied = [
+            (rgb, np.where(worn_mask(rgb, alpha, mesh, mask, px), np.float32(0), alpha), mesh, px)
+            for rgb, alpha, mesh, px in studied
+        ]
+        votes = [scalp_votes(rgb, mesh, alpha) for rgb, alpha, mesh, _ in studied]
+    counted = (face_colours(rgb, alpha, mesh) for rgb, alpha, mesh, _ in studied)
+    colours = [counts for counts in counted if counts is not None]
     skin = sum(colours[1:], colours[0]) if colours else None
     return judge_scalp(votes), skin, mask, frames
 

@@ -18,6 +18,7 @@ from express50.head.load import load_head
 from express50.head.model import pose
 from pipelines.regions import STAGE, RegionsConfig
 from pipelines.regions.colour import (
+    agreed_mask,
     bare_skin,
     face_colours,
     judge_scalp,
@@ -304,6 +305,15 @@ def test_a_mask_over_the_mouth_is_apparel(colour: tuple[int, int, int]) -> None:
     assert apparel[cloth].mean() > 0.95 and apparel[~cloth].mean() < 0.005
     assert skin[label_mask(front.labels, "skin") & ~cloth].mean() > 0.9
     assert not label_mask(view.labels, "lips", "mouth", "teeth").any()
+
+
+def test_most_views_decide_on_a_mask_and_a_bald_heads_white_beard_is_not_one() -> None:
+    blue, white, none = np.array([-0.6, -0.3, -0.1]), np.array([-0.3, 0.0, 0.0]), np.full(3, np.nan)
+    np.testing.assert_allclose(agreed_mask([blue, none, blue, None], bald=True), blue)
+    np.testing.assert_allclose(agreed_mask([white, None], bald=False), white)
+    assert agreed_mask([white, white], bald=True) is None
+    assert agreed_mask([blue, none], bald=False) is None
+    assert agreed_mask([None], bald=False) is None
 
 
 @pytest.mark.parametrize("colour", [(60, 40, 30), (130, 128, 125), (200, 150, 110)])
