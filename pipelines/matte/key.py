@@ -132,8 +132,8 @@ def part_like_the_wall(
 ) -> np.ndarray:
     """Return the opacity (H, W) float32 of the parts beside the subject that look like the wall.
 
-    They have its colours, but hide its texture, which a shadow keeps. There are none if the wall
-    has no texture, or if it is missing elsewhere too, as after compression or if a curtain moved.
+    They have its colours, but hide its texture, which shadows do not. Nothing is returned for smooth
+    walls, nor where texture is missing at the picture's rim too: compression or a draught took it.
     """
     opaque = np.rint(255 * alpha), 255 * valid
     solid, known = (shrink(v.astype(np.uint8), TEXTURE_SIDE) > 240 for v in opaque)
@@ -160,9 +160,9 @@ def part_like_the_wall(
 def texture_shown(seen: np.ndarray, held: np.ndarray, alike: np.ndarray) -> np.ndarray:
     """Return how much (H, W) of the texture that a plate has its frame shows: 1 if all, 0 if none.
 
-    The texture that is `held` by the plate (H, W, 3) and the one that is `seen` in the frame are
-    compared. Noise weakens both: how much is left where the wall shows is measured in the pixels
-    that are `alike` (H, W), most of which show it. Texture that noise hides counts as shown.
+    The frame is `seen`, the plate `held`, both (H, W, 3) float32 in one exposure. Noise weakens what
+    they share, so that it is compared with what they share in most pixels whose colours are `alike`
+    (H, W), which show the wall. Texture that noise hides counts as shown.
     """
     greys = [cv2.transform(image, np.full((1, 3), 1 / 3)) for image in (seen, held)]
     seen, held = (grey - cv2.GaussianBlur(grey, (0, 0), FINE) for grey in greys)
