@@ -132,7 +132,7 @@ def part_like_the_wall(
 ) -> np.ndarray:
     """Return the opacity (H, W) float32 of the parts beside the subject that look like the wall.
 
-    They have its colours, but hide its texture, which shadows do not. Nothing is returned for smooth
+    They have its colours, but hide its texture, which shadows do not. There are none before smooth
     walls, nor where texture is missing at the picture's rim too: compression or a draught took it.
     """
     opaque = np.rint(255 * alpha), 255 * valid
@@ -160,8 +160,8 @@ def part_like_the_wall(
 def texture_shown(seen: np.ndarray, held: np.ndarray, alike: np.ndarray) -> np.ndarray:
     """Return how much (H, W) of the texture that a plate has its frame shows: 1 if all, 0 if none.
 
-    The frame is `seen`, the plate `held`, both (H, W, 3) float32 in one exposure. Noise weakens what
-    they share, so that it is compared with what they share in most pixels whose colours are `alike`
+    The frame is `seen`, the plate `held`, both (H, W, 3) float32 in one exposure. Noise weakens
+    what they share, so it is compared with what they share in most pixels whose colours are `alike`
     (H, W), which show the wall. Texture that noise hides counts as shown.
     """
     greys = [cv2.transform(image, np.full((1, 3), 1 / 3)) for image in (seen, held)]
