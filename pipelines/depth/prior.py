@@ -31,8 +31,8 @@ from pipelines.regions.things import NEAR_M, FaceView
 REACH = 0.015  # metres that the hull may lie above a mesh that is trusted; beyond is hair or cloth
 BORDER = 0.03  # metres from the mesh's open border, where collars are, over which trust grows
 BODY = 0.5  # metres that the body continues below the neck, and widens; shoulders are nearer
-SHOULDERS = 0.04  # metres that shoulders may stand out from this body, if more views than these
-FEW_VIEWS = 4  # limit what is behind and before it
+# Metres that shoulders may stand out from this body, unless few views limit what stands out.
+SHOULDERS, FEW_VIEWS = 0.04, 4
 EYES_M = 0.03  # metres from glasses within which the head is trusted, whatever the hull
 WORN_M = 0.004  # radius about a place on glasses that shows glasses, or what is behind them
 OUTLINE_SIDE = 512  # longest side, pixels, of the body's outlines: they count at the first level
