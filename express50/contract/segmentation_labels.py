@@ -10,7 +10,7 @@ LABELS = (
 )  # fmt: skip
 """Names of the labels by value; new ones are added at the end, so that older shards stay read.
 
-Apparel is glasses with their lenses and face masks; only a network finds hats and microphones.
+Apparel is glasses with their lenses, face masks, and what a network calls so, such as hats.
 """
 HEAD = LABELS[1:10]
 TORSO = LABELS.index("torso")
