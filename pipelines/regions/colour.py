@@ -71,7 +71,7 @@ TWO_COLOURED = 0.77
 OTHER_LIGHT = 0.4
 # Masks: least difference from the skin about the eyes in redness; ratios of colours below which
 # nothing is skin or hair; more brightness than skin's, of white ones; least share of the lips and
-# of the skin below them that has one colour. Distance between eyes and lips is 1 of LOWER_FACE.
+# of the skin below them that has one colour. Parts of the face are in units of `_axes_of_face`.
 UNLIKE_SKIN, COLD, WHITE, ONE_COLOUR = 0.18, -0.05, 0.1, 0.5
 UPPER_FACE, LOWER_FACE = (-0.6, 0.45), (0.6, 1.4)
 PLEATS = np.array([0.6, 0.12, 0.12])  # most by which a mask's pixels differ from its usual colour
@@ -199,25 +199,27 @@ def mask_colour(rgb: np.ndarray, alpha: np.ndarray, mesh: np.ndarray) -> np.ndar
     or green, and white ones are rare where the scalp's hair is not white. The result is None in
     grey views and those that do not show the mouth. Arguments are those of `face_colours`.
     """
-    eyes, lips = (label_mask(mesh, name) & (alpha > SOLID) for name in ("eyes", "lips"))
-    if is_grey(rgb) or min(eyes.sum(), lips.sum()) < LEAST:
+    axes = None if is_grey(rgb) else _axes_of_face(mesh)
+    if axes is None:
         return None
-    (top, left), (bottom, right) = (np.argwhere(part).mean(0) for part in (eyes, lips))
-    down, across = bottom - top, right - left
-    row, column = np.ogrid[: mesh.shape[0], : mesh.shape[1]]
-    along = ((row - top) * down + (column - left) * across) / max(down**2 + across**2, 1.0)
-    skin = (mesh == SKIN) & (alpha > SOLID)
-    upper, lower = (skin & (along > a) & (along < b) for a, b in (UPPER_FACE, LOWER_FACE))
-    if min(upper.sum(), lower.sum()) < LEAST:
+    solid = alpha > SOLID
+    lips, skin = label_mask(mesh, "lips") & solid, (mesh == SKIN) & solid
+    upper, lower = (skin & (axes[0] > a) & (axes[0] < b) for a, b in (UPPER_FACE, LOWER_FACE))
+    if min(part.sum() for part in (lips, upper, lower)) < LEAST:
         return None
     above, mouth, below = (_some_ratios(rgb[part]) for part in (upper, lips, lower))
     usual, own = np.median(above, axis=0), np.median(np.concatenate([mouth, below]), axis=0)
     one = min(_share_near(own, mouth), _share_near(own, below)) > ONE_COLOUR
-    scalp = rgb[(mesh == SCALP) & (alpha > SOLID)]
+    scalp = rgb[(mesh == SCALP) & solid]
     as_hair = len(scalp) >= LEAST and _share_near(own, _some_ratios(scalp)) > 1 - COHERENT
     white = own[0] > usual[0] + WHITE and len(scalp) >= LEAST
     masked = one and usual[1] - own[1] > UNLIKE_SKIN and not as_hair
-    return own if masked and (own[1:].min() < COLD or white) else np.full(3, np.nan)
+    return own if masked and (_is_cold(own) or white) else np.full(3, np.nan)
+
+
+def _is_cold(colour: np.ndarray) -> bool:
+    """Return whether a colour (3,), ratios, is bluer or greener than any skin or hair."""
+    return bool(colour[1:].min() < COLD)
 
 
 def agreed_mask(said: Sequence[np.ndarray | None], bald: bool) -> np.ndarray | None:
@@ -230,7 +232,7 @@ def agreed_mask(said: Sequence[np.ndarray | None], bald: bool) -> np.ndarray | N
     if 2 * len(masked) <= len(known):
         return None
     mask: np.ndarray = np.median(masked, axis=0)
-    return None if bald and mask[1:].min() >= COLD else mask
+    return None if bald and not _is_cold(mask) else mask
 
 
 def worn_mask(
@@ -256,14 +258,24 @@ def worn_mask(
 
 def left_of_middle(mesh: np.ndarray) -> np.ndarray:
     """Mark the pixels (H, W) on one side of the line through eyes and mouth of a mesh's labels."""
+    axes = _axes_of_face(mesh)
+    return np.zeros(mesh.shape, bool) if axes is None else axes[1] > 0
+
+
+def _axes_of_face(mesh: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return where pixels (H, W) lie along the line from eyes (0) to lips (1), and beside it.
+
+    None if a mesh's labels (H, W) lack either.
+    """
     ends = [np.argwhere(label_mask(mesh, name)) for name in ("eyes", "lips")]
     if not all(map(len, ends)):
-        return np.zeros(mesh.shape, bool)
+        return None
     eyes, lips = (end.mean(0) for end in ends)
-    row, column = np.ogrid[: mesh.shape[0], : mesh.shape[1]]
     down, across = lips - eyes
-    left: np.ndarray = (column - eyes[1]) * down > (row - eyes[0]) * across
-    return left
+    row, column = np.ogrid[: mesh.shape[0], : mesh.shape[1]]
+    row, column = row - eyes[0], column - eyes[1]
+    length = max(down**2 + across**2, 1.0)
+    return (row * down + column * across) / length, (column * down - row * across) / length
 
 
 def _uncovered(
