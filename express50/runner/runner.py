@@ -192,7 +192,7 @@ def run_stage(
             aside = [item for item in gone if _retire(dataset, ledger, stage.name, item)]
             if aside and progress:
                 words = f"{count_of(len(aside), 'item')} ({few(aside)})"
-                write(f"{stage.name}: set aside {words}, which the dataset no longer has")
+                write(f"{stage.name}: set aside {words}, which it no longer makes")
             ledger.forget(stage.name, gone)
         with RunLog(dataset.ledger, stage.name, len(chosen)) as log:
             if shortage := expected_shortage(dataset, ledger, stage.name, chosen):

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from express50.capture.index import peak_items
+from express50.capture.index import peak_items, read_index
 from express50.contract.config import check_ranges
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
+from express50.dataset.tracks import tracked_items
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +37,16 @@ PRESETS: dict[str, dict[str, object]] = {
     "draft": {"voxel_mm": 4.0, "image_side": 512},
     "reference": {"voxel_mm": 1.0, "image_side": 2048},
 }
+
+
+def items(dataset: Dataset) -> list[str]:
+    """List the peaks; of one camera, whose depth is the tracked head's, those with a face."""
+    tracked = set(tracked_items(dataset))
+    return [
+        item
+        for item in peak_items(dataset)
+        if item in tracked or len(read_index(dataset, item.split("/")[0]).cameras) > 1
+    ]
 
 
 def inputs(dataset: Dataset, item: str, config: DepthConfig) -> dict[str, Path | str]:
@@ -70,7 +81,7 @@ STAGE = Stage(
     version=24,
     config=DepthConfig,
     presets=PRESETS,
-    items=peak_items,
+    items=items,
     inputs=inputs,
     run=run,
     help="reconstruct the head's surface and depth maps of each expression",

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from express50.capture.index import peak_items
 from express50.contract.config import check_ranges
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
+from express50.dataset.tracks import tracked_items
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +85,7 @@ STAGE = Stage(
     name="regions",
     version=20,
     config=RegionsConfig,
-    items=peak_items,
+    items=tracked_items,
     inputs=inputs,
     run=run,
     try_files=try_files,

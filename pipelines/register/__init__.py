@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from express50.capture.index import peak_items
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, NoSettings, Result, Stage
+from express50.dataset.tracks import tracked_items
 
 
 def inputs(dataset: Dataset, item: str, config: NoSettings) -> dict[str, Path | str]:
@@ -32,7 +32,7 @@ STAGE = Stage(
     name="register",
     version=10,
     config=NoSettings,
-    items=peak_items,
+    items=tracked_items,
     inputs=inputs,
     run=run,
     help="lay the tracked mesh onto the reconstructed surface",

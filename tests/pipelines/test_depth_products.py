@@ -10,11 +10,13 @@ from express50.capture.frames import read_cameras_of
 from express50.dataset.depth_files import depth_file, read_depth, read_normals
 from express50.dataset.tracks import read_track
 from express50.errors import ConfigError
+from express50.files.atomic import write_json
 from express50.files.images import read_image, srgb_to_linear
 from express50.geometry.cameras import transform_camera
 from express50.geometry.raycast import mesh_scene
 from express50.geometry.transforms import make_transform
 from express50.head.load import load_head
+from pipelines import regions, register
 from pipelines.depth import STAGE, DepthConfig
 from pipelines.depth.maps import PhotoErrors, compared_view, photo_errors
 from pipelines.pack import ENCODE, EncodeConfig
@@ -141,6 +143,15 @@ def test_one_camera_gets_the_tracked_heads_depth_at_low_confidence(tmp_path):
     dataset.track_file("S001").unlink()
     (outcome, _) = run_here(STAGE, dataset, voxel_mm=3.0).outcomes
     assert "express50 track" in outcome.reason
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_what_shows_no_face_is_left_out_of_the_stages_that_need_one(tmp_path, cameras):
+    dataset = make_dataset(tmp_path, cameras=cameras, size=48)
+    note = {"what": "smile", "why": "no camera sees a face"}
+    write_json(dataset.item_dir("track", "S001") / "metrics.json", {"dropped": [note]})
+    assert STAGE.items(dataset) == list(ITEMS[:cameras])  # several cameras need no tracked head
+    assert register.STAGE.items(dataset) == regions.STAGE.items(dataset) == list(ITEMS[:1])
 
 
 def test_a_rig_of_which_one_camera_is_left_is_refused(tmp_path):

@@ -122,7 +122,7 @@ def test_finished_work_that_will_be_made_again_is_announced(tmp_path, capsys):
     )
     assert "again" not in said()  # restored at no cost
     (dataset.root / "in" / "b.txt").unlink()
-    assert "toy: set aside 1 item (b), which the dataset no longer has" in said()
+    assert "toy: set aside 1 item (b), which it no longer makes" in said()
 
 
 def test_the_receipt_of_an_output_that_fills_the_disk_is_kept(tmp_path, monkeypatch):
