@@ -13,6 +13,7 @@ request (`express50.capture.frames.read_proxy`).
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import combinations
@@ -32,7 +33,7 @@ from express50.capture.index import (
 )
 from express50.capture.raw import RawCapture, check_calibrated_sizes, check_focals
 from express50.capture.readers.read import OURS, read_any, subject_of, watched
-from express50.console import log
+from express50.console import group_lines, log
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
 from express50.dataset.withdraw import withdrawn
@@ -181,9 +182,11 @@ def run(
         dropped[name] = reason
         del cameras[name]
         remove_proxies(out / "proxies", name)
+    dropped = shared_reasons(dropped)
     if not cameras:
-        reasons = few([f"{name}: {why}" for name, why in sorted(dropped.items())], between="; ")
-        raise CaptureError(f"{raw.root}: no usable camera: {reasons or 'cameras/ is empty'}")
+        reasons = [*group_lines((f"camera {k}", why) for k, why in sorted(dropped.items()))]
+        why = few(reasons, between="; ") or "cameras/ is empty"
+        raise CaptureError(f"{raw.root}: no usable camera: {why}")
     if calibration is not None:
         write_cameras(out / "calibration.json", calibration)
     index = make_index(raw, cameras, cues)
@@ -229,6 +232,13 @@ def _scan(
                 f" rename {name}"
             )
     return cameras, measured, dropped
+
+
+def shared_reasons(dropped: Mapping[str, str]) -> dict[str, str]:
+    """Write * for the camera's name in paths, where that makes the reasons of several alike."""
+    alike = {k: re.sub(rf"/{re.escape(k)}(?=[/.:])", "/*", why) for k, why in dropped.items()}
+    several = {why for why, count in Counter(alike.values()).items() if count > 1}
+    return {k: alike[k] if alike[k] in several else why for k, why in dropped.items()}
 
 
 def _calibration(raw: RawCapture, cameras: Mapping[str, CameraSource]) -> dict[str, Camera] | None:

@@ -123,7 +123,7 @@ def test_capture_without_a_usable_camera_fails(dataset):
         (camera_folder(dataset, name) / "video.mp4").write_bytes(b"junk")
     summary = run(dataset)
     assert summary.count("failed") == 1
-    assert "no usable camera: cam00: " in summary.outcomes[0].reason
+    assert summary.outcomes[0].reason.count("video.mp4") == 1, "one reason of three cameras"
     assert not dataset.item_dir("ingest", "S001").exists()
 
 
@@ -133,7 +133,21 @@ def test_a_rig_of_which_every_camera_is_damaged_fails_with_the_reasons(tmp_path)
         (tmp_path / "rig" / name / "000001.png").write_bytes(b"junk")
     dataset = Dataset(tmp_path / "data")
     ingest.add_captures(dataset, [tmp_path / "rig"])
-    assert "no usable camera: cam0: " in run(dataset).outcomes[0].reason
+    (outcome,) = run(dataset).outcomes
+    assert "no usable camera: camera cam0, cam1: " in outcome.reason
+    assert outcome.reason.count("/rig/*/000001.png") == outcome.reason.count("000001.png") == 1
+
+
+def test_a_frame_that_several_cameras_lack_is_one_line(tmp_path):
+    make_capture(tmp_path / "raw", cameras=3)
+    for name in ("cam00", "cam02"):
+        (tmp_path / "raw" / "cameras" / name / "frames" / "000003.png").unlink()
+    dataset = Dataset(tmp_path / "data")
+    ingest.add_captures(dataset, [tmp_path / "raw"])
+    lines = [line for line in run(dataset).lines() if "frame 3 is missing" in line]
+    assert len(lines) == 1
+    assert "dropped camera cam00, camera cam02 of S001: " in lines[0]
+    assert "cameras/*/frames: " in lines[0]
 
 
 def test_wrong_calibration_fails_its_item_only(dataset, tmp_path):
