@@ -9,7 +9,7 @@ import hashlib
 import json
 import shutil
 import tarfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -331,16 +331,30 @@ def copy_samples(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> in
             writer.add_group(splits[subject], samples)
         writer.close()
         write_json(aside / "splits.json", names | {"chosen_by": "the shards these are made of"})
-        # The sources' cards follow one another, so that consent and licence are kept.
-        cards = [reader.root / "card.md" for reader in readers]
-        texts = [card.read_text("utf-8") if card.is_file() else "(no card)\n" for card in cards]
-        title = f"# {count(samples_in_all, 'sample')} of {count(len(readers), 'folder')} of shards"
-        text = f"{title}\n\nTheir cards, as they were:\n\n" + "\n".join(texts)
-        (aside / "card.md").write_text(text, encoding="utf-8")
+        (aside / "card.md").write_text(_card_of_copies(readers, names), encoding="utf-8")
         write_manifest(aside, writer.digests)
         if out.exists():
             out.rmdir()  # fails if somebody has filled the folder meanwhile
     return samples_in_all
+
+
+def _card_of_copies(readers: Sequence[ShardReader], splits: Mapping[str, Sequence[str]]) -> str:
+    """Describe copied samples as Markdown; the cards of folders that were merged follow."""
+    entries = [entry for reader in readers for entry in reader.entries]
+    rows: dict[str, Iterable[str]] = {f"{split} subjects": splits[split] for split in splits}
+    rows["expressions"] = [entry.expression for entry in entries]
+    rows["cameras"] = [entry.camera for entry in entries]
+    metas = (reader.meta(number) for reader in readers for number in range(len(reader)))
+    stated = ("licence", "consent", "head")
+    facts = {tuple(str(meta.get(key) or "not stated") for key in stated) for meta in metas}
+    rows |= dict(zip(stated, zip(*facts, strict=True), strict=True))
+    lines = ["# Dataset card", "", f"{count(len(entries), 'sample')}", "", "| | |", "|---|---|"]
+    lines += [f"| {what} | {', '.join(sorted(set(values)))} |" for what, values in rows.items()]
+    if len(readers) > 1:
+        lines += ["", "The cards of the folders that were merged:", ""]
+        cards = [reader.root / "card.md" for reader in readers]
+        lines += [card.read_text("utf-8") if card.is_file() else "(no card)\n" for card in cards]
+    return "\n".join([*lines, ""])
 
 
 def _checked_splits(readers: Sequence[ShardReader]) -> dict[str, str]:

@@ -32,6 +32,10 @@ def test_a_split_folder_merges_to_the_same_samples(
     again, said = tmp_path / "again", capsys.readouterr().err
     assert f"{parts[1]}: copying 6 samples\n" in said and f"{again}: copying 18 samples\n" in said
     assert verify(again) == [] and content(again) == content(whole)
+    cards = [(folder / "card.md").read_text() for folder in (*parts, again)]
+    assert "| train subjects | S001, S002 |" in cards[0] and "S003" not in cards[0]
+    assert "\n6 samples\n" in cards[1] and "S001" not in cards[1]
+    assert "\n18 samples\n" in cards[2] and cards[2].endswith(cards[0] + "\n" + cards[1] + "\n")
     splits = json.loads((again / "splits.json").read_text())
     assert splits["train"] == ["S001", "S002"] and splits["test"] == ["S003"]
     assert [e.split for e in ShardReader(again).entries].count("test") == 6
